@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The errors that bad input raises: each says what, the value found and what was expected."""
+
+
+class L1SlamError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class GraphError(L1SlamError):
+    """A factor or pose that cannot be part of the graph, or a graph that cannot be solved."""
+
+
+class NoiseError(L1SlamError):
+    """A covariance or information matrix that is none."""
+
+
+class OptionError(L1SlamError):
+    """An option outside its range."""
+
+
+class MessageError(L1SlamError):
+    """A message that cannot be used; `cause` is the short word it is counted under."""
+
+    def __init__(self, cause: str, message: str):
+        super().__init__(message)
+        self.cause = cause
+
+
+class FileError(L1SlamError):
+    """A file that cannot be read or written; the text names the file and, if known, the line."""
+
+    def __init__(self, path: object, message: str, line: int | None = None):
+        super().__init__(f'{path}:{line}: {message}' if line else f'{path}: {message}')

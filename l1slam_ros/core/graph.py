@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The pose factor graph: which keyframes exist and what was measured, never where they are.
+
+Factors are stored as arrays per kind and are only ever appended, so the row of a factor in the
+linear system never moves, a warm start is a pad with zeros, and what an earlier call returned
+stays valid while the graph grows. Poses live outside, in (n, p) arrays.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.manifold import Array, Indices, Manifold
+from l1slam_ros.core.noise import square_root_information
+
+
+@dataclass(frozen=True)
+class BetweenFactors:
+    """
+    Measurements of the pose of keyframe j seen from keyframe i.
+
+    i, j : (m,) keyframe indices; measurement : (m, p) relative poses;
+    sqrt_information : (m, d, d) upper triangular roots, see `noise`.
+    """
+
+    i: Indices
+    j: Indices
+    measurement: Array
+    sqrt_information: Array
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+    @cached_property
+    def is_odometry(self) -> np.ndarray:
+        """(m,) bool: the first factor between each two consecutive keyframes, either way round."""
+        consecutive = np.flatnonzero(np.abs(self.i - self.j) == 1)
+        _, first = np.unique(np.minimum(self.i, self.j)[consecutive], return_index=True)
+        mask = np.zeros(len(self), bool)
+        mask[consecutive[first]] = True
+        return mask
+
+
+@dataclass(frozen=True)
+class PriorFactors:
+    """
+    Measurements of the pose of keyframe i in the map frame.
+
+    i : (m,) keyframe indices; measurement : (m, p) poses; sqrt_information : (m, d, d).
+    """
+
+    i: Indices
+    measurement: Array
+    sqrt_information: Array
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+
+class FactorGraph:
+    """
+    An append-only pose graph on one manifold.
+
+    Parameters
+    ----------
+    manifold : the module the poses live on, e.g. `se2`
+
+    """
+
+    def __init__(self, manifold: Manifold):
+        self.manifold = manifold
+        self.n_poses = 0
+        p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
+        self._between = [_Column((), np.int64), _Column((), np.int64), _Column((p,)),
+                         _Column((d, d))]
+        self._prior = [_Column((), np.int64), _Column((p,)), _Column((d, d))]
+
+    @property
+    def between(self) -> BetweenFactors:
+        """All between factors so far: a snapshot that later appends do not change."""
+        return BetweenFactors(*(column.view() for column in self._between))
+
+    @property
+    def prior(self) -> PriorFactors:
+        """All prior factors so far: a snapshot that later appends do not change."""
+        return PriorFactors(*(column.view() for column in self._prior))
+
+    def add_poses(self, count: int = 1) -> None:
+        """Let `count` more keyframes exist; the next index is `n_poses` before the call."""
+        self.n_poses += count
+
+    def add_between(self, i: Indices, j: Indices, measurement: Array, information: Array) -> None:
+        """
+        Append between factors: i, j (m,), measurement (m, p), information (m, d, d).
+
+        Raises
+        ------
+        GraphError : an index without a keyframe, a self loop, a measurement that is not finite.
+        NoiseError : an information matrix that is not positive definite.
+
+        Nothing is appended when anything is wrong.
+
+        """
+        i, j = np.atleast_1d(i), np.atleast_1d(j)
+        if (i == j).any():
+            raise GraphError(f'keyframe {i[np.argmax(i == j)]} has a factor to itself')
+        self._check(np.concatenate((i, j)), measurement)
+        self._append(self._between, (i, j, measurement, square_root_information(information)))
+
+    def add_prior(self, i: Indices, measurement: Array, information: Array) -> None:
+        """Append prior factors: i (m,), measurement (m, p), information (m, d, d); as above."""
+        i = np.atleast_1d(i)
+        self._check(i, measurement)
+        self._append(self._prior, (i, measurement, square_root_information(information)))
+
+    def _check(self, indices: Indices, measurement: Array) -> None:
+        unknown = (indices < 0) | (indices >= self.n_poses)
+        if unknown.any():
+            raise GraphError(f'a factor names keyframe {indices[np.argmax(unknown)]}, '
+                             f'the graph has 0 to {self.n_poses - 1}')
+        if not np.isfinite(measurement).all():
+            row = int(np.argmin(np.isfinite(measurement).all(axis=1)))
+            raise GraphError(f'measurement {row} is not finite: {measurement[row]}')
+
+    @staticmethod
+    def _append(columns: list['_Column'], values: tuple[np.ndarray, ...]) -> None:
+        for column, value in zip(columns, values, strict=True):
+            column.extend(value)
+
+
+def component_labels(graph: FactorGraph) -> Indices:
+    """Return a component number for each keyframe, (n,); one component: all zero."""
+    factors = graph.between
+    adjacency = coo_array((np.ones(len(factors)), (factors.i, factors.j)),
+                          shape=(graph.n_poses, graph.n_poses))
+    labels: Indices = connected_components(adjacency, directed=False)[1]
+    return labels
+
+
+class _Column:
+    """An array that grows at its end; amortised doubling, old views stay valid."""
+
+    def __init__(self, shape: tuple[int, ...], dtype: type = np.float64):
+        self._data = np.empty((16, *shape), dtype)
+        self._length = 0
+
+    def extend(self, rows: np.ndarray) -> None:
+        end = self._length + len(rows)
+        if end > len(self._data):
+            grown = np.empty((max(end, 2 * len(self._data)), *self._data.shape[1:]),
+                             self._data.dtype)
+            grown[: self._length] = self.view()
+            self._data = grown
+        self._data[self._length : end] = rows
+        self._length = end
+
+    def view(self) -> np.ndarray:
+        return self._data[: self._length]

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What L1 is compared with: Gauss-Newton for L2, and Huber, on the same linearisation.
+
+In: a graph and poses. Out: poses of lower cost. Both solve sparse normal equations and add
+Marquardt's damping only when a plain Gauss-Newton step fails.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.least_squares import weighted_least_squares
+from l1slam_ros.core.linearise import linearise, step_poses, whitened_residual
+from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.optimality import Status, l2_cost
+from l1slam_ros.core.optimiser import Report, Solution
+
+_FIRST_DAMPING = 1e-6
+_MOST_DAMPING = 1e6
+
+
+@dataclass(frozen=True)
+class LeastSquaresOptions:
+    """How long Gauss-Newton runs and when it is content."""
+
+    iterations: int = 100
+    """Most linearisations."""
+
+    tolerance: float = 1e-9
+    """Converged when the cost fell by no more than this part of itself. [1]"""
+
+    huber_delta: float = 1.345
+    """Length of a factor's whitened residual where Huber turns linear. [sigmas]"""
+
+    def __post_init__(self) -> None:
+        """Refuse what no run could mean."""
+        if self.iterations < 0:
+            raise OptionError(f'iterations is {self.iterations}, expected 0 or more')
+        if not 0 <= self.tolerance < 1:
+            raise OptionError(f'tolerance is {self.tolerance}, expected 0 to 1')
+        if not self.huber_delta > 0:
+            raise OptionError(f'huber_delta is {self.huber_delta}, expected above 0')
+
+
+# From the whitened residual (rows,) to the cost, and to the weight of each row.
+_Cost = Callable[[Array], float]
+_Weights = Callable[[Array], Array]
+
+
+def minimise_l2(
+    graph: FactorGraph,
+    poses: Array,
+    options: LeastSquaresOptions,
+    report: Report = lambda iteration, cost: None,
+) -> Solution:
+    """Minimise chi2, the sum of squared whitened residuals; arguments as `optimiser.minimise`."""
+    return _gauss_newton(graph, poses, l2_cost, np.ones_like, options, report)
+
+
+def minimise_huber(
+    graph: FactorGraph,
+    poses: Array,
+    options: LeastSquaresOptions,
+    report: Report = lambda iteration, cost: None,
+) -> Solution:
+    """
+    Minimise sum rho(|e_k|) over the factors k, odometry included; arguments as above.
+
+    rho(s) = s^2 up to delta, 2 delta s - delta^2 beyond (g2o's Huber), e_k the whitened residual
+    of one factor.
+    """
+    delta, d = options.huber_delta, graph.manifold.TANGENT_SIZE
+
+    def weights(residual: Array) -> Array:
+        length = _lengths(residual, d)
+        return np.repeat(delta / np.maximum(length, delta), d)
+
+    return _gauss_newton(graph, poses, lambda r: huber_cost(r, d, delta), weights, options,
+                         report)
+
+
+def huber_cost(residual: Array, d: int, delta: float) -> float:
+    """Return sum rho(|e_k|) for the whitened residual (rows,) of factors with d rows each."""
+    length = _lengths(residual, d)
+    return float(np.where(length <= delta, length**2, 2 * delta * length - delta**2).sum())
+
+
+def _lengths(residual: Array, d: int) -> Array:
+    lengths: Array = np.linalg.norm(residual.reshape(-1, d), axis=1)
+    return lengths
+
+
+def _gauss_newton(
+    graph: FactorGraph,
+    poses: Array,
+    cost_of: _Cost,
+    weights_of: _Weights,
+    options: LeastSquaresOptions,
+    report: Report,
+) -> Solution:
+    history = [cost_of(whitened_residual(graph, poses))]
+    status, damping = Status.ITERATION_LIMIT, 0.0
+    while len(history) <= options.iterations:
+        system = linearise(graph, poses)
+        step = weighted_least_squares(system.A, system.b, weights_of(system.b), damping)
+        candidate = step_poses(graph, poses, step)
+        cost = cost_of(whitened_residual(graph, candidate))
+        decrease = history[-1] - cost
+        if decrease >= 0:
+            poses = candidate
+            damping = damping / 10 if damping > _FIRST_DAMPING else 0.0
+        else:
+            damping, cost = max(10 * damping, _FIRST_DAMPING), history[-1]
+        history.append(cost)
+        report(len(history) - 1, cost)
+        if 0 <= decrease <= options.tolerance * cost and not damping:
+            status = Status.CONVERGED
+            break
+        # Rounding alone can keep the last digits from falling: that is the optimum too.
+        if damping > _MOST_DAMPING:
+            status = Status.STALLED
+            break
+    return Solution(poses, history[-1], status, len(history) - 1, 0, np.array(history),
+                    np.zeros(0))

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The conventions of the whole package, and the verbs that every pose manifold offers.
+
+Pose
+    `T_map_k`: takes points of the body frame of keyframe k to the map frame [m, rad].
+    Stored as rows of an (n, p) array; p = `POSE_SIZE`.
+Step
+    Tangent vector, translation first, rotation after; rows of an (n, d) array, d =
+    `TANGENT_SIZE`. **Steps apply on the right**, in the axes of the body: X (+) s = X v2t(s).
+Residual
+    `e = t2v(Z^-1 Xi^-1 Xj)`: the error of the relative pose, in the axes of the measured pose.
+    t2v reads the coordinates off (as g2o does); it is not the logarithm.
+Jacobian
+    `J_r_i`: derivative of the residual r with respect to the step of pose i, at step zero.
+Stamp
+    Integer nanoseconds.
+
+A manifold is a module of plain functions on stacked arrays: `se2` today. Nothing outside it
+assumes a dimension: sizes, and which part of a step is rotation, are asked of it.
+"""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+class Manifold(Protocol):
+    """The verbs of a pose manifold; every array is stacked along its first axis."""
+
+    # Attributes of a module: constants, so read-only here.
+    @property
+    def NAME(self) -> str: ...  # noqa: D102
+    @property
+    def POSE_SIZE(self) -> int: ...  # noqa: D102
+    @property
+    def TANGENT_SIZE(self) -> int: ...  # noqa: D102
+    @property
+    def TRANSLATION(self) -> slice: ...  # noqa: D102
+    @property
+    def ROTATION(self) -> slice: ...  # noqa: D102
+    @property
+    def COVARIANCE_ROWS(self) -> tuple[int, ...]: ...  # noqa: D102
+
+    def identity(self, n: int) -> Array:
+        """Return n identity poses, (n, p)."""
+
+    def compose(self, a: Array, b: Array) -> Array:
+        """Return a b, (n, p)."""
+
+    def inverse(self, a: Array) -> Array:
+        """Return a^-1, (n, p)."""
+
+    def between(self, a: Array, b: Array) -> Array:
+        """Return a^-1 b, the pose of b seen from a, (n, p)."""
+
+    def retract(self, pose: Array, step: Array) -> Array:
+        """Return pose v2t(step), (n, p)."""
+
+    def local(self, a: Array, b: Array) -> Array:
+        """Return t2v(a^-1 b), (n, d): the step that retracts a to b."""
+
+    def adjoint(self, pose: Array) -> Array:
+        """Return Ad, (n, d, d): pose v2t(s) = v2t(Ad s) pose to first order in s."""
+
+    def residual(self, measurement: Array, pose_i: Array, pose_j: Array) -> Array:
+        """Return t2v(Z^-1 Xi^-1 Xj), (n, d)."""
+
+    def residual_jacobians(
+        self, measurement: Array, pose_i: Array, pose_j: Array
+    ) -> tuple[Array, Array]:
+        """Return J_r_i and J_r_j of `residual`, each (n, d, d)."""
+
+    def local_jacobian(self, a: Array, b: Array) -> Array:
+        """Return J_l_b of `local`, (n, d, d)."""
+
+    def interpolate(self, a: Array, b: Array, fraction: Array) -> Array:
+        """Return the poses at `fraction` (n,) of the way from a to b, (n, p)."""
+
+    def motion(self, step: Array) -> tuple[Array, Array]:
+        """Return the length [m] and the angle [rad] of each relative pose given as a step."""
+
+    def positions(self, pose: Array) -> Array:
+        """Return the coordinates of the body's origin in the map [m], (n, 2 or 3)."""
+
+    def from_pose3(self, pose3: Array) -> Array:
+        """Return poses from rows x y z qx qy qz qw (ROS order), (n, 7) -> (n, p)."""
+
+    def to_pose3(self, pose: Array) -> Array:
+        """Return rows x y z qx qy qz qw (ROS order), (n, p) -> (n, 7)."""

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Algorithm 4: the outer loop. Linearise as for L2, solve by Algorithm 2, retract, accept or shrink.
+
+In: a graph, poses and the dual of an earlier solve, if any. Out: poses of lower L1 cost. The
+dual is kept from one linearisation to the next: restarted from zero, the loop stalls above the
+optimum, which is where the paper's own figures lie.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.least_squares import reweighted_start
+from l1slam_ros.core.linearise import linearise, step_poses, whitened_residual
+from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.optimality import Status, l1_cost
+from l1slam_ros.core.primal_dual import PrimalDualOptions, minimise_l1
+
+# A linearisation whose cost fell by more than this part left a different problem behind: its dual
+# no longer fits. Keeping it there ends 15% above the optimum from City's stored start.
+_FAR = 0.01
+# A step is halved this often before the direction is given up: to 1/32 of it.
+_HALVINGS = 5
+
+
+@dataclass(frozen=True)
+class OptimiserOptions:
+    """How long Algorithm 4 runs and when it is content."""
+
+    outer_iterations: int = 30
+    """Most linearisations; about 30 reach the optimum on the paper's graphs."""
+
+    outer_tolerance: float = 1e-6
+    """Converged when the cost fell by less than this part of itself, twice in a row. [1]"""
+
+    inner: PrimalDualOptions = field(default_factory=PrimalDualOptions)
+    """The primal-dual solve of each linearisation."""
+
+    def __post_init__(self) -> None:
+        """Refuse what no run could mean."""
+        if self.outer_iterations < 0:
+            raise OptionError(f'outer_iterations is {self.outer_iterations}, expected 0 or more')
+        if not 0 <= self.outer_tolerance < 1:
+            raise OptionError(f'outer_tolerance is {self.outer_tolerance}, expected 0 to 1')
+
+
+@dataclass(frozen=True)
+class Solution:
+    """
+    What a solver ended with.
+
+    poses : (n, p); cost : of the norm it minimises; history : (outer_iterations + 1,) costs,
+    the start first; dual : (rows,) of the last linear problem, empty for L2 and Huber.
+    """
+
+    poses: Array
+    cost: float
+    status: Status
+    outer_iterations: int
+    inner_iterations: int
+    history: Array
+    dual: Array
+
+
+Report = Callable[[int, float], None]
+
+
+def minimise(
+    graph: FactorGraph,
+    poses: Array,
+    options: OptimiserOptions,
+    dual: Array | None = None,
+    deadline: float = np.inf,
+    report: Report = lambda iteration, cost: None,
+) -> Solution:
+    """
+    Minimise the L1 norm of the whitened residuals over the poses.
+
+    Parameters
+    ----------
+    graph, poses : the factors and the (n, p) poses to start from
+    options : see `OptimiserOptions`
+    dual : (rows,) of an earlier solve; without one, and while the poses are still far from the
+        optimum, a linear problem is started from reweighted least squares
+    deadline : `time.monotonic()` [s] after which no new linearisation begins
+    report : called with the outer iteration and its cost
+
+    """
+    history = [l1_cost(whitened_residual(graph, poses))]
+    status, inner, small_steps = Status.ITERATION_LIMIT, 0, 0
+    for outer in range(options.outer_iterations):
+        system = linearise(graph, poses)
+        if dual is None or _is_far(history):
+            x, dual = reweighted_start(system.A, system.b)
+        else:
+            x = np.zeros(system.A.shape[1])
+        solution = minimise_l1(system.A, system.b, x, dual, options.inner, deadline)
+        inner += solution.iterations
+        dual = solution.y
+        poses, cost = backtrack(graph, poses, solution.x, history[-1])
+        history.append(cost)
+        report(outer + 1, cost)
+        # A failed step is not the end: with the better dual the next one may succeed.
+        small = history[-2] - cost <= options.outer_tolerance * cost
+        small_steps = small_steps + 1 if small else 0
+        if small_steps == 2:
+            status = Status.CONVERGED if history[-3] > cost else Status.STALLED
+            break
+        if time.monotonic() > deadline:
+            status = Status.OUT_OF_TIME
+            break
+    return Solution(poses, history[-1], status, len(history) - 1, inner, np.array(history),
+                    np.zeros(0) if dual is None else dual)
+
+
+def _is_far(history: list[float]) -> bool:
+    return len(history) > 1 and history[-2] - history[-1] > _FAR * history[-1]
+
+
+def backtrack(
+    graph: FactorGraph, poses: Array, step: Array, cost: float
+) -> tuple[Array, float]:
+    """
+    Return the poses and cost after the longest of step, step/2, ... that lowers the true cost.
+
+    Where none does, the poses and cost are returned as they came.
+    """
+    for halvings in range(_HALVINGS + 1):
+        candidate = step_poses(graph, poses, step / 2**halvings)
+        candidate_cost = l1_cost(whitened_residual(graph, candidate))
+        if candidate_cost < cost:
+            return candidate, candidate_cost
+    return poses, cost
