@@ -15,6 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.growing import GrowingArray
 from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.noise import square_root_information
 
@@ -76,9 +77,17 @@ class FactorGraph:
         self.manifold = manifold
         self.n_poses = 0
         p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
-        self._between = [_Column((), np.int64), _Column((), np.int64), _Column((p,)),
-                         _Column((d, d))]
-        self._prior = [_Column((), np.int64), _Column((p,)), _Column((d, d))]
+        self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64), GrowingArray((p,)),
+                         GrowingArray((d, d))]
+        self._prior = [GrowingArray((), np.int64), GrowingArray((p,)), GrowingArray((d, d))]
+
+    def copy(self) -> 'FactorGraph':
+        """Return a graph that shares all factors so far; either may grow without the other."""
+        clone = FactorGraph(self.manifold)
+        clone.n_poses = self.n_poses
+        clone._between = [column.copy() for column in self._between]
+        clone._prior = [column.copy() for column in self._prior]
+        return clone
 
     @property
     def between(self) -> BetweenFactors:
@@ -128,7 +137,7 @@ class FactorGraph:
             raise GraphError(f'measurement {row} is not finite: {measurement[row]}')
 
     @staticmethod
-    def _append(columns: list['_Column'], values: tuple[np.ndarray, ...]) -> None:
+    def _append(columns: list['GrowingArray'], values: tuple[np.ndarray, ...]) -> None:
         for column, value in zip(columns, values, strict=True):
             column.extend(value)
 
@@ -140,24 +149,3 @@ def component_labels(graph: FactorGraph) -> Indices:
                           shape=(graph.n_poses, graph.n_poses))
     labels: Indices = connected_components(adjacency, directed=False)[1]
     return labels
-
-
-class _Column:
-    """An array that grows at its end; amortised doubling, old views stay valid."""
-
-    def __init__(self, shape: tuple[int, ...], dtype: type = np.float64):
-        self._data = np.empty((16, *shape), dtype)
-        self._length = 0
-
-    def extend(self, rows: np.ndarray) -> None:
-        end = self._length + len(rows)
-        if end > len(self._data):
-            grown = np.empty((max(end, 2 * len(self._data)), *self._data.shape[1:]),
-                             self._data.dtype)
-            grown[: self._length] = self.view()
-            self._data = grown
-        self._data[self._length : end] = rows
-        self._length = end
-
-    def view(self) -> np.ndarray:
-        return self._data[: self._length]

@@ -57,7 +57,7 @@ def compose_tree(manifold: Manifold, parent: Indices, relative: Array) -> Array:
     rows are their poses. Pointer doubling: as many compositions of whole arrays as the tree's
     depth has binary digits.
     """
-    poses = relative.copy()
+    poses: Array = relative.copy()
     root = parent == np.arange(len(parent))
     while not root.all():
         poses = np.where(root[:, None], poses, manifold.compose(poses[parent], poses))

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.least_squares import weighted_least_squares
 from l1slam_ros.core.linearise import linearise, step_poses, whitened_residual
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.optimality import Status, l2_cost
+from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.optimiser import Report, Solution
 
 _FIRST_DAMPING = 1e-6
@@ -24,26 +24,15 @@ _MOST_DAMPING = 1e6
 
 
 @dataclass(frozen=True)
-class LeastSquaresOptions:
+class LeastSquaresOptions(Options):
     """How long Gauss-Newton runs and when it is content."""
 
-    iterations: int = 100
-    """Most linearisations."""
-
-    tolerance: float = 1e-9
-    """Converged when the cost fell by no more than this part of itself. [1]"""
-
-    huber_delta: float = 1.345
-    """Length of a factor's whitened residual where Huber turns linear. [sigmas]"""
-
-    def __post_init__(self) -> None:
-        """Refuse what no run could mean."""
-        if self.iterations < 0:
-            raise OptionError(f'iterations is {self.iterations}, expected 0 or more')
-        if not 0 <= self.tolerance < 1:
-            raise OptionError(f'tolerance is {self.tolerance}, expected 0 to 1')
-        if not self.huber_delta > 0:
-            raise OptionError(f'huber_delta is {self.huber_delta}, expected above 0')
+    iterations: int = option(100, 'most linearisations', '', 0, 10**6)
+    tolerance: float = option(
+        1e-9, 'converged when the cost fell by no more than this part of itself', '1', 0, 1)
+    huber_delta: float = option(
+        1.345, "length of a factor's whitened residual where Huber turns linear", 'sigmas',
+        1e-9, 1e9)
 
 
 # From the whitened residual (rows,) to the cost, and to the weight of each row.

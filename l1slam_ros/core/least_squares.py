@@ -45,29 +45,40 @@ def weighted_least_squares(
     return x
 
 
-def reweighted_start(A: csr_array, b: Array) -> tuple[Array, Array]:
+def reweighted_step(A: csr_array, b: Array, r: Array, mu: float) -> tuple[Array, Array]:
     """
-    Return a primal and a dual near the optimum of |A x - b|_1, to start Algorithm 2 from.
+    Return one step of iteratively reweighted least squares towards |A x - b|_1, and its dual.
 
-    Minimises sum_i sqrt(r_i^2 + mu^2) with mu halved at each step, by iteratively reweighted
-    least squares: weights w = 1 / sqrt(r^2 + mu^2). The normal equations A'(w r) = 0 say that
-    y = w r is a feasible dual of the previous weights. The optimum of the angles is often not
-    unique (files round their numbers, so costs tie): this start picks the middle of the optimal
-    face, where a first-order method alone ends wherever it came from.
+    Weights w = 1 / sqrt(r^2 + mu^2) at the residual r (rows,). The normal equations say
+    A'(w (A x - b)) = 0, so y = w (A x - b), clipped to the unit box, is nearly a feasible dual.
 
     Returns
     -------
-    x : (columns,); y : (rows,), |y| < 1
+    x : (columns,); y : (rows,)
 
     """
+    weights = 1 / np.sqrt(r * r + mu * mu)
+    x = weighted_least_squares(A, b, weights)
+    return x, np.clip(weights * (A @ x - b), -1, 1)
+
+
+def smoothing(r: Array) -> float:
+    """Return the mean of |r|, kept above what would divide by zero where all fits exactly."""
+    return max(float(np.abs(r).mean()), np.finfo(float).tiny ** 0.25)
+
+
+def reweighted_start(A: csr_array, b: Array) -> tuple[Array, Array]:
+    """
+    Return a primal (columns,) and a dual (rows,) near the optimum of |A x - b|_1.
+
+    From the least squares solution, `reweighted_step` with mu halved each time: it follows the
+    minimum of sum sqrt(r^2 + mu^2). The optimum of the angles is often not unique (files round
+    their numbers, so costs tie): this path leads to the middle of the optimal face, where a
+    first-order method alone ends wherever it came from.
+    """
     x = weighted_least_squares(A, b)
-    r = A @ x - b
-    # A system that fits exactly would leave nothing to divide by.
-    mu = max(float(np.abs(r).mean()), np.finfo(float).tiny ** 0.25)
+    mu = smoothing(A @ x - b)
     for _ in range(_SMOOTHING_STEPS):
-        weights = 1 / np.sqrt(r * r + mu * mu)
-        x = weighted_least_squares(A, b, weights)
-        r = A @ x - b
-        y = np.clip(weights * r, -1, 1)
+        x, y = reweighted_step(A, b, A @ x - b, mu)
         mu /= 2
     return x, y

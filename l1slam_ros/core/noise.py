@@ -31,7 +31,8 @@ def square_root_information(information: Array) -> Array:
 
     """
     information = np.asarray(information, float)
-    _refuse(~np.isfinite(information).all(axis=(1, 2)), information, 'finite')
+    finite = np.isfinite(information).all(axis=(1, 2))
+    _refuse(np.logical_not(finite), information, 'finite')
     scale = np.abs(information).max(axis=(1, 2), initial=0.0)
     skew = np.abs(information - information.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
     _refuse(skew > _ASYMMETRY * scale, information, 'symmetric')

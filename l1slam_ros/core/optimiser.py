@@ -9,16 +9,16 @@ optimum, which is where the paper's own figures lie.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.least_squares import reweighted_start
 from l1slam_ros.core.linearise import linearise, step_poses, whitened_residual
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.optimality import Status, l1_cost
+from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.primal_dual import PrimalDualOptions, minimise_l1
 
 # A linearisation whose cost fell by more than this part left a different problem behind: its dual
@@ -29,24 +29,13 @@ _HALVINGS = 5
 
 
 @dataclass(frozen=True)
-class OptimiserOptions:
+class OptimiserOptions(Options):
     """How long Algorithm 4 runs and when it is content."""
 
-    outer_iterations: int = 30
-    """Most linearisations; about 30 reach the optimum on the paper's graphs."""
-
-    outer_tolerance: float = 1e-6
-    """Converged when the cost fell by less than this part of itself, twice in a row. [1]"""
-
-    inner: PrimalDualOptions = field(default_factory=PrimalDualOptions)
-    """The primal-dual solve of each linearisation."""
-
-    def __post_init__(self) -> None:
-        """Refuse what no run could mean."""
-        if self.outer_iterations < 0:
-            raise OptionError(f'outer_iterations is {self.outer_iterations}, expected 0 or more')
-        if not 0 <= self.outer_tolerance < 1:
-            raise OptionError(f'outer_tolerance is {self.outer_tolerance}, expected 0 to 1')
+    outer_iterations: int = option(30, 'most linearisations of one solve', '', 0, 10**6)
+    outer_tolerance: float = option(
+        1e-6, 'converged when the cost fell by less than this part of itself twice', '1', 0, 1)
+    inner: PrimalDualOptions = PrimalDualOptions()
 
 
 @dataclass(frozen=True)
@@ -94,8 +83,11 @@ def minimise(
     history = [l1_cost(whitened_residual(graph, poses))]
     status, inner, small_steps = Status.ITERATION_LIMIT, 0, 0
     for outer in range(options.outer_iterations):
+        if history[-1] == 0:  # a chain without loops fits exactly
+            status = Status.CONVERGED
+            break
         system = linearise(graph, poses)
-        if dual is None or _is_far(history):
+        if dual is None or (outer and is_far(*history[-2:])):
             x, dual = reweighted_start(system.A, system.b)
         else:
             x = np.zeros(system.A.shape[1])
@@ -115,11 +107,12 @@ def minimise(
             status = Status.OUT_OF_TIME
             break
     return Solution(poses, history[-1], status, len(history) - 1, inner, np.array(history),
-                    np.zeros(0) if dual is None else dual)
+                    np.zeros(len(whitened_residual(graph, poses))) if dual is None else dual)
 
 
-def _is_far(history: list[float]) -> bool:
-    return len(history) > 1 and history[-2] - history[-1] > _FAR * history[-1]
+def is_far(before: float, after: float) -> bool:
+    """Tell whether a cost that fell that much leaves a linear problem unlike the last one."""
+    return before - after > _FAR * after
 
 
 def backtrack(

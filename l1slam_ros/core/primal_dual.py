@@ -23,9 +23,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array
 
-from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.optimality import Status, duality_gap, l1_cost
+from l1slam_ros.core.options import Options, option
 
 # Iterations between two looks at the stopping test, which costs as much as one iteration.
 CHECK_EVERY = 40
@@ -34,26 +34,15 @@ Resolvent = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
-class PrimalDualOptions:
+class PrimalDualOptions(Options):
     """How long Algorithm 2 runs and when it is content."""
 
-    iterations: int = 400
-    """Most iterations of one call; the paper takes 400."""
-
-    tolerance: float = 1e-5
-    """Stop when duality gap <= tolerance * |A x - b|_1, inside the box |x_j|. [1]"""
-
-    theta: float = 1.0
-    """Over-relaxation of the primal, 0 to 1; convergence is proved for 1. [1]"""
-
-    def __post_init__(self) -> None:
-        """Refuse what no run could mean."""
-        if self.iterations < 1:
-            raise OptionError(f'iterations is {self.iterations}, expected 1 or more')
-        if not 0 <= self.tolerance < 1:
-            raise OptionError(f'tolerance is {self.tolerance}, expected 0 to 1')
-        if not 0 <= self.theta <= 1:
-            raise OptionError(f'theta is {self.theta}, expected 0 to 1')
+    iterations: int = option(400, 'most iterations of one primal-dual solve', '', 1, 10**7)
+    tolerance: float = option(
+        1e-5, 'stop when the duality gap, in the box |x_j|, is below this part of the cost', '1',
+        0, 1)
+    theta: float = option(
+        1.0, 'over-relaxation of the primal; convergence is proved for 1', '1', 0, 1)
 
 
 @dataclass(frozen=True)

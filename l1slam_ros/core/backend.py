@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The incremental back end: samples and loops in, optimised poses out.
+
+`Backend` owns the growing graph, the poses and the dual. An update is three calls, so that a
+caller with threads need hold its lock for the first and the last only, which are short:
+
+    problem = backend.problem()                         # snapshot, O(new loops)
+    improvement = improve(problem, options, budget)     # the work; touches nothing of the backend
+    backend.adopt(improvement)                          # poses and dual for the next warm start
+"""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.growth import GraphGrowth, GrowthOptions
+from l1slam_ros.core.least_squares import reweighted_step, smoothing
+from l1slam_ros.core.linearise import linearise, whitened_residual
+from l1slam_ros.core.manifold import Array, Manifold
+from l1slam_ros.core.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.optimality import Status, l1_cost
+from l1slam_ros.core.optimiser import OptimiserOptions, backtrack, is_far, minimise
+
+
+@dataclass(frozen=True)
+class BackendOptions(GrowthOptions):
+    """Everything the back end can be told."""
+
+    solver: OptimiserOptions = OptimiserOptions()
+
+
+@dataclass(frozen=True)
+class Problem:
+    """
+    A snapshot to improve: graph, poses (n, p), dual (rows,) and the cost the last update left.
+
+    settled : nothing has come since an update that converged.
+    """
+
+    graph: FactorGraph
+    poses: Array
+    dual: Array
+    last_cost: float
+    settled: bool
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """
+    What one update did: new poses (n, p) and dual (rows,), and the account of it.
+
+    cost_before, cost : L1 cost of the snapshot's factors; reweighted_steps : factorisations for
+    the long-range part; outer, inner : iterations of Algorithm 4; seconds : all of it.
+    """
+
+    poses: Array
+    dual: Array
+    cost_before: float
+    cost: float
+    status: Status
+    reweighted_steps: int
+    outer_iterations: int
+    inner_iterations: int
+    seconds: float
+
+
+class Backend:
+    """
+    Keeps a map while it grows.
+
+    Parameters
+    ----------
+    manifold : what the poses live on
+    options : see `BackendOptions`
+
+    """
+
+    def __init__(self, manifold: Manifold, options: BackendOptions):
+        self._manifold = manifold
+        self.options = options
+        self.growth = GraphGrowth(manifold, options)
+        self._poses = manifold.identity(0)
+        self._dual = np.zeros(0)
+        self._last_cost = 0.0
+        self._status = Status.OUT_OF_TIME
+
+    @property
+    def poses(self) -> Array:
+        """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
+        new = self.growth.odometry[len(self._poses) :]
+        carried = self._manifold.compose(np.broadcast_to(self.map_to_odom, new.shape), new)
+        return np.concatenate((self._poses, carried))
+
+    @property
+    def map_to_odom(self) -> Array:
+        """The odometry frame seen from the map, (1, p): what the last optimised keyframe says."""
+        last = len(self._poses) - 1
+        if last < 0:
+            return self._manifold.identity(1)
+        odometry = self.growth.odometry[last : last + 1]
+        return self._manifold.compose(self._poses[last:], self._manifold.inverse(odometry))
+
+    def add_odometry(self, sample: OdometrySample) -> bool:
+        """Add one sample; see `GraphGrowth.add_odometry`."""
+        return self.growth.add_odometry(sample)
+
+    def add_loop(self, loop: LoopClosure) -> None:
+        """Add one loop closure; see `GraphGrowth.add_loop`."""
+        self.growth.add_loop(loop)
+
+    def problem(self) -> Problem:
+        """Return a snapshot of the graph, the due loops in it, warm start included."""
+        self.growth.add_due_loops()
+        graph = self.growth.graph.copy()
+        rows = len(graph.between) * self._manifold.TANGENT_SIZE
+        # Rows are only ever appended, so the dual of the old ones stays; new ones start at zero.
+        dual = np.concatenate((self._dual, np.zeros(rows - len(self._dual))))
+        grown = len(self._poses) < graph.n_poses or len(self._dual) < rows
+        settled = not grown and self._status in (Status.CONVERGED, Status.STALLED)
+        return Problem(graph, self.poses, dual, self._last_cost, settled)
+
+    def adopt(self, improvement: Improvement) -> None:
+        """Take over what `improve` made of a snapshot; keyframes since then follow along."""
+        self._poses = improvement.poses
+        self._dual = improvement.dual
+        self._last_cost = improvement.cost
+        self._status = improvement.status
+
+    def update(self, budget: float) -> Improvement | None:
+        """Improve the map for about `budget` seconds; None: there was nothing to do."""
+        problem = self.problem()
+        if problem.settled or not problem.graph.n_poses:
+            return None
+        improvement = improve(problem, self.options.solver, budget)
+        self.adopt(improvement)
+        return improvement
+
+
+def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Improvement:
+    """
+    Lower the L1 cost of a snapshot for about `budget` seconds.
+
+    While the cost is far above what the last update left (a loop has closed), reweighted least
+    squares steps carry the long-range part: one factorisation bends the whole chain, where a
+    first-order method moves it a few keyframes per iteration. Then, always, Algorithm 4 from the
+    kept dual.
+    """
+    start = time.monotonic()
+    deadline = start + budget
+    graph, poses, dual = problem.graph, problem.poses, problem.dual
+    before = cost = l1_cost(whitened_residual(graph, poses))
+    steps, far = 0, is_far(before, problem.last_cost)
+    while far and (not steps or time.monotonic() < deadline):
+        system = linearise(graph, poses)
+        step, dual = reweighted_step(system.A, system.b, system.b, smoothing(system.b))
+        previous = cost
+        poses, cost = backtrack(graph, poses, step, cost)
+        steps += 1
+        far = is_far(previous, cost)
+    solution = minimise(graph, poses, options, dual, deadline)
+    return Improvement(solution.poses, solution.dual, before, solution.cost, solution.status,
+                       steps, solution.outer_iterations, solution.inner_iterations,
+                       time.monotonic() - start)

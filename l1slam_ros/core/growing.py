@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An array that grows at its end."""
+
+import numpy as np
+
+
+class GrowingArray:
+    """
+    Rows of one shape, appended in amortised constant time.
+
+    What `view` returned is never written to again, so it stays valid while the array grows.
+
+    Parameters
+    ----------
+    shape : the shape of one row
+    dtype : the type of one entry
+
+    """
+
+    def __init__(self, shape: tuple[int, ...] = (), dtype: type = np.float64):
+        self._data: np.ndarray = np.empty((0, *shape), dtype)
+        self._length = 0
+
+    def __len__(self) -> int:
+        return self._length
+
+    def extend(self, rows: np.ndarray) -> None:
+        """Append rows, (k, *shape)."""
+        end = self._length + len(rows)
+        if end > len(self._data):
+            capacity = max(end, 2 * len(self._data), 16)
+            grown = np.empty((capacity, *self._data.shape[1:]), self._data.dtype)
+            grown[: self._length] = self.view()
+            self._data = grown
+        self._data[self._length : end] = rows
+        self._length = end
+
+    def view(self) -> np.ndarray:
+        """Return all rows so far, (n, *shape), without copying."""
+        return self._data[: self._length]
+
+    def copy(self) -> 'GrowingArray':
+        """Return an equal array that shares these rows; without spare room, it moves to grow."""
+        clone = GrowingArray(self._data.shape[1:], self._data.dtype.type)
+        clone._data = self.view()
+        clone._length = self._length
+        return clone

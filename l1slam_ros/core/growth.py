@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+How the graph grows: odometry samples and loop closures in, keyframes and factors out.
+
+A loop closure names two times. It waits until odometry has reached both, is then carried to the
+nearest keyframes by the raw odometry in between, and becomes a between factor.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.errors import MessageError
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.growing import GrowingArray
+from l1slam_ros.core.keyframes import (
+    KeyframeOptions, Motion, OdometryOptions, diagonal_covariance, reduced_covariance)
+from l1slam_ros.core.manifold import Array, Indices, Manifold
+from l1slam_ros.core.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.noise import information_from_covariance, is_usable_covariance
+from l1slam_ros.core.options import Options, option
+
+
+@dataclass(frozen=True)
+class LoopOptions(Options):
+    """How loop closures are read."""
+
+    covariance_source: str = option(
+        'message', 'message: as stated, the model where that is unusable; model: the sigmas below',
+        '', choices=('message', 'model'))
+    sigma_translation: float = option(0.1, 'model: of the position', 'm', 1e-9, 1e6)
+    sigma_rotation: float = option(0.05, 'model: of the heading', 'rad', 1e-9, 1e6)
+    wait: float = option(
+        10.0, 'how long a loop for times not yet seen waits, on the clock of the odometry', 's',
+        0, 1e9)
+
+
+@dataclass(frozen=True)
+class GrowthOptions(Options):
+    """What makes keyframes and factors of messages."""
+
+    keyframe: KeyframeOptions = KeyframeOptions()
+    odometry: OdometryOptions = OdometryOptions()
+    loop: LoopOptions = LoopOptions()
+
+
+class GraphGrowth:
+    """
+    Grows a factor graph from messages.
+
+    Parameters
+    ----------
+    manifold : what the poses live on
+    options : see `GrowthOptions`; may be replaced at any time
+
+    Attributes
+    ----------
+    graph : the factor graph so far; loops enter it in `add_due_loops`
+    refused : why loops were not used, cause -> count
+
+    """
+
+    def __init__(self, manifold: Manifold, options: GrowthOptions):
+        self.options = options
+        self.graph = FactorGraph(manifold)
+        self.refused: Counter[str] = Counter()
+        self._stamps = GrowingArray((), np.int64)
+        self._odometry = GrowingArray((manifold.POSE_SIZE,))
+        self._keyframe_samples = GrowingArray((), np.int64)
+        self._motion: Motion | None = None
+        self._waiting: list[tuple[int, LoopClosure]] = []
+
+    @property
+    def stamps(self) -> Indices:
+        """Stamps of the keyframes, (n,) [ns]."""
+        stamps: Indices = self._stamps.view()[self._keyframe_samples.view()]
+        return stamps
+
+    @property
+    def odometry(self) -> Array:
+        """Poses of the keyframes in the odometry frame, (n, p)."""
+        poses: Array = self._odometry.view()[self._keyframe_samples.view()]
+        return poses
+
+    @property
+    def n_waiting(self) -> int:
+        """How many loops are not in the graph yet, nor refused."""
+        return len(self._waiting)
+
+    def add_odometry(self, sample: OdometrySample) -> bool:
+        """
+        Add one sample; return whether it made a keyframe.
+
+        Raises
+        ------
+        MessageError : `old_stamp`, the stamp is not after the last one; nothing is added.
+
+        """
+        manifold = self.graph.manifold
+        pose = manifold.from_pose3(sample.pose3[None])
+        if not len(self._stamps):
+            self._append_sample(sample.stamp, pose)
+            self._begin_keyframe(sample.stamp)
+            return True
+        last = int(self._stamps.view()[-1])
+        if sample.stamp <= last:
+            raise MessageError('old_stamp', f'odometry stamp {sample.stamp} ns is not after the '
+                               f'last one, {last} ns')
+        increment = manifold.between(self._odometry.view()[-1:], pose)
+        self._append_sample(sample.stamp, pose)
+        assert self._motion is not None
+        self._motion.add(sample, increment, (sample.stamp - last) * 1e-9, self.options.odometry)
+        if not self._motion.is_keyframe(sample.stamp, self.options.keyframe):
+            return False
+        covariance = self._motion.covariance(self.options.odometry)
+        measurement = self._motion.pose
+        self._begin_keyframe(sample.stamp)
+        k = self.graph.n_poses - 1
+        self.graph.add_between(np.array([k - 1]), np.array([k]), measurement,
+                               information_from_covariance(covariance[None]))
+        return True
+
+    def add_loop(self, loop: LoopClosure) -> None:
+        """Take a loop closure in; it becomes a factor in `add_due_loops`."""
+        arrival = int(self._stamps.view()[-1]) if len(self._stamps) else loop.stamp
+        self._waiting.append((arrival, loop))
+
+    def add_due_loops(self) -> int:
+        """
+        Make factors of the waiting loops whose times odometry has reached; return how many.
+
+        Loops that can never become one are counted in `refused`: `before_start` (a time before
+        the first odometry), `same_keyframe`, `expired`.
+        """
+        if not self._waiting or not len(self._stamps):
+            return 0
+        now = int(self._stamps.view()[-1])
+        due = [loop for _, loop in self._waiting if loop.stamp <= now]
+        patience = int(self.options.loop.wait * 1e9)
+        later = [entry for entry in self._waiting if entry[1].stamp > now]
+        self._waiting = [entry for entry in later if now - entry[0] <= patience]
+        self.refused['expired'] += len(later) - len(self._waiting)
+        return self._add_loops(due) if due else 0
+
+    def _add_loops(self, loops: list[LoopClosure]) -> int:
+        manifold = self.graph.manifold
+        stamps = np.array([(loop.reference_stamp, loop.stamp) for loop in loops])
+        early = stamps[:, 0] < self._stamps.view()[0]
+        i, j = self._nearest_keyframe(stamps[:, 0]), self._nearest_keyframe(stamps[:, 1])
+        same = (i == j) & ~early
+        self.refused['before_start'] += int(early.sum())
+        self.refused['same_keyframe'] += int(same.sum())
+        keep = ~early & ~same
+        if not keep.any():
+            return 0
+        loops = [loop for loop, kept in zip(loops, keep, strict=True) if kept]
+        i, j, stamps = i[keep], j[keep], stamps[keep]
+        to_reference = manifold.between(self.odometry[i], self._odometry_at(stamps[:, 0]))
+        to_keyframe = manifold.between(self._odometry_at(stamps[:, 1]), self.odometry[j])
+        measured = manifold.from_pose3(np.array([loop.pose3 for loop in loops]))
+        measurement = manifold.compose(manifold.compose(to_reference, measured), to_keyframe)
+        # The error lives in the axes of the measured pose; see it from the keyframe instead.
+        Ad = manifold.adjoint(manifold.inverse(to_keyframe))
+        covariance = Ad @ np.array([self._covariance(loop) for loop in loops]) @ (
+            Ad.transpose(0, 2, 1))
+        self.graph.add_between(i, j, measurement, information_from_covariance(covariance))
+        return len(loops)
+
+    def _covariance(self, loop: LoopClosure) -> Array:
+        options, manifold = self.options.loop, self.graph.manifold
+        covariance = reduced_covariance(manifold, loop.covariance)
+        if options.covariance_source == 'message' and is_usable_covariance(covariance):
+            return covariance
+        return diagonal_covariance(manifold, options.sigma_translation, options.sigma_rotation)
+
+    def _nearest_keyframe(self, stamps: Indices) -> Indices:
+        keyframes = self.stamps
+        after = np.clip(np.searchsorted(keyframes, stamps), 1, max(len(keyframes) - 1, 1))
+        after = np.minimum(after, len(keyframes) - 1)
+        before = np.maximum(after - 1, 0)
+        nearer_before = stamps - keyframes[before] <= keyframes[after] - stamps
+        nearest: Indices = np.where(nearer_before, before, after)
+        return nearest
+
+    def _odometry_at(self, stamps: Indices) -> Array:
+        """Return the odometry poses at `stamps`, interpolated between samples, (m, p)."""
+        times, poses = self._stamps.view(), self._odometry.view()
+        after = np.clip(np.searchsorted(times, stamps), min(1, len(times) - 1), len(times) - 1)
+        before = np.maximum(after - 1, 0)
+        span = np.maximum(times[after] - times[before], 1)
+        fraction = (stamps - times[before]) / span
+        return self.graph.manifold.interpolate(poses[before], poses[after], fraction)
+
+    def _append_sample(self, stamp: int, pose: Array) -> None:
+        self._stamps.extend(np.array([stamp]))
+        self._odometry.extend(pose)
+
+    def _begin_keyframe(self, stamp: int) -> None:
+        self._keyframe_samples.extend(np.array([len(self._stamps) - 1]))
+        self.graph.add_poses(1)
+        self._motion = Motion(self.graph.manifold, stamp)

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Options: frozen dataclasses whose fields carry their meaning, unit and range.
+
+They become ROS parameters and lines of a YAML file, so a field is a bool, int, float or str, or
+another `Options`. A default is written once, at its field.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
+
+from l1slam_ros.core.errors import OptionError
+
+Scalar = bool | int | float | str
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """What a field means: one sentence, its unit, and what it may be."""
+
+    doc: str
+    unit: str = ''
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+
+    def expected(self) -> str:
+        """Return the allowed values in words."""
+        if self.choices:
+            return 'one of ' + ', '.join(self.choices)
+        return f'{self.low:g} to {self.high:g}'
+
+    def allows(self, value: Scalar) -> bool:
+        """Tell whether a value of the right type is in range; NaN never is."""
+        if self.choices:
+            return value in self.choices
+        if self.low is None or self.high is None:
+            return True
+        return not isinstance(value, str) and self.low <= value <= self.high
+
+
+def option(default: Scalar, doc: str, unit: str = '', low: float | None = None,
+           high: float | None = None, choices: tuple[str, ...] = ()) -> Any:  # noqa: ANN401
+    """Return a dataclass field with its meaning attached."""
+    return field(default=default, metadata={'meaning': Meaning(doc, unit, low, high, choices)})
+
+
+@dataclass(frozen=True)
+class Options:
+    """Base of all options: refuses values outside their type and range."""
+
+    def __post_init__(self) -> None:
+        """Check every field; ints are taken for floats, as people write them."""
+        for f in fields(self):
+            if 'meaning' not in f.metadata:
+                continue
+            meaning, value, kind = f.metadata['meaning'], getattr(self, f.name), type(f.default)
+            if kind is float and type(value) is int:
+                value = float(value)
+                object.__setattr__(self, f.name, value)
+            if type(value) is not kind:
+                raise OptionError(f'{f.name} is {value!r}, expected a value of type '
+                                  f'{kind.__name__}')
+            if not meaning.allows(value):
+                raise OptionError(f'{f.name} is {value!r}, expected {meaning.expected()}')
+
+
+AnyOptions = TypeVar('AnyOptions', bound=Options)
+
+
+def flatten(options: Options, prefix: str = '') -> dict[str, tuple[Scalar, Meaning]]:
+    """Return dotted name -> (value, meaning) of every field, nested ones included."""
+    flat: dict[str, tuple[Scalar, Meaning]] = {}
+    for f in fields(options):
+        value = getattr(options, f.name)
+        if isinstance(value, Options):
+            flat.update(flatten(value, f'{prefix}{f.name}.'))
+        else:
+            flat[prefix + f.name] = (value, f.metadata['meaning'])
+    return flat
+
+
+def with_values(options: AnyOptions, values: Mapping[str, Scalar], prefix: str = '') -> AnyOptions:
+    """
+    Return the options with some fields, named by dotted names, replaced.
+
+    Raises
+    ------
+    OptionError : naming the unknown name, or the value and what was expected.
+
+    """
+    unknown = set(values) - set(flatten(options))
+    if unknown:
+        raise OptionError(f'no option is called {prefix}{min(unknown)}')
+    changes: dict[str, Any] = {}
+    for f in fields(options):
+        inner = {name[len(f.name) + 1 :]: value for name, value in values.items()
+                 if name.startswith(f.name + '.')}
+        if f.name in values:
+            changes[f.name] = values[f.name]
+        elif inner:
+            changes[f.name] = with_values(getattr(options, f.name), inner, f'{prefix}{f.name}.')
+    try:
+        return replace(options, **changes)
+    except OptionError as error:
+        raise OptionError(f'{prefix}{error}') from error
