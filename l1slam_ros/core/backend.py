@@ -53,7 +53,8 @@ class Improvement:
     What one update did: new poses (n, p) and dual (rows,), and the account of it.
 
     cost_before, cost : L1 cost of the snapshot's factors; reweighted_steps : factorisations for
-    the long-range part; outer, inner : iterations of Algorithm 4; seconds : all of it.
+    the long-range part; outer, inner : iterations of Algorithm 4; gap : of its last linear
+    problem; seconds : all of it.
     """
 
     poses: Array
@@ -64,6 +65,7 @@ class Improvement:
     reweighted_steps: int
     outer_iterations: int
     inner_iterations: int
+    gap: float
     seconds: float
 
 
@@ -80,7 +82,7 @@ class Backend:
 
     def __init__(self, manifold: Manifold, options: BackendOptions):
         self._manifold = manifold
-        self.options = options
+        self._options = options
         self.growth = GraphGrowth(manifold, options)
         self._poses = manifold.identity(0)
         self._dual = np.zeros(0)
@@ -102,6 +104,11 @@ class Backend:
             return self._manifold.identity(1)
         odometry = self.growth.odometry[last : last + 1]
         return self._manifold.compose(self._poses[last:], self._manifold.inverse(odometry))
+
+    def set_options(self, options: BackendOptions) -> None:
+        """Work by other options from now on; what is in the graph stays."""
+        self._options = options
+        self.growth.options = options
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """Add one sample; see `GraphGrowth.add_odometry`."""
@@ -134,7 +141,7 @@ class Backend:
         problem = self.problem()
         if problem.settled or not problem.graph.n_poses:
             return None
-        improvement = improve(problem, self.options.solver, budget)
+        improvement = improve(problem, self._options.solver, budget)
         self.adopt(improvement)
         return improvement
 
@@ -162,5 +169,5 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Impro
         far = is_far(previous, cost)
     solution = minimise(graph, poses, options, dual, deadline)
     return Improvement(solution.poses, solution.dual, before, solution.cost, solution.status,
-                       steps, solution.outer_iterations, solution.inner_iterations,
+                       steps, solution.outer_iterations, solution.inner_iterations, solution.gap,
                        time.monotonic() - start)

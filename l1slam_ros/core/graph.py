@@ -77,8 +77,8 @@ class FactorGraph:
         self.manifold = manifold
         self.n_poses = 0
         p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
-        self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64), GrowingArray((p,)),
-                         GrowingArray((d, d))]
+        self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
+                         GrowingArray((p,)), GrowingArray((d, d))]
         self._prior = [GrowingArray((), np.int64), GrowingArray((p,)), GrowingArray((d, d))]
 
     def copy(self) -> 'FactorGraph':

@@ -15,7 +15,12 @@ from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.growing import GrowingArray
 from l1slam_ros.core.keyframes import (
-    KeyframeOptions, Motion, OdometryOptions, diagonal_covariance, reduced_covariance)
+    KeyframeOptions,
+    Motion,
+    OdometryOptions,
+    diagonal_covariance,
+    reduced_covariance,
+)
 from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.noise import information_from_covariance, is_usable_covariance

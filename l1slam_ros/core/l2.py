@@ -16,8 +16,8 @@ from l1slam_ros.core.least_squares import weighted_least_squares
 from l1slam_ros.core.linearise import linearise, step_poses, whitened_residual
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.optimality import Status, l2_cost
-from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.optimiser import Report, Solution
+from l1slam_ros.core.options import Options, option
 
 _FIRST_DAMPING = 1e-6
 _MOST_DAMPING = 1e6

@@ -74,7 +74,7 @@ def _block_rows(values: Array, keyframe: Indices, d: int) -> tuple[Array, Indice
 
 
 def _stack(blocks: list[tuple[Array, Indices]], columns: int) -> csr_array:
-    """Return the CSR of the blocks below each other; zeros and the anchor's columns are left out."""
+    """Stack the blocks as one CSR; zeros and the columns of the anchor are left out."""
     keep = [(values != 0) & (column >= 0) for values, column in blocks]
     counts = np.concatenate([mask.sum(axis=1) for mask in keep])
     data = np.concatenate([values[mask] for (values, _), mask in zip(blocks, keep, strict=True)])

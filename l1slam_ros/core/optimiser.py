@@ -44,7 +44,8 @@ class Solution:
     What a solver ended with.
 
     poses : (n, p); cost : of the norm it minimises; history : (outer_iterations + 1,) costs,
-    the start first; dual : (rows,) of the last linear problem, empty for L2 and Huber.
+    the start first; dual : (rows,) and gap : of the last linear problem, see `duality_gap`; L2 and
+    Huber have neither (empty, infinite).
     """
 
     poses: Array
@@ -54,6 +55,7 @@ class Solution:
     inner_iterations: int
     history: Array
     dual: Array
+    gap: float = np.inf
 
 
 Report = Callable[[int, float], None]
@@ -81,10 +83,10 @@ def minimise(
 
     """
     history = [l1_cost(whitened_residual(graph, poses))]
-    status, inner, small_steps = Status.ITERATION_LIMIT, 0, 0
+    status, inner, small_steps, gap = Status.ITERATION_LIMIT, 0, 0, np.inf
     for outer in range(options.outer_iterations):
         if history[-1] == 0:  # a chain without loops fits exactly
-            status = Status.CONVERGED
+            status, gap = Status.CONVERGED, 0.0
             break
         system = linearise(graph, poses)
         if dual is None or (outer and is_far(*history[-2:])):
@@ -93,7 +95,7 @@ def minimise(
             x = np.zeros(system.A.shape[1])
         solution = minimise_l1(system.A, system.b, x, dual, options.inner, deadline)
         inner += solution.iterations
-        dual = solution.y
+        dual, gap = solution.y, solution.gap
         poses, cost = backtrack(graph, poses, solution.x, history[-1])
         history.append(cost)
         report(outer + 1, cost)
@@ -106,8 +108,10 @@ def minimise(
         if time.monotonic() > deadline:
             status = Status.OUT_OF_TIME
             break
-    return Solution(poses, history[-1], status, len(history) - 1, inner, np.array(history),
-                    np.zeros(len(whitened_residual(graph, poses))) if dual is None else dual)
+    if dual is None:
+        dual = np.zeros(len(graph.between) * graph.manifold.TANGENT_SIZE)
+    return Solution(poses, history[-1], status, len(history) - 1, inner, np.array(history), dual,
+                    gap)
 
 
 def is_far(before: float, after: float) -> bool:

@@ -24,6 +24,8 @@ class Meaning:
     low: float | None = None
     high: float | None = None
     choices: tuple[str, ...] = ()
+    fixed: bool = False
+    """Read once at start; a running node refuses to change it."""
 
     def expected(self) -> str:
         """Return the allowed values in words."""
@@ -41,9 +43,10 @@ class Meaning:
 
 
 def option(default: Scalar, doc: str, unit: str = '', low: float | None = None,
-           high: float | None = None, choices: tuple[str, ...] = ()) -> Any:  # noqa: ANN401
+           high: float | None = None, choices: tuple[str, ...] = (), fixed: bool = False) -> Any:
     """Return a dataclass field with its meaning attached."""
-    return field(default=default, metadata={'meaning': Meaning(doc, unit, low, high, choices)})
+    meaning = Meaning(doc, unit, low, high, choices, fixed)
+    return field(default=default, metadata={'meaning': meaning})
 
 
 @dataclass(frozen=True)

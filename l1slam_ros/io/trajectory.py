@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Trajectories as text: TUM files for other tools, references to be measured against.
+
+TUM: `stamp x y z qx qy qz qw`, stamps in seconds, exact to the nanosecond.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core import se2
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.manifold import Array, Indices, Manifold
+from l1slam_ros.io.files import (
+    NANOSECONDS,
+    TextLines,
+    parse_rows,
+    quoted,
+    read_lines,
+    stamp_from_text,
+    stamp_text,
+    write_lines,
+)
+from l1slam_ros.io.graph_file import read_vertices
+from l1slam_ros.io.messages import QUATERNION_NORM_ERROR
+
+_TUM_COLUMNS = 8
+
+
+@dataclass(frozen=True)
+class Reference:
+    """
+    Poses to compare with.
+
+    keys : (n,) ascending, vertex ids, or stamps [ns] when `stamped`; poses : (n, p).
+    """
+
+    keys: Indices
+    poses: Array
+    stamped: bool
+
+
+def invented_stamps(n: int) -> Indices:
+    """Return stamps [ns] for n poses that have none: 1000 s, then ten poses a second, (n,)."""
+    return 1000 * NANOSECONDS + np.arange(n, dtype=np.int64) * (NANOSECONDS // 10)
+
+
+def write_tum(
+    path: str | os.PathLike[str], stamps: Indices, poses: Array, manifold: Manifold
+) -> None:
+    """
+    Write a TUM file: stamps (n,) [ns], poses (n, p).
+
+    Raises
+    ------
+    FileError : the file cannot be written.
+
+    """
+    rows = manifold.to_pose3(poses).tolist()
+    write_lines(path, (f'{stamp_text(stamp)} {" ".join(map(repr, row))}'
+                       for stamp, row in zip(stamps.tolist(), rows, strict=True)))
+
+
+def write_truth(path: str | os.PathLike[str], ids: Indices, poses: Array) -> None:
+    """
+    Write true poses, `id x y theta` (the columns of the manifold): ids (n,), poses (n, p).
+
+    Raises
+    ------
+    FileError : the file cannot be written.
+
+    """
+    write_lines(path, (f'{k} {" ".join(map(repr, row))}'
+                       for k, row in zip(ids.tolist(), poses.tolist(), strict=True)))
+
+
+def write_false_loops(path: str | os.PathLike[str], pairs: Sequence[tuple[int, int]]) -> None:
+    """
+    Write the vertex ids `i j` of each false loop.
+
+    Raises
+    ------
+    FileError : the file cannot be written.
+
+    """
+    write_lines(path, (f'{i} {j}' for i, j in pairs))
+
+
+def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2) -> Reference:
+    """
+    Read reference poses: a TUM file, a graph file's vertices, or `id x y theta` lines.
+
+    Which of them it is, the first line tells.
+
+    Raises
+    ------
+    FileError : naming the line, when the file is none of them.
+
+    """
+    lines = read_lines(path)
+    if not lines.texts:
+        raise FileError(path, 'the file is empty; expected reference poses')
+    columns = len(lines.texts[0].split())
+    if lines.texts[0].split()[0][0].isalpha():
+        return Reference(*read_vertices(path), stamped=False)
+    if columns == _TUM_COLUMNS:
+        return _sorted(path, lines, *_read_tum(path, lines, manifold), stamped=True)
+    if columns == 1 + manifold.POSE_SIZE:
+        ids, poses = parse_rows(path, 'pose', lines, 1, manifold.POSE_SIZE)
+        return _sorted(path, lines, ids[:, 0], poses, stamped=False)
+    raise FileError(path, f'{columns} columns; expected {_TUM_COLUMNS} (TUM), '
+                    f'{1 + manifold.POSE_SIZE} (id and pose) or a graph file', lines.numbers[0])
+
+
+def _read_tum(path: object, lines: TextLines, manifold: Manifold) -> tuple[Indices, Array]:
+    """Return stamps [ns] (n,) and poses (n, p)."""
+    exact = TextLines(lines.numbers, [
+        _whole_stamp(path, number, text)
+        for number, text in zip(lines.numbers, lines.texts, strict=True)])
+    stamps, pose3 = parse_rows(path, 'TUM pose', exact, 1, _TUM_COLUMNS - 1)
+    far = np.abs(np.linalg.norm(pose3[:, 3:], axis=1) - 1.0) > QUATERNION_NORM_ERROR
+    if far.any():
+        k = int(np.argmax(far))
+        raise FileError(path, f'quaternion {pose3[k, 3:].tolist()}; expected one of norm 1',
+                        lines.numbers[k])
+    return stamps[:, 0], manifold.from_pose3(pose3)
+
+
+def _whole_stamp(path: object, number: int, text: str) -> str:
+    """Return the line with its stamp in nanoseconds: a float would lose the last digits."""
+    stamp, *rest = text.split(None, 1)
+    try:
+        return f'{stamp_from_text(stamp)} {rest[0] if rest else ""}'
+    except ValueError as error:
+        raise FileError(path, f'stamp {quoted(stamp)}; expected seconds', number) from error
+
+
+def _sorted(path: object, lines: TextLines, keys: Indices, poses: Array, *,
+            stamped: bool) -> Reference:
+    """Return the reference in ascending order of its keys; each may stand once."""
+    order = np.argsort(keys, kind='stable')
+    again = np.flatnonzero(np.diff(keys[order]) == 0) + 1
+    if len(again):
+        line = min(lines.numbers[k] for k in order[again])
+        raise FileError(path, 'the same id or stamp a second time; expected each once', line)
+    return Reference(keys[order], poses[order], stamped)

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+`backend`: the node. Odometry and loop closures in, the optimised Path out; no arithmetic.
+
+Callbacks convert a message and append it to the back end, under a lock that nobody holds for
+long. A timer wakes one worker thread, which takes a snapshot, improves it with no lock held, and
+hands it back; so the solver never keeps a callback waiting.
+"""
+
+import sys
+import threading
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+from l1slam_ros.core import se2
+from l1slam_ros.core.backend import Backend, Improvement, improve
+from l1slam_ros.core.errors import L1SlamError, MessageError
+from l1slam_ros.diagnosis import Diagnosis
+from l1slam_ros.io.messages import loop_closure, odometry_sample
+from l1slam_ros.node_options import NodeOptions
+from l1slam_ros.params import NodeParameters
+from l1slam_ros.publishing import path_bytes, pose_stamped, transform_stamped
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # the ROS wheels on PyPI have none
+    TFMessage = None
+
+_DEPTH = 1000
+_REPEAT_WARNING = 5.0  # [s]
+
+
+class BackendNode(Node):
+    """
+    The ROS face of `core.backend.Backend`.
+
+    Parameters
+    ----------
+    keywords : passed to `rclpy.node.Node`, e.g. parameter_overrides, context
+
+    Raises
+    ------
+    OptionError : a parameter given at start is refused.
+
+    """
+
+    def __init__(self, **keywords: Any):
+        super().__init__('backend', **keywords)
+        self._parameters = NodeParameters(self, NodeOptions(), self._on_options)
+        options = self.options
+        self._manifold = se2
+        self._backend = Backend(self._manifold, options)
+        self._base_frame = options.base_frame
+        self._refused: Counter[str] = Counter()
+        self._last_stamp = 0
+        self._map_to_odom = self._manifold.identity(1)
+        self._lock = threading.Lock()  # guards the back end
+        self._wake = threading.Event()
+        self._closing = False
+        self._make_publishers()
+        self._make_subscriptions()
+        self.create_timer(options.update.period, self._on_timer)
+        self.create_timer(1.0, self._on_second)
+        self._worker = threading.Thread(target=self._work, name='solver', daemon=True)
+        self._worker.start()
+
+    @property
+    def options(self) -> NodeOptions:
+        """The options as they are now."""
+        return self._parameters.options
+
+    def close(self) -> None:
+        """End the worker and the node."""
+        self._closing = True
+        self._wake.set()
+        self._worker.join()
+        self.destroy_node()
+
+    def _make_publishers(self) -> None:
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._path = self.create_publisher(Path, 'path', latched)
+        self._pose = self.create_publisher(PoseStamped, 'pose', 10)
+        self._transform = self.create_publisher(TransformStamped, 'map_to_odom', 10)
+        self._tf = None
+        if TFMessage is not None and self.options.publish_tf:
+            self._tf = self.create_publisher(TFMessage, '/tf', 100)
+        self._diagnosis = Diagnosis(self)
+
+    def _make_subscriptions(self) -> None:
+        reliable = QoSProfile(depth=_DEPTH)
+        overridable = QoSOverridingOptions.with_default_policies()
+        for kind, topic, callback in (
+            (Odometry, 'odom', self._on_odometry),
+            (PoseWithCovarianceStamped, 'loop_closures', self._on_loop),
+            (PoseWithCovarianceStamped, 'trusted_loop_closures', self._on_trusted_loop),
+        ):
+            self.create_subscription(kind, topic, callback, reliable,
+                                     qos_overriding_options=overridable)
+
+    def _on_options(self, options: NodeOptions) -> None:
+        with self._lock:
+            self._backend.set_options(options)
+
+    def _on_odometry(self, message: Odometry) -> None:
+        try:
+            self._check_base_frame(message.child_frame_id)
+            sample = odometry_sample(message)
+            with self._lock:
+                self._backend.add_odometry(sample)
+        except MessageError as error:
+            self._refuse(error)
+            return
+        self._last_stamp = sample.stamp
+        pose = self._manifold.compose(self._map_to_odom,
+                                      self._manifold.from_pose3(sample.pose3[None]))
+        self._pose.publish(pose_stamped(self.options.map_frame, sample.stamp,
+                                        self._manifold.to_pose3(pose)[0]))
+
+    def _check_base_frame(self, frame: str) -> None:
+        self._base_frame = self._base_frame or frame
+        if frame and frame != self._base_frame:
+            raise MessageError('child_frame', f'odometry of {frame!r}, expected that of '
+                               f'{self._base_frame!r}')
+
+    def _on_loop(self, message: PoseWithCovarianceStamped) -> None:
+        self._add_loop(message, trusted=False)
+
+    def _on_trusted_loop(self, message: PoseWithCovarianceStamped) -> None:
+        self._add_loop(message, trusted=True)
+
+    def _add_loop(self, message: PoseWithCovarianceStamped, trusted: bool) -> None:
+        try:
+            loop = loop_closure(message, self._base_frame, trusted)
+        except MessageError as error:
+            self._refuse(error)
+            return
+        with self._lock:
+            self._backend.add_loop(loop)
+
+    def _refuse(self, error: MessageError) -> None:
+        self._refused[error.cause] += 1
+        self.get_logger().warning(f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
+
+    def _on_timer(self) -> None:
+        self._wake.set()
+        if self._last_stamp:
+            self._publish_transform()
+
+    def _on_second(self) -> None:
+        with self._lock:
+            growth = self._backend.growth
+            counts = {'keyframes': growth.graph.n_poses, 'factors': len(growth.graph.between),
+                      'waiting_loops': growth.n_waiting}
+            refused = self._refused + growth.refused
+        self._diagnosis.publish(counts, refused)
+
+    def _work(self) -> None:
+        while self._wake.wait() and not self._closing:
+            self._wake.clear()
+            try:
+                self._update()
+            except (L1SlamError, ArithmeticError, np.linalg.LinAlgError) as error:
+                # The last good map stays; the next update tries again.
+                self.get_logger().error(f'update failed: {error}',
+                                        throttle_duration_sec=_REPEAT_WARNING)
+
+    def _update(self) -> None:
+        with self._lock:
+            problem = self._backend.problem()
+        if problem.settled or not problem.graph.n_poses:
+            return
+        options = self.options
+        improvement = improve(problem, options.solver, options.update.budget)
+        with self._lock:
+            self._backend.adopt(improvement)
+            stamps, poses = self._backend.growth.stamps, self._backend.poses
+            self._map_to_odom = self._backend.map_to_odom
+        self._path.publish(path_bytes(options.map_frame, self._last_stamp, stamps,
+                                      self._manifold.to_pose3(poses)))
+        self._publish_transform()
+        self._report(improvement)
+
+    def _publish_transform(self) -> None:
+        options = self.options
+        transform = transform_stamped(options.map_frame, options.odom_frame, self._last_stamp,
+                                      self._manifold.to_pose3(self._map_to_odom)[0])
+        self._transform.publish(transform)
+        if self._tf is not None:
+            self._tf.publish(TFMessage(transforms=[transform]))
+
+    def _report(self, improvement: Improvement) -> None:
+        self._diagnosis.note(improvement)
+        self.get_logger().debug(
+            f'update: cost {improvement.cost_before:.6g} -> {improvement.cost:.6g}, '
+            f'{improvement.reweighted_steps} reweighted steps, {improvement.outer_iterations} '
+            f'outer and {improvement.inner_iterations} inner iterations, '
+            f'{improvement.seconds * 1e3:.0f} ms, {improvement.status.value}')
+
+
+def main() -> int:
+    """Run the node until SIGINT or SIGTERM; return the exit code."""
+    rclpy.init()
+    node = None
+    try:
+        node = BackendNode()
+        node.get_logger().info('ready: waiting for odometry')
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except L1SlamError as error:
+        print(f'backend: {error}', file=sys.stderr)
+        return 1
+    finally:
+        if node is not None:
+            node.close()
+        rclpy.try_shutdown()
+    return 0

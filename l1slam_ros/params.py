@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options <-> ROS parameters, generically: a parameter is declared nowhere but at its field."""
+
+from collections.abc import Callable
+from typing import Generic
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.options import AnyOptions, Meaning, Scalar, flatten, with_values
+
+
+class NodeParameters(Generic[AnyOptions]):
+    """
+    The parameters of a node, as one options record that follows every change.
+
+    Parameters
+    ----------
+    node : where to declare them
+    defaults : the options as shipped
+    on_change : called with the new options after each accepted change
+
+    Raises
+    ------
+    OptionError : a value given at start is refused.
+
+    """
+
+    def __init__(self, node: Node, defaults: AnyOptions,
+                 on_change: Callable[[AnyOptions], None]):
+        self._names = set(flatten(defaults))
+        self._on_change = on_change
+        try:
+            given = {name: node.declare_parameter(name, value, _descriptor(value, meaning)).value
+                     for name, (value, meaning) in flatten(defaults).items()}
+        except ParameterException as error:
+            raise OptionError(str(error)) from error
+        self.options = with_values(defaults, given)
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._apply)
+
+    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            self._changed(parameters)
+        except OptionError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _apply(self, parameters: list[Parameter]) -> None:
+        changed = self._changed(parameters)
+        if changed != self.options:
+            self.options = changed
+            self._on_change(changed)
+
+    def _changed(self, parameters: list[Parameter]) -> AnyOptions:
+        return with_values(self.options, {parameter.name: parameter.value
+                                          for parameter in parameters
+                                          if parameter.name in self._names})
+
+
+def _descriptor(value: Scalar, meaning: Meaning) -> ParameterDescriptor:
+    unit = f' [{meaning.unit}]' if meaning.unit else ''
+    descriptor = ParameterDescriptor(
+        description=meaning.doc + unit,
+        read_only=meaning.fixed,
+        # The options check types themselves, and take 1 for 1.0 as people write it.
+        dynamic_typing=True)
+    if meaning.choices:
+        descriptor.additional_constraints = meaning.expected()
+    if meaning.low is not None and meaning.high is not None:
+        if isinstance(value, float):
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(meaning.low), to_value=float(meaning.high))]
+        else:
+            descriptor.integer_range = [
+                IntegerRange(from_value=int(meaning.low), to_value=int(meaning.high))]
+    return descriptor

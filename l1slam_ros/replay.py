@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+`replay`: plays a bag onto topics, paced by the times its messages were recorded.
+
+Messages are published as the bytes they are in the bag; nothing is decoded.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from importlib import import_module
+from pathlib import Path
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.utilities import remove_ros_args
+from rosgraph_msgs.msg import Clock
+
+from l1slam_ros.core.errors import FileError, L1SlamError, OptionError
+from l1slam_ros.io.bag import BagSummary, RawMessage, bag_summary, read_raw
+from l1slam_ros.progress import Progress
+from l1slam_ros.publishing import header
+
+_BAD_INPUT = 2
+_DEPTH = 1000
+_SECOND = 1_000_000_000
+# Discovery takes part of a second; a reliable publisher sends nothing to whom it has not met.
+_DISCOVERY = 2.0  # [s]
+_CLOCK_PERIOD = 0.01  # [s] of the bag's time
+_PAUSE = 0.05  # [s] longest sleep at a time, so that an interrupt is seen
+
+
+class Player:
+    """
+    Publishes the messages of one bag.
+
+    Parameters
+    ----------
+    node : to publish with
+    summary : of the bag
+    topics : only these; None: all whose type is installed here
+    remap : topic in the bag -> topic to publish on
+    clock : publish /clock too
+
+    Raises
+    ------
+    OptionError : a topic that the bag does not have, or whose type is not installed.
+
+    """
+
+    def __init__(self, node: Node, summary: BagSummary, topics: Sequence[str] | None,
+                 remap: dict[str, str], clock: bool):
+        self._node = node
+        names = {topic.name for topic in summary.topics}
+        for name in [*(topics or ()), *remap]:
+            if name not in names:
+                raise OptionError(f'the bag has no topic {name}; it has {", ".join(sorted(names))}')
+        self.publishers: dict[str, Publisher] = {}
+        for topic in summary.topics:
+            if topics is not None and topic.name not in topics:
+                continue
+            kind = _message_class(topic.msgtype)
+            if kind is None and topics is not None:
+                raise OptionError(f'{topic.name}: the type {topic.msgtype} is not installed')
+            if kind is None:
+                node.get_logger().warning(f'{topic.name} is left out: the type {topic.msgtype} '
+                                          'is not installed')
+                continue
+            self.publishers[topic.name] = node.create_publisher(
+                kind, remap.get(topic.name, topic.name), QoSProfile(depth=_DEPTH))
+        self._clock = node.create_publisher(Clock, '/clock', 10) if clock else None
+
+    def wait_for_subscribers(self, seconds: float) -> None:
+        """Wait until every topic has a subscriber, but no longer than `seconds`."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline and not all(
+                publisher.get_subscription_count() for publisher in self.publishers.values()):
+            _sleep_until(min(deadline, time.monotonic() + _PAUSE))
+
+    def play(self, messages: Iterable[RawMessage], rate: float, progress: Progress) -> None:
+        """Publish the messages, `rate` times as fast as they were recorded."""
+        first, began, shown, next_clock = None, time.monotonic(), 0.0, 0.0
+        for message in messages:
+            first = message.time if first is None else first
+            recorded = (message.time - first) / _SECOND
+            while self._clock is not None and next_clock <= recorded:
+                _sleep_until(began + next_clock / rate)
+                self._publish_clock(first + round(next_clock * _SECOND))
+                next_clock += _CLOCK_PERIOD
+            _sleep_until(began + recorded / rate)
+            self.publishers[message.topic].publish(message.data)
+            progress.advance(recorded - shown)
+            shown = recorded
+        for publisher in self.publishers.values():
+            publisher.wait_for_all_acked()
+
+    def _publish_clock(self, stamp: int) -> None:
+        assert self._clock is not None
+        self._clock.publish(Clock(clock=header('', stamp).stamp))
+
+
+def _sleep_until(moment: float) -> None:
+    """Sleep until a `time.monotonic()` [s]; raise when ROS is shut down meanwhile."""
+    while (rest := moment - time.monotonic()) > 0:
+        time.sleep(min(rest, _PAUSE))
+        if not rclpy.ok():
+            raise ExternalShutdownException()
+    if not rclpy.ok():
+        raise ExternalShutdownException()
+
+
+def _message_class(msgtype: str) -> type | None:
+    """Return the class of `package/msg/Name`, None where it is not installed."""
+    package, _, name = msgtype.replace('/', '.').rpartition('.')
+    try:
+        kind: type = getattr(import_module(package), name)
+    except (ImportError, AttributeError, ValueError):
+        return None
+    return kind
+
+
+def _rounds(arguments: argparse.Namespace, summary: BagSummary,
+            topics: list[str]) -> Iterator[Iterator[RawMessage]]:
+    """Yield the messages to play: once, or again and again with --loop."""
+    start = summary.start + round(arguments.start * _SECOND)
+    stop = None
+    if arguments.duration is not None:
+        stop = start + round(arguments.duration * _SECOND)
+    while True:
+        yield read_raw(arguments.bag, topics, start=start, stop=stop)
+        if not arguments.loop:
+            return
+
+
+def _play(arguments: argparse.Namespace) -> None:
+    summary = bag_summary(arguments.bag)
+    node = rclpy.create_node('replay')
+    try:
+        player = Player(node, summary, arguments.topics, arguments.remap, arguments.clock)
+        if not player.publishers:
+            raise FileError(arguments.bag, 'no topic of this bag can be played')
+        player.wait_for_subscribers(_DISCOVERY)
+        seconds = max(summary.duration / _SECOND - arguments.start, 0)
+        for messages in _rounds(arguments, summary, list(player.publishers)):
+            with Progress(min(seconds, arguments.duration or seconds), 's') as progress:
+                player.play(messages, arguments.rate, progress)
+    finally:
+        node.destroy_node()
+
+
+def _remapping(text: str) -> tuple[str, str]:
+    old, separator, new = text.partition(':=')
+    if not (old and separator and new):
+        raise argparse.ArgumentTypeError(f'{text!r}, expected old:=new')
+    return old, new
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float('inf'):
+        raise argparse.ArgumentTypeError(f'{text}, expected above 0')
+    return value
+
+
+def _not_negative(text: str) -> float:
+    value = float(text)
+    if not 0 <= value < float('inf'):
+        raise argparse.ArgumentTypeError(f'{text}, expected 0 or more')
+    return value
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog='replay', description='Play a bag onto topics.')
+    add = parser.add_argument
+    add('bag', type=Path, help='.mcap, .db3 or a rosbag2 directory')
+    add('--rate', type=_positive, default=1.0, help='times as fast as recorded')
+    add('--start', type=_not_negative, default=0.0, help='skip so much of the bag [s]')
+    add('--duration', type=_positive, help='play only so much of the bag [s]')
+    add('--loop', action='store_true', help='again and again')
+    add('--remap', type=_remapping, nargs='+', default=[], metavar='OLD:=NEW')
+    add('--topics', nargs='+', help='play only these')
+    add('--clock', action='store_true', help='publish /clock')
+    return parser
+
+
+def main() -> int:
+    """Play; return the exit code: 0, or 2 for bad input."""
+    arguments = _parser().parse_args(remove_ros_args(sys.argv)[1:])
+    arguments.remap = dict(arguments.remap)
+    rclpy.init(args=sys.argv)
+    try:
+        _play(arguments)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except L1SlamError as error:
+        print(f'replay: {error}', file=sys.stderr)
+        return _BAD_INPUT
+    finally:
+        rclpy.try_shutdown()
+    return 0

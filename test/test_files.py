@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text files: whole or not at all, numbers in bulk, the guilty line named."""
+
+import stat
+
+import numpy as np
+import pytest
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.io.files import (
+    TextLines,
+    first_failure,
+    parse_rows,
+    read_lines,
+    replacing,
+    stamp_from_text,
+    stamp_text,
+    write_lines,
+)
+
+
+def test_a_failing_write_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / 'a.txt'
+    write_lines(path, ['old'])
+
+    def lines():
+        yield 'new'
+        raise RuntimeError('half way')
+
+    with pytest.raises(RuntimeError):
+        write_lines(path, lines())
+    assert path.read_text() == 'old\n'
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_file_appears_only_when_the_block_has_succeeded(tmp_path):
+    path = tmp_path / 'a.txt'
+    with replacing(path) as temporary:
+        temporary.write_text('whole')
+        assert temporary.parent == tmp_path
+        assert not path.exists()
+    assert path.read_text() == 'whole'
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_others_may_read_what_is_written(tmp_path):
+    ordinary = tmp_path / 'ordinary'
+    ordinary.touch()
+    write_lines(tmp_path / 'a.txt', ['x'])
+    assert stat.S_IMODE((tmp_path / 'a.txt').stat().st_mode) == stat.S_IMODE(
+        ordinary.stat().st_mode)
+
+
+@pytest.mark.parametrize('name', ['missing/a.txt', 'folder', 'file/a.txt'])
+def test_what_cannot_be_written_is_named(tmp_path, name):
+    (tmp_path / 'folder').mkdir()
+    (tmp_path / 'file').touch()
+    with pytest.raises(FileError, match=f'{tmp_path / name}: cannot be written: '):
+        write_lines(tmp_path / name, ['x'])
+    assert {p.name for p in tmp_path.rglob('*')} == {'folder', 'file'}
+
+
+def test_comments_and_blank_lines_are_left_out_and_still_counted(tmp_path):
+    path = tmp_path / 'a.txt'
+    path.write_bytes(b'\xef\xbb\xbf# made by\r\n\r\n  \t\r\na 1\r\n  # b 2\r\nc 3')
+    lines = read_lines(path)
+    assert lines.numbers == [4, 6]
+    assert [text.split() for text in lines.texts] == [['a', '1'], ['c', '3']]
+
+
+@pytest.mark.parametrize(('content', 'message'), [
+    (b'good\n\xff\xfe', 'byte 0xff at offset 5; expected a text file'),
+    (None, 'cannot be read: No such file or directory'),
+])
+def test_what_is_no_text_is_named(tmp_path, content, message):
+    path = tmp_path / 'a.txt'
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(FileError, match=f'^{path}: {message}$'):
+        read_lines(path)
+
+
+def test_ids_are_exact_where_a_float_is_not(tmp_path):
+    name = 2**63 - 1
+    ids, values = parse_rows('f', 'row', TextLines([1], [f'{name} 0.1']), 1, 1)
+    assert ids.tolist() == [[name]]
+    assert values.tolist() == [[0.1]]
+
+
+@pytest.mark.parametrize(('text', 'found'), [
+    ('1 2', '2 fields'),
+    ('1 2 3 4', '4 fields'),
+    ('', '0 fields'),
+    ('# only a comment', '0 fields'),
+    ('1.5 2 3', "'1.5' is not a whole number"),
+    ('1.0 2 3', "'1.0' is not a whole number"),
+    ('99999999999999999999 2 3', "'99999999999999999999' is not a whole number"),
+    ('1 x 3', "'x' is not a finite number"),
+    ('1 nan 3', "'nan' is not a finite number"),
+    ('1 2 -inf', "'-inf' is not a finite number"),
+    ('1 2 1e999', "'1e999' is not a finite number"),
+    ('1 2 0x10', "'0x10' is not a finite number"),
+    ('1 2 1_0', "'1_0' is not a finite number"),
+])
+@pytest.mark.parametrize('where', [0, 1, 6, 12])
+def test_the_guilty_line_is_named_among_good_ones(text, found, where):
+    texts = ['1 2 3'] * 13
+    texts[where] = text
+    lines = TextLines(list(range(100, 113)), texts)
+    with pytest.raises(FileError) as caught:
+        parse_rows('file.txt', 'row', lines, 1, 2)
+    assert str(caught.value).startswith(f'file.txt:{100 + where}: row: {found}')
+    assert str(caught.value).endswith('; expected 1 whole and 2 finite numbers')
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('bad', [{0}, {9}, {3, 4, 9}, {8, 9}])
+def test_bisection_finds_the_first_failure(bad):
+    assert first_failure(10, lambda part: not bad & set(range(10)[part])) == min(bad)
+
+
+@pytest.mark.parametrize('stamp', [0, 1, 10**9, 1305031102175300121, 2**63 - 1])
+def test_stamps_keep_their_last_nanosecond(stamp):
+    if stamp < 9223372036 * 10**9:
+        assert stamp_from_text(stamp_text(stamp)) == stamp
+    whole, decimals = stamp_text(stamp).split('.')
+    assert len(decimals) == 9
+    assert int(whole) * 10**9 + int(decimals) == stamp
+    assert stamp_text(np.int64(stamp)) == stamp_text(stamp)
+
+
+@pytest.mark.parametrize(('text', 'stamp'), [
+    ('12', 12 * 10**9), ('12.5', 12500000000), ('1.305031102175300121e+09', 1305031102175300121),
+    ('0.0000000004', 0),
+])
+def test_stamps_of_other_tools(text, stamp):
+    assert stamp_from_text(text) == stamp
+
+
+@pytest.mark.parametrize('text', ['', 'x', 'nan', 'inf', '-1', '1e30', '1e999999999', '1.2.3'])
+def test_what_is_no_stamp(text):
+    with pytest.raises(ValueError):
+        stamp_from_text(text)

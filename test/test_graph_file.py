@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Graph files: g2o and TORO in, the same numbers out, every malformed line named."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l1slam_ros.core import se2
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.noise import square_root_information
+from l1slam_ros.io.files import stamps_path
+from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, read_vertices, write_graph_file
+
+SQUARE = """\
+# a comment
+VERTEX_SE2 7 1.5 0 1.5
+VERTEX_SE2 3 0 0 0
+
+EDGE_SE2 3 7 1 0.25 1.5 4 0.5 0.25 5 0.125 6
+VERTEX_SE2 9 1 1 3
+EDGE_SE2 7 9 1 0 1.5 4 0 0 4 0 9
+EDGE_SE2 9 3 -0.5 1 -3 1 0 0 1 0 1
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def file(content, name='a.g2o'):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+    return file
+
+
+def message_of(path):
+    with pytest.raises(FileError) as caught:
+        read_graph_file(path)
+    assert '\n' not in str(caught.value)
+    return str(caught.value).removeprefix(str(path))
+
+
+def information_of(factors):
+    roots = factors.sqrt_information
+    return roots.transpose(0, 2, 1) @ roots
+
+
+def test_a_small_graph(write):
+    record = read_graph_file(write(SQUARE))
+    assert record.ids.tolist() == [3, 7, 9]
+    assert record.poses.tolist() == [[0, 0, 0], [1.5, 0, 1.5], [1, 1, 3]]
+    factors = record.graph.between
+    assert factors.i.tolist() == [0, 1, 2]
+    assert factors.j.tolist() == [1, 2, 0]
+    assert factors.measurement[0].tolist() == [1, 0.25, 1.5]
+    np.testing.assert_allclose(
+        information_of(factors)[0], [[4, 0.5, 0.25], [0.5, 5, 0.125], [0.25, 0.125, 6]],
+        rtol=1e-15)
+    assert record.stamps is None
+    assert record.skipped == ()
+
+
+def test_toro_orders_the_information_otherwise(write):
+    g2o = 'EDGE_SE2 0 1 1 2 0.5 10 1 2 20 3 30\n'
+    toro = 'EDGE2 0 1 1 2 0.5 10 1 20 30 2 3\n'
+    first, second = (read_graph_file(write(text)).graph.between for text in (g2o, toro))
+    assert (first.sqrt_information == second.sqrt_information).all()
+    assert (first.measurement == second.measurement).all()
+
+
+def test_edges_alone_name_the_vertices(write):
+    record = read_graph_file(write('EDGE_SE2 5 -2 1 0 0 1 0 0 1 0 1\n'))
+    assert record.ids.tolist() == [-2, 5]
+    assert record.poses is None
+    assert record.graph.between.i.tolist() == [1]
+
+
+def test_ids_beyond_the_floats(write):
+    # Names such as x0, x1 of other tools: a letter in the top byte.
+    a = ord('x') << 56
+    record = read_graph_file(write(f'EDGE_SE2 {a} {a + 1} 1 0 0 1 0 0 1 0 1\n'))
+    assert record.ids.tolist() == [a, a + 1]
+
+
+def test_priors(write):
+    record = read_graph_file(write(SQUARE + 'EDGE_PRIOR_SE2 7 1 2 0.5 10 1 2 20 3 30\n'))
+    prior = record.graph.prior
+    assert prior.i.tolist() == [1]
+    assert prior.measurement.tolist() == [[1, 2, 0.5]]
+    np.testing.assert_allclose(
+        information_of(prior)[0], [[10, 1, 2], [1, 20, 3], [2, 3, 30]], rtol=1e-15)
+
+
+def test_edges_of_both_formats_keep_the_order_of_the_file(write):
+    record = read_graph_file(write(
+        'EDGE2 0 1 1 0 0 1 0 1 1 0 0\nEDGE_SE2 0 1 2 0 0 1 0 0 1 0 1\n'
+        'EDGE2 0 1 3 0 0 1 0 1 1 0 0\n'))
+    assert record.graph.between.measurement[:, 0].tolist() == [1, 2, 3]
+
+
+def test_a_disconnected_graph_is_read(write):
+    record = read_graph_file(write(
+        'EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 5 6 1 0 0 1 0 0 1 0 1\n'))
+    assert record.graph.n_poses == 4
+
+
+def test_what_is_not_used_is_said(write):
+    record = read_graph_file(write(
+        SQUARE + 'FIX 9\nFIX 3\nPARAMS_SE2OFFSET 0 0 0 0\nVERTEX_XY 20 1 2\nVERTEX_XY 21 1 2\n'
+        'EDGE_SE2_XY 3 20 1 1 1 0 1\n'))
+    assert record.skipped == (
+        'FIX 9 3: the anchor is the first vertex (3)', '1 PARAMS_SE2OFFSET line: not used',
+        '2 VERTEX_XY lines: not used', '1 EDGE_SE2_XY line: not used')
+
+
+def test_a_fixed_first_vertex_is_no_news(write):
+    assert read_graph_file(write(SQUARE + 'FIX 3\n')).skipped == ()
+
+
+@pytest.mark.parametrize(('line', 'message'), [
+    ('EDGE_SE2 3 7 1 0 0 1 0 0 1 0', 'EDGE_SE2: 10 fields; expected 2 whole and 9 finite numbers'),
+    ('EDGE_SE2 3 7 1 0 0 1 0 0 1 0 1 1', 'EDGE_SE2: 12 fields; expected 2 whole'),
+    ('EDGE_SE2', 'EDGE_SE2: 0 fields; expected 2 whole'),
+    ('VERTEX_SE2 5 0 0', 'VERTEX_SE2: 3 fields; expected 1 whole and 3 finite numbers'),
+    ('VERTEX_SE2 5 0 nan 0', "VERTEX_SE2: 'nan' is not a finite number; expected"),
+    ('VERTEX_SE2 5 0 O 0', "VERTEX_SE2: 'O' is not a finite number; expected"),
+    ('EDGE_SE2 3 7.5 1 0 0 1 0 0 1 0 1', "EDGE_SE2: '7.5' is not a whole number of 64 bits"),
+    ('EDGE_SE2 3 x 1 0 0 1 0 0 1 0 1', "EDGE_SE2: 'x' is not a whole number of 64 bits"),
+    ('EDGE_SE2 3 7 1 inf 0 1 0 0 1 0 1', "EDGE_SE2: 'inf' is not a finite number; expected"),
+    ('EDGE_SE2 3 7 1 0 0 1 2 0 1 0 1',
+     'information [1 2 0 2 1 0 0 0 1]; expected a positive definite matrix'),
+    ('EDGE_SE2 3 7 1 0 0 0 0 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected a positive'),
+    ('EDGE_PRIOR_SE2 3 1 0 0 1 0 0 1 0 -1', 'information [1 0 0 0 1 0 0 0 -1]; expected'),
+    ('EDGE_SE2 3 8 1 0 0 1 0 0 1 0 1', 'vertex 8 is unknown; expected one of the 3 vertices'),
+    ('EDGE_SE2 100 3 1 0 0 1 0 0 1 0 1', 'vertex 100 is unknown; expected one of the 3 vertices'),
+    ('EDGE_PRIOR_SE2 -1 1 0 0 1 0 0 1 0 1', 'vertex -1 is unknown; expected one of the 3'),
+    ('EDGE_SE2 7 7 1 0 0 1 0 0 1 0 1', 'an edge from vertex 7 to itself; expected two vertices'),
+    ('VERTEX_SE2 7 0 0 0', 'vertex 7 stands twice, before at line 2; expected each once'),
+    ('VERTEX2 7 0 0 0', 'vertex 7 stands twice, before at line 2; expected each once'),
+    ('EGDE_SE2 3 7 1 0 0 1 0 0 1 0 1', "unknown tag 'EGDE_SE2'; expected VERTEX_SE2, EDGE_SE2, "),
+    ('VERTEX_SE3:QUAT 5 0 0 0 0 0 0 1', 'VERTEX_SE3:QUAT: 3D graphs are not supported yet'),
+    ('EDGE_SE3:QUAT 5 6', 'EDGE_SE3:QUAT: 3D graphs are not supported yet'),
+    ('VERTEX3 5 0 0 0 0 0 0', 'VERTEX3: 3D graphs are not supported yet'),
+    ('EDGE3 5 6', 'EDGE3: 3D graphs are not supported yet'),
+])
+def test_each_malformed_line_is_named(write, line, message):
+    text = SQUARE + line + '\n' + 'EDGE_SE2 3 9 1 1 3 1 0 0 1 0 1\n'
+    assert message_of(write(text)).startswith(f':9: {message}')
+
+
+@pytest.mark.parametrize(('content', 'message'), [
+    ('', ': the file is empty; expected EDGE_SE2 or EDGE2 lines'),
+    ('# nothing\n\n', ': the file is empty; expected EDGE_SE2 or EDGE2 lines'),
+    ('VERTEX_SE2 0 0 0 0\n', ': no edges; expected EDGE_SE2 or EDGE2 lines'),
+    ('0 1 2\n', ":1: unknown tag '0'; expected VERTEX_SE2, "),
+    (b'\x89MCAP0\r\n', ': byte 0x89 at offset 0; expected a text file'),
+    (b'\x00' * 1000, ":1: unknown tag '\\x00"),
+    (b'VERTEX_SE2 0 0 0 0\n\x00\x01 EDGE\n', ":2: unknown tag '\\x00\\x01'; expected"),
+])
+def test_what_is_no_graph_is_told(write, content, message):
+    found = message_of(write(content))
+    assert found.startswith(message)
+    assert len(found) < 400
+
+
+def test_no_file_and_a_directory(tmp_path):
+    assert message_of(tmp_path / 'none.g2o') == ': cannot be read: No such file or directory'
+    assert message_of(tmp_path) == ': cannot be read: Is a directory'
+
+
+@pytest.mark.skipif(not hasattr(os, 'geteuid') or os.geteuid() == 0, reason='root reads all')
+def test_an_unreadable_file(write):
+    path = write(SQUARE)
+    path.chmod(0)
+    assert message_of(path) == ': cannot be read: Permission denied'
+
+
+def random_record(rng, n=40, stamps=True):
+    graph = FactorGraph(se2)
+    graph.add_poses(n)
+    i = np.concatenate((np.arange(n - 1), rng.integers(0, n - 5, 60)))
+    j = np.concatenate((np.arange(1, n), i[n - 1:] + rng.integers(1, 5, 60)))
+    A = rng.normal(size=(len(i), 3, 3))
+    graph.add_between(i, j, rng.normal(size=(len(i), 3)),
+                      A @ A.transpose(0, 2, 1) + 0.1 * np.eye(3))
+    graph.add_prior(np.array([3]), rng.normal(size=(1, 3)), 7.7 * np.eye(3)[None])
+    ids = np.sort(rng.choice(10**12, n, replace=False))
+    return GraphRecord(graph, rng.normal(size=(n, 3)) * 1e3, ids,
+                       np.cumsum(rng.integers(1, 10**12, n)) if stamps else None)
+
+
+def assert_same(a, b):
+    assert (a.ids == b.ids).all()
+    assert (a.poses == b.poses).all()
+    for x, y in ((a.graph.between, b.graph.between), (a.graph.prior, b.graph.prior)):
+        assert (x.i == y.i).all()
+        assert (x.measurement == y.measurement).all()
+        np.testing.assert_allclose(x.sqrt_information, y.sqrt_information, rtol=0, atol=1e-13)
+
+
+def test_round_trip(tmp_path, rng):
+    record = random_record(rng)
+    write_graph_file(tmp_path / 'a.g2o', record)
+    back = read_graph_file(tmp_path / 'a.g2o')
+    assert_same(record, back)
+    assert (back.stamps == record.stamps).all()
+    assert {p.name for p in tmp_path.iterdir()} == {'a.g2o', 'a.g2o.stamps.txt'}
+
+
+def test_toro_round_trip_and_what_it_cannot_hold(tmp_path, rng):
+    record = random_record(rng, stamps=False)
+    path = tmp_path / 'a.graph'
+    with pytest.raises(FileError, match='toro has no line for a prior of SE2'):
+        write_graph_file(path, record)
+    assert not path.exists()
+    write_graph_file(tmp_path / 'a.g2o', record)
+    text = (tmp_path / 'a.g2o').read_text()
+    (tmp_path / 'b.g2o').write_text(
+        ''.join(f'{line}\n' for line in text.splitlines() if 'PRIOR' not in line))
+    record = read_graph_file(tmp_path / 'b.g2o')
+    write_graph_file(path, record)
+    assert {line.split()[0] for line in path.read_text().splitlines()} == {'VERTEX2', 'EDGE2'}
+    assert_same(record, read_graph_file(path))
+
+
+@pytest.mark.parametrize('name', ['intel', 'manhattan3500', 'city10000'])
+def test_the_papers_graphs_come_back_number_by_number(datasets, tmp_path, name):
+    source, copy = datasets / f'{name}.g2o', tmp_path / 'copy.g2o'
+    write_graph_file(copy, read_graph_file(source))
+
+    def rows(path, tag):
+        lines = [line.split() for line in path.read_text().splitlines()]
+        return [[float(v) for v in line[1:]] for line in lines if line and line[0] == tag]
+
+    assert rows(copy, 'VERTEX_SE2') == sorted(rows(source, 'VERTEX_SE2'))
+    assert rows(copy, 'EDGE_SE2') == rows(source, 'EDGE_SE2')
+
+
+def test_what_the_papers_graphs_hold(datasets):
+    record = read_graph_file(datasets / 'manhattan3500.g2o')
+    assert record.graph.n_poses == 3500
+    assert len(record.graph.between) == 5598
+    assert record.graph.between.is_odometry.sum() == 3499
+
+
+@pytest.mark.parametrize(('name', 'tag'), [
+    ('sphere2500', 'VERTEX_SE3:QUAT'), ('parking-garage', 'VERTEX_SE3:QUAT')])
+def test_3d_graphs_are_refused(datasets, name, tag):
+    assert message_of(datasets / f'{name}.g2o').startswith(f':1: {tag}: 3D graphs are not')
+
+
+@pytest.mark.parametrize('exponent', [-30, -8, 0, 8, 25])
+def test_information_of_many_digits_keeps_them(tmp_path, rng, exponent):
+    information = np.diag(rng.uniform(1, 10, 3) * 10.0**exponent)[None]
+    graph = FactorGraph(se2)
+    graph.add_poses(2)
+    graph.add_between(np.array([0]), np.array([1]), np.ones((1, 3)), information)
+    write_graph_file(tmp_path / 'a.g2o', GraphRecord(graph, None, np.array([0, 1])))
+    back = read_graph_file(tmp_path / 'a.g2o')
+    np.testing.assert_allclose(back.graph.between.sqrt_information,
+                               square_root_information(information), rtol=1e-15, atol=0)
+
+
+def test_a_graph_without_stamps_does_not_inherit_those_of_its_predecessor(tmp_path, rng):
+    path, record = tmp_path / 'a.g2o', random_record(rng)
+    write_graph_file(path, record)
+    write_graph_file(path, replace(record, stamps=None))
+    assert read_graph_file(path).stamps is None
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_graph_survives_a_failing_replacement(tmp_path, rng):
+    path, record = tmp_path / 'a.g2o', random_record(rng)
+    write_graph_file(path, record)
+    before = {p: p.read_bytes() for p in tmp_path.iterdir()}
+    poses = record.poses.copy()
+    poses[2, 1] = np.nan
+    with pytest.raises(FileError, match=rf'VERTEX_SE2 \[{record.ids[2]}\] is not finite'):
+        write_graph_file(path, replace(record, poses=poses))
+    assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize(('text', 'message'), [
+    ('3 1.5\n7 2.5\n', ': 2 stamps that are not those of the 3 vertices; expected one for each'),
+    ('3 1\n7 2\n8 3\n', ': 3 stamps that are not those of the 3 vertices'),
+    ('3 1\n7 2\n7 2\n9 3\n', ': 4 stamps that are not those of the 3 vertices'),
+    ('3 1\n# x\n7 two\n9 3\n', ":3: '7 two'; expected a vertex id and seconds"),
+    ('3 1\n7\n9 3\n', ":2: '7'; expected a vertex id and seconds"),
+])
+def test_damaged_stamps_are_named(write, text, message):
+    path = write(SQUARE)
+    stamps_path(path).write_text(text)
+    with pytest.raises(FileError) as caught:
+        read_graph_file(path)
+    assert str(caught.value).startswith(f'{stamps_path(path)}{message}')
+
+
+def test_stamps_of_any_order(write):
+    path = write(SQUARE)
+    stamps_path(path).write_text('9 3\n# c\n3 1.25\n7 2.000000001\n')
+    assert read_graph_file(path).stamps.tolist() == [1250000000, 2000000001, 3000000000]
+
+
+def test_vertices_alone(write):
+    ids, poses = read_vertices(write('VERTEX_SE2 4 1 2 3\nVERTEX_SE2 2 4 5 6\n'))
+    assert ids.tolist() == [2, 4]
+    assert poses.tolist() == [[4, 5, 6], [1, 2, 3]]
+    with pytest.raises(FileError, match='no vertices; expected VERTEX_SE2 or VERTEX2 lines'):
+        read_vertices(write('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n'))
+
+
+def test_the_readers_need_no_bag_or_plot_library():
+    modules = ['files', 'graph_file', 'trajectory', 'messages', 'bag', 'graph_bag']
+    code = (''.join(f'import l1slam_ros.io.{name}\n' for name in modules)
+            + 'import sys\nprint([m for m in sys.modules if m.split(".")[0] in '
+              '("rosbags", "mcap", "matplotlib", "yaml", "rclpy")])')
+    out = subprocess.run([sys.executable, '-c', code], check=True, capture_output=True, text=True,
+                         cwd=Path(__file__).parents[1])
+    assert out.stdout.strip() == '[]'
