@@ -12,15 +12,16 @@ import numpy as np
 
 from l1slam_ros import offline
 from l1slam_ros.core.errors import L1SlamError, OptionError
+from l1slam_ros.core.false_loops import FALSE_LOOPS
 from l1slam_ros.core.graph import component_labels
 from l1slam_ros.core.l2 import LeastSquaresOptions
 from l1slam_ros.core.optimality import SENTENCES
+from l1slam_ros.core.optimiser import OptimiserOptions
 from l1slam_ros.io.graph_file import GraphRecord
-from l1slam_ros.node_options import NodeOptions, read_params_file
+from l1slam_ros.node_options import read_params_file
 from l1slam_ros.progress import Progress
 
 BAD_INPUT = 2
-KINDS = ('random', 'identity', 'grouped')
 # In this order: what `auto` picks first is what there is.
 SOLVERS = ('auto', 'primal-dual')
 
@@ -82,47 +83,61 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
     add('--edges', type=int, required=True, metavar='M', help='true ones, odometry included')
     add('--seed', type=int, default=0, metavar='S')
     add('--false-loops', type=int, default=0, metavar='K', help='on top of the edges')
-    add('--kind', choices=KINDS, default=KINDS[0], help='of the false loops')
+    add('--kind', choices=list(FALSE_LOOPS), default='random', help='of the false loops')
     parser.set_defaults(run=_simulate)
 
 
 def _solve(arguments: argparse.Namespace) -> None:
-    if arguments.params_file:
-        node_options = read_params_file(arguments.params_file)
-        record = offline.read_input(arguments.input, node_options)
-    else:
-        node_options = NodeOptions()
-        record = offline.read_input(arguments.input)
-    _warn(record, arguments.quiet)
-    solver, least_squares = node_options.solver, LeastSquaresOptions()
-    if arguments.outer is not None:
-        solver = replace(solver, outer_iterations=arguments.outer)
-        least_squares = replace(least_squares, iterations=arguments.outer)
-    if arguments.inner is not None:
-        solver = replace(solver, inner=replace(solver.inner, iterations=arguments.inner))
+    _check_outputs(arguments)
+    record, solver, least_squares = _solve_input(arguments)
     steps = solver.outer_iterations if arguments.norm == 'l1' else least_squares.iterations
     with Progress(steps, 'step', arguments.quiet) as progress:
         outcome = offline.solve(record, arguments.start, arguments.norm, solver, least_squares,
                                 progress.report)
     poses = outcome.solution.poses
-    if arguments.output:
-        offline.write_output(arguments.output, record, poses)
-    ate = None
+    report = _solve_report(record, arguments.norm, outcome)
     if arguments.reference:
-        ate = offline.position_error(record, poses, arguments.reference)
+        report['ate'] = offline.position_error(record, poses, arguments.reference)
     if arguments.plot:
         _plot_solution(arguments, record, outcome)
-    report = _solve_report(record, arguments.norm, outcome, ate)
+    if arguments.output:
+        offline.write_output(arguments.output, record, poses)
     if arguments.json:
         print(json.dumps(report))
     elif not arguments.quiet:
         _print_report(report, arguments.norm, SENTENCES[outcome.solution.status])
 
 
-def _solve_report(record: GraphRecord, norm: str, outcome: offline.Outcome,
-                  ate: float | None) -> dict[str, object]:
+def _check_outputs(arguments: argparse.Namespace) -> None:
+    """Refuse names of outputs before the work is done, not after."""
+    if arguments.output:
+        offline.check_output(arguments.output)
+    if arguments.plot:
+        from l1slam_ros.io.plot import check_picture
+
+        check_picture(arguments.plot)
+
+
+def _solve_input(
+    arguments: argparse.Namespace,
+) -> tuple[GraphRecord, OptimiserOptions, LeastSquaresOptions]:
+    growth, solver, least_squares = None, OptimiserOptions(), LeastSquaresOptions()
+    if arguments.params_file:
+        growth = read_params_file(arguments.params_file)
+        solver = growth.solver
+    if arguments.outer is not None:
+        solver = replace(solver, outer_iterations=arguments.outer)
+        least_squares = replace(least_squares, iterations=arguments.outer)
+    if arguments.inner is not None:
+        solver = replace(solver, inner=replace(solver.inner, iterations=arguments.inner))
+    record = offline.read_input(arguments.input, growth)
+    _warn(record, arguments.quiet)
+    return record, solver, least_squares
+
+
+def _solve_report(record: GraphRecord, norm: str, outcome: offline.Outcome) -> dict[str, object]:
     solution, factors = outcome.solution, record.graph.between
-    report: dict[str, object] = {
+    return {
         'poses': record.graph.n_poses,
         'factors': len(factors) + len(record.graph.prior),
         'loops': int((~factors.is_odometry).sum()),
@@ -136,9 +151,6 @@ def _solve_report(record: GraphRecord, norm: str, outcome: offline.Outcome,
         'inner_iterations': solution.inner_iterations,
         'rejected': [],
     }
-    if ate is not None:
-        report['ate'] = ate
-    return report
 
 
 def _print_report(report: dict[str, object], norm: str, status: str) -> None:
@@ -171,7 +183,6 @@ def _convert(arguments: argparse.Namespace) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> None:
-    from l1slam_ros.core.false_loops import FALSE_LOOPS
     from l1slam_ros.core.simulate import WorldOptions, simulate_world, with_false_loops
     from l1slam_ros.io.graph_bag import write_graph_bag
     from l1slam_ros.io.trajectory import write_false_loops, write_truth

@@ -55,7 +55,7 @@ class BackendNode(Node):
 
     def __init__(self, **keywords: Any):
         super().__init__('backend', **keywords)
-        self._parameters = NodeParameters(self, NodeOptions(), self._on_options)
+        self._declared = NodeParameters(self, NodeOptions(), self._on_options)
         options = self.options
         self._manifold = se2
         self._backend = Backend(self._manifold, options)
@@ -76,7 +76,7 @@ class BackendNode(Node):
     @property
     def options(self) -> NodeOptions:
         """The options as they are now."""
-        return self._parameters.options
+        return self._declared.options
 
     def close(self) -> None:
         """End the worker and the node."""
@@ -212,15 +212,19 @@ def main() -> int:
     node = None
     try:
         node = BackendNode()
-        node.get_logger().info('ready: waiting for odometry')
         executor = SingleThreadedExecutor()
         executor.add_node(node)
+        node.get_logger().info('ready: waiting for odometry')
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except L1SlamError as error:
         print(f'backend: {error}', file=sys.stderr)
         return 1
+    except Exception:
+        # A signal can shut ROS down under any call; what that call then raises is no failure.
+        if rclpy.ok():
+            raise
     finally:
         if node is not None:
             node.close()

@@ -202,6 +202,13 @@ def stamps_of(record: GraphRecord) -> Indices:
     return record.stamps if record.stamps is not None else invented_stamps(record.graph.n_poses)
 
 
+def check_output(path: Path) -> None:
+    """Refuse, before any work is done, an output whose suffix names no format."""
+    if path.suffix not in (*GRAPH_SUFFIXES, '.tum', ''):
+        raise FileError(path, f'unknown suffix; expected {", ".join(GRAPH_SUFFIXES)}, .tum, or '
+                        'none for a bag directory')
+
+
 def write_output(path: Path, record: GraphRecord, poses: Array) -> None:
     """
     Write a graph with its poses (n, p), in the format that the suffix names; none: a bag.
@@ -211,12 +218,10 @@ def write_output(path: Path, record: GraphRecord, poses: Array) -> None:
     FileError : an unknown suffix, or the file cannot be written.
 
     """
+    check_output(path)
     if path.suffix in GRAPH_SUFFIXES:
         write_graph_file(path, replace(record, poses=poses))
     elif path.suffix == '.tum':
         write_tum(path, stamps_of(record), poses, record.graph.manifold)
-    elif path.suffix == '':
-        write_graph_bag(path, record)
     else:
-        raise FileError(path, f'unknown suffix; expected {", ".join(GRAPH_SUFFIXES)}, .tum, or '
-                        'none for a bag directory')
+        write_graph_bag(path, record)

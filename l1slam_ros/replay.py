@@ -17,7 +17,6 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
 from l1slam_ros.core.errors import FileError, L1SlamError, OptionError
@@ -28,8 +27,10 @@ from l1slam_ros.publishing import header
 _BAD_INPUT = 2
 _DEPTH = 1000
 _SECOND = 1_000_000_000
-# Discovery takes part of a second; a reliable publisher sends nothing to whom it has not met.
-_DISCOVERY = 2.0  # [s]
+# A publisher sends nothing to whom it has not met. Meeting takes part of a second, but where a
+# first announcement is lost (a busy machine), as many times 3 s as it takes.
+_DISCOVERY = 10.0  # [s] longest wait for anybody to subscribe
+_REST = 0.5  # [s] then, for the other topics of the same node
 _CLOCK_PERIOD = 0.01  # [s] of the bag's time
 _PAUSE = 0.05  # [s] longest sleep at a time, so that an interrupt is seen
 
@@ -58,7 +59,8 @@ class Player:
         names = {topic.name for topic in summary.topics}
         for name in [*(topics or ()), *remap]:
             if name not in names:
-                raise OptionError(f'the bag has no topic {name}; it has {", ".join(sorted(names))}')
+                raise OptionError(f'the bag has no topic {name}; it has '
+                                  f'{", ".join(sorted(names))}')
         self.publishers: dict[str, Publisher] = {}
         for topic in summary.topics:
             if topics is not None and topic.name not in topics:
@@ -74,12 +76,18 @@ class Player:
                 kind, remap.get(topic.name, topic.name), QoSProfile(depth=_DEPTH))
         self._clock = node.create_publisher(Clock, '/clock', 10) if clock else None
 
-    def wait_for_subscribers(self, seconds: float) -> None:
-        """Wait until every topic has a subscriber, but no longer than `seconds`."""
-        deadline = time.monotonic() + seconds
-        while time.monotonic() < deadline and not all(
-                publisher.get_subscription_count() for publisher in self.publishers.values()):
-            _sleep_until(min(deadline, time.monotonic() + _PAUSE))
+    def wait_for_subscribers(self) -> None:
+        """Wait until anybody subscribes, then a little for the rest; play to nobody in the end."""
+        began = time.monotonic()
+        while not any(p.get_subscription_count() for p in self.publishers.values()):
+            if time.monotonic() > began + _DISCOVERY:
+                self._node.get_logger().warning('nobody subscribes; playing all the same')
+                return
+            _sleep_until(time.monotonic() + _PAUSE)
+        rest = time.monotonic() + _REST
+        while time.monotonic() < rest and not all(
+                p.get_subscription_count() for p in self.publishers.values()):
+            _sleep_until(time.monotonic() + _PAUSE)
 
     def play(self, messages: Iterable[RawMessage], rate: float, progress: Progress) -> None:
         """Publish the messages, `rate` times as fast as they were recorded."""
@@ -143,7 +151,7 @@ def _play(arguments: argparse.Namespace) -> None:
         player = Player(node, summary, arguments.topics, arguments.remap, arguments.clock)
         if not player.publishers:
             raise FileError(arguments.bag, 'no topic of this bag can be played')
-        player.wait_for_subscribers(_DISCOVERY)
+        player.wait_for_subscribers()
         seconds = max(summary.duration / _SECOND - arguments.start, 0)
         for messages in _rounds(arguments, summary, list(player.publishers)):
             with Progress(min(seconds, arguments.duration or seconds), 's') as progress:
@@ -187,11 +195,18 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Split at `--ros-args`. rclpy's own splitting also takes the old:=new of --remap for its."""
+    at = arguments.index('--ros-args') if '--ros-args' in arguments else len(arguments)
+    return arguments[:at], arguments[at:]
+
+
 def main() -> int:
     """Play; return the exit code: 0, or 2 for bad input."""
-    arguments = _parser().parse_args(remove_ros_args(sys.argv)[1:])
+    own, ros = _split(sys.argv[1:])
+    arguments = _parser().parse_args(own)
     arguments.remap = dict(arguments.remap)
-    rclpy.init(args=sys.argv)
+    rclpy.init(args=ros)
     try:
         _play(arguments)
     except (KeyboardInterrupt, ExternalShutdownException):

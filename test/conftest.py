@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures every test may ask for."""
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+# A domain of its own, seen on this machine only: no robot nearby hears the tests, nor they it.
+os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 100 + 1)
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
 
 @pytest.fixture
@@ -20,3 +25,12 @@ def datasets():
     if not folder.is_dir():
         pytest.skip('the public datasets are not on this machine')
     return folder
+
+
+@pytest.fixture
+def ros():
+    """Bring ROS up for one test and down after it; skip where there is none."""
+    rclpy = pytest.importorskip('rclpy')
+    rclpy.init()
+    yield rclpy
+    rclpy.try_shutdown()

@@ -85,7 +85,7 @@ class Backend:
         self._options = options
         self.growth = GraphGrowth(manifold, options)
         self._poses = manifold.identity(0)
-        self._dual = np.zeros(0)
+        self._dual: Array = np.zeros(0)
         self._last_cost = 0.0
         self._status = Status.OUT_OF_TIME
 

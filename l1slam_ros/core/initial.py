@@ -73,8 +73,8 @@ def _compose_along(graph: FactorGraph, parent: Indices, candidates: Indices) -> 
         lost = child[np.argmax(parent[child] < 0)]
         raise GraphError(f'keyframe {lost} has no path to the rest of the graph')
     i, j = factors.i[candidates], factors.j[candidates]
-    pairs, first = np.unique(_pair_key(i, j, n), return_index=True)
-    wanted = _pair_key(parent[child], child, n)
+    pairs, first = np.unique(pair_key(i, j, n), return_index=True)
+    wanted = pair_key(parent[child], child, n)
     place = np.minimum(np.searchsorted(pairs, wanted), max(len(pairs) - 1, 0))
     missing = pairs[place] != wanted if len(pairs) else np.ones(len(wanted), bool)
     if missing.any():
@@ -88,6 +88,7 @@ def _compose_along(graph: FactorGraph, parent: Indices, candidates: Indices) -> 
     return compose_tree(manifold, parent, relative)
 
 
-def _pair_key(i: Indices, j: Indices, n: int) -> Indices:
+def pair_key(i: Indices, j: Indices, n: int) -> Indices:
+    """Return one number for each pair of keyframes of n, whichever way round, (m,)."""
     key: Indices = np.minimum(i, j) * n + np.maximum(i, j)
     return key

@@ -6,7 +6,7 @@ In: a linear system A, b. Out: the step that minimises a weighted sum of squares
 """
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csr_array, dia_array
 from scipy.sparse.linalg import splu
 
 from l1slam_ros.core.errors import GraphError
@@ -31,10 +31,10 @@ def weighted_least_squares(
     GraphError : the matrix is singular: some keyframe is not tied to the anchor.
 
     """
-    WA = A if weights is None else diags_array(weights) @ A
+    WA = A if weights is None else _diagonal(weights) @ A
     H = (A.T @ WA).tocsc()
     if damping:
-        H = (H + damping * diags_array(H.diagonal())).tocsc()
+        H = (H + _diagonal(damping * H.diagonal())).tocsc()
     try:
         factor = splu(H, permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
                       options={'SymmetricMode': True})
@@ -43,6 +43,10 @@ def weighted_least_squares(
                          'the anchor, or weights differ beyond double precision') from error
     x: Array = factor.solve(WA.T @ b)
     return x
+
+
+def _diagonal(values: Array) -> dia_array:
+    return dia_array((values[None], [0]), shape=(len(values), len(values)))
 
 
 def reweighted_step(A: csr_array, b: Array, r: Array, mu: float) -> tuple[Array, Array]:

@@ -39,8 +39,8 @@ def square_root_information(information: Array) -> Array:
     # A pivot lost to rounding counts as not positive: its square root would be noise.
     smallest = np.linalg.eigvalsh(information)[:, 0]
     _refuse(smallest <= 1e-15 * scale, information, 'positive definite')
-    root: Array = np.linalg.cholesky(information).transpose(0, 2, 1)
-    return root
+    root = np.linalg.cholesky(information).transpose(0, 2, 1)
+    return root.astype(np.float64, copy=False)
 
 
 def information_from_covariance(covariance: Array) -> Array:

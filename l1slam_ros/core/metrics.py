@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far an estimated trajectory is from the truth, once both lie in the same frame."""
+
+import numpy as np
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.manifold import Array
+
+
+def align(estimate: Array, truth: Array) -> tuple[Array, Array]:
+    """
+    Return the rigid motion R, t that minimises sum |R estimate + t - truth|^2.
+
+    Parameters
+    ----------
+    estimate, truth : (n, k) positions [m] of the same times, k = 2 or 3
+
+    Returns
+    -------
+    R : (k, k) rotation, never a reflection; t : (k,) [m].
+
+    Raises
+    ------
+    GraphError : no position at all, or not as many of one as of the other.
+
+    Source
+    ------
+    Umeyama, "Least-squares estimation of transformation parameters between two point patterns"
+    (1991), equations 40, 41 and 43, with scale 1.
+
+    """
+    if estimate.shape != truth.shape or not len(estimate):
+        raise GraphError(f'{len(estimate)} positions of {estimate.shape[1]} coordinates to align '
+                         f'with {len(truth)} of {truth.shape[1]}, expected as many, 1 or more')
+    mean_estimate, mean_truth = estimate.mean(axis=0), truth.mean(axis=0)
+    U, _, Vt = np.linalg.svd((truth - mean_truth).T @ (estimate - mean_estimate))
+    sign = np.ones(len(U))
+    sign[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    R = (U * sign) @ Vt
+    return R, mean_truth - R @ mean_estimate
+
+
+def aligned_positions(estimate: Array, truth: Array) -> Array:
+    """Return the estimated positions (n, k) [m] in the frame of the truth; see `align`."""
+    R, t = align(estimate, truth)
+    aligned: Array = estimate @ R.T + t
+    return aligned
+
+
+def absolute_trajectory_error(estimate: Array, truth: Array) -> float:
+    """Return the RMSE of the positions (n, k) [m] after alignment; see `align`."""
+    distance = np.linalg.norm(aligned_positions(estimate, truth) - truth, axis=1)
+    return float(np.sqrt(np.mean(distance**2)))

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+`make demo`: plays the demo bag into the real node, draws its map, and compares with the truth.
+
+`backend` and `replay` run as processes of their own, with the parameters as shipped; this one
+only listens to the Path, as any other ROS program would.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import sysconfig
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from nav_msgs.msg import Path as PathMessage
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from l1slam_ros.core.manifold import Array, Indices
+from l1slam_ros.core.metrics import absolute_trajectory_error, aligned_positions
+from l1slam_ros.io.bag import read_messages
+from l1slam_ros.io.graph_bag import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
+from l1slam_ros.io.messages import stamp_of
+from l1slam_ros.io.plot import MapDrawing, plot_maps
+
+BAG = Path('bags/demo')
+PICTURE = Path('demo/map.png')
+RATE = 10.0
+# The map is final when the node, which publishes what it improves, has been silent so long [s].
+QUIET = 2.0
+LONGEST = 120.0  # [s] for the node to come up, and to become quiet
+
+
+@dataclass
+class Listener:
+    """Keeps the last Path and counts how many came."""
+
+    node: Node
+    last: PathMessage | None = None
+    times: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Subscribe."""
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(PathMessage, 'path', self._hear, latched)
+
+    def _hear(self, message: PathMessage) -> None:
+        self.last = message
+        self.times.append(time.monotonic())
+
+    def wait_until_quiet(self) -> None:
+        """Wait until no Path came for `QUIET` seconds."""
+        deadline = time.monotonic() + LONGEST
+        while not self.times or time.monotonic() - self.times[-1] < QUIET:
+            if time.monotonic() > deadline:
+                raise TimeoutError(f'the map has not come to rest within {LONGEST:.0f} s')
+            rclpy.spin_once(self.node, timeout_sec=0.1)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What the bag holds: stamps (n,) [ns] of the truth, positions (n, 2) [m], loops (m, 2)."""
+
+    stamps: Indices
+    odometry: Array
+    truth: Array
+    loops: Indices
+
+
+def read_recording(path: Path) -> Recording:
+    """Read the demo bag; loops as rows of `stamps`."""
+    stamps: list[int] = []
+    poses: dict[str, list[tuple[float, float]]] = {ODOMETRY_TOPIC: [], TRUTH_TOPIC: []}
+    loops: list[tuple[int, int]] = []
+    for topic, _, _, message in read_messages(path):
+        if topic == LOOP_TOPIC:
+            seconds, _, nanoseconds = message.header.frame_id.split('@')[1].partition('.')
+            loops.append((int(seconds + nanoseconds), stamp_of(message.header)))
+            continue
+        if topic == ODOMETRY_TOPIC:
+            stamps.append(stamp_of(message.header))
+            message = message.pose
+        poses[topic].append((message.pose.position.x, message.pose.position.y))
+    return Recording(np.array(stamps), np.array(poses[ODOMETRY_TOPIC]),
+                     np.array(poses[TRUTH_TOPIC]), np.searchsorted(stamps, loops))
+
+
+@contextmanager
+def running_backend() -> Iterator[None]:
+    """Run `backend` as a process; end it as a user would, by SIGINT, and look at its exit code."""
+    backend = subprocess.Popen([executable('backend')])
+    try:
+        yield
+    finally:
+        backend.send_signal(signal.SIGINT)
+        code = backend.wait(timeout=LONGEST)
+    if code:
+        raise RuntimeError(f'backend ended with exit code {code}')
+
+
+def executable(name: str) -> str:
+    """Return the path of one of this package's executables, beside the running Python."""
+    return str(Path(sysconfig.get_path('scripts')) / name)
+
+
+def record_map(bag: Path) -> tuple[PathMessage, float]:
+    """Play the bag into `backend`; return its last Path and how often it published one [1/s]."""
+    rclpy.init()
+    try:
+        listener = Listener(rclpy.create_node('demo'))
+        with running_backend():
+            replay = subprocess.Popen([executable('replay'), str(bag), '--rate', str(RATE)])
+            while replay.poll() is None:
+                rclpy.spin_once(listener.node, timeout_sec=0.1)
+            if replay.returncode:
+                raise RuntimeError(f'replay ended with exit code {replay.returncode}')
+            listener.wait_until_quiet()
+        assert listener.last is not None
+        rate = (len(listener.times) - 1) / max(listener.times[-1] - listener.times[0], 1e-9)
+        return listener.last, rate
+    finally:
+        rclpy.try_shutdown()
+
+
+def summarise(recording: Recording, path: PathMessage, rate: float, picture: Path) -> str:
+    """Draw the map and return what to print about it."""
+    stamps = np.array([stamp_of(pose.header) for pose in path.poses])
+    positions = np.array([(p.pose.position.x, p.pose.position.y) for p in path.poses])
+    rows = np.searchsorted(recording.stamps, stamps)
+    truth, odometry = recording.truth[rows], recording.odometry[rows]
+    errors = (absolute_trajectory_error(odometry, truth),
+              absolute_trajectory_error(positions, truth))
+    note = f'position error {errors[0]:.2f} m by odometry, {errors[1]:.2f} m optimised'
+    keyframe = np.searchsorted(stamps, recording.stamps[recording.loops])
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    plot_maps(picture, [MapDrawing('l1slam_ros demo', positions, odometry,
+                                   aligned_positions(truth, positions), keyframe, note=note)])
+    return '\n'.join((
+        f'position error  {errors[0]:.3f} m by odometry, {errors[1]:.3f} m in the map (RMSE)',
+        f'graph           {len(stamps)} keyframes, {len(recording.loops)} loops',
+        f'node            {rate:.1f} updates per second',
+        f'picture         {picture}'))
+
+
+def main() -> int:
+    """Run the demo from the checkout's top folder; return the exit code."""
+    # A domain of its own: the demo neither hears nor disturbs what else runs here.
+    os.environ.setdefault('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    recording = read_recording(BAG)
+    path, rate = record_map(BAG)
+    print(summarise(recording, path, rate, PICTURE))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Pictures: maps beside each other, and costs against iterations.
+
+In: positions, pairs of keyframes, costs. Out: a .png, .svg or .pdf file. Colours are those of
+Okabe and Ito, which people who see red and green alike can tell apart.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.manifold import Array, Indices
+from l1slam_ros.io.files import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_SUFFIXES = ('.png', '.svg', '.pdf')
+_BLUE, _GREEN, _ORANGE, _RED, _GREY = '#0072B2', '#009E73', '#E69F00', '#D5370E', '#808080'
+_CURVE_COLOURS = (_BLUE, '#D55E00', _GREEN, '#CC79A7', _ORANGE, '#56B4E9', '#000000')
+# More loops than this make a picture slow and no clearer.
+_MOST_LOOPS = 20_000
+# The view follows odometry astray by no more than this part of the map's size.
+_ASTRAY = 0.4
+_PANEL = 5.6  # [inch]
+_DOTS_PER_INCH = 150
+
+
+def _no_pairs() -> Indices:
+    return np.zeros((0, 2), np.int64)
+
+
+@dataclass(frozen=True)
+class MapDrawing:
+    """
+    What one map shows, seen from above.
+
+    positions, odometry, truth : (n, 2 or 3) [m]; loops, rejected : (m, 2) pairs of rows of
+    `positions`; note : a line under the title, e.g. costs.
+    """
+
+    title: str
+    positions: Array
+    odometry: Array | None = None
+    truth: Array | None = None
+    loops: Indices = field(default_factory=_no_pairs)
+    rejected: Indices = field(default_factory=_no_pairs)
+    note: str = ''
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of a diagram: costs (k,), above 0, after so many iterations (k,)."""
+
+    label: str
+    iterations: Array
+    costs: Array
+
+
+def check_picture(path: str | Path) -> None:
+    """Refuse, before any work is done, a name whose suffix is not that of a picture."""
+    if Path(path).suffix.lower() not in _SUFFIXES:
+        raise FileError(path, f'unknown suffix; expected {", ".join(_SUFFIXES)}')
+
+
+def plot_maps(path: str | Path, maps: Sequence[MapDrawing]) -> None:
+    """
+    Draw maps beside each other, in equal axes [m].
+
+    Raises
+    ------
+    FileError : a suffix other than .png, .svg and .pdf, or a file that cannot be written.
+
+    """
+    columns = len(maps) if len(maps) <= 3 else math.ceil(math.sqrt(len(maps)))
+    rows = math.ceil(len(maps) / columns)
+    figure = _new_figure(path, columns, rows)
+    for k, drawing in enumerate(maps, 1):
+        _draw_map(figure.add_subplot(rows, columns, k), drawing)
+    _save(figure, path)
+
+
+def plot_curves(path: str | Path, curves: Sequence[Curve], title: str = '') -> None:
+    """Draw costs, on a logarithmic scale, against iterations; errors as for `plot_maps`."""
+    figure = _new_figure(path, 1.3, 0.8)
+    axes = figure.add_subplot()
+    for k, curve in enumerate(curves):
+        axes.plot(curve.iterations, curve.costs, label=curve.label, linewidth=1.6,
+                  color=_CURVE_COLOURS[k % len(_CURVE_COLOURS)])
+    axes.set_yscale('log')
+    axes.set_title(title, loc='left', fontweight='bold')
+    axes.set_xlabel('iteration')
+    axes.set_ylabel('cost')
+    _tidy(axes)
+    axes.legend(frameon=False)
+    _save(figure, path)
+
+
+def _new_figure(path: str | Path, columns: float, rows: float) -> 'Figure':
+    """Return an empty figure, after a look at the name it will have."""
+    from matplotlib.figure import Figure
+
+    check_picture(path)
+    return Figure(figsize=(_PANEL * columns, _PANEL * rows), dpi=_DOTS_PER_INCH,
+                  layout='constrained')
+
+
+def _save(figure: 'Figure', path: str | Path) -> None:
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format=Path(path).suffix[1:].lower(), bbox_inches='tight',
+                       pad_inches=0.15)
+
+
+def _draw_map(axes: 'Axes', drawing: MapDrawing) -> None:
+    """Draw from the ground up: what was believed, what is true, what came out, what did not."""
+    if drawing.odometry is not None:
+        _draw_path(axes, drawing.odometry, 'odometry', _GREY, 0.7, zorder=1,
+                   opacity=_opacity(len(drawing.odometry)))
+    if drawing.truth is not None:
+        _draw_path(axes, drawing.truth, 'truth', _ORANGE, 2.8, zorder=2)
+    _draw_pairs(axes, drawing.positions, drawing.loops, 'loops', _GREEN, zorder=3)
+    _draw_path(axes, drawing.positions, 'optimised', _BLUE, 1.0, zorder=4)
+    _draw_pairs(axes, drawing.positions, drawing.rejected, 'rejected loops', _RED, zorder=5)
+    axes.plot(*drawing.positions[0, :2], 'o', color=_BLUE, markersize=5, zorder=6)
+    axes.set_title(drawing.title, loc='left', fontweight='bold', pad=24)
+    axes.annotate(_small_print(drawing), (0, 1), (0, 7), xycoords='axes fraction',
+                  textcoords='offset points', color='#555555', fontsize='small')
+    _set_view(axes, drawing)
+    axes.set_xlabel('x [m]')
+    axes.set_ylabel('y [m]')
+    _tidy(axes)
+    axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.1), ncols=5, frameon=False,
+                fontsize='small', columnspacing=1.4, handlelength=1.4)
+
+
+def _small_print(drawing: MapDrawing) -> str:
+    parts = [f'{len(drawing.positions):,} poses', f'{len(drawing.loops):,} loops']
+    if len(drawing.loops) > _MOST_LOOPS:
+        parts[-1] += f' ({_MOST_LOOPS:,} drawn)'
+    if len(drawing.rejected):
+        parts.append(f'{len(drawing.rejected):,} rejected')
+    return ', '.join(parts) + (f'; {drawing.note}' if drawing.note else '')
+
+
+def _draw_path(
+    axes: 'Axes', positions: Array, label: str, colour: str, width: float, zorder: int,
+    opacity: float = 1.0,
+) -> None:
+    axes.plot(positions[:, 0], positions[:, 1], color=colour, linewidth=width, label=label,
+              zorder=zorder, alpha=opacity, solid_joinstyle='round')
+
+
+def _draw_pairs(
+    axes: 'Axes', positions: Array, pairs: Indices, label: str, colour: str, zorder: int
+) -> None:
+    """Draw loops as lines between the positions they join, evenly thinned out if too many."""
+    from matplotlib.collections import LineCollection
+
+    if not len(pairs):
+        return
+    count = min(len(pairs), _MOST_LOOPS)
+    shown = pairs[np.linspace(0, len(pairs) - 1, count).astype(np.int64)]
+    # Without `rasterized` an .svg or .pdf of a large graph takes minutes to open.
+    axes.add_collection(LineCollection(list(positions[shown][:, :, :2]), colors=colour,
+                                       linewidths=0.8, alpha=_opacity(count), zorder=zorder,
+                                       rasterized=True), autolim=False)
+    axes.plot([], [], color=colour, linewidth=1.2, label=label)
+
+
+def _opacity(count: int) -> float:
+    """Return a fainter opacity the more lines there are, so that none drowns the others."""
+    return float(np.clip(25 / math.sqrt(count), 0.3, 0.8))
+
+
+def _set_view(axes: 'Axes', drawing: MapDrawing) -> None:
+    """Show the map and the truth whole, the odometry as far as it stays in their neighbourhood."""
+    seen = [drawing.positions] if drawing.truth is None else [drawing.positions, drawing.truth]
+    points = np.concatenate([positions[:, :2] for positions in seen])
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = max(float((high - low).max()), 1.0)
+    if drawing.odometry is not None:
+        strayed = drawing.odometry[:, :2].clip(low - _ASTRAY * size, high + _ASTRAY * size)
+        low, high = np.minimum(low, strayed.min(axis=0)), np.maximum(high, strayed.max(axis=0))
+    margin = 0.04 * size
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - margin, high[1] + margin)
+    axes.set_aspect('equal')
+
+
+def _tidy(axes: 'Axes') -> None:
+    axes.grid(True, color='#DDDDDD', linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[['top', 'right']].set_visible(False)

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The package's metadata; package.xml repeats what rosdep and colcon read, a test compares."""
+
+import sys
+from glob import glob
+
+from setuptools import find_packages, setup
+
+package_name = 'l1slam_ros'
+
+data_files = [
+    ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
+    (f'share/{package_name}', ['package.xml']),
+    (f'share/{package_name}/config', sorted(glob('config/*'))),
+]
+# `ros2 run` looks in lib/<package>. colcon (it calls `install` or `develop`) puts the console
+# scripts there by setup.cfg; pip puts them in bin, so what pip installs carries starters.
+if not {'install', 'develop'}.intersection(sys.argv):
+    data_files.append((f'lib/{package_name}', sorted(glob('resource/run/*'))))
+
+setup(
+    name=package_name,
+    version='0.1.0',
+    description='Pose-graph SLAM back end for ROS 2: L1 norm, primal-dual, robust to false loops',
+    maintainer='l1slam_ros maintainers',
+    maintainer_email='maintainers@l1slam-ros.invalid',
+    license='Apache-2.0',
+    packages=find_packages(exclude=['test']),
+    data_files=data_files,
+    zip_safe=True,
+    python_requires='>=3.10',
+    # Lower bounds: what Ubuntu 24.04, the home of ROS 2 Jazzy, ships. rosbags comes from PyPI
+    # there too; before 0.11.6 it reads the messages of one time in any order.
+    install_requires=[
+        'numpy>=1.26',
+        'scipy>=1.11',
+        'matplotlib>=3.6',
+        'tqdm>=4.66',
+        'PyYAML>=6.0',
+        'mcap>=1.2',
+        'rosbags>=0.11.6',
+    ],
+    extras_require={
+        # The distribution must be named: the wheels' unpinned `ros-rclpy` is not Jazzy.
+        'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
+        # Newer style tools find other things, and a test asserts that they find none.
+        # setuptools: a test builds the wheel, and from 70.1 on it can do so by itself.
+        'test': [
+            'pytest>=7.4',
+            'hypothesis>=6.98',
+            'ruff~=0.17.5',
+            'mypy~=2.4.1',
+            'packaging',
+            'setuptools>=70.1',
+        ],
+    },
+    entry_points={
+        'console_scripts': [
+            'backend = l1slam_ros.node:main',
+            'replay = l1slam_ros.replay:main',
+            'l1slam = l1slam_ros.cli:main',
+        ],
+    },
+)

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The real node on real DDS, in this process: messages in, the optimised Path out."""
+
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from l1slam_ros.core import se2
+from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.linearise import whitened_residual
+from l1slam_ros.core.optimality import l1_cost
+from l1slam_ros.core.optimiser import OptimiserOptions, minimise
+from l1slam_ros.core.seed import seed_poses
+from l1slam_ros.core.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.bag import read_raw
+from l1slam_ros.io.graph_bag import write_graph_bag
+from l1slam_ros.io.graph_file import GraphRecord, read_graph_file
+from l1slam_ros.node import BackendNode
+from l1slam_ros.publishing import header
+
+EVERY_MESSAGE = {'keyframe.translation': 0.0, 'keyframe.rotation': 0.0,
+                 'odometry.covariance_source': 'increment'}
+DEADLINE = 60.0
+TYPES = {'/odom': Odometry, '/loop_closures': PoseWithCovarianceStamped}
+
+
+class Bench:
+    """The node under test and a peer that talks to it, spun by one executor."""
+
+    def __init__(self, rclpy, parameters):
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        self.backend = BackendNode(parameter_overrides=overrides)
+        self.peer = rclpy.create_node('peer')
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.backend)
+        self.executor.add_node(self.peer)
+        self.publishers = {topic: self.peer.create_publisher(kind, topic, QoSProfile(depth=1000))
+                           for topic, kind in TYPES.items()}
+        self.received = {'path': [], 'pose': [], 'map_to_odom': []}
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.listen(Path, 'path', latched)
+        self.listen(PoseStamped, 'pose', 1000)
+        self.listen(TransformStamped, 'map_to_odom', 1000)
+        self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values()),
+                   'the node subscribes')
+
+    def listen(self, kind, topic, qos):
+        self.peer.create_subscription(kind, topic, self.received[topic].append, qos)
+
+    def until(self, condition, what):
+        deadline = time.monotonic() + DEADLINE
+        while not condition():
+            assert time.monotonic() < deadline, f'waited {DEADLINE} s in vain until {what}'
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def send(self, topic, message):
+        self.publishers[topic].publish(message)
+        self.executor.spin_once(timeout_sec=0.0)
+
+    def path(self):
+        return self.received['path'][-1] if self.received['path'] else Path()
+
+    def close(self):
+        self.executor.shutdown()
+        self.backend.close()
+        self.peer.destroy_node()
+
+
+@pytest.fixture
+def bench(ros):
+    benches = []
+
+    def make(**parameters):
+        benches.append(Bench(ros, parameters))
+        return benches[-1]
+
+    yield make
+    for made in benches:
+        made.close()
+
+
+def odometry(stamp, x, frame='base_link'):
+    message = Odometry(header=header('odom', stamp), child_frame_id=frame)
+    message.pose.pose.position.x = x
+    return message
+
+
+def poses_of(path):
+    return se2.from_pose3(np.array([
+        (p.pose.position.x, p.pose.position.y, p.pose.position.z, p.pose.orientation.x,
+         p.pose.orientation.y, p.pose.orientation.z, p.pose.orientation.w)
+        for p in path.poses]).reshape(-1, 7))
+
+
+def play(bench, bag):
+    for message in read_raw(bag):
+        bench.send(message.topic, message.data)
+
+
+def assert_near_optimum(bench, record, optimum, tolerance):
+    n = record.graph.n_poses
+    limit = (1 + tolerance) * optimum
+    bench.until(
+        lambda: len(bench.path().poses) == n
+        and l1_cost(whitened_residual(record.graph, poses_of(bench.path()))) <= limit,
+        f'the Path has {n} poses and a cost of at most {limit}')
+
+
+def test_a_recorded_world_becomes_its_optimal_map(bench, tmp_path, rng):
+    world = simulate_world(300, 500, WorldOptions(), rng)
+    record = GraphRecord(world.graph, None, np.arange(300))
+    write_graph_bag(tmp_path / 'bag', record)
+    optimum = minimise(world.graph, seed_poses(world.graph), OptimiserOptions()).cost
+    b = bench(**EVERY_MESSAGE)
+    play(b, tmp_path / 'bag')
+    assert_near_optimum(b, record, optimum, 0.02)
+    assert b.path().header.frame_id == 'map'
+
+
+def test_intel_ends_within_two_percent_of_the_optimum(bench, tmp_path, datasets):
+    record = read_graph_file(datasets / 'intel.g2o')
+    write_graph_bag(tmp_path / 'bag', record)
+    b = bench(**EVERY_MESSAGE)
+    play(b, tmp_path / 'bag')
+    assert_near_optimum(b, record, 961.77375, 0.02)
+
+
+def test_pose_and_transform_agree_with_the_path(bench, tmp_path, rng):
+    world = simulate_world(120, 200, WorldOptions(), rng)
+    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(120)))
+    b = bench(**EVERY_MESSAGE)
+    play(b, tmp_path / 'bag')
+    b.until(lambda: len(b.path().poses) == 120, 'all keyframes are in the Path')
+    b.until(lambda: not b.backend._wake.is_set(), 'the worker is idle')
+    last = b.path().poses[-1]
+    t = b.received['map_to_odom'][-1]
+    assert (t.header.frame_id, t.child_frame_id) == ('map', 'odom')
+    assert len(b.received['pose']) == 120
+    assert {p.header.frame_id for p in b.received['pose']} == {'map'}
+    b.received['pose'].clear()
+    b.received['map_to_odom'].clear()
+    b.until(lambda: b.received['map_to_odom'], 'a transform is repeated')
+    assert last.header.stamp == b.received['map_to_odom'][-1].header.stamp
+
+
+def test_default_thresholds_make_a_keyframe_every_half_metre(bench):
+    b = bench()
+    for k in range(101):
+        b.send('/odom', odometry(10**9 + k * 10**8, 0.05 * k))
+    b.until(lambda: len(b.path().poses) == 11, 'eleven keyframes came of five metres')
+    assert len(b.received['pose']) == 101
+
+
+def test_bad_messages_are_counted_and_the_node_goes_on(bench):
+    b = bench()
+    b.send('/odom', odometry(10**9, 0.0))
+    b.send('/odom', odometry(10**9 - 5, 9.0))
+    b.send('/odom', odometry(2 * 10**9, float('nan')))
+    b.send('/odom', odometry(2 * 10**9, 0.0, frame='camera'))
+    loop = PoseWithCovarianceStamped(header=header('map', 2 * 10**9))
+    loop.pose.pose.orientation.w = 1.0
+    b.send('/loop_closures', loop)
+    b.send('/odom', odometry(3 * 10**9, 1.0))
+    b.until(lambda: len(b.path().poses) == 2, 'the good samples are in the Path')
+    b.until(lambda: b.backend._refused.total() == 4, 'the four bad ones are counted')
+    assert b.backend._refused == {'old_stamp': 1, 'not_finite': 1, 'child_frame': 1, 'frame': 1}
+
+
+def test_nonsense_parameters_are_refused_at_start_and_on_set(ros, bench):
+    with pytest.raises(OptionError, match=r'keyframe\.translation'):
+        Bench(ros, {'keyframe.translation': -1.0})
+    b = bench(**{'keyframe.rotation': 1})
+    assert b.backend.options.keyframe.rotation == 1.0
+    answer = b.backend.set_parameters([Parameter('keyframe.translation', value=float('nan'))])[0]
+    assert not answer.successful and 'translation' in answer.reason
+    answer = b.backend.set_parameters([Parameter('map_frame', value='world')])[0]
+    assert not answer.successful
+    assert b.backend.set_parameters([Parameter('update.budget', value=0.05)])[0].successful
+    assert b.backend.options.update.budget == 0.05

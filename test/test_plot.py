@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures: real files, read back with other libraries."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.io.plot import Curve, MapDrawing, plot_curves, plot_maps
+
+ROOT = Path(__file__).parents[1]
+SQUARE = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0], [0.0, 1.0]])
+RED = (0xD5, 0x37, 0x0E)
+
+
+def pixels(path):
+    with Image.open(path) as image:
+        return np.asarray(image.convert('RGB')).astype(int)
+
+
+def reddish(path):
+    """How many pixels are rather red: those of rejected loops, half transparent on white."""
+    r, g, b = np.moveaxis(pixels(path), -1, 0)
+    return int(((r > 190) & (g < 120) & (b < 100)).sum())
+
+
+def words(path):
+    """The texts of an SVG: matplotlib draws them as outlines and notes them in comments."""
+    return '\n'.join(re.findall(r'<!-- (.*?) -->', path.read_text()))
+
+
+def test_maps_stand_beside_each_other(tmp_path):
+    drawing = MapDrawing('square', SQUARE)
+    sizes = []
+    for count in (1, 2, 4):
+        plot_maps(tmp_path / f'{count}.png', [drawing] * count)
+        height, width, _ = pixels(tmp_path / f'{count}.png').shape
+        sizes.append((width, height))
+    assert sizes[1][0] > 1.5 * sizes[0][0] and sizes[1][1] < 1.2 * sizes[0][1]
+    assert sizes[2][0] == pytest.approx(sizes[1][0], rel=0.1)
+    assert sizes[2][1] > 1.5 * sizes[1][1]
+
+
+def test_everything_given_is_drawn_and_named(tmp_path):
+    path = tmp_path / 'map.svg'
+    plot_maps(path, [MapDrawing(
+        'Some street', SQUARE, odometry=SQUARE * 1.1, truth=SQUARE * 0.9,
+        loops=np.array([[0, 4], [1, 3]]), rejected=np.array([[0, 2]]), note='cost 12.5')])
+    ElementTree.parse(path)
+    said = words(path)
+    for word in ('Some street', 'optimised', 'odometry', 'truth', 'loops', 'rejected loops',
+                 'x [m]', 'y [m]', '5 poses, 2 loops, 1 rejected; cost 12.5'):
+        assert word in said
+
+
+def test_what_is_not_given_is_not_named(tmp_path):
+    path = tmp_path / 'map.svg'
+    plot_maps(path, [MapDrawing('Some street', SQUARE)])
+    assert '5 poses, 0 loops' in words(path)
+    assert not {'odometry', 'truth', 'rejected'} & set(words(path).split())
+
+
+def test_rejected_loops_are_red(tmp_path):
+    for name, rejected in ('none', np.zeros((0, 2), int)), ('one', np.array([[0, 2]])):
+        plot_maps(tmp_path / f'{name}.png', [MapDrawing('', SQUARE, rejected=rejected)])
+    assert reddish(tmp_path / 'none.png') == 0
+    assert reddish(tmp_path / 'one.png') > 300
+
+
+def test_axes_are_equal(tmp_path):
+    """The blue square is as wide as it is high."""
+    path = tmp_path / 'map.png'
+    plot_maps(path, [MapDrawing('', SQUARE * [3, 1])])
+    blue = np.argwhere((pixels(path) == (0x00, 0x72, 0xB2)).all(axis=-1))
+    blue = blue[blue[:, 0] < 0.85 * len(pixels(path))]  # not the legend's line
+    height, width = np.ptp(blue, axis=0)
+    assert width / height == pytest.approx(3, rel=0.03)
+
+
+def test_odometry_astray_does_not_shrink_the_map(tmp_path):
+    path = tmp_path / 'map.png'
+    plot_maps(path, [MapDrawing('', SQUARE, odometry=SQUARE * 1000)])
+    blue = np.argwhere((pixels(path) == (0x00, 0x72, 0xB2)).all(axis=-1))
+    blue = blue[blue[:, 0] < 0.85 * len(pixels(path))]
+    assert np.ptp(blue[:, 1]) > 0.4 * pixels(path).shape[1]
+
+
+def test_the_loops_of_a_large_graph_are_thinned_out_and_one_image(tmp_path, rng):
+    path = tmp_path / 'map.svg'
+    walk = np.cumsum(rng.normal(size=(50_000, 2)), axis=0)
+    plot_maps(path, [MapDrawing('large', walk, loops=rng.integers(50_000, size=(650_000, 2)))])
+    assert '50,000 poses, 650,000 loops (20,000 drawn)' in words(path)
+    elements = [element.tag.split('}')[1] for element in ElementTree.parse(path).iter()]
+    assert elements.count('image') == 1
+    assert elements.count('path') < 500
+
+
+def test_positions_in_space_are_seen_from_above(tmp_path):
+    flat, tall = tmp_path / 'flat.png', tmp_path / 'tall.png'
+    heights = np.array([[0.0], [5.0], [9.0], [-3.0], [1.0]])
+    loops = np.array([[0, 2]])
+    plot_maps(flat, [MapDrawing('', SQUARE, loops=loops)])
+    plot_maps(tall, [MapDrawing('', np.hstack((SQUARE, heights)), loops=loops)])
+    np.testing.assert_array_equal(pixels(flat), pixels(tall))
+
+
+def test_one_pose_is_a_map(tmp_path):
+    plot_maps(tmp_path / 'map.png', [MapDrawing('', np.zeros((1, 2)), np.zeros((1, 2)))])
+    assert pixels(tmp_path / 'map.png').min() < 100
+
+
+def test_curves_are_drawn_on_a_logarithmic_scale(tmp_path):
+    path = tmp_path / 'curves.svg'
+    k = np.arange(50)
+    plot_curves(path, [Curve('angles', k, 1e6 * np.exp(-k)), Curve('global', k, 10.0 + k)],
+                'Cost of things')
+    for word in ('Cost of things', 'angles', 'global', 'iteration', 'cost', 'mathdefault{10^{'):
+        assert word in words(path)
+
+
+@pytest.mark.parametrize('name, start', [
+    ('map.png', b'\x89PNG'), ('MAP.PNG', b'\x89PNG'), ('map.svg', b'<?xml'), ('map.pdf', b'%PDF')])
+def test_the_suffix_decides(name, start, tmp_path):
+    plot_maps(tmp_path / name, [MapDrawing('', SQUARE)])
+    assert (tmp_path / name).read_bytes().startswith(start)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize('name', ['map.jpg', 'map', 'map.png.txt'])
+def test_another_suffix_is_refused(name, tmp_path):
+    expected = f'{tmp_path / name}: unknown suffix; expected .png, .svg, .pdf'
+    for draw in (lambda path: plot_maps(path, [MapDrawing('', SQUARE)]),
+                 lambda path: plot_curves(path, [Curve('', np.arange(2), np.ones(2))])):
+        with pytest.raises(FileError) as caught:
+            draw(tmp_path / name)
+        assert str(caught.value) == expected
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_cannot_be_written_is_said_and_leaves_nothing(tmp_path):
+    (tmp_path / 'taken.png').mkdir()
+    for path in tmp_path / 'missing' / 'map.png', tmp_path / 'taken.png':
+        with pytest.raises(FileError, match=f'^{path}: cannot be written: '):
+            plot_maps(path, [MapDrawing('', SQUARE)])
+    assert [path.name for path in tmp_path.iterdir()] == ['taken.png']
+
+
+def test_importing_it_does_not_import_matplotlib():
+    code = 'import sys, l1slam_ros.io.plot; sys.exit("matplotlib" in sys.modules)'
+    assert subprocess.run([sys.executable, '-c', code], cwd=ROOT).returncode == 0

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The installed executables as processes: `replay` plays a bag into `backend`, signals end it."""
+
+import signal
+import subprocess
+import sysconfig
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip('rclpy')
+
+from nav_msgs.msg import Path as PathMessage
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from l1slam_ros.core.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.graph_bag import write_graph_bag
+from l1slam_ros.io.graph_file import GraphRecord
+
+SCRIPTS = Path(sysconfig.get_path('scripts'))
+DEADLINE = 60.0
+
+
+@pytest.fixture
+def backend():
+    process = subprocess.Popen([SCRIPTS / 'backend'], stderr=subprocess.PIPE, text=True)
+    # The node says when it is ready; before that a signal would meet a half-started process.
+    assert 'ready' in process.stderr.readline()
+    yield process
+    process.kill()
+    process.communicate()
+
+
+@pytest.fixture
+def bag(tmp_path, rng):
+    world = simulate_world(200, 300, WorldOptions(), rng)
+    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(200)))
+    return tmp_path / 'bag'
+
+
+def replay(*arguments):
+    return subprocess.run([SCRIPTS / 'replay', *map(str, arguments)], capture_output=True,
+                          text=True, timeout=DEADLINE)
+
+
+@pytest.fixture
+def paths(ros):
+    """Return what comes on `path`, and a function that waits for a condition on it."""
+    node = ros.create_node('listener')
+    heard = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(PathMessage, 'path', heard.append, latched)
+
+    def until(condition):
+        deadline = time.monotonic() + DEADLINE
+        while not (heard and condition(heard[-1])):
+            assert time.monotonic() < deadline, (
+                f'{len(heard)} paths; the last has {len(heard[-1].poses) if heard else 0} poses')
+            ros.spin_once(node, timeout_sec=0.1)
+        return heard[-1]
+
+    yield until
+    node.destroy_node()
+
+
+def test_replay_plays_a_bag_into_backend_and_a_map_comes_out(backend, bag, paths):
+    played = replay(bag, '--rate', '10')
+    assert (played.returncode, played.stderr) == (0, '')
+    path = paths(lambda path: len(path.poses) == 200)
+    assert path.header.frame_id == 'map'
+    stamps = [p.header.stamp.sec * 10**9 + p.header.stamp.nanosec for p in path.poses]
+    assert stamps == [1000 * 10**9 + k * 10**8 for k in range(200)]
+    backend.send_signal(signal.SIGINT)
+    assert backend.wait(DEADLINE) == 0
+
+
+def test_a_part_of_a_bag_on_other_topics(backend, bag, paths):
+    played = replay(bag, '--rate', '10', '--start', '5', '--duration', '10',
+                    '--topics', '/odom', '--remap', '/odom:=/other')
+    assert played.returncode == 0
+    played = replay(bag, '--rate', '10', '--start', '2', '--duration', '3', '--topics', '/odom')
+    assert played.returncode == 0
+    path = paths(lambda path: len(path.poses) == 30)
+    assert path.poses[0].header.stamp.sec == 1002
+
+
+@pytest.mark.parametrize('name', ['SIGINT', 'SIGTERM'])
+def test_signals_end_backend_with_exit_code_0(backend, name):
+    backend.send_signal(getattr(signal, name))
+    assert backend.wait(DEADLINE) == 0
+    assert 'Traceback' not in backend.stderr.read()
+
+
+def test_replay_is_paced(bag):
+    began = time.monotonic()
+    assert replay(bag, '--rate', '5', '--duration', '10').returncode == 0
+    assert time.monotonic() - began >= 2.0
+
+
+@pytest.mark.parametrize('arguments, complaint', [
+    (('/no/such/bag',), 'no such file'),
+    ((__file__,), 'no bag'),
+])
+def test_replay_of_no_bag_is_one_line_and_exit_code_2(arguments, complaint):
+    played = replay(*arguments)
+    assert played.returncode == 2
+    assert complaint in played.stderr and played.stderr.count('\n') == 1
+
+
+def test_replay_of_a_topic_that_is_not_there_names_those_that_are(bag):
+    played = replay(bag, '--topics', '/scan')
+    assert played.returncode == 2
+    assert '/scan' in played.stderr and '/loop_closures, /odom' in played.stderr
+
+
+def test_a_refused_parameter_is_one_line_and_exit_code_1():
+    run = subprocess.run(
+        [SCRIPTS / 'backend', '--ros-args', '-p', 'keyframe.translation:=-1.0'],
+        capture_output=True, text=True, timeout=DEADLINE)
+    assert run.returncode == 1
+    assert 'keyframe.translation' in run.stderr and 'Traceback' not in run.stderr
