@@ -2,9 +2,8 @@
 """
 `backend`: the node. Odometry and loop closures in, the optimised Path out; no arithmetic.
 
-Callbacks convert a message and append it to the back end, under a lock that nobody holds for
-long. A timer wakes one worker thread, which takes a snapshot, improves it with no lock held, and
-hands it back; so the solver never keeps a callback waiting.
+Callbacks convert a message and append it to the back end. A timer wakes one worker thread, which
+improves the map and publishes it; see `shared_backend` for why neither waits for the other.
 """
 
 import sys
@@ -16,19 +15,26 @@ import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry, Path
+from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core import se2
-from l1slam_ros.core.backend import Backend, Improvement, improve
+from l1slam_ros.core.backend import Improvement
 from l1slam_ros.core.errors import L1SlamError, MessageError
 from l1slam_ros.diagnosis import Diagnosis
 from l1slam_ros.io.messages import loop_closure, odometry_sample
+from l1slam_ros.markers import graph_markers
 from l1slam_ros.node_options import NodeOptions
+from l1slam_ros.orders import Orders
 from l1slam_ros.params import NodeParameters
 from l1slam_ros.publishing import path_bytes, pose_stamped, transform_stamped
+from l1slam_ros.services import MapServices
+from l1slam_ros.shared_backend import SharedBackend
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -41,7 +47,7 @@ _REPEAT_WARNING = 5.0  # [s]
 
 class BackendNode(Node):
     """
-    The ROS face of `core.backend.Backend`.
+    The ROS face of `shared_backend.SharedBackend`.
 
     Parameters
     ----------
@@ -58,16 +64,22 @@ class BackendNode(Node):
         self._declared = NodeParameters(self, NodeOptions(), self._on_options)
         options = self.options
         self._manifold = se2
-        self._backend = Backend(self._manifold, options)
+        self._backend = SharedBackend(self._manifold, options)
         self._base_frame = options.base_frame
         self._refused: Counter[str] = Counter()
         self._last_stamp = 0
         self._map_to_odom = self._manifold.identity(1)
-        self._lock = threading.Lock()  # guards the back end
         self._wake = threading.Event()
-        self._closing = False
+        self._paused = self._closing = False
         self._make_publishers()
         self._make_subscriptions()
+        self._orders = Orders(self, self._wake)
+        self._map_services = MapServices(
+            self, self._backend, self._orders, lambda: self.options.save_path, self._set_paused)
+        self._jumps = self.get_clock().create_jump_callback(
+            JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
+                          on_clock_change=False),
+            post_callback=self._on_time_jump)
         self.create_timer(options.update.period, self._on_timer)
         self.create_timer(1.0, self._on_second)
         self._worker = threading.Thread(target=self._work, name='solver', daemon=True)
@@ -90,6 +102,7 @@ class BackendNode(Node):
         self._path = self.create_publisher(Path, 'path', latched)
         self._pose = self.create_publisher(PoseStamped, 'pose', 10)
         self._transform = self.create_publisher(TransformStamped, 'map_to_odom', 10)
+        self._graph = self.create_publisher(MarkerArray, 'graph', latched)
         self._tf = None
         if TFMessage is not None and self.options.publish_tf:
             self._tf = self.create_publisher(TFMessage, '/tf', 100)
@@ -107,15 +120,21 @@ class BackendNode(Node):
                                      qos_overriding_options=overridable)
 
     def _on_options(self, options: NodeOptions) -> None:
-        with self._lock:
-            self._backend.set_options(options)
+        self._backend.set_options(options)
+
+    def _set_paused(self, paused: bool) -> None:
+        self._paused = paused
+
+    def _on_time_jump(self, _: TimeJump) -> None:
+        if self.options.on_time_jump == 'reset':
+            self.get_logger().warning('the clock jumped back: the map begins anew')
+            self._orders.place(self._map_services.reset)
 
     def _on_odometry(self, message: Odometry) -> None:
         try:
             self._check_base_frame(message.child_frame_id)
             sample = odometry_sample(message)
-            with self._lock:
-                self._backend.add_odometry(sample)
+            self._backend.add_odometry(sample)
         except MessageError as error:
             self._refuse(error)
             return
@@ -143,8 +162,7 @@ class BackendNode(Node):
         except MessageError as error:
             self._refuse(error)
             return
-        with self._lock:
-            self._backend.add_loop(loop)
+        self._backend.add_loop(loop)
 
     def _refuse(self, error: MessageError) -> None:
         self._refused[error.cause] += 1
@@ -156,38 +174,38 @@ class BackendNode(Node):
             self._publish_transform()
 
     def _on_second(self) -> None:
-        with self._lock:
-            growth = self._backend.growth
-            counts = {'keyframes': growth.graph.n_poses, 'factors': len(growth.graph.between),
-                      'waiting_loops': growth.n_waiting}
-            refused = self._refused + growth.refused
-        self._diagnosis.publish(counts, refused)
+        counts, refused = self._backend.counts()
+        self._diagnosis.publish(counts, self._refused + Counter(refused))
 
     def _work(self) -> None:
         while self._wake.wait() and not self._closing:
             self._wake.clear()
             try:
-                self._update()
+                if self._orders.carry_out():
+                    self._publish_map()
+                if not self._paused:
+                    self._update()
             except (L1SlamError, ArithmeticError, np.linalg.LinAlgError) as error:
                 # The last good map stays; the next update tries again.
                 self.get_logger().error(f'update failed: {error}',
                                         throttle_duration_sec=_REPEAT_WARNING)
 
     def _update(self) -> None:
-        with self._lock:
-            problem = self._backend.problem()
-        if problem.settled or not problem.graph.n_poses:
-            return
-        options = self.options
-        improvement = improve(problem, options.solver, options.update.budget)
-        with self._lock:
-            self._backend.adopt(improvement)
-            stamps, poses = self._backend.growth.stamps, self._backend.poses
-            self._map_to_odom = self._backend.map_to_odom
-        self._path.publish(path_bytes(options.map_frame, self._last_stamp, stamps,
-                                      self._manifold.to_pose3(poses)))
+        improvement = self._backend.update(self.options.update.budget)
+        if improvement is not None:
+            self._publish_map()
+            self._report(improvement)
+
+    def _publish_map(self) -> None:
+        state = self._backend.state()
+        self._map_to_odom = state.map_to_odom
+        frame, stamp = self.options.map_frame, self._last_stamp
+        pose3 = self._manifold.to_pose3(state.poses)
+        self._path.publish(path_bytes(frame, stamp, state.stamps, pose3))
         self._publish_transform()
-        self._report(improvement)
+        # Markers are slow to make: not unless somebody looks.
+        if self._graph.get_subscription_count():
+            self._graph.publish(graph_markers(frame, stamp, pose3, state.factors))
 
     def _publish_transform(self) -> None:
         options = self.options

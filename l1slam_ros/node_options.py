@@ -30,6 +30,10 @@ class NodeOptions(BackendOptions):
         '', "the robot's frame; empty: the first child_frame_id seen", fixed=True)
     publish_tf: bool = option(
         True, 'publish map -> odom on /tf, where tf2_msgs is installed', fixed=True)
+    save_path: str = option('', 'the .g2o file of ~/save and ~/load')
+    on_time_jump: str = option(
+        'ignore', 'what to do when the ROS clock jumps back: go on, or begin a new map', '',
+        choices=('reset', 'ignore'))
     update: UpdateOptions = UpdateOptions()
 
 

@@ -8,11 +8,14 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core import se2
 from l1slam_ros.core.errors import OptionError
@@ -140,7 +143,6 @@ def test_pose_and_transform_agree_with_the_path(bench, tmp_path, rng):
     b = bench(**EVERY_MESSAGE)
     play(b, tmp_path / 'bag')
     b.until(lambda: len(b.path().poses) == 120, 'all keyframes are in the Path')
-    b.until(lambda: not b.backend._wake.is_set(), 'the worker is idle')
     last = b.path().poses[-1]
     t = b.received['map_to_odom'][-1]
     assert (t.header.frame_id, t.child_frame_id) == ('map', 'odom')
@@ -186,3 +188,90 @@ def test_nonsense_parameters_are_refused_at_start_and_on_set(ros, bench):
     assert not answer.successful
     assert b.backend.set_parameters([Parameter('update.budget', value=0.05)])[0].successful
     assert b.backend.options.update.budget == 0.05
+
+
+def call(b, name, request=None):
+    """Call a service of the node and return its answer."""
+    kind = SetBool if name == 'pause' else Trigger
+    client = b.peer.create_client(kind, f'/backend/{name}')
+    b.until(client.service_is_ready, f'{name} is offered')
+    future = client.call_async(request or kind.Request())
+    b.until(future.done, f'{name} answers')
+    return future.result()
+
+
+def test_a_saved_map_is_loaded_and_odometry_goes_on_from_its_end(bench, tmp_path):
+    b = bench(save_path=str(tmp_path / 'map.g2o'))
+    assert not call(b, 'save').success
+    for k in range(3):
+        b.send('/odom', odometry((k + 1) * 10**9, 1.0 * k))
+    b.until(lambda: len(b.path().poses) == 3, 'three keyframes')
+    assert call(b, 'save').success
+    assert call(b, 'reset').success
+    b.until(lambda: len(b.path().poses) == 0, 'the map is empty')
+    answer = call(b, 'load')
+    assert answer.success and '3 keyframes' in answer.message
+    b.until(lambda: len(b.path().poses) == 3, 'the map is back')
+    # The robot was switched off in between: its odometry begins at 50 m.
+    b.send('/odom', odometry(10 * 10**9, 50.0))
+    b.send('/odom', odometry(11 * 10**9, 51.0))
+    b.until(lambda: len(b.path().poses) == 4, 'a keyframe after the load')
+    np.testing.assert_allclose(poses_of(b.path())[:, 0], [0, 1, 2, 3], atol=1e-9)
+    b.until(lambda: b.received['pose'][-1].header.stamp.sec == 11, 'the last pose')
+    b.send('/odom', odometry(12 * 10**9, 51.1))
+    b.until(lambda: b.received['pose'][-1].header.stamp.sec == 12, 'a pose after the update')
+    assert b.received['pose'][-1].pose.position.x == pytest.approx(3.1)
+
+
+def test_optimize_answers_with_the_cost_and_a_broken_file_leaves_the_map(bench, tmp_path, rng):
+    world = simulate_world(60, 90, WorldOptions(), rng)
+    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(60)))
+    (tmp_path / 'broken.g2o').write_text('no graph')
+    b = bench(save_path=str(tmp_path / 'broken.g2o'), **EVERY_MESSAGE)
+    assert call(b, 'optimize').message == 'there are no factors yet'
+    play(b, tmp_path / 'bag')
+    b.until(lambda: len(b.path().poses) == 60, 'all keyframes')
+    answer = call(b, 'optimize')
+    assert answer.success and 'L1 cost' in answer.message
+    answer = call(b, 'load')
+    assert not answer.success and 'broken.g2o:1' in answer.message
+    assert len(b.path().poses) == 60
+
+
+def test_no_update_while_paused(bench):
+    b = bench()
+    assert call(b, 'pause', SetBool.Request(data=True)).success
+    b.send('/odom', odometry(10**9, 0.0))
+    b.until(lambda: b.received['pose'], 'poses go on')
+    ticks = len(b.received['map_to_odom'])
+    b.until(lambda: len(b.received['map_to_odom']) > ticks + 3, 'the timer goes on')
+    assert not b.received['path']
+    assert call(b, 'pause', SetBool.Request(data=False)).success
+    b.until(lambda: len(b.path().poses) == 1, 'the update is made up for')
+
+
+def test_diagnostics_count_what_was_refused(bench):
+    b = bench()
+    heard = []
+    b.peer.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 10)
+    b.send('/odom', odometry(10**9, 0.0))
+    b.send('/odom', odometry(10**9, 0.0))
+    b.until(lambda: any(
+        {v.key: v.value for v in status.values}.get('refused.old_stamp') == '1'
+        for message in heard for status in message.status), 'the refusal is reported')
+
+
+def test_the_graph_is_drawn_for_who_looks(bench, tmp_path, rng):
+    world = simulate_world(40, 60, WorldOptions(), rng)
+    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(40)))
+    b = bench(**EVERY_MESSAGE)
+    heard = []
+    b.peer.create_subscription(MarkerArray, 'graph', heard.append, 1)
+    b.until(lambda: b.backend._graph.get_subscription_count(), 'somebody looks')
+    play(b, tmp_path / 'bag')
+
+    def sizes():
+        return {m.ns: len(m.points) for m in heard[-1].markers} if heard else {}
+
+    b.until(lambda: sizes() == {'keyframes': 40, 'odometry': 2 * 39, 'loops': 2 * 21},
+            'keyframes and both ends of each factor are drawn')

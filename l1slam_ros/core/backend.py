@@ -19,10 +19,11 @@ from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.growth import GraphGrowth, GrowthOptions
 from l1slam_ros.core.least_squares import reweighted_step, smoothing
 from l1slam_ros.core.linearise import linearise, whitened_residual
-from l1slam_ros.core.manifold import Array, Manifold
+from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.optimality import Status, l1_cost
-from l1slam_ros.core.optimiser import OptimiserOptions, backtrack, is_far, minimise
+from l1slam_ros.core.optimiser import OptimiserOptions, Solution, backtrack, is_far, minimise
+from l1slam_ros.core.seed import seed_poses
 
 
 @dataclass(frozen=True)
@@ -92,8 +93,13 @@ class Backend:
     @property
     def poses(self) -> Array:
         """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
-        new = self.growth.odometry[len(self._poses) :]
-        carried = self._manifold.compose(np.broadcast_to(self.map_to_odom, new.shape), new)
+        optimised, odometry = len(self._poses), self.growth.odometry
+        if not optimised or optimised == len(odometry):
+            return np.concatenate((self._poses, odometry[optimised:]))
+        new = odometry[optimised:]
+        start = np.broadcast_to(odometry[optimised - 1], new.shape)
+        last = np.broadcast_to(self._poses[-1], new.shape)
+        carried = self._manifold.compose(last, self._manifold.between(start, new))
         return np.concatenate((self._poses, carried))
 
     @property
@@ -102,13 +108,19 @@ class Backend:
         last = len(self._poses) - 1
         if last < 0:
             return self._manifold.identity(1)
-        odometry = self.growth.odometry[last : last + 1]
-        return self._manifold.compose(self._poses[last:], self._manifold.inverse(odometry))
+        manifold, odometry = self._manifold, self.growth.odometry[last : last + 1]
+        to_kept = manifold.compose(self._poses[last:], manifold.inverse(odometry))
+        return manifold.compose(to_kept, self.growth.offset)
 
     def set_options(self, options: BackendOptions) -> None:
         """Work by other options from now on; what is in the graph stays."""
         self._options = options
         self.growth.options = options
+
+    def restore(self, graph: FactorGraph, poses: Array, stamps: Indices) -> None:
+        """Begin with the map of an earlier run: see `GraphGrowth.restore`; call it first."""
+        self.growth.restore(graph, stamps, poses)
+        self._poses = poses
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """Add one sample; see `GraphGrowth.add_odometry`."""
@@ -168,6 +180,20 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Impro
         steps += 1
         far = is_far(previous, cost)
     solution = minimise(graph, poses, options, dual, deadline)
+    return _improvement(solution, before, steps, start)
+
+
+def optimise(problem: Problem, options: OptimiserOptions) -> Improvement:
+    """Solve a snapshot to the end: from its own poses and from the seed, whichever ends lower."""
+    start = time.monotonic()
+    graph = problem.graph
+    before = l1_cost(whitened_residual(graph, problem.poses))
+    starts = (problem.poses, seed_poses(graph))
+    solution = min((minimise(graph, poses, options) for poses in starts), key=lambda s: s.cost)
+    return _improvement(solution, before, 0, start)
+
+
+def _improvement(solution: Solution, before: float, steps: int, start: float) -> Improvement:
     return Improvement(solution.poses, solution.dual, before, solution.cost, solution.status,
                        steps, solution.outer_iterations, solution.inner_iterations, solution.gap,
                        time.monotonic() - start)

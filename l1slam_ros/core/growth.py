@@ -63,6 +63,8 @@ class GraphGrowth:
     ----------
     graph : the factor graph so far; loops enter it in `add_due_loops`
     refused : why loops were not used, cause -> count
+    offset : (1, p) takes poses of the odometry frame to those kept here; the identity, but after
+        `restore`, when odometry goes on from the last keyframe wherever its frame now begins
 
     """
 
@@ -74,6 +76,8 @@ class GraphGrowth:
         self._odometry = GrowingArray((manifold.POSE_SIZE,))
         self._keyframe_samples = GrowingArray((), np.int64)
         self._motion: Motion | None = None
+        self._glued = True
+        self.offset = manifold.identity(1)
         self._waiting: list[tuple[int, LoopClosure]] = []
 
     @property
@@ -112,6 +116,10 @@ class GraphGrowth:
         if sample.stamp <= last:
             raise MessageError('old_stamp', f'odometry stamp {sample.stamp} ns is not after the '
                                f'last one, {last} ns')
+        if not self._glued:
+            self.offset = manifold.compose(self._odometry.view()[-1:], manifold.inverse(pose))
+            self._glued = True
+        pose = manifold.compose(self.offset, pose)
         increment = manifold.between(self._odometry.view()[-1:], pose)
         self._append_sample(sample.stamp, pose)
         assert self._motion is not None
@@ -125,6 +133,19 @@ class GraphGrowth:
         self.graph.add_between(np.array([k - 1]), np.array([k]), measurement,
                                information_from_covariance(covariance[None]))
         return True
+
+    def restore(self, graph: FactorGraph, stamps: Indices, poses: Array) -> None:
+        """
+        Take over a graph of an earlier run, its stamps (n,) [ns] and poses (n, p).
+
+        The robot is taken to stand where that run ended; its odometry may begin anywhere.
+        """
+        self.graph = graph
+        self._stamps.extend(stamps)
+        self._odometry.extend(poses)
+        self._keyframe_samples.extend(np.arange(len(stamps)))
+        self._motion = Motion(graph.manifold, int(stamps[-1]))
+        self._glued = False
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Take a loop closure in; it becomes a factor in `add_due_loops`."""

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The services of the node; the worker carries out what they ask for."""
+
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+from rclpy.node import Node
+from std_srvs.srv import SetBool, Trigger
+
+from l1slam_ros.core.errors import OptionError
+from l1slam_ros.orders import Orders
+from l1slam_ros.shared_backend import SharedBackend
+
+
+class MapServices:
+    """
+    `~/optimize`, `~/reset`, `~/save`, `~/load` and `~/pause`.
+
+    Parameters
+    ----------
+    node : to create them on
+    backend : what they act on
+    orders : where they place their work
+    save_path : returns the file of `~/save` and `~/load` as it is set now
+    pause : called with whether updates shall pause
+
+    """
+
+    def __init__(self, node: Node, backend: SharedBackend, orders: Orders,
+                 save_path: Callable[[], str], pause: Callable[[bool], None]):
+        self._backend, self._orders = backend, orders
+        self._save_path, self._pause = save_path, pause
+        for name, work in (('optimize', self._optimise), ('reset', self.reset),
+                           ('save', self._save), ('load', self._load)):
+            node.create_service(Trigger, f'~/{name}', self._trigger(work))
+        node.create_service(SetBool, '~/pause', self._set_pause)
+
+    def _trigger(
+        self, work: Callable[[], str]
+    ) -> Callable[[Trigger.Request, Trigger.Response], Awaitable[Trigger.Response]]:
+        async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            result = await self._orders.place(work)
+            response.success, response.message = result.success, result.message
+            return response
+
+        return answer
+
+    def _set_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._pause(request.data)
+        response.success = True
+        response.message = 'updates pause' if request.data else 'updates go on'
+        return response
+
+    def _optimise(self) -> str:
+        improvement = self._backend.optimise()
+        if improvement is None:
+            return 'there are no factors yet'
+        return (f'L1 cost {improvement.cost_before:.6g} -> {improvement.cost:.6g}, '
+                f'{improvement.status.value}, {improvement.seconds:.2f} s')
+
+    def reset(self) -> str:
+        """Empty the map; the worker calls it."""
+        self._backend.reset()
+        return 'the map is empty'
+
+    def _save(self) -> str:
+        path = self._file()
+        return f'{self._backend.save(path)} keyframes saved to {path}'
+
+    def _load(self) -> str:
+        path = self._file()
+        return f'{self._backend.load(path)} keyframes loaded from {path}'
+
+    def _file(self) -> Path:
+        path = self._save_path()
+        if not path:
+            raise OptionError('the parameter save_path is empty, expected the name of a .g2o file')
+        return Path(path)
