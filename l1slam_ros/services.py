@@ -4,6 +4,7 @@
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
@@ -30,10 +31,12 @@ class MapServices:
                  save_path: Callable[[], str], pause: Callable[[bool], None]):
         self._backend, self._orders = backend, orders
         self._save_path, self._pause = save_path, pause
+        # A group of their own: a service that awaits its answer would block its whole group.
+        group = ReentrantCallbackGroup()
         for name, work in (('optimize', self._optimise), ('reset', self.reset),
                            ('save', self._save), ('load', self._load)):
-            node.create_service(Trigger, f'~/{name}', self._trigger(work))
-        node.create_service(SetBool, '~/pause', self._set_pause)
+            node.create_service(Trigger, f'~/{name}', self._trigger(work), callback_group=group)
+        node.create_service(SetBool, '~/pause', self._set_pause, callback_group=group)
 
     def _trigger(
         self, work: Callable[[], str]

@@ -26,7 +26,7 @@ from l1slam_ros.core.seed import seed_poses
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bag import read_raw
 from l1slam_ros.io.graph_bag import write_graph_bag
-from l1slam_ros.io.graph_file import GraphRecord, read_graph_file
+from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, write_graph_file
 from l1slam_ros.node import BackendNode
 from l1slam_ros.publishing import header
 
@@ -275,3 +275,21 @@ def test_the_graph_is_drawn_for_who_looks(bench, tmp_path, rng):
 
     b.until(lambda: sizes() == {'keyframes': 40, 'odometry': 2 * 39, 'loops': 2 * 21},
             'keyframes and both ends of each factor are drawn')
+
+
+def test_the_solver_never_starves_the_callbacks(bench, tmp_path, rng):
+    world = simulate_world(1500, 2600, WorldOptions(), rng)
+    stamps = 10**9 + np.arange(1500)
+    record = GraphRecord(world.graph, world.odometry, np.arange(1500), stamps)
+    write_graph_file(tmp_path / 'map.g2o', record)
+    b = bench(save_path=str(tmp_path / 'map.g2o'))
+    assert call(b, 'load').success
+    client = b.peer.create_client(Trigger, '/backend/optimize')
+    b.until(client.service_is_ready, 'optimize is offered')
+    answer = client.call_async(Trigger.Request())
+    for k in range(20):
+        b.send('/odom', odometry((10 + k) * 10**9, 0.1 * k))
+    b.until(lambda: len(b.received['pose']) == 20, 'each odometry message is answered')
+    assert not answer.done(), 'the solver was done before the callbacks: make the world larger'
+    b.until(answer.done, 'the solver answers')
+    assert answer.result().success
