@@ -6,8 +6,8 @@ In: a linear system A, b. Out: the step that minimises a weighted sum of squares
 """
 
 import numpy as np
-from scipy.sparse import csr_array, dia_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import csc_array, csr_array, dia_array
+from scipy.sparse.linalg import SuperLU, splu
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.manifold import Array
@@ -23,29 +23,35 @@ def weighted_least_squares(
     """
     Return argmin_x sum_i w_i (A x - b)_i^2 + damping sum_j D_j x_j^2, (columns,).
 
-    D is the diagonal of A'WA (Marquardt's scaling). The normal matrix is symmetric positive
-    definite, so it is factored without pivoting, in a fill-reducing symmetric order.
+    D is the diagonal of A'WA (Marquardt's scaling). Raises as `factorise`.
+    """
+    WA = A if weights is None else diagonal(weights) @ A
+    H = (A.T @ WA).tocsc()
+    if damping:
+        H = (H + diagonal(damping * H.diagonal())).tocsc()
+    x: Array = factorise(H).solve(WA.T @ b)
+    return x
+
+
+def factorise(H: csc_array) -> SuperLU:
+    """
+    Factor a sparse symmetric matrix without pivoting, in a fill-reducing symmetric order.
 
     Raises
     ------
     GraphError : the matrix is singular: some keyframe is not tied to the anchor.
 
     """
-    WA = A if weights is None else _diagonal(weights) @ A
-    H = (A.T @ WA).tocsc()
-    if damping:
-        H = (H + _diagonal(damping * H.diagonal())).tocsc()
     try:
-        factor = splu(H, permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
-                      options={'SymmetricMode': True})
+        return splu(H, permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
+                    options={'SymmetricMode': True})
     except RuntimeError as error:
         raise GraphError('the normal matrix is singular: a part of the graph is not tied to '
                          'the anchor, or weights differ beyond double precision') from error
-    x: Array = factor.solve(WA.T @ b)
-    return x
 
 
-def _diagonal(values: Array) -> dia_array:
+def diagonal(values: Array) -> dia_array:
+    """Return the diagonal matrix of values (n,)."""
     return dia_array((values[None], [0]), shape=(len(values), len(values)))
 
 

@@ -10,6 +10,7 @@ from enum import Enum
 import numpy as np
 from scipy.sparse import csr_array
 
+from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.manifold import Array
 
 
@@ -38,6 +39,11 @@ def l1_cost(residual: Array) -> float:
 def l2_cost(residual: Array) -> float:
     """Return chi2, the sum of squares of the whitened residual (rows,); no half."""
     return float(residual @ residual)
+
+
+def fits_exactly(cost: float, graph: FactorGraph) -> bool:
+    """Tell whether only rounding is left: less than a billionth of a sigma in each factor."""
+    return cost <= 1e-9 * (len(graph.between) + len(graph.prior))
 
 
 def dual_residual(A: csr_array, y: Array) -> float:

@@ -17,7 +17,7 @@ from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.least_squares import reweighted_start
 from l1slam_ros.core.linearise import linearise, step_poses, whitened_residual
 from l1slam_ros.core.manifold import Array
-from l1slam_ros.core.optimality import Status, l1_cost
+from l1slam_ros.core.optimality import Status, fits_exactly, l1_cost
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.primal_dual import PrimalDualOptions, minimise_l1
 
@@ -85,7 +85,7 @@ def minimise(
     history = [l1_cost(whitened_residual(graph, poses))]
     status, inner, small_steps, gap = Status.ITERATION_LIMIT, 0, 0, np.inf
     for outer in range(options.outer_iterations):
-        if history[-1] == 0:  # a chain without loops fits exactly
+        if fits_exactly(history[-1], graph):
             status, gap = Status.CONVERGED, 0.0
             break
         system = linearise(graph, poses)

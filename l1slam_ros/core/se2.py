@@ -98,6 +98,29 @@ def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> tupl
     return J_r_i, local_jacobian(measurement, relative)
 
 
+def residual_curvature(
+    measurement: Array, pose_i: Array, pose_j: Array, dual: Array
+) -> Array:
+    """
+    Return the Hessian of dual'e over (step of i, step of j), (n, 6, 6); dual (n, 3).
+
+    With l = Rz (dual_x, dual_y), t = Ri'(tj - ti) and phi the angle of the residual, the entries
+    (and their mirrors) are (theta_i, x_i) = l_y, (theta_i, y_i) = -l_x, (theta_i, theta_i) = -l.t,
+    (theta_i, x_j) = dual_x sin phi - dual_y cos phi,
+    (theta_i, y_j) = dual_y sin phi + dual_x cos phi. The residual is linear in all else.
+    """
+    relative = between(pose_i, pose_j)
+    lever = _rotate(measurement[..., 2], dual[..., :2])
+    # Seen from keyframe j: the derivative of R(-phi) turns by a right angle.
+    seen = _rotate(-(relative[..., 2] - measurement[..., 2]), dual[..., :2])
+    H = np.zeros((*pose_i.shape[:-1], 6, 6))
+    H[..., 2, 0], H[..., 2, 1] = lever[..., 1], -lever[..., 0]
+    H[..., 2, 3], H[..., 2, 4] = -seen[..., 1], seen[..., 0]
+    H[..., 0:5, 2] = H[..., 2, 0:5]
+    H[..., 2, 2] = -(lever * relative[..., :2]).sum(axis=-1)
+    return H
+
+
 def local_jacobian(a: Array, b: Array) -> Array:
     """Return J_l_b of t2v(a^-1 b) = [[Ra' Rb, 0], [0, 1]], (n, 3, 3)."""
     J = np.zeros((*b.shape, 3))
