@@ -135,7 +135,7 @@ class BackendNode(Node):
             self._check_base_frame(message.child_frame_id)
             sample = odometry_sample(message)
             self._backend.add_odometry(sample)
-        except MessageError as error:
+        except L1SlamError as error:
             self._refuse(error)
             return
         self._last_stamp = sample.stamp
@@ -159,13 +159,13 @@ class BackendNode(Node):
     def _add_loop(self, message: PoseWithCovarianceStamped, trusted: bool) -> None:
         try:
             loop = loop_closure(message, self._base_frame, trusted)
-        except MessageError as error:
+        except L1SlamError as error:
             self._refuse(error)
             return
         self._backend.add_loop(loop)
 
-    def _refuse(self, error: MessageError) -> None:
-        self._refused[error.cause] += 1
+    def _refuse(self, error: L1SlamError) -> None:
+        self._refused[error.cause if isinstance(error, MessageError) else 'unusable'] += 1
         self.get_logger().warning(f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
 
     def _on_timer(self) -> None:

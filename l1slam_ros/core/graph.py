@@ -116,6 +116,7 @@ class FactorGraph:
 
         """
         i, j = np.atleast_1d(i), np.atleast_1d(j)
+        self._check_shapes(measurement, information, i, j)
         if (i == j).any():
             raise GraphError(f'keyframe {i[np.argmax(i == j)]} has a factor to itself')
         self._check(np.concatenate((i, j)), measurement)
@@ -124,8 +125,17 @@ class FactorGraph:
     def add_prior(self, i: Indices, measurement: Array, information: Array) -> None:
         """Append prior factors: i (m,), measurement (m, p), information (m, d, d); as above."""
         i = np.atleast_1d(i)
+        self._check_shapes(measurement, information, i)
         self._check(i, measurement)
         self._append(self._prior, (i, measurement, square_root_information(information)))
+
+    def _check_shapes(self, measurement: Array, information: Array, *indices: Indices) -> None:
+        m, p, d = len(indices[0]), self.manifold.POSE_SIZE, self.manifold.TANGENT_SIZE
+        found = [np.shape(a) for a in (*indices, measurement, information)]
+        expected = [(m,)] * len(indices) + [(m, p), (m, d, d)]
+        if found != expected:
+            raise GraphError(f'indices, measurements and information have the shapes {found}, '
+                             f'expected {expected}')
 
     def _check(self, indices: Indices, measurement: Array) -> None:
         unknown = (indices < 0) | (indices >= self.n_poses)

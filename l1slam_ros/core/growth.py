@@ -23,7 +23,7 @@ from l1slam_ros.core.keyframes import (
 )
 from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.noise import information_from_covariance, is_usable_covariance
+from l1slam_ros.core.noise import information_from_covariance, usable
 from l1slam_ros.core.options import Options, option
 
 
@@ -127,11 +127,11 @@ class GraphGrowth:
         if not self._motion.is_keyframe(sample.stamp, self.options.keyframe):
             return False
         covariance = self._motion.covariance(self.options.odometry)
+        information = information_from_covariance(covariance[None])
         measurement = self._motion.pose
         self._begin_keyframe(sample.stamp)
         k = self.graph.n_poses - 1
-        self.graph.add_between(np.array([k - 1]), np.array([k]), measurement,
-                               information_from_covariance(covariance[None]))
+        self.graph.add_between(np.array([k - 1]), np.array([k]), measurement, information)
         return True
 
     def restore(self, graph: FactorGraph, stamps: Indices, poses: Array) -> None:
@@ -149,7 +149,7 @@ class GraphGrowth:
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Take a loop closure in; it becomes a factor in `add_due_loops`."""
-        arrival = int(self._stamps.view()[-1]) if len(self._stamps) else loop.stamp
+        arrival = int(self._stamps.view()[-1]) if len(self._stamps) else 0
         self._waiting.append((arrival, loop))
 
     def add_due_loops(self) -> int:
@@ -161,19 +161,21 @@ class GraphGrowth:
         """
         if not self._waiting or not len(self._stamps):
             return 0
-        now = int(self._stamps.view()[-1])
-        due = [loop for _, loop in self._waiting if loop.stamp <= now]
+        first, now = (int(stamp) for stamp in self._stamps.view()[[0, -1]])
+        due = [entry for entry in self._waiting if entry[1].stamp <= now]
         patience = int(self.options.loop.wait * 1e9)
         later = [entry for entry in self._waiting if entry[1].stamp > now]
-        self._waiting = [entry for entry in later if now - entry[0] <= patience]
+        self._waiting = [entry for entry in later if now - max(entry[0], first) <= patience]
         self.refused['expired'] += len(later) - len(self._waiting)
         return self._add_loops(due) if due else 0
 
-    def _add_loops(self, loops: list[LoopClosure]) -> int:
+    def _add_loops(self, due: list[tuple[int, LoopClosure]]) -> int:
         manifold = self.graph.manifold
+        loops = [loop for _, loop in due]
         stamps = np.array([(loop.reference_stamp, loop.stamp) for loop in loops])
         early = stamps[:, 0] < self._stamps.view()[0]
-        i, j = self._nearest_keyframe(stamps[:, 0]), self._nearest_keyframe(stamps[:, 1])
+        known = self._known_until(np.array([arrival for arrival, _ in due]), stamps[:, 1])
+        i, j = (self._nearest_keyframe(end, known) for end in stamps.T)
         same = (i == j) & ~early
         self.refused['before_start'] += int(early.sum())
         self.refused['same_keyframe'] += int(same.sum())
@@ -188,22 +190,40 @@ class GraphGrowth:
         measurement = manifold.compose(manifold.compose(to_reference, measured), to_keyframe)
         # The error lives in the axes of the measured pose; see it from the keyframe instead.
         Ad = manifold.adjoint(manifold.inverse(to_keyframe))
-        covariance = Ad @ np.array([self._covariance(loop) for loop in loops]) @ (
-            Ad.transpose(0, 2, 1))
+        covariance = Ad @ self._covariances(loops) @ Ad.transpose(0, 2, 1)
+        # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
+        covariance = self._or_model(covariance, usable(covariance))
         self.graph.add_between(i, j, measurement, information_from_covariance(covariance))
         return len(loops)
 
-    def _covariance(self, loop: LoopClosure) -> Array:
-        options, manifold = self.options.loop, self.graph.manifold
-        covariance = reduced_covariance(manifold, loop.covariance)
-        if options.covariance_source == 'message' and is_usable_covariance(covariance):
-            return covariance
-        return diagonal_covariance(manifold, options.sigma_translation, options.sigma_rotation)
+    def _covariances(self, loops: list[LoopClosure]) -> Array:
+        manifold = self.graph.manifold
+        stated = np.array([reduced_covariance(manifold, loop.covariance) for loop in loops])
+        return self._or_model(
+            stated, usable(stated) & (self.options.loop.covariance_source == 'message'))
 
-    def _nearest_keyframe(self, stamps: Indices) -> Indices:
+    def _or_model(self, covariance: Array, good: np.ndarray) -> Array:
+        """Return the covariances (m, d, d) that are good, (m,), and the model for the others."""
+        options = self.options.loop
+        model = diagonal_covariance(
+            self.graph.manifold, options.sigma_translation, options.sigma_rotation)
+        return np.where(good[:, None, None], covariance, model)
+
+    def _known_until(self, arrivals: Indices, stamps: Indices) -> Indices:
+        """
+        Return up to which stamp odometry had come when each loop could first be used, (m,) [ns].
+
+        Only keyframes of that time are candidates, so a loop becomes the same factor whenever an
+        update happens to look for it.
+        """
+        times = self._stamps.view()
+        reached: Indices = np.maximum(arrivals, times[np.searchsorted(times, stamps)])
+        return reached
+
+    def _nearest_keyframe(self, stamps: Indices, known: Indices) -> Indices:
         keyframes = self.stamps
-        after = np.clip(np.searchsorted(keyframes, stamps), 1, max(len(keyframes) - 1, 1))
-        after = np.minimum(after, len(keyframes) - 1)
+        last = np.searchsorted(keyframes, known, side='right') - 1
+        after = np.minimum(np.searchsorted(keyframes, stamps), last)
         before = np.maximum(after - 1, 0)
         nearer_before = stamps - keyframes[before] <= keyframes[after] - stamps
         nearest: Indices = np.where(nearer_before, before, after)

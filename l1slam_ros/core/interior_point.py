@@ -139,8 +139,9 @@ def minimise_interior_point(
     it is not (and false loops would bend it), from raw odometry it is. The result is the best
     poses met, never worse than the start.
     """
-    history = [l1_cost(whitened_residual(graph, poses))]
-    if fits_exactly(history[0], graph):
+    residual = whitened_residual(graph, poses)
+    history = [l1_cost(residual)]
+    if fits_exactly(history[0], len(residual)):
         return _solution(graph, poses, history, Status.CONVERGED, None)
     at = _start(graph, _better_start(graph, poses, history[0]))
     best, best_cost = poses, history[0]

@@ -12,7 +12,7 @@ import numpy as np
 
 from l1slam_ros.core.manifold import Array, Manifold
 from l1slam_ros.core.measurements import OdometrySample
-from l1slam_ros.core.noise import is_usable_covariance
+from l1slam_ros.core.noise import usable
 from l1slam_ros.core.options import Options, option
 
 
@@ -99,7 +99,7 @@ class Motion:
 
     def covariance(self, options: OdometryOptions) -> Array:
         """Return the covariance of the motion in the axes of its end, (d, d)."""
-        if self._sum is not None and is_usable_covariance(self._sum):
+        if self._sum is not None and usable(self._sum[None])[0]:
             return self._sum
         return diagonal_covariance(
             self._manifold,
@@ -116,4 +116,4 @@ def _message_covariance(manifold: Manifold, sample: OdometrySample, seconds: flo
         covariance = reduced_covariance(manifold, sample.covariance)
     else:
         covariance = reduced_covariance(manifold, sample.twist_covariance) * seconds**2
-    return covariance if is_usable_covariance(covariance) else None
+    return covariance if usable(covariance[None])[0] else None

@@ -15,7 +15,7 @@ from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.least_squares import weighted_least_squares
 from l1slam_ros.core.linearise import linearise, step_poses, whitened_residual
 from l1slam_ros.core.manifold import Array
-from l1slam_ros.core.optimality import Status, l2_cost
+from l1slam_ros.core.optimality import Status, fits_exactly, l1_cost, l2_cost
 from l1slam_ros.core.optimiser import Report, Solution
 from l1slam_ros.core.options import Options, option
 
@@ -95,6 +95,9 @@ def _gauss_newton(
     status, damping = Status.ITERATION_LIMIT, 0.0
     while len(history) <= options.iterations:
         system = linearise(graph, poses)
+        if fits_exactly(l1_cost(system.b), len(system.b)):
+            status = Status.CONVERGED
+            break
         step = weighted_least_squares(system.A, system.b, weights_of(system.b), damping)
         candidate = step_poses(graph, poses, step)
         cost = cost_of(whitened_residual(graph, candidate))

@@ -15,6 +15,8 @@ from l1slam_ros.core.manifold import Array
 # Ten halvings bring the smoothing a thousand times below the mean residual, well under the
 # percent that the primal-dual iterations then have to mend; each costs one factorisation.
 _SMOOTHING_STEPS = 10
+# [sigma] Weights of rows that fit to rounding must stay comparable with those of exact zeros.
+_EXACT = 1e-6
 
 
 def weighted_least_squares(
@@ -73,8 +75,8 @@ def reweighted_step(A: csr_array, b: Array, r: Array, mu: float) -> tuple[Array,
 
 
 def smoothing(r: Array) -> float:
-    """Return the mean of |r|, kept above what would divide by zero where all fits exactly."""
-    return max(float(np.abs(r).mean()), np.finfo(float).tiny ** 0.25)
+    """Return the mean of |r|, or where all fits exactly a millionth of a sigma."""
+    return max(float(np.abs(r).mean()), _EXACT)
 
 
 def reweighted_start(A: csr_array, b: Array) -> tuple[Array, Array]:

@@ -31,7 +31,7 @@ class LinearSystem:
 
 def anchor(graph: FactorGraph) -> int:
     """Return how many leading keyframes are held fixed: one, unless a prior fixes the gauge."""
-    return 0 if len(graph.prior) else 1
+    return 0 if len(graph.prior) else min(1, graph.n_poses)
 
 
 def whitened_residual(graph: FactorGraph, poses: Array) -> Array:

@@ -9,12 +9,19 @@ Algorithm 3 solve for the angles first.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from l1slam_ros.core.errors import NoiseError
 from l1slam_ros.core.manifold import Array
 
+Mask = NDArray[np.bool_]
+
 # Files print six digits or more; a matrix less symmetric than this was not meant as one.
 _ASYMMETRY = 1e-4
+# Beyond, squares and products of the entries overflow; no measurement is that good or that bad.
+_SMALLEST, _LARGEST = 1e-30, 1e30
+# Least eigenvalue of the correlation: below it is rounding, and the root would be noise.
+_SINGULAR = 1e-14
 
 
 def square_root_information(information: Array) -> Array:
@@ -36,9 +43,9 @@ def square_root_information(information: Array) -> Array:
     scale = np.abs(information).max(axis=(1, 2), initial=0.0)
     skew = np.abs(information - information.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
     _refuse(skew > _ASYMMETRY * scale, information, 'symmetric')
-    # A pivot lost to rounding counts as not positive: its square root would be noise.
-    smallest = np.linalg.eigvalsh(information)[:, 0]
-    _refuse(smallest <= 1e-15 * scale, information, 'positive definite')
+    _refuse(np.logical_not(_is_definite(information)), information, 'positive definite')
+    _refuse(np.logical_not(_is_representable(information)), information,
+            f'within {_SMALLEST:g} to {_LARGEST:g} on its diagonal')
     root = np.linalg.cholesky(information).transpose(0, 2, 1)
     return root.astype(np.float64, copy=False)
 
@@ -58,13 +65,30 @@ def information_from_covariance(covariance: Array) -> Array:
     return product
 
 
-def is_usable_covariance(covariance: Array) -> bool:
-    """Tell whether one (d, d) matrix can be inverted: messages carry zeros, -1 and worse."""
-    try:
-        square_root_information(covariance[None])
-    except NoiseError:
-        return False
-    return True
+def usable(covariance: Array) -> Mask:
+    """Tell which of (m, d, d) matrices are covariances, (m,): messages carry zeros and worse."""
+    finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
+    safe = np.where(finite[:, None, None], covariance, 0.0)
+    skew = np.abs(safe - safe.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
+    symmetric = np.asarray(skew <= _ASYMMETRY * np.abs(safe).max(axis=(1, 2), initial=0.0))
+    return np.asarray(finite & symmetric & _is_definite(safe) & _is_representable(safe))
+
+
+def _is_definite(matrices: Array) -> Mask:
+    """Tell which matrices are positive definite beyond rounding, whatever the units, (m,)."""
+    variances = np.diagonal(matrices, axis1=1, axis2=2)
+    positive = np.asarray((variances > 0).all(axis=1))
+    root = np.sqrt(np.where(positive[:, None], variances, 1.0))
+    correlation = matrices / root[:, :, None] / root[:, None, :]
+    # A correlation above 1 is not definite; clipped, so that nothing overflows, it still is not.
+    smallest = np.linalg.eigvalsh(np.clip(correlation, -2, 2))[:, 0]
+    return positive & np.asarray(smallest > _SINGULAR)
+
+
+def _is_representable(matrices: Array) -> Mask:
+    variances = np.diagonal(matrices, axis1=1, axis2=2)
+    inside = (variances >= _SMALLEST) & (variances <= _LARGEST)
+    return np.asarray(inside.all(axis=1))
 
 
 def whiten(sqrt_information: Array, vectors: Array) -> Array:
@@ -76,7 +100,7 @@ def whiten(sqrt_information: Array, vectors: Array) -> Array:
     return product
 
 
-def _refuse(bad: np.ndarray, matrices: Array, expected: str) -> None:
+def _refuse(bad: Mask, matrices: Array, expected: str) -> None:
     if bad.any():
         index = int(np.argmax(bad))
         rows = '; '.join(' '.join(f'{v:g}' for v in row) for row in matrices[index])

@@ -82,10 +82,11 @@ def minimise(
     report : called with the outer iteration and its cost
 
     """
-    history = [l1_cost(whitened_residual(graph, poses))]
+    residual = whitened_residual(graph, poses)
+    history = [l1_cost(residual)]
     status, inner, small_steps, gap = Status.ITERATION_LIMIT, 0, 0, np.inf
     for outer in range(options.outer_iterations):
-        if fits_exactly(history[-1], graph):
+        if fits_exactly(history[-1], len(residual)):
             status, gap = Status.CONVERGED, 0.0
             break
         system = linearise(graph, poses)
@@ -109,7 +110,7 @@ def minimise(
             status = Status.OUT_OF_TIME
             break
     if dual is None:
-        dual = np.zeros(len(graph.between) * graph.manifold.TANGENT_SIZE)
+        dual = np.zeros(len(residual))
     return Solution(poses, history[-1], status, len(history) - 1, inner, np.array(history), dual,
                     gap)
 

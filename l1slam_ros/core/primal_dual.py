@@ -101,7 +101,9 @@ def primal_dual(
 def diagonal_step_sizes(A: csr_array) -> tuple[Array, Array]:
     """Return tau_j = 1 / sum_i |A_ij| (columns,), sigma_i = 1 / sum_j |A_ij| (rows,)."""
     magnitude = abs(A)
-    return _inverse(magnitude.sum(axis=0)), _inverse(magnitude.sum(axis=1))
+    # Nothing moves with an empty column; an empty row's dual is to jump to its bound.
+    return (_inverse(magnitude.sum(axis=0), where_zero=0.0),
+            _inverse(magnitude.sum(axis=1), where_zero=1 / np.finfo(float).eps))
 
 
 def primal_weight(A: csr_array, b: Array, x: Array) -> float:
@@ -112,7 +114,8 @@ def primal_weight(A: csr_array, b: Array, x: Array) -> float:
     dual's size, 1, to the primal's. Without it the method depends on the unit of length.
     """
     largest = abs(A).max(axis=1).toarray().ravel()
-    return 1 / max(float(np.mean(np.abs(A @ x - b) * _inverse(largest))), np.finfo(float).eps)
+    needed = np.abs(A @ x - b) * _inverse(largest, where_zero=0.0)
+    return 1 / max(float(needed.mean()), np.finfo(float).eps)
 
 
 def minimise_l1(
@@ -160,6 +163,5 @@ def minimise_l1(
     return PrimalDualSolution(x, y, history[-1][1], gap, status, k, np.array(history))
 
 
-def _inverse(sums: Array) -> Array:
-    """Return 1 / sums, and 0 for an empty row or column, whose step size does not matter."""
-    return np.divide(1.0, sums, out=np.zeros_like(sums), where=sums > 0)
+def _inverse(values: Array, where_zero: float) -> Array:
+    return np.divide(1.0, values, out=np.full_like(values, where_zero), where=values > 0)

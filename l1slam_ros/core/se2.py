@@ -22,7 +22,9 @@ COVARIANCE_ROWS = (0, 1, 5)
 def wrap(angle: Array) -> Array:
     """Return the angle [rad] in (-pi, pi]; values already there are returned to the last bit."""
     inside = (angle > -np.pi) & (angle <= np.pi)
-    return np.where(inside, angle, np.pi - np.mod(np.pi - angle, 2 * np.pi))
+    wrapped = np.pi - np.mod(np.pi - angle, 2 * np.pi)
+    # One rounding above pi the remainder is rounded up to the whole turn.
+    return np.where(inside, angle, np.where(wrapped <= -np.pi, np.pi, wrapped))
 
 
 def _rotate(theta: Array, vector: Array) -> Array:

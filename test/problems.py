@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Problems whose answer is known: hand-solved LPs, random systems, tiny graphs, messages."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linprog
+from scipy.sparse import csr_array
+
+from l1slam_ros.core import se2
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.growth import GraphGrowth
+from l1slam_ros.core.measurements import LoopClosure, OdometrySample
+
+
+@dataclass(frozen=True)
+class LinearProblem:
+    """Minimise |A x - b|_1; x and y are the only primal and a dual optimum, |y| <= 1, A'y = 0."""
+
+    A: csr_array
+    b: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    optimum: float
+
+
+def problem(A, b, x, y, optimum):
+    return LinearProblem(csr_array(np.array(A, float)), *(np.array(v, float) for v in (b, x, y)),
+                         optimum)
+
+
+def median():
+    """
+    Minimise |x| + |x - 1| + |x - 5|: the median, x = 1, at a cost of 1 + 0 + 4 = 5.
+
+    Dual: y1 = sign(1 - 0) = 1 and y3 = sign(1 - 5) = -1, so A'y = 0 leaves y2 = 0;
+    -b'y = -(0 + 0 - 5) = 5.
+    """
+    return problem([[1], [1], [1]], [0, 1, 5], [1], [1, 0, -1], 5.0)
+
+
+def weighted_median():
+    """
+    Minimise 3 |x| + |x - 1| + |x - 5|: the heavy row wins, x = 0, at a cost of 0 + 1 + 5 = 6.
+
+    Dual: y2 = y3 = -1, and 3 y1 - 1 - 1 = 0 gives y1 = 2/3; -b'y = 1 + 5 = 6.
+    """
+    return problem([[3], [1], [1]], [0, 1, 5], [0], [2 / 3, -1, -1], 6.0)
+
+
+def line_with_outlier():
+    """
+    Fit c + m t to (0, 0), (1, 1), (2, 2), (3, 3), (4, 10): c = 0, m = 1, cost |4 - 10| = 6.
+
+    Dual: y5 = -1; A'y = 0 asks y1 + y2 + y3 + y4 = 1 and y2 + 2 y3 + 3 y4 = 4, which
+    (-1/2, 0, 1/2, 1) does; -b'y = -(0 + 0 + 1 + 3 - 10) = 6.
+    """
+    return problem([[1, t] for t in range(5)], [0, 1, 2, 3, 10], [0, 1], [-0.5, 0, 0.5, 1, -1],
+                   6.0)
+
+
+def light_false_loop():
+    """
+    Minimise |x1 - 1| + |x2 - x1 - 1| + .5 |x2 - 5|: a chain of two and a loop of half its weight.
+
+    The loop gives way: x = (1, 2), cost .5 * 3. Dual: y3 = sign(2 - 5) = -1; A'y = 0 asks
+    y1 = y2 and y2 = 1/2; -b'y = -(1/2 + 1/2 - 5/2) = 3/2.
+    """
+    return problem([[1, 0], [-1, 1], [0, 0.5]], [1, 1, 2.5], [1, 2], [0.5, 0.5, -1], 1.5)
+
+
+def consistent():
+    """Minimise |x1 - 3| + |x1 + x2 - 4| + |x2 - 1|: x = (3, 1) fits all; cost 0, dual 0."""
+    return problem([[1, 0], [1, 1], [0, 1]], [3, 4, 1], [3, 1], [0, 0, 0], 0.0)
+
+
+HAND_SOLVED = [median, weighted_median, line_with_outlier, light_false_loop, consistent]
+RANDOM_SYSTEMS = ['dense', 'sparse', 'scaled rows', 'empty row and column']
+
+
+def random_system(kind, rng):
+    """Return A (rows, columns) and b (rows,) of one of `RANDOM_SYSTEMS`."""
+    if kind == 'dense':
+        A = rng.standard_normal((30, 8))
+    else:
+        kept = rng.random((50, 15)) < 0.2
+        kept[np.arange(50), rng.integers(15, size=50)] = True
+        A = rng.standard_normal((50, 15)) * kept
+    if kind == 'scaled rows':
+        A *= 10 ** rng.uniform(-1.5, 1.5, (len(A), 1))
+    if kind == 'empty row and column':
+        A[[4, -1]] = 0.0
+        A[:, [3, -1]] = 0.0
+    return csr_array(A), rng.standard_normal(len(A))
+
+
+def linprog_l1(A, b, box=np.inf):
+    """Return the optimum of |A x - b|_1 with |x_j| <= box_j, and a minimiser, by HiGHS."""
+    A = A.toarray()
+    rows, columns = A.shape
+    bound = np.broadcast_to(box, columns)
+    solution = linprog(
+        np.concatenate((np.zeros(columns), np.ones(rows))),
+        A_ub=np.block([[A, -np.eye(rows)], [-A, -np.eye(rows)]]), b_ub=np.concatenate((b, -b)),
+        bounds=[*zip(-bound, bound, strict=True), *[(0, None)] * rows], method='highs')
+    assert solution.status == 0, solution.message
+    return solution.fun, solution.x[:columns]
+
+
+def random_poses(n, rng, spread=3.0):
+    """Return n poses anywhere in SE(2), (n, 3)."""
+    return np.concatenate((spread * rng.standard_normal((n, 2)),
+                           rng.uniform(-np.pi, np.pi, (n, 1))), axis=1)
+
+
+def random_information(n, rng):
+    """Return n information matrices with every entry non-zero, (n, 3, 3)."""
+    root = rng.standard_normal((n, 3, 3))
+    return root @ root.transpose(0, 2, 1) + 0.5 * np.eye(3)
+
+
+def drive(n, rng):
+    """Return n poses of a robot that moves about a metre ahead and turns at will, (n, 3)."""
+    poses = np.zeros((n, 3))
+    for k in range(1, n):
+        step = np.array([[1.0, 0.0, 0.0]]) + [0.2, 0.1, 0.6] * rng.standard_normal((1, 3))
+        poses[k] = se2.compose(poses[k - 1 : k], step)[0]
+    return poses
+
+
+def graph_of(truth, pairs, noise=None, information=None):
+    """
+    Return the graph that measures the pairs (m, 2) of the poses `truth` (n, 3).
+
+    noise : (m, 3) steps applied to the measurements; information : (m, 3, 3), else diagonal.
+    """
+    i, j = np.array(pairs).T
+    measurement = se2.between(truth[i], truth[j])
+    if noise is not None:
+        measurement = se2.retract(measurement, noise)
+    if information is None:
+        information = np.broadcast_to(np.diag([100.0, 100.0, 400.0]), (len(i), 3, 3))
+    graph = FactorGraph(se2)
+    graph.add_poses(len(truth))
+    graph.add_between(i, j, measurement, information)
+    return graph
+
+
+def chain_and_loops(n, n_loops, rng):
+    """Return the pairs of a chain of n and of as many loops, (n - 1 + n_loops, 2)."""
+    first = rng.integers(n - 2, size=n_loops)
+    last = rng.integers(first + 2, n)
+    return [(k, k + 1) for k in range(n - 1)] + list(zip(first, last, strict=True))
+
+
+def noisy_graph(n, n_loops, rng, sigma=(0.1, 0.1, 0.05)):
+    """Return a graph with Gaussian noise and the truth (n, 3) it measures."""
+    truth = drive(n, rng)
+    pairs = chain_and_loops(n, n_loops, rng)
+    noise = np.array(sigma) * rng.standard_normal((len(pairs), 3))
+    return graph_of(truth, pairs, noise), truth
+
+
+def seconds(value):
+    """Return a stamp [ns]."""
+    return round(value * 1e9)
+
+
+def covariance6(covariance3):
+    """Return the (6, 6) covariance of a message whose x, y, yaw have this one, (3, 3)."""
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_((0, 1, 5), (0, 1, 5))] = covariance3
+    return covariance
+
+
+UNKNOWN = np.zeros((6, 6))
+
+
+def odometry(time, pose, covariance=UNKNOWN, twist_covariance=UNKNOWN):
+    """Return the sample of a robot at `pose` (3,), `time` in seconds."""
+    return OdometrySample(seconds(time), se2.to_pose3(np.array(pose, float)), covariance,
+                          twist_covariance)
+
+
+def loop(reference_time, time, pose, covariance=UNKNOWN):
+    """Return the loop that saw the robot at `pose` (3,), times in seconds."""
+    return LoopClosure(seconds(reference_time), seconds(time), se2.to_pose3(np.array(pose, float)),
+                       covariance)
+
+
+PERIOD = 0.1  # [s] from one sample to the next
+
+
+def curve(n):
+    """Return a drive along a curve, .12 m and .01 to .05 rad per sample, (n, 3)."""
+    poses = np.zeros((n, 3))
+    for k in range(1, n):
+        step = np.array([[0.12, 0.01, 0.03 + 0.02 * np.sin(k / 5)]])
+        poses[k] = se2.compose(poses[k - 1 : k], step)[0]
+    return poses
+
+
+def true_loop(poses, reference, sample, covariance=UNKNOWN):
+    """Return what sees sample from reference without noise."""
+    pose = se2.between(poses[reference : reference + 1], poses[sample : sample + 1])[0]
+    return loop(reference * PERIOD, sample * PERIOD, pose, covariance)
+
+
+def grown(poses, options, covariance=UNKNOWN):
+    """Return the growth after the samples of `poses` (n, 3), one every .1 s from 0."""
+    growth = GraphGrowth(se2, options)
+    drive_on(growth, poses, 0, covariance)
+    return growth
+
+
+def drive_on(growth, poses, first, covariance=UNKNOWN):
+    """Add the samples of `poses` (n, 3) from `first` on."""
+    for k in range(first, len(poses)):
+        growth.add_odometry(odometry(k * PERIOD, poses[k], covariance))
+
+
+def keyframe_samples(growth):
+    """Return which sample each keyframe is, (n,)."""
+    return np.round(growth.stamps / seconds(PERIOD)).astype(int)
+
+
+def loops_of(growth):
+    """Return i, j and measurement of all factors that are no odometry."""
+    factors = growth.graph.between
+    rows = ~factors.is_odometry
+    return factors.i[rows].tolist(), factors.j[rows].tolist(), factors.measurement[rows]
+
+
+def covariance_of(growth, row):
+    """Return the covariance of one between factor, (3, 3)."""
+    root = growth.graph.between.sqrt_information[row]
+    return np.linalg.inv(root.T @ root)
+
+
+def play(backend, world, first=0, last=None):
+    """Add keyframes first to last and the loops that end there."""
+    factors = world.graph.between
+    covariance = np.linalg.inv(factors.sqrt_information.transpose(0, 2, 1)
+                               @ factors.sqrt_information)
+    for k in range(first, world.graph.n_poses if last is None else last):
+        for row in np.flatnonzero(factors.j == k):
+            if factors.is_odometry[row]:
+                backend.add_odometry(odometry(k * PERIOD, world.odometry[k],
+                                              covariance6(covariance[row])))
+            else:
+                backend.add_loop(loop(factors.i[row] * PERIOD, k * PERIOD,
+                                      factors.measurement[row], covariance6(covariance[row])))
+        if k == 0:
+            backend.add_odometry(odometry(0.0, world.odometry[0]))
