@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from l1slam_ros.core import se2
-from l1slam_ros.core.choice import INTERIOR_POINT, PRIMAL_DUAL, minimise_automatically
+from l1slam_ros.core.choice import AUTO, INTERIOR_POINT, PRIMAL_DUAL, minimise_by
 from l1slam_ros.core.false_loops import random_false_loops
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.initial import odometry_poses
@@ -48,7 +48,7 @@ def test_the_paper_graphs_are_solved_to_a_few_millionths(datasets, name, start):
     record = read_graph_file(datasets / f'{name}.g2o')
     poses = {'stored': lambda: record.poses, 'odometry': lambda: odometry_poses(record.graph),
              'seed': lambda: seed_poses(record.graph)}[start]()
-    solution = minimise_interior_point(record.graph, poses)
+    solution = minimise_interior_point(record.graph, poses, OptimiserOptions())
     assert solution.status is Status.CONVERGED
     assert solution.cost == cost_of(record.graph, solution.poses)
     # Manhattan's valley is flat: from the seed it ends 2.5e-5 above the lowest cost known.
@@ -57,7 +57,7 @@ def test_the_paper_graphs_are_solved_to_a_few_millionths(datasets, name, start):
 
 def test_city_from_its_odometry(datasets):
     graph = read_graph_file(datasets / 'city10000.g2o').graph
-    solution = minimise_interior_point(graph, odometry_poses(graph))
+    solution = minimise_interior_point(graph, odometry_poses(graph), OptimiserOptions())
     assert solution.status is Status.CONVERGED
     assert solution.cost <= (1 + 1e-5) * OPTIMA['city10000']
 
@@ -65,7 +65,7 @@ def test_city_from_its_odometry(datasets):
 def test_it_agrees_with_algorithm_4_and_is_optimal_by_its_dual(rng):
     graph = simulate_world(200, 330, WorldOptions(), rng).graph
     seed = seed_poses(graph)
-    solution = minimise_interior_point(graph, seed)
+    solution = minimise_interior_point(graph, seed, OptimiserOptions())
     first_order = minimise(graph, seed, OptimiserOptions(outer_iterations=60))
     assert solution.cost <= (1 + 1e-5) * first_order.cost
     system = linearise(graph, solution.poses)
@@ -82,17 +82,17 @@ def test_it_never_ends_worse_than_it_began(seed):
     loops = random_false_loops(world.graph, world.truth, 30, rng)
     graph = with_false_loops(world, loops).graph
     start = cost_of(graph, world.truth)
-    solution = minimise_interior_point(graph, world.truth)
+    solution = minimise_interior_point(graph, world.truth, OptimiserOptions())
     assert solution.cost <= start
     assert solution.cost == cost_of(graph, solution.poses)
     assert (np.diff(solution.history) <= 0).all()
-    chosen, _ = minimise_automatically(graph, world.truth, OptimiserOptions())
+    chosen, _ = minimise_by(AUTO, graph, world.truth, OptimiserOptions())
     assert chosen.cost <= solution.cost
 
 
 def test_a_chain_without_loops_is_solved_as_it_is(rng):
     graph = simulate_world(20, 19, WorldOptions(), rng).graph
-    solution = minimise_interior_point(graph, odometry_poses(graph))
+    solution = minimise_interior_point(graph, odometry_poses(graph), OptimiserOptions())
     assert solution.status is Status.CONVERGED
     assert solution.cost == pytest.approx(0, abs=1e-9)
 
@@ -100,7 +100,7 @@ def test_a_chain_without_loops_is_solved_as_it_is(rng):
 def test_sparse_graphs_get_the_interior_point_and_dense_ones_algorithm_4(rng):
     sparse = simulate_world(60, 90, WorldOptions(), rng).graph
     dense = simulate_world(60, 400, WorldOptions(), rng).graph
-    names = [minimise_automatically(g, seed_poses(g), OptimiserOptions())[1]
+    names = [minimise_by(AUTO, g, seed_poses(g), OptimiserOptions())[1]
              for g in (sparse, dense)]
     assert names == [INTERIOR_POINT, PRIMAL_DUAL]
 
@@ -114,8 +114,8 @@ def test_a_prior_fixes_the_gauge_instead_of_the_anchor(rng):
     root = factors.sqrt_information
     graph.add_between(factors.i, factors.j, factors.measurement, root.transpose(0, 2, 1) @ root)
     graph.add_prior(np.array([7]), moved[7:8], 1e4 * np.eye(3)[None])
-    solution = minimise_interior_point(graph, moved)
+    solution = minimise_interior_point(graph, moved, OptimiserOptions())
     assert solution.status is Status.CONVERGED
     np.testing.assert_allclose(solution.poses[7], moved[7], atol=1e-6)
-    unfixed = minimise_interior_point(world.graph, world.truth)
+    unfixed = minimise_interior_point(world.graph, world.truth, OptimiserOptions())
     assert solution.cost == pytest.approx(unfixed.cost, rel=1e-5)

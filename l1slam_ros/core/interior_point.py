@@ -37,9 +37,8 @@ from l1slam_ros.core.linearise import (
 )
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.optimality import Status, fits_exactly, l1_cost
-from l1slam_ros.core.optimiser import Report, Solution
+from l1slam_ros.core.optimiser import OptimiserOptions, Report, Solution
 
-_MOST_STEPS = 60
 # Converged when both the complementarity gap u's + v't and |e - u + v|_1 are below this part of
 # the cost, which leaves it some 10^-6 above the optimum.
 _TOLERANCE = 3e-5
@@ -130,10 +129,11 @@ class _Regularisation:
 def minimise_interior_point(
     graph: FactorGraph,
     poses: Array,
+    options: OptimiserOptions,
     report: Report = lambda iteration, cost: None,
 ) -> Solution:
     """
-    Minimise the L1 norm of the whitened residuals over the poses.
+    Minimise the L1 norm of the whitened residuals in `options.outer_iterations` steps at most.
 
     From poses (n, p), or from the L2 map that they lead to if its L1 cost is lower: from the seed
     it is not (and false loops would bend it), from raw odometry it is. The result is the best
@@ -146,7 +146,7 @@ def minimise_interior_point(
     at = _start(graph, _better_start(graph, poses, history[0]))
     best, best_cost = poses, history[0]
     regularisation, status = _Regularisation(), Status.ITERATION_LIMIT
-    for step in range(_MOST_STEPS):
+    for step in range(options.outer_iterations):
         cost = l1_cost(at.residual)
         if cost < best_cost:
             best, best_cost = at.poses, cost

@@ -32,7 +32,7 @@ _HALVINGS = 5
 class OptimiserOptions(Options):
     """How long Algorithm 4 runs and when it is content."""
 
-    outer_iterations: int = option(30, 'most linearisations of one solve', '', 0, 10**6)
+    outer_iterations: int = option(60, 'most linearisations of one solve', '', 0, 10**6)
     outer_tolerance: float = option(
         1e-6, 'converged when the cost fell by less than this part of itself twice', '1', 0, 1)
     inner: PrimalDualOptions = PrimalDualOptions()
