@@ -17,7 +17,8 @@ test: $(STAMP)
 	$(VENV)/bin/python -m pytest
 
 clean:
-	rm -rf $(VENV) build demo *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf $(VENV) build demo dist install log *.egg-info
+	rm -rf .pytest_cache .ruff_cache .mypy_cache .hypothesis
 
 # Editable, so that every process, whoever starts it, runs the checkout; an editable install
 # leaves the data files out, so they are put in place by a command of their own. Setuptools

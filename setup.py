@@ -3,6 +3,7 @@
 
 import sys
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
@@ -18,10 +19,15 @@ data_files = [
 if not {'install', 'develop'}.intersection(sys.argv):
     data_files.append((f'lib/{package_name}', sorted(glob('resource/run/*'))))
 
+# `colcon build --symlink-install` runs a link to this file, in a folder without the README.
+readme = Path(__file__).resolve().with_name('README.md')
+
 setup(
     name=package_name,
     version='0.1.0',
     description='Pose-graph SLAM back end for ROS 2: L1 norm, primal-dual, robust to false loops',
+    long_description=readme.read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
     maintainer='l1slam_ros maintainers',
     maintainer_email='maintainers@l1slam-ros.invalid',
     license='Apache-2.0',
@@ -38,7 +44,7 @@ setup(
         'tqdm>=4.66',
         'PyYAML>=6.0',
         'mcap>=1.2',
-        'rosbags>=0.11.6',
+        'rosbags>=0.11.7',
     ],
     extras_require={
         # The distribution must be named: the wheels' unpinned `ros-rclpy` is not Jazzy.

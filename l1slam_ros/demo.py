@@ -106,7 +106,11 @@ def running_backend() -> Iterator[None]:
 
 
 def executable(name: str) -> str:
-    """Return the path of one of this package's executables, beside the running Python."""
+    """Return where this package's executable is: where `ros2 run` looks, or beside Python."""
+    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+        path = Path(prefix) / 'lib' / 'l1slam_ros' / name
+        if prefix and path.exists():
+            return str(path)
     return str(Path(sysconfig.get_path('scripts')) / name)
 
 

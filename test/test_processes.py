@@ -3,9 +3,7 @@
 
 import signal
 import subprocess
-import sysconfig
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,16 +14,16 @@ from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
+from l1slam_ros.demo import executable
 from l1slam_ros.io.graph_bag import write_graph_bag
 from l1slam_ros.io.graph_file import GraphRecord
 
-SCRIPTS = Path(sysconfig.get_path('scripts'))
 DEADLINE = 60.0
 
 
 @pytest.fixture
 def backend():
-    process = subprocess.Popen([SCRIPTS / 'backend'], stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen([executable('backend')], stderr=subprocess.PIPE, text=True)
     # The node says when it is ready; before that a signal would meet a half-started process.
     assert 'ready' in process.stderr.readline()
     yield process
@@ -41,7 +39,7 @@ def bag(tmp_path, rng):
 
 
 def replay(*arguments):
-    return subprocess.run([SCRIPTS / 'replay', *map(str, arguments)], capture_output=True,
+    return subprocess.run([executable('replay'), *map(str, arguments)], capture_output=True,
                           text=True, timeout=DEADLINE)
 
 
@@ -117,7 +115,7 @@ def test_replay_of_a_topic_that_is_not_there_names_those_that_are(bag):
 
 def test_a_refused_parameter_is_one_line_and_exit_code_1():
     run = subprocess.run(
-        [SCRIPTS / 'backend', '--ros-args', '-p', 'keyframe.translation:=-1.0'],
+        [executable('backend'), '--ros-args', '-p', 'keyframe.translation:=-1.0'],
         capture_output=True, text=True, timeout=DEADLINE)
     assert run.returncode == 1
     assert 'keyframe.translation' in run.stderr and 'Traceback' not in run.stderr
