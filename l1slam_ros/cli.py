@@ -1,240 +1,167 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`l1slam`: the core from the command line, without ROS. Parsing, one call each, and printing."""
+"""`l1slam`: the core from the command line, without ROS. Parsing, and the exit code."""
 
 import argparse
-import json
 import sys
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from l1slam_ros import offline
-from l1slam_ros.core.errors import L1SlamError, OptionError
+from l1slam_ros import commands, offline
+from l1slam_ros.core.choice import SOLVERS
+from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.false_loops import FALSE_LOOPS
-from l1slam_ros.core.graph import component_labels
-from l1slam_ros.core.l2 import LeastSquaresOptions
-from l1slam_ros.core.optimality import SENTENCES
-from l1slam_ros.core.optimiser import OptimiserOptions
-from l1slam_ros.io.graph_file import GraphRecord
-from l1slam_ros.node_options import read_params_file
-from l1slam_ros.progress import Progress
+from l1slam_ros.graph_from_bag import DEFAULT_TOPICS
 
-BAD_INPUT = 2
-# In this order: what `auto` picks first is what there is.
-SOLVERS = ('auto', 'primal-dual')
+BAD_INPUT, READ_IN_PART, INTERRUPTED = 2, 3, 130
+
+_INPUT = '.g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1'
+_OUTPUT = '.g2o, .graph, .tum, or a name without a suffix for a bag directory'
+_GRAPH_OUTPUT = '.g2o, .graph, or a name without a suffix for a bag directory'
+_KIND = ('random: far poses said to be near each other; identity: at the very same place; '
+         'grouped: 10 to 20 in a row that agree (default: %(default)s)')
+_FIRST_STEPS = """\
+a first look:
+  l1slam simulate world.g2o --poses 1000 --edges 2000
+  l1slam solve world.g2o --reference world.g2o.truth.txt --plot map.png
+"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; return the exit code: 0, or 2 for bad input."""
-    options = _parser().parse_args(arguments)
+    """Run one command; return the exit code: 0, 2 for bad input, 3 for input read in part."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.run is None:
+        parser.print_help(sys.stderr)
+        return BAD_INPUT
     try:
-        options.run(options)
+        # Numbers beyond all measure end in an error that says so, not in NumPy's warnings.
+        with np.errstate(all='ignore'):
+            damage = options.run(options)
     except (L1SlamError, OSError) as error:
         print(f'l1slam: {error}', file=sys.stderr)
         return BAD_INPUT
+    except MemoryError:
+        print('l1slam: not enough memory for a graph of this size', file=sys.stderr)
+        return BAD_INPUT
     except KeyboardInterrupt:
-        return 130
+        return INTERRUPTED
+    if damage:
+        print(f'l1slam: {damage}', file=sys.stderr)
+        return READ_IN_PART
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog='l1slam', description='Pose-graph SLAM by the L1 norm, offline.')
-    commands = parser.add_subparsers(required=True, metavar='COMMAND')
-    _add_solve(commands.add_parser('solve', help='optimise a graph or a bag'))
-    convert = commands.add_parser('convert', help='graph file <-> bag')
-    convert.add_argument('input', type=Path)
-    convert.add_argument('output', type=Path, help='.g2o, .graph, .tum, or a bag directory')
-    convert.set_defaults(run=_convert)
-    _add_simulate(commands.add_parser('simulate', help='make a Manhattan world'))
-    info = commands.add_parser('info', help='say what is in a graph or a bag')
-    info.add_argument('input', type=Path)
-    info.set_defaults(run=_info)
-    plot = commands.add_parser('plot', help='draw maps beside each other')
-    plot.add_argument('input', type=Path, nargs='+')
-    plot.add_argument('--output', type=Path, required=True, metavar='PNG')
-    plot.set_defaults(run=_plot)
+        prog='l1slam', description='Pose-graph SLAM by the L1 norm, from files; needs no ROS.',
+        epilog=_FIRST_STEPS + '\n`l1slam COMMAND --help` explains one command.',
+        formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.set_defaults(run=None)
+    commands_of = parser.add_subparsers(metavar='COMMAND')
+
+    def add(name: str, run: Callable[[argparse.Namespace], str], text: str,
+            example: str) -> argparse.ArgumentParser:
+        command = commands_of.add_parser(
+            name, help=text, description=f'{text[0].upper()}{text[1:]}.',
+            epilog=f'example:\n  l1slam {name} {example}',
+            formatter_class=argparse.RawDescriptionHelpFormatter)
+        command.set_defaults(run=run)
+        return command
+
+    _add_solve(add('solve', commands.solve, 'optimise a graph or a bag',
+                   'graph.g2o --output solved.g2o --plot map.png'))
+    _add_convert(add('convert', commands.convert, 'turn a graph file into a bag, or back',
+                     'graph.g2o bag'))
+    _add_simulate(add('simulate', commands.simulate, 'make a world of streets, its truth known',
+                      'world.g2o --poses 1000 --edges 2000 --seed 1'))
+    _add_corrupt(add('corrupt', commands.corrupt, 'add false loops to a graph',
+                     'graph.g2o spoiled.g2o --false-loops 20 --kind grouped'))
+    _add_info(add('info', commands.info, 'say what is in a graph or a bag, and what looks wrong',
+                  'graph.g2o'))
+    _add_plot(add('plot', commands.plot, 'draw maps beside each other, false loops red',
+                  'graph.g2o solved.g2o --output maps.png'))
     return parser
 
 
+def _add_input(parser: argparse.ArgumentParser) -> None:
+    """Add the input, and how a bag of other origin is read."""
+    parser.add_argument('input', type=Path, metavar='INPUT', help=_INPUT)
+    _add_bag_options(parser)
+
+
+def _add_bag_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group('how to read a bag').add_argument
+    add('--odom-topic', default=DEFAULT_TOPICS.odometry, metavar='TOPIC',
+        help='nav_msgs/Odometry (default: %(default)s)')
+    add('--loop-topic', default=DEFAULT_TOPICS.loops, metavar='TOPIC',
+        help='geometry_msgs/PoseWithCovarianceStamped (default: %(default)s)')
+    add('--trusted-topic', default=DEFAULT_TOPICS.trusted, metavar='TOPIC',
+        help='the same, loops somebody vouches for (default: %(default)s)')
+    add('--params-file', type=Path, metavar='YAML',
+        help="the node's parameter file: what makes keyframes, their noise, and the solver; "
+        'without it, what a bag of l1slam notes of itself, or the defaults of the node')
+
+
 def _add_solve(parser: argparse.ArgumentParser) -> None:
+    _add_input(parser)
     add = parser.add_argument
-    add('input', type=Path, help='.g2o, .graph, .mcap, .db3 or a rosbag2 directory')
-    add('--start', choices=offline.STARTS, default=offline.STARTS[0])
-    add('--norm', choices=offline.NORMS, default=offline.NORMS[0])
-    add('--solver', choices=SOLVERS, default=SOLVERS[0])
+    add('--start', choices=offline.STARTS, default=offline.STARTS[0],
+        help='where from: first poses from the graph alone, the stored poses, or the odometry '
+        '(default: %(default)s)')
+    add('--norm', choices=offline.NORMS, default=offline.NORMS[0],
+        help='what is minimised (default: %(default)s)')
+    add('--solver', choices=SOLVERS, default=SOLVERS[0],
+        help='for l1; auto: interior-point on sparse graphs (default: %(default)s)')
     add('--outer', type=int, metavar='N', help='most linearisations')
     add('--inner', type=int, metavar='N', help='most primal-dual iterations of each')
-    add('--output', type=Path, help='.g2o, .graph, .tum, or a bag directory')
-    add('--reference', type=Path, metavar='TRUTH', help='TUM, g2o or `id x y theta` text')
-    add('--plot', type=Path, metavar='PNG', help='draw the map')
-    add('--params-file', type=Path, metavar='YAML', help="the node's parameter file")
+    add('--output', type=Path, metavar='OUT', help=_OUTPUT)
+    add('--reference', type=Path, metavar='TRUTH',
+        help='print the position error to it: TUM, g2o or `id x y theta` text')
+    add('--plot', type=Path, metavar='PNG', help='draw the map and its cost; .svg and .pdf too')
     add('--json', action='store_true', help='one object on standard output')
     add('--quiet', action='store_true', help='no progress, no summary')
-    parser.set_defaults(run=_solve)
+
+
+def _add_convert(parser: argparse.ArgumentParser) -> None:
+    _add_input(parser)
+    parser.add_argument('output', type=Path, metavar='OUTPUT', help=_OUTPUT)
 
 
 def _add_simulate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add('output', type=Path, help='.g2o, .graph, or a bag directory')
+    add('output', type=Path, metavar='OUTPUT',
+        help=f'{_GRAPH_OUTPUT}; beside it OUTPUT.truth.txt and OUTPUT.false.txt')
     add('--poses', type=int, required=True, metavar='N')
     add('--edges', type=int, required=True, metavar='M', help='true ones, odometry included')
-    add('--seed', type=int, default=0, metavar='S')
-    add('--false-loops', type=int, default=0, metavar='K', help='on top of the edges')
-    add('--kind', choices=list(FALSE_LOOPS), default='random', help='of the false loops')
-    parser.set_defaults(run=_simulate)
+    add('--false-loops', type=int, default=0, metavar='K',
+        help='on top of the edges (default: %(default)s)')
+    _add_randomness(parser)
 
 
-def _solve(arguments: argparse.Namespace) -> None:
-    _check_outputs(arguments)
-    record, solver, least_squares = _solve_input(arguments)
-    steps = solver.outer_iterations if arguments.norm == 'l1' else least_squares.iterations
-    with Progress(steps, 'step', arguments.quiet) as progress:
-        outcome = offline.solve(record, arguments.start, arguments.norm, solver, least_squares,
-                                progress.report)
-    poses = outcome.solution.poses
-    report = _solve_report(record, arguments.norm, outcome)
-    if arguments.reference:
-        report['ate'] = offline.position_error(record, poses, arguments.reference)
-    if arguments.plot:
-        _plot_solution(arguments, record, outcome)
-    if arguments.output:
-        offline.write_output(arguments.output, record, poses)
-    if arguments.json:
-        print(json.dumps(report))
-    elif not arguments.quiet:
-        _print_report(report, arguments.norm, SENTENCES[outcome.solution.status])
+def _add_corrupt(parser: argparse.ArgumentParser) -> None:
+    _add_input(parser)
+    add = parser.add_argument
+    add('output', type=Path, metavar='OUTPUT',
+        help=f'{_GRAPH_OUTPUT}; beside it OUTPUT.false.txt, the vertex ids of the false loops')
+    add('--false-loops', type=int, required=True, metavar='K', help='how many')
+    _add_randomness(parser)
 
 
-def _check_outputs(arguments: argparse.Namespace) -> None:
-    """Refuse names of outputs before the work is done, not after."""
-    if arguments.output:
-        offline.check_output(arguments.output)
-    if arguments.plot:
-        from l1slam_ros.io.plot import check_picture
-
-        check_picture(arguments.plot)
+def _add_randomness(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--kind', choices=list(FALSE_LOOPS), default='random', help=_KIND)
+    parser.add_argument('--seed', type=int, default=0, metavar='S',
+                        help='another one, another draw (default: %(default)s)')
 
 
-def _solve_input(
-    arguments: argparse.Namespace,
-) -> tuple[GraphRecord, OptimiserOptions, LeastSquaresOptions]:
-    growth, solver, least_squares = None, OptimiserOptions(), LeastSquaresOptions()
-    if arguments.params_file:
-        growth = read_params_file(arguments.params_file)
-        solver = growth.solver
-    if arguments.outer is not None:
-        solver = replace(solver, outer_iterations=arguments.outer)
-        least_squares = replace(least_squares, iterations=arguments.outer)
-    if arguments.inner is not None:
-        solver = replace(solver, inner=replace(solver.inner, iterations=arguments.inner))
-    record = offline.read_input(arguments.input, growth)
-    _warn(record, arguments.quiet)
-    return record, solver, least_squares
+def _add_info(parser: argparse.ArgumentParser) -> None:
+    _add_input(parser)
 
 
-def _solve_report(record: GraphRecord, norm: str, outcome: offline.Outcome) -> dict[str, object]:
-    solution, factors = outcome.solution, record.graph.between
-    return {
-        'poses': record.graph.n_poses,
-        'factors': len(factors) + len(record.graph.prior),
-        'loops': int((~factors.is_odometry).sum()),
-        'initial_cost': outcome.initial_cost,
-        'seed_cost': outcome.seed_cost,
-        'final_cost': solution.cost,
-        'status': solution.status.value,
-        'seconds': outcome.seconds,
-        'solver': 'primal-dual' if norm == 'l1' else 'gauss-newton',
-        'outer_iterations': solution.outer_iterations,
-        'inner_iterations': solution.inner_iterations,
-        'rejected': [],
-    }
-
-
-def _print_report(report: dict[str, object], norm: str, status: str) -> None:
-    seed = f'seed {report["seed_cost"]:.6g}, ' if report['seed_cost'] is not None else ''
-    print(f'{report["poses"]} poses, {report["factors"]} factors, {report["loops"]} loops')
-    print(f'{norm} cost: initial {report["initial_cost"]:.6g}, {seed}'
-          f'final {report["final_cost"]:.6g}')
-    print(f'{report["status"]} ({status}): {report["outer_iterations"]} outer, '
-          f'{report["inner_iterations"]} inner iterations, {report["seconds"]:.2f} s, '
-          f'{report["solver"]}')
-    if 'ate' in report:
-        print(f'position error {report["ate"]:.4f} m (RMSE after rigid alignment)')
-
-
-def _plot_solution(arguments: argparse.Namespace, record: GraphRecord,
-                   outcome: offline.Outcome) -> None:
-    from l1slam_ros.drawing import drawing
-    from l1slam_ros.io.plot import plot_maps
-
-    poses = outcome.solution.poses
-    note = f'{arguments.norm} cost {outcome.solution.cost:.6g}'
-    plot_maps(arguments.plot, [drawing(arguments.input.stem, record, poses, arguments.reference,
-                                       note)])
-
-
-def _convert(arguments: argparse.Namespace) -> None:
-    record = offline.read_input(arguments.input)
-    _warn(record, quiet=False)
-    offline.write_output(arguments.output, record, offline.stored_poses(record))
-
-
-def _simulate(arguments: argparse.Namespace) -> None:
-    from l1slam_ros.core.simulate import WorldOptions, simulate_world, with_false_loops
-    from l1slam_ros.io.graph_bag import write_graph_bag
-    from l1slam_ros.io.trajectory import write_false_loops, write_truth
-
-    if arguments.seed < 0 or arguments.false_loops < 0:
-        raise OptionError('--seed and --false-loops: expected 0 or more')
-    rng = np.random.default_rng(arguments.seed)
-    world = simulate_world(arguments.poses, arguments.edges, WorldOptions(), rng)
-    if arguments.false_loops:
-        make = FALSE_LOOPS[arguments.kind]
-        world = with_false_loops(
-            world, make(world.graph, world.truth, arguments.false_loops, rng))
-    ids = np.arange(world.graph.n_poses)
-    record = GraphRecord(world.graph, world.odometry, ids)
-    if arguments.output.suffix == '':
-        write_graph_bag(arguments.output, record, world.truth)
-    else:
-        offline.write_output(arguments.output, record, world.odometry)
-    write_truth(Path(f'{arguments.output}.truth.txt'), ids, world.truth)
-    write_false_loops(Path(f'{arguments.output}.false.txt'), world.false_loops.tolist())
-
-
-def _info(arguments: argparse.Namespace) -> None:
-    record = offline.read_input(arguments.input)
-    graph = record.graph
-    factors, labels = graph.between, component_labels(graph)
-    print(f'{arguments.input}: {graph.manifold.NAME} graph')
-    print(f'poses       {graph.n_poses} (ids {record.ids[0]} to {record.ids[-1]})')
-    print(f'odometry    {int(factors.is_odometry.sum())}')
-    print(f'loops       {int((~factors.is_odometry).sum())}')
-    if len(graph.prior):
-        print(f'priors      {len(graph.prior)}')
-    print(f'components  {labels.max() + 1}')
-    if record.poses is not None:
-        cost = offline.cost_function(record, 'l1', LeastSquaresOptions())(record.poses)
-        print(f'l1 cost     {cost:.6g} at the stored poses')
-    _warn(record, quiet=False)
-
-
-def _plot(arguments: argparse.Namespace) -> None:
-    from l1slam_ros.drawing import drawing
-    from l1slam_ros.io.plot import plot_maps
-
-    drawings = []
-    for path in arguments.input:
-        record = offline.read_input(path)
-        truth = Path(f'{path}.truth.txt')
-        drawings.append(drawing(path.stem, record, offline.stored_poses(record),
-                                truth if truth.exists() else None, ''))
-    plot_maps(arguments.output, drawings)
-
-
-def _warn(record: GraphRecord, quiet: bool) -> None:
-    for sentence in () if quiet else record.skipped:
-        print(f'l1slam: {sentence}', file=sys.stderr)
+def _add_plot(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('input', type=Path, nargs='+', metavar='INPUT',
+                        help=f'{_INPUT}; INPUT.truth.txt and INPUT.false.txt are drawn, if there')
+    parser.add_argument('--output', type=Path, required=True, metavar='PNG',
+                        help='.png, .svg or .pdf')
+    _add_bag_options(parser)

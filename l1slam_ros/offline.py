@@ -1,55 +1,52 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The core without ROS: any input file -> graph -> solution -> any output file.
-
-A bag is grown by the code that the node grows with, so live and offline see one graph.
-"""
+"""The core without ROS: any input file -> graph -> solution -> any output file."""
 
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from l1slam_ros.core import se2
-from l1slam_ros.core.errors import FileError, GraphError, MessageError
+from l1slam_ros.core.choice import minimise_by
+from l1slam_ros.core.errors import FileError, GraphError
 from l1slam_ros.core.graph import component_labels
-from l1slam_ros.core.growth import GraphGrowth, GrowthOptions
-from l1slam_ros.core.initial import odometry_poses
-from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.growth import GrowthOptions
+from l1slam_ros.core.initial import odometry_poses, tree_poses
+from l1slam_ros.core.inspection import odometry_gaps
 from l1slam_ros.core.l2 import LeastSquaresOptions, huber_cost, minimise_huber, minimise_l2
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.metrics import absolute_trajectory_error
 from l1slam_ros.core.optimality import l1_cost, l2_cost
-from l1slam_ros.core.optimiser import OptimiserOptions, Report, Solution, minimise
+from l1slam_ros.core.optimiser import OptimiserOptions, Report, Solution
 from l1slam_ros.core.seed import seed_poses
-from l1slam_ros.io.bag import read_messages, read_note
-from l1slam_ros.io.graph_bag import GRAPH_NOTE, LOOP_TOPIC, ODOMETRY_TOPIC, write_graph_bag
+from l1slam_ros.graph_from_bag import DEFAULT_TOPICS, Topics, graph_from_bag
+from l1slam_ros.io.bag import BAG_SUFFIXES
+from l1slam_ros.io.files import require_folder
+from l1slam_ros.io.graph_bag import write_graph_bag
 from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, write_graph_file
-from l1slam_ros.io.messages import loop_closure, odometry_sample
 from l1slam_ros.io.trajectory import invented_stamps, read_reference, write_tum
 
 GRAPH_SUFFIXES = ('.g2o', '.graph')
-BAG_SUFFIXES = ('.mcap', '.db3')
-TRUSTED_LOOP_TOPIC = '/trusted_loop_closures'
 # [ns] Stamps that far apart are of one pose: trajectory files print them as rounded floats.
 _SAME_STAMP = 1_000_000
 NORMS = ('l1', 'l2', 'huber')
 STARTS = ('seed', 'file', 'odometry')
 
 
-def read_input(path: Path, options: GrowthOptions | None = None) -> GraphRecord:
+def read_input(
+    path: Path, options: GrowthOptions | None = None, topics: Topics = DEFAULT_TOPICS
+) -> GraphRecord:
     """
     Read a graph file or grow a graph from a bag.
 
     Parameters
     ----------
-    path : .g2o, .graph, .mcap, .db3 or a rosbag2 directory
+    path : .g2o, .graph, .mcap, .db3, .bag (ROS 1) or a rosbag2 directory
     options : what makes keyframes of a bag's messages; None: what the bag's note says, or the
         node's defaults
+    topics : where in a bag to look
 
     Raises
     ------
@@ -58,92 +55,91 @@ def read_input(path: Path, options: GrowthOptions | None = None) -> GraphRecord:
     """
     if not path.exists():
         raise FileError(path, 'no such file or directory')
-    if path.is_dir() or path.suffix in BAG_SUFFIXES:
-        return _grow(path, options or _noted_options(path))
+    if is_bag(path):
+        return graph_from_bag(path, options, topics)
     if path.suffix in GRAPH_SUFFIXES:
         return read_graph_file(path)
     raise FileError(path, f'unknown kind of file; expected {", ".join(GRAPH_SUFFIXES)}, '
                     f'{", ".join(BAG_SUFFIXES)} or a rosbag2 directory')
 
 
-def _noted_options(path: Path) -> GrowthOptions:
-    note = read_note(path)
-    options = GrowthOptions()
-    if note.get('keyframes') == GRAPH_NOTE['keyframes']:
-        options = replace(options, keyframe=KeyframeOptions(0.0, 0.0, 0.0))
-    if note.get('covariance') == GRAPH_NOTE['covariance']:
-        options = replace(options, odometry=OdometryOptions(GRAPH_NOTE['covariance']))
-    return options
-
-
-def _grow(path: Path, options: GrowthOptions) -> GraphRecord:
-    growth = GraphGrowth(se2, options)
-    refused: Counter[str] = Counter()
-    base_frame = ''
-    for topic, _, _, message in read_messages(
-            path, (ODOMETRY_TOPIC, LOOP_TOPIC, TRUSTED_LOOP_TOPIC)):
-        try:
-            if topic == ODOMETRY_TOPIC:
-                base_frame = base_frame or message.child_frame_id
-                growth.add_odometry(odometry_sample(message))
-            else:
-                growth.add_loop(loop_closure(message, base_frame, topic == TRUSTED_LOOP_TOPIC))
-        except MessageError as error:
-            refused[error.cause] += 1
-    growth.add_due_loops()
-    n = growth.graph.n_poses
-    if n < 2:
-        raise FileError(path, f'{n} keyframes from its odometry on {ODOMETRY_TOPIC}; '
-                        'expected 2 or more')
-    refused += growth.refused
-    skipped = [f'{count} messages refused: {cause}' for cause, count in refused.items()]
-    if growth.n_waiting:
-        skipped.append(f'{growth.n_waiting} loops name times after the last odometry')
-    return GraphRecord(growth.graph, None, np.arange(n), growth.stamps, tuple(skipped))
+def is_bag(path: Path) -> bool:
+    """Tell whether an input is taken for a bag."""
+    return path.is_dir() or path.suffix in BAG_SUFFIXES
 
 
 def stored_poses(record: GraphRecord) -> Array:
-    """Return the stored start, (n, p); where none is stored, the odometry chain."""
-    return record.poses if record.poses is not None else odometry_poses(record.graph)
+    """
+    Return the stored start, (n, p); where none is stored, the odometry chain.
+
+    Where that has gaps, the poses along a breadth-first tree from the first keyframe.
+
+    Raises
+    ------
+    GraphError : none is stored, and the graph is not connected.
+
+    """
+    if record.poses is not None:
+        return record.poses
+    require_connected(record)
+    if len(odometry_gaps(record.graph)):
+        return tree_poses(record.graph, 0)
+    return odometry_poses(record.graph)
+
+
+def with_poses(record: GraphRecord) -> GraphRecord:
+    """Return the record with `stored_poses`; as it is where there are none to be had."""
+    try:
+        return replace(record, poses=stored_poses(record))
+    except GraphError:
+        return record
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What `solve` did; costs are of the norm that was asked for, seed_cost None without one."""
+    """
+    What `solve` did; costs are of the norm that was asked for, seed_cost None without one.
+
+    solver : what found the solution, by its name.
+    """
 
     solution: Solution
+    solver: str
     initial_cost: float
     seed_cost: float | None
     seconds: float
 
 
 def solve(
-    record: GraphRecord, start: str, norm: str, options: OptimiserOptions,
+    record: GraphRecord, start: str, norm: str, solver: str, options: OptimiserOptions,
     least_squares: LeastSquaresOptions, report: Report
 ) -> Outcome:
     """
     Solve a graph from a start (of `STARTS`) for a norm (of `NORMS`); seconds: solving alone.
 
+    The solver (of `choice.SOLVERS`) is for L1; the other norms have Gauss-Newton.
+
     Raises
     ------
-    GraphError : the graph is not connected, or has no such start.
+    GraphError : the graph is not connected, has no such start, or numbers beyond all measure.
 
     """
-    _require_connected(record)
-    if start == 'file' and record.poses is None:
-        raise GraphError('the input stores no poses to start from; expected --start seed or '
-                         'odometry')
+    require_start(record, start)
     graph, cost = record.graph, cost_function(record, norm, least_squares)
     initial = odometry_poses(graph) if start == 'odometry' else stored_poses(record)
     began = time.perf_counter()
     poses = seed_poses(graph) if start == 'seed' else initial
     if norm == 'l1':
-        solution = minimise(graph, poses, options, report=report)
+        solution, solver = minimise_by(solver, graph, poses, options, report)
     else:
         minimise_norm = minimise_l2 if norm == 'l2' else minimise_huber
-        solution = minimise_norm(graph, poses, least_squares, report)
-    return Outcome(solution, cost(initial), cost(poses) if start == 'seed' else None,
-                   time.perf_counter() - began)
+        solution, solver = minimise_norm(graph, poses, least_squares, report), 'gauss-newton'
+    seconds = time.perf_counter() - began
+    seed_cost = cost(poses) if start == 'seed' else None
+    if not np.isfinite([cost(initial), seed_cost or 0.0, solution.cost]).all():
+        raise GraphError('the cost leaves double precision: measurements and information of the '
+                         'graph are too large, or too different from each other')
+    return Outcome(solution, solver, cost(initial), seed_cost, seconds)
 
 
 def cost_function(
@@ -159,12 +155,41 @@ def cost_function(
     return lambda poses: of_residual[norm](whitened_residual(graph, poses))
 
 
-def _require_connected(record: GraphRecord) -> None:
+def require_start(record: GraphRecord, start: str) -> None:
+    """
+    Refuse, before any work is done, a graph that cannot be solved from a start (of `STARTS`).
+
+    Raises
+    ------
+    GraphError : the graph is not connected, or has no such start.
+
+    """
+    require_connected(record)
+    if start == 'file' and record.poses is None:
+        raise GraphError('the input stores no poses to start from; expected --start seed or '
+                         'odometry')
+    gaps = odometry_gaps(record.graph)
+    if start == 'odometry' and len(gaps):
+        raise GraphError(f'no edge between the consecutive vertices {record.ids[gaps[0]]} and '
+                         f'{record.ids[gaps[0] + 1]}, so no chain of odometry to start from; '
+                         'expected --start seed')
+
+
+def require_connected(record: GraphRecord) -> None:
+    """
+    Refuse a graph of several parts.
+
+    Raises
+    ------
+    GraphError : naming a vertex of the loose part.
+
+    """
     labels = component_labels(record.graph)
     loose = np.flatnonzero(labels != labels[0])
     if len(loose):
-        raise GraphError(f'the graph is not connected: vertex {record.ids[loose[0]]} and '
-                         f'{len(loose) - 1} more have no path to vertex {record.ids[0]}')
+        others = f' and {len(loose) - 1} more have' if len(loose) > 1 else ' has'
+        raise GraphError(f'the graph is not connected: vertex {record.ids[loose[0]]}{others} no '
+                         f'path to vertex {record.ids[0]}; `l1slam info` lists the parts')
 
 
 def matching_rows(record: GraphRecord, reference_path: Path) -> tuple[Indices, Array]:
@@ -190,11 +215,10 @@ def matching_rows(record: GraphRecord, reference_path: Path) -> tuple[Indices, A
     return ours, reference.poses[theirs]
 
 
-def position_error(record: GraphRecord, poses: Array, reference_path: Path) -> float:
-    """Return the RMSE of the positions [m] after rigid alignment; errors as `matching_rows`."""
-    ours, reference = matching_rows(record, reference_path)
+def position_error(record: GraphRecord, poses: Array, rows: Indices, reference: Array) -> float:
+    """Return the RMSE of the positions [m] after rigid alignment; rows as of `matching_rows`."""
     positions = record.graph.manifold.positions
-    return absolute_trajectory_error(positions(poses)[ours], positions(reference))
+    return absolute_trajectory_error(positions(poses)[rows], positions(reference))
 
 
 def stamps_of(record: GraphRecord) -> Indices:
@@ -207,21 +231,31 @@ def check_output(path: Path) -> None:
     if path.suffix not in (*GRAPH_SUFFIXES, '.tum', ''):
         raise FileError(path, f'unknown suffix; expected {", ".join(GRAPH_SUFFIXES)}, .tum, or '
                         'none for a bag directory')
+    require_folder(path)
 
 
-def write_output(path: Path, record: GraphRecord, poses: Array) -> None:
+def check_graph_output(path: Path) -> None:
+    """Refuse, as `check_output`, an output that does not hold a graph."""
+    check_output(path)
+    if path.suffix == '.tum':
+        raise FileError(path, 'a trajectory has no edges; expected '
+                        f'{", ".join(GRAPH_SUFFIXES)}, or no suffix for a bag directory')
+
+
+def write_output(path: Path, record: GraphRecord) -> None:
     """
-    Write a graph with its poses (n, p), in the format that the suffix names; none: a bag.
+    Write a graph with its poses, in the format that the suffix names; none: a bag.
 
     Raises
     ------
     FileError : an unknown suffix, or the file cannot be written.
+    GraphError : the format has no place for a part of the graph.
 
     """
     check_output(path)
     if path.suffix in GRAPH_SUFFIXES:
-        write_graph_file(path, replace(record, poses=poses))
+        write_graph_file(path, record)
     elif path.suffix == '.tum':
-        write_tum(path, stamps_of(record), poses, record.graph.manifold)
+        write_tum(path, stamps_of(record), stored_poses(record), record.graph.manifold)
     else:
         write_graph_bag(path, record)

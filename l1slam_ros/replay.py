@@ -20,11 +20,13 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from l1slam_ros.core.errors import FileError, L1SlamError, OptionError
-from l1slam_ros.io.bag import BagSummary, RawMessage, bag_summary, read_raw
+from l1slam_ros.io.bag import BagSummary, bag_summary, read_raw
+from l1slam_ros.io.walk import RawMessage
 from l1slam_ros.progress import Progress
 from l1slam_ros.publishing import header
 
 _BAD_INPUT = 2
+_DAMAGED = 3
 _DEPTH = 1000
 _SECOND = 1_000_000_000
 # A publisher sends nothing to whom it has not met. Meeting takes part of a second, but where a
@@ -131,20 +133,33 @@ def _message_class(msgtype: str) -> type | None:
     return kind
 
 
-def _rounds(arguments: argparse.Namespace, summary: BagSummary,
-            topics: list[str]) -> Iterator[Iterator[RawMessage]]:
+class _Damage:
+    """Says each damage once, however often the bag is played."""
+
+    def __init__(self) -> None:
+        self.sentences: set[str] = set()
+
+    def tell(self, sentence: str) -> None:
+        """Say a sentence on damage."""
+        if sentence not in self.sentences:
+            print(f'replay: {sentence}', file=sys.stderr)
+        self.sentences.add(sentence)
+
+
+def _rounds(arguments: argparse.Namespace, summary: BagSummary, topics: list[str],
+            damage: _Damage) -> Iterator[Iterator[RawMessage]]:
     """Yield the messages to play: once, or again and again with --loop."""
     start = summary.start + round(arguments.start * _SECOND)
     stop = None
     if arguments.duration is not None:
         stop = start + round(arguments.duration * _SECOND)
     while True:
-        yield read_raw(arguments.bag, topics, start=start, stop=stop)
+        yield read_raw(arguments.bag, topics, damage.tell, start=start, stop=stop)
         if not arguments.loop:
             return
 
 
-def _play(arguments: argparse.Namespace) -> None:
+def _play(arguments: argparse.Namespace, damage: _Damage) -> None:
     summary = bag_summary(arguments.bag)
     node = rclpy.create_node('replay')
     try:
@@ -153,7 +168,7 @@ def _play(arguments: argparse.Namespace) -> None:
             raise FileError(arguments.bag, 'no topic of this bag can be played')
         player.wait_for_subscribers()
         seconds = max(summary.duration / _SECOND - arguments.start, 0)
-        for messages in _rounds(arguments, summary, list(player.publishers)):
+        for messages in _rounds(arguments, summary, list(player.publishers), damage):
             with Progress(min(seconds, arguments.duration or seconds), 's') as progress:
                 player.play(messages, arguments.rate, progress)
     finally:
@@ -184,7 +199,7 @@ def _not_negative(text: str) -> float:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog='replay', description='Play a bag onto topics.')
     add = parser.add_argument
-    add('bag', type=Path, help='.mcap, .db3 or a rosbag2 directory')
+    add('bag', type=Path, help='.mcap, .db3, .bag (ROS 1) or a rosbag2 directory')
     add('--rate', type=_positive, default=1.0, help='times as fast as recorded')
     add('--start', type=_not_negative, default=0.0, help='skip so much of the bag [s]')
     add('--duration', type=_positive, help='play only so much of the bag [s]')
@@ -202,13 +217,14 @@ def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
 
 
 def main() -> int:
-    """Play; return the exit code: 0, or 2 for bad input."""
+    """Play; return the exit code: 0, 2 for bad input, 3 where only a part could be read."""
     own, ros = _split(sys.argv[1:])
     arguments = _parser().parse_args(own)
     arguments.remap = dict(arguments.remap)
+    damage = _Damage()
     rclpy.init(args=ros)
     try:
-        _play(arguments)
+        _play(arguments, damage)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except L1SlamError as error:
@@ -216,4 +232,4 @@ def main() -> int:
         return _BAD_INPUT
     finally:
         rclpy.try_shutdown()
-    return 0
+    return _DAMAGED if damage.sentences else 0

@@ -2,11 +2,19 @@
 """`l1slam`: what it prints, writes and answers to bad input."""
 
 import json
+import re
+import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.cli import main
+from l1slam_ros.core import se2
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.optimality import l1_cost
 from l1slam_ros.io.graph_file import read_graph_file
@@ -50,10 +58,19 @@ def test_solve_reports_what_it_wrote(capsys, world, tmp_path):
     assert recomputed == pytest.approx(report['final_cost'], rel=1e-12)
     assert report['final_cost'] < report['seed_cost'] < report['initial_cost']
     assert (report['poses'], report['factors'], report['loops']) == (150, 250, 101)
-    assert report['rejected'] == [] and report['solver'] == 'primal-dual'
+    assert report['rejected'] == [] and report['solver'] == 'interior-point'
     assert report['status'] in ('converged', 'iteration_limit', 'stalled')
     assert 0 < report['ate'] < 0.3
     assert picture.read_bytes().startswith(b'\x89PNG')
+
+
+@pytest.mark.parametrize('solver', ['primal-dual', 'interior-point'])
+def test_a_chosen_solver_is_the_one_that_solves(capsys, world, solver):
+    report = solve_json(capsys, world, '--solver', solver)
+    best = solve_json(capsys, world)
+    assert report['solver'] == solver
+    assert report['final_cost'] == pytest.approx(best['final_cost'], rel=1e-3)
+    assert (report['inner_iterations'] > 0) == (solver == 'primal-dual')
 
 
 def test_ate_of_the_odometry_is_that_of_zero_steps(capsys, world):
@@ -85,6 +102,106 @@ def test_graph_to_bag_to_graph_is_one_graph(capsys, world, tmp_path):
     costs = [solve_json(capsys, path, '--start', 'odometry', '--outer', 0)['initial_cost']
              for path in (world, tmp_path / 'bag', tmp_path / 'back.g2o')]
     assert np.ptp(costs) <= 1e-9 * costs[0]
+
+
+def copied_bag(bag, copy, renamed=None, note=True):
+    """Copy a bag into an sqlite one by rosbags' own reader and writer."""
+    writer = Writer(copy, version=9, storage_plugin=StoragePlugin.SQLITE3)
+    metadata = yaml.safe_load((bag / 'metadata.yaml').read_text())
+    for key, text in metadata['rosbag2_bagfile_information']['custom_data'].items():
+        if note:
+            writer.set_custom_data(key, text)
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    with AnyReader([bag]) as reader, writer:
+        connections = {c.id: writer.add_connection(
+            (renamed or {}).get(c.topic, c.topic), c.msgtype, typestore=typestore)
+            for c in reader.connections}
+        for connection, time, data in reader.messages():
+            writer.write(connections[connection.id], time, data)
+    return copy
+
+
+@pytest.fixture
+def doors(capsys, world, tmp_path):
+    """One graph in every form that a user may have it in."""
+    run(capsys, 'convert', world, tmp_path / 'a.graph')
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    sqlite = copied_bag(tmp_path / 'bag', tmp_path / 'sqlite')
+    return [world, tmp_path / 'a.graph', tmp_path / 'bag', tmp_path / 'bag' / 'bag.mcap', sqlite,
+            sqlite / 'sqlite.db3']
+
+
+def test_every_door_leads_to_the_same_costs(capsys, doors):
+    for norm in 'l1', 'l2', 'huber':
+        costs = [solve_json(capsys, door, '--start', 'odometry', '--norm', norm, '--outer', 0)
+                 ['initial_cost'] for door in doors]
+        np.testing.assert_allclose(costs, costs[0], rtol=1e-9)
+        assert costs[0] > 100
+
+
+@pytest.mark.parametrize('norm', ['l1', 'l2'])
+def test_every_door_leads_to_the_same_poses(capsys, doors, tmp_path, norm):
+    outputs = []
+    for k, door in enumerate(doors):
+        run(capsys, 'solve', door, '--start', 'odometry', '--norm', norm, '--quiet',
+            '--output', tmp_path / f'{k}.tum')
+        outputs.append(np.loadtxt(tmp_path / f'{k}.tum'))
+    moved = np.linalg.norm(outputs[0][:, 1:3] - np.loadtxt(f'{doors[0]}.truth.txt')[:, 1:3])
+    assert moved > 0.1
+    for output in outputs[1:]:
+        np.testing.assert_allclose(output, outputs[0], atol=1e-6)
+
+
+def test_a_bag_without_our_note_goes_by_the_parameters(capsys, world, tmp_path):
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    plain = copied_bag(tmp_path / 'bag', tmp_path / 'plain', note=False)
+    params = tmp_path / 'params.yaml'
+    params.write_text('/**: {ros__parameters: {odometry: {covariance_source: increment}, '
+                      'keyframe: {translation: 0.0, rotation: 0.0, period: 0.0}}}')
+    expected = solve_json(capsys, world, '--norm', 'l2')['final_cost']
+    by_defaults = solve_json(capsys, plain, '--norm', 'l2')['final_cost']
+    told = solve_json(capsys, plain, '--norm', 'l2', '--params-file', params)['final_cost']
+    assert told == pytest.approx(expected, rel=1e-6)
+    assert by_defaults != pytest.approx(expected, rel=0.01)
+    # So do the other commands that read bags.
+    run(capsys, 'convert', plain, tmp_path / 'told.g2o', '--params-file', params)
+    assert solve_json(capsys, tmp_path / 'told.g2o', '--norm', 'l2')[
+        'final_cost'] == pytest.approx(expected, rel=1e-6)
+
+
+def test_other_topics(capsys, world, tmp_path):
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    other = copied_bag(tmp_path / 'bag', tmp_path / 'other', {
+        '/odom': '/wheels/odom', '/loop_closures': '/places'})
+    code = main(['info', str(other)])
+    out, err = capsys.readouterr()
+    assert code == 2 and '/wheels/odom: 150 of nav_msgs/msg/Odometry' in out
+    assert err.startswith('l1slam: ') and err.count('\n') == 1 and '/wheels/odom' in err
+    topics = ('--odom-topic', '/wheels/odom', '--loop-topic', '/places')
+    assert solve_json(capsys, other, *topics)['loops'] == 101
+    vouched = ('--odom-topic', '/wheels/odom', '--trusted-topic', '/places')
+    assert solve_json(capsys, other, *vouched)['loops'] == 101
+    run(capsys, 'plot', other, *topics, '--output', tmp_path / 'map.png')
+
+
+def test_a_cut_bag_is_read_in_part_and_exits_with_3(capsys, world, tmp_path):
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    whole = (tmp_path / 'bag' / 'bag.mcap').read_bytes()
+    cut = tmp_path / 'cut.mcap'
+    cut.write_bytes(whole[:len(whole) // 2])
+    for arguments in (['solve', cut, '--quiet', '--output', tmp_path / 'out.g2o'], ['info', cut],
+                      ['convert', cut, tmp_path / 'out.graph'],
+                      ['corrupt', cut, tmp_path / 'bad.g2o', '--false-loops', 1],
+                      ['plot', cut, world, '--output', tmp_path / 'map.png']):
+        assert main([str(a) for a in arguments]) == 3
+        out, err = capsys.readouterr()
+        assert err.startswith(f'l1slam: {cut}') and err.count('\n') == 1 and 'damaged' in err
+        assert 'nothing looks wrong' not in out
+    assert read_graph_file(tmp_path / 'out.g2o').graph.n_poses > 20
+    cut.write_bytes(whole[:100])
+    assert main(['solve', str(cut), '--json']) == 2
+    out, err = capsys.readouterr()
+    assert out == '' and err.startswith(f'l1slam: {cut}') and err.count('\n') == 1
 
 
 def test_intel_as_a_bag_is_the_same_graph(capsys, datasets, tmp_path):
@@ -128,9 +245,181 @@ def test_info_counts_components(capsys, tmp_path):
     assert 'poses       5' in out and 'components  2' in out and 'odometry    3' in out
 
 
+def test_info_of_a_good_graph_and_of_its_bag(capsys, world, tmp_path):
+    out, err = run(capsys, 'info', world)
+    assert out.endswith('\nnothing looks wrong\n') and err == ''
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    out, _ = run(capsys, 'info', tmp_path / 'bag')
+    for row in ('duration    14.9 s from 1000.000000000',
+                'note        covariance increment, keyframes every',
+                'topic       /loop_closures: 101 of geometry_msgs/msg/PoseWithCovarianceStamped',
+                'topic       /odom: 150 of nav_msgs/msg/Odometry', 'poses       150 in SE2',
+                'time        14.9 s', 'nothing looks wrong'):
+        assert f'\n{row}' in f'\n{out}', out
+
+
+def test_info_says_what_was_skipped(capsys, tmp_path):
+    out, err = run(capsys, 'info', graph_file(tmp_path, [*VERTICES, *EDGES, 'VERTEX_XY 9 1 2']))
+    assert "- 1 'VERTEX_XY' line is not used" in out and err == ''
+
+
+def words(path):
+    """The texts of an SVG: matplotlib draws them as outlines and notes them in comments."""
+    return re.findall(r'<!-- (.*?) -->', path.read_text())
+
+
 def test_plot_draws_several_maps(capsys, world, tmp_path):
     run(capsys, 'plot', world, world, '--output', tmp_path / 'maps.svg')
-    assert (tmp_path / 'maps.svg').read_text().count('odometry') >= 1
+    assert words(tmp_path / 'maps.svg').count('world.g2o') == 2
+    assert words(tmp_path / 'maps.svg').count('odometry') == 2
+    assert words(tmp_path / 'maps.svg').count('truth') == 2
+
+
+def test_plot_shows_false_loops_where_they_are_known(capsys, world, tmp_path):
+    run(capsys, 'corrupt', world, tmp_path / 'bad.g2o', '--false-loops', 12)
+    run(capsys, 'plot', world, tmp_path / 'bad.g2o', '--output', tmp_path / 'maps.svg')
+    said = words(tmp_path / 'maps.svg')
+    assert said.count('false loops') == 1
+    assert '150 poses, 101 loops' in said and '150 poses, 101 loops, 12 false' in said
+
+
+@pytest.mark.parametrize('line, words', [
+    ('3 5', 'no edge between 3 and 5'), ('3 999', 'no edge between 3 and 999'),
+    ('3', '1 fields; expected 2 whole numbers'), ('3 x', "'x' is not a whole number"),
+])
+def test_a_file_of_other_false_loops_is_refused(capsys, tmp_path, line, words):
+    path = graph_file(tmp_path, [*VERTICES, *EDGES])
+    (tmp_path / 'graph.g2o.false.txt').write_text(f'0 2\n{line}\n')
+    assert main(['plot', str(path), '--output', str(tmp_path / 'map.png')]) == 2
+    _, err = capsys.readouterr()
+    assert err.startswith(f'l1slam: {path}.false.txt') and words in err and err.count('\n') == 1
+
+
+def test_solve_draws_the_costs_beside_the_map(capsys, world, tmp_path):
+    picture = tmp_path / 'map.svg'
+    report = solve_json(capsys, world, '--plot', picture, '--reference', f'{world}.truth.txt')
+    said = words(picture)
+    for word in ('world.g2o', 'optimised', 'truth', 'odometry', 'l1 cost', 'iteration',
+                 f'seed {report["seed_cost"]:.6g}', f'initial {report["initial_cost"]:.6g}',
+                 f'final {report["final_cost"]:.6g}'):
+        assert word in said
+
+
+@pytest.fixture
+def odd(world, tmp_path):
+    """The world with stamps and with ids 10, 13, 16, ..."""
+    path = tmp_path / 'odd.g2o'
+    lines = [line.split() for line in world.read_text().splitlines()]
+    for fields in lines:
+        for k in (1,) if fields[0] == 'VERTEX_SE2' else (1, 2):
+            fields[k] = str(10 + 3 * int(fields[k]))
+    path.write_text('\n'.join(' '.join(fields) for fields in lines) + '\n')
+    Path(f'{path}.stamps.txt').write_text(
+        ''.join(f'{10 + 3 * k} {5 + k}.25\n' for k in range(150)))
+    return path
+
+
+def corrupted(capsys, path, output, *options):
+    """Corrupt; return the record, which of its factors are false, and the pairs of the file."""
+    run(capsys, 'corrupt', path, output, *options)
+    pairs = np.loadtxt(f'{output}.false.txt', dtype=int, ndmin=2)
+    record = read_graph_file(output)
+    factors = record.graph.between
+    ids = np.stack((record.ids[factors.i], record.ids[factors.j]), axis=1)
+    false = (ids[:, None] == pairs).all(axis=2).any(axis=1)
+    assert false.sum() == len(pairs)
+    return record, false, pairs
+
+
+@pytest.mark.parametrize('kind', ['random', 'identity', 'grouped'])
+def test_corrupt_adds_far_pairs_and_keeps_the_rest(capsys, odd, world, tmp_path, kind):
+    before = read_graph_file(odd)
+    after, false, pairs = corrupted(capsys, odd, tmp_path / 'bad.g2o', '--false-loops', 40,
+                                    '--kind', kind, '--seed', 3)
+    assert len(pairs) == 40 and set(pairs.ravel() % 3) == {1}
+    np.testing.assert_array_equal(after.poses, before.poses)
+    np.testing.assert_array_equal(after.ids, before.ids)
+    np.testing.assert_array_equal(after.stamps, before.stamps)
+    np.testing.assert_array_equal(after.graph.between.measurement[~false],
+                                  before.graph.between.measurement)
+    truth = np.loadtxt(f'{world}.truth.txt')[:, 1:3]
+    i, j = ((pairs - 10) // 3).T
+    distance = np.linalg.norm(truth[i] - truth[j], axis=1)
+    # A tenth of the diagonal of the map; the map that judged it is some centimetres off.
+    assert distance.min() > 0.1 * np.linalg.norm(np.ptp(truth, axis=0)) - 0.3
+    assert (j - i).min() >= 15
+    claimed = np.linalg.norm(after.graph.between.measurement[false][:, :2], axis=1)
+    assert claimed.max() < {'random': 2, 'identity': 1e-9, 'grouped': 40}[kind]
+    assert solve_json(capsys, tmp_path / 'bad.g2o')['loops'] == 141
+
+
+def test_grouped_false_loops_run_along_and_agree(capsys, odd, tmp_path):
+    record, false, pairs = corrupted(capsys, odd, tmp_path / 'bad.g2o', '--false-loops', 45,
+                                     '--kind', 'grouped')
+    factors = record.graph.between
+    z = {(i, j): m for i, j, m in zip(factors.i[false], factors.j[false],
+                                      factors.measurement[false], strict=True)}
+    steps = factors.measurement[factors.is_odometry]
+    runs = [(i, j) for i, j in z if (i - 1, j - 1) not in z]
+    lengths = []
+    for i, j in runs:
+        k = 0
+        while (i + k + 1, j + k + 1) in z:
+            around = se2.compose(steps[i + k], z[i + k + 1, j + k + 1])
+            np.testing.assert_allclose(se2.compose(z[i + k, j + k], steps[j + k]), around,
+                                       atol=1e-9)
+            k += 1
+        lengths.append(k + 1)
+    assert sum(lengths) == 45 and len(lengths) <= 5
+    assert sum(10 <= length <= 20 for length in lengths) >= len(lengths) - 2
+
+
+def test_another_seed_draws_other_loops_and_the_same_one_the_same(capsys, world, tmp_path):
+    drawn = [corrupted(capsys, world, tmp_path / f'{k}.g2o', '--false-loops', 10, '--seed', seed)
+             [2].tolist() for k, seed in enumerate((1, 1, 2))]
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
+def test_false_loops_are_told_by_the_solved_map_not_by_a_drifted_start(capsys, world, tmp_path):
+    """The stored start is wound up like a spring: by it, the same place is far from itself."""
+    path = tmp_path / 'drift.g2o'
+    record = read_graph_file(world)
+    steps = record.graph.between.measurement[record.graph.between.is_odometry]
+    poses = [np.zeros(3)]
+    for step in steps + [0, 0, 0.2]:
+        poses.append(se2.compose(poses[-1], step))
+    lines = [f'VERTEX_SE2 {k} {x} {y} {theta}' for k, (x, y, theta) in enumerate(poses)]
+    edges = [line for line in world.read_text().splitlines() if line.startswith('EDGE')]
+    path.write_text('\n'.join(lines + edges))
+    _, _, pairs = corrupted(capsys, path, tmp_path / 'bad.g2o', '--false-loops', 200)
+    truth = np.loadtxt(f'{world}.truth.txt')[:, 1:3]
+    distance = np.linalg.norm(truth[pairs[:, 0]] - truth[pairs[:, 1]], axis=1)
+    assert distance.min() > 0.1 * np.linalg.norm(np.ptp(truth, axis=0)) - 0.3
+
+
+def test_corrupting_twice_names_the_false_loops_of_both(capsys, world, tmp_path):
+    _, _, first = corrupted(capsys, world, tmp_path / 'a.g2o', '--false-loops', 10)
+    _, _, both = corrupted(capsys, tmp_path / 'a.g2o', tmp_path / 'b.g2o', '--false-loops', 20,
+                           '--kind', 'grouped')
+    assert len(both) == 30 and both[:10].tolist() == first.tolist()
+
+
+def test_corrupting_to_a_bag_counts_as_the_bag_does(capsys, odd, tmp_path):
+    run(capsys, 'corrupt', odd, tmp_path / 'bad', '--false-loops', 7)
+    pairs = np.loadtxt(tmp_path / 'bad.false.txt', dtype=int)
+    assert pairs.shape == (7, 2) and pairs.max() < 150
+    run(capsys, 'plot', tmp_path / 'bad', '--output', tmp_path / 'map.svg')
+    assert '150 poses, 101 loops, 7 false' in words(tmp_path / 'map.svg')
+
+
+def test_a_graph_that_cannot_be_written_leaves_no_file_of_false_loops(capsys, world, tmp_path):
+    # The priors of a graph have no place in TORO.
+    path = tmp_path / 'prior.g2o'
+    path.write_text(world.read_text() + 'EDGE_PRIOR_SE2 0 0 0 0 1 0 0 1 0 1\n')
+    there = sorted(tmp_path.iterdir())
+    assert main(['corrupt', str(path), str(tmp_path / 'bad.graph'), '--false-loops', '3']) == 2
+    assert sorted(tmp_path.iterdir()) == there
+    assert capsys.readouterr().err.count('\n') == 1
 
 
 def test_a_parameter_file_speaks_to_both_growth_and_solver(capsys, world, tmp_path):
@@ -158,7 +447,7 @@ def test_bad_input_is_one_line_exit_code_2_and_no_output(capsys, tmp_path, lines
     path, output = graph_file(tmp_path, lines), tmp_path / 'out.g2o'
     assert main(['solve', str(path), '--output', str(output)]) == 2
     out, err = capsys.readouterr()
-    assert out == '' and err.count('\n') == 1 and err.startswith('l1slam: ')
+    assert out == '' and err.count('\n') == 1 and err.startswith(f'l1slam: {path}:')
     assert words.lower() in err.lower()
     if line is not None:
         assert f'{path}:{line}:' in err
@@ -171,6 +460,18 @@ def test_bad_input_is_one_line_exit_code_2_and_no_output(capsys, tmp_path, lines
     (['solve', 'graph.g2o', '--start', 'file'], 'no poses'),
     (['solve', 'graph.g2o', '--inner', '0'], 'iterations'),
     (['solve', 'graph.g2o', '--output', 'out.doc'], 'suffix'),
+    (['solve', 'graph.g2o', '--output', 'missing/out.g2o'], 'missing is no folder'),
+    (['solve', 'graph.g2o', '--plot', 'missing/out.png'], 'missing is no folder'),
+    (['solve', 'gap.g2o', '--start', 'odometry'], 'consecutive vertices 1 and 2'),
+    (['convert', 'graph.g2o', 'out.doc'], 'suffix'),
+    (['corrupt', 'graph.g2o', 'out.tum', '--false-loops', '1'], 'trajectory'),
+    (['corrupt', 'graph.g2o', 'out.g2o', '--false-loops', '-1'], '--false-loops is -1'),
+    (['corrupt', 'graph.g2o', 'out.g2o', '--false-loops', '1000000000'], '3 pairs among 3'),
+    (['corrupt', 'missing.g2o', 'out.g2o', '--false-loops', '1'], 'no such file'),
+    (['plot', 'graph.g2o', '--output', 'map.doc'], '.png'),
+    (['plot', 'graph.g2o', 'missing.g2o', '--output', 'map.png'], 'missing.g2o'),
+    (['info', 'missing.g2o'], 'no such file'),
+    (['simulate', 'out.tum', '--poses', '10', '--edges', '12'], 'trajectory'),
     (['solve', 'graph.g2o', '--plot', 'out.doc'], '.png'),
     (['solve', 'graph.g2o', '--reference', 'missing.txt'], 'missing.txt'),
     (['solve', 'graph.g2o', '--params-file', 'graph.txt'], 'parameters'),
@@ -182,7 +483,54 @@ def test_bad_arguments_are_one_line_and_exit_code_2(
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'graph.g2o').write_text('\n'.join(EDGES))
     (tmp_path / 'graph.txt').write_text('{}')
+    (tmp_path / 'gap.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 0 5 1 '))
     assert main([*arguments]) == 2
     _, err = capsys.readouterr()
     assert err.count('\n') == 1 and words in err, err
-    assert sorted(p.name for p in tmp_path.iterdir()) == ['graph.g2o', 'graph.txt']
+    assert sorted(p.name for p in tmp_path.iterdir()) == ['gap.g2o', 'graph.g2o', 'graph.txt']
+
+
+def test_a_graph_with_gaps_and_without_poses_is_solved_from_its_tree(capsys, tmp_path):
+    path = graph_file(tmp_path, [EDGES[0], 'EDGE_SE2 1 5 1.1 0 0 1 0 0 1 0 1',
+                                 'EDGE_SE2 1 7 2.2 0 0 1 0 0 1 0 1',
+                                 'EDGE_SE2 0 7 3 0 0 1 0 0 1 0 1'])
+    report = solve_json(capsys, path)
+    assert report['final_cost'] < report['initial_cost']
+    run(capsys, 'convert', path, tmp_path / 'out.g2o')
+    assert read_graph_file(tmp_path / 'out.g2o').poses.shape == (4, 3)
+
+
+def test_a_graph_in_parts_without_poses_is_converted_all_the_same(capsys, tmp_path):
+    path = graph_file(tmp_path, [*EDGES, EDGES[0].replace(' 0 1 ', ' 7 9 ', 1)])
+    run(capsys, 'convert', path, tmp_path / 'out.graph')
+    record = read_graph_file(tmp_path / 'out.graph')
+    assert record.poses is None and record.ids.tolist() == [0, 1, 2, 7, 9]
+
+
+COMMANDS = ['simulate', 'convert', 'solve', 'corrupt', 'info', 'plot']
+
+
+def help_of(capsys, *arguments):
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, '--help'])
+    assert ended.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_the_examples_of_the_help_work(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run(capsys, 'simulate', 'graph.g2o', '--poses', 100, '--edges', 180)
+    for command in COMMANDS:
+        example = re.search(r'example:\n  l1slam (.*)', help_of(capsys, command))[1]
+        assert example.startswith(f'{command} ')
+        run(capsys, *shlex.split(example))
+    for example in re.findall(r'\n  l1slam (.*)', help_of(capsys)):
+        run(capsys, *shlex.split(example))
+    written = {p.name for p in tmp_path.iterdir()}
+    assert {'world.g2o', 'bag', 'solved.g2o', 'map.png', 'spoiled.g2o', 'maps.png'} <= written
+
+
+def test_without_a_command_there_is_help(capsys):
+    assert main([]) == 2
+    out, err = capsys.readouterr()
+    assert out == '' and all(f'    {command} ' in err for command in COMMANDS)

@@ -13,6 +13,7 @@ from l1slam_ros.core.false_loops import (
     identity_false_loops,
     insert_loops,
     random_false_loops,
+    without_factors,
 )
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
@@ -161,6 +162,28 @@ def test_inserting_keeps_what_was_there(rng):
     np.testing.assert_allclose(longer.prior.sqrt_information, [np.sqrt(7) * np.eye(3)])
     assert longer.n_poses == 9 and longer.prior.i.tolist() == [4]
     assert len(graph.between) == 5
+
+
+def test_what_was_put_in_is_taken_out(world, rng):
+    before = world.graph.between
+    loops = random_false_loops(world.graph, world.truth, 30, rng)
+    longer = insert_loops(world.graph, loops)
+    longer.add_prior(np.array([4]), np.array([[1.0, 2.0, 3.0]]), 7 * np.eye(3)[None])
+    pairs = set(zip(loops.i.tolist(), loops.j.tolist(), strict=True))
+    after = longer.between
+    false = np.array([pair in pairs for pair in zip(after.i, after.j, strict=True)])
+    shorter = without_factors(longer, false)
+    np.testing.assert_array_equal(shorter.between.i, before.i)
+    np.testing.assert_array_equal(shorter.between.measurement, before.measurement)
+    np.testing.assert_allclose(shorter.between.sqrt_information, before.sqrt_information)
+    assert shorter.n_poses == 1000 and shorter.prior.i.tolist() == [4]
+
+
+def test_more_loops_than_pairs_are_refused_before_memory_is_taken(rng):
+    graph, poses = chain_graph(100)
+    for make in FALSE_LOOPS.values():
+        with pytest.raises(GraphError, match='found 4950 pairs among 100 keyframes'):
+            make(graph, poses, 10**15, rng)
 
 
 @pytest.mark.parametrize('kind', FALSE_LOOPS)

@@ -13,6 +13,8 @@ from l1slam_ros.io.files import (
     parse_rows,
     read_lines,
     replacing,
+    require_folder,
+    settled,
     stamp_from_text,
     stamp_text,
     write_lines,
@@ -101,6 +103,8 @@ def test_ids_are_exact_where_a_float_is_not(tmp_path):
     ('1 2 1e999', "'1e999' is not a finite number"),
     ('1 2 0x10', "'0x10' is not a finite number"),
     ('1 2 1_0', "'1_0' is not a finite number"),
+    ('1 2 1.1e30', "'1.1e30' is beyond 1e+30"),
+    ('1 -1e308 3', "'-1e308' is beyond 1e+30"),
 ])
 @pytest.mark.parametrize('where', [0, 1, 6, 12])
 def test_the_guilty_line_is_named_among_good_ones(text, found, where):
@@ -112,6 +116,35 @@ def test_the_guilty_line_is_named_among_good_ones(text, found, where):
     assert str(caught.value).startswith(f'file.txt:{100 + where}: row: {found}')
     assert str(caught.value).endswith('; expected 1 whole and 2 finite numbers')
     assert '\n' not in str(caught.value)
+
+
+def test_the_largest_numbers_are_read():
+    lines = TextLines([1], ['1 1e30 -1e30'])
+    assert parse_rows('f', 'row', lines, 1, 2)[1].tolist() == [[1e30, -1e30]]
+
+
+def test_a_row_of_names_alone():
+    ids, values = parse_rows('f', 'row', TextLines([1, 2], ['1 2', '3 4']), 2, 0)
+    assert ids.tolist() == [[1, 2], [3, 4]] and values.size == 0
+    with pytest.raises(FileError, match='f:1: row: 3 fields; expected 2 whole numbers$'):
+        parse_rows('f', 'row', TextLines([1], ['1 2 3']), 2, 0)
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    require_folder('a.txt')
+    require_folder(tmp_path / 'a.txt')
+    for path in 'none/a.txt', tmp_path / 'none' / 'a.txt':
+        with pytest.raises(FileError) as caught:
+            require_folder(path)
+        assert str(caught.value) == f'{path}: cannot be written: {tmp_path}/none is no folder'
+
+
+@pytest.mark.parametrize(('value', 'decimal'), [
+    (50.00000000000001, 50.0), (0.30000000000000004, 0.3), (1e-8 + 1e-24, 1e-8), (0.0, 0.0),
+    (-3000.0000000000005, -3e3), (1 / 3, 1 / 3), (0.1234567890123456, 0.1234567890123456)])
+def test_rounding_is_undone_where_it_can_be(value, decimal):
+    assert settled(np.array([value])).tolist() == [decimal]
 
 
 @pytest.mark.parametrize('bad', [{0}, {9}, {3, 4, 9}, {8, 9}])

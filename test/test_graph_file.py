@@ -2,6 +2,7 @@
 """Graph files: g2o and TORO in, the same numbers out, every malformed line named."""
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,8 +15,8 @@ from l1slam_ros.core import se2
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.noise import square_root_information
-from l1slam_ros.io.files import stamps_path
 from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, read_vertices, write_graph_file
+from l1slam_ros.io.side_files import stamps_path
 
 SQUARE = """\
 # a comment
@@ -114,43 +115,111 @@ def test_what_is_not_used_is_said(write):
         SQUARE + 'FIX 9\nFIX 3\nPARAMS_SE2OFFSET 0 0 0 0\nVERTEX_XY 20 1 2\nVERTEX_XY 21 1 2\n'
         'EDGE_SE2_XY 3 20 1 1 1 0 1\n'))
     assert record.skipped == (
-        'FIX 9 3: the anchor is the first vertex (3)', '1 PARAMS_SE2OFFSET line: not used',
-        '2 VERTEX_XY lines: not used', '1 EDGE_SE2_XY line: not used')
+        "FIX '9 3' is not used: the first vertex, 3, is the one held fixed",
+        "1 'PARAMS_SE2OFFSET' line is not used: "
+        'sensor data and calibration are no part of a pose graph',
+        "2 'VERTEX_XY' lines are not used: landmarks are no part of a pose graph",
+        "1 'EDGE_SE2_XY' line is not used: landmarks are no part of a pose graph")
+
+
+@pytest.mark.parametrize('tag', [
+    'VERTEX_XY', 'EDGE_SE2_XY', 'EDGE_BEARING_SE2_XY', 'EDGE_PRIOR_SE2_XY', 'VERTEX_LINE2D',
+    'EDGE_SE2_SEGMENT2D', 'ROBOTLASER1', 'RAWLASER1', 'VERTEX_TAG', 'PARAMS_CAMERAPARAMETERS',
+])
+def test_known_tags_may_say_anything(write, tag):
+    record = read_graph_file(write(SQUARE + f'{tag}\n{tag} 3 x nan 1 2 3 4 5 6 7 8 9\n'))
+    sentence, = record.skipped
+    assert sentence.startswith(f'2 {tag!r} lines are not used: ')
+    assert record.graph.n_poses == 3 and len(record.graph.between) == 3
 
 
 def test_a_fixed_first_vertex_is_no_news(write):
     assert read_graph_file(write(SQUARE + 'FIX 3\n')).skipped == ()
 
 
+# The square again, as TORO has it.
+TORO_SQUARE = """\
+# a comment
+VERTEX2 7 1.5 0 1.5
+VERTEX2 3 0 0 0
+
+EDGE2 3 7 1 0.25 1.5 4 0.5 5 6 0.25 0.125
+VERTEX2 9 1 1 3
+EDGE2 7 9 1 0 1.5 4 0 4 9 0 0
+EDGE2 9 3 -0.5 1 -3 1 0 1 1 0 0
+"""
+
+
+def test_the_same_square_in_toro(write):
+    a, b = read_graph_file(write(SQUARE)), read_graph_file(write(TORO_SQUARE, 'a.graph'))
+    assert_same(a, b)
+
+
+# As g2o has them; in TORO the tags are others, and so is the order of the information.
+MALFORMED = [
+    ('EDGE 3 7 1 0 0 1 0 0 1 0', 'EDGE: 10 fields; expected 2 whole and 9 finite numbers'),
+    ('EDGE 3 7 1 0 0 1 0 0 1 0 1 1', 'EDGE: 12 fields; expected 2 whole'),
+    ('EDGE', 'EDGE: 0 fields; expected 2 whole'),
+    ('EDGE 3 7 # 1 0 0 1 0 0 1 0 1', 'EDGE: 2 fields; expected 2 whole'),
+    ('VERTEX 5 0 0', 'VERTEX: 3 fields; expected 1 whole and 3 finite numbers'),
+    ('VERTEX', 'VERTEX: 0 fields; expected 1 whole and 3 finite numbers'),
+    ('VERTEX 5 0 nan 0', "VERTEX: 'nan' is not a finite number; expected"),
+    ('VERTEX 5 0 O 0', "VERTEX: 'O' is not a finite number; expected"),
+    ('VERTEX 5 0 1,5 0', "VERTEX: '1,5' is not a finite number; expected"),
+    ('VERTEX 5 0 1e31 0', "VERTEX: '1e31' is beyond 1e+30; expected"),
+    ('VERTEX 5.0 0 0 0', "VERTEX: '5.0' is not a whole number of 64 bits; expected"),
+    ('VERTEX 9223372036854775808 0 0 0',
+     "VERTEX: '9223372036854775808' is not a whole number of 64 bits; expected"),
+    ('EDGE 3 7.5 1 0 0 1 0 0 1 0 1', "EDGE: '7.5' is not a whole number of 64 bits"),
+    ('EDGE 3 x 1 0 0 1 0 0 1 0 1', "EDGE: 'x' is not a whole number of 64 bits"),
+    ('EDGE 3 7 1 inf 0 1 0 0 1 0 1', "EDGE: 'inf' is not a finite number; expected"),
+    ('EDGE 3 7 1 0 0 nan 0 0 1 0 1', "EDGE: 'nan' is not a finite number; expected"),
+    ('EDGE 3 7 1 0 0 -1e99 0 0 1 0 1', "EDGE: '-1e99' is beyond 1e+30; expected"),
+    ('EDGE 3 7 1 0 0 0 0 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected a positive'),
+    ('EDGE 3 8 1 0 0 1 0 0 1 0 1', 'vertex 8 is unknown; expected one of the 3 vertices'),
+    ('EDGE 100 3 1 0 0 1 0 0 1 0 1', 'vertex 100 is unknown; expected one of the 3 vertices'),
+    ('EDGE 7 7 1 0 0 1 0 0 1 0 1', 'an edge from vertex 7 to itself; expected two vertices'),
+    ('VERTEX 7 0 0 0', 'vertex 7 stands twice, before at line 2; expected each once'),
+    ('EGDE_SE2 3 7 1 0 0 1 0 0 1 0 1', "unknown tag 'EGDE_SE2'; expected VERTEX_SE2, EDGE_SE2, "),
+    ('vertex_se2 5 0 0 0', "unknown tag 'vertex_se2'; expected VERTEX_SE2, EDGE_SE2, "),
+    ('VERTEX_SE3:QUAT 5 0 0 0 0 0 0 1', "'VERTEX_SE3:QUAT': 3D graphs are not supported yet; "
+     'expected a graph in the plane (EDGE_SE2 or EDGE2 lines)'),
+    ('EDGE_SE3:QUAT 5 6', "'EDGE_SE3:QUAT': 3D graphs are not supported yet"),
+    ('VERTEX_SE3:EXPMAP 5 6', "'VERTEX_SE3:EXPMAP': 3D graphs are not supported yet"),
+    ('VERTEX_TRACKXYZ 5 6', "'VERTEX_TRACKXYZ': 3D graphs are not supported yet"),
+    ('VERTEX3 5 0 0 0 0 0 0', "'VERTEX3': 3D graphs are not supported yet"),
+    ('EDGE3 5 6', "'EDGE3': 3D graphs are not supported yet"),
+]
+
+
+def with_tags(text, tags):
+    return re.sub(r'\b(VERTEX|EDGE)\b', lambda word: tags[word[0]], text)
+
+
+@pytest.mark.parametrize(('square', 'tags'), [
+    (SQUARE, {'VERTEX': 'VERTEX_SE2', 'EDGE': 'EDGE_SE2'}),
+    (TORO_SQUARE, {'VERTEX': 'VERTEX2', 'EDGE': 'EDGE2'}),
+], ids=['g2o', 'toro'])
+@pytest.mark.parametrize(('line', 'message'), MALFORMED)
+def test_each_malformed_line_is_named(write, square, tags, line, message):
+    # A good line follows: it is not the last one that is named, nor the first of its tag.
+    text = square + with_tags(line, tags) + '\n' + square.splitlines()[4] + '\n'
+    assert message_of(write(text)).startswith(f':9: {with_tags(message, tags)}')
+
+
 @pytest.mark.parametrize(('line', 'message'), [
-    ('EDGE_SE2 3 7 1 0 0 1 0 0 1 0', 'EDGE_SE2: 10 fields; expected 2 whole and 9 finite numbers'),
-    ('EDGE_SE2 3 7 1 0 0 1 0 0 1 0 1 1', 'EDGE_SE2: 12 fields; expected 2 whole'),
-    ('EDGE_SE2', 'EDGE_SE2: 0 fields; expected 2 whole'),
-    ('VERTEX_SE2 5 0 0', 'VERTEX_SE2: 3 fields; expected 1 whole and 3 finite numbers'),
-    ('VERTEX_SE2 5 0 nan 0', "VERTEX_SE2: 'nan' is not a finite number; expected"),
-    ('VERTEX_SE2 5 0 O 0', "VERTEX_SE2: 'O' is not a finite number; expected"),
-    ('EDGE_SE2 3 7.5 1 0 0 1 0 0 1 0 1', "EDGE_SE2: '7.5' is not a whole number of 64 bits"),
-    ('EDGE_SE2 3 x 1 0 0 1 0 0 1 0 1', "EDGE_SE2: 'x' is not a whole number of 64 bits"),
-    ('EDGE_SE2 3 7 1 inf 0 1 0 0 1 0 1', "EDGE_SE2: 'inf' is not a finite number; expected"),
     ('EDGE_SE2 3 7 1 0 0 1 2 0 1 0 1',
      'information [1 2 0 2 1 0 0 0 1]; expected a positive definite matrix'),
-    ('EDGE_SE2 3 7 1 0 0 0 0 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected a positive'),
+    ('EDGE2 3 7 1 0 0 1 2 1 1 0 0',
+     'information [1 2 0 2 1 0 0 0 1]; expected a positive definite matrix'),
+    # Positive definite in one order, not in the other.
+    ('EDGE2 3 7 1 0 0 1 0 0 1 0 1', 'information [1 0 0 0 0 1 0 1 1]; expected a positive'),
     ('EDGE_PRIOR_SE2 3 1 0 0 1 0 0 1 0 -1', 'information [1 0 0 0 1 0 0 0 -1]; expected'),
-    ('EDGE_SE2 3 8 1 0 0 1 0 0 1 0 1', 'vertex 8 is unknown; expected one of the 3 vertices'),
-    ('EDGE_SE2 100 3 1 0 0 1 0 0 1 0 1', 'vertex 100 is unknown; expected one of the 3 vertices'),
     ('EDGE_PRIOR_SE2 -1 1 0 0 1 0 0 1 0 1', 'vertex -1 is unknown; expected one of the 3'),
-    ('EDGE_SE2 7 7 1 0 0 1 0 0 1 0 1', 'an edge from vertex 7 to itself; expected two vertices'),
-    ('VERTEX_SE2 7 0 0 0', 'vertex 7 stands twice, before at line 2; expected each once'),
-    ('VERTEX2 7 0 0 0', 'vertex 7 stands twice, before at line 2; expected each once'),
-    ('EGDE_SE2 3 7 1 0 0 1 0 0 1 0 1', "unknown tag 'EGDE_SE2'; expected VERTEX_SE2, EDGE_SE2, "),
-    ('VERTEX_SE3:QUAT 5 0 0 0 0 0 0 1', 'VERTEX_SE3:QUAT: 3D graphs are not supported yet'),
-    ('EDGE_SE3:QUAT 5 6', 'EDGE_SE3:QUAT: 3D graphs are not supported yet'),
-    ('VERTEX3 5 0 0 0 0 0 0', 'VERTEX3: 3D graphs are not supported yet'),
-    ('EDGE3 5 6', 'EDGE3: 3D graphs are not supported yet'),
+    ('EDGE_PRIOR_SE2 3 7 1 0 0 1 0 0 1 0 1', 'EDGE_PRIOR_SE2: 11 fields; expected 1 whole and 9'),
 ])
-def test_each_malformed_line_is_named(write, line, message):
-    text = SQUARE + line + '\n' + 'EDGE_SE2 3 9 1 1 3 1 0 0 1 0 1\n'
-    assert message_of(write(text)).startswith(f':9: {message}')
+def test_each_order_of_the_information_is_its_own(write, line, message):
+    assert message_of(write(SQUARE + line + '\n')).startswith(f':9: {message}')
 
 
 @pytest.mark.parametrize(('content', 'message'), [
@@ -251,7 +320,9 @@ def test_what_the_papers_graphs_hold(datasets):
 @pytest.mark.parametrize(('name', 'tag'), [
     ('sphere2500', 'VERTEX_SE3:QUAT'), ('parking-garage', 'VERTEX_SE3:QUAT')])
 def test_3d_graphs_are_refused(datasets, name, tag):
-    assert message_of(datasets / f'{name}.g2o').startswith(f':1: {tag}: 3D graphs are not')
+    assert message_of(datasets / f'{name}.g2o') == (
+        f":1: '{tag}': 3D graphs are not supported yet; expected a graph in the plane "
+        '(EDGE_SE2 or EDGE2 lines)')
 
 
 @pytest.mark.parametrize('exponent', [-30, -8, 0, 8, 25])
@@ -278,11 +349,12 @@ def test_the_graph_survives_a_failing_replacement(tmp_path, rng):
     path, record = tmp_path / 'a.g2o', random_record(rng)
     write_graph_file(path, record)
     before = {p: p.read_bytes() for p in tmp_path.iterdir()}
-    poses = record.poses.copy()
-    poses[2, 1] = np.nan
-    with pytest.raises(FileError, match=rf'VERTEX_SE2 \[{record.ids[2]}\] is not finite'):
-        write_graph_file(path, replace(record, poses=poses))
-    assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
+    for number in np.nan, np.inf, -1.1e30:
+        poses = record.poses.copy()
+        poses[2, 1] = number
+        with pytest.raises(FileError, match=f'VERTEX_SE2 {record.ids[2]} would be .* expected'):
+            write_graph_file(path, replace(record, poses=poses))
+        assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
 
 
 @pytest.mark.parametrize(('text', 'message'), [
@@ -315,7 +387,7 @@ def test_vertices_alone(write):
 
 
 def test_the_readers_need_no_bag_or_plot_library():
-    modules = ['files', 'graph_file', 'trajectory', 'messages', 'bag', 'graph_bag']
+    modules = ['files', 'graph_file', 'side_files', 'trajectory', 'messages', 'bag', 'graph_bag']
     code = (''.join(f'import l1slam_ros.io.{name}\n' for name in modules)
             + 'import sys\nprint([m for m in sys.modules if m.split(".")[0] in '
               '("rosbags", "mcap", "matplotlib", "yaml", "rclpy")])')

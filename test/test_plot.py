@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.io.plot import Curve, MapDrawing, plot_curves, plot_maps
+from l1slam_ros.io.plot import Curve, MapDrawing, plot_curves, plot_maps, plot_solution
 
 ROOT = Path(__file__).parents[1]
 SQUARE = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0], [0.0, 1.0]])
@@ -73,6 +73,17 @@ def test_rejected_loops_are_red(tmp_path):
     assert reddish(tmp_path / 'one.png') > 300
 
 
+def test_false_loops_are_red_and_named_as_such(tmp_path):
+    drawing = MapDrawing('', SQUARE, loops=np.array([[1, 3]]), false=np.array([[0, 2], [0, 3]]),
+                         name='stored')
+    plot_maps(tmp_path / 'map.png', [drawing])
+    assert reddish(tmp_path / 'map.png') > 300
+    plot_maps(tmp_path / 'map.svg', [drawing])
+    said = words(tmp_path / 'map.svg')
+    assert '5 poses, 1 loops, 2 false' in said and 'false loops' in said and 'stored' in said
+    assert 'rejected' not in said and 'optimised' not in said
+
+
 def test_axes_are_equal(tmp_path):
     """The blue square is as wide as it is high."""
     path = tmp_path / 'map.png'
@@ -124,6 +135,30 @@ def test_curves_are_drawn_on_a_logarithmic_scale(tmp_path):
         assert word in words(path)
 
 
+def curve_of(costs):
+    return Curve('l1 cost', np.arange(len(costs), dtype=float), np.array(costs),
+                 ((0.0, 5940.0, 'initial'), (len(costs) - 1.0, costs[-1], 'final')))
+
+
+def test_a_solution_is_a_map_and_the_way_there(tmp_path):
+    plot_maps(tmp_path / 'alone.png', [MapDrawing('square', SQUARE)])
+    plot_solution(tmp_path / 'both.png', MapDrawing('square', SQUARE), curve_of([1158.0, 972.0]))
+    alone, both = (pixels(tmp_path / f'{name}.png').shape for name in ('alone', 'both'))
+    assert both[1] > 1.6 * alone[1] and both[0] < 1.2 * alone[0]
+    plot_solution(tmp_path / 'both.svg', MapDrawing('square', SQUARE), curve_of([1158.0, 972.0]))
+    for word in 'square', 'l1 cost', 'iteration', 'initial 5940', 'final 972', '3000':
+        assert word in words(tmp_path / 'both.svg')
+
+
+@pytest.mark.parametrize('costs', [
+    [0.0], [0.0, 0.0], [5940.0], [971.78, 971.7, 971.69], [2.7e6, 3772.0], [5.0, 0.0],
+    np.linspace(9e3, 1e3, 1000)])
+@pytest.mark.filterwarnings('error')
+def test_any_costs_are_drawn_without_a_warning(tmp_path, costs):
+    plot_solution(tmp_path / 'a.png', MapDrawing('', SQUARE * [30, 1]), curve_of(list(costs)))
+    assert pixels(tmp_path / 'a.png').min() < 100
+
+
 @pytest.mark.parametrize('name, start', [
     ('map.png', b'\x89PNG'), ('MAP.PNG', b'\x89PNG'), ('map.svg', b'<?xml'), ('map.pdf', b'%PDF')])
 def test_the_suffix_decides(name, start, tmp_path):
@@ -145,7 +180,8 @@ def test_another_suffix_is_refused(name, tmp_path):
 
 def test_what_cannot_be_written_is_said_and_leaves_nothing(tmp_path):
     (tmp_path / 'taken.png').mkdir()
-    for path in tmp_path / 'missing' / 'map.png', tmp_path / 'taken.png':
+    missing = tmp_path / 'missing' / 'map.png'
+    for path in missing, tmp_path / 'taken.png':
         with pytest.raises(FileError, match=f'^{path}: cannot be written: '):
             plot_maps(path, [MapDrawing('', SQUARE)])
     assert [path.name for path in tmp_path.iterdir()] == ['taken.png']

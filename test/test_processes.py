@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The installed executables as processes: `replay` plays a bag into `backend`, signals end it."""
 
+import re
 import signal
 import subprocess
 import time
@@ -15,6 +16,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
 from l1slam_ros.demo import executable
+from l1slam_ros.io.bag import read_raw
 from l1slam_ros.io.graph_bag import write_graph_bag
 from l1slam_ros.io.graph_file import GraphRecord
 
@@ -91,7 +93,7 @@ def test_signals_end_backend_with_exit_code_0(backend, name):
     assert 'Traceback' not in backend.stderr.read()
 
 
-def test_replay_is_paced(bag):
+def test_replay_is_paced(backend, bag):
     began = time.monotonic()
     assert replay(bag, '--rate', '5', '--duration', '10').returncode == 0
     assert time.monotonic() - began >= 2.0
@@ -105,6 +107,18 @@ def test_replay_of_no_bag_is_one_line_and_exit_code_2(arguments, complaint):
     played = replay(*arguments)
     assert played.returncode == 2
     assert complaint in played.stderr and played.stderr.count('\n') == 1
+
+
+def test_replay_of_a_damaged_bag_plays_a_part_says_so_and_exits_with_3(backend, bag, paths):
+    file = bag / 'bag.mcap'
+    file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
+    odometry = sum(message.topic == '/odom' for message in read_raw(file, None, lambda _: None))
+    assert 50 < odometry < 150
+    played = replay(bag, '--rate', '10')
+    assert played.returncode == 3
+    assert re.fullmatch(rf'replay: {file} is damaged: it breaks off after [0-9,]+ bytes; '
+                        '[0-9,]+ messages before that were used\n', played.stderr)
+    paths(lambda path: len(path.poses) == odometry)
 
 
 def test_replay_of_a_topic_that_is_not_there_names_those_that_are(bag):

@@ -9,7 +9,6 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.trajectory import (
     invented_stamps,
     read_reference,
-    write_false_loops,
     write_truth,
     write_tum,
 )
@@ -108,8 +107,3 @@ def test_each_malformed_reference_is_named(tmp_path, text, message):
 def test_no_reference(tmp_path):
     with pytest.raises(FileError, match='cannot be read: No such file or directory'):
         read_reference(tmp_path / 'none.txt')
-
-
-def test_false_loops(tmp_path):
-    write_false_loops(tmp_path / 'a.false.txt', [(1, 5), (2, 9)])
-    assert (tmp_path / 'a.false.txt').read_text() == '1 5\n2 9\n'

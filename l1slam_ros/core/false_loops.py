@@ -64,6 +64,17 @@ def insert_loops(graph: FactorGraph, loops: Loops) -> FactorGraph:
     return longer
 
 
+def without_factors(graph: FactorGraph, left_out: np.ndarray) -> FactorGraph:
+    """Return a new graph without some between factors, left_out : (m,) bool."""
+    factors, prior, kept = graph.between, graph.prior, ~left_out
+    shorter = FactorGraph(graph.manifold)
+    shorter.add_poses(graph.n_poses)
+    shorter.add_prior(prior.i, prior.measurement, _information(prior.sqrt_information))
+    shorter.add_between(factors.i[kept], factors.j[kept], factors.measurement[kept],
+                        _information(factors.sqrt_information[kept]))
+    return shorter
+
+
 def random_false_loops(
     graph: FactorGraph, poses: Array, count: int, rng: np.random.Generator
 ) -> Loops:
@@ -80,6 +91,7 @@ def random_false_loops(
     GraphError : too few far pairs are free.
 
     """
+    _require_room(graph, count)
     i, j, _ = _far_runs(graph, poses, np.ones(count, np.int64), rng)
     return _loops(graph, i, j, _small_offsets(graph.manifold, count, rng))
 
@@ -88,6 +100,7 @@ def identity_false_loops(
     graph: FactorGraph, poses: Array, count: int, rng: np.random.Generator
 ) -> Loops:
     """Return loops between far poses that measure exactly nothing; as `random_false_loops`."""
+    _require_room(graph, count)
     i, j, _ = _far_runs(graph, poses, np.ones(count, np.int64), rng)
     return _loops(graph, i, j, graph.manifold.identity(count))
 
@@ -102,6 +115,7 @@ def grouped_false_loops(
     others follow from it by the odometry of both stretches, without any noise of their own. A
     run has 10 to 20 loops, the last one of all perhaps fewer.
     """
+    _require_room(graph, count)
     few, many = _GROUP
     ends = np.cumsum(rng.integers(few, many + 1, size=count // few + 1)).clip(max=count)
     lengths = np.diff(ends, prepend=0)
@@ -119,6 +133,15 @@ FALSE_LOOPS: dict[str, Callable[[FactorGraph, Array, int, np.random.Generator], 
     'identity': identity_false_loops,
     'grouped': grouped_false_loops,
 }
+
+
+def _require_room(graph: FactorGraph, count: int) -> None:
+    """Refuse, before arrays of that size are made, more loops than there are pairs."""
+    n = graph.n_poses
+    pairs = n * (n - 1) // 2
+    if count > pairs:
+        raise GraphError(f'{count} false loops asked for, found {pairs} pairs among {n} '
+                         'keyframes')
 
 
 def _small_offsets(manifold: Manifold, count: int, rng: np.random.Generator) -> Array:
@@ -151,8 +174,9 @@ def _far_runs(
         todo = todo[~kept]
         if not len(todo):
             return _run_pairs(start, lengths)
-    raise GraphError(f'{lengths.sum()} false loops asked for, found far pairs of keyframes for '
-                     f'{lengths.sum() - lengths[todo].sum()} among {n}')
+    raise GraphError(f'{lengths.sum()} false loops asked for, found room for '
+                     f'{lengths.sum() - lengths[todo].sum()} between far pairs among {n} '
+                     'keyframes')
 
 
 def _run_pairs(start: Indices, lengths: Indices) -> tuple[Indices, Indices, Indices]:

@@ -1,30 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Bags in and out; the only importer of the bag libraries, and only where they are needed.
+Bags in: rosbag2 directories, bare `.mcap` and `.db3` files, `.bag` files of ROS 1.
 
-In: rosbag2 directories, bare `.mcap` and `.db3` files. Out: rosbag2 directories (mcap) that
-`ros2 bag play`, rosbags, Foxglove and the mcap tools read. A note of ours in a bag's metadata
-(`custom_data`, key `l1slam`) says what its messages mean.
+The bag library reads them while it can; where it gives up, `salvage` goes on. The bag libraries
+are imported by `bag`, `bag_writer`, `salvage` and the walks alone, and only where needed.
 """
 
 import os
-import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any, NamedTuple
 
-from l1slam_ros.core.errors import FileError, L1SlamError
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.io.bag_writer import NOTE_KEY
+from l1slam_ros.io.salvage import (
+    METADATA,
+    Salvage,
+    complaint,
+    directory_metadata,
+    storage_files,
+)
+from l1slam_ros.io.sqlite_pages import is_cut
+from l1slam_ros.io.walk import RawMessage, ros1_types
+from l1slam_ros.io.walk_mcap import is_indexed, mcap_metadata
+from l1slam_ros.io.walk_sqlite import has_journal, sqlite_metadata
 
-_NOTE_KEY = 'l1slam'
-_METADATA = 'metadata.yaml'
-_STORAGE_SUFFIXES = ('.mcap', '.db3')
-# What recorders leave in a bag's directory besides.
-_BAG_SUFFIXES = (*_STORAGE_SUFFIXES, '.db3-shm', '.db3-wal', '.zstd')
-# The longest piece of a library's complaint that is passed on.
-_COMPLAINT = 200
+BAG_SUFFIXES = ('.mcap', '.db3', '.bag')
+_TO_ITS_END = 'expected a bag that can be read to its end'
+# Told of damage, in one sentence.
+OnDamage = Callable[[str], None]
 
 
 class BagMessage(NamedTuple):
@@ -34,15 +40,6 @@ class BagMessage(NamedTuple):
     msgtype: str
     time: int
     message: Any
-
-
-class RawMessage(NamedTuple):
-    """The same, still serialised (CDR)."""
-
-    topic: str
-    msgtype: str
-    time: int
-    data: bytes
 
 
 @dataclass(frozen=True)
@@ -57,7 +54,7 @@ class TopicSummary:
 @dataclass(frozen=True)
 class BagSummary:
     """
-    What a bag holds.
+    What a bag holds, as far as it can be read.
 
     start : time of the first message [ns]; duration : until the last one [ns]; note : `read_note`.
     """
@@ -69,30 +66,45 @@ class BagSummary:
 
 
 def read_messages(
-    path: str | os.PathLike[str], topics: Collection[str] | None = None
+    path: str | os.PathLike[str],
+    topics: Collection[str] | None = None,
+    on_damage: OnDamage | None = None,
 ) -> Iterator[BagMessage]:
     """
     Yield the messages of a bag in order of time.
 
     Parameters
     ----------
-    path : a rosbag2 directory, .mcap or .db3
-    topics : only these; None: all
+    path : a rosbag2 directory, .mcap, .db3 or .bag
+    topics : only these, as far as the bag has them; None: all
+    on_damage : told, in the end, why only a part could be read; None: damage is an error
 
     Raises
     ------
-    FileError : it cannot be read, or has none of the topics.
+    FileError : nothing in it can be read, or it is damaged and nobody wants to be told.
 
     """
-    with _reading(path) as reader:
-        for connection, time, data in reader.messages(_connections(path, reader, topics)):
-            message = reader.deserialize(data, connection.msgtype)
-            yield BagMessage(connection.topic, connection.msgtype, time, message)
+    count = undecodable = 0
+    for raw, types in _messages(path, topics, None, None, on_damage):
+        try:
+            message = types.deserialize_cdr(raw.data, raw.msgtype)
+        except Exception as error:  # bytes that are no message make the library raise anything
+            undecodable += 1
+            if on_damage is None:
+                raise FileError(path, f'a message on {raw.topic} cannot be decoded '
+                                f'({complaint(error)}); {_TO_ITS_END}') from error
+            continue
+        count += 1
+        yield BagMessage(raw.topic, raw.msgtype, raw.time, message)
+    if undecodable and on_damage is not None:
+        on_damage(f'{path} is damaged: {undecodable:,} messages cannot be decoded; '
+                  f'{count:,} others were used')
 
 
 def read_raw(
     path: str | os.PathLike[str],
     topics: Collection[str] | None = None,
+    on_damage: OnDamage | None = None,
     *,
     start: int | None = None,
     stop: int | None = None,
@@ -102,10 +114,8 @@ def read_raw(
 
     start, stop : only messages from start [ns] on and before stop [ns].
     """
-    with _reading(path) as reader:
-        connections = _connections(path, reader, topics)
-        for connection, time, data in reader.messages(connections, start, stop):
-            yield RawMessage(connection.topic, connection.msgtype, time, bytes(data))
+    for message, _ in _messages(path, topics, start, stop, on_damage):
+        yield message
 
 
 def bag_summary(path: str | os.PathLike[str]) -> BagSummary:
@@ -114,218 +124,159 @@ def bag_summary(path: str | os.PathLike[str]) -> BagSummary:
 
     Raises
     ------
-    FileError : it cannot be read.
+    FileError : nothing in it can be read.
 
     """
-    with _reading(path) as reader:
-        topics = tuple(TopicSummary(name, topic.msgtype or 'several types', topic.msgcount)
-                       for name, topic in sorted(reader.topics.items()))
-        # Without messages the library's times are its largest and smallest numbers.
-        start = reader.start_time if reader.message_count else 0
-        # The library's end lies one nanosecond behind the last message.
-        duration = reader.end_time - 1 - start if reader.message_count else 0
-    return BagSummary(topics, start, duration, read_note(path))
+    bag = _bag_path(path)
+    try:
+        with _reader(bag) as reader:
+            counts = [(name, topic.msgtype or 'several types', topic.msgcount)
+                      for name, topic in reader.topics.items()]
+            # Without messages the library's times are its largest and smallest numbers; its end
+            # lies one nanosecond behind the last message.
+            times = [reader.start_time, reader.end_time - 1] if reader.message_count else [0]
+    except Exception as error:  # damaged bags make the library raise anything
+        salvage = _salvage(bag, error)
+        counts = [(*names, count) for names, count in salvage.counts.items()]
+        times = salvage.times
+    topics = tuple(TopicSummary(*entry) for entry in sorted(counts))
+    return BagSummary(topics, min(times), max(times) - min(times), read_note(path))
 
 
 def read_note(path: str | os.PathLike[str]) -> dict[str, str]:
     """
-    Return what this package noted in a bag's metadata, {} where it noted nothing.
+    Return what this package noted in a bag, {} where it noted nothing or nothing can be read.
 
     `keyframes: every`: each odometry message is a keyframe; `covariance: increment`: its
     covariance is that of the motion since the message before.
 
     Raises
     ------
-    FileError : the bag cannot be read.
+    FileError : there is no such bag.
 
     """
+    bag = _bag_path(path)
+    for file in [bag] if bag.is_file() else [bag, *storage_files(bag)]:
+        try:
+            note = _note_in(file)
+        except Exception:  # damaged files make the libraries raise anything
+            continue
+        if note:
+            return {str(key): str(value) for key, value in note.items()}
+    return {}
+
+
+def _note_in(file: Path) -> dict[str, str]:
+    """Return the note in a file, or in the metadata.yaml of a directory."""
     import yaml
 
-    path = _bag_path(path)
-    with _named_errors(path):
-        metadata = _directory_metadata(path) if path.is_dir() else _file_metadata(path)
-        note = yaml.safe_load((metadata.get('custom_data') or {}).get(_NOTE_KEY, '{}'))
-        return {str(key): str(value) for key, value in note.items()}
-
-
-class BagWriter:
-    """Writes messages into a new bag; `types` holds the classes of all ROS 2 messages by name."""
-
-    def __init__(self, writer: Any, typestore: Any):
-        self._writer, self._typestore = writer, typestore
-        self._connections: dict[str, Any] = {}
-        self.types: dict[str, Any] = typestore.types
-
-    def add_topic(self, topic: str, msgtype: str) -> None:
-        """Announce a topic: reliable, volatile, the last 1000 messages kept."""
-        self._connections[topic] = self._writer.add_connection(
-            topic, msgtype, typestore=self._typestore, offered_qos_profiles=[_offered_qos()])
-
-    def write(self, topic: str, time: int, message: Any) -> None:
-        """Write a message at a time [ns]."""
-        connection = self._connections[topic]
-        data = self._typestore.serialize_cdr(message, connection.msgtype)
-        self._writer.write(connection, time, data)
-
-
-@contextmanager
-def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagWriter]:
-    """
-    Yield the writer of a bag (a rosbag2 directory, mcap), in its place when the block succeeds.
-
-    Parameters
-    ----------
-    path : a bag already there is replaced once the new one is complete
-    note : what `read_note` will return
-
-    Raises
-    ------
-    FileError : the bag cannot be written, or something that is no bag is in its place.
-
-    """
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    target = Path(os.path.abspath(path))
-    with _replacing_directory(target) as temporary:
-        writer = Writer(temporary, version=9, storage_plugin=StoragePlugin.MCAP)
-        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-        writer.set_custom_data(_NOTE_KEY, _note_text(note))
-        with writer:
-            yield BagWriter(writer, get_typestore(Stores.ROS2_JAZZY))
+    metadata: dict[str, Any] = {}
+    if file.is_dir():
+        metadata = directory_metadata(file)
+    elif file.suffix == '.db3':
+        metadata = yaml.safe_load(sqlite_metadata(file)) or {}
+    elif file.suffix == '.mcap':
+        for name, entries in mcap_metadata(file):
+            if name == NOTE_KEY:
+                return entries
+            if name == 'rosbag2':
+                metadata = yaml.safe_load(entries['serialized_metadata'])
+    note: dict[str, str] = yaml.safe_load((metadata.get('custom_data') or {}).get(NOTE_KEY, '{}'))
+    return note
 
 
 def _bag_path(path: str | os.PathLike[str]) -> Path:
     bag = Path(path)
     if not bag.exists():
         raise FileError(path, 'no such file or directory; expected a bag')
-    if not bag.is_dir() and bag.suffix not in _STORAGE_SUFFIXES:
-        raise FileError(path, f'no bag by its name; expected {", ".join(_STORAGE_SUFFIXES)} '
+    if bag.is_file() and bag.suffix not in BAG_SUFFIXES:
+        raise FileError(path, f'no bag by its name; expected {", ".join(BAG_SUFFIXES)} '
                         'or a rosbag2 directory')
-    if bag.is_dir() and not (bag / _METADATA).is_file():
-        raise FileError(path, f'a directory without {_METADATA}; expected a rosbag2 directory')
+    if bag.is_dir() and not ((bag / METADATA).is_file() or storage_files(bag)):
+        raise FileError(path, f'a directory without {METADATA} or any file of a bag; '
+                        'expected a rosbag2 directory')
     return bag
 
 
+class _Place:
+    """How far the messages of a bag have been read: `count` of them."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._time = -1
+        self._at_time = 0
+
+    def advance(self, time: int) -> None:
+        """Count a message."""
+        self._at_time = self._at_time + 1 if time == self._time else 1
+        self._time = time
+        self.count += 1
+
+    def rest(self, messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
+        """Yield those of all messages, in order of time, that have not been read yet."""
+        time, at_time = self._time, self._at_time
+        for message in messages:
+            at_time -= message.time == time
+            if message.time > time or (message.time == time and at_time < 0):
+                yield message
+
+
+def _messages(
+    path: str | os.PathLike[str], topics: Collection[str] | None, start: int | None,
+    stop: int | None, on_damage: OnDamage | None
+) -> Iterator[tuple[RawMessage, Any]]:
+    """Yield the messages of a bag, each with the types to decode it by."""
+    bag, place = _bag_path(path), _Place()
+    try:
+        for message, types in _by_library(bag, topics, start, stop):
+            place.advance(message.time)
+            yield message, types
+        return
+    except Exception as error:  # damaged bags make the library raise anything
+        salvage = _salvage(bag, error)
+    damage = salvage.damage
+    if damage is not None and on_damage is None:
+        raise FileError(damage.path, f'damaged{damage.where}; {_TO_ITS_END}')
+    types = salvage.types()
+    for message in place.rest(salvage.messages(topics, start, stop)):
+        place.advance(message.time)
+        yield message, types
+    if damage is not None and on_damage is not None:
+        on_damage(damage.sentence(place.count))
+
+
+def _by_library(
+    bag: Path, topics: Collection[str] | None, start: int | None, stop: int | None
+) -> Iterator[tuple[RawMessage, Any]]:
+    with _reader(bag) as reader:
+        types = reader.typestore if reader.is2 else ros1_types(reader.typestore.fielddefs)
+        connections = [c for c in reader.connections if topics is None or c.topic in topics]
+        # No connection would mean all of them to the library.
+        for c, time, data in reader.messages(connections, start, stop) if connections else ():
+            cdr = bytes(data if reader.is2 else types.ros1_to_cdr(data, c.msgtype))
+            yield RawMessage(c.topic, c.msgtype, time, cdr), types
+
+
 @contextmanager
-def _reading(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Yield a reader of the bag."""
+def _reader(bag: Path) -> Iterator[Any]:
+    """Yield the library's reader of a bag that it can be trusted with."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    bag = _bag_path(path)
+    for file in storage_files(bag) if bag.is_dir() else [bag]:
+        if file.suffix == '.mcap' and not is_indexed(file):
+            raise LookupError(f'{file.name} has no sound index')
+        if file.suffix == '.db3' and (has_journal(file) or is_cut(file)):
+            raise LookupError(f'{file.name} is not all there')
     # The definitions in the bag come first; sqlite bags of older distributions have none.
     typestore = get_typestore(Stores.ROS2_JAZZY)
-    with _named_errors(path), AnyReader([bag], default_typestore=typestore) as reader:
+    with AnyReader([bag], default_typestore=typestore) as reader:
         yield reader
 
 
-@contextmanager
-def _named_errors(path: object) -> Iterator[None]:
-    """Turn what the bag libraries raise on damaged files, nearly anything, into a FileError."""
-    try:
-        yield
-    except L1SlamError:
-        raise
-    except Exception as error:
-        complaint = ' '.join(str(error).split())[:_COMPLAINT] or type(error).__name__
-        raise FileError(path, f'damaged, or no bag ({complaint}); expected a bag that can be '
-                        'read to its end') from error
-
-
-def _connections(path: object, reader: Any, topics: Collection[str] | None) -> list[Any]:
-    """Return the library's connections of the topics."""
-    found = [c for c in reader.connections if topics is None or c.topic in topics]
-    if topics is not None and not found:
-        names = ', '.join(sorted({c.topic for c in reader.connections})) or 'no topic at all'
-        raise FileError(path, f'the bag has {names}; expected {", ".join(sorted(topics))}')
-    return found
-
-
-def _directory_metadata(bag: Path) -> dict[str, Any]:
-    import yaml
-
-    document = yaml.safe_load((bag / _METADATA).read_text(encoding='utf-8'))
-    metadata: dict[str, Any] = document['rosbag2_bagfile_information']
-    return metadata
-
-
-def _file_metadata(bag: Path) -> dict[str, Any]:
-    """Return what rosbag2 keeps inside an mcap file; .db3 files are never written here."""
-    import yaml
-    from mcap.reader import make_reader
-
-    if bag.suffix != '.mcap':
-        return {}
-    with bag.open('rb') as file:
-        for record in make_reader(file).iter_metadata():
-            if record.name == 'rosbag2':
-                return yaml.safe_load(record.metadata['serialized_metadata']) or {}
-    return {}
-
-
-def _note_text(note: dict[str, str]) -> str:
-    return '{' + ', '.join(f'{key}: {value}' for key, value in note.items()) + '}'
-
-
-def _offered_qos() -> Any:
-    from rosbags.interfaces import (
-        Qos,
-        QosDurability,
-        QosHistory,
-        QosLiveliness,
-        QosReliability,
-        QosTime,
-    )
-
-    # As rosbag2 writes it: 2^63 - 1 nanoseconds.
-    forever = QosTime(9223372036, 854775807)
-    return Qos(QosHistory.KEEP_LAST, 1000, QosReliability.RELIABLE, QosDurability.VOLATILE,
-               forever, forever, QosLiveliness.AUTOMATIC, forever, False)
-
-
-def _refuse_other_than_bag(target: Path) -> None:
-    """Refuse to replace what is there, unless it is a bag and nothing else."""
-    if not os.path.lexists(target):
-        return
-    if not (target / _METADATA).is_file():
-        raise FileError(target, 'exists and is no bag, so it is not overwritten; expected a bag '
-                        'or nothing there')
-    for child in sorted(target.iterdir()):
-        if child.name != _METADATA and not child.name.endswith(_BAG_SUFFIXES):
-            raise FileError(target, f'holds {child.name}, which is no part of a bag, so it is not '
-                            'overwritten; expected a bag or nothing there')
-
-
-@contextmanager
-def _replacing_directory(target: Path) -> Iterator[Path]:
-    """Yield the name of a directory to make, which takes the place of `target` in the end."""
-    scratch = None
-    try:
-        _refuse_other_than_bag(target)
-        scratch = Path(mkdtemp(prefix=f'.{target.name}.', suffix='.tmp', dir=target.parent))
-        # The bag is made under its own name: that of the file inside repeats it.
-        made = scratch / target.name
-        yield made
-        for file in made.iterdir():
-            with file.open('rb') as written:
-                os.fsync(written.fileno())
-        _swap(made, target, scratch / f'{target.name}.former')
-    except OSError as error:
-        raise FileError(target, f'cannot be written: {error.strerror or error}') from error
-    finally:
-        if scratch is not None:
-            shutil.rmtree(scratch, ignore_errors=True)
-
-
-def _swap(made: Path, target: Path, former: Path) -> None:
-    """Put `made` in the place of `target`, and what was there, if anything, into `former`."""
-    replaces = os.path.lexists(target)
-    if replaces:
-        os.rename(target, former)
-    try:
-        os.rename(made, target)
-    except OSError:
-        if replaces:
-            os.rename(former, target)
-        raise
+def _salvage(bag: Path, error: Exception) -> Salvage:
+    """Return what can be had of a bag that the library gave up on."""
+    salvage = Salvage(bag)
+    if not salvage.counts:
+        raise FileError(bag, f'damaged, or no bag ({complaint(error)}); {_TO_ITS_END}') from error
+    return salvage

@@ -21,6 +21,8 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.manifold import Array, Indices
 
 NANOSECONDS = 10**9
+# No pose or information is beyond this, and with less no square of one leaves the doubles.
+LARGEST = 1e30
 # The longest piece of a damaged file that is quoted in an error.
 _QUOTED = 40
 
@@ -54,6 +56,13 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink()
+
+
+def require_folder(path: str | os.PathLike[str]) -> None:
+    """Refuse, before any work is done, to write where there is no folder."""
+    folder = Path(path).absolute().parent
+    if not folder.is_dir():
+        raise FileError(path, f'cannot be written: {folder} is no folder')
 
 
 def put_lines(path: Path, lines: Iterable[str]) -> None:
@@ -108,7 +117,7 @@ def parse_rows(
     path: object, name: str, lines: TextLines, ids: int, values: int
 ) -> tuple[Indices, Array]:
     """
-    Convert lines of `ids` whole numbers followed by `values` finite numbers.
+    Convert lines of `ids` whole numbers followed by `values` finite numbers, none beyond 1e30.
 
     Returns
     -------
@@ -125,8 +134,9 @@ def parse_rows(
         k = first_failure(len(lines.texts),
                           lambda part: _convert(lines.texts[part], dtype) is not None)
         found = _complaint(lines.texts[k], ids, values)
-        expected = f'{ids} whole and {values} finite numbers'
-        raise FileError(path, f'{name}: {found}; expected {expected}', lines.numbers[k])
+        finite = f' and {values} finite' if values else ''
+        raise FileError(path, f'{name}: {found}; expected {ids} whole{finite} numbers',
+                        lines.numbers[k])
     return rows['ids'], rows['values']
 
 
@@ -166,52 +176,32 @@ def stamp_from_text(text: str) -> int:
     return int((seconds * NANOSECONDS).to_integral_value())
 
 
-def stamps_path(path: str | os.PathLike[str]) -> Path:
-    """Return the name of the side file with the stamps of a graph file."""
-    return Path(f'{os.fspath(path)}.stamps.txt')
-
-
-def write_stamps(path: Path, ids: Indices, stamps: Indices) -> None:
+def settled(values: Array) -> Array:
     """
-    Write the stamp [ns] of each vertex, `id seconds`: ids, stamps (n,).
+    Return the 15-digit decimal next to each value where rounding cannot tell the two apart.
 
-    Raises
-    ------
-    FileError : the file cannot be written.
-
+    For numbers that come out of a computation: a root that is squared again makes
+    50.00000000000001 of a 50.
     """
-    write_lines(path, (f'{k} {stamp_text(stamp)}' for k, stamp
-                       in zip(ids.tolist(), stamps.tolist(), strict=True)))
-
-
-def read_stamps(path: Path, ids: Indices) -> Indices | None:
-    """
-    Return the stamps [ns] of the vertices `ids` (n,), or None where there is no such file.
-
-    Raises
-    ------
-    FileError : the file is damaged, or is not about these vertices.
-
-    """
-    if not path.exists():
-        return None
-    lines = read_lines(path)
-    stamp_of = {}
-    for number, text in zip(lines.numbers, lines.texts, strict=True):
-        try:
-            name, stamp = text.split()
-            stamp_of[int(name)] = stamp_from_text(stamp)
-        except ValueError as error:
-            raise FileError(path, f'{quoted(text)}; expected a vertex id and seconds',
-                            number) from error
-    if len(lines.texts) != len(ids) or stamp_of.keys() != set(ids.tolist()):
-        raise FileError(path, f'{len(lines.texts)} stamps that are not those of the {len(ids)} '
-                        'vertices; expected one for each, or no such file')
-    return np.array([stamp_of[k] for k in ids.tolist()], np.int64)
+    magnitude = np.abs(np.where(values == 0.0, 1.0, values))
+    # Powers up to 10^22 are exact, so the quotient is the double nearest to the decimal.
+    places = np.clip(14 - np.floor(np.log10(magnitude)), 0, 22).astype(int)
+    scale = np.array([float(f'1e{k}') for k in range(23)])[places]
+    decimal = np.rint(values * scale) / scale
+    return np.where(np.abs(decimal - values) <= 4 * np.spacing(magnitude), decimal, values)
 
 
 def _convert(texts: list[str], dtype: np.dtype) -> np.ndarray | None:
     """Return the rows as a structured array, or None when any of them is not as it should be."""
+    rows = _numbers(texts, dtype)
+    # Written so that NaN fails too.
+    if rows is None or not (np.abs(rows['values']) <= LARGEST).all():
+        return None
+    return rows
+
+
+def _numbers(texts: list[str], dtype: np.dtype) -> np.ndarray | None:
+    """Return the rows as a structured array, or None when any of them has other fields."""
     if not texts:
         return np.empty(0, dtype)
     with warnings.catch_warnings():
@@ -222,9 +212,7 @@ def _convert(texts: list[str], dtype: np.dtype) -> np.ndarray | None:
         except (ValueError, Warning):
             return None
     # `loadtxt` passes over rows without any field.
-    if len(rows) != len(texts) or not np.isfinite(rows['values']).all():
-        return None
-    return rows
+    return rows if len(rows) == len(texts) else None
 
 
 def _complaint(text: str, ids: int, values: int) -> str:
@@ -233,9 +221,12 @@ def _complaint(text: str, ids: int, values: int) -> str:
     if len(fields) != ids + values:
         return f'{len(fields)} fields'
     for field in fields[:ids]:
-        if _convert([field], np.dtype([('values', np.int64, (1,))])) is None:
+        if _numbers([field], np.dtype([('values', np.int64, (1,))])) is None:
             return f'{quoted(field)} is not a whole number of 64 bits'
     for field in fields[ids:]:
-        if _convert([field], np.dtype([('values', np.float64, (1,))])) is None:
+        number = _numbers([field], np.dtype([('values', np.float64, (1,))]))
+        if number is None or not np.isfinite(number['values']).all():
             return f'{quoted(field)} is not a finite number'
+        if np.abs(number['values']) > LARGEST:
+            return f'{quoted(field)} is beyond {LARGEST:g}'
     return f'{quoted(text)} is not understood'

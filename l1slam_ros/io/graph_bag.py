@@ -18,7 +18,7 @@ import numpy as np
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.manifold import Array, Indices
-from l1slam_ros.io.bag import BagWriter, new_bag
+from l1slam_ros.io.bag_writer import BagWriter, new_bag
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.graph_file import GraphRecord
 from l1slam_ros.io.messages import reference_frame_id

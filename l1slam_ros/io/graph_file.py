@@ -25,17 +25,17 @@ from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.noise import square_root_information
 from l1slam_ros.io.files import (
+    LARGEST,
     TextLines,
     first_failure,
     parse_rows,
     put_lines,
     quoted,
     read_lines,
-    read_stamps,
     replacing,
-    stamps_path,
-    write_stamps,
+    settled,
 )
+from l1slam_ros.io.side_files import read_stamps, stamps_path, write_stamps
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,8 @@ class GraphRecord:
 
     graph : the factors, in the order of the file; poses : (n, p) the stored start, None when
     the file has none; ids : (n,) vertex ids, ascending: keyframe k is vertex ids[k];
-    stamps : (n,) [ns] or None; skipped : a sentence on each kind of line that was not used.
+    stamps : (n,) [ns] or None; skipped : a sentence on each kind of line that was not used;
+    damage : a sentence where only a part of the input could be read, else empty.
     """
 
     graph: FactorGraph
@@ -53,6 +54,7 @@ class GraphRecord:
     ids: Indices
     stamps: Indices | None = None
     skipped: tuple[str, ...] = ()
+    damage: str = ''
 
 
 @dataclass(frozen=True)
@@ -83,16 +85,26 @@ _TAGS = {
 }
 _FORMAT_OF_SUFFIX = {'.graph': 'toro'}
 
+# Besides all that have SE3 or SIM3 in their names.
 _TAGS_3D = frozenset({
-    'VERTEX_SE3:QUAT', 'EDGE_SE3:QUAT', 'EDGE_SE3_PRIOR', 'VERTEX_SE3:EULER', 'EDGE_SE3:EULER',
-    'VERTEX_TRACKXYZ', 'EDGE_SE3_TRACKXYZ', 'VERTEX3', 'EDGE3',
+    'VERTEX3', 'EDGE3', 'VERTEX_TRACKXYZ', 'EDGE_POINTXYZ', 'EDGE_XYZPRIOR', 'EDGE_PROJECT_DEPTH',
+    'EDGE_PROJECT_DISPARITY',
 })
-# Landmarks, sensors and raw data: no part of a pose graph.
-_TAGS_SKIPPED = frozenset({
-    'FIX', 'VERTEX_XY', 'EDGE_SE2_XY', 'EDGE_BEARING_SE2_XY', 'EDGE_SE2_XY_CALIB',
-    'EDGE_PRIOR_SE2_XY', 'EDGE_POINTXY', 'EDGE_SE2_POINTXY_OFFSET', 'EDGE_SE2_TWOPOINTSXY',
-    'EDGE_SE2_LOTSOFXY', 'ROBOTLASER1', 'RAWLASER1', 'FRONTLASER1', 'REARLASER1',
-})
+_LANDMARKS = 'landmarks are no part of a pose graph'
+_SENSORS = 'sensor data and calibration are no part of a pose graph'
+# Known and left out, with the reason that is told; PARAMS_... and FIX are, too.
+_TAGS_SKIPPED = {
+    **dict.fromkeys((
+        'VERTEX_XY', 'EDGE_SE2_XY', 'EDGE_BEARING_SE2_XY', 'EDGE_SE2_XY_CALIB', 'EDGE_POINTXY',
+        'EDGE_SE2_POINTXY_OFFSET', 'EDGE_SE2_TWOPOINTSXY', 'EDGE_SE2_LOTSOFXY',
+        'VERTEX_SEGMENT2D', 'VERTEX_LINE2D', 'EDGE_SE2_SEGMENT2D', 'EDGE_SE2_SEGMENT2D_LINE',
+        'EDGE_SE2_SEGMENT2D_POINTLINE', 'EDGE_SE2_LINE2D', 'EDGE_LINE2D', 'EDGE_LINE2D_POINTXY',
+    ), _LANDMARKS),
+    **dict.fromkeys((
+        'ROBOTLASER1', 'RAWLASER1', 'FRONTLASER1', 'REARLASER1', 'VERTEX_TAG', 'VERTEX_ELLIPSE',
+    ), _SENSORS),
+    'EDGE_PRIOR_SE2_XY': 'a prior on a position without a heading is not supported',
+}
 
 
 @dataclass(frozen=True)
@@ -193,11 +205,12 @@ def _group(path: str | os.PathLike[str]) -> dict[str, TextLines]:
 
 
 def _refuse_unknown(path: object, tag: str, line: int) -> None:
-    if tag in _TAGS_3D:
-        raise FileError(path, f'{tag}: 3D graphs are not supported yet; expected a graph in the '
-                        f'plane ({_expected("between")} lines)', line)
-    if tag not in _TAGS and tag not in _TAGS_SKIPPED and not tag.startswith('PARAMS_'):
-        raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(_TAGS)}', line)
+    if tag in _TAGS or tag in _TAGS_SKIPPED or tag == 'FIX' or tag.startswith('PARAMS_'):
+        return
+    if tag in _TAGS_3D or 'SE3' in tag or 'SIM3' in tag:
+        raise FileError(path, f'{quoted(tag)}: 3D graphs are not supported yet; expected a graph '
+                        f'in the plane ({_expected("between")} lines)', line)
+    raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(_TAGS)}', line)
 
 
 def _expected(kind: str) -> str:
@@ -287,12 +300,13 @@ def _skipped(groups: dict[str, TextLines], ids: Indices) -> tuple[str, ...]:
     sentences = []
     fixed = ' '.join(groups['FIX'].texts).split() if 'FIX' in groups else []
     if set(fixed) - {str(ids[0])}:
-        sentences.append(f'FIX {" ".join(fixed[:8])}{" ..." if len(fixed) > 8 else ""}: '
-                         f'the anchor is the first vertex ({ids[0]})')
+        sentences.append(f'FIX {quoted(" ".join(fixed))} is not used: the first vertex, {ids[0]}, '
+                         'is the one held fixed')
     for tag, group in groups.items():
         if tag not in _TAGS and tag != 'FIX':
-            count = len(group.texts)
-            sentences.append(f'{count} {tag} line{"s" if count > 1 else ""}: not used')
+            lines = 'line is' if len(group.texts) == 1 else 'lines are'
+            sentences.append(f'{len(group.texts)} {quoted(tag)} {lines} not used: '
+                             f'{_TAGS_SKIPPED.get(tag, _SENSORS)}')
     return tuple(sentences)
 
 
@@ -323,25 +337,13 @@ def _lines(path: Path, graph: FactorGraph, kind: str, ids: Indices, pose: Array,
     values = pose
     if _TAGS[names[0]].information:
         rows, columns = np.array(_TAGS[names[0]].information).T
-        information = _settled(roots.transpose(0, 2, 1) @ roots)
+        information = settled(roots.transpose(0, 2, 1) @ roots)
         values = np.concatenate((pose, information[:, rows, columns]), axis=1)
-    if not np.isfinite(values).all():
-        k = int(np.argmin(np.isfinite(values).all(axis=1)))
-        raise FileError(path, f'{names[0]} {ids[k]} is not finite: {values[k]}; nothing written')
+    readable = (np.abs(values) <= LARGEST).all(axis=1)
+    if not readable.all():
+        k = int(np.argmin(readable))
+        line = ' '.join((names[0], *map(str, ids[k]), 'would be', *(f'{v:g}' for v in values[k])))
+        raise FileError(path, f'{line}; expected numbers to {LARGEST:g}; nothing written')
     # repr: the fewest digits, 17 at most, that read back as the very same number.
     return [f'{names[0]} {" ".join(map(repr, row_ids))} {" ".join(map(repr, row))}'
             for row_ids, row in zip(ids.tolist(), values.tolist(), strict=True)]
-
-
-def _settled(values: Array) -> Array:
-    """
-    Return the 15-digit decimal next to each value where rounding cannot tell the two apart.
-
-    The graph keeps the root of the information; squaring it makes 50.00000000000001 of a 50.
-    """
-    magnitude = np.abs(np.where(values == 0.0, 1.0, values))
-    # Powers up to 10^22 are exact, so the quotient is the double nearest to the decimal.
-    places = np.clip(14 - np.floor(np.log10(magnitude)), 0, 22).astype(int)
-    scale = np.array([float(f'1e{k}') for k in range(23)])[places]
-    decimal = np.rint(values * scale) / scale
-    return np.where(np.abs(decimal - values) <= 4 * np.spacing(magnitude), decimal, values)

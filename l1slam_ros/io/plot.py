@@ -16,7 +16,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.manifold import Array, Indices
-from l1slam_ros.io.files import replacing
+from l1slam_ros.io.files import replacing, require_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,7 +29,11 @@ _CURVE_COLOURS = (_BLUE, '#D55E00', _GREEN, '#CC79A7', _ORANGE, '#56B4E9', '#000
 _MOST_LOOPS = 20_000
 # The view follows odometry astray by no more than this part of the map's size.
 _ASTRAY = 0.4
+# Below this ratio of highest to lowest cost, an axis of powers of ten gets ticks in between.
+_FEW_DECADES = 1e3
 _PANEL = 5.6  # [inch]
+# Lowest and highest a diagram beside a map may be, of its width.
+_ASPECTS = 0.6, 1.4
 _DOTS_PER_INCH = 150
 
 
@@ -42,8 +46,9 @@ class MapDrawing:
     """
     What one map shows, seen from above.
 
-    positions, odometry, truth : (n, 2 or 3) [m]; loops, rejected : (m, 2) pairs of rows of
-    `positions`; note : a line under the title, e.g. costs.
+    positions, odometry, truth : (n, 2 or 3) [m]; loops, rejected, false : (m, 2) pairs of rows
+    of `positions`, `false` those that are known to be and were not rejected; name : what the
+    positions are; note : a line under the title, e.g. costs.
     """
 
     title: str
@@ -52,22 +57,30 @@ class MapDrawing:
     truth: Array | None = None
     loops: Indices = field(default_factory=_no_pairs)
     rejected: Indices = field(default_factory=_no_pairs)
+    false: Indices = field(default_factory=_no_pairs)
+    name: str = 'optimised'
     note: str = ''
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One line of a diagram: costs (k,), above 0, after so many iterations (k,)."""
+    """
+    One line of a diagram: costs (k,), above 0, after so many iterations (k,).
+
+    marks : (iteration, cost, word) of points that are named.
+    """
 
     label: str
     iterations: Array
     costs: Array
+    marks: tuple[tuple[float, float, str], ...] = ()
 
 
 def check_picture(path: str | Path) -> None:
-    """Refuse, before any work is done, a name whose suffix is not that of a picture."""
+    """Refuse, before any work is done, a name that no picture can have."""
     if Path(path).suffix.lower() not in _SUFFIXES:
         raise FileError(path, f'unknown suffix; expected {", ".join(_SUFFIXES)}')
+    require_folder(path)
 
 
 def plot_maps(path: str | Path, maps: Sequence[MapDrawing]) -> None:
@@ -91,15 +104,21 @@ def plot_curves(path: str | Path, curves: Sequence[Curve], title: str = '') -> N
     """Draw costs, on a logarithmic scale, against iterations; errors as for `plot_maps`."""
     figure = _new_figure(path, 1.3, 0.8)
     axes = figure.add_subplot()
-    for k, curve in enumerate(curves):
-        axes.plot(curve.iterations, curve.costs, label=curve.label, linewidth=1.6,
-                  color=_CURVE_COLOURS[k % len(_CURVE_COLOURS)])
-    axes.set_yscale('log')
-    axes.set_title(title, loc='left', fontweight='bold')
-    axes.set_xlabel('iteration')
-    axes.set_ylabel('cost')
-    _tidy(axes)
+    _draw_curves(axes, curves, title)
     axes.legend(frameon=False)
+    _save(figure, path)
+
+
+def plot_solution(path: str | Path, drawing: MapDrawing, curve: Curve) -> None:
+    """Draw a map, and beside it the costs on the way there; errors as for `plot_maps`."""
+    figure = _new_figure(path, 2, 1)
+    beside = figure.add_subplot(1, 2, 1)
+    _draw_map(beside, drawing)
+    axes = figure.add_subplot(1, 2, 2)
+    _draw_curves(axes, [curve], curve.label)
+    # As high as the map, unless that is a long corridor.
+    (left, right), (low, high) = beside.get_xlim(), beside.get_ylim()
+    axes.set_box_aspect(float(np.clip((high - low) / (right - left), *_ASPECTS)))
     _save(figure, path)
 
 
@@ -118,6 +137,42 @@ def _save(figure: 'Figure', path: str | Path) -> None:
                        pad_inches=0.15)
 
 
+def _draw_curves(axes: 'Axes', curves: Sequence[Curve], title: str) -> None:
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+
+    for k, curve in enumerate(curves):
+        colour = _CURVE_COLOURS[k % len(_CURVE_COLOURS)]
+        axes.plot(curve.iterations, curve.costs, label=curve.label, linewidth=1.6, color=colour)
+        for mark in curve.marks:
+            _draw_mark(axes, *mark, colour)
+    if any((curve.costs > 0).any() for curve in curves):
+        axes.set_yscale('log')
+    low, high = axes.get_ylim()
+    if high < _FEW_DECADES * low:
+        # Powers of ten alone would be hardly any ticks at all.
+        axes.yaxis.set_major_locator(
+            LogLocator(subs=(1.0, 2.0, 5.0)) if high > 10 * low else MaxNLocator(6))
+        axes.yaxis.set_major_formatter(StrMethodFormatter('{x:g}'))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.margins(0.06, 0.08)
+    axes.set_xlim(right=max(1.0, axes.get_xlim()[1]))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_title(title, loc='left', fontweight='bold')
+    axes.set_xlabel('iteration')
+    axes.set_ylabel('cost')
+    _tidy(axes)
+
+
+def _draw_mark(axes: 'Axes', iteration: float, cost: float, word: str, colour: str) -> None:
+    """Name a point, towards the middle of the picture."""
+    if not cost > 0:  # nowhere on a logarithmic scale
+        return
+    axes.plot(iteration, cost, 'o', color=colour, markersize=5)
+    axes.annotate(f'{word} {cost:.6g}', (iteration, cost), (7 if iteration == 0 else 0, 7),
+                  textcoords='offset points', ha='left' if iteration == 0 else 'right',
+                  color='#555555', fontsize='small')
+
+
 def _draw_map(axes: 'Axes', drawing: MapDrawing) -> None:
     """Draw from the ground up: what was believed, what is true, what came out, what did not."""
     if drawing.odometry is not None:
@@ -126,7 +181,8 @@ def _draw_map(axes: 'Axes', drawing: MapDrawing) -> None:
     if drawing.truth is not None:
         _draw_path(axes, drawing.truth, 'truth', _ORANGE, 2.8, zorder=2)
     _draw_pairs(axes, drawing.positions, drawing.loops, 'loops', _GREEN, zorder=3)
-    _draw_path(axes, drawing.positions, 'optimised', _BLUE, 1.0, zorder=4)
+    _draw_path(axes, drawing.positions, drawing.name, _BLUE, 1.0, zorder=4)
+    _draw_pairs(axes, drawing.positions, drawing.false, 'false loops', _RED, zorder=5)
     _draw_pairs(axes, drawing.positions, drawing.rejected, 'rejected loops', _RED, zorder=5)
     axes.plot(*drawing.positions[0, :2], 'o', color=_BLUE, markersize=5, zorder=6)
     axes.set_title(drawing.title, loc='left', fontweight='bold', pad=24)
@@ -146,6 +202,8 @@ def _small_print(drawing: MapDrawing) -> str:
         parts[-1] += f' ({_MOST_LOOPS:,} drawn)'
     if len(drawing.rejected):
         parts.append(f'{len(drawing.rejected):,} rejected')
+    if len(drawing.false):
+        parts.append(f'{len(drawing.false):,} false')
     return ', '.join(parts) + (f'; {drawing.note}' if drawing.note else '')
 
 

@@ -6,7 +6,6 @@ TUM: `stamp x y z qx qy qz qw`, stamps in seconds, exact to the nanosecond.
 """
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,18 +74,6 @@ def write_truth(path: str | os.PathLike[str], ids: Indices, poses: Array) -> Non
     """
     write_lines(path, (f'{k} {" ".join(map(repr, row))}'
                        for k, row in zip(ids.tolist(), poses.tolist(), strict=True)))
-
-
-def write_false_loops(path: str | os.PathLike[str], pairs: Sequence[tuple[int, int]]) -> None:
-    """
-    Write the vertex ids `i j` of each false loop.
-
-    Raises
-    ------
-    FileError : the file cannot be written.
-
-    """
-    write_lines(path, (f'{i} {j}' for i, j in pairs))
 
 
 def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2) -> Reference:
