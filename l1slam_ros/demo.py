@@ -29,6 +29,7 @@ from l1slam_ros.io.bag import read_messages
 from l1slam_ros.io.graph_bag import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
 from l1slam_ros.io.messages import stamp_of
 from l1slam_ros.io.plot import MapDrawing, plot_maps
+from l1slam_ros.io.side_files import false_loops_path, read_false_loops
 
 BAG = Path('bags/demo')
 PICTURE = Path('demo/map.png')
@@ -66,12 +67,18 @@ class Listener:
 
 @dataclass(frozen=True)
 class Recording:
-    """What the bag holds: stamps (n,) [ns] of the truth, positions (n, 2) [m], loops (m, 2)."""
+    """
+    What the bag holds.
+
+    stamps : (n,) [ns]; odometry, truth : (n, 2) positions [m]; loops : (m, 2) rows of these;
+    is_false : (m,) bool, the loops that the file beside the bag calls false.
+    """
 
     stamps: Indices
     odometry: Array
     truth: Array
     loops: Indices
+    is_false: np.ndarray
 
 
 def read_recording(path: Path) -> Recording:
@@ -88,8 +95,11 @@ def read_recording(path: Path) -> Recording:
             stamps.append(stamp_of(message.header))
             message = message.pose
         poses[topic].append((message.pose.position.x, message.pose.position.y))
+    pairs = np.searchsorted(stamps, loops)
+    false = read_false_loops(false_loops_path(path))
+    is_false = (pairs[:, None] == false).all(axis=2).any(axis=1)
     return Recording(np.array(stamps), np.array(poses[ODOMETRY_TOPIC]),
-                     np.array(poses[TRUTH_TOPIC]), np.searchsorted(stamps, loops))
+                     np.array(poses[TRUTH_TOPIC]), pairs, is_false)
 
 
 @contextmanager
@@ -142,13 +152,15 @@ def summarise(recording: Recording, path: PathMessage, rate: float, picture: Pat
     errors = (absolute_trajectory_error(odometry, truth),
               absolute_trajectory_error(positions, truth))
     note = f'position error {errors[0]:.2f} m by odometry, {errors[1]:.2f} m optimised'
-    keyframe = np.searchsorted(stamps, recording.stamps[recording.loops])
+    loops = np.searchsorted(stamps, recording.stamps[recording.loops])
+    true, false = loops[~recording.is_false], loops[recording.is_false]
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot_maps(picture, [MapDrawing('l1slam_ros demo', positions, odometry,
-                                   aligned_positions(truth, positions), keyframe, note=note)])
+                                   aligned_positions(truth, positions), true, false=false,
+                                   note=note)])
     return '\n'.join((
         f'position error  {errors[0]:.3f} m by odometry, {errors[1]:.3f} m in the map (RMSE)',
-        f'graph           {len(stamps)} keyframes, {len(recording.loops)} loops',
+        f'graph           {len(stamps)} keyframes, {len(loops)} loops, {len(false)} of them false',
         f'node            {rate:.1f} updates per second',
         f'picture         {picture}'))
 
