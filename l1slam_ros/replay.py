@@ -227,7 +227,7 @@ def main() -> int:
         _play(arguments, damage)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except L1SlamError as error:
+    except (L1SlamError, OSError) as error:
         print(f'replay: {error}', file=sys.stderr)
         return _BAD_INPUT
     finally:

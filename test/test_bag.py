@@ -23,6 +23,14 @@ def write_strings(path, count=5, note=None):
     return path
 
 
+def test_a_directory_of_several_bags_is_none(tmp_path):
+    folder = write_strings(tmp_path / 'bag')
+    (folder / 'metadata.yaml').unlink()
+    (folder / 'other_0.mcap').write_bytes((folder / 'bag.mcap').read_bytes())
+    for call in (read_messages, bag_summary, read_note):
+        assert 'without metadata.yaml and with the files of 2 bags' in error_of(call, folder)
+
+
 def write_with_rosbags(path, plugin):
     typestore = get_typestore(Stores.ROS2_JAZZY)
     with Writer(path, version=8, storage_plugin=plugin) as writer:

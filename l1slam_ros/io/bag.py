@@ -18,6 +18,7 @@ from l1slam_ros.io.bag_writer import NOTE_KEY
 from l1slam_ros.io.salvage import (
     METADATA,
     Salvage,
+    bag_names,
     complaint,
     directory_metadata,
     storage_files,
@@ -192,9 +193,9 @@ def _bag_path(path: str | os.PathLike[str]) -> Path:
     if bag.is_file() and bag.suffix not in BAG_SUFFIXES:
         raise FileError(path, f'no bag by its name; expected {", ".join(BAG_SUFFIXES)} '
                         'or a rosbag2 directory')
-    if bag.is_dir() and not ((bag / METADATA).is_file() or storage_files(bag)):
-        raise FileError(path, f'a directory without {METADATA} or any file of a bag; '
-                        'expected a rosbag2 directory')
+    if bag.is_dir() and not (bag / METADATA).is_file() and len(bag_names(bag)) != 1:
+        raise FileError(path, f'a directory without {METADATA} and with the files of '
+                        f'{len(bag_names(bag))} bags; expected a rosbag2 directory')
     return bag
 
 
@@ -277,6 +278,9 @@ def _reader(bag: Path) -> Iterator[Any]:
 def _salvage(bag: Path, error: Exception) -> Salvage:
     """Return what can be had of a bag that the library gave up on."""
     salvage = Salvage(bag)
-    if not salvage.counts:
-        raise FileError(bag, f'damaged, or no bag ({complaint(error)}); {_TO_ITS_END}') from error
-    return salvage
+    if salvage.counts:
+        return salvage
+    reason = complaint(error)
+    if salvage.damage is not None and salvage.damage.where.startswith(': '):
+        reason = salvage.damage.where[2:]
+    raise FileError(bag, f'damaged, or no bag ({reason}); {_TO_ITS_END}') from error

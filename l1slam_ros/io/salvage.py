@@ -23,7 +23,7 @@ from l1slam_ros.io.walk_sqlite import walk_sqlite
 
 METADATA = 'metadata.yaml'
 # How rosbag2 names the files of a bag; `.zstd` where it compresses them as a whole.
-_STORAGE_NAME = re.compile(r'.+(\.mcap|\.db3)(\.zstd)?')
+_STORAGE_NAME = re.compile(r'(?P<bag>.+?)(_[0-9]+)?(\.mcap|\.db3)(\.zstd)?')
 # The first bytes of a message that rosbag2 has compressed by itself; of CDR they never are.
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 _WALKS = {'.mcap': walk_mcap, '.db3': walk_sqlite, '.bag': walk_rosbag1}
@@ -174,6 +174,12 @@ def storage_files(directory: Path) -> list[Path]:
 
     return sorted((path for path in directory.iterdir() if _STORAGE_NAME.fullmatch(path.name)),
                   key=by_number)
+
+
+def bag_names(directory: Path) -> set[str]:
+    """Return the names of the bags that a directory has files of, without their numbers."""
+    matches = map(_STORAGE_NAME.fullmatch, (path.name for path in directory.iterdir()))
+    return {match['bag'] for match in matches if match}
 
 
 def _files(bag: Path) -> tuple[list[Path], Damage | None]:

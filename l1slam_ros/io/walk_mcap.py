@@ -54,12 +54,13 @@ def walk_mcap(path: Path, definitions: dict[str, str]) -> Iterator[RawMessage]:
         for start, opcode, length in _records(file, size):
             if opcode == _DATA_END:
                 break
+            if opcode not in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK):
+                continue
             content = file.read(length)
-            read = channels.chunk(content) if opcode == _CHUNK else channels.record(
-                opcode, content)
-            # The last record of a whole file is no chunk and no message: this one is cut.
-            cut = file.tell() == size
-            yield from broken_at(size if cut else start, read)
+            # The last record of a whole file is none of these: this one is cut.
+            position = size if file.tell() == size else start
+            yield from broken_at(position, channels.chunk(content) if opcode == _CHUNK
+                                 else channels.record(opcode, content))
         file.seek(-min(size, len(MAGIC)), 2)
         if file.read() != MAGIC:
             raise BrokenRecordError(size)
