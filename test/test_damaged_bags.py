@@ -408,4 +408,4 @@ def test_no_bytes_make_a_traceback_or_half_a_file(tmp_path, small, capfd, name, 
         [] if code == 2 else ['out.g2o', 'out.g2o.stamps.txt'])
     if code != 2:
         assert read_graph_file(output).graph.n_poses >= 2
-    assert (code == 3) == ('is damaged' in err)
+        assert (code == 3) == ('is damaged' in err)
