@@ -105,17 +105,26 @@ def poses_of(path):
 
 
 def play(bench, bag):
+    """Play a bag as fast as the node answers: a burst is more than DDS holds on a busy machine."""
+    sent, heard = 0, len(bench.received['pose'])
     for message in read_raw(bag):
         bench.send(message.topic, message.data)
+        sent += message.topic == '/odom'
+        if sent % 20 == 0:
+            target = heard + sent
+            bench.until(lambda n=target: len(bench.received['pose']) >= n, 'poses come back')
 
 
 def assert_near_optimum(bench, record, optimum, tolerance):
     n = record.graph.n_poses
+    bench.until(lambda: len(bench.path().poses) == n, f'the Path has {n} poses')
+    sizes = bench.backend._backend.counts
+    bench.until(lambda: sizes()[0]['factors'] == len(record.graph.between),
+                'no message was lost on the way')
     limit = (1 + tolerance) * optimum
     bench.until(
-        lambda: len(bench.path().poses) == n
-        and l1_cost(whitened_residual(record.graph, poses_of(bench.path()))) <= limit,
-        f'the Path has {n} poses and a cost of at most {limit}')
+        lambda: l1_cost(whitened_residual(record.graph, poses_of(bench.path()))) <= limit,
+        f'the cost is at most {limit}')
 
 
 def test_a_recorded_world_becomes_its_optimal_map(bench, tmp_path, rng):

@@ -5,7 +5,8 @@ import json
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bags import KINDS, TYPES, mcap_file, recording_of, rosbag2_directory, write_world
 from l1slam_ros.cli import main
@@ -139,6 +140,20 @@ def test_a_topic_of_another_type_is_told(tmp_path, world):
     with pytest.raises(FileError, match='0 keyframes from /odom.* on /loop_closures; '
                                         '181 messages refused: type$'):
         read_input(mcap_file(tmp_path / 'a.mcap', swapped))
+
+
+def test_a_type_defined_otherwise_is_told(tmp_path):
+    other = get_typestore(Stores.EMPTY)
+    other.register(get_types_from_msg('float64 x', ODOMETRY))
+    writer = Writer(tmp_path / 'a', version=9, storage_plugin=StoragePlugin.MCAP)
+    with writer:
+        topic = writer.add_connection('/odom', ODOMETRY, typestore=other)
+        for k in range(5):
+            message = other.types[ODOMETRY](x=float(k))
+            writer.write(topic, k, other.serialize_cdr(message, ODOMETRY))
+    with pytest.raises(FileError, match='0 keyframes from /odom; expected 2 or more; '
+                                        '5 messages refused: fields$'):
+        read_input(tmp_path / 'a')
 
 
 def test_loops_may_be_recorded_before_the_odometry_they_name(tmp_path, world):

@@ -79,7 +79,8 @@ def _is_definite(matrices: Array) -> Mask:
     variances = np.diagonal(matrices, axis1=1, axis2=2)
     positive = np.asarray((variances > 0).all(axis=1))
     root = np.sqrt(np.where(positive[:, None], variances, 1.0))
-    correlation = matrices / root[:, :, None] / root[:, None, :]
+    with np.errstate(over='ignore'):  # an infinite correlation is refused like any above 1
+        correlation = matrices / root[:, :, None] / root[:, None, :]
     # A correlation above 1 is not definite; clipped, so that nothing overflows, it still is not.
     smallest = np.linalg.eigvalsh(np.clip(correlation, -2, 2))[:, 0]
     return positive & np.asarray(smallest > _SINGULAR)

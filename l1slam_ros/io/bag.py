@@ -6,7 +6,9 @@ The bag library reads them while it can; where it gives up, `salvage` goes on. T
 are imported by `bag`, `bag_writer`, `salvage` and the walks alone, and only where needed.
 """
 
+import math
 import os
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -204,21 +206,26 @@ class _Place:
 
     def __init__(self) -> None:
         self.count = 0
-        self._time = -1
-        self._at_time = 0
+        self._time = -math.inf
+        # At that very time: the library may have another order than the file.
+        self._read: Counter[tuple[str, bytes]] = Counter()
 
-    def advance(self, time: int) -> None:
+    def advance(self, message: RawMessage) -> None:
         """Count a message."""
-        self._at_time = self._at_time + 1 if time == self._time else 1
-        self._time = time
+        if message.time != self._time:
+            self._read.clear()
+        self._time = message.time
+        self._read[message.topic, message.data] += 1
         self.count += 1
 
     def rest(self, messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
         """Yield those of all messages, in order of time, that have not been read yet."""
-        time, at_time = self._time, self._at_time
+        time, read = self._time, self._read.copy()
         for message in messages:
-            at_time -= message.time == time
-            if message.time > time or (message.time == time and at_time < 0):
+            key = (message.topic, message.data)
+            if message.time == time and read[key]:
+                read[key] -= 1
+            elif message.time >= time:
                 yield message
 
 
@@ -230,7 +237,7 @@ def _messages(
     bag, place = _bag_path(path), _Place()
     try:
         for message, types in _by_library(bag, topics, start, stop):
-            place.advance(message.time)
+            place.advance(message)
             yield message, types
         return
     except Exception as error:  # damaged bags make the library raise anything
@@ -240,7 +247,7 @@ def _messages(
         raise FileError(damage.path, f'damaged{damage.where}; {_TO_ITS_END}')
     types = salvage.types()
     for message in place.rest(salvage.messages(topics, start, stop)):
-        place.advance(message.time)
+        place.advance(message)
         yield message, types
     if damage is not None and on_damage is not None:
         on_damage(damage.sentence(place.count))
