@@ -121,6 +121,9 @@ class SharedBackend:
         record = read_graph_file(path)
         if record.poses is None or record.stamps is None:
             raise FileError(path, 'has no poses or no stamps beside it; expected a saved map')
+        if len(record.graph.prior):
+            raise FileError(path, 'has prior factors, which a growing map has no rows for; '
+                            'expected a saved map')
         backend = Backend(self._manifold, self._options)
         backend.restore(record.graph, record.poses, record.stamps)
         with self._lock:

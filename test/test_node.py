@@ -247,6 +247,18 @@ def test_optimize_answers_with_the_cost_and_a_broken_file_leaves_the_map(bench, 
     assert len(b.path().poses) == 60
 
 
+def test_a_map_with_priors_is_refused_and_the_node_goes_on(bench, tmp_path, rng):
+    graph = simulate_world(10, 12, WorldOptions(), rng).graph
+    graph.add_prior(np.array([0]), np.zeros((1, 3)), np.eye(3)[None])
+    record = GraphRecord(graph, np.zeros((10, 3)), np.arange(10), 10**9 + np.arange(10))
+    write_graph_file(tmp_path / 'map.g2o', record)
+    b = bench(save_path=str(tmp_path / 'map.g2o'))
+    answer = call(b, 'load')
+    assert not answer.success and 'prior' in answer.message
+    b.send('/odom', odometry(2 * 10**9, 0.0))
+    b.until(lambda: len(b.path().poses) == 1, 'a new map begins')
+
+
 def test_no_update_while_paused(bench):
     b = bench()
     assert call(b, 'pause', SetBool.Request(data=True)).success
