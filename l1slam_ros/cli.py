@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from l1slam_ros import commands, offline
+from l1slam_ros import commands, offline, paper
 from l1slam_ros.core.choice import SOLVERS
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.false_loops import FALSE_LOOPS
@@ -82,6 +82,9 @@ def _parser() -> argparse.ArgumentParser:
                   'graph.g2o'))
     _add_plot(add('plot', commands.plot, 'draw maps beside each other, false loops red',
                   'graph.g2o solved.g2o --output maps.png'))
+    _add_reproduce(add('reproduce', commands.reproduce,
+                       "run the paper's experiments and report them beside what it printed",
+                       '--datasets datasets --worlds 10k --output reproduction'))
     return parser
 
 
@@ -165,3 +168,15 @@ def _add_plot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--output', type=Path, required=True, metavar='PNG',
                         help='.png, .svg or .pdf')
     _add_bag_options(parser)
+
+
+def _add_reproduce(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add('--datasets', type=Path, metavar='DIR',
+        help=f"the folder with the paper's own graphs: {', '.join(paper.FILES)}; "
+        'without it, the simulated worlds alone')
+    add('--worlds', choices=list(paper.WORLDS), default='all',
+        help="which of the paper's large worlds to simulate: 10,000 poses with 64,000 edges, and "
+        '50,000 with 700,000, which takes minutes (default: %(default)s)')
+    add('--output', type=Path, default=Path('reproduction'), metavar='DIR',
+        help='the folder for report.md and its pictures (default: %(default)s)')

@@ -48,7 +48,7 @@ def solve(arguments: argparse.Namespace) -> str:
     if arguments.json:
         print(json.dumps(report))
     elif not arguments.quiet:
-        _print_report(report, arguments.norm, SENTENCES[outcome.solution.status])
+        _print_report(report, arguments.norm, SENTENCES[outcome.solution.status], outcome.reason)
     return record.damage
 
 
@@ -94,14 +94,14 @@ def _solve_report(record: GraphRecord, norm: str, outcome: offline.Outcome) -> d
     }
 
 
-def _print_report(report: dict[str, object], norm: str, status: str) -> None:
+def _print_report(report: dict[str, object], norm: str, status: str, reason: str) -> None:
     seed = f'seed {report["seed_cost"]:.6g}, ' if report['seed_cost'] is not None else ''
     print(f'{report["poses"]} poses, {report["factors"]} factors, {report["loops"]} loops')
     print(f'{norm} cost: initial {report["initial_cost"]:.6g}, {seed}'
           f'final {report["final_cost"]:.6g}')
     print(f'{report["status"]} ({status}): {report["outer_iterations"]} outer, '
           f'{report["inner_iterations"]} inner iterations, {report["seconds"]:.2f} s, '
-          f'{report["solver"]}')
+          f'{report["solver"]} ({reason})')
     if 'ate' in report:
         print(f'position error {report["ate"]:.4f} m (RMSE after rigid alignment)')
 
@@ -239,6 +239,17 @@ def plot(arguments: argparse.Namespace) -> str:
         damages.append(record.damage)
     plot_maps(arguments.output, drawings)
     return '; '.join(filter(None, damages))
+
+
+def reproduce(arguments: argparse.Namespace) -> str:
+    """Run the paper's experiments; write the report and say where it is."""
+    from l1slam_ros.core.reproduction import Effort
+    from l1slam_ros.paper import WORLDS
+    from l1slam_ros.reproduce import REPORT, reproduce
+
+    reproduce(arguments.datasets, WORLDS[arguments.worlds], arguments.output, Effort())
+    print(arguments.output / REPORT)
+    return ''
 
 
 def _read(arguments: argparse.Namespace, path: Path) -> GraphRecord:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from l1slam_ros.core.choice import minimise_by
+from l1slam_ros.core.choice import choose, minimise_by
+from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.errors import FileError, GraphError
 from l1slam_ros.core.graph import component_labels
 from l1slam_ros.core.growth import GrowthOptions
@@ -100,11 +101,12 @@ class Outcome:
     """
     What `solve` did; costs are of the norm that was asked for, seed_cost None without one.
 
-    solver : what found the solution, by its name.
+    solver : what found the solution, by its name; reason : a clause that says why it.
     """
 
     solution: Solution
     solver: str
+    reason: str
     initial_cost: float
     seed_cost: float | None
     seconds: float
@@ -128,18 +130,23 @@ def solve(
     graph, cost = record.graph, cost_function(record, norm, least_squares)
     initial = odometry_poses(graph) if start == 'odometry' else stored_poses(record)
     began = time.perf_counter()
-    poses = seed_poses(graph) if start == 'seed' else initial
     if norm == 'l1':
-        solution, solver = minimise_by(solver, graph, poses, options, report)
+        choice = choose(solver, graph)
+        poses = seed_poses(graph, choice.cholesky) if start == 'seed' else initial
+        solution, solver = minimise_by(choice, graph, poses, options, report)
+        reason = choice.reason if solver == choice.solver else f'the {choice.solver} stalled'
     else:
+        cholesky = cholesky_of(graph)
+        poses = seed_poses(graph, cholesky) if start == 'seed' else initial
         minimise_norm = minimise_l2 if norm == 'l2' else minimise_huber
-        solution, solver = minimise_norm(graph, poses, least_squares, report), 'gauss-newton'
+        solution = minimise_norm(graph, poses, least_squares, cholesky, report)
+        solver, reason = 'gauss-newton', f'the norm is {norm}'
     seconds = time.perf_counter() - began
     seed_cost = cost(poses) if start == 'seed' else None
     if not np.isfinite([cost(initial), seed_cost or 0.0, solution.cost]).all():
         raise GraphError('the cost leaves double precision: measurements and information of the '
                          'graph are too large, or too different from each other')
-    return Outcome(solution, solver, cost(initial), seed_cost, seconds)
+    return Outcome(solution, solver, reason, cost(initial), seed_cost, seconds)
 
 
 def cost_function(

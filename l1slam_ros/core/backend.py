@@ -15,13 +15,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l1slam_ros.core.choice import AUTO, choose, minimise_by
+from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.growth import GraphGrowth, GrowthOptions
-from l1slam_ros.core.least_squares import reweighted_step, smoothing
+from l1slam_ros.core.least_squares import reweighted_step
 from l1slam_ros.core.linearise import linearise, whitened_residual
 from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.optimality import Status, l1_cost
+from l1slam_ros.core.optimality import Status, l1_cost, smoothing
 from l1slam_ros.core.optimiser import OptimiserOptions, Solution, backtrack, is_far, minimise
 from l1slam_ros.core.seed import seed_poses
 
@@ -172,14 +174,15 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Impro
     graph, poses, dual = problem.graph, problem.poses, problem.dual
     before = cost = l1_cost(whitened_residual(graph, poses))
     steps, far = 0, is_far(before, problem.last_cost)
-    while far and (not steps or time.monotonic() < deadline):
+    cholesky = cholesky_of(graph) if far else None
+    while cholesky and far and (not steps or time.monotonic() < deadline):
         system = linearise(graph, poses)
-        step, dual = reweighted_step(system.A, system.b, system.b, smoothing(system.b))
+        step, dual = reweighted_step(system, cholesky, system.b, smoothing(system.b))
         previous = cost
         poses, cost = backtrack(graph, poses, step, cost)
         steps += 1
         far = is_far(previous, cost)
-    solution = minimise(graph, poses, options, dual, deadline)
+    solution = minimise(graph, poses, options, cholesky, dual, deadline)
     return _improvement(solution, before, steps, start)
 
 
@@ -188,8 +191,10 @@ def optimise(problem: Problem, options: OptimiserOptions) -> Improvement:
     start = time.monotonic()
     graph = problem.graph
     before = l1_cost(whitened_residual(graph, problem.poses))
-    starts = (problem.poses, seed_poses(graph))
-    solution = min((minimise(graph, poses, options) for poses in starts), key=lambda s: s.cost)
+    choice = choose(AUTO, graph)
+    starts = (problem.poses, seed_poses(graph, choice.cholesky))
+    solution = min((minimise_by(choice, graph, poses, options)[0] for poses in starts),
+                   key=lambda s: s.cost)
     return _improvement(solution, before, 0, start)
 
 

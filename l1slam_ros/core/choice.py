@@ -2,35 +2,79 @@
 """
 The L1 solvers by name, and which one a graph gets where nobody chose.
 
-In: a graph and poses. Out: the solution, and the name of the solver that found it.
+In: a graph and poses. Out: the solution, the name of the solver that found it, and why it was it.
 """
 
+from dataclasses import dataclass
+
+from l1slam_ros.core.cholesky import BlockCholesky, cholesky_of
+from l1slam_ros.core.errors import FillError
+from l1slam_ros.core.exact import minimise_interior_point
 from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.interior_point import minimise_interior_point
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.optimality import Status
 from l1slam_ros.core.optimiser import OptimiserOptions, Report, Solution, minimise
 
 AUTO, PRIMAL_DUAL, INTERIOR_POINT = SOLVERS = ('auto', 'primal-dual', 'interior-point')
-# Factors per keyframe up to which a factorisation stays cheap: the paper's sparse graphs have 1.6
-# to 2.1, its dense worlds 6 to 14, where the factor fills in.
-_SPARSE = 3.0
+# Multiplications of blocks in one factorisation that a factor of the graph may cost before the
+# primal-dual method is the quicker one: measured, some 25 factorisations against some 6,000
+# iterations, each of which passes once over the factors.
+_WORK_PER_FACTOR = 700.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """
+    What a graph is solved by.
+
+    cholesky : of the graph, None where it fills in too much; solver : of `SOLVERS`, not `auto`;
+    reason : a clause that says why; falls_back : another solver may go on where it fails.
+    """
+
+    cholesky: BlockCholesky | None
+    solver: str
+    reason: str
+    falls_back: bool = False
+
+
+def choose(solver: str, graph: FactorGraph) -> Choice:
+    """
+    Resolve one of `SOLVERS`: `auto` goes by the predicted work of a factorisation.
+
+    Raises
+    ------
+    FillError : the interior point was asked for, and the graph fills in.
+
+    """
+    try:
+        cholesky = cholesky_of(graph)
+    except FillError:
+        if solver == INTERIOR_POINT:
+            raise
+        return Choice(None, PRIMAL_DUAL, 'the graph fills in')
+    if solver != AUTO:
+        return Choice(cholesky, solver, 'asked for')
+    work = cholesky.pattern.work / max(len(graph.between), 1)
+    reason = (f'a factorisation takes {work:.3g} block products per factor, '
+              f'{_WORK_PER_FACTOR:.3g} would be too many')
+    chosen = INTERIOR_POINT if work <= _WORK_PER_FACTOR else PRIMAL_DUAL
+    return Choice(cholesky, chosen, reason, falls_back=True)
 
 
 def minimise_by(
-    solver: str, graph: FactorGraph, poses: Array, options: OptimiserOptions,
+    choice: Choice, graph: FactorGraph, poses: Array, options: OptimiserOptions,
     report: Report = lambda iteration, cost: None
 ) -> tuple[Solution, str]:
     """
-    Minimise the L1 norm of the whitened residuals by one of `SOLVERS`.
+    Minimise the L1 norm of the whitened residuals; return the solution and what found it.
 
-    `auto` is the interior point on sparse graphs and Algorithm 4 on dense ones. Where the
-    interior point does not converge, Algorithm 4 goes on from its best poses.
+    Where nobody asked for the interior point and it does not converge, Algorithm 4 goes on from
+    its best poses.
     """
-    dense = len(graph.between) > _SPARSE * graph.n_poses
-    if solver == PRIMAL_DUAL or (solver == AUTO and dense):
-        return minimise(graph, poses, options, report=report), PRIMAL_DUAL
-    solution = minimise_interior_point(graph, poses, options, report)
-    if solver == INTERIOR_POINT or solution.status is Status.CONVERGED:
+    cholesky = choice.cholesky
+    if choice.solver == PRIMAL_DUAL or cholesky is None:
+        return minimise(graph, poses, options, cholesky, report=report), PRIMAL_DUAL
+    solution = minimise_interior_point(graph, poses, options, cholesky, report)
+    if solution.status is Status.CONVERGED or not choice.falls_back:
         return solution, INTERIOR_POINT
-    return minimise(graph, solution.poses, options, report=report), PRIMAL_DUAL
+    return minimise(graph, solution.poses, options, cholesky, report=report), PRIMAL_DUAL

@@ -10,6 +10,10 @@ class GraphError(L1SlamError):
     """A factor or pose that cannot be part of the graph, or a graph that cannot be solved."""
 
 
+class FillError(GraphError):
+    """A graph whose factorisation would take more memory than is sensible."""
+
+
 class NoiseError(L1SlamError):
     """A covariance or information matrix that is none."""
 

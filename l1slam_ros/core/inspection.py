@@ -6,15 +6,16 @@ In: a graph. Out: which keyframes and factors are suspicious, and by how much; s
 of them elsewhere. All but `noise_scales` look at each factor once.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from l1slam_ros.core.cholesky import BlockCholesky, cholesky_of
 from l1slam_ros.core.graph import FactorGraph, component_labels
 from l1slam_ros.core.initial import pair_key
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.least_squares import weighted_least_squares
-from l1slam_ros.core.linearise import linearise
+from l1slam_ros.core.linearise import LinearSystem, linearise
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.seed import seed_poses
 
@@ -149,21 +150,28 @@ def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
     ends = int(keyframes[0]), int(keyframes[-1])
     if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < _FEWEST_SPARE:
         return NoiseScales(np.nan, np.nan, *ends)
-    poses = minimise_l2(part, seed_poses(part), _SOLVE).poses
+    cholesky = cholesky_of(part)
+    poses = minimise_l2(part, seed_poses(part, cholesky), _SOLVE, cholesky).poses
     system, d = linearise(part, poses), graph.manifold.TANGENT_SIZE
     group = np.repeat(is_loop.astype(np.int64), d)
     noise = rng.standard_normal(len(group))
     variance, spare = np.ones(2), np.zeros(2)
     for _ in range(_ROUNDS):
-        both = np.stack((system.b, np.sqrt(variance)[group] * noise), axis=1)
-        step = weighted_least_squares(system.A, both, 1 / variance[group])
-        found, drawn = (np.bincount(group, r * r, minlength=2)
-                        for r in (both - system.A @ step).T)
+        found, drawn = (
+            np.bincount(group, _left(replace(system, b=b), cholesky, 1 / variance[group]) ** 2,
+                        minlength=2)
+            for b in (system.b, np.sqrt(variance)[group] * noise))
         spare = drawn / variance
         ratio = np.divide(found, drawn, out=np.ones(2), where=spare >= _FEWEST_SPARE)
         variance = np.clip(variance * ratio, 1e-12, 1e12)
     odometry, loops = np.where(spare >= _FEWEST_SPARE, np.sqrt(variance), np.nan).tolist()
     return NoiseScales(odometry, loops, *ends)
+
+
+def _left(system: LinearSystem, cholesky: BlockCholesky, weights: Array) -> Array:
+    """Return b - A x at the weighted least squares solution x, (rows,)."""
+    x = weighted_least_squares(system, cholesky, weights)
+    return system.b - system.times(x)
 
 
 def _densest_part(graph: FactorGraph) -> tuple[FactorGraph, Indices, np.ndarray]:

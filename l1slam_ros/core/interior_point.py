@@ -14,34 +14,29 @@ the curvature of the residuals: without it the run fails where a map bends easil
 It costs one sparse factorisation a step, some twenty in all: cheap on sparse graphs, hopeless on
 dense ones. It is local: started far off it can return its start, which it says by its status.
 
+The same run solves a linear problem (the two of Algorithm 3): one whose linearisation is exact.
+
 Source: Mehrotra (1992) for the predictor and corrector; the rest is ours, defended by
 `test_interior_point.py`.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
-from scipy.sparse import coo_array, csc_array
-from scipy.sparse.linalg import SuperLU
 
-from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.cholesky import BlockCholesky
 from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.least_squares import diagonal, factorise, smoothing
 from l1slam_ros.core.linearise import (
     LinearSystem,
-    anchor,
     linearise,
     step_poses,
     whitened_residual,
 )
 from l1slam_ros.core.manifold import Array
-from l1slam_ros.core.optimality import Status, fits_exactly, l1_cost
-from l1slam_ros.core.optimiser import OptimiserOptions, Report, Solution
+from l1slam_ros.core.optimality import Status, fits_exactly, l1_cost, smoothing
 
-# Converged when both the complementarity gap u's + v't and |e - u + v|_1 are below this part of
-# the cost, which leaves it 10^-6 above the optimum, 3 10^-5 in Manhattan's flat valley.
-_TOLERANCE = 3e-5
 # How far to go towards the nearest bound.
 _FRACTION = 0.9995
 # Slacks are kept above this and never recomputed as 1 -+ y, which would cancel.
@@ -50,10 +45,92 @@ _SMALLEST_SLACK = 1e-15
 # the gap, but not below the last number.
 _DEPARTURE, _SHORTEST = 0.5, 1e-4
 # Of the curvature: how much of it is wanted, and how fast that is taken up again once refused.
-_CURVATURE, _RECOVERY = 0.5, 1.3
+_CURVATURE, _RECOVERY = 0.7, 1.3
 # Of the damping: added where a pivot is not positive; and where a step was short.
-_DAMPING_PIVOT, _DAMPING_STEP = 0.1, 0.05
-_ROUGH_L2 = LeastSquaresOptions(iterations=30, tolerance=1e-5)
+_DAMPING_PIVOT, _DAMPING_STEP = 0.1, 3.0
+_DAMPING_FACTOR = 10.0
+
+Report = Callable[[int, float], None]
+
+
+class Problem(Protocol):
+    """What is minimised: the L1 norm of a residual, over poses that move by steps."""
+
+    def residual(self, poses: Array) -> Array:
+        """Return the whitened residual, (rows,)."""
+
+    def linearise(self, poses: Array, residual: Array) -> LinearSystem:
+        """Return the linear system whose b is minus the residual."""
+
+    def step(self, poses: Array, x: Array) -> Array:
+        """Return the poses moved by x (columns,)."""
+
+    def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> Array | None:
+        """Return the Hessian of dual'e for each of the first factors, (m', 2 k, 2 k)."""
+
+
+@dataclass(frozen=True)
+class GraphProblem:
+    """The poses of a graph."""
+
+    graph: FactorGraph
+
+    def residual(self, poses: Array) -> Array:
+        """See `Problem`."""
+        return whitened_residual(self.graph, poses)
+
+    def linearise(self, poses: Array, residual: Array) -> LinearSystem:
+        """See `Problem`."""
+        return linearise(self.graph, poses, residual)
+
+    def step(self, poses: Array, x: Array) -> Array:
+        """See `Problem`."""
+        return step_poses(self.graph, poses, x)
+
+    def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> Array:
+        """See `Problem`."""
+        factors = self.graph.between
+        gradient = system.gradients(dual)[: len(factors)]
+        return self.graph.manifold.residual_curvature(
+            poses[factors.i], poses[factors.j], gradient)
+
+
+@dataclass(frozen=True)
+class LinearProblem:
+    """A step x (columns,) in the place of poses: |A x - b|."""
+
+    system: LinearSystem
+
+    def residual(self, poses: Array) -> Array:
+        """See `Problem`."""
+        return self.system.times(poses) - self.system.b
+
+    def linearise(self, poses: Array, residual: Array) -> LinearSystem:
+        """See `Problem`."""
+        return replace(self.system, b=-residual)
+
+    def step(self, poses: Array, x: Array) -> Array:
+        """See `Problem`."""
+        return poses + x
+
+    def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> None:
+        """See `Problem`."""
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """
+    What a run ended with: the best poses met, never worse than the start.
+
+    costs : (steps + 1,) the lowest so far; y : (rows,) a dual with A'y = 0, |y| <= 1; gap : by how
+    much a step of the linear problem at the poses could lower their cost at most.
+    """
+
+    poses: Array
+    costs: list[float]
+    status: Status
+    y: Array
+    gap: float
 
 
 @dataclass
@@ -74,27 +151,36 @@ class _Iterate:
 
     @property
     def gap(self) -> float:
-        return float(self.u @ self.s + self.v @ self.t)
+        from l1slam_ros.core.kernels.interior_point import gap_after
 
-    def is_solved(self, cost: float) -> bool:
+        return float(gap_after(*self.bounded, self.y, self.u, self.v, 0.0, 0.0))
+
+    @property
+    def weights(self) -> Array:
+        """Q = 1 / (u/s + v/t)."""
+        return 1 / (self.u / self.s + self.v / self.t)
+
+    @property
+    def bounded(self) -> tuple[Array, Array, Array, Array]:
+        """What must stay positive: u, v, s, t."""
+        return self.u, self.v, self.s, self.t
+
+    def is_solved(self, cost: float, tolerance: float) -> bool:
         split = l1_cost(self.residual - self.u + self.v)
-        return max(self.gap, split) < _TOLERANCE * cost
+        return max(self.gap, split) <= tolerance * cost
 
 
 @dataclass(frozen=True)
 class _Direction:
-    """A step: of the poses, of the linearised residual, of the dual, of u and v."""
+    """A step of the poses, of the linearised residual, of y, u, v; and how far it can go."""
 
     x: Array
     residual: Array
     y: Array
     u: Array
     v: Array
-
-    def longest(self, at: _Iterate) -> tuple[float, float]:
-        """Return how far primal and dual can go before a bound, 1 at most."""
-        primal = min(_to_bound(at.u, self.u), _to_bound(at.v, self.v))
-        return primal, min(_to_bound(at.s, -self.y), _to_bound(at.t, self.y))
+    primal: float
+    dual: float
 
 
 class _Regularisation:
@@ -103,82 +189,80 @@ class _Regularisation:
     def __init__(self) -> None:
         self._kappa, self._damping = _CURVATURE, 0.0
 
-    def factorise(self, graph: FactorGraph, at: _Iterate, H: csc_array) -> SuperLU:
-        """Factor H with curvature; take less of that while a pivot is not positive."""
-        C = _curvature(graph, at.poses, at.y)
+    def factorise(self, problem: Problem, at: _Iterate, weights: Array,
+                  cholesky: BlockCholesky) -> bool:
+        """Factor J'QJ + kappa C + D I; take less curvature while that is not definite."""
+        C = problem.curvature(at.poses, at.system, at.y)
         kappa, damping = self._kappa, self._damping
-        for shares in (0.5, 0.5, 0.0, None):
-            factor = factorise(
-                (H + kappa * C + diagonal(np.full(H.shape[0], damping))).tocsc())
-            if shares is None or (factor.U.diagonal() > 0).all():
+        for share in (0.5, 0.5, 0.0, None):
+            definite = cholesky.factorise(at.system, weights, damping, C, kappa)
+            if definite or share is None:
                 break
-            kappa, damping = shares * kappa, max(damping, _DAMPING_PIVOT)
+            kappa, damping = share * kappa, max(damping, _DAMPING_PIVOT)
         clean = kappa == self._kappa
         recovered = min(_CURVATURE, _RECOVERY * max(kappa, _CURVATURE / 10))
         self._kappa = recovered if clean else kappa
-        return factor
+        return definite
 
     def learn(self, length: float) -> None:
         """Damp more after a short step, less after a long one."""
         if length < 0.1:
-            self._damping = max(4 * self._damping, _DAMPING_STEP)
+            self._damping = max(_DAMPING_FACTOR * self._damping, _DAMPING_STEP)
         elif length > 0.3:
-            self._damping /= 4
+            self._damping /= _DAMPING_FACTOR
 
 
-def minimise_interior_point(
-    graph: FactorGraph,
-    poses: Array,
-    options: OptimiserOptions,
+def interior_point(
+    problem: Problem, poses: Array, cholesky: BlockCholesky, iterations: int, tolerance: float,
     report: Report = lambda iteration, cost: None,
-) -> Solution:
+) -> Optimum:
     """
-    Minimise the L1 norm of the whitened residuals in `options.outer_iterations` steps at most.
+    Minimise the L1 norm of a problem's residual from poses.
 
-    From poses (n, p), or from the L2 map that they lead to if its L1 cost is lower: from the seed
-    it is not (and false loops would bend it), from raw odometry it is. The result is the best
-    poses met, never worse than the start.
+    Parameters
+    ----------
+    cholesky : for the problem's factors
+    iterations : most steps
+    tolerance : converged when both the complementarity gap u's + v't and |e - u + v|_1 are below
+        this part of the cost
+
     """
-    residual = whitened_residual(graph, poses)
-    history = [l1_cost(residual)]
-    if fits_exactly(history[0], len(residual)):
-        return _solution(graph, poses, history, Status.CONVERGED, None)
-    at = _start(graph, _better_start(graph, poses, history[0]))
-    best, best_cost = poses, history[0]
-    regularisation, status = _Regularisation(), Status.ITERATION_LIMIT
-    for step in range(options.outer_iterations):
+    at = _start(problem, poses)
+    costs, best, regularisation = [l1_cost(at.residual)], at, _Regularisation()
+    status = Status.ITERATION_LIMIT
+    for iteration in range(iterations + 1):
         cost = l1_cost(at.residual)
-        if cost < best_cost:
-            best, best_cost = at.poses, cost
-        history.append(best_cost)
-        report(step, best_cost)
-        if at.is_solved(cost):
-            status = Status.CONVERGED if cost <= best_cost else Status.STALLED
+        if at.is_solved(cost, tolerance) or fits_exactly(cost, len(at.y)):
+            status = Status.CONVERGED if cost <= costs[-1] else Status.STALLED
+        if cost <= costs[-1]:
+            best = replace(at, u=at.u.copy(), v=at.v.copy(), s=at.s.copy(), t=at.t.copy(),
+                           y=at.y.copy())
+        if iteration:
+            costs.append(min(cost, costs[-1]))
+            report(iteration, costs[-1])
+        if status is not Status.ITERATION_LIMIT or iteration == iterations:
             break
-        try:
-            _step(graph, at, regularisation)
-        except GraphError:
+        if not _step(problem, at, cholesky, regularisation):
             status = Status.STALLED
             break
-    return _solution(graph, best, history, status, at)
+    y = _feasible_dual(best, cholesky)
+    return Optimum(best.poses, costs, status, y, max(costs[-1] - float(y @ best.residual), 0.0))
 
 
-def _solution(graph: FactorGraph, poses: Array, history: list[float], status: Status,
-              at: _Iterate | None) -> Solution:
-    dual = np.zeros(len(whitened_residual(graph, poses))) if at is None else at.y
-    gap = 0.0 if at is None else at.gap
-    return Solution(poses, history[-1], status, len(history) - 1, 0, np.array(history), dual, gap)
+def _feasible_dual(at: _Iterate, cholesky: BlockCholesky) -> Array:
+    """Return a dual near y with A'y = 0, |y| <= 1: projected along the weights, then shrunk."""
+    Q = at.weights
+    if not cholesky.factorise(at.system, Q):
+        return np.zeros_like(at.y)
+    x = cholesky.solve(at.system.transposed_times(at.y))
+    y = at.y - Q * at.system.times(x)
+    return y / max(1.0, float(np.abs(y).max(initial=0.0)))
 
 
-def _better_start(graph: FactorGraph, poses: Array, cost: float) -> Array:
-    rough = minimise_l2(graph, poses, _ROUGH_L2).poses
-    return rough if l1_cost(whitened_residual(graph, rough)) < cost else poses
-
-
-def _start(graph: FactorGraph, poses: Array) -> _Iterate:
+def _start(problem: Problem, poses: Array) -> _Iterate:
     """Return the point of the central path of mu = mean |e| for the residual as it is."""
-    system = linearise(graph, poses)
-    e = -system.b
+    e = problem.residual(poses)
+    system = problem.linearise(poses, e)
     mu = smoothing(e)
     root = np.hypot(mu, e)
     large = (mu + root + np.abs(e)) / 2
@@ -187,68 +271,51 @@ def _start(graph: FactorGraph, poses: Array) -> _Iterate:
     return _Iterate(poses, system, u, v, mu / u, mu / v, e / (mu + root))
 
 
-def _step(graph: FactorGraph, at: _Iterate, regularisation: _Regularisation) -> None:
-    """Move `at` by one predictor and corrector step."""
-    A, n = at.system.A, len(at.y)
-    Q = 1 / (at.u / at.s + at.v / at.t)
-    factor = regularisation.factorise(graph, at, (A.T @ (diagonal(Q) @ A)).tocsc())
-    predictor = _direction(at, factor, Q, np.zeros(n), np.zeros(n))
-    primal, dual = predictor.longest(at)
-    reached = float((at.u + primal * predictor.u) @ (at.s - dual * predictor.y)
-                    + (at.v + primal * predictor.v) @ (at.t + dual * predictor.y))
+def _step(problem: Problem, at: _Iterate, cholesky: BlockCholesky,
+          regularisation: _Regularisation) -> bool:
+    """Move `at` by one predictor and corrector step; False: there was no direction."""
+    from l1slam_ros.core.kernels.interior_point import advance, gap_after
+
+    n, Q = len(at.y), at.weights
+    if not regularisation.factorise(problem, at, Q, cholesky):
+        return False
+    predictor = _direction(at, cholesky, Q, np.zeros(n), np.zeros(n))
+    reached = gap_after(*at.bounded, predictor.y, predictor.u, predictor.v, predictor.primal,
+                        predictor.dual)
     mu = at.gap / (2 * n) * (reached / at.gap) ** 3
-    corrector = _direction(at, factor, Q, mu + predictor.u * predictor.y,
+    corrector = _direction(at, cholesky, Q, mu + predictor.u * predictor.y,
                            mu - predictor.v * predictor.y)
-    primal, dual = corrector.longest(at)
-    primal, poses = _trusted(graph, at, corrector, primal)
+    if not np.isfinite(corrector.x).all():
+        return False
+    primal, at.poses, residual = _trusted(problem, at, corrector)
     regularisation.learn(primal)
-    at.poses, at.system = poses, linearise(graph, poses)
-    at.u, at.v = at.u + primal * corrector.u, at.v + primal * corrector.v
-    at.y = at.y + dual * corrector.y
-    at.s = np.maximum(at.s - dual * corrector.y, _SMALLEST_SLACK)
-    at.t = np.maximum(at.t + dual * corrector.y, _SMALLEST_SLACK)
+    at.system = problem.linearise(at.poses, residual)
+    advance(*at.bounded, at.y, corrector.y, corrector.u, corrector.v, primal, corrector.dual,
+            _SMALLEST_SLACK)
+    return True
 
 
-def _direction(at: _Iterate, factor: SuperLU, Q: Array, c1: Array, c2: Array) -> _Direction:
+def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, c1: Array,
+               c2: Array) -> _Direction:
     """Solve for the step whose complementarity products become c1, c2 to first order."""
-    A = at.system.A
-    g = at.residual - (at.u - at.v) - (c1 / at.s - at.u) + (c2 / at.t - at.v)
-    x = factor.solve(-(A.T @ (at.y + Q * g)))
-    residual = A @ x
-    y = Q * (residual + g)
-    return _Direction(x, residual, y, (c1 + at.u * y) / at.s - at.u,
-                      (c2 - at.v * y) / at.t - at.v)
+    from l1slam_ros.core.kernels.interior_point import complete, right_side
+
+    g, z = right_side(at.residual, *at.bounded, at.y, Q, c1, c2)
+    x = cholesky.solve(-at.system.transposed_times(z))
+    moved = at.system.times(x)
+    y, u, v, primal, dual = complete(*at.bounded, Q, c1, c2, g, moved)
+    return _Direction(x, moved, y, u, v, min(1.0, _FRACTION * primal),
+                      min(1.0, _FRACTION * dual))
 
 
-def _trusted(graph: FactorGraph, at: _Iterate, direction: _Direction,
-             length: float) -> tuple[float, Array]:
+def _trusted(problem: Problem, at: _Iterate, direction: _Direction) -> tuple[float, Array, Array]:
     """Halve the primal step while the residual departs too far from its linearisation."""
+    length = direction.primal
     while True:
-        poses = step_poses(graph, at.poses, length * direction.x)
+        poses = problem.step(at.poses, length * direction.x)
         linear = at.residual + length * direction.residual
-        departure = l1_cost(whitened_residual(graph, poses) - linear)
+        residual = problem.residual(poses)
+        departure = l1_cost(residual - linear)
         if departure <= _DEPARTURE * at.gap or length < _SHORTEST:
-            return length, poses
+            return length, poses, residual
         length /= 2
-
-
-def _to_bound(value: Array, step: Array) -> float:
-    shrinks = step < 0
-    if not shrinks.any():
-        return 1.0
-    return min(1.0, _FRACTION * float(np.min(-value[shrinks] / step[shrinks])))
-
-
-def _curvature(graph: FactorGraph, poses: Array, y: Array) -> csc_array:
-    """Return C = sum y d2e over the between factors, (columns, columns)."""
-    manifold, factors, d = graph.manifold, graph.between, graph.manifold.TANGENT_SIZE
-    rows = y[: len(factors) * d].reshape(-1, d, 1)
-    dual = (factors.sqrt_information.transpose(0, 2, 1) @ rows)[..., 0]
-    H = manifold.residual_curvature(
-        factors.measurement, poses[factors.i], poses[factors.j], dual)
-    keyframe = np.stack((factors.i, factors.j), axis=1) - anchor(graph)
-    column = (keyframe[:, :, None] * d + np.arange(d)).reshape(-1, 2 * d)
-    row, column = (np.broadcast_to(c, H.shape) for c in (column[:, :, None], column[:, None, :]))
-    keep = (H != 0) & (row >= 0) & (column >= 0)
-    n = (graph.n_poses - anchor(graph)) * d
-    return coo_array((H[keep], (row[keep], column[keep])), shape=(n, n)).tocsc()

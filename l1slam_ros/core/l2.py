@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l1slam_ros.core.cholesky import BlockCholesky
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.least_squares import weighted_least_squares
 from l1slam_ros.core.linearise import linearise, step_poses, whitened_residual
@@ -44,16 +45,18 @@ def minimise_l2(
     graph: FactorGraph,
     poses: Array,
     options: LeastSquaresOptions,
+    cholesky: BlockCholesky,
     report: Report = lambda iteration, cost: None,
 ) -> Solution:
     """Minimise chi2, the sum of squared whitened residuals; arguments as `optimiser.minimise`."""
-    return _gauss_newton(graph, poses, l2_cost, np.ones_like, options, report)
+    return _gauss_newton(graph, poses, l2_cost, np.ones_like, options, cholesky, report)
 
 
 def minimise_huber(
     graph: FactorGraph,
     poses: Array,
     options: LeastSquaresOptions,
+    cholesky: BlockCholesky,
     report: Report = lambda iteration, cost: None,
 ) -> Solution:
     """
@@ -69,7 +72,7 @@ def minimise_huber(
         return np.repeat(delta / np.maximum(length, delta), d)
 
     return _gauss_newton(graph, poses, lambda r: huber_cost(r, d, delta), weights, options,
-                         report)
+                         cholesky, report)
 
 
 def huber_cost(residual: Array, d: int, delta: float) -> float:
@@ -89,21 +92,24 @@ def _gauss_newton(
     cost_of: _Cost,
     weights_of: _Weights,
     options: LeastSquaresOptions,
+    cholesky: BlockCholesky,
     report: Report,
 ) -> Solution:
-    history = [cost_of(whitened_residual(graph, poses))]
+    residual = whitened_residual(graph, poses)
+    history = [cost_of(residual)]
     status, damping = Status.ITERATION_LIMIT, 0.0
     while len(history) <= options.iterations:
-        system = linearise(graph, poses)
-        if fits_exactly(l1_cost(system.b), len(system.b)):
+        if fits_exactly(l1_cost(residual), len(residual)):
             status = Status.CONVERGED
             break
-        step = weighted_least_squares(system.A, system.b, weights_of(system.b), damping)
+        system = linearise(graph, poses, residual)
+        step = weighted_least_squares(system, cholesky, weights_of(residual), damping)
         candidate = step_poses(graph, poses, step)
-        cost = cost_of(whitened_residual(graph, candidate))
+        moved = whitened_residual(graph, candidate)
+        cost = cost_of(moved)
         decrease = history[-1] - cost
         if decrease >= 0:
-            poses = candidate
+            poses, residual = candidate, moved
             damping = damping / 10 if damping > _FIRST_DAMPING else 0.0
         else:
             damping, cost = max(10 * damping, _FIRST_DAMPING), history[-1]

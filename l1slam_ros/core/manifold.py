@@ -75,10 +75,12 @@ class Manifold(Protocol):
     ) -> tuple[Array, Array]:
         """Return J_r_i and J_r_j of `residual`, each (n, d, d)."""
 
-    def residual_curvature(
-        self, measurement: Array, pose_i: Array, pose_j: Array, dual: Array
-    ) -> Array:
-        """Return the Hessian of dual'e over (step of i, step of j), (n, 2 d, 2 d); dual (n, d)."""
+    def residual_curvature(self, pose_i: Array, pose_j: Array, gradient: Array) -> Array:
+        """
+        Return the Hessian of dual'e over (step of i, step of j), (n, 2 d, 2 d).
+
+        gradient : (n, 2, d) J_r_i' dual and J_r_j' dual
+        """
 
     def local_jacobian(self, a: Array, b: Array) -> Array:
         """Return J_l_b of `local`, (n, d, d)."""

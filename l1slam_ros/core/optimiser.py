@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Algorithm 4: the outer loop. Linearise as for L2, solve by Algorithm 2, retract, accept or shrink.
+Algorithm 4: the outer loop. Linearise as for L2, primal-dual solve, retract, accept or shrink.
 
 In: a graph, poses and the dual of an earlier solve, if any. Out: poses of lower L1 cost. The
 dual is kept from one linearisation to the next: restarted from zero, the loop stalls above the
@@ -13,13 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l1slam_ros.core.cholesky import BlockCholesky
 from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.halpern import minimise_l1_halpern
 from l1slam_ros.core.least_squares import reweighted_start
 from l1slam_ros.core.linearise import linearise, step_poses, whitened_residual
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.optimality import Status, fits_exactly, l1_cost
 from l1slam_ros.core.options import Options, option
-from l1slam_ros.core.primal_dual import PrimalDualOptions, minimise_l1
+from l1slam_ros.core.primal_dual import PrimalDualOptions
 
 # A linearisation whose cost fell by more than this part left a different problem behind: its dual
 # no longer fits. Keeping it there ends 15% above the optimum from City's stored start.
@@ -65,6 +67,7 @@ def minimise(
     graph: FactorGraph,
     poses: Array,
     options: OptimiserOptions,
+    cholesky: BlockCholesky | None = None,
     dual: Array | None = None,
     deadline: float = np.inf,
     report: Report = lambda iteration, cost: None,
@@ -76,8 +79,10 @@ def minimise(
     ----------
     graph, poses : the factors and the (n, p) poses to start from
     options : see `OptimiserOptions`
-    dual : (rows,) of an earlier solve; without one, and while the poses are still far from the
-        optimum, a linear problem is started from reweighted least squares
+    cholesky : of the graph; while there is no dual, and while the poses are still far from the
+        optimum, a linear problem is started from reweighted least squares by it; without it, from
+        what the last one left
+    dual : (rows,) of an earlier solve
     deadline : `time.monotonic()` [s] after which no new linearisation begins
     report : called with the outer iteration and its cost
 
@@ -90,11 +95,12 @@ def minimise(
             status, gap = Status.CONVERGED, 0.0
             break
         system = linearise(graph, poses)
-        if dual is None or (outer and is_far(*history[-2:])):
-            x, dual = reweighted_start(system.A, system.b)
+        if cholesky and (dual is None or (outer and is_far(*history[-2:]))):
+            x, dual = reweighted_start(system, cholesky)
         else:
-            x = np.zeros(system.A.shape[1])
-        solution = minimise_l1(system.A, system.b, x, dual, options.inner, deadline)
+            x = np.zeros(system.size * system.block_size)
+            dual = np.zeros(len(residual)) if dual is None else dual
+        solution = minimise_l1_halpern(system, x, dual, options.inner, deadline=deadline)
         inner += solution.iterations
         dual, gap = solution.y, solution.gap
         poses, cost = backtrack(graph, poses, solution.x, history[-1])

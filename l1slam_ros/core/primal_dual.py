@@ -51,7 +51,7 @@ class PrimalDualSolution:
     What Algorithm 2 ended with.
 
     x : (columns,) step; y : (rows,) dual; objective : |A x - b|_1; gap : see `duality_gap`;
-    history : (k, 2) rows (iteration, objective), the start first.
+    history : (k, 2) rows (iteration, objective), the start first; weight : the primal weight.
     """
 
     x: Array
@@ -61,6 +61,7 @@ class PrimalDualSolution:
     status: Status
     iterations: int
     history: Array
+    weight: float
 
 
 def primal_dual(
@@ -160,7 +161,8 @@ def minimise_l1(
         if time.monotonic() > deadline:
             status = Status.OUT_OF_TIME
             break
-    return PrimalDualSolution(x, y, history[-1][1], gap, status, k, np.array(history))
+    return PrimalDualSolution(x, y, history[-1][1], gap, status, k, np.array(history),
+                              omega)
 
 
 def _inverse(values: Array, where_zero: float) -> Array:

@@ -21,21 +21,21 @@ COVARIANCE_ROWS = (0, 1, 5)
 
 def wrap(angle: Array) -> Array:
     """Return the angle [rad] in (-pi, pi]; values already there are returned to the last bit."""
-    inside = (angle > -np.pi) & (angle <= np.pi)
-    wrapped = np.pi - np.mod(np.pi - angle, 2 * np.pi)
-    # One rounding above pi the remainder is rounded up to the whole turn.
-    return np.where(inside, angle, np.where(wrapped <= -np.pi, np.pi, wrapped))
+    wrapped = angle - 2 * np.pi * np.rint(angle / (2 * np.pi))
+    # Rounding can leave it one rounding outside.
+    return np.where(wrapped <= -np.pi, np.pi, np.minimum(wrapped, np.pi))
 
 
-def _rotate(theta: Array, vector: Array) -> Array:
-    """Return R(theta) vector for stacked angles (n,) and vectors (n, 2)."""
+def _turned(theta: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    """Return R(theta) (x, y)', the two coordinates."""
     c, s = np.cos(theta), np.sin(theta)
-    x, y = vector[..., 0], vector[..., 1]
-    return np.stack((c * x - s * y, s * x + c * y), axis=-1)
+    return c * x - s * y, s * x + c * y
 
 
-def _join(translation: Array, theta: Array) -> Array:
-    return np.concatenate((translation, wrap(theta)[..., None]), axis=-1)
+def _pose(x: Array, y: Array, theta: Array) -> Array:
+    pose = np.empty((*theta.shape, 3))
+    pose[..., 0], pose[..., 1], pose[..., 2] = x, y, wrap(theta)
+    return pose
 
 
 def identity(n: int) -> Array:
@@ -45,17 +45,19 @@ def identity(n: int) -> Array:
 
 def compose(a: Array, b: Array) -> Array:
     """Return a b, (n, 3)."""
-    return _join(a[..., :2] + _rotate(a[..., 2], b[..., :2]), a[..., 2] + b[..., 2])
+    x, y = _turned(a[..., 2], b[..., 0], b[..., 1])
+    return _pose(a[..., 0] + x, a[..., 1] + y, a[..., 2] + b[..., 2])
 
 
 def inverse(a: Array) -> Array:
     """Return a^-1, (n, 3)."""
-    return _join(-_rotate(-a[..., 2], a[..., :2]), -a[..., 2])
+    return _pose(*_turned(-a[..., 2], -a[..., 0], -a[..., 1]), -a[..., 2])
 
 
 def between(a: Array, b: Array) -> Array:
     """Return a^-1 b, (n, 3)."""
-    return _join(_rotate(-a[..., 2], b[..., :2] - a[..., :2]), b[..., 2] - a[..., 2])
+    moved = _turned(-a[..., 2], b[..., 0] - a[..., 0], b[..., 1] - a[..., 1])
+    return _pose(*moved, b[..., 2] - a[..., 2])
 
 
 def retract(pose: Array, step: Array) -> Array:
@@ -71,7 +73,9 @@ def local(a: Array, b: Array) -> Array:
 def adjoint(pose: Array) -> Array:
     """Return Ad = [[R, (y, -x)'], [0, 1]], (n, 3, 3)."""
     J = np.zeros((*pose.shape, 3))
-    J[..., :2, :2] = _rotation_matrix(pose[..., 2])
+    J[..., 0, 0] = J[..., 1, 1] = np.cos(pose[..., 2])
+    J[..., 1, 0] = np.sin(pose[..., 2])
+    J[..., 0, 1] = -J[..., 1, 0]
     J[..., 0, 2] = pose[..., 1]
     J[..., 1, 2] = -pose[..., 0]
     J[..., 2, 2] = 1.0
@@ -80,7 +84,11 @@ def adjoint(pose: Array) -> Array:
 
 def residual(measurement: Array, pose_i: Array, pose_j: Array) -> Array:
     """Return t2v(Z^-1 Xi^-1 Xj), (n, 3)."""
-    return between(measurement, between(pose_i, pose_j))
+    from l1slam_ros.core.kernels import se2
+
+    e: Array = se2.residual(measurement, pose_i, pose_j)
+    e[:, 2] = wrap(e[:, 2])
+    return e
 
 
 def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> tuple[Array, Array]:
@@ -90,43 +98,33 @@ def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> tupl
     With t = Ri'(tj - ti): `J_r_i = [[-Rz', Rz'(t_y, -t_x)'], [0, -1]]` and
     `J_r_j = [[Rz' Ri' Rj, 0], [0, 1]]`.
     """
-    relative = between(pose_i, pose_j)
-    theta_z = measurement[..., 2]
-    J_r_i = np.zeros((*pose_i.shape, 3))
-    J_r_i[..., :2, :2] = -_rotation_matrix(-theta_z)
-    lever = np.stack((relative[..., 1], -relative[..., 0]), axis=-1)
-    J_r_i[..., :2, 2] = _rotate(-theta_z, lever)
-    J_r_i[..., 2, 2] = -1.0
-    return J_r_i, local_jacobian(measurement, relative)
+    from l1slam_ros.core.kernels import se2
+
+    J_r_i, J_r_j = se2.jacobians(measurement, pose_i, pose_j)
+    return J_r_i, J_r_j
 
 
-def residual_curvature(
-    measurement: Array, pose_i: Array, pose_j: Array, dual: Array
-) -> Array:
+def residual_curvature(pose_i: Array, pose_j: Array, gradient: Array) -> Array:
     """
-    Return the Hessian of dual'e over (step of i, step of j), (n, 6, 6); dual (n, 3).
+    Return the Hessian of dual'e over (step of i, step of j), (n, 6, 6); gradient (n, 2, 3).
 
-    With l = Rz (dual_x, dual_y), t = Ri'(tj - ti) and phi the angle of the residual, the entries
-    (and their mirrors) are (theta_i, x_i) = l_y, (theta_i, y_i) = -l_x, (theta_i, theta_i) = -l.t,
-    (theta_i, x_j) = dual_x sin phi - dual_y cos phi,
-    (theta_i, y_j) = dual_y sin phi + dual_x cos phi. The residual is linear in all else.
+    With g = J_r_i' dual, h = J_r_j' dual (the gradients) and t = Ri'(tj - ti), the entries (and
+    their mirrors) are (theta_i, x_i) = -g_y, (theta_i, y_i) = g_x, (theta_i, theta_i) = g.t,
+    (theta_i, x_j) = -h_y, (theta_i, y_j) = h_x. The residual is linear in all else.
     """
-    relative = between(pose_i, pose_j)
-    lever = _rotate(measurement[..., 2], dual[..., :2])
-    # Seen from keyframe j: the derivative of R(-phi) turns by a right angle.
-    seen = _rotate(-(relative[..., 2] - measurement[..., 2]), dual[..., :2])
-    H = np.zeros((*pose_i.shape[:-1], 6, 6))
-    H[..., 2, 0], H[..., 2, 1] = lever[..., 1], -lever[..., 0]
-    H[..., 2, 3], H[..., 2, 4] = -seen[..., 1], seen[..., 0]
-    H[..., 0:5, 2] = H[..., 2, 0:5]
-    H[..., 2, 2] = -(lever * relative[..., :2]).sum(axis=-1)
+    from l1slam_ros.core.kernels import se2
+
+    H: Array = se2.curvature(pose_i, pose_j, gradient)
     return H
 
 
 def local_jacobian(a: Array, b: Array) -> Array:
     """Return J_l_b of t2v(a^-1 b) = [[Ra' Rb, 0], [0, 1]], (n, 3, 3)."""
+    theta = b[..., 2] - a[..., 2]
     J = np.zeros((*b.shape, 3))
-    J[..., :2, :2] = _rotation_matrix(b[..., 2] - a[..., 2])
+    J[..., 0, 0] = J[..., 1, 1] = np.cos(theta)
+    J[..., 1, 0] = np.sin(theta)
+    J[..., 0, 1] = -J[..., 1, 0]
     J[..., 2, 2] = 1.0
     return J
 
@@ -160,8 +158,3 @@ def to_pose3(pose: Array) -> Array:
     pose3[..., 5] = np.sin(pose[..., 2] / 2)
     pose3[..., 6] = np.cos(pose[..., 2] / 2)
     return pose3
-
-
-def _rotation_matrix(theta: Array) -> Array:
-    c, s = np.cos(theta), np.sin(theta)
-    return np.stack((np.stack((c, -s), -1), np.stack((s, c), -1)), -2)

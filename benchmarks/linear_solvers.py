@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+How a solver of min |A x - b|_1 is brought to a mark: a cost at most so much above the optimum.
+
+Nobody's own word is taken: the cost is that of the x which came back. A solver that stops by a
+tolerance is given one after the other, loosest first, and the cheapest run that reaches the mark
+is its own; one that yields its iterates is stopped at the first that does.
+"""
+
+import itertools
+import time
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from measuring import Answer, timed
+from problems import InnerProblem
+
+from l1slam_ros.core.manifold import Array
+
+Setting = Hashable
+TOLERANCES = tuple(10.0**-k for k in range(2, 9))
+# Iterations between two looks at the cost, when it is not yet known how many are needed.
+_LOOK_EVERY = 20
+
+
+class LinearSolver(Protocol):
+    """What a row of the table of inner problems is made with."""
+
+    @property
+    def name(self) -> str:
+        """Of the row."""
+
+    def reach(
+        self, problem: InnerProblem, costs: Sequence[float], limit: float
+    ) -> list[Setting | None]:
+        """Return the setting that reaches each cost the fastest; None: not in `limit` [s]."""
+
+    def run(self, problem: InnerProblem, setting: Setting, limit: float) -> Answer:
+        """Solve once, in at most about `limit` [s]."""
+
+
+@dataclass(frozen=True)
+class ByTolerance:
+    """
+    A solver that stops by itself.
+
+    sweeps : settings to try, loosest first, of each form or method that it offers
+    solve : problem, setting, time limit [s] -> x and the time it took
+    """
+
+    name: str
+    sweeps: tuple[tuple[Setting, ...], ...]
+    solve: Callable[[InnerProblem, Setting, float], Answer]
+
+    def reach(
+        self, problem: InnerProblem, costs: Sequence[float], limit: float
+    ) -> list[Setting | None]:
+        """Try the settings of each sweep until one reaches the lowest cost or takes too long."""
+        tried: list[tuple[float, float, Setting]] = []
+        for sweep in self.sweeps:
+            for setting in sweep:
+                answer = self.solve(problem, setting, limit)
+                tried.append((answer.seconds, problem.cost(answer.x), setting))
+                if tried[-1][1] <= min(costs) or answer.seconds >= limit:
+                    break
+        best = [min((t for t in tried if t[0] < limit and t[1] <= cost), key=lambda t: t[0],
+                    default=None) for cost in costs]
+        return [t[2] if t else None for t in best]
+
+    def run(self, problem: InnerProblem, setting: Setting, limit: float) -> Answer:
+        """Solve once."""
+        return self.solve(problem, setting, limit)
+
+
+@dataclass(frozen=True)
+class ByIterations:
+    """A solver that yields its x after each iteration; a setting is how many there are."""
+
+    name: str
+    iterates: Callable[[InnerProblem], Iterator[Array]]
+
+    def reach(
+        self, problem: InnerProblem, costs: Sequence[float], limit: float
+    ) -> list[Setting | None]:
+        """Iterate, and note when each cost is first reached."""
+        needed: list[Setting | None] = [None] * len(costs)
+        deadline = time.monotonic() + limit
+        for k, x in enumerate(self.iterates(problem), 1):
+            if k % _LOOK_EVERY:
+                continue
+            cost = problem.cost(x)
+            needed = [k if n is None and cost <= c else n
+                      for n, c in zip(needed, costs, strict=True)]
+            if None not in needed or time.monotonic() > deadline:
+                break
+        return needed
+
+    def run(self, problem: InnerProblem, setting: Setting, limit: float) -> Answer:
+        """Iterate as often as the setting says, however long that takes."""
+        assert isinstance(setting, int)
+        return timed(lambda: next(itertools.islice(
+            self.iterates(problem), setting - 1, setting)))

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What is measured: graphs with their starts, and the linear L1 problems inside them.
+
+In: a folder of public graphs. Out: `Case` (a graph, poses to start from) and `InnerProblem`
+(minimise |A x - b|_1). Worlds come from the package's own simulation, by a fixed seed.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.initial import odometry_poses
+from l1slam_ros.core.linearise import LinearSystem, linearise
+from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.seed import seed_poses
+from l1slam_ros.core.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.graph_file import read_graph_file
+
+GRAPHS = ('intel', 'manhattan3500', 'city10000')
+# Poses and edges of the world that has many loops per pose.
+DENSE_WORLD = (10_000, 64_000)
+STARTS = ('stored', 'odometry', 'seed')
+PARTS = ('angle', 'translation', 'global')
+_SEED = 4
+# [m, rad] How far, one sigma, a perturbed start lies from the stored one.
+_PERTURBATION = (0.2, 0.05)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A graph and its stored poses (n, p)."""
+
+    name: str
+    graph: FactorGraph
+    stored: Array
+
+    @cached_property
+    def starts(self) -> dict[str, Array]:
+        """Poses (n, p) by the name of the start; the seed is not counted where it is one."""
+        return {'stored': self.stored, 'odometry': odometry_poses(self.graph), 'seed': self.seed}
+
+    @cached_property
+    def seed(self) -> Array:
+        return seed_poses(self.graph)
+
+    def perturbed(self, number: int) -> Array:
+        """Return the stored poses, each but the first moved by noise of its own, (n, p)."""
+        manifold = self.graph.manifold
+        sigma = np.empty(manifold.TANGENT_SIZE)
+        sigma[manifold.TRANSLATION], sigma[manifold.ROTATION] = _PERTURBATION
+        rng = np.random.default_rng((_SEED, number))
+        step = sigma * rng.standard_normal((self.graph.n_poses, manifold.TANGENT_SIZE))
+        step[0] = 0.0
+        return manifold.retract(self.stored, step)
+
+
+@dataclass(frozen=True)
+class InnerProblem:
+    """Minimise |A x - b|_1; A (rows, columns), b (rows,)."""
+
+    name: str
+    A: csr_array
+    b: Array
+
+    def cost(self, x: Array) -> float:
+        """Return |A x - b|_1, the only word that is taken for how good an x is."""
+        return float(np.abs(self.A @ x - self.b).sum())
+
+
+def public_case(datasets: Path, name: str) -> Case:
+    """Return one of `GRAPHS`."""
+    record = read_graph_file(datasets / f'{name}.g2o')
+    assert record.poses is not None, name
+    return Case(name, record.graph, record.poses)
+
+
+def simulated_case(n_poses: int, n_edges: int) -> Case:
+    """Return a world; what it stores is the odometry chain."""
+    world = simulate_world(n_poses, n_edges, WorldOptions(), np.random.default_rng(_SEED))
+    return Case(f'world {n_poses} / {n_edges}', world.graph, world.odometry)
+
+
+def inner_problems(case: Case) -> Iterator[InnerProblem]:
+    """
+    Yield the angle and the translation problem of Algorithm 3 and the global step at the seed.
+
+    All three at the seed. Unknowns of the first two are measured from the odometry chain, as
+    Algorithm 3 meets them: measured from the seed, the answer would be zero.
+    """
+    system = linearise(case.graph, case.seed)
+    manifold = case.graph.manifold
+    chain = manifold.local(case.seed, odometry_poses(case.graph))[1:].ravel()
+    for part, entries in (('angle', manifold.ROTATION), ('translation', manifold.TRANSLATION)):
+        yield _part(f'{case.name}: {part}', system, entries, manifold.TANGENT_SIZE, chain)
+    yield InnerProblem(f'{case.name}: global', system.A, system.b)
+
+
+def _part(
+    name: str, system: LinearSystem, entries: slice, size: int, origin: Array
+) -> InnerProblem:
+    """Return the rows and columns of some entries of each tangent vector, seen from `origin`."""
+    rows, columns = (np.arange(n).reshape(-1, size)[:, entries].ravel() for n in system.A.shape)
+    A: csr_array = system.A[rows][:, columns].tocsr()
+    return InnerProblem(name, A, system.b[rows] - A @ origin[columns])

@@ -1,0 +1,335 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Supernodal Cholesky of a sparse matrix of d x d blocks: factorisation and solution.
+
+Panels are dense, row after row: entry (r, c) of panel s is panels[offset[s] + r width + c].
+Left-looking: each supernode gathers what all earlier ones subtract from it, then is factored; all
+the work is done in tiles of 3 x 3 inner products, which reuse what they load and suit blocks of
+three and of six. Source: Ng and Peyton, "Block sparse Cholesky algorithms on advanced uniprocessor
+computers" (1993).
+"""
+
+import numpy as np
+
+from l1slam_ros.core.kernels.compiled import compiled
+
+# A pivot that is left with less than this part of its diagonal entry is rounding.
+_SINGULAR = 1e-15
+
+
+@compiled
+def block_addresses(row, col, first, start, pattern, offset, d):
+    """Return where the blocks (row, col) lie in the panels, and the panel's width, (m,) each."""
+    address, width = np.empty(len(row), np.int64), np.empty(len(row), np.int64)
+    supernode = np.searchsorted(first, col, side='right') - 1
+    for k in range(len(row)):
+        s = supernode[k]
+        place = np.searchsorted(pattern[start[s]:start[s + 1]], row[k])
+        width[k] = (first[s + 1] - first[s]) * d
+        address[k] = offset[s] + place * d * width[k] + (col[k] - first[s]) * d
+    return address, width
+
+
+@compiled
+def factorise(panels, first, start, pattern, offset, size):
+    """
+    Turn the lower triangle in `panels` into its Cholesky factor.
+
+    Returns the first position whose pivot is not positive; the number of positions when all are.
+    """
+    count, n, d = len(first) - 1, first[-1], len(size)
+    # Supernodes that have something to subtract from s are a linked list; reach: from which of
+    # their rows on.
+    waiting, following = np.full(count, -1, np.int32), np.full(count, -1, np.int32)
+    reach = np.zeros(count, np.int64)
+    owner, local = np.empty(n, np.int32), np.empty(n, np.int64)
+    tallest = 0
+    for s in range(count):
+        owner[first[s]:first[s + 1]] = s
+        tallest = max(tallest, (start[s + 1] - start[s]) * d)
+    place, target = np.empty(tallest, np.int64), np.empty(tallest, np.int64)
+    least = np.empty(tallest)
+    for s in range(count):
+        width = (first[s + 1] - first[s]) * d
+        for k in range(start[s], start[s + 1]):
+            local[pattern[k]] = offset[s] + (k - start[s]) * d * width
+        for c in range(width):
+            least[c] = _SINGULAR * panels[offset[s] + c * (width + 1)]
+        source = waiting[s]
+        while source >= 0:
+            next_source = following[source]
+            rows = pattern[start[source] + reach[source]:start[source + 1]]
+            inner = (first[source + 1] - first[source]) * d
+            top = offset[source] + reach[source] * d * inner
+            columns = _within(rows, first[s + 1])
+            for k in range(len(rows)):
+                for a in range(d):
+                    place[k * d + a] = local[rows[k]] + a * width
+            for k in range(columns):
+                for a in range(d):
+                    target[k * d + a] = (rows[k] - first[s]) * d + a
+            _subtract(panels, top, inner, len(rows) * d, columns * d, place, target, size)
+            reach[source] += columns
+            _enqueue(source, reach[source], start, pattern, owner, waiting, following)
+            source = next_source
+        panel = panels[offset[s]:offset[s + 1]]
+        bad = _factorise_panel(panel, (start[s + 1] - start[s]) * d, width, least)
+        if bad < width:
+            return first[s] + bad // d
+        reach[s] = first[s + 1] - first[s]
+        _enqueue(s, reach[s], start, pattern, owner, waiting, following)
+    return n
+
+
+@compiled
+def _within(rows, end):
+    """Return how many of the sorted rows lie before `end`."""
+    count = 0
+    while count < len(rows) and rows[count] < end:
+        count += 1
+    return count
+
+
+@compiled
+def _enqueue(source, reach, start, pattern, owner, waiting, following):
+    """Let a supernode wait for the one that owns its next row."""
+    if start[source] + reach < start[source + 1]:
+        target = owner[pattern[start[source] + reach]]
+        following[source] = waiting[target]
+        waiting[target] = source
+
+
+@compiled
+def _subtract(panels, top, inner, height, columns, place, target, size):
+    """
+    Subtract products of a source's rows, from `top` on, from the panel that they belong to.
+
+    place : (height,) where each of the rows begins in the target's panel; target : (columns,) the
+    column of that panel that belongs to each of the first rows
+    """
+    source = panels[top:top + height * inner]
+    for c in range(0, columns, 3):
+        c1, c2 = min(c + 1, columns - 1), min(c + 2, columns - 1)
+        right = (source[c * inner:(c + 1) * inner], source[c1 * inner:(c1 + 1) * inner],
+                 source[c2 * inner:(c2 + 1) * inner])
+        for r in range(c, height, 3):
+            r1, r2 = min(r + 1, height - 1), min(r + 2, height - 1)
+            left = (source[r * inner:(r + 1) * inner], source[r1 * inner:(r1 + 1) * inner],
+                    source[r2 * inner:(r2 + 1) * inner])
+            tile = _narrow_tile(left, right, size) if inner == len(size) else _tile(left, right)
+            _write(panels[place[r]:], target[c], target[c1], target[c2], c1 > c, c2 > c1, tile[0])
+            if r1 > r:
+                _write(panels[place[r1]:], target[c], target[c1], target[c2], c1 > c, c2 > c1,
+                       tile[1])
+            if r2 > r1:
+                _write(panels[place[r2]:], target[c], target[c1], target[c2], c1 > c, c2 > c1,
+                       tile[2])
+
+
+@compiled
+def _write(row, t0, t1, t2, has_second, has_third, values):
+    """Subtract up to three values from a row of a panel."""
+    row[t0] -= values[0]
+    if has_second:
+        row[t1] -= values[1]
+    if has_third:
+        row[t2] -= values[2]
+
+
+@compiled
+def _tile(left, right):
+    """Return the nine inner products of three rows with three rows."""
+    left0, left1, left2 = left
+    right0, right1, right2 = right
+    s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = 0.0
+    for q in range(len(left0)):
+        x0, x1, x2 = left0[q], left1[q], left2[q]
+        y0, y1, y2 = right0[q], right1[q], right2[q]
+        s00 += x0 * y0
+        s01 += x0 * y1
+        s02 += x0 * y2
+        s10 += x1 * y0
+        s11 += x1 * y1
+        s12 += x1 * y2
+        s20 += x2 * y0
+        s21 += x2 * y1
+        s22 += x2 * y2
+    return (s00, s01, s02), (s10, s11, s12), (s20, s21, s22)
+
+
+@compiled
+def _narrow_tile(left, right, size):
+    """Return `_tile` of rows as long as a block, most of them on sparse graphs: unrolled."""
+    left0, left1, left2 = left
+    right0, right1, right2 = right
+    s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = 0.0
+    for q in range(len(size)):
+        x0, x1, x2 = left0[q], left1[q], left2[q]
+        y0, y1, y2 = right0[q], right1[q], right2[q]
+        s00 += x0 * y0
+        s01 += x0 * y1
+        s02 += x0 * y2
+        s10 += x1 * y0
+        s11 += x1 * y1
+        s12 += x1 * y2
+        s20 += x2 * y0
+        s21 += x2 * y1
+        s22 += x2 * y2
+    return (s00, s01, s02), (s10, s11, s12), (s20, s21, s22)
+
+
+@compiled
+def _factorise_panel(panel, height, width, least):
+    """
+    Factor the diagonal block of a panel and solve for the rest; return the bad column.
+
+    least : (width,) what each pivot must exceed
+    """
+    for c in range(0, width, 3):
+        strip = min(3, width - c)
+        if c:
+            _update_strip(panel, height, width, c, strip)
+        at = c * width + c
+        for k in range(strip):
+            pivot = panel[at + k * width + k]
+            for q in range(k):
+                pivot -= panel[at + k * width + q] ** 2
+            if not pivot > max(least[c + k], 0.0):
+                return c + k
+            panel[at + k * width + k] = np.sqrt(pivot)
+            for r in range(k + 1, strip):
+                value = panel[at + r * width + k]
+                for q in range(k):
+                    value -= panel[at + r * width + q] * panel[at + k * width + q]
+                panel[at + r * width + k] = value / panel[at + k * width + k]
+        _solve_strip(panel[at + strip * width:], panel[at:], height - c - strip, width, strip)
+    return width
+
+
+@compiled
+def _update_strip(panel, height, width, c, strip):
+    """Subtract from up to three columns what the columns before them do."""
+    c1, c2 = min(c + 1, width - 1), min(c + 2, width - 1)
+    right = (panel[c * width:c * width + c], panel[c1 * width:c1 * width + c],
+             panel[c2 * width:c2 * width + c])
+    for r in range(c, height, 3):
+        r1, r2 = min(r + 1, height - 1), min(r + 2, height - 1)
+        left = (panel[r * width:r * width + c], panel[r1 * width:r1 * width + c],
+                panel[r2 * width:r2 * width + c])
+        tile = _tile(left, right)
+        _write(panel[r * width:], c, c1, c2, strip > 1, strip > 2, tile[0])
+        if r1 > r:
+            _write(panel[r1 * width:], c, c1, c2, strip > 1, strip > 2, tile[1])
+        if r2 > r1:
+            _write(panel[r2 * width:], c, c1, c2, strip > 1, strip > 2, tile[2])
+
+
+@compiled
+def _solve_strip(below, diagonal, height, width, strip):
+    """Solve for the rows below a factored block of one to three columns."""
+    f00, f10, f11, f20, f21, f22 = 1 / diagonal[0], 0.0, 0.0, 0.0, 0.0, 0.0
+    if strip > 1:
+        f10, f11 = diagonal[width], 1 / diagonal[width + 1]
+    if strip > 2:
+        f20, f21 = diagonal[2 * width], diagonal[2 * width + 1]
+        f22 = 1 / diagonal[2 * width + 2]
+    for r in range(height):
+        row = below[r * width:r * width + strip]
+        x = row[0] * f00
+        row[0] = x
+        if strip > 1:
+            y = (row[1] - x * f10) * f11
+            row[1] = y
+            if strip > 2:
+                row[2] = (row[2] - x * f20 - y * f21) * f22
+
+
+@compiled
+def add_diagonal(panels, address, width, position, added, size):
+    """Add to the diagonal of the panels; added : (n, d) in the order of the keyframes."""
+    for k in range(len(added)):
+        at = address[position[k]]
+        for a in range(len(size)):
+            panels[at + a * (width[position[k]] + 1)] += added[k, a]
+
+
+@compiled
+def solve(panels, first, start, pattern, offset, position, right, size):
+    """Return the solution of L L' x = right; both (n, d) in the order of the keyframes."""
+    x = np.empty_like(right)
+    for k in range(len(right)):
+        for a in range(len(size)):
+            x[position[k], a] = right[k, a]
+    tallest = 0
+    for s in range(len(first) - 1):
+        tallest = max(tallest, start[s + 1] - start[s])
+    local = np.empty(tallest * len(size))
+    for s in range(len(first) - 1):
+        _forward(panels[offset[s]:offset[s + 1]], pattern[start[s]:start[s + 1]],
+                 first[s], first[s + 1] - first[s], x, local, size)
+    for s in range(len(first) - 2, -1, -1):
+        _backward(panels[offset[s]:offset[s + 1]], pattern[start[s]:start[s + 1]],
+                  first[s], first[s + 1] - first[s], x, local, size)
+    solution = np.empty_like(x)
+    for k in range(len(right)):
+        for a in range(len(size)):
+            solution[k, a] = x[position[k], a]
+    return solution
+
+
+@compiled
+def _forward(panel, rows, first, columns, x, local, size):
+    """Solve for the supernode's own rows, and subtract what they do to the rows below."""
+    d = len(size)
+    width = columns * d
+    at = 0
+    for k in range(columns):
+        for a in range(d):
+            total = x[first + k, a]
+            for c in range(k * d + a):
+                total -= panel[at + c] * local[c]
+            local[k * d + a] = total / panel[at + k * d + a]
+            x[first + k, a] = local[k * d + a]
+            at += width
+    below = panel[at:]
+    for k in range(len(rows) - columns):
+        row = rows[columns + k]
+        for a in range(d):
+            line = below[(k * d + a) * width:(k * d + a + 1) * width]
+            total = 0.0
+            if columns == 1:
+                for c in range(d):
+                    total += line[c] * local[c]
+            else:
+                for c in range(width):
+                    total += line[c] * local[c]
+            x[row, a] -= total
+
+
+@compiled
+def _backward(panel, rows, first, columns, x, local, size):
+    """Solve with the transpose for the supernode's own rows, once all below are known."""
+    d = len(size)
+    width = columns * d
+    for k in range(columns):
+        for a in range(d):
+            local[k * d + a] = x[first + k, a]
+    below = panel[width * width:]
+    for k in range(len(rows) - columns):
+        row = rows[columns + k]
+        for a in range(d):
+            line = below[(k * d + a) * width:(k * d + a + 1) * width]
+            value = x[row, a]
+            if columns == 1:
+                for c in range(d):
+                    local[c] -= line[c] * value
+            else:
+                for c in range(width):
+                    local[c] -= line[c] * value
+    for r in range(width - 1, -1, -1):
+        local[r] /= panel[r * width + r]
+        for c in range(r):
+            local[c] -= panel[r * width + c] * local[r]
+    for k in range(columns):
+        for a in range(d):
+            x[first + k, a] = local[k * d + a]

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+One pass over the factors per iteration of `halpern`: gather, update the dual, scatter.
+
+Factors come in tiles of `LANES`, each number of a factor one row of a tile, so that one
+instruction works on as many factors as fit a register. Rows of a tile, k the block size:
+
+    2 k k   the blocks, row after row, that of the first keyframe before the second's
+    k       b
+    k       y
+    k       y0, the dual where the iteration was last restarted
+
+A tile is a flat array and `LANES` a constant: only so does the compiler know that rows do not
+overlap. K is a tuple of k zeros; its length is a constant to the compiler, an argument k is not.
+"""
+
+import numpy as np
+
+from l1slam_ros.core.kernels.compiled import compiled
+
+# One cache line of single precision. Below 16 the loop vectoriser takes a loop for a short one,
+# where it does not check that arrays are apart, and gives up.
+LANES = 16
+
+
+@compiled
+def iterate(tiles, keyframes, x, z, g, weight, first, count, K):
+    """
+    Advance x, the y of the tiles and g = A'y by `count` iterations of `halpern.halpern_step`.
+
+    tiles : (tiles, rows LANES); keyframes : (tiles, 2 LANES) uint32; x, z, g : (size + 1, k), the
+    last row of no keyframe, z scratch; first : iterations since the restart.
+    """
+    k, number = len(K), tiles.dtype.type
+    dual = 2 * k * k + k
+    local = np.empty(3 * k * LANES, tiles.dtype)
+    for iteration in range(first, first + count):
+        # Numbers of the tiles' own precision: one double makes all of its loop double.
+        a, rest = number((iteration + 1) / (iteration + 2)), number(1 / (iteration + 2))
+        w, twice, one = number(weight), number(2 / weight), number(1)
+        _reflect(x.ravel(), z.ravel(), g.ravel(), twice, a)
+        for t in range(len(tiles)):
+            tile = tiles[t]
+            _gather(local, 0, z, keyframes[t], K)
+            for r in range(k):
+                for lane in range(LANES):
+                    residual = -tile[(2 * k * k + r) * LANES + lane]
+                    for c in range(k):
+                        residual += (
+                            tile[(r * k + c) * LANES + lane] * local[c * LANES + lane]
+                            + tile[((k + r) * k + c) * LANES + lane]
+                            * local[(k + c) * LANES + lane])
+                    y = tile[(dual + r) * LANES + lane]
+                    y_bar = min(max(y + w * residual, -one), one)
+                    y = a * (y_bar + y_bar - y) + rest * tile[(dual + k + r) * LANES + lane]
+                    tile[(dual + r) * LANES + lane] = y
+                    local[(2 * k + r) * LANES + lane] = y
+            _scatter(local, tile, g, keyframes[t], K)
+
+
+@compiled
+def look(tiles, keyframes, x, g, weight, x_bar, g_bar, y_bar, K):
+    """
+    Find the next point without the pull to the restart, and what the tests want to know.
+
+    Written: x_bar and g_bar = A'y_bar (size + 1, k), y_bar (tiles, k LANES).
+
+    Returns
+    -------
+    residual : the squared fixed-point residual, see `halpern`
+    cost, dual : |A x_bar - b|_1 and -b'y_bar
+
+    """
+    k, number = len(K), tiles.dtype.type
+    dual = 2 * k * k + k
+    local = np.empty(5 * k * LANES, tiles.dtype)
+    d = g * number(1 / weight)
+    w, one = number(weight), number(1)
+    moved, turned, crossed, cost, value = 0.0, 0.0, 0.0, 0.0, 0.0
+    for v in range(len(x)):
+        for c in range(k):
+            x_bar[v, c] = x[v, c] - d[v, c]
+            moved += d[v, c] * d[v, c]
+    g_bar[:] = number(0)
+    for t in range(len(tiles)):
+        tile = tiles[t]
+        _gather(local, 0, x_bar, keyframes[t], K)
+        _gather(local, 2 * k, d, keyframes[t], K)
+        for r in range(k):
+            for lane in range(LANES):
+                b = tile[(2 * k * k + r) * LANES + lane]
+                residual, Ad = -b, b - b
+                for c in range(k):
+                    i, j = c * LANES + lane, (k + c) * LANES + lane
+                    A_i, A_j = tile[r * k * LANES + i], tile[(k + r - 1) * k * LANES + j]
+                    residual += A_i * local[i] + A_j * local[j]
+                    Ad += A_i * local[2 * k * LANES + i] + A_j * local[2 * k * LANES + j]
+                y = tile[(dual + r) * LANES + lane]
+                new = min(max(y + w * (residual - Ad), -one), one)
+                turned += (new - y) * (new - y)
+                crossed += (new - y) * Ad
+                cost += abs(residual)
+                value -= b * new
+                local[(4 * k + r) * LANES + lane] = new
+        y_bar[t] = local[4 * k * LANES:]
+        local[2 * k * LANES: 3 * k * LANES] = y_bar[t]
+        _scatter(local, tile, g_bar, keyframes[t], K)
+    return weight * moved + turned / weight + 2 * crossed, cost, value
+
+
+@compiled
+def adjoint(tiles, keyframes, g, K):
+    """Set g = A'y for the y of the tiles."""
+    k = len(K)
+    local = np.empty(3 * k * LANES, tiles.dtype)
+    g[:] = 0
+    for t in range(len(tiles)):
+        row = (2 * k * k + k) * LANES
+        local[2 * k * LANES:] = tiles[t, row: row + k * LANES]
+        _scatter(local, tiles[t], g, keyframes[t], K)
+
+
+@compiled
+def _reflect(x, z, g, twice, a):
+    """Set z = x - twice g, x = a z, and clear g."""
+    for j in range(len(x)):
+        z[j] = x[j] - twice * g[j]
+        x[j] = a * z[j]
+        g[j] = 0
+
+
+@compiled
+def _gather(local, first, x, keyframes, K):
+    """Copy x at both keyframes of each factor to 2 k rows of `local` from row `first` on."""
+    k = len(K)
+    for side in range(2):
+        for lane in range(LANES):
+            v = keyframes[side * LANES + lane]
+            for c in range(k):
+                local[(first + side * k + c) * LANES + lane] = x[v, c]
+
+
+@compiled
+def _scatter(local, tile, g, keyframes, K):
+    """Add A'y of a tile to g; y : rows 2 k to 3 k of `local`, the rows before are scratch."""
+    k = len(K)
+    for lane in range(LANES):
+        for c in range(k):
+            first = second = local.dtype.type(0)
+            for r in range(k):
+                y = local[(2 * k + r) * LANES + lane]
+                first += tile[(r * k + c) * LANES + lane] * y
+                second += tile[((k + r) * k + c) * LANES + lane] * y
+            local[c * LANES + lane] = first
+            local[(k + c) * LANES + lane] = second
+    for side in range(2):
+        for lane in range(LANES):
+            v = keyframes[side * LANES + lane]
+            for c in range(k):
+                g[v, c] += local[(side * k + c) * LANES + lane]

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+SE(2) factor by factor: the residual e = t2v(Z^-1 Xi^-1 Xj), its Jacobians and its curvature.
+
+z, x_i, x_j : (m, 3) measurements and poses. Formulas: see `se2`.
+"""
+
+import numpy as np
+
+from l1slam_ros.core.kernels.compiled import compiled
+
+
+@compiled
+def _seen(x_i, x_j):
+    """Return Ri'(tj - ti): the position of j seen from i."""
+    c, s = np.cos(x_i[2]), np.sin(x_i[2])
+    dx, dy = x_j[0] - x_i[0], x_j[1] - x_i[1]
+    return c * dx + s * dy, c * dy - s * dx
+
+
+@compiled
+def residual(z, x_i, x_j):
+    """Return e (m, 3), its angle not yet wrapped."""
+    e = np.empty_like(z)
+    for f in range(len(z)):
+        c, s = np.cos(z[f, 2]), np.sin(z[f, 2])
+        tx, ty = _seen(x_i[f], x_j[f])
+        e[f, 0] = c * (tx - z[f, 0]) + s * (ty - z[f, 1])
+        e[f, 1] = c * (ty - z[f, 1]) - s * (tx - z[f, 0])
+        e[f, 2] = x_j[f, 2] - x_i[f, 2] - z[f, 2]
+    return e
+
+
+@compiled
+def jacobians(z, x_i, x_j):
+    """Return J_e_i and J_e_j, (m, 3, 3) each."""
+    J_i, J_j = np.zeros((len(x_i), 3, 3)), np.zeros((len(x_i), 3, 3))
+    for f in range(len(x_i)):
+        c, s = np.cos(z[f, 2]), np.sin(z[f, 2])
+        phi = x_j[f, 2] - x_i[f, 2] - z[f, 2]
+        tx, ty = _seen(x_i[f], x_j[f])
+        J_i[f, 0, 0], J_i[f, 0, 1], J_i[f, 0, 2] = -c, -s, c * ty - s * tx
+        J_i[f, 1, 0], J_i[f, 1, 1], J_i[f, 1, 2] = s, -c, -s * ty - c * tx
+        J_i[f, 2, 2] = -1.0
+        J_j[f, 0, 0], J_j[f, 0, 1] = np.cos(phi), -np.sin(phi)
+        J_j[f, 1, 0], J_j[f, 1, 1] = np.sin(phi), np.cos(phi)
+        J_j[f, 2, 2] = 1.0
+    return J_i, J_j
+
+
+@compiled
+def curvature(x_i, x_j, gradient):
+    """Return the Hessian of dual'e over (step of i, step of j), (m, 6, 6); gradient (m, 2, 3)."""
+    H = np.zeros((len(x_i), 6, 6))
+    for f in range(len(x_i)):
+        t = _seen(x_i[f], x_j[f])
+        H[f, 2, 0], H[f, 2, 1] = -gradient[f, 0, 1], gradient[f, 0, 0]
+        H[f, 2, 2] = gradient[f, 0, 0] * t[0] + gradient[f, 0, 1] * t[1]
+        H[f, 2, 3], H[f, 2, 4] = -gradient[f, 1, 1], gradient[f, 1, 0]
+        for c in (0, 1, 3, 4):
+            H[f, c, 2] = H[f, 2, c]
+    return H

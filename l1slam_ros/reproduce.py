@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`l1slam reproduce`: runs the paper's experiments and writes the report, its pictures beside."""
+
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import mkdtemp
+
+import numpy as np
+
+from l1slam_ros import offline, paper, report
+from l1slam_ros.core.errors import FileError, GraphError, OptionError
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.l2 import LeastSquaresOptions
+from l1slam_ros.core.linearise import whitened_residual
+from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.optimality import l1_cost
+from l1slam_ros.core.optimiser import OptimiserOptions
+from l1slam_ros.core.reproduction import (
+    Costs,
+    Effort,
+    measure_convergence,
+    measure_costs,
+    measure_seconds,
+)
+from l1slam_ros.core.seed import seed_poses
+from l1slam_ros.core.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.files import put_lines, require_folder
+from l1slam_ros.io.graph_file import GraphRecord
+from l1slam_ros.io.plot import Curve, MapDrawing, plot_curves, plot_maps
+from l1slam_ros.paper import PaperGraph
+from l1slam_ros.progress import Progress
+from l1slam_ros.report import WORLD_SEED, GraphResult, Results
+
+REPORT = 'report.md'
+
+
+def reproduce(
+    datasets: Path | None, worlds: Sequence[PaperGraph], output: Path, effort: Effort
+) -> None:
+    """
+    Run the experiments and write the report into the folder `output`, whole or not at all.
+
+    Parameters
+    ----------
+    datasets : the folder with the paper's own graphs; None: without them
+    worlds : which of the paper's simulated worlds to make anew, in their sizes
+    output : its other files stay as they are
+    effort : how long the experiments run
+
+    Raises
+    ------
+    FileError : no graph of the paper in the folder, one that cannot be used, or no place to write.
+    OptionError : nothing to run.
+
+    """
+    if not datasets and not worlds:
+        raise OptionError('nothing to run: no datasets and no worlds; expected --datasets DIR, '
+                          'or --worlds other than none')
+    _check_folder(output)
+    records = read_datasets(datasets) if datasets else {}
+    results = run(records, worlds, effort)
+    with _filling(output) as folder:
+        lines = report.head(results)
+        for title, section in SECTIONS.items():
+            lines += ['', f'## {title}', '', *section(results, folder)]
+        put_lines(folder / REPORT, lines)
+
+
+def read_datasets(datasets: Path) -> dict[str, GraphRecord]:
+    """
+    Return name in the paper -> graph, for those of the paper's graphs that are in the folder.
+
+    Raises
+    ------
+    FileError : none is there, or one cannot be used.
+
+    """
+    files = {graph.name: datasets / graph.file for graph in paper.GRAPHS
+             if graph.file and (datasets / graph.file).is_file()}
+    if not files:
+        raise FileError(datasets, "none of the paper's graphs is there; expected "
+                        + ', '.join(paper.FILES))
+    return {name: _read(path) for name, path in files.items()}
+
+
+def _read(path: Path) -> GraphRecord:
+    record = offline.read_input(path)
+    try:
+        offline.require_connected(record)
+    except GraphError as error:
+        raise FileError(path, str(error)) from error
+    return record
+
+
+def run(
+    records: dict[str, GraphRecord], worlds: Sequence[PaperGraph], effort: Effort
+) -> Results:
+    """Measure every graph, in the order of the paper; records as of `read_datasets`."""
+    simulated = {world.name: world for world in worlds}
+    graphs, convergence, missing = [], {}, []
+    for graph in paper.GRAPHS:
+        if graph.name in records or graph.name in simulated:
+            print(f'l1slam: {graph.name}', file=sys.stderr)
+        if graph.name in records:
+            graphs.append(_run_record(graph, records[graph.name], effort))
+        elif graph.name in simulated:
+            result, curves = _run_world(simulated[graph.name], effort)
+            graphs.append(result)
+            convergence.update(curves)
+        else:
+            missing.append(graph)
+    return Results(graphs, missing, convergence)
+
+
+def _run_record(graph: PaperGraph, record: GraphRecord, effort: Effort) -> GraphResult:
+    seed = seed_poses(record.graph)
+    return _measured(graph, record.graph, offline.stored_poses(record), seed, effort)
+
+
+def _run_world(
+    graph: PaperGraph, effort: Effort
+) -> tuple[GraphResult, dict[str, dict[str, Array]]]:
+    """Return what a world of the graph's size gives, with the curves if they are shown of it."""
+    world = simulate_world(graph.poses, graph.edges, WorldOptions(),
+                           np.random.default_rng(WORLD_SEED))
+    seed = seed_poses(world.graph)
+    truth_cost = l1_cost(whitened_residual(world.graph, world.truth))
+    result = _measured(graph, world.graph, world.odometry, seed, effort, truth_cost)
+    if graph.name != paper.MANHATTAN_10K.name:
+        return result, {}
+    curves = measure_convergence(world.graph, world.odometry, seed, effort.iterations)
+    return result, {**curves, 'global': _global_curves(result.costs)}
+
+
+def _measured(
+    paper_graph: PaperGraph, graph: FactorGraph, start: Array, seed: Array, effort: Effort,
+    truth_cost: float | None = None,
+) -> GraphResult:
+    steps = (OptimiserOptions().outer_iterations + effort.outer
+             + LeastSquaresOptions().iterations)
+    with Progress(steps, 'step') as progress:
+        costs = measure_costs(graph, start, seed, effort, progress.report)
+    seconds = measure_seconds(graph, seed, effort)
+    return GraphResult(paper_graph, graph.n_poses, len(graph.between), costs, seconds,
+                       _map(paper_graph, graph, costs), truth_cost)
+
+
+def _map(paper_graph: PaperGraph, graph: FactorGraph, costs: Costs) -> MapDrawing:
+    factors, solution = graph.between, costs.solution
+    loops = np.stack((factors.i, factors.j), axis=1)[~factors.is_odometry]
+    return MapDrawing(paper_graph.name, graph.manifold.positions(solution.poses), loops=loops,
+                      note=f'L1 cost {solution.cost:.6g}')
+
+
+def _global_curves(costs: Costs) -> dict[str, Array]:
+    histories = {'as printed': costs.printed, f'ours, {costs.solver}': costs.solution.history}
+    return {method: np.stack((np.arange(len(history)), history), axis=1)
+            for method, history in histories.items()}
+
+
+def _table_1(results: Results, folder: Path) -> list[str]:
+    return report.table_1(results)
+
+
+def _table_2(results: Results, folder: Path) -> list[str]:
+    return report.table_2(results)
+
+
+def _figure_2(results: Results, folder: Path) -> list[str]:
+    """Draw cost against iterations, one picture for each problem."""
+    if not results.convergence:
+        return [f'Not run: it is of {paper.MANHATTAN_10K.name}, which `--worlds 10k` makes.']
+    lines = [f'Of our world in the place of {paper.MANHATTAN_10K.name}. The paper shows 100,000 '
+             'iterations of the angle and translation problems and 10,000 outer ones of 400 for '
+             'the global one; how many are shown here is in the table. *Weighted* is with the '
+             'primal weight that this package adds, *least squares* its start from reweighted '
+             'ones. An iteration of the global problem is one linearisation.', '']
+    for problem, methods in results.convergence.items():
+        name = f'figure_2_{problem}.png'
+        curves = [Curve(method, history[:, 0], history[:, 1])
+                  for method, history in methods.items()]
+        plot_curves(folder / name, curves, f'{problem} problem, L1 cost')
+        lines.append(f'![cost against iterations of the {problem} problem]({name})')
+    return [*lines, '', *report.figure_2(results)]
+
+
+def _figure_3(results: Results, folder: Path) -> list[str]:
+    """Draw the maps that our default solver ended with."""
+    plot_maps(folder / 'figure_3.png', [r.drawing for r in results.graphs])
+    return ['The maps that our default solver ended with.', '', '![maps](figure_3.png)']
+
+
+# Title -> what draws the section's pictures into a folder and returns its lines.
+SECTIONS: dict[str, Callable[[Results, Path], list[str]]] = {
+    'Table I: the cost': _table_1,
+    'Table II: the time per iteration': _table_2,
+    'Figure 2: cost against iterations': _figure_2,
+    'Figure 3: the maps': _figure_3,
+}
+
+
+def _check_folder(output: Path) -> None:
+    """Refuse, before any work is done, a place where no folder can be."""
+    require_folder(output)
+    if os.path.lexists(output) and not output.is_dir():
+        raise FileError(output, 'is no folder; expected one, or nothing there')
+
+
+@contextmanager
+def _filling(output: Path) -> Iterator[Path]:
+    """Yield a new folder, whose files go into the folder `output` when the block succeeds."""
+    target, scratch = Path(os.path.abspath(output)), None
+    try:
+        scratch = Path(mkdtemp(prefix=f'.{target.name}.', suffix='.tmp', dir=target.parent))
+        # One of our own inside it: what `mkdtemp` makes is for its owner only.
+        made = scratch / target.name
+        made.mkdir()
+        yield made
+        if target.is_dir():
+            # The report last: it names the others.
+            for file in sorted(made.iterdir(), key=lambda file: file.name == REPORT):
+                os.replace(file, target / file.name)
+        else:
+            os.rename(made, target)
+    except OSError as error:
+        raise FileError(output, f'cannot be written: {error.strerror or error}') from error
+    finally:
+        if scratch is not None:
+            shutil.rmtree(scratch, ignore_errors=True)
