@@ -118,11 +118,14 @@ def _g2o_by(algorithm: str) -> Callable[[Case, Array], Callable[[], Answer]]:
     def prepare(case: Case, poses: Array) -> Callable[[], Answer]:
         import g2opy as g2o
 
-        optimiser = _g2o_graph(case.graph, poses, algorithm)
+        optimiser, stop = _g2o_graph(case.graph, poses, algorithm)
+        # The optimiser does not keep its action alive.
+        optimiser.add_post_iteration_action(stop)
         vertices = [optimiser.vertex(k) for k in range(len(poses))]
         starts = [g2o.SE2(*pose) for pose in poses.tolist()]
 
         def work() -> Array:
+            stop.set_gain_threshold(SAME_TOLERANCE)
             optimiser.initialize_optimization()
             optimiser.optimize(MOST_ITERATIONS)
             return np.zeros(0)
@@ -139,8 +142,8 @@ def _g2o_by(algorithm: str) -> Callable[[Case, Array], Callable[[], Answer]]:
     return prepare
 
 
-def _g2o_graph(graph: FactorGraph, poses: Array, algorithm: str) -> Any:
-    """Return g2o's optimiser, with the only direct sparse solver of its wheel: Eigen's."""
+def _g2o_graph(graph: FactorGraph, poses: Array, algorithm: str) -> tuple[Any, Any]:
+    """Return g2o's optimiser, with the only direct sparse solver of its wheel, and its stop."""
     import g2opy as g2o
 
     optimiser = g2o.SparseOptimizer()
@@ -164,10 +167,8 @@ def _g2o_graph(graph: FactorGraph, poses: Array, algorithm: str) -> Any:
         edge.set_information(information)
         optimiser.add_edge(edge)
     stop = g2o.SparseOptimizerTerminateAction()
-    stop.set_gain_threshold(SAME_TOLERANCE)
     stop.set_max_iterations(MOST_ITERATIONS)
-    optimiser.add_post_iteration_action(stop)
-    return optimiser
+    return optimiser, stop
 
 
 # What the ratios of the whole solves are to.

@@ -27,7 +27,7 @@ GRAPHS = ('intel', 'manhattan3500', 'city10000')
 DENSE_WORLD = (10_000, 64_000)
 STARTS = ('stored', 'odometry', 'seed')
 PARTS = ('angle', 'translation', 'global')
-_SEED = 4
+WORLD_SEED = 4
 # [m, rad] How far, one sigma, a perturbed start lies from the stored one.
 _PERTURBATION = (0.2, 0.05)
 
@@ -54,7 +54,7 @@ class Case:
         manifold = self.graph.manifold
         sigma = np.empty(manifold.TANGENT_SIZE)
         sigma[manifold.TRANSLATION], sigma[manifold.ROTATION] = _PERTURBATION
-        rng = np.random.default_rng((_SEED, number))
+        rng = np.random.default_rng((WORLD_SEED, number))
         step = sigma * rng.standard_normal((self.graph.n_poses, manifold.TANGENT_SIZE))
         step[0] = 0.0
         return manifold.retract(self.stored, step)
@@ -82,7 +82,7 @@ def public_case(datasets: Path, name: str) -> Case:
 
 def simulated_case(n_poses: int, n_edges: int) -> Case:
     """Return a world; what it stores is the odometry chain."""
-    world = simulate_world(n_poses, n_edges, WorldOptions(), np.random.default_rng(_SEED))
+    world = simulate_world(n_poses, n_edges, WorldOptions(), np.random.default_rng(WORLD_SEED))
     return Case(f'world {n_poses} / {n_edges}', world.graph, world.odometry)
 
 

@@ -33,6 +33,7 @@ def solve(arguments: argparse.Namespace) -> str:
     record = _read(arguments, arguments.input)
     _warn(record, arguments.quiet)
     reference = arguments.reference and offline.matching_rows(record, arguments.reference)
+    _make_ready(arguments.quiet)
     steps = solver.outer_iterations if arguments.norm == 'l1' else least_squares.iterations
     with _named(arguments.input), Progress(steps, 'step', arguments.quiet) as progress:
         outcome = offline.solve(record, arguments.start, arguments.norm, arguments.solver,
@@ -50,6 +51,14 @@ def solve(arguments: argparse.Namespace) -> str:
     elif not arguments.quiet:
         _print_report(report, arguments.norm, SENTENCES[outcome.solution.status], outcome.reason)
     return record.damage
+
+
+def _make_ready(quiet: bool = False) -> None:
+    """Compile the solver's loops, which takes long only at the first use on a machine."""
+    from l1slam_ros.core.warm_up import STEPS, warm_up
+
+    with Progress(len(STEPS), 'part', quiet, 'compiling, once', delay=1.0) as progress:
+        warm_up(lambda step: progress.advance())
 
 
 def _check_outputs(arguments: argparse.Namespace) -> None:
@@ -100,8 +109,8 @@ def _print_report(report: dict[str, object], norm: str, status: str, reason: str
     print(f'{norm} cost: initial {report["initial_cost"]:.6g}, {seed}'
           f'final {report["final_cost"]:.6g}')
     print(f'{report["status"]} ({status}): {report["outer_iterations"]} outer, '
-          f'{report["inner_iterations"]} inner iterations, {report["seconds"]:.2f} s, '
-          f'{report["solver"]} ({reason})')
+          f'{report["inner_iterations"]} inner iterations, {report["seconds"]:.2f} s\n'
+          f'{report["solver"]}: {reason}')
     if 'ate' in report:
         print(f'position error {report["ate"]:.4f} m (RMSE after rigid alignment)')
 
@@ -168,6 +177,7 @@ def corrupt(arguments: argparse.Namespace) -> str:
     former = known_false(arguments.input, record)
     believed = replace(record, graph=without_factors(record.graph, former))
     options = LeastSquaresOptions()
+    _make_ready()
     with _named(arguments.input), Progress(options.iterations, 'step') as progress:
         solution = offline.solve(believed, 'seed', 'l2', AUTO, OptimiserOptions(), options,
                                  progress.report).solution
@@ -209,6 +219,7 @@ def info(arguments: argparse.Namespace) -> str:
     if offline.is_bag(arguments.input):
         _print_rows(findings.bag_numbers(arguments.input))
     record = _read(arguments, arguments.input)
+    _make_ready()
     _print_rows(findings.numbers(record))
     sentences = [*record.skipped, *findings.complaints(record)]
     for sentence in sentences:
@@ -247,6 +258,7 @@ def reproduce(arguments: argparse.Namespace) -> str:
     from l1slam_ros.paper import WORLDS
     from l1slam_ros.reproduce import REPORT, reproduce
 
+    _make_ready()
     reproduce(arguments.datasets, WORLDS[arguments.worlds], arguments.output, Effort())
     print(arguments.output / REPORT)
     return ''

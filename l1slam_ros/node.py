@@ -8,6 +8,7 @@ improves the map and publishes it; see `shared_backend` for why neither waits fo
 
 import sys
 import threading
+import time
 from collections import Counter
 from typing import Any
 
@@ -26,6 +27,7 @@ from visualization_msgs.msg import MarkerArray
 from l1slam_ros.core import se2
 from l1slam_ros.core.backend import Improvement
 from l1slam_ros.core.errors import L1SlamError, MessageError
+from l1slam_ros.core.warm_up import warm_up
 from l1slam_ros.diagnosis import Diagnosis
 from l1slam_ros.io.messages import loop_closure, odometry_sample
 from l1slam_ros.markers import graph_markers
@@ -62,6 +64,7 @@ class BackendNode(Node):
     def __init__(self, **keywords: Any):
         super().__init__('backend', **keywords)
         self._declared = NodeParameters(self, NodeOptions(), self._on_options)
+        self._make_ready()
         options = self.options
         self._manifold = se2
         self._backend = SharedBackend(self._manifold, options)
@@ -96,6 +99,14 @@ class BackendNode(Node):
         self._wake.set()
         self._worker.join()
         self.destroy_node()
+
+    def _make_ready(self) -> None:
+        """Compile the solver's loops before messages come: it would hold up their callbacks."""
+        self.get_logger().info('getting the solver ready; the first time on a machine it is '
+                               'compiled, which takes up to half a minute')
+        began = time.monotonic()
+        warm_up()
+        self.get_logger().info(f'solver ready after {time.monotonic() - began:.1f} s')
 
     def _make_publishers(self) -> None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

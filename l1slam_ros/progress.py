@@ -13,14 +13,18 @@ class Progress:
     total : how many steps there are at most
     unit : what one step is called
     quiet : show nothing, even on a terminal
+    label : what is being done
+    delay : [s] show nothing of what is done sooner
 
     """
 
-    def __init__(self, total: float, unit: str, quiet: bool = False):
+    def __init__(self, total: float, unit: str, quiet: bool = False, label: str = '',
+                 delay: float = 0.0):
         from tqdm import tqdm
 
         # None: tqdm looks whether standard error is a terminal.
-        self._bar = tqdm(total=total, unit=unit, disable=True if quiet else None, leave=False)
+        self._bar = tqdm(total=total, unit=unit, disable=True if quiet else None, leave=False,
+                         desc=label or None, delay=delay)
 
     def __enter__(self) -> 'Progress':
         return self

@@ -10,6 +10,7 @@ from problems import PERIOD, loop, odometry, play
 
 from l1slam_ros.core import se2
 from l1slam_ros.core.backend import Backend, BackendOptions, improve, optimise
+from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.optimality import Status, l1_cost
@@ -63,7 +64,7 @@ def test_incremental_ends_at_the_cost_of_batch(world):
         assert improvement.cost <= improvement.cost_before
         if k in (40, 90, 140):
             graph = backend.problem().graph
-            batch = minimise(graph, seed_poses(graph), OptimiserOptions())
+            batch = minimise(graph, seed_poses(graph, cholesky_of(graph)), OptimiserOptions())
             assert cost(graph, backend.poses) == pytest.approx(batch.cost, rel=1e-2)
     settled(backend)
     assert cost(world.graph, backend.poses) == pytest.approx(batch.cost, rel=2e-4)
@@ -74,7 +75,7 @@ def test_a_solve_to_the_end_is_as_good(world):
     play(backend, world)
     problem = backend.problem()
     solved = optimise(problem, EVERY.solver)
-    batch = minimise(world.graph, seed_poses(world.graph), OptimiserOptions())
+    batch = minimise(world.graph, seed_poses(world.graph, cholesky_of(world.graph)), OptimiserOptions())
     assert solved.cost == cost(problem.graph, solved.poses) == pytest.approx(batch.cost, rel=2e-4)
     assert solved.cost_before == cost(problem.graph, problem.poses)
     backend.adopt(solved)
@@ -145,7 +146,7 @@ def test_small_budgets_add_up(world):
         costs.append(improvement.cost)
     assert improvement is None
     assert (np.diff(costs) <= 1e-9).all()
-    batch = minimise(world.graph, seed_poses(world.graph), OptimiserOptions())
+    batch = minimise(world.graph, seed_poses(world.graph, cholesky_of(world.graph)), OptimiserOptions())
     assert costs[-1] == pytest.approx(batch.cost, rel=1e-3)
 
 
@@ -198,7 +199,7 @@ def test_keyframes_during_an_update_follow_the_map(world):
                     atol=1e-9)
     settled(backend)
     graph = backend.problem().graph
-    batch = minimise(graph, seed_poses(graph), OptimiserOptions())
+    batch = minimise(graph, seed_poses(graph, cholesky_of(graph)), OptimiserOptions())
     assert cost(graph, backend.poses) == pytest.approx(batch.cost, rel=1e-3)
 
 
@@ -304,7 +305,7 @@ def test_a_warm_update_does_more_with_little_work_than_a_cold_one(world):
     play(cold, world)
     options = OptimiserOptions(outer_iterations=2, inner=PrimalDualOptions(iterations=100))
     first, second = (improve(backend.problem(), options, PLENTY) for backend in (warm, cold))
-    best = minimise(world.graph, seed_poses(world.graph), OptimiserOptions()).cost
+    best = minimise(world.graph, seed_poses(world.graph, cholesky_of(world.graph)), OptimiserOptions()).cost
     assert first.cost_before < 0.2 * second.cost_before
     assert first.reweighted_steps == 0 < second.reweighted_steps
     assert first.cost / best - 1 < 0.5 * (second.cost / best - 1)

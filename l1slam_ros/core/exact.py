@@ -5,6 +5,8 @@ The exact L1 map of a graph: rough L2 first where that helps, then one interior-
 In: a graph and poses. Out: poses at a local optimum, and a bound on what is left.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from l1slam_ros.core.cholesky import BlockCholesky
@@ -39,7 +41,8 @@ def minimise_interior_point(
     start.
     """
     cost = l1_cost(whitened_residual(graph, poses))
-    rough = minimise_l2(graph, poses, _ROUGH_L2, cholesky).poses
+    iterations = min(_ROUGH_L2.iterations, options.outer_iterations)
+    rough = minimise_l2(graph, poses, replace(_ROUGH_L2, iterations=iterations), cholesky).poses
     straight = l1_cost(whitened_residual(graph, rough)) < _STRAIGHT * cost
     optimum = interior_point(GraphProblem(graph), rough if straight else poses, cholesky,
                              options.outer_iterations, _TOLERANCE, report)

@@ -47,10 +47,13 @@ _ENOUGH = 0.2
 _SOME = 0.8
 # ... or when this part of all iterations has been since the last restart.
 _LONG = 0.36
-# The weight that balances primal and dual, times the mean |A x - b|; measured .3 to 1.
-_BALANCE = 0.5
+# The weight that balances primal and dual, times the mean |A x - b|. Sparse graphs with a good
+# start do not feel it from .15 to .5; dense worlds from a poor one need half the iterations at .1.
+_BALANCE = 0.1
 # How far the weight may go from there; without a limit it drifts.
 _WEIGHT_RANGE = 10.0
+# [sigma] A mean |A x - b| below is as good as none; the weight must stay finite.
+_EXACT = 1e-6
 # Part of a keyframe's scale by which a direction that no factor measures is held.
 _UNMEASURED = 1e-12
 
@@ -76,12 +79,12 @@ def scaled_system(system: LinearSystem) -> tuple[LinearSystem, Array]:
     x = R_v^-1 x_scaled of each keyframe; one without factors keeps its own scale.
     """
     k, size = system.block_size, system.size
-    gram = np.zeros((size + 1, k * k))
+    summed = np.zeros((size + 1, k * k))
     for side in range(2):
         blocks = system.blocks[:, side]
         squares = (2 * blocks.transpose(0, 2, 1) @ blocks).reshape(-1, k * k)
-        gram += _incidence(system, side).T @ squares
-    gram = gram[:size].reshape(size, k, k)
+        summed += _incidence(system, side).T @ squares
+    gram = summed[:size].reshape(size, k, k)
     trace = np.trace(gram, axis1=1, axis2=2)[:, None, None]
     gram += np.where(trace > 0, _UNMEASURED * trace, 1.0) * np.eye(k)
     inverse = np.linalg.inv(np.linalg.cholesky(gram)).transpose(0, 2, 1)
@@ -118,7 +121,7 @@ def minimise_l1_halpern(
     if not len(system.b) or not system.size:
         cost = float(np.abs(system.b).sum())
         return PrimalDualSolution(x, -np.sign(system.b), cost, 0.0, Status.CONVERGED, 0,
-                                  np.array([(0.0, cost)]), weight)
+                                  np.array([(0.0, cost)]), weight or 1.0)
     run = _Run(system, x, y, weight)
     history = [(0.0, run.cost)]
     done, status = 0, Status.ITERATION_LIMIT
@@ -134,18 +137,9 @@ def minimise_l1_halpern(
         elif run.restart_is_due(residual, done):
             run.restart(cost)
     x, y = run.candidate()
-    history[-1] = (done, l1_cost(residual_of(system, x)))
+    history[-1] = (done, l1_cost(system.times(x) - system.b))
     return PrimalDualSolution(x, y, history[-1][1], gap, status, done, np.array(history),
                               run.weight)
-
-
-def residual_of(system: LinearSystem, x: Array) -> Array:
-    """Return A x - b without A, (rows,)."""
-    k = system.block_size
-    padded = np.concatenate((x, np.zeros(k))).reshape(-1, k)
-    product = sum(np.einsum('mrc,mc->mr', system.blocks[:, side],
-                            padded[system.keyframe[:, side]]) for side in range(2))
-    return np.ravel(product) - system.b
 
 
 class _Run:
@@ -165,6 +159,9 @@ class _Run:
         self._x, self._z, self._g, self._x_bar, self._g_bar = np.zeros(
             (5, system.size + 1, k), np.float32)
         self._y_bar = np.empty((len(self._tiles), k, kernels.LANES), np.float32)
+        # Iterations since the restart, and the residuals of its first and its latest look.
+        self._since = 0
+        self._residuals: tuple[float, ...] = ()
         # The origin of the loop's x, and how far, scaled, it has come from the start.
         self._origin, self._offset = np.array(x, float), np.zeros((system.size, k))
         self.cost = self._set_origin()
@@ -185,12 +182,13 @@ class _Run:
         return float(np.sqrt(max(squared, 0.0))), cost, float(gap)
 
     def restart_is_due(self, residual: float, done: int) -> bool:
-        """Tell whether to restart; done : iterations of the whole solve."""
-        first, last, self._last = self._first, self._last, residual
-        self._first = min(first, residual) if np.isinf(first) else first
-        if np.isinf(first):
+        """Tell whether to restart; residual : of this look; done : iterations of the solve."""
+        if not self._residuals:
+            self._residuals = (residual, residual)
             return False
-        return (residual <= _ENOUGH * first or (residual <= _SOME * first and residual > last)
+        first, last = self._residuals
+        self._residuals = (first, residual)
+        return (residual <= _ENOUGH * first or last < residual <= _SOME * first
                 or self._since >= _LONG * done)
 
     def restart(self, cost: float) -> None:
@@ -215,14 +213,14 @@ class _Run:
 
     def _set_origin(self) -> float:
         """Let x of the loop count from the origin; returns the cost there."""
-        residual = residual_of(self._system, self._origin)
+        residual = self._system.times(self._origin) - self._system.b
         self._b[:] = self._layout.pack(-residual.reshape(-1, self._system.block_size))
         self._x[:] = 0
-        self._since, self._first, self._last = 0, np.inf, np.inf
+        self._since, self._residuals = 0, ()
         return l1_cost(residual)
 
     def _typical_weight(self, cost: float) -> float:
-        return _BALANCE * len(self._system.b) / max(cost, np.finfo(np.float32).tiny)
+        return _BALANCE / max(cost / len(self._system.b), _EXACT)
 
     def _call(self, kernel: Callable[..., Any], *arguments: Any) -> Any:
         """Call a compiled loop; its K tells the compiler the block size."""

@@ -44,4 +44,4 @@ class Tiles:
 
     def _side_by_side(self, padded: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(
-            padded.reshape(self._count, self._lanes, -1).transpose(0, 2, 1))
+            padded.reshape(self._count, self._lanes, padded.shape[1]).transpose(0, 2, 1))

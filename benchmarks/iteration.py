@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Part `iteration`: one iteration, beside the time that its bytes need at the measured bandwidth.
+
+The bandwidth is that of a triad `a = b + s c`, counted as 24 bytes per element: over arrays far
+larger than the second-level cache, and over arrays that together are as large as what the
+iteration works on.
+"""
+
+import statistics
+import time
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from measuring import Measured, Row, report_progress, row
+from ours import ITERATIONS, Iteration
+from problems import Case, InnerProblem, inner_problems
+
+from l1slam_ros.core.manifold import Array
+
+REFERENCE = ITERATIONS[0].name
+_ITERATIONS = 400
+_TRIAD_BYTES = 24
+# Three arrays of this many elements: 600 MB, more than any second-level cache.
+_LARGE = 25_000_000
+# [s] A triad is repeated until it took this long.
+_TRIAD_TIME = 0.2
+
+
+def measure(cases: Iterable[Case], repeats: int, limit: float) -> list[Row]:
+    """Return a row for each global problem and method; the limit is of no use here."""
+    triad = compiled_triad()
+    rows: list[Row] = []
+    for case in cases:
+        *_, problem = inner_problems(case)
+        report_progress(f'iteration: {problem.name}')
+        rows.extend(_rows(problem, case, triad, repeats))
+    return rows
+
+
+def _rows(problem: InnerProblem, case: Case, triad: Callable[..., None],
+          repeats: int) -> list[Row]:
+    edges = len(case.graph.between)
+    started = [(method, method.start(problem)) for method in ITERATIONS]
+    seconds: dict[str, list[float]] = {method.name: [] for method in ITERATIONS}
+    bandwidths: dict[str, list[float]] = {method.name: [] for method in ITERATIONS}
+    large: list[float] = []
+    for _, iterate in started:
+        iterate(_ITERATIONS)
+    for _ in range(repeats):
+        large.append(bandwidth(triad, _LARGE))
+        for method, iterate in started:
+            began = time.perf_counter()
+            iterate(_ITERATIONS)
+            seconds[method.name].append((time.perf_counter() - began) / _ITERATIONS)
+            if method.bytes_per_edge:
+                elements = int(method.bytes_per_edge * edges / _TRIAD_BYTES)
+                bandwidths[method.name].append(bandwidth(triad, elements))
+    numbers = {'edges': edges, 'bandwidth_large': statistics.median(large)}
+    return [row(problem.name, 'one iteration', method.name, True,
+                Measured(tuple(seconds[method.name]), np.zeros(0)),
+                **numbers, **_needed(method, edges, bandwidths[method.name]))
+            for method in ITERATIONS]
+
+
+def _needed(method: Iteration, edges: int, bandwidths: list[float]) -> dict[str, float]:
+    """Return the bytes of an iteration, the bandwidth [B/s] at that size, and their time [s]."""
+    if not method.bytes_per_edge:
+        return {}
+    speed = statistics.median(bandwidths)
+    return {'bytes_per_edge': method.bytes_per_edge, 'bandwidth': speed,
+            'needed': method.bytes_per_edge * edges / speed}
+
+
+def bandwidth(triad: Callable[..., None], elements: int) -> float:
+    """Return how many bytes a second a triad over three arrays moves [B/s]."""
+    a, b, c = np.zeros(elements), np.ones(elements), np.ones(elements)
+    triad(a, b, c, 0.5, 1)
+    count = 1
+    while True:
+        began = time.perf_counter()
+        triad(a, b, c, 0.5, count)
+        seconds = time.perf_counter() - began
+        if seconds > _TRIAD_TIME:
+            return _TRIAD_BYTES * elements * count / seconds
+        count *= 2
+
+
+def compiled_triad() -> Callable[..., None]:
+    """Return `a = b + s c`, so many times over, compiled."""
+    from numba import njit
+
+    def triad(a: Array, b: Array, c: Array, s: float, count: int) -> None:
+        for k in range(count):
+            # The factor differs each time, or the compiler could leave all but one out.
+            factor = s + k
+            for i in range(len(a)):
+                a[i] = b[i] + factor * c[i]
+
+    compiled: Callable[..., None] = njit(triad)
+    return compiled

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+One world in a process of its own, so that its memory is its own.
+
+    python one_world.py POSES EDGES
+
+Prints one JSON object: seconds of seed and solve, the L1 costs of the solution and of the true
+poses, and the peak memory of the process before and after [MiB].
+"""
+
+import json
+import resource
+import sys
+
+import numpy as np
+from measuring import timed
+from problems import WORLD_SEED
+
+from l1slam_ros.core.choice import AUTO, minimise_by
+from l1slam_ros.core.linearise import whitened_residual
+from l1slam_ros.core.optimality import l1_cost
+from l1slam_ros.core.optimiser import OptimiserOptions
+from l1slam_ros.core.seed import seed_poses
+from l1slam_ros.core.simulate import World, WorldOptions, simulate_world
+
+# Large enough for every kernel to be compiled.
+_WARM_UP = (100, 160)
+
+
+def solve(world: World) -> dict[str, float]:
+    """Return the seconds of each phase and the costs."""
+    graph = world.graph
+    seed = timed(lambda: seed_poses(graph))
+    solved = timed(lambda: minimise_by(AUTO, graph, seed.x, OptimiserOptions())[0].poses)
+    return {'seed': seed.seconds, 'solve': solved.seconds,
+            'cost': l1_cost(whitened_residual(graph, solved.x)),
+            'true_cost': l1_cost(whitened_residual(graph, world.truth))}
+
+
+def peak() -> float:
+    """Return the most memory this process has held [MiB]."""
+    kibibytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return kibibytes / 1024
+
+
+def main() -> None:
+    """Solve one small world to warm up, and one as asked for."""
+    size = [int(word) for word in sys.argv[1:3]]
+    solve(simulate_world(*_WARM_UP, WorldOptions(), np.random.default_rng(WORLD_SEED)))
+    world = simulate_world(size[0], size[1], WorldOptions(), np.random.default_rng(WORLD_SEED))
+    before = peak()
+    print(json.dumps(solve(world) | {'peak_before': before, 'peak': peak()}))
+
+
+if __name__ == '__main__':
+    main()
