@@ -8,15 +8,15 @@ gives a lower bound.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from cases import Case, InnerProblem, inner_problems
 from linear_peers import PEERS, clarabel_solution
-from linear_solvers import LinearSolver, Setting
-from measuring import Answer, Row, interleaved, report_progress, row
+from linear_solvers import LinearSolver, Setting, normal_factor
+from measuring import Row, interleaved, report_progress, row
 from ours import INNER, PLAIN
-from problems import Case, InnerProblem, inner_problems
 
-from l1slam_ros.core.least_squares import factorise
 from l1slam_ros.core.manifold import Array
 
 MARKS = (1e-3, 1e-4)
@@ -24,7 +24,6 @@ REFERENCE = PLAIN
 _TIGHT = 1e-10
 # A reference may take this long [s].
 _PATIENCE = 600.0
-_Run = tuple[LinearSolver, Setting]
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ def lower_bound(problem: InnerProblem, y: Array) -> float:
     y - A (A'A)^-1 A'y has A'y = 0; scaled into |y| <= 1, |A x - b|_1 >= y'(A x - b) = -b'y.
     """
     A = problem.A
-    factor = factorise((A.T @ A).tocsc())
+    factor = normal_factor(A)
     for _ in range(2):  # the second time mends the rounding of the first
         y = y - A @ factor.solve(A.T @ y)
     return -float(problem.b @ y) / max(1.0, float(np.abs(y).max()))
@@ -68,15 +67,15 @@ def _problem_rows(problem: InnerProblem, repeats: int, limit: float) -> list[Row
     best = optimum(problem)
     costs = [best.cost * (1 + mark) for mark in MARKS]
     solvers = (*INNER, *PEERS)
-    chosen: dict[tuple[str, float], _Run] = {}
+    chosen: dict[tuple[str, float], tuple[LinearSolver, Setting]] = {}
     for solver in solvers:
         report_progress(f'inner: {problem.name}, {solver.name}')
         for mark, setting in zip(MARKS, solver.reach(problem, costs, limit), strict=True):
             if setting is not None:
                 chosen[solver.name, mark] = solver, setting
     measured = interleaved(
-        {key: (lambda run=run: _once(problem, run, limit)) for key, run in chosen.items()},
-        repeats, limit)
+        {key: partial(solver.run, problem, setting, limit)
+         for key, (solver, setting) in chosen.items()}, repeats, limit)
     rows, ours = [], {solver.name for solver in INNER}
     for mark in MARKS:
         for solver in solvers:
@@ -89,7 +88,3 @@ def _problem_rows(problem: InnerProblem, repeats: int, limit: float) -> list[Row
                             found, **numbers))
     return rows
 
-
-def _once(problem: InnerProblem, run: _Run, limit: float) -> Answer:
-    solver, setting = run
-    return solver.run(problem, setting, limit)

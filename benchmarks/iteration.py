@@ -8,13 +8,12 @@ iteration works on.
 """
 
 import statistics
-import time
 from collections.abc import Callable, Iterable
 
 import numpy as np
-from measuring import Measured, Row, report_progress, row
+from cases import Case, InnerProblem, inner_problems
+from measuring import Measured, Row, clock, report_progress, row
 from ours import ITERATIONS, Iteration
-from problems import Case, InnerProblem, inner_problems
 
 from l1slam_ros.core.manifold import Array
 
@@ -41,35 +40,43 @@ def measure(cases: Iterable[Case], repeats: int, limit: float) -> list[Row]:
 def _rows(problem: InnerProblem, case: Case, triad: Callable[..., None],
           repeats: int) -> list[Row]:
     edges = len(case.graph.between)
-    started = [(method, method.start(problem)) for method in ITERATIONS]
-    seconds: dict[str, list[float]] = {method.name: [] for method in ITERATIONS}
-    bandwidths: dict[str, list[float]] = {method.name: [] for method in ITERATIONS}
+    sizes = {method.name: method.bytes_per_edge(problem) if method.bytes_per_edge else None
+             for method in ITERATIONS}
+    seconds: dict[str, list[float]] = {name: [] for name in sizes}
+    bandwidths: dict[str, list[float]] = {name: [] for name in sizes}
     large: list[float] = []
-    for _, iterate in started:
-        iterate(_ITERATIONS)
+    for method in ITERATIONS:
+        method.run(problem, 1)
     for _ in range(repeats):
         large.append(bandwidth(triad, _LARGE))
-        for method, iterate in started:
-            began = time.perf_counter()
-            iterate(_ITERATIONS)
-            seconds[method.name].append((time.perf_counter() - began) / _ITERATIONS)
-            if method.bytes_per_edge:
-                elements = int(method.bytes_per_edge * edges / _TRIAD_BYTES)
+        for method in ITERATIONS:
+            seconds[method.name].append(_one(method, problem))
+            if size := sizes[method.name]:
+                elements = int(size * edges / _TRIAD_BYTES)
                 bandwidths[method.name].append(bandwidth(triad, elements))
     numbers = {'edges': edges, 'bandwidth_large': statistics.median(large)}
     return [row(problem.name, 'one iteration', method.name, True,
                 Measured(tuple(seconds[method.name]), np.zeros(0)),
-                **numbers, **_needed(method, edges, bandwidths[method.name]))
+                **numbers, **_needed(sizes[method.name], edges, bandwidths[method.name]))
             for method in ITERATIONS]
 
 
-def _needed(method: Iteration, edges: int, bandwidths: list[float]) -> dict[str, float]:
+def _one(method: Iteration, problem: InnerProblem) -> float:
+    """Return the time [s] of one iteration, without what comes before the first."""
+    ends = []
+    for count in (_ITERATIONS, 3 * _ITERATIONS):
+        began = clock()
+        method.run(problem, count)
+        ends.append(clock() - began)
+    return (ends[1] - ends[0]) / (2 * _ITERATIONS)
+
+
+def _needed(size: float | None, edges: int, bandwidths: list[float]) -> dict[str, float]:
     """Return the bytes of an iteration, the bandwidth [B/s] at that size, and their time [s]."""
-    if not method.bytes_per_edge:
+    if not size:
         return {}
     speed = statistics.median(bandwidths)
-    return {'bytes_per_edge': method.bytes_per_edge, 'bandwidth': speed,
-            'needed': method.bytes_per_edge * edges / speed}
+    return {'bytes_per_edge': size, 'bandwidth': speed, 'needed': size * edges / speed}
 
 
 def bandwidth(triad: Callable[..., None], elements: int) -> float:
@@ -78,9 +85,9 @@ def bandwidth(triad: Callable[..., None], elements: int) -> float:
     triad(a, b, c, 0.5, 1)
     count = 1
     while True:
-        began = time.perf_counter()
+        began = clock()
         triad(a, b, c, 0.5, count)
-        seconds = time.perf_counter() - began
+        seconds = clock() - began
         if seconds > _TRIAD_TIME:
             return _TRIAD_BYTES * elements * count / seconds
         count *= 2

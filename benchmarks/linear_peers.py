@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from cases import InnerProblem
 from linear_solvers import TOLERANCES, ByTolerance, Setting
 from measuring import Answer, timed
-from problems import InnerProblem
 
 from l1slam_ros.core.manifold import Array
 

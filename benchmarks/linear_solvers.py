@@ -13,13 +13,17 @@ from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+from cases import InnerProblem
 from measuring import Answer, timed
-from problems import InnerProblem
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import SuperLU, splu
 
 from l1slam_ros.core.manifold import Array
 
 Setting = Hashable
-TOLERANCES = tuple(10.0**-k for k in range(2, 9))
+# 1e-2 to 1e-8, two to a decade.
+TOLERANCES = tuple(float(f'{10**(-k / 2):.0e}') for k in range(4, 17))
 # Iterations between two looks at the cost, when it is not yet known how many are needed.
 _LOOK_EVERY = 20
 
@@ -101,3 +105,16 @@ class ByIterations:
         assert isinstance(setting, int)
         return timed(lambda: next(itertools.islice(
             self.iterates(problem), setting - 1, setting)))
+
+
+def normal_factor(A: csr_array) -> SuperLU:
+    """Return SciPy's factor of A'A."""
+    return splu((A.T @ A).tocsc(), permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
+                options={'SymmetricMode': True})
+
+
+def least_squares_start(A: csr_array, b: Array) -> tuple[Array, Array]:
+    """Return the least squares solution (columns,), and the dual (rows,) its residuals suggest."""
+    x = normal_factor(A).solve(A.T @ b)
+    r = A @ x - b
+    return x, np.clip(r / np.abs(r).mean(), -1, 1)

@@ -3,7 +3,8 @@
 How anything here is measured: by turns, in one process, medians; and the record of it.
 
 Machines differ from day to day and from minute to minute, so whatever is compared is run in turn,
-round after round: a slow minute then hits all alike.
+round after round: a slow minute then hits all alike. Time is the processor's, of all threads of the
+process: on one idle core that is the wall's, and on a busy one it leaves out what others take.
 """
 
 import os
@@ -22,11 +23,12 @@ from l1slam_ros.core.manifold import Array
 _PACKAGES = ('numpy', 'scipy', 'numba', 'gtsam', 'g2opy', 'clarabel', 'highspy', 'ortools')
 
 Key = TypeVar('Key')
+clock = time.process_time
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a solver returned, a step or poses, and the time [s] it took, by the wall."""
+    """What a solver returned, a step or poses, and the time [s] it took."""
 
     x: Array
     seconds: float
@@ -41,6 +43,7 @@ class Measured:
 
     @property
     def median(self) -> float:
+        """Of the seconds."""
         return statistics.median(self.seconds)
 
 
@@ -66,6 +69,7 @@ class Row:
 
     @property
     def key(self) -> tuple[str, str, str]:
+        """What tells it from the other rows of its part."""
         return self.problem, self.group, self.solver
 
 
@@ -81,9 +85,9 @@ def row(problem: str, group: str, solver: str, ours: bool, measured: Measured | 
 
 def timed(work: Callable[[], Array]) -> Answer:
     """Return what `work` returns, and its time."""
-    began = time.perf_counter()
+    began = clock()
     x = work()
-    return Answer(x, time.perf_counter() - began)
+    return Answer(x, clock() - began)
 
 
 def interleaved(

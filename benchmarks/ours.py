@@ -7,25 +7,36 @@ iteration, for the comparison with the bytes that it has to move.
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from cases import Case, InnerProblem, seed_of
 from graph_solvers import SAME_TOLERANCE, GraphSolver
-from linear_solvers import ByIterations, ByTolerance, LinearSolver, Setting
+from linear_solvers import (
+    TOLERANCES,
+    ByIterations,
+    ByTolerance,
+    LinearSolver,
+    Setting,
+    least_squares_start,
+)
 from measuring import Answer, timed
-from problems import Case, InnerProblem
 
-from l1slam_ros.core.choice import AUTO, INTERIOR_POINT, PRIMAL_DUAL, minimise_by
+from l1slam_ros.core.choice import AUTO, INTERIOR_POINT, PRIMAL_DUAL, choose, minimise_by
+from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.halpern import minimise_l1_halpern
+from l1slam_ros.core.interior_point import LinearProblem, interior_point
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.least_squares import reweighted_start, weighted_least_squares
+from l1slam_ros.core.least_squares import weighted_least_squares
 from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.optimality import smoothing
 from l1slam_ros.core.optimiser import OptimiserOptions
 from l1slam_ros.core.primal_dual import (
     PrimalDualOptions,
+    PrimalDualSolution,
     diagonal_step_sizes,
-    minimise_l1,
     primal_dual,
     primal_weight,
 )
@@ -35,6 +46,9 @@ from l1slam_ros.core.seed import seed_poses
 PLAIN = 'Algorithm 2, plain'
 # More than any limit lets it take.
 _MANY = 10**7
+# Where a search for the iteration that reaches a mark ends, if the marks lie below.
+_TIGHTEST = 1e-7
+_STEPS = 100
 
 
 def algorithm_2(problem: InnerProblem, x: Array, omega: float) -> Iterator[Array]:
@@ -42,53 +56,101 @@ def algorithm_2(problem: InnerProblem, x: Array, omega: float) -> Iterator[Array
     tau, sigma = diagonal_step_sizes(problem.A)
     tau, sigma = tau / omega, sigma * omega
     sigma_b = sigma * problem.b
-    for x, _ in primal_dual(problem.A, lambda v: np.clip(v - sigma_b, -1, 1), lambda v: v,
-                            x, np.zeros(len(problem.b)), tau, sigma):
-        yield x
+    iterates = primal_dual(problem.A, lambda v: np.clip(v - sigma_b, -1, 1), lambda v: v, x,
+                           np.zeros(len(problem.b)), tau, sigma)
+    yield from (x for x, _ in iterates)
 
 
 def _plain(problem: InnerProblem) -> Iterator[Array]:
-    yield from algorithm_2(problem, weighted_least_squares(problem.A, problem.b), 1.0)
+    x, _ = least_squares_start(problem.A, problem.b)
+    yield from algorithm_2(problem, x, 1.0)
 
 
 def _weighted(problem: InnerProblem) -> Iterator[Array]:
-    x = weighted_least_squares(problem.A, problem.b)
+    x, _ = least_squares_start(problem.A, problem.b)
     yield from algorithm_2(problem, x, primal_weight(problem.A, problem.b, x))
 
 
-def _reweighted(problem: InnerProblem, setting: Setting, limit: float) -> Answer:
-    """Solve as the package does: from reweighted least squares, x and y."""
+@dataclass(frozen=True)
+class _Halpern:
+    """The fused primal-dual method from least squares, ordering counted; a setting: iterations."""
+
+    name: str = 'ours, primal-dual'
+
+    def reach(
+        self, problem: InnerProblem, costs: Sequence[float], limit: float
+    ) -> list[Setting | None]:
+        """Look up in the history of one long run where each cost is reached."""
+        solution = _halpern(problem, PrimalDualOptions(_MANY, _TIGHTEST), limit)
+        iterations, values = solution.history.T
+        return [int(iterations[np.argmax(values <= cost)]) or 1 if values.min() <= cost else None
+                for cost in costs]
+
+    def run(self, problem: InnerProblem, setting: Setting, limit: float) -> Answer:
+        """Iterate that often."""
+        assert isinstance(setting, int)
+        return timed(lambda: _halpern(problem, PrimalDualOptions(setting, 0.0), limit).x)
+
+
+def _halpern(
+    problem: InnerProblem, options: PrimalDualOptions, limit: float
+) -> PrimalDualSolution:
+    deadline, system = time.monotonic() + limit, problem.system
+    x = weighted_least_squares(system, cholesky_of(problem.graph), np.ones(len(system.b)))
+    r = system.times(x) - system.b
+    return minimise_l1_halpern(system, x, np.clip(r / smoothing(r), -1, 1), options,
+                               deadline=deadline)
+
+
+def _interior_point(problem: InnerProblem, setting: Setting, limit: float) -> Answer:
+    """Solve from least squares, ordering counted; it knows no time limit, and needs none."""
     assert isinstance(setting, float)
-    A, b, options = problem.A, problem.b, PrimalDualOptions(_MANY, setting)
-    deadline = time.monotonic() + limit
-    return timed(lambda: minimise_l1(A, b, *reweighted_start(A, b), options, deadline).x)
+    system = problem.system
+
+    def solve() -> Array:
+        cholesky = cholesky_of(problem.graph)
+        x = weighted_least_squares(system, cholesky, np.ones(len(system.b)))
+        return interior_point(LinearProblem(system), x, cholesky, _STEPS, setting).poses
+
+    return timed(solve)
 
 
 INNER: tuple[LinearSolver, ...] = (
     ByIterations(PLAIN, _plain),
     ByIterations('Algorithm 2, primal weight', _weighted),
-    ByTolerance('Algorithm 2, reweighted start', (tuple(10.0**-k for k in range(1, 8)),),
-                _reweighted),
+    _Halpern(),
+    ByTolerance('ours, interior point', (TOLERANCES,), _interior_point),
 )
 
 
 def _l1(solver: str) -> GraphSolver:
     """Solve by one of `choice.SOLVERS`, from given poses."""
-    return _from_poses(f'ours, L1 {solver}', lambda graph, poses: minimise_by(
-        solver, graph, poses, OptimiserOptions())[0].poses)
+
+    def solve(graph: FactorGraph, poses: Array) -> Array:
+        return minimise_by(choose(solver, graph), graph, poses, OptimiserOptions())[0].poses
+
+    return _from_poses(f'ours, L1 {solver}', solve)
 
 
 def _l2(graph: FactorGraph, poses: Array) -> Array:
-    return minimise_l2(graph, poses, LeastSquaresOptions(tolerance=SAME_TOLERANCE)).poses
+    options = LeastSquaresOptions(tolerance=SAME_TOLERANCE)
+    return minimise_l2(graph, poses, options, cholesky_of(graph)).poses
 
 
 def _seed(graph: FactorGraph, poses: Array) -> Array:
     """Return Algorithm 3's poses, which come from the graph alone."""
-    return seed_poses(graph)
+    return seed_of(graph)
 
 
 def _seed_and_l1(graph: FactorGraph, poses: Array) -> Array:
-    return minimise_by(AUTO, graph, seed_poses(graph), OptimiserOptions())[0].poses
+    return seed_and_l1(graph)[1]
+
+
+def seed_and_l1(graph: FactorGraph) -> tuple[Array, Array]:
+    """Return the seed and the map, (n, p) each, by the default solver; one ordering for both."""
+    choice = choose(AUTO, graph)
+    seed = seed_poses(graph, choice.cholesky)
+    return seed, minimise_by(choice, graph, seed, OptimiserOptions())[0].poses
 
 
 def _from_poses(name: str, solve: Callable[[FactorGraph, Array], Array]) -> GraphSolver:
@@ -114,24 +176,43 @@ class Iteration:
     """
     One iteration of a method on a problem.
 
-    start : problem -> a function that does so many iterations; bytes_per_edge : what one of them
-    has to read and write for each edge, None where nobody counted.
+    run : does so many iterations; bytes_per_edge : what one of them has to read and write for each
+    edge of the problem, None where nobody counted.
     """
 
     name: str
-    start: Callable[[InnerProblem], Callable[[int], None]]
-    bytes_per_edge: float | None = None
+    run: Callable[[InnerProblem, int], None]
+    bytes_per_edge: Callable[[InnerProblem], float] | None = None
 
 
-def _two_products(problem: InnerProblem) -> Callable[[int], None]:
+def _two_products(problem: InnerProblem, count: int) -> None:
     """Do Algorithm 2: two sparse products of SciPy and the updates of the vectors."""
     iterates = algorithm_2(problem, np.zeros(problem.A.shape[1]), 1.0)
-
-    def iterate(count: int) -> None:
-        for _ in range(count):
-            next(iterates)
-
-    return iterate
+    for _ in range(count):
+        next(iterates)
 
 
-ITERATIONS = (Iteration('SciPy, Algorithm 2', _two_products),)
+def _fused(problem: InnerProblem, count: int) -> None:
+    """Do the fused iteration, with a look every 40, as it is used."""
+    x, y = np.zeros(problem.A.shape[1]), np.zeros(len(problem.b))
+    minimise_l1_halpern(problem.system, x, y, PrimalDualOptions(count, 0.0))
+
+
+def _fused_bytes(problem: InnerProblem) -> float:
+    """
+    Return the bytes of `kernels.halpern.iterate` for each edge.
+
+    Read: both blocks, b, y and y0 in single precision, two 32-bit keyframes; written: y. For each
+    keyframe x, z and g are read and written once by the sweep over keyframes, and z read and g
+    written once, if the cache holds what neighbouring factors share.
+    """
+    k, edges = problem.system.block_size, len(problem.system.blocks)
+    each_edge = 4 * (2 * k * k + 3 * k) + 4 * k + 2 * 4
+    each_keyframe = 4 * k * 8
+    return float(each_edge + each_keyframe * problem.system.size / edges)
+
+
+ITERATIONS = (
+    Iteration('SciPy, Algorithm 2', _two_products),
+    Iteration('ours, fused', _fused, _fused_bytes),
+)

@@ -89,7 +89,7 @@ def _measure(part: str, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _cases(arguments: argparse.Namespace) -> Iterator[Any]:
-    from problems import DENSE_WORLD, GRAPHS, public_case, simulated_case
+    from cases import DENSE_WORLD, GRAPHS, public_case, simulated_case
 
     for name in arguments.graphs or (*GRAPHS, DENSE):
         yield (simulated_case(*DENSE_WORLD) if name == DENSE

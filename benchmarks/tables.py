@@ -77,7 +77,7 @@ def inner_tables(rows: Sequence[Row]) -> Lines:
 def whole_tables(rows: Sequence[Row]) -> Lines:
     """Return a table for each graph: starts and solvers down."""
     of = _references(rows)
-    lines = ['Ratio: to gtsam\'s plain L2 Gauss-Newton from the same start; from nothing, to '
+    lines = ["Ratio: to gtsam's plain L2 Gauss-Newton from the same start; from nothing, to "
              'LAGO and Gauss-Newton. Above: the part of the L1 cost above the lowest known.', '']
     for problem in _unique(r.problem for r in rows):
         body = [(r.group, r.solver, number(r.seconds), number(of[r.key]),
@@ -154,7 +154,7 @@ def comparison(now: Mapping[str, Any], before: Mapping[str, Any]) -> Lines:
                          f'{number(ratio)}')
     for word, values in (('ours', logs[True]), ('peers', logs[False])):
         if values:
-            lines.append(f'{word}: {np.exp(np.mean(values)):.3f} of the baseline\'s time, '
+            lines.append(f"{word}: {np.exp(np.mean(values)):.3f} of the baseline's time, "
                          f'geometric mean of {len(values)}')
     return lines
 

@@ -10,11 +10,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
+from cases import STARTS, Case
 from graph_peers import GAUSS_NEWTON, LAGO, PEERS
 from graph_solvers import GraphSolver
 from measuring import Measured, Row, interleaved, report_progress, row
 from ours import DEFAULT, FROM_NOTHING, WHOLE
-from problems import STARTS, Case
 
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.manifold import Array

@@ -33,6 +33,11 @@ def cost(graph, poses):
     return l1_cost(whitened_residual(graph, poses))
 
 
+def batch_of(graph):
+    cholesky = cholesky_of(graph)
+    return minimise(graph, seed_poses(graph, cholesky), OptimiserOptions(), cholesky)
+
+
 def settled(backend):
     """Update until there is nothing left to do; return how often."""
     for count in range(100):
@@ -64,7 +69,7 @@ def test_incremental_ends_at_the_cost_of_batch(world):
         assert improvement.cost <= improvement.cost_before
         if k in (40, 90, 140):
             graph = backend.problem().graph
-            batch = minimise(graph, seed_poses(graph, cholesky_of(graph)), OptimiserOptions())
+            batch = batch_of(graph)
             assert cost(graph, backend.poses) == pytest.approx(batch.cost, rel=1e-2)
     settled(backend)
     assert cost(world.graph, backend.poses) == pytest.approx(batch.cost, rel=2e-4)
@@ -75,7 +80,7 @@ def test_a_solve_to_the_end_is_as_good(world):
     play(backend, world)
     problem = backend.problem()
     solved = optimise(problem, EVERY.solver)
-    batch = minimise(world.graph, seed_poses(world.graph, cholesky_of(world.graph)), OptimiserOptions())
+    batch = batch_of(world.graph)
     assert solved.cost == cost(problem.graph, solved.poses) == pytest.approx(batch.cost, rel=2e-4)
     assert solved.cost_before == cost(problem.graph, problem.poses)
     backend.adopt(solved)
@@ -146,7 +151,7 @@ def test_small_budgets_add_up(world):
         costs.append(improvement.cost)
     assert improvement is None
     assert (np.diff(costs) <= 1e-9).all()
-    batch = minimise(world.graph, seed_poses(world.graph, cholesky_of(world.graph)), OptimiserOptions())
+    batch = batch_of(world.graph)
     assert costs[-1] == pytest.approx(batch.cost, rel=1e-3)
 
 
@@ -199,7 +204,7 @@ def test_keyframes_during_an_update_follow_the_map(world):
                     atol=1e-9)
     settled(backend)
     graph = backend.problem().graph
-    batch = minimise(graph, seed_poses(graph, cholesky_of(graph)), OptimiserOptions())
+    batch = batch_of(graph)
     assert cost(graph, backend.poses) == pytest.approx(batch.cost, rel=1e-3)
 
 
@@ -258,7 +263,9 @@ def test_a_restored_map_is_the_map_it_was(world):
     assert_array_equal(second.poses, first.poses)
     assert_array_equal(second.growth.stamps, first.growth.stamps)
     second.update(PLENTY)
-    assert second.problem().last_cost == pytest.approx(first.problem().last_cost, rel=1e-4)
+    # Started anew it may end nearer to the optimum, of which a settled map is within 2e-4.
+    before, after = first.problem().last_cost, second.problem().last_cost
+    assert (1 - 5e-4) * before <= after <= (1 + 1e-4) * before
 
 
 def test_after_a_restore_odometry_may_begin_anywhere(world):
@@ -305,7 +312,7 @@ def test_a_warm_update_does_more_with_little_work_than_a_cold_one(world):
     play(cold, world)
     options = OptimiserOptions(outer_iterations=2, inner=PrimalDualOptions(iterations=100))
     first, second = (improve(backend.problem(), options, PLENTY) for backend in (warm, cold))
-    best = minimise(world.graph, seed_poses(world.graph, cholesky_of(world.graph)), OptimiserOptions()).cost
+    best = batch_of(world.graph).cost
     assert first.cost_before < 0.2 * second.cost_before
     assert first.reweighted_steps == 0 < second.reweighted_steps
     assert first.cost / best - 1 < 0.5 * (second.cost / best - 1)

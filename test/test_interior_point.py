@@ -1,121 +1,226 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The interior point finds the L1 optimum, says so only when it did, and never ends worse."""
+"""The interior-point method: linear problems against HiGHS, graphs near their map, its account."""
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import HAND_SOLVED, chain_and_loops, drive, graph_of, linprog_l1, noisy_graph
+from systems import SHAPES, cholesky_of_system, random_system, system_of
 
 from l1slam_ros.core import se2
-from l1slam_ros.core.choice import AUTO, INTERIOR_POINT, PRIMAL_DUAL, minimise_by
-from l1slam_ros.core.false_loops import random_false_loops
+from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.initial import odometry_poses
-from l1slam_ros.core.interior_point import minimise_interior_point
+from l1slam_ros.core.interior_point import GraphProblem, LinearProblem, interior_point
+from l1slam_ros.core.kernels import interior_point as kernels
 from l1slam_ros.core.linearise import linearise, whitened_residual
 from l1slam_ros.core.optimality import Status, l1_cost
-from l1slam_ros.core.optimiser import OptimiserOptions, minimise
-from l1slam_ros.core.seed import seed_poses
-from l1slam_ros.core.simulate import WorldOptions, simulate_world, with_false_loops
-from l1slam_ros.io.graph_file import read_graph_file
 
-OPTIMA = {'intel': 961.77375, 'manhattan3500': 971.66316, 'city10000': 3772.00977}
+TOLERANCE = 1e-8
+
+
+def solve_linear(system, x, iterations=60, tolerance=TOLERANCE):
+    return interior_point(LinearProblem(system), x, cholesky_of_system(system), iterations,
+                          tolerance)
+
+
+def solve_graph(graph, poses, iterations=100, tolerance=TOLERANCE):
+    return interior_point(GraphProblem(graph), poses, cholesky_of(graph), iterations, tolerance)
 
 
 def cost_of(graph, poses):
     return l1_cost(whitened_residual(graph, poses))
 
 
-def test_the_curvature_is_the_second_derivative_of_the_residual(rng):
-    measurement, pose_i, pose_j, dual = rng.normal(size=(4, 1, 3))
-    h = 1e-4
-
-    def weighted(step):
-        residual = se2.residual(measurement, se2.retract(pose_i, step[None, :3]),
-                                se2.retract(pose_j, step[None, 3:]))
-        return float((dual * residual).sum())
-
-    H, axes = np.zeros((6, 6)), h * np.eye(6)
-    for a in range(6):
-        for b in range(6):
-            H[a, b] = (weighted(axes[a] + axes[b]) - weighted(axes[a] - axes[b])
-                       - weighted(axes[b] - axes[a]) + weighted(-axes[a] - axes[b])) / (4 * h * h)
-    curvature = se2.residual_curvature(measurement, pose_i, pose_j, dual)[0]
-    np.testing.assert_allclose(curvature, H, atol=1e-6)
+@pytest.fixture
+def world(rng):
+    return noisy_graph(60, 50, rng)
 
 
-@pytest.mark.parametrize('name', ['intel', 'manhattan3500'])
-@pytest.mark.parametrize('start', ['stored', 'odometry', 'seed'])
-def test_the_paper_graphs_are_solved_to_a_few_millionths(datasets, name, start):
-    record = read_graph_file(datasets / f'{name}.g2o')
-    poses = {'stored': lambda: record.poses, 'odometry': lambda: odometry_poses(record.graph),
-             'seed': lambda: seed_poses(record.graph)}[start]()
-    solution = minimise_interior_point(record.graph, poses, OptimiserOptions())
-    assert solution.status is Status.CONVERGED
-    assert solution.cost == cost_of(record.graph, solution.poses)
-    # Manhattan's valley is flat: from the seed it ends 2.5e-5 above the lowest cost known.
-    assert solution.cost <= (1 + 3e-5) * OPTIMA[name]
+# Linear problems
 
 
-def test_city_from_its_odometry(datasets):
-    graph = read_graph_file(datasets / 'city10000.g2o').graph
-    solution = minimise_interior_point(graph, odometry_poses(graph), OptimiserOptions())
-    assert solution.status is Status.CONVERGED
-    assert solution.cost <= (1 + 1e-5) * OPTIMA['city10000']
+@pytest.mark.parametrize('k', [1, 2, 3])
+@pytest.mark.parametrize('shape', SHAPES, ids=lambda shape: shape.__name__)
+@pytest.mark.parametrize('scale', [0.0, 1.5])
+def test_linear_problems_are_solved_as_by_highs(shape, k, scale, rng):
+    # Twice each pair, or a chain has as many rows as columns and fits exactly.
+    system = random_system(2 * shape(12), 12, k, rng, scale)
+    optimum = solve_linear(system, np.zeros(12 * k))
+    best, _ = linprog_l1(system.A, system.b)
+    assert optimum.status is Status.CONVERGED
+    assert l1_cost(system.A @ optimum.poses - system.b) == pytest.approx(best, rel=1e-7)
 
 
-def test_it_agrees_with_algorithm_4_and_is_optimal_by_its_dual(rng):
-    graph = simulate_world(200, 330, WorldOptions(), rng).graph
-    seed = seed_poses(graph)
-    solution = minimise_interior_point(graph, seed, OptimiserOptions())
-    first_order = minimise(graph, seed, OptimiserOptions(outer_iterations=60))
-    assert solution.cost <= (1 + 1e-5) * first_order.cost
-    system = linearise(graph, solution.poses)
-    assert np.abs(solution.dual).max() <= 1
-    # The dual is feasible for the linear problem at the end, and its value is the cost.
-    assert np.abs(system.A.T @ solution.dual).max() < 1e-3 * np.abs(system.A).sum(axis=0).max()
-    assert solution.dual @ -system.b == pytest.approx(solution.cost, rel=1e-3)
+@pytest.mark.parametrize('make', HAND_SOLVED[:-1], ids=lambda make: make.__name__)
+def test_hand_solved_problems(make):
+    problem = make()
+    optimum = solve_linear(system_of(problem.A, problem.b), np.zeros(problem.A.shape[1]))
+    assert_allclose(optimum.poses, problem.x, atol=1e-6)
+    assert optimum.costs[-1] == pytest.approx(problem.optimum, rel=1e-7)
+    assert problem.b @ -optimum.y == pytest.approx(problem.optimum, rel=1e-6)
 
 
-@pytest.mark.parametrize('seed', range(4))
-def test_it_never_ends_worse_than_it_began(seed):
-    rng = np.random.default_rng(seed)
-    world = simulate_world(150, 220, WorldOptions(), rng)
-    loops = random_false_loops(world.graph, world.truth, 30, rng)
-    graph = with_false_loops(world, loops).graph
-    start = cost_of(graph, world.truth)
-    solution = minimise_interior_point(graph, world.truth, OptimiserOptions())
-    assert solution.cost <= start
-    assert solution.cost == cost_of(graph, solution.poses)
-    assert (np.diff(solution.history) <= 0).all()
-    chosen, _ = minimise_by(AUTO, graph, world.truth, OptimiserOptions())
-    assert chosen.cost <= solution.cost
+@pytest.mark.parametrize('iterations', [0, 1, 3, 60])
+def test_the_dual_is_feasible_and_the_gap_bounds_the_error(iterations, rng):
+    for shape in SHAPES:
+        system = random_system(2 * shape(12), 12, 2, rng)
+        optimum = solve_linear(system, np.zeros(24), iterations)
+        assert np.abs(optimum.y).max() <= 1
+        assert_allclose(system.A.T @ optimum.y, 0, atol=1e-9 * np.abs(system.blocks).max())
+        best, _ = linprog_l1(system.A, system.b)
+        assert optimum.costs[-1] - optimum.gap <= best * (1 + 1e-9)
+        assert optimum.gap <= (1e-6 if iterations == 60 else 1) * optimum.costs[-1]
 
 
-def test_a_chain_without_loops_is_solved_as_it_is(rng):
-    graph = simulate_world(20, 19, WorldOptions(), rng).graph
-    solution = minimise_interior_point(graph, odometry_poses(graph), OptimiserOptions())
-    assert solution.status is Status.CONVERGED
-    assert solution.cost == pytest.approx(0, abs=1e-9)
+def test_a_start_far_away_is_no_trouble_to_a_linear_problem(rng):
+    system = random_system(2 * SHAPES[0](12), 12, 3, rng)
+    optimum = solve_linear(system, 1e6 * rng.standard_normal(36))
+    assert optimum.costs[-1] == pytest.approx(linprog_l1(system.A, system.b)[0], rel=1e-6)
 
 
-def test_sparse_graphs_get_the_interior_point_and_dense_ones_algorithm_4(rng):
-    sparse = simulate_world(60, 90, WorldOptions(), rng).graph
-    dense = simulate_world(60, 400, WorldOptions(), rng).graph
-    names = [minimise_by(AUTO, g, seed_poses(g), OptimiserOptions())[1]
-             for g in (sparse, dense)]
-    assert names == [INTERIOR_POINT, PRIMAL_DUAL]
+# Graphs
 
 
-def test_a_prior_fixes_the_gauge_instead_of_the_anchor(rng):
-    world = simulate_world(60, 90, WorldOptions(), rng)
-    moved = se2.compose(np.broadcast_to([3.0, 4.0, 0.5], world.truth.shape), world.truth)
+def test_no_small_step_is_better_by_highs(world):
+    graph, truth = world
+    optimum = solve_graph(graph, truth)
+    assert optimum.status is Status.CONVERGED
+    system = linearise(graph, optimum.poses)
+    best, _ = linprog_l1(system.A, system.b, box=0.02)
+    assert optimum.costs[-1] == cost_of(graph, optimum.poses)
+    assert best >= (1 - 1e-5) * optimum.costs[-1]
+    assert optimum.costs[-1] - optimum.gap <= linprog_l1(system.A, system.b)[0] * (1 + 1e-9)
+
+
+def test_converged_means_that_little_is_left(world):
+    """A hundred times as loose, a hundred times as far from the best, but for luck."""
+    graph, truth = world
+    best = solve_graph(graph, truth, tolerance=1e-10).costs[-1]
+    for tolerance in (1e-2, 1e-4, 1e-6):
+        optimum = solve_graph(graph, truth, tolerance=tolerance)
+        assert optimum.status is Status.CONVERGED
+        assert 0 <= optimum.costs[-1] / best - 1 <= tolerance + 1e-10
+
+
+def test_the_lowest_cost_met_is_what_is_returned(world):
+    graph, truth = world
+    for iterations in (1, 2, 5, 100):
+        optimum = solve_graph(graph, truth, iterations)
+        assert optimum.costs[0] == cost_of(graph, truth)
+        assert (np.diff(optimum.costs) <= 0).all()
+        assert optimum.costs[-1] == cost_of(graph, optimum.poses)
+
+
+@pytest.mark.parametrize('iterations', [0, 1, 3])
+def test_the_iteration_limit_is_kept_and_named(iterations, world):
+    graph, truth = world
+    optimum = solve_graph(graph, truth, iterations)
+    assert optimum.status is Status.ITERATION_LIMIT
+    assert len(optimum.costs) == iterations + 1
+    assert optimum.y.shape == (3 * len(graph.between),)
+    assert iterations or optimum.poses is truth
+
+
+@pytest.mark.parametrize('iterations', [0, 60])
+def test_an_exact_start_is_the_end(iterations, rng):
+    truth = drive(20, rng)
+    graph = graph_of(truth, chain_and_loops(20, 10, rng))
+    optimum = solve_graph(graph, truth, iterations)
+    assert optimum.status is Status.CONVERGED and len(optimum.costs) == 1
+    assert_array_equal(optimum.poses, truth)
+    assert optimum.gap <= optimum.costs[0]
+
+
+def test_one_keyframe_is_solved():
     graph = FactorGraph(se2)
-    graph.add_poses(60)
-    factors = world.graph.between
-    root = factors.sqrt_information
-    graph.add_between(factors.i, factors.j, factors.measurement, root.transpose(0, 2, 1) @ root)
-    graph.add_prior(np.array([7]), moved[7:8], 1e4 * np.eye(3)[None])
-    solution = minimise_interior_point(graph, moved, OptimiserOptions())
-    assert solution.status is Status.CONVERGED
-    np.testing.assert_allclose(solution.poses[7], moved[7], atol=1e-6)
-    unfixed = minimise_interior_point(world.graph, world.truth, OptimiserOptions())
-    assert solution.cost == pytest.approx(unfixed.cost, rel=1e-5)
+    graph.add_poses(1)
+    optimum = solve_graph(graph, se2.identity(1))
+    assert (optimum.status, optimum.costs, optimum.gap) == (Status.CONVERGED, [0.0], 0.0)
+
+
+def test_a_loose_keyframe_stays_and_nothing_is_claimed(rng):
+    """The damping holds it, the rest is solved; there is no dual to prove it by."""
+    truth = drive(4, rng)
+    noise = 0.1 * rng.standard_normal((3, 3))
+    pairs = [(0, 1), (1, 2), (0, 2)]
+    optimum = solve_graph(graph_of(truth, pairs, noise), truth)
+    tied = solve_graph(graph_of(truth[:3], pairs, noise), truth[:3])
+    assert_array_equal(optimum.poses[3], truth[3])
+    assert optimum.costs[-1] == pytest.approx(tied.costs[-1], rel=1e-6)
+    assert_array_equal(optimum.y, 0)
+    assert optimum.gap == optimum.costs[-1]
+
+
+def test_where_there_is_no_direction_it_stalls_at_its_start(world):
+    """A pose that is not finite: nothing can be factored."""
+    graph, truth = world
+    truth[7, 0] = np.nan
+    optimum = solve_graph(graph, truth)
+    assert optimum.status is Status.STALLED and optimum.poses is truth
+    assert len(optimum.costs) == 1
+
+
+def test_progress_is_reported(world):
+    graph, truth = world
+    reports = []
+    optimum = interior_point(GraphProblem(graph), truth, cholesky_of(graph), 8, TOLERANCE,
+                             lambda k, cost: reports.append((k, cost)))
+    assert reports == list(enumerate(optimum.costs))[1:]
+
+
+def test_the_start_is_left_as_it_was(world):
+    graph, truth = world
+    before = truth.copy()
+    truth.flags.writeable = False
+    solve_graph(graph, truth, 5)
+    assert_array_equal(truth, before)
+
+
+# The compiled row-wise work
+
+
+@pytest.fixture
+def rows(rng):
+    """Return e, (u, v, s, t), y, q, c1, c2 of a point inside its bounds."""
+    e, c1, c2 = rng.standard_normal((3, 50))
+    u, v = rng.uniform(0.1, 2, (2, 50))
+    y = rng.uniform(-0.9, 0.9, 50)
+    s, t = 1 - y, 1 + y
+    return e, (u, v, s, t), y, 1 / (u / s + v / t), c1, c2
+
+
+def test_the_right_hand_side(rows):
+    e, (u, v, s, t), y, q, c1, c2 = rows
+    g, z = kernels.right_side(e, u, v, s, t, y, q, c1, c2)
+    assert_allclose(g, e - (u - v) - (c1 / s - u) + (c2 / t - v))
+    assert_allclose(z, y + q * g)
+
+
+def test_the_step_solves_the_newton_equations(rows, rng):
+    """u s = c1 and v t = c2 to first order, e + J dx = u - v, and bounds met as said."""
+    e, (u, v, s, t), y, q, c1, c2 = rows
+    moved = rng.standard_normal(50)
+    g, _ = kernels.right_side(e, u, v, s, t, y, q, c1, c2)
+    dy, du, dv, primal, dual = kernels.complete(u, v, s, t, q, c1, c2, g, moved)
+    assert_allclose(u * s + s * du - u * dy, c1)
+    assert_allclose(v * t + t * dv + v * dy, c2)
+    assert_allclose((u + du) - (v + dv), e + moved, atol=1e-12)
+    # At these lengths the first bound is met, and none is passed.
+    assert min((u + primal * du).min(), (v + primal * dv).min()) == pytest.approx(0, abs=1e-12)
+    assert min((s - dual * dy).min(), (t + dual * dy).min()) == pytest.approx(0, abs=1e-12)
+
+
+def test_the_gap_after_a_step_and_the_step(rows, rng):
+    _, (u, v, s, t), y, *_ = rows
+    dy, du, dv = rng.standard_normal((3, 50))
+    after = u + 0.3 * du, v + 0.3 * dv, s - 0.2 * dy, t + 0.2 * dy
+    gap = after[0] @ after[2] + after[1] @ after[3]
+    assert kernels.gap_after(u, v, s, t, dy, du, dv, 0.3, 0.2) == pytest.approx(gap)
+    expected_y = y + 0.2 * dy
+    kernels.advance(u, v, s, t, y, dy, du, dv, 0.3, 0.2, 0.4)
+    assert_allclose(u, after[0])
+    assert_allclose(v, after[1])
+    assert_allclose(s, np.maximum(after[2], 0.4))
+    assert_allclose(t, np.maximum(after[3], 0.4))
+    assert_allclose(y, expected_y)
+    assert (after[2] < 0.4).any() and (after[3] < 0.4).any()

@@ -12,6 +12,7 @@ from l1slam_ros.core.optimality import (
     duality_gap,
     l1_cost,
     l2_cost,
+    smoothing,
 )
 
 
@@ -65,3 +66,10 @@ def test_the_gap_bounds_the_distance_to_the_best_in_the_box(kind, rng):
 def test_every_status_has_its_sentence():
     assert set(SENTENCES) == set(Status)
     assert {status.value for status in Status} >= {'converged', 'iteration_limit', 'stalled'}
+
+
+def test_smoothing_is_the_mean_and_never_zero():
+    assert smoothing(np.array([1.0, -3.0])) == 2.0
+    for rows in (0, 5):
+        mu = smoothing(np.zeros(rows))
+        assert mu > 0 and np.isfinite(1 / (mu / 1024) ** 2)

@@ -20,7 +20,7 @@ from l1slam_ros.core.optimiser import OptimiserOptions, Report, Solution
 
 # It leaves the cost 10^-6 above the optimum, 3 10^-6 in Manhattan's flat valley.
 _TOLERANCE = 3e-5
-_ROUGH_L2 = LeastSquaresOptions(iterations=30, tolerance=1e-2)
+_ROUGH_L2 = LeastSquaresOptions(iterations=30, tolerance=1e-3)
 # The L2 map is the better start, in the middle of the valley, unless false loops bend it. Its L1
 # cost is a quarter above the optimum at most on clean data (measured: 17 to 25%).
 _STRAIGHT = 4 / 3

@@ -30,6 +30,7 @@ from l1slam_ros.core.cholesky import BlockCholesky
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.linearise import (
     LinearSystem,
+    ends,
     linearise,
     step_poses,
     whitened_residual,
@@ -89,10 +90,8 @@ class GraphProblem:
 
     def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> Array:
         """See `Problem`."""
-        factors = self.graph.between
-        gradient = system.gradients(dual)[: len(factors)]
-        return self.graph.manifold.residual_curvature(
-            poses[factors.i], poses[factors.j], gradient)
+        gradient = system.gradients(dual)[: len(self.graph.between)]
+        return self.graph.manifold.residual_curvature(*ends(self.graph, poses), gradient)
 
 
 @dataclass(frozen=True)
@@ -167,7 +166,7 @@ class _Iterate:
 
     def is_solved(self, cost: float, tolerance: float) -> bool:
         split = l1_cost(self.residual - self.u + self.v)
-        return max(self.gap, split) <= tolerance * cost
+        return split <= tolerance * cost and self.gap <= tolerance * cost
 
 
 @dataclass(frozen=True)

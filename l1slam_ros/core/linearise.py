@@ -90,13 +90,19 @@ def anchor(graph: FactorGraph) -> int:
     return 0 if len(graph.prior) else min(1, graph.n_poses)
 
 
+def ends(graph: FactorGraph, poses: Array) -> tuple[Array, Array]:
+    """Return the poses of keyframes i and j of each between factor, (m, p) each."""
+    factors = graph.between
+    return poses.take(factors.i, axis=0), poses.take(factors.j, axis=0)
+
+
 def whitened_residual(graph: FactorGraph, poses: Array) -> Array:
     """Return the whitened residual of every row, (rows,), in the order of `LinearSystem`."""
     from l1slam_ros.core.kernels.blocks import whiten
 
     manifold, factors, prior = graph.manifold, graph.between, graph.prior
     sizes = (0,) * manifold.TANGENT_SIZE
-    e = manifold.residual(factors.measurement, poses[factors.i], poses[factors.j])
+    e = manifold.residual(factors.measurement, *ends(graph, poses))
     whitened = whiten(factors.sqrt_information, e, sizes).ravel()
     if not len(prior):
         return whitened
@@ -117,7 +123,7 @@ def linearise(
     manifold, factors, prior, m = graph.manifold, graph.between, graph.prior, len(graph.between)
     d, size = manifold.TANGENT_SIZE, graph.n_poses - anchor(graph)
     blocks = np.zeros((m + len(prior), 2, d, d))
-    pair = manifold.residual_jacobians(factors.measurement, poses[factors.i], poses[factors.j])
+    pair = manifold.residual_jacobians(factors.measurement, *ends(graph, poses))
     for side, J in enumerate(pair):
         whiten_blocks(factors.sqrt_information, J, side, blocks[:m], (0,) * d)
     if len(prior):

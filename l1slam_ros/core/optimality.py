@@ -44,7 +44,7 @@ def l2_cost(residual: Array) -> float:
 def smoothing(residual: Array) -> float:
     """Return the mean of |r|, or where all fits exactly a millionth of a sigma."""
     # Weights of rows that fit to rounding must stay comparable with those of exact zeros.
-    return max(float(np.abs(residual).mean()), 1e-6)
+    return max(l1_cost(residual) / max(len(residual), 1), 1e-6)
 
 
 def fits_exactly(cost: float, rows: int) -> bool:

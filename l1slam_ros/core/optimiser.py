@@ -90,6 +90,7 @@ def minimise(
     residual = whitened_residual(graph, poses)
     history = [l1_cost(residual)]
     status, inner, small_steps, gap = Status.ITERATION_LIMIT, 0, 0, np.inf
+    weight: float | None = None
     for outer in range(options.outer_iterations):
         if fits_exactly(history[-1], len(residual)):
             status, gap = Status.CONVERGED, 0.0
@@ -100,9 +101,9 @@ def minimise(
         else:
             x = np.zeros(system.size * system.block_size)
             dual = np.zeros(len(residual)) if dual is None else dual
-        solution = minimise_l1_halpern(system, x, dual, options.inner, deadline=deadline)
+        solution = minimise_l1_halpern(system, x, dual, options.inner, weight, deadline)
         inner += solution.iterations
-        dual, gap = solution.y, solution.gap
+        dual, gap, weight = solution.y, solution.gap, solution.weight
         poses, cost = backtrack(graph, poses, solution.x, history[-1])
         history.append(cost)
         report(outer + 1, cost)

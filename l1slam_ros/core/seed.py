@@ -27,7 +27,7 @@ from l1slam_ros.core.optimality import l1_cost
 from l1slam_ros.core.primal_dual import PrimalDualOptions
 
 # The paper takes 1,000 iterations or more of each; by factorisations it is some ten steps.
-SEED_OPTIONS = PrimalDualOptions(iterations=2000, tolerance=1e-4)
+SEED_OPTIONS = PrimalDualOptions(iterations=2000, tolerance=1e-3)
 # Rounds of re-wrapping the angles; measured: 1 to 6 until the cost stops falling.
 _MOST_ROUNDS = 10
 # [sigma] A residual that departs that little from its linearisation is not wrapped anew.

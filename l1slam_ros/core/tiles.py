@@ -27,21 +27,21 @@ class Tiles:
         self._order = np.argsort(keyframe[:, 0] * (size + 1) + keyframe[:, 1], kind='stable')
         padded = np.full((self._count * lanes, 2), size, np.uint32)
         padded[: len(keyframe)] = keyframe[self._order]
-        self.keyframes = self._side_by_side(padded).reshape(self._count, 2 * lanes)
+        side_by_side = padded.reshape(self._count, lanes, 2).transpose(0, 2, 1)
+        self.keyframes = np.ascontiguousarray(side_by_side).reshape(self._count, 2 * lanes)
 
     def pack(self, values: Array) -> Single:
         """Return the values of all factors, (m, c), as tiles (t, c, lanes)."""
-        padded = np.zeros((self._count * self._lanes, values.shape[1]), np.float32)
-        padded[: len(values)] = values[self._order]
-        return self._side_by_side(padded)
+        from l1slam_ros.core.kernels import tiles as kernels
+
+        tiles = np.zeros((self._count, values.shape[1], self._lanes), np.float32)
+        kernels.pack(values, self._order, tiles)
+        return tiles
 
     def unpack(self, tiles: Single) -> Array:
         """Return the values of all factors, (m, c), from tiles (t, c, lanes)."""
-        flat = tiles.transpose(0, 2, 1).reshape(self._count * self._lanes, -1)
-        values = np.empty((len(self._order), flat.shape[1]))
-        values[self._order] = flat[: len(self._order)]
-        return values
+        from l1slam_ros.core.kernels import tiles as kernels
 
-    def _side_by_side(self, padded: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(
-            padded.reshape(self._count, self._lanes, padded.shape[1]).transpose(0, 2, 1))
+        values = np.empty((len(self._order), tiles.shape[1]))
+        kernels.unpack(tiles, self._order, values)
+        return values

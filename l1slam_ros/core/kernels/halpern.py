@@ -24,6 +24,34 @@ LANES = 16
 
 
 @compiled
+def add_squares(keyframe, blocks, gram, K):
+    """Add 2 A_fv'A_fv of every factor to its keyframes' gram (size + 1, k, k)."""
+    k = len(K)
+    for f in range(len(keyframe)):
+        for side in range(2):
+            block, total = blocks[f, side], gram[keyframe[f, side]]
+            for a in range(k):
+                for b in range(k):
+                    for r in range(k):
+                        total[a, b] += 2 * block[r, a] * block[r, b]
+
+
+@compiled
+def scale(keyframe, blocks, inverse, scaled, K):
+    """Set each block of `scaled` to that of `blocks` times its keyframe's inverse."""
+    k = len(K)
+    for f in range(len(keyframe)):
+        for side in range(2):
+            block, factor = blocks[f, side], inverse[keyframe[f, side]]
+            for r in range(k):
+                for c in range(k):
+                    total = 0.0
+                    for a in range(k):
+                        total += block[r, a] * factor[a, c]
+                    scaled[f, side, r, c] = total
+
+
+@compiled
 def iterate(tiles, keyframes, x, z, g, weight, first, count, K):
     """
     Advance x, the y of the tiles and g = A'y by `count` iterations of `halpern.halpern_step`.

@@ -7,16 +7,17 @@ In: a folder of public graphs. Out: `Case` (a graph, poses to start from) and `I
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from scipy.sparse import csr_array
 
+from l1slam_ros.core.choice import AUTO, choose
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.initial import odometry_poses
-from l1slam_ros.core.linearise import LinearSystem, linearise
+from l1slam_ros.core.linearise import LinearSystem, anchor, linearise
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.seed import seed_poses
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
@@ -26,7 +27,6 @@ GRAPHS = ('intel', 'manhattan3500', 'city10000')
 # Poses and edges of the world that has many loops per pose.
 DENSE_WORLD = (10_000, 64_000)
 STARTS = ('stored', 'odometry', 'seed')
-PARTS = ('angle', 'translation', 'global')
 WORLD_SEED = 4
 # [m, rad] How far, one sigma, a perturbed start lies from the stored one.
 _PERTURBATION = (0.2, 0.05)
@@ -47,7 +47,8 @@ class Case:
 
     @cached_property
     def seed(self) -> Array:
-        return seed_poses(self.graph)
+        """The poses of Algorithm 3, (n, p)."""
+        return seed_of(self.graph)
 
     def perturbed(self, number: int) -> Array:
         """Return the stored poses, each but the first moved by noise of its own, (n, p)."""
@@ -62,15 +63,35 @@ class Case:
 
 @dataclass(frozen=True)
 class InnerProblem:
-    """Minimise |A x - b|_1; A (rows, columns), b (rows,)."""
+    """
+    Minimise |A x - b|_1.
+
+    graph : whose factors it is made of; system : A and b in blocks. A is there as a sparse matrix
+    too, made before any clock starts.
+    """
 
     name: str
-    A: csr_array
-    b: Array
+    graph: FactorGraph
+    system: LinearSystem
+
+    @cached_property
+    def A(self) -> csr_array:
+        """(rows, columns)."""
+        return self.system.A
+
+    @property
+    def b(self) -> Array:
+        """(rows,)."""
+        return self.system.b
 
     def cost(self, x: Array) -> float:
         """Return |A x - b|_1, the only word that is taken for how good an x is."""
         return float(np.abs(self.A @ x - self.b).sum())
+
+
+def seed_of(graph: FactorGraph) -> Array:
+    """Return the poses of Algorithm 3, (n, p), found as the package finds them by default."""
+    return seed_poses(graph, choose(AUTO, graph).cholesky)
 
 
 def public_case(datasets: Path, name: str) -> Case:
@@ -93,18 +114,11 @@ def inner_problems(case: Case) -> Iterator[InnerProblem]:
     All three at the seed. Unknowns of the first two are measured from the odometry chain, as
     Algorithm 3 meets them: measured from the seed, the answer would be zero.
     """
-    system = linearise(case.graph, case.seed)
-    manifold = case.graph.manifold
-    chain = manifold.local(case.seed, odometry_poses(case.graph))[1:].ravel()
-    for part, entries in (('angle', manifold.ROTATION), ('translation', manifold.TRANSLATION)):
-        yield _part(f'{case.name}: {part}', system, entries, manifold.TANGENT_SIZE, chain)
-    yield InnerProblem(f'{case.name}: global', system.A, system.b)
-
-
-def _part(
-    name: str, system: LinearSystem, entries: slice, size: int, origin: Array
-) -> InnerProblem:
-    """Return the rows and columns of some entries of each tangent vector, seen from `origin`."""
-    rows, columns = (np.arange(n).reshape(-1, size)[:, entries].ravel() for n in system.A.shape)
-    A: csr_array = system.A[rows][:, columns].tocsr()
-    return InnerProblem(name, A, system.b[rows] - A @ origin[columns])
+    graph, manifold = case.graph, case.graph.manifold
+    system = linearise(graph, case.seed)
+    chain = manifold.local(case.seed, odometry_poses(graph))[anchor(graph):]
+    for name, entries in (('angle', manifold.ROTATION), ('translation', manifold.TRANSLATION)):
+        part = system.part(entries)
+        shifted = replace(part, b=part.b - part.times(chain[:, entries].ravel()))
+        yield InnerProblem(f'{case.name}: {name}', graph, shifted)
+    yield InnerProblem(f'{case.name}: global', graph, system)
