@@ -3,8 +3,8 @@
 How anything here is measured: by turns, in one process, medians; and the record of it.
 
 Machines differ from day to day and from minute to minute, so whatever is compared is run in turn,
-round after round: a slow minute then hits all alike. Time is the processor's, of all threads of the
-process: on one idle core that is the wall's, and on a busy one it leaves out what others take.
+round after round: a slow minute then hits all alike. Time is the processor's, of all threads of
+the process: on one idle core that is the wall's, on a busy one it leaves out what others take.
 """
 
 import os

@@ -44,10 +44,8 @@ from l1slam_ros.core.seed import seed_poses
 
 # What the ratios of the inner problems are to.
 PLAIN = 'Algorithm 2, plain'
-# More than any limit lets it take.
-_MANY = 10**7
-# Where a search for the iteration that reaches a mark ends, if the marks lie below.
-_TIGHTEST = 1e-7
+# Iterations with which the search begins for how many are needed; then twice as many.
+_FEWEST = 160
 _STEPS = 100
 
 
@@ -80,9 +78,14 @@ class _Halpern:
     def reach(
         self, problem: InnerProblem, costs: Sequence[float], limit: float
     ) -> list[Setting | None]:
-        """Look up in the history of one long run where each cost is reached."""
-        solution = _halpern(problem, PrimalDualOptions(_MANY, _TIGHTEST), limit)
-        iterations, values = solution.history.T
+        """Look up in the history of a run that is long enough where each cost is reached."""
+        deadline, count = time.monotonic() + limit, _FEWEST
+        while True:
+            solution = _halpern(problem, PrimalDualOptions(count, 0.0), limit)
+            iterations, values = solution.history.T
+            if values.min() <= min(costs) or time.monotonic() > deadline:
+                break
+            count *= 2
         return [int(iterations[np.argmax(values <= cost)]) or 1 if values.min() <= cost else None
                 for cost in costs]
 

@@ -12,6 +12,7 @@ from tempfile import mkdtemp
 import numpy as np
 
 from l1slam_ros import offline, paper, report
+from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.errors import FileError, GraphError, OptionError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.l2 import LeastSquaresOptions
@@ -117,7 +118,7 @@ def run(
 
 
 def _run_record(graph: PaperGraph, record: GraphRecord, effort: Effort) -> GraphResult:
-    seed = seed_poses(record.graph)
+    seed = seed_poses(record.graph, cholesky_of(record.graph))
     return _measured(graph, record.graph, offline.stored_poses(record), seed, effort)
 
 
@@ -127,7 +128,7 @@ def _run_world(
     """Return what a world of the graph's size gives, with the curves if they are shown of it."""
     world = simulate_world(graph.poses, graph.edges, WorldOptions(),
                            np.random.default_rng(WORLD_SEED))
-    seed = seed_poses(world.graph)
+    seed = seed_poses(world.graph, cholesky_of(world.graph))
     truth_cost = l1_cost(whitened_residual(world.graph, world.truth))
     result = _measured(graph, world.graph, world.odometry, seed, effort, truth_cost)
     if graph.name != paper.MANHATTAN_10K.name:

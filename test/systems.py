@@ -10,7 +10,7 @@ PLENTY = 10**6  # blocks that a factor of these small systems never needs
 
 
 def system_of(A, b):
-    """Return the system of a matrix (m, n) that has at most two entries in a row, as blocks of one."""
+    """Return the system, in blocks of one, of a matrix (m, n) with at most two entries a row."""
     A, (m, n) = A.toarray(), A.shape
     keyframe, blocks = np.full((m, 2), n), np.zeros((m, 2, 1, 1))
     for row, entries in enumerate(A):
@@ -51,7 +51,7 @@ def star(n):
 
 
 def grid(n):
-    """Return the pairs of a square grid of at most n keyframes, the rest a chain from its corner."""
+    """Return the pairs of a square grid of at most n keyframes, the rest a chain from there."""
     side = int(np.sqrt(n))
     here = np.arange(side * side).reshape(side, side)
     across = np.column_stack((here[:, :-1].ravel(), here[:, 1:].ravel()))

@@ -66,6 +66,13 @@ def test_clean_worlds_converge_to_one_cost_from_all_starts(seed):
     assert_allclose([solution.cost for solution in solutions], solutions[0].cost, rtol=3e-5)
 
 
+def test_from_its_own_map_it_converges_to_that_map(world):
+    first = solve(world.graph, world.truth)
+    again = solve(world.graph, first.poses)
+    assert again.status is Status.CONVERGED
+    assert (1 - 3e-5) * first.cost <= again.cost <= first.cost
+
+
 @pytest.mark.parametrize('seed', range(4))
 def test_it_never_ends_worse_than_it_began(seed):
     rng = np.random.default_rng(seed)

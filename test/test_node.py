@@ -18,10 +18,12 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core import se2
+from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.exact import minimise_interior_point
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.optimality import l1_cost
-from l1slam_ros.core.optimiser import OptimiserOptions, minimise
+from l1slam_ros.core.optimiser import OptimiserOptions
 from l1slam_ros.core.seed import seed_poses
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bag import read_raw
@@ -131,7 +133,9 @@ def test_a_recorded_world_becomes_its_optimal_map(bench, tmp_path, rng):
     world = simulate_world(300, 500, WorldOptions(), rng)
     record = GraphRecord(world.graph, None, np.arange(300))
     write_graph_bag(tmp_path / 'bag', record)
-    optimum = minimise(world.graph, seed_poses(world.graph), OptimiserOptions()).cost
+    cholesky = cholesky_of(world.graph)
+    seed = seed_poses(world.graph, cholesky)
+    optimum = minimise_interior_point(world.graph, seed, OptimiserOptions(), cholesky).cost
     b = bench(**EVERY_MESSAGE)
     play(b, tmp_path / 'bag')
     assert_near_optimum(b, record, optimum, 0.02)

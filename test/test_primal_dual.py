@@ -159,8 +159,8 @@ def test_algorithm_2_agrees_with_highs(kind, within, rng):
 @pytest.mark.parametrize('theta', [0.0, 0.5])
 def test_algorithm_2_with_less_relaxation(theta, rng):
     A, b = random_system('dense', rng)
-    options = PrimalDualOptions(iterations=20_000, tolerance=1e-4, theta=theta)
-    solution = minimise_l1(A, b, *zeros(A), options)
+    options = PrimalDualOptions(iterations=20_000, tolerance=1e-4)
+    solution = minimise_l1(A, b, *zeros(A), options, theta=theta)
     assert solution.objective <= 1.01 * linprog_l1(A, b)[0]
 
 

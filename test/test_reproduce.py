@@ -14,6 +14,7 @@ from problems import linprog_l1
 
 from l1slam_ros import paper, report, reproduce
 from l1slam_ros.cli import main
+from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.linearise import linearise, step_poses, whitened_residual
 from l1slam_ros.core.noise import whiten
@@ -52,7 +53,7 @@ def world():
 
 @pytest.fixture(scope='module')
 def seed(world):
-    return seed_poses(world.graph)
+    return seed_poses(world.graph, cholesky_of(world.graph))
 
 
 def cost(graph, poses):

@@ -149,6 +149,38 @@ def test_residual_jacobians_equal_differences(manifold, triple, error, rng):
                     atol=1e-8)
 
 
+def gradients(manifold, z, a, b, dual):
+    """Return J_r_i' dual and J_r_j' dual, (n, 2, d)."""
+    pair = manifold.residual_jacobians(z, a, b)
+    return np.stack([np.einsum('nrc,nr->nc', J, dual) for J in pair], axis=1)
+
+
+@pytest.mark.parametrize('error', [0.0, 0.5])
+def test_residual_curvature_equals_differences_of_the_gradient(manifold, triple, error, rng):
+    """Of J' dual at poses stepped to, turned back into the steps from where they came."""
+    _, a, b = triple
+    d, dual = manifold.TANGENT_SIZE, rng.standard_normal((N, manifold.TANGENT_SIZE))
+    step = error * rng.uniform(-1, 1, (N, d))
+    z = manifold.retract(manifold.between(a, b), step)
+
+    def gradient(step):
+        steps = [np.broadcast_to(part, (N, d)) for part in np.split(step, 2)]
+        there = [manifold.retract(*pair) for pair in zip((a, b), steps, strict=True)]
+        product = gradients(manifold, z, *there, dual)
+        origin = manifold.identity(N)
+        for side, part in enumerate(steps):
+            further = manifold.local_jacobian(origin, manifold.retract(origin, part))
+            back = np.linalg.inv(further).transpose(0, 2, 1)
+            product[:, side] = (back @ product[:, side, :, None])[..., 0]
+        return product.reshape(N, 2 * d)
+
+    expected = np.stack([(gradient(H * axis) - gradient(-H * axis)) / (2 * H)
+                         for axis in np.eye(2 * d)], axis=2)
+    curvature = manifold.residual_curvature(a, b, gradients(manifold, z, a, b, dual))
+    assert_allclose(curvature, expected, atol=1e-7)
+    assert_array_equal(curvature, curvature.transpose(0, 2, 1))
+
+
 @pytest.mark.parametrize('error', [0.0, 0.5])
 def test_local_jacobian_equals_differences(manifold, triple, error, rng):
     b = triple[0]

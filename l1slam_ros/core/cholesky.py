@@ -118,6 +118,16 @@ class BlockCholesky:
                                   right.reshape(-1, len(layout.sizes)), layout.sizes)
         return x.ravel()
 
+    def solve_many(self, right: Array) -> Array:
+        """Return the solutions for q right hand sides (free keyframes, k, q), of that shape."""
+        from l1slam_ros.core.kernels.prediction import solve_many
+
+        layout = self._factored
+        assert layout is not None, 'solve before factorise'
+        x: Array = solve_many(layout.panels, *layout.shape, self.pattern.position, right,
+                              layout.sizes)
+        return x
+
 
 class _Layout:
     """

@@ -103,7 +103,7 @@ def minimise_l1_halpern(
     deadline: float = np.inf,
 ) -> PrimalDualSolution:
     """
-    Minimise |A x - b|_1 from (x, y); `options.theta` has no meaning here.
+    Minimise |A x - b|_1 from (x, y).
 
     It stops when the duality gap is below `options.tolerance` of the cost: the gap to the best x'
     that is, in each scaled unknown, at most a typical residual farther from the start than x,

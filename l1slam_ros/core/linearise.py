@@ -36,7 +36,7 @@ class LinearSystem:
     @property
     def block_size(self) -> int:
         """Rows of a factor and columns of a keyframe, k."""
-        return self.blocks.shape[-1]
+        return int(self.blocks.shape[-1])
 
     @cached_property
     def A(self) -> csr_array:
@@ -103,7 +103,7 @@ def whitened_residual(graph: FactorGraph, poses: Array) -> Array:
     manifold, factors, prior = graph.manifold, graph.between, graph.prior
     sizes = (0,) * manifold.TANGENT_SIZE
     e = manifold.residual(factors.measurement, *ends(graph, poses))
-    whitened = whiten(factors.sqrt_information, e, sizes).ravel()
+    whitened: Array = whiten(factors.sqrt_information, e, sizes).ravel()
     if not len(prior):
         return whitened
     e_prior = manifold.local(prior.measurement, poses[prior.i])

@@ -35,20 +35,18 @@ Resolvent = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class PrimalDualOptions(Options):
-    """How long Algorithm 2 runs and when it is content."""
+    """How long a primal-dual solve runs and when it is content."""
 
     iterations: int = option(400, 'most iterations of one primal-dual solve', '', 1, 10**7)
     tolerance: float = option(
         1e-5, 'stop when the duality gap, in the box |x_j|, is below this part of the cost', '1',
         0, 1)
-    theta: float = option(
-        1.0, 'over-relaxation of the primal; convergence is proved for 1', '1', 0, 1)
 
 
 @dataclass(frozen=True)
 class PrimalDualSolution:
     """
-    What Algorithm 2 ended with.
+    What a primal-dual solve ended with.
 
     x : (columns,) step; y : (rows,) dual; objective : |A x - b|_1; gap : see `duality_gap`;
     history : (k, 2) rows (iteration, objective), the start first; weight : the primal weight.
@@ -126,6 +124,7 @@ def minimise_l1(
     y: Array,
     options: PrimalDualOptions,
     deadline: float = np.inf,
+    theta: float = 1.0,
 ) -> PrimalDualSolution:
     """
     Minimise |A x - b|_1 by Algorithm 2, from (x, y).
@@ -139,6 +138,7 @@ def minimise_l1(
     x, y : (columns,), (rows,), where to start
     options : see `PrimalDualOptions`
     deadline : `time.monotonic()` [s] after which to stop at the next look
+    theta : over-relaxation of the primal in [0, 1]; convergence is proved for 1
 
     """
     tau, sigma = diagonal_step_sizes(A)
@@ -146,7 +146,7 @@ def minimise_l1(
     tau, sigma = tau / omega, sigma * omega
     sigma_b = sigma * b
     iterates = primal_dual(A, lambda v: np.clip(v - sigma_b, -1, 1), lambda v: v,
-                           x, y, tau, sigma, options.theta)
+                           x, y, tau, sigma, theta)
     history = [(0.0, l1_cost(A @ x - b))]
     gap, status = np.inf, Status.ITERATION_LIMIT
     for k in range(1, options.iterations + 1):

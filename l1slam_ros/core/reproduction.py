@@ -16,8 +16,10 @@ from itertools import islice
 
 import numpy as np
 
-from l1slam_ros.core.choice import AUTO, minimise_by
+from l1slam_ros.core.choice import AUTO, choose, minimise_by
+from l1slam_ros.core.cholesky import BlockCholesky, cholesky_of
 from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.halpern import minimise_l1_halpern
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.least_squares import reweighted_start
 from l1slam_ros.core.linearise import (
@@ -93,9 +95,10 @@ def measure_costs(
     graph: FactorGraph, start: Array, seed: Array, effort: Effort, report: Report
 ) -> Costs:
     """Return what the solvers make of a graph from its seed; start, seed : (n, p) poses."""
-    solution, solver = minimise_by(AUTO, graph, seed, OptimiserOptions(), report)
+    solution, solver = minimise_by(choose(AUTO, graph), graph, seed, OptimiserOptions(),
+                                   report)
     printed = printed_costs(graph, seed, effort, report)
-    l2 = minimise_l2(graph, seed, LeastSquaresOptions(), report)
+    l2 = minimise_l2(graph, seed, LeastSquaresOptions(), cholesky_of(graph), report)
     return Costs(_cost(graph, start), _cost(graph, seed), _cost(graph, l2.poses), printed,
                  solution, solver)
 
@@ -130,7 +133,7 @@ def measure_seconds(graph: FactorGraph, seed: Array, effort: Effort) -> Seconds:
     methods = {name: [_median(partial(timed, system, effort.timed)) / effort.timed
                       for system in systems]
                for name, timed in TIMED.items()}
-    return Seconds(methods, _median(partial(_l2_seconds, graph, seed)))
+    return Seconds(methods, _median(partial(_l2_seconds, graph, seed, cholesky_of(graph))))
 
 
 def _plain_seconds(system: LinearSystem, iterations: int) -> float:
@@ -141,17 +144,30 @@ def _plain_seconds(system: LinearSystem, iterations: int) -> float:
     return time.perf_counter() - began
 
 
-def _l2_seconds(graph: FactorGraph, seed: Array) -> float:
+def _fused_seconds(system: LinearSystem, iterations: int) -> float:
+    x, y = np.zeros(system.size * system.block_size), np.zeros(len(system.b))
+
+    def seconds(count: int) -> float:
+        began = time.perf_counter()
+        minimise_l1_halpern(system, x, y, PrimalDualOptions(count, 0.0))
+        return time.perf_counter() - began
+
+    # Its set-up, once per linear problem, is as long as some iterations.
+    return seconds(2 * iterations) - seconds(iterations)
+
+
+def _l2_seconds(graph: FactorGraph, seed: Array, cholesky: BlockCholesky) -> float:
     """Return the seconds of one Gauss-Newton step: linearise, factor, solve, retract."""
     options = LeastSquaresOptions(iterations=_TIMED_L2_STEPS, tolerance=0.0)
     began = time.perf_counter()
-    solution = minimise_l2(graph, seed, options)
+    solution = minimise_l2(graph, seed, options, cholesky)
     return (time.perf_counter() - began) / max(solution.outer_iterations, 1)
 
 
 # From a system and a number of iterations to the seconds they take, set-up not counted.
 TIMED: dict[str, Callable[[LinearSystem, int], float]] = {
     'plain': _plain_seconds,
+    'fused': _fused_seconds,
 }
 
 
@@ -170,19 +186,23 @@ def measure_convergence(
     """
     angle, translation = rotation_system(graph, start), translation_system(graph, seed)
     moved = graph.manifold.local(seed, start)[anchor(graph):, graph.manifold.TRANSLATION].ravel()
-    return {'angle': _histories(angle, np.zeros(angle.A.shape[1]), iterations),
-            'translation': _histories(translation, moved, iterations)}
+    cholesky = cholesky_of(graph)
+    return {'angle': _histories(angle, np.zeros(angle.A.shape[1]), cholesky, iterations),
+            'translation': _histories(translation, moved, cholesky, iterations)}
 
 
-def _histories(system: LinearSystem, x: Array, iterations: int) -> dict[str, Array]:
-    """Return what becomes of x (columns,) by every method; the last one starts elsewhere."""
+def _histories(
+    system: LinearSystem, x: Array, cholesky: BlockCholesky, iterations: int
+) -> dict[str, Array]:
+    """Return what becomes of x (columns,) by every method; one of them starts elsewhere."""
     A, b = system.A, system.b
     options = PrimalDualOptions(iterations=iterations, tolerance=0.0)
     return {
         'as printed': _printed_history(system, x, iterations),
         'weighted': minimise_l1(A, b, x, np.zeros(len(b)), options).history,
         'weighted, from least squares':
-            minimise_l1(A, b, *reweighted_start(A, b), options).history,
+            minimise_l1(A, b, *reweighted_start(system, cholesky), options).history,
+        'fused': minimise_l1_halpern(system, x, np.zeros(len(b)), options).history,
     }
 
 

@@ -2,9 +2,9 @@
 """
 The decorator of every compiled loop.
 
-The modules beside this one import numba, which takes half a second, so the core imports them where
-it calls them. A loop is compiled at its first call, once per machine: numba keeps the result beside
-the package, or where that is read-only in the user's cache folder.
+The modules beside this one import numba, which takes half a second, so the core imports them
+where it calls them. A loop is compiled at its first call, once per machine: numba keeps the result
+beside the package, or where that is read-only in the user's cache folder.
 """
 
 from collections.abc import Callable

@@ -35,7 +35,8 @@ def minimum_degree(start, adjacent, limit):
     n_variables = start[1:] - start[:-1]
     n_elements = np.zeros(n, np.int32)
     degree = n_variables.copy()
-    head, after, before = np.full(n + 1, -1, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
+    head = np.full(n + 1, -1, np.int32)
+    after, before = np.empty(n, np.int32), np.empty(n, np.int32)
     for k in range(n):
         _put(head, after, before, k, degree[k])
     seen, absorbed = np.full(n, -1, np.int32), np.zeros(n, np.bool_)
@@ -68,7 +69,8 @@ def minimum_degree(start, adjacent, limit):
 
 
 @compiled
-def _gather(pivot, start, lists, n_variables, n_elements, column, rows, place, seen, absorbed, end):
+def _gather(pivot, start, lists, n_variables, n_elements, column, rows, place, seen, absorbed,
+            end):
     """Write the pivot's neighbours to rows from `end` on; its elements are absorbed."""
     first, n_var = start[pivot], n_variables[pivot]
     for k in lists[first:first + n_var]:

@@ -2,8 +2,9 @@
 """
 Many steps of all keyframes at once, and what they say of each factor.
 
-Arrays of steps are (n, k, q): q samples of the k numbers of each of n keyframes. `size` is a tuple
-of k zeros, see `blocks`; other arrays are those of `LinearSystem` and of `cholesky`.
+Arrays of steps are (n, k, q): q samples of the k numbers of each of n keyframes, the last keyframe
+standing for all that are held fixed. `size` is a tuple of k zeros, see `blocks`; other arrays are
+those of `LinearSystem` and of `cholesky`.
 """
 
 import numpy as np
@@ -74,53 +75,85 @@ def _subtract(row, factor, other):
 
 @compiled
 def left_over(keyframe, blocks, x, y, size):
-    """Return |y - A x|^2 of each factor, mean over the samples, (m,); x : (n + 1, k, q)."""
-    k, q = len(size), x.shape[2]
-    mean, row = np.zeros(len(blocks)), np.empty(q)
-    for f in range(len(blocks)):
-        x_i, x_j = x[keyframe[f, 0]], x[keyframe[f, 1]]
-        for r in range(k):
-            for t in range(q):
-                row[t] = y[f, r, t]
-            for c in range(k):
-                _subtract(row, blocks[f, 0, r, c], x_i[c])
-                _subtract(row, blocks[f, 1, r, c], x_j[c])
-            for t in range(q):
-                mean[f] += row[t] * row[t] / q
-    return mean
-
-
-@compiled
-def spreads(keyframe, blocks, x, size):
-    """Return the second moment of A x for each factor, (m, k, k); x : (n + 1, k, q)."""
+    """Return the second moment of y - A x for each factor, (m, k, k); y : (m, k, q)."""
     k, q = len(size), x.shape[2]
     moment, d = np.empty((len(blocks), k, k)), np.empty((k, q))
     for f in range(len(blocks)):
-        _moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], d)
         for r in range(k):
-            for c in range(r + 1):
-                total = 0.0
-                for t in range(q):
-                    total += d[r, t] * d[c, t]
-                moment[f, r, c] = moment[f, c, r] = total / q
+            for t in range(q):
+                d[r, t] = y[f, r, t]
+        _add_moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], -1.0, d)
+        _second_moment(d, moment[f])
     return moment
 
 
 @compiled
-def _moved(pair, x_i, x_j, d):
-    """Write J_i x_i + J_j x_j of one factor, (k, q)."""
-    for r in range(len(d)):
-        for t in range(d.shape[1]):
-            d[r, t] = 0.0
-        for c in range(len(d)):
-            _subtract(d[r], -pair[0, r, c], x_i[c])
-            _subtract(d[r], -pair[1, r, c], x_j[c])
+def spreads(keyframe, blocks, x, size):
+    """Return the second moment of A x for each factor, (m, k, k)."""
+    moment, d = np.empty((len(blocks), len(size), len(size))), np.empty((len(size), x.shape[2]))
+    for f in range(len(blocks)):
+        d[:] = 0.0
+        _add_moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], 1.0, d)
+        _second_moment(d, moment[f])
+    return moment
 
 
 @compiled
 def moved(keyframe, blocks, x, size):
-    """Return A x of each factor and sample, (m, k, q); x : (n + 1, k, q)."""
-    d = np.empty((len(blocks), len(size), x.shape[2]))
+    """Return A x of each factor and sample, (m, k, q)."""
+    d = np.zeros((len(blocks), len(size), x.shape[2]))
     for f in range(len(blocks)):
-        _moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], d[f])
+        _add_moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], 1.0, d[f])
     return d
+
+
+@compiled
+def _add_moved(pair, x_i, x_j, sign, d):
+    """Add sign (J_i x_i + J_j x_j) of one factor to d (k, q)."""
+    for r in range(len(d)):
+        for c in range(len(d)):
+            _subtract(d[r], -sign * pair[0, r, c], x_i[c])
+            _subtract(d[r], -sign * pair[1, r, c], x_j[c])
+
+
+@compiled
+def _second_moment(d, moment):
+    for r in range(len(d)):
+        for c in range(r + 1):
+            total = 0.0
+            for t in range(d.shape[1]):
+                total += d[r, t] * d[c, t]
+            moment[r, c] = moment[c, r] = total / d.shape[1]
+
+
+@compiled
+def normalise(covariance, residual):
+    """
+    Return r'C^-1 r and ln det C of each factor, (m,); C (m, k, k) is overwritten.
+
+    Cholesky; where C is not definite beyond rounding, infinity and minus infinity.
+    """
+    m, k = residual.shape
+    square, log_det = np.zeros(m), np.zeros(m)
+    u = np.empty(k)
+    for f in range(m):
+        C = covariance[f]
+        for r in range(k):
+            least = 1e-14 * C[r, r]
+            for c in range(r):
+                value = C[r, c]
+                for e in range(c):
+                    value -= C[r, e] * C[c, e]
+                C[r, c] = value / C[c, c]
+            value, total = C[r, r], residual[f, r]
+            for e in range(r):
+                value -= C[r, e] ** 2
+                total -= C[r, e] * u[e]
+            if not value > least:
+                square[f], log_det[f] = np.inf, -np.inf
+                break
+            C[r, r] = np.sqrt(value)
+            u[r] = total / C[r, r]
+            square[f] += u[r] ** 2
+            log_det[f] += 2 * np.log(C[r, r])
+    return square, log_det

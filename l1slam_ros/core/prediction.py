@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a solved graph says of a factor, before or without it: how far off, and how sure.
+
+In: a graph at its L2 optimum. Out: for any factor the covariance of its residual, and how likely it
+is to be true. Covariances come from samples of the posterior: solutions of `H y = A' xi` for random
+xi have the covariance H^-1, so the moment of `J_i y_i + J_j y_j` is that of the residual of a
+factor that is not in the graph, and the moment of `xi - J y` that of one that is. Two dozen
+samples cost a few solutions by a factorisation that is there anyway.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import betaincinv, gammaincinv
+
+from l1slam_ros.core.cholesky import BlockCholesky
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.linearise import LinearSystem, linearise
+from l1slam_ros.core.manifold import Array, Indices, Manifold
+
+# A covariance from that many samples has standard deviations right to 15% (1 / sqrt(2 SAMPLES)).
+SAMPLES = 24
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """
+    A graph at its optimum.
+
+    samples : (free keyframes + 1, k, SAMPLES) steps from it, as probable as the noise makes them,
+    the last one of what is held fixed; residual : (m, k) whitened, of each factor of the graph;
+    moment : (m, k, k) what noise as stated would make of it.
+    """
+
+    samples: Array
+    residual: Array
+    moment: Array
+
+    def left_out(self) -> Array:
+        """
+        Return the squared innovation of each factor by all others, (m,).
+
+        With the covariance R of the residual, `R^-1 r` is the residual of the factor if it were
+        left out and R^-1 its covariance, so the square is r'R^-1 r. Where no other factor says
+        anything of it, that is 0.
+        """
+        from l1slam_ros.core.kernels.prediction import normalise
+
+        square: Array = normalise(self.moment.copy(), self.residual)[0]
+        square[~np.isfinite(square)] = 0.0
+        return square
+
+
+def sample_posterior(
+    graph: FactorGraph, poses: Array, cholesky: BlockCholesky, rng: np.random.Generator
+) -> Posterior:
+    """
+    Return the posterior of a graph about its optimum, poses (n, p).
+
+    Raises
+    ------
+    GraphError : some keyframe is not tied to the anchor.
+
+    """
+    from l1slam_ros.core.kernels.prediction import gather, left_over
+
+    system = linearise(graph, poses)
+    if not cholesky.factorise(system, np.ones_like(system.b)):
+        raise GraphError('the normal matrix is singular: a part of the graph is not tied to '
+                         'the anchor, or weights differ beyond double precision')
+    m, k = len(system.blocks), system.block_size
+    sizes = (0,) * k
+    # Signs have the covariance of white noise, and are quicker to draw.
+    noise = 2.0 * rng.integers(0, 2, (m, k, SAMPLES), dtype=np.int8) - 1.0
+    right = np.zeros((system.size + 1, k, SAMPLES))
+    gather(system.keyframe, system.blocks, noise, right, sizes)
+    samples = np.zeros_like(right)
+    samples[:-1] = cholesky.solve_many(right[:-1])
+    moment = left_over(system.keyframe, system.blocks, samples, noise, sizes)
+    return Posterior(samples, -system.b.reshape(m, k), moment)
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """
+    Factors against a posterior that does not know them.
+
+    system : their linearisation, b minus the residual; square : (m,) the squared residual in units
+    of its covariance C; log_det : (m,) of C; log_claim : (m,) of the volume of residuals that a
+    false factor could have.
+    """
+
+    system: LinearSystem
+    square: Array
+    log_det: Array
+    log_claim: Array
+
+    def log_ratio(self, scale: float = 1.0) -> Array:
+        """
+        Return how much more probable each residual is if its factor is true, (m,) logarithms.
+
+        ln N(residual; 0, scale C) + ln(volume of a false one's)
+        """
+        k = self.system.block_size
+        ratio: Array = self.log_claim - (
+            k * np.log(2 * np.pi * scale) + self.log_det + self.square / scale) / 2
+        return ratio
+
+    def joint(self, posterior: Posterior, first: Indices, second: Indices) -> tuple[Array, Array]:
+        """
+        Return the squared residual of pairs of factors and ln det of their covariance, (pairs,).
+
+        first, second : (pairs,) factors
+        """
+        from l1slam_ros.core.kernels import prediction
+
+        system, k = self.system, self.system.block_size
+        rows, place = np.unique(np.concatenate((first, second)), return_inverse=True)
+        moved = prediction.moved(system.keyframe[rows], system.blocks[rows], posterior.samples,
+                                 (0,) * k)
+        residual = -system.b.reshape(-1, k)[rows]
+        pairs = place.reshape(2, -1)
+        both = np.concatenate((moved[pairs[0]], moved[pairs[1]]), axis=1)
+        covariance = both @ both.transpose(0, 2, 1) / SAMPLES + np.eye(2 * k)
+        square, log_det = prediction.normalise(
+            covariance, np.concatenate((residual[pairs[0]], residual[pairs[1]]), axis=1))
+        return square, log_det
+
+
+def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
+                log_volume: float) -> Innovations:
+    """
+    Return the innovations of the between factors of a graph, none of which made the posterior.
+
+    log_volume : of `claimed_volume`
+    """
+    from l1slam_ros.core.kernels import prediction
+
+    count = len(graph.between)
+    system = _between_part(linearise(graph, poses), count)
+    k = system.block_size
+    covariance = prediction.spreads(system.keyframe, system.blocks, posterior.samples, (0,) * k)
+    covariance += np.eye(k)
+    square, log_det = prediction.normalise(covariance, -system.b.reshape(count, k))
+    roots = np.diagonal(graph.between.sqrt_information, axis1=1, axis2=2)
+    return Innovations(system, square, log_det, log_volume + np.log(roots).sum(axis=1))
+
+
+def _between_part(system: LinearSystem, count: int) -> LinearSystem:
+    k = system.block_size
+    return LinearSystem(system.keyframe[:count], system.blocks[:count], system.b[: count * k],
+                        system.size)
+
+
+def claimed_volume(manifold: Manifold, poses: Array, rng: np.random.Generator) -> float:
+    """
+    Return the logarithm of the volume that the relative poses of random pairs fill.
+
+    It is that of the Gaussian of their second moment, (2 pi)^(k/2) sqrt(det M): a false factor is
+    anywhere in there.
+    """
+    apart = manifold.local(poses, poses[rng.permutation(len(poses))])
+    k = manifold.TANGENT_SIZE
+    log_det = np.linalg.slogdet(apart.T @ apart / len(apart))[1]
+    return float(k * np.log(2 * np.pi) + log_det) / 2
+
+
+def chi2_quantile(probability: float, freedom: int) -> float:
+    """Return what a sum of `freedom` squared standard normal numbers stays below."""
+    return float(2 * gammaincinv(freedom / 2, probability))
+
+
+def left_out_quantile(probability: float, freedom: int) -> float:
+    """
+    Return what `Posterior.left_out` of a true factor stays below.
+
+    Its covariance is that of `SAMPLES` samples, so it has Hotelling's distribution:
+    T^2 (q - k + 1) / (q k) is Fisher's F of k and q - k + 1 degrees of freedom.
+    """
+    rest = SAMPLES - freedom + 1
+    x = float(betaincinv(freedom / 2, rest / 2, probability))
+    return SAMPLES * x / (1 - x)

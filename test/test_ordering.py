@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Minimum degree and what follows from it, against brute-force elimination and SciPy's MMD."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from scipy.sparse import coo_array, eye_array
+from scipy.sparse.linalg import splu
+from scipy.spatial import Delaunay
+from systems import PLENTY, SHAPES
+
+from l1slam_ros.core.kernels.ordering import minimum_degree
+from l1slam_ros.core.kernels.symbolic import panel_rows, postorder, supernodes
+
+
+def adjacency_of(pairs, n):
+    """Return start and adjacent, as of `minimum_degree`, of the pairs between free nodes."""
+    i, j = np.array([pair for pair in pairs if max(pair) < n], int).reshape(-1, 2).T
+    matrix = coo_array((np.ones(2 * len(i)), (np.append(i, j), np.append(j, i))), shape=(n, n))
+    matrix = matrix.tocsr()
+    matrix.sum_duplicates()
+    return matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32)
+
+
+def eliminate(start, adjacent, order):
+    """Return the neighbours of each node when its turn comes, by joining them: a list of sets."""
+    neighbours = [set(adjacent[start[k]:start[k + 1]].tolist()) for k in range(len(start) - 1)]
+    columns = []
+    for pivot in order.tolist():
+        columns.append(neighbours[pivot])
+        for k in neighbours[pivot]:
+            neighbours[k] |= neighbours[pivot]
+            neighbours[k] -= {k, pivot}
+    return columns
+
+
+def planar(n, rng):
+    """Return the pairs of a triangulation of places anywhere in a square, most of them."""
+    triangles = Delaunay(rng.random((n, 2))).simplices
+    pairs = np.sort(np.concatenate((triangles[:, :2], triangles[:, 1:], triangles[:, ::2])))
+    pairs = np.unique(pairs, axis=0)
+    return pairs[rng.random(len(pairs)) < 0.8].tolist() + [(k, k + 1) for k in range(n - 1)]
+
+
+def tree(n, rng):
+    return [(int(rng.integers(k)), k) for k in range(1, n)]
+
+
+@pytest.fixture(params=SHAPES + ['planar', 'dense', 'nothing'],
+                ids=lambda shape: getattr(shape, '__name__', shape))
+def graph(request, rng):
+    """The start and adjacent of a graph of fifty nodes."""
+    n = 50
+    pairs = {'planar': lambda: planar(n, rng), 'nothing': lambda: [],
+             'dense': lambda: [(i, j) for i in range(n) for j in range(i)]}
+    return adjacency_of(pairs.get(request.param, lambda: request.param(n))(), n)
+
+
+def test_the_order_is_a_permutation(graph):
+    order, _, _ = minimum_degree(*graph, PLENTY)
+    assert_array_equal(np.sort(order), np.arange(50))
+
+
+def test_the_columns_are_those_of_brute_force(graph):
+    order, column, rows = minimum_degree(*graph, PLENTY)
+    assert column[-1] == len(rows)
+    found = [rows[column[k]:column[k + 1]].tolist() for k in range(50)]
+    expected = eliminate(*graph, order)
+    for ours, theirs in zip(found, expected, strict=True):
+        assert set(ours) == theirs and len(ours) == len(theirs)
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_it_fills_hardly_more_than_scipys_mmd(seed):
+    """A Laplacian that SciPy factors with its own order: splu.perm_c is where each column goes."""
+    rng = np.random.default_rng(seed)
+    n = 300
+    start, adjacent = adjacency_of(planar(n, rng), n)
+    degree = np.diff(start)
+    row = np.repeat(np.arange(n), degree)
+    laplacian = coo_array((-np.ones(len(row)), (row, adjacent)), shape=(n, n)).tocsc()
+    laplacian += coo_array((degree + 1.0, (range(n), range(n))), shape=(n, n)).tocsc()
+    splu_of = splu(laplacian, permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
+                   options={'SymmetricMode': True})
+    theirs = sum(map(len, eliminate(start, adjacent, np.argsort(splu_of.perm_c))))
+    _, _, rows = minimum_degree(start, adjacent, PLENTY)
+    natural = sum(map(len, eliminate(start, adjacent, np.arange(n))))
+    assert len(rows) <= 1.3 * theirs < natural
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_trees_do_not_fill_in(seed):
+    rng = np.random.default_rng(seed)
+    _, _, rows = minimum_degree(*adjacency_of(tree(80, rng), 80), PLENTY)
+    assert len(rows) == 79
+
+
+def test_a_hub_is_eliminated_among_the_last():
+    pairs = [(20, k) for k in range(41) if k != 20]
+    order, _, rows = minimum_degree(*adjacency_of(pairs, 41), PLENTY)
+    assert 20 in order[-2:] and len(rows) == 40
+
+
+def test_the_limit_is_exact(rng):
+    """With just enough room the order is the same; with one less it ends before it."""
+    graph = adjacency_of(planar(50, rng), 50)
+    order, column, rows = minimum_degree(*graph, PLENTY)
+    enough = minimum_degree(*graph, len(rows))
+    assert_array_equal(enough[0], order)
+    for limit in (len(rows) - 1, len(rows) // 2, 0):
+        short = minimum_degree(*graph, limit)
+        assert len(short[0]) < 50 and len(short[2]) <= limit
+        assert_array_equal(short[0], order[: len(short[0])])
+        assert_array_equal(short[1], column[: len(short[1])])
+
+
+def test_no_nodes_at_all():
+    order, column, rows = minimum_degree(np.zeros(1, np.int32), np.zeros(0, np.int32), PLENTY)
+    assert (len(order), column.tolist(), len(rows)) == (0, [0], 0)
+
+
+def test_the_graph_is_left_as_it_was(graph):
+    before = [array.copy() for array in graph]
+    minimum_degree(*graph, PLENTY)
+    for array, expected in zip(graph, before, strict=True):
+        assert_array_equal(array, expected)
+
+
+# What follows from an order
+
+
+def test_the_postorder_fills_in_alike(graph):
+    """A topological order of the elimination tree: as many entries, subtrees are runs."""
+    order, column, rows = minimum_degree(*graph, PLENTY)
+    position, parent, below, step = postorder(order, column, rows)
+    assert_array_equal(np.sort(position), np.arange(50))
+    again = np.argsort(position)
+    assert_array_equal(again, order[step])
+    columns = eliminate(*graph, again)
+    assert_array_equal(below, [len(entries) for entries in columns])
+    first = np.array([min((position[k] for k in entries), default=50) for entries in columns])
+    assert_array_equal(parent, first)
+    # In a postorder all between a node and its parent are descendants of the parent.
+    for k in np.flatnonzero(parent < 50):
+        assert (parent[k: parent[k]] <= parent[k]).all()
+
+
+def test_panels_hold_all_entries_and_few_zeros(graph):
+    order, column, rows = minimum_degree(*graph, PLENTY)
+    position, parent, below, step = postorder(order, column, rows)
+    first = supernodes(parent, below)
+    start, pattern = panel_rows(first, column, rows, step, position)
+    assert (first[0], first[-1]) == (0, 50) and (np.diff(first) > 0).all()
+    columns = eliminate(*graph, np.argsort(position))
+    stored = 0
+    for s in range(len(first) - 1):
+        panel = pattern[start[s]:start[s + 1]]
+        width = first[s + 1] - first[s]
+        assert (np.diff(panel) > 0).all()
+        assert_array_equal(panel[:width], np.arange(first[s], first[s + 1]))
+        for c in range(width):
+            entries = {int(position[k]) for k in columns[first[s] + c]}
+            assert entries <= set(panel[c + 1:].tolist())
+        stored += (len(panel) - np.arange(width)).sum()
+    needed = 50 + below.sum()
+    assert needed <= stored <= needed / (1 - 0.2)
+
+
+def test_a_dense_graph_is_one_panel():
+    graph = adjacency_of([(i, j) for i in range(20) for j in range(i)], 20)
+    order, column, rows = minimum_degree(*graph, PLENTY)
+    _, parent, below, _ = postorder(order, column, rows)
+    assert supernodes(parent, below).tolist() == [0, 20]
+
+
+def test_eliminating_by_hand():
+    """A square 0-1-2-3: eliminating 0 joins 1 and 3, then nothing more fills in."""
+    graph = adjacency_of([(0, 1), (1, 2), (2, 3), (3, 0)], 4)
+    assert eliminate(*graph, np.arange(4)) == [{1, 3}, {2, 3}, {3}, set()]
+    _, _, rows = minimum_degree(*graph, PLENTY)
+    assert len(rows) == 5
+    assert eye_array(4).nnz + len(rows) == 9
