@@ -15,6 +15,10 @@ from l1slam_ros.io.files import replacing
 _PANEL = 6.0, 4.5  # [inch]
 # Those of Okabe and Ito, which people who see red and green alike can tell apart.
 _COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#000000', '#808080')
+# For the first, second and third time round the colours.
+_SPOTS, _CROSSES = 'os^', 'x+*'
+# The lowest cost known has none, which a logarithm cannot show.
+_LEAST_EXCESS = 1e-8
 
 
 def draw(path: Path, recorded: Mapping[str, Mapping[str, Any]]) -> None:
@@ -37,9 +41,8 @@ def _inner(axes: Any, rows: Sequence[Row]) -> None:
     """Draw a dot for each problem and solver, at the tightest mark."""
     group = f'to {min(inner.MARKS):g}'
     problems = list(dict.fromkeys(r.problem for r in rows))
-    for r, colour, first in _coloured([r for r in rows if r.group == group]):
-        axes.plot(problems.index(r.problem), r.seconds if r.seconds else np.nan, color=colour,
-                  marker='o' if r.ours else 'x', linestyle='', label=r.solver if first else None)
+    for r, style in _styles([r for r in rows if r.group == group]):
+        axes.plot(problems.index(r.problem), r.seconds or np.nan, **style)
     axes.set(yscale='log', ylabel='s', title=f'inner problems, {group} of the optimum')
     axes.set_xticks(range(len(problems)), problems, rotation=30, ha='right')
     axes.legend(frameon=False, fontsize='x-small')
@@ -47,9 +50,8 @@ def _inner(axes: Any, rows: Sequence[Row]) -> None:
 
 def _whole(axes: Any, rows: Sequence[Row]) -> None:
     """Draw the L1 cost above the lowest known against the time, a dot for each solve."""
-    for r, colour, first in _coloured(rows):
-        axes.plot(r.seconds, max(r.numbers['excess'], 1e-8), color=colour,
-                  marker='o' if r.ours else 'x', linestyle='', label=r.solver if first else None)
+    for r, style in _styles(rows):
+        axes.plot(r.seconds, max(r.numbers['excess'], _LEAST_EXCESS), **style)
     axes.set(xscale='log', yscale='log', xlabel='s', title='whole solves, all graphs and starts',
              ylabel='L1 cost above the lowest known')
     axes.legend(frameon=False, fontsize='x-small')
@@ -68,13 +70,15 @@ def _growth(axes: Any, rows: Sequence[Row]) -> None:
     axes.legend(frameon=False, fontsize='small')
 
 
-def _coloured(rows: Sequence[Row]) -> list[tuple[Row, str, bool]]:
-    """Return each row with the colour of its solver, and whether it is that one's first."""
+def _styles(rows: Sequence[Row]) -> list[tuple[Row, dict[str, Any]]]:
+    """Return each row with how it is drawn: ours as spots; a solver's first row names it."""
     solvers = list(dict.fromkeys(r.solver for r in rows))
     seen: set[str] = set()
-    coloured = []
+    styles = []
     for r in rows:
-        colour = _COLOURS[solvers.index(r.solver) % len(_COLOURS)]
-        coloured.append((r, colour, r.solver not in seen))
+        lap, colour = divmod(solvers.index(r.solver), len(_COLOURS))
+        style = {'color': _COLOURS[colour], 'linestyle': '',
+                 'marker': (_SPOTS if r.ours else _CROSSES)[lap]}
+        styles.append((r, style if r.solver in seen else style | {'label': r.solver}))
         seen.add(r.solver)
-    return coloured
+    return styles

@@ -134,7 +134,7 @@ def solve(
         choice = choose(solver, graph)
         poses = seed_poses(graph, choice.cholesky) if start == 'seed' else initial
         solution, solver = minimise_by(choice, graph, poses, options, report)
-        reason = choice.reason if solver == choice.solver else f'the {choice.solver} method stalled'
+        reason = choice.reason if solver == choice.solver else f'the {choice.solver} method did not converge'
     else:
         cholesky = cholesky_of(graph)
         poses = seed_poses(graph, cholesky) if start == 'seed' else initial

@@ -126,4 +126,5 @@ def test_progress_is_reported_by_every_solver(world):
         choice = choose(solver, world.graph)
         solution, _ = minimise_by(choice, world.graph, world.truth, DEFAULTS,
                                   lambda k, cost, reports=reports: reports.append((k, cost)))
-        assert reports[-1] == (solution.outer_iterations, solution.cost)
+        assert reports[-1][1] == solution.cost
+        assert 0 < len(reports) <= solution.outer_iterations

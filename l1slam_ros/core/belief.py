@@ -2,8 +2,8 @@
 """
 Which of many factors to believe, given how well each one fits.
 
-In: likelihood ratios of true against false. Out: the odds of a false one among them, and those that
-may be believed. The odds come from the factors themselves (empirical Bayes), so no share of
+In: likelihood ratios of true against false. Out: the odds of a false one among them, and those
+that may be believed. The odds come from the factors themselves (empirical Bayes), so no share of
 false ones is assumed.
 """
 
@@ -15,7 +15,7 @@ from l1slam_ros.core.prediction import Innovations
 # A factor is believed when it is false with at most this probability.
 DOUBT = 0.01
 # So many false ones may be expected among all that are believed at one time.
-_EXPECTED_FALSE = 0.1
+_EXPECTED_FALSE = 1.0
 # The noise is judged by so many of the best predicted factors.
 _BEST_PREDICTED = 1000
 _ROUNDS = 100

@@ -68,13 +68,14 @@ def minimise_by(
     """
     Minimise the L1 norm of the whitened residuals; return the solution and what found it.
 
-    Where nobody asked for the interior point and it stalls, Algorithm 4 goes on from its best
-    poses.
+    Where nobody asked for the interior point and it does not converge, Algorithm 4 goes on from
+    its best poses.
     """
     cholesky = choice.cholesky
     if choice.solver == PRIMAL_DUAL or cholesky is None:
         return minimise(graph, poses, options, cholesky, report=report), PRIMAL_DUAL
     solution = minimise_interior_point(graph, poses, options, cholesky, report)
-    if solution.status is not Status.STALLED or not choice.falls_back:
+    content = solution.status is Status.CONVERGED or not options.outer_iterations
+    if content or not choice.falls_back:
         return solution, INTERIOR_POINT
     return minimise(graph, solution.poses, options, cholesky, report=report), PRIMAL_DUAL

@@ -5,8 +5,6 @@ The exact L1 map of a graph: rough L2 first where that helps, then one interior-
 In: a graph and poses. Out: poses at a local optimum, and a bound on what is left.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from l1slam_ros.core.cholesky import BlockCholesky
@@ -21,9 +19,6 @@ from l1slam_ros.core.optimiser import OptimiserOptions, Report, Solution
 # It leaves the cost 10^-6 above the optimum, 3 10^-6 in Manhattan's flat valley.
 _TOLERANCE = 3e-5
 _ROUGH_L2 = LeastSquaresOptions(iterations=30, tolerance=1e-3)
-# The L2 map is the better start, in the middle of the valley, unless false loops bend it. Its L1
-# cost is a quarter above the optimum at most on clean data (measured: 17 to 25%).
-_STRAIGHT = 4 / 3
 
 
 def minimise_interior_point(
@@ -36,19 +31,20 @@ def minimise_interior_point(
     """
     Minimise the L1 norm of the whitened residuals in `options.outer_iterations` steps at most.
 
-    From the L2 map that poses (n, p) lead to, or where its L1 cost is far above theirs (false loops
-    bend it) from the poses themselves. The result is the best poses met, never worse than the
-    start.
+    From the L2 map that poses (n, p) lead to, which lies in the middle of the valley; should that
+    end above the poses' own cost (false loops bend it), from the poses themselves. The result is
+    the best poses met, never worse than the start. The L2 map counts as one step.
     """
-    cost = l1_cost(whitened_residual(graph, poses))
-    iterations = min(_ROUGH_L2.iterations, options.outer_iterations)
-    rough = minimise_l2(graph, poses, replace(_ROUGH_L2, iterations=iterations), cholesky).poses
-    straight = l1_cost(whitened_residual(graph, rough)) < _STRAIGHT * cost
-    optimum = interior_point(GraphProblem(graph), rough if straight else poses, cholesky,
-                             options.outer_iterations, _TOLERANCE, report)
-    history = np.minimum.accumulate([cost, *optimum.costs[1:]])
-    best, status = optimum.poses, optimum.status
-    if optimum.costs[-1] > cost:
-        best, status = poses, Status.STALLED
-    return Solution(best, history[-1], status, len(history) - 1, 0, history, optimum.y,
-                    optimum.gap)
+    start = l1_cost(whitened_residual(graph, poses))
+    steps = options.outer_iterations - 1
+    if steps < 0:
+        return Solution(poses, start, Status.ITERATION_LIMIT, 0, 0, np.array([start]),
+                        np.zeros(len(whitened_residual(graph, poses))))
+    problem = GraphProblem(graph)
+    rough = minimise_l2(graph, poses, _ROUGH_L2, cholesky).poses
+    optimum = interior_point(problem, rough, cholesky, steps, _TOLERANCE, report)
+    if optimum.costs[-1] > start:
+        optimum = interior_point(problem, poses, cholesky, steps, _TOLERANCE, report)
+    history = np.minimum.accumulate([start, *optimum.costs])
+    return Solution(optimum.poses, optimum.costs[-1], optimum.status, len(history) - 1, 0,
+                    history, optimum.y, optimum.gap)

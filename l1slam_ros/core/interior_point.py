@@ -40,6 +40,9 @@ from l1slam_ros.core.optimality import Status, fits_exactly, l1_cost, smoothing
 
 # How far to go towards the nearest bound.
 _FRACTION = 0.9995
+# Converged must also mean that no step of the last linear problem would lower the cost by more than
+# this part: with many false loops it can come to rest where one would.
+_PROVEN = 1e-2
 # Slacks are kept above this and never recomputed as 1 -+ y, which would cancel.
 _SMALLEST_SLACK = 1e-15
 # A step is shortened while the residual departs from its linearisation by more than this part of
@@ -50,6 +53,11 @@ _CURVATURE, _RECOVERY = 0.7, 1.3
 # Of the damping: added where a pivot is not positive; and where a step was short.
 _DAMPING_PIVOT, _DAMPING_STEP = 0.1, 3.0
 _DAMPING_FACTOR = 10.0
+# Of the dual at the end: most projections to make it feasible (each costs a solution, none a
+# factorisation), and when it is so.
+_PROJECTIONS, _FEASIBLE = 10, 1 + 1e-6
+# A row at its bound still gives way a little, or there might be no feasible dual nearby.
+_LEAST_WEIGHT = 1e-9
 
 Report = Callable[[int, float], None]
 
@@ -228,11 +236,11 @@ def interior_point(
     """
     at = _start(problem, poses)
     costs, best, regularisation = [l1_cost(at.residual)], at, _Regularisation()
-    status = Status.ITERATION_LIMIT
+    status, worst = Status.ITERATION_LIMIT, 1 + tolerance
     for iteration in range(iterations + 1):
         cost = l1_cost(at.residual)
         if at.is_solved(cost, tolerance) or fits_exactly(cost, len(at.y)):
-            status = Status.CONVERGED if cost <= costs[-1] else Status.STALLED
+            status = Status.CONVERGED if cost <= worst * costs[-1] else Status.STALLED
         if cost <= costs[-1]:
             best = replace(at, u=at.u.copy(), v=at.v.copy(), s=at.s.copy(), t=at.t.copy(),
                            y=at.y.copy())
@@ -244,18 +252,38 @@ def interior_point(
         if not _step(problem, at, cholesky, regularisation):
             status = Status.STALLED
             break
-    y = _feasible_dual(best, cholesky)
-    return Optimum(best.poses, costs, status, y, max(costs[-1] - float(y @ best.residual), 0.0))
+    # The last dual is the better one, unless the poses moved on from the best ones.
+    lasts = [best] if best.system is at.system else [best, replace(at, system=best.system)]
+    duals = [_feasible_dual(last, cholesky) for last in lasts]
+    gaps = [max(costs[-1] - float((y * best.residual).sum()), 0.0) for y in duals]
+    y, gap = duals[int(np.argmin(gaps))], min(gaps)
+    if status is Status.CONVERGED and _is_unproven(gap, costs[-1], len(y)):
+        status = Status.STALLED
+    return Optimum(best.poses, costs, status, y, gap)
+
+
+def _is_unproven(gap: float, cost: float, rows: int) -> bool:
+    return gap > _PROVEN * cost and not fits_exactly(cost, rows)
 
 
 def _feasible_dual(at: _Iterate, cholesky: BlockCholesky) -> Array:
-    """Return a dual near y with A'y = 0, |y| <= 1: projected along the weights, then shrunk."""
-    Q = at.weights
-    if not cholesky.factorise(at.system, Q):
+    """
+    Return a dual near y with A'y = 0, |y| <= 1.
+
+    By turns projected on the one, along the slack each row has left, and clipped to the other; at
+    the end shrunk by what is missing.
+    """
+    slack = np.maximum(np.minimum(at.s, at.t), _LEAST_WEIGHT)
+    if not cholesky.factorise(at.system, slack):
         return np.zeros_like(at.y)
-    x = cholesky.solve(at.system.transposed_times(at.y))
-    y = at.y - Q * at.system.times(x)
-    return y / max(1.0, float(np.abs(y).max(initial=0.0)))
+    y = at.y
+    for _ in range(_PROJECTIONS):
+        x = cholesky.solve(at.system.transposed_times(np.clip(y, -1, 1)))
+        y = np.clip(y, -1, 1) - slack * at.system.times(x)
+        largest = float(np.abs(y).max(initial=0.0))
+        if largest <= _FEASIBLE:
+            break
+    return y / max(1.0, largest)
 
 
 def _start(problem: Problem, poses: Array) -> _Iterate:

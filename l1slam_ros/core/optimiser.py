@@ -9,7 +9,7 @@ optimum, which is where the paper's own figures lie.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +26,9 @@ from l1slam_ros.core.primal_dual import PrimalDualOptions
 # A linearisation whose cost fell by more than this part left a different problem behind: its dual
 # no longer fits. Keeping it there ends 15% above the optimum from City's stored start.
 _FAR = 0.01
+# After a step that lowers the cost but little, the next one gets that many times the iterations;
+# so many such steps in a row are the end.
+_MORE_EFFORT, _SMALL_STEPS = 4, 2
 # A step is halved this often before the direction is given up: to 1/32 of it.
 _HALVINGS = 5
 
@@ -36,7 +39,8 @@ class OptimiserOptions(Options):
 
     outer_iterations: int = option(60, 'most linearisations of one solve', '', 0, 10**6)
     outer_tolerance: float = option(
-        1e-6, 'converged when the cost fell by less than this part of itself twice', '1', 0, 1)
+        1e-6, 'converged when the cost fell by less than this part of itself twice in a row',
+        '1', 0, 1)
     inner: PrimalDualOptions = PrimalDualOptions()
 
 
@@ -101,17 +105,21 @@ def minimise(
         else:
             x = np.zeros(system.size * system.block_size)
             dual = np.zeros(len(residual)) if dual is None else dual
-        solution = minimise_l1_halpern(system, x, dual, options.inner, weight, deadline)
+        effort = options.inner.iterations * _MORE_EFFORT**small_steps
+        solution = minimise_l1_halpern(system, x, dual, replace(options.inner, iterations=effort),
+                                       weight, deadline)
         inner += solution.iterations
         dual, gap, weight = solution.y, solution.gap, solution.weight
         poses, cost = backtrack(graph, poses, solution.x, history[-1])
         history.append(cost)
         report(outer + 1, cost)
-        # A failed step is not the end: with the better dual the next one may succeed.
+        # A failed step is not the end: with the better dual, and more iterations, the next one may
+        # succeed.
         small = history[-2] - cost <= options.outer_tolerance * cost
         small_steps = small_steps + 1 if small else 0
-        if small_steps == 2:
-            status = Status.CONVERGED if history[-3] > cost else Status.STALLED
+        if small_steps == _SMALL_STEPS:
+            falls = history[-_SMALL_STEPS - 1] > cost or solution.status is Status.CONVERGED
+            status = Status.CONVERGED if falls else Status.STALLED
             break
         if time.monotonic() > deadline:
             status = Status.OUT_OF_TIME

@@ -22,6 +22,8 @@ from l1slam_ros.core.manifold import Array, Indices, Manifold
 
 # A covariance from that many samples has standard deviations right to 15% (1 / sqrt(2 SAMPLES)).
 SAMPLES = 24
+# A factor whose residual has a variance below this part of its noise is checked by no other.
+_REDUNDANT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,8 @@ class Posterior:
         from l1slam_ros.core.kernels.prediction import normalise
 
         square: Array = normalise(self.moment.copy(), self.residual)[0]
-        square[~np.isfinite(square)] = 0.0
-        return square
+        alone = np.trace(self.moment, axis1=1, axis2=2) < _REDUNDANT
+        return np.where(alone | ~np.isfinite(square), 0.0, square)
 
 
 def sample_posterior(
@@ -82,6 +84,12 @@ def sample_posterior(
     return Posterior(samples, -system.b.reshape(m, k), moment)
 
 
+def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array, size: int) -> Array:
+    """Return ln N(residual; 0, C) + ln(volume of a false one's), (m,); size : of a residual."""
+    ratio: Array = log_claim - (size * np.log(2 * np.pi) + log_det + square) / 2
+    return ratio
+
+
 @dataclass(frozen=True)
 class Innovations:
     """
@@ -104,13 +112,12 @@ class Innovations:
         ln N(residual; 0, scale C) + ln(volume of a false one's)
         """
         k = self.system.block_size
-        ratio: Array = self.log_claim - (
-            k * np.log(2 * np.pi * scale) + self.log_det + self.square / scale) / 2
-        return ratio
+        return log_likelihood_ratio(self.square / scale, self.log_det + k * np.log(scale),
+                                    self.log_claim, k)
 
     def joint(self, posterior: Posterior, first: Indices, second: Indices) -> tuple[Array, Array]:
         """
-        Return the squared residual of pairs of factors and ln det of their covariance, (pairs,).
+        Return the squared residual of pairs of factors together, and `log_ratio` of these, (pairs,).
 
         first, second : (pairs,) factors
         """
@@ -126,7 +133,8 @@ class Innovations:
         covariance = both @ both.transpose(0, 2, 1) / SAMPLES + np.eye(2 * k)
         square, log_det = prediction.normalise(
             covariance, np.concatenate((residual[pairs[0]], residual[pairs[1]]), axis=1))
-        return square, log_det
+        claim = self.log_claim[first] + self.log_claim[second]
+        return square, log_likelihood_ratio(square, log_det, claim, 2 * k)
 
 
 def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,

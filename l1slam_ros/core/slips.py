@@ -1,91 +1,136 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Odometry that lies: one gross slip, which all loops across it agree upon.
+Odometry that lies: found by what the loops across a slip have in common.
 
-In: a map in which no more loop can be believed. Out: the odometry factor that slipped, the loops
-that say so, and poses with the slip mended. Where no believed loop spans a factor, the two sides of
-it are rigid pieces each, and any refused loop across says how they lie to each other; true ones
-say the same.
+In: a robust solve in which nothing more can be believed. Out: one in which an odometry factor is
+left out, and the loops that were refused because of it are accepted.
+
+A slip that believed loops span makes all others speak against it. Where none does, the two sides
+of it are pieces of their own; every true loop across is refused, but from one of them, and from how
+its ends lie to those of another, follows the other one.
 """
-
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
-from l1slam_ros.core.belief import one_of_each_group
-from l1slam_ros.core.graph import BetweenFactors
-from l1slam_ros.core.manifold import Array, Indices, Manifold
-from l1slam_ros.core.noise import Mask
+from l1slam_ros.core.belief import DOUBT, log_odds_of_false
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.linearise import anchor
+from l1slam_ros.core.manifold import Array, Indices
+from l1slam_ros.core.noise import whiten
+from l1slam_ros.core.prediction import (
+    Posterior,
+    chi2_quantile,
+    claimed_volume,
+    innovations,
+    log_likelihood_ratio,
+)
+from l1slam_ros.core.robust_growth import Growth
 
-# So many loops across are asked how the sides lie, and so many judge each answer.
-_PROPOSERS, _JURY = 30, 300
-# Loops of this many groups have to agree: one may be one and the same mistake.
+# Loops of that many groups have to agree upon a slip.
 _VOTES = 3
-
-# From loops and poses to the loops' log odds of being true there, (k,).
-Judge = Callable[[Indices, Array], Array]
-
-
-@dataclass(frozen=True)
-class Slip:
-    """
-    A slip and its mending.
-
-    factor : the odometry factor; loops : (k,) that agree about it; poses : (n, p) mended.
-    """
-
-    factor: int
-    loops: Indices
-    poses: Array
+# So many refused loops are asked, and of those that agree so many say how the slip is mended.
+_JURY, _PROPOSALS = 500, 20
+# Of each one so many pairs are looked at closely, those that differ least.
+_NEAREST = 20
 
 
-def find_slip(
-    manifold: Manifold, factors: BetweenFactors, accepted: Mask, refused: Indices, poses: Array,
-    judge: Judge, apart: int,
-) -> Slip | None:
-    """
-    Return the slip that most loops agree upon, if any.
-
-    Parameters
-    ----------
-    accepted : (m,) bool; refused : (k,) loops, the best predicted first
-    judge : log odds of loops at poses
-    apart : least distance of loops with a vote each, see `one_of_each_group`
-
-    """
-    best: Slip | None = None
-    for first, last in bridges(factors, accepted, len(poses)):
-        low = np.minimum(factors.i[refused], factors.j[refused])
-        high = np.maximum(factors.i[refused], factors.j[refused])
-        jury = refused[(low <= last) & (high > first)][:_JURY]
-        for loop in jury[:_PROPOSERS]:
-            k = _most_spanned(factors, jury, first, last)
-            mended = _mended(manifold, factors, poses, loop, k)
-            log_odds = judge(jury, mended)
-            agree = jury[np.argsort(-log_odds, kind='stable')][: np.count_nonzero(log_odds > 0)]
-            votes = one_of_each_group(factors.i[agree], factors.j[agree], apart)
-            if len(votes) >= _VOTES and (best is None or len(agree) > len(best.loops)):
-                k = _most_spanned(factors, agree, first, last)
-                best = Slip(_odometry(factors, k), agree, mended)
-    return best
+def without_slip(growth: Growth) -> Growth | None:
+    """Return a state without an odometry factor that loops agree is wrong; None: there is none."""
+    before = np.count_nonzero(growth.accepted)
+    for attempt in (_without_worst, _mended):
+        trial = growth.copy()
+        votes = attempt(trial)
+        trial.accepted[votes] = True
+        gained = np.count_nonzero(trial.accepted) - before
+        if growth.groups(votes) >= _VOTES and gained >= _VOTES:
+            return trial
+    return None
 
 
-def bridges(factors: BetweenFactors, accepted: Mask, n: int) -> list[tuple[int, int]]:
-    """
-    Return the runs of odometry factors that nothing accepted spans: first, last (of `spanned`).
+def _without_worst(growth: Growth) -> Indices:
+    """Leave out the odometry factor that all others speak against; return who agrees, (k,)."""
+    inside = np.flatnonzero(growth.accepted)
+    against = np.where(growth.is_loop[inside], 0.0, growth.posterior.left_out())
+    k = growth.graph.manifold.TANGENT_SIZE
+    if against.max() < chi2_quantile(1 - DOUBT / len(inside), k):
+        return np.zeros(0, np.int64)
+    growth.accepted[inside[np.argmax(against)]] = False
+    rows = growth.undecided()
+    growth.settle()
+    return growth.believable(rows[growth.is_loop[rows]])
 
-    Factor k is that of the keyframes k and k + 1.
-    """
-    loops = accepted & ~factors.is_odometry
-    free = np.flatnonzero(spanned(factors.i[loops], factors.j[loops], n) == 0)
-    starts = np.flatnonzero(np.diff(free, prepend=-2) > 1)
-    ends = np.append(starts[1:], len(free)) - 1
-    return list(zip(free[starts].tolist(), free[ends].tolist(), strict=True))
+
+def _mended(growth: Growth) -> Indices:
+    """Leave out the odometry factor that most refused loops span in accord; as above."""
+    agreed = _accord(growth)
+    if growth.groups(agreed) < _VOTES:
+        return agreed
+    factors = growth.factors
+    across = spanned(factors.i[agreed], factors.j[agreed], growth.graph.n_poses)
+    steps = np.flatnonzero(across == across.max())
+    low, high = np.minimum(factors.i, factors.j), np.maximum(factors.i, factors.j)
+    affected = growth.is_loop & (low <= steps[-1]) & (high > steps[0])
+    growth.accepted &= ~affected | growth.trusted
+    growth.settle()
+    affected &= ~growth.accepted
+    jury = _some(growth, np.flatnonzero(affected), _JURY)
+    proposals = _some(growth, agreed, _PROPOSALS).tolist()
+    loop, _ = _most_votes(growth, jury, [(loop, int(steps[0])) for loop in proposals])
+    # Where exactly it is, only those tell that span some of the steps.
+    jury = np.flatnonzero(affected & ((low > steps[0]) | (high <= steps[-1])))
+    loop, step = _most_votes(growth, jury, [(loop, step) for step in steps.tolist()])
+    growth.poses = mended(growth.graph, growth.poses, loop, step)
+    growth.accepted &= growth.is_loop | (low != step)
+    return _votes(growth, np.flatnonzero(affected), growth.poses)
+
+
+def _accord(growth: Growth) -> Indices:
+    """Return the refused loops of most groups that agree with one of them, (k,)."""
+    rows = growth.undecided()
+    rows = rows[growth.is_loop[rows]]
+    if not len(rows):
+        return rows
+    rows = _some(growth, rows[growth.innovations(rows).square > growth.gate()], _JURY)
+    if len(rows) < _VOTES:
+        return rows
+    volume = claimed_volume(growth.graph.manifold, growth.poses, growth.rng)
+    one, other = agreement(growth.part(rows), growth.poses, growth.posterior, volume,
+                           growth.gate(), np.log(len(rows)))
+    camps = [np.append(rows[other[one == k]], rows[k]) for k in range(len(rows))]
+    return max(camps, key=growth.groups)
+
+
+def _some(growth: Growth, rows: Indices, count: int) -> Indices:
+    """Return so many factors of these, at random, or all."""
+    chosen: Indices = growth.rng.permutation(rows)[:count]
+    return chosen
+
+
+def _most_votes(
+    growth: Growth, jury: Indices, proposals: list[tuple[int, int]]
+) -> tuple[int, int]:
+    """Return the loop and the step after which most of a jury fit, see `mended`."""
+    return max(proposals, key=lambda proposal: len(
+        _votes(growth, jury, mended(growth.graph, growth.poses, *proposal))))
+
+
+def _votes(growth: Growth, rows: Indices, poses: Array) -> Indices:
+    """Return the factors that may be believed at mended poses, (k,)."""
+    if not len(rows):
+        return rows
+    graph = growth.part(rows)
+    volume = claimed_volume(graph.manifold, poses, np.random.default_rng(0))
+    found = innovations(graph, poses, growth.posterior, volume)
+    # The loop that mended the poses is as uncertain as the one that is judged by it.
+    fits = found.square < 2 * growth.gate()
+    log_ratio = found.log_ratio(2.0)
+    odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)))
+    votes: Indices = rows[fits & (log_ratio > odds + np.log(1 / DOUBT - 1))]
+    return votes
 
 
 def spanned(i: Indices, j: Indices, n: int) -> Indices:
-    """Return how many of the factors (i, j) span the step from each keyframe to the next."""
+    """Return how many of the factors (i, j) span the step from each of n keyframes, (n - 1,)."""
     change = np.zeros(n, np.int64)
     np.add.at(change, np.minimum(i, j), 1)
     np.add.at(change, np.maximum(i, j), -1)
@@ -93,24 +138,65 @@ def spanned(i: Indices, j: Indices, n: int) -> Indices:
     return count
 
 
-def _most_spanned(factors: BetweenFactors, loops: Indices, first: int, last: int) -> int:
-    count = spanned(factors.i[loops], factors.j[loops], int(factors.j.max()) + 2)
-    return first + int(np.argmax(count[first : last + 1]))
-
-
-def _odometry(factors: BetweenFactors, k: int) -> int:
-    low = np.minimum(factors.i, factors.j)
-    return int(np.flatnonzero(factors.is_odometry & (low == k))[0])
-
-
-def _mended(manifold: Manifold, factors: BetweenFactors, poses: Array, loop: int,
-            k: int) -> Array:
-    """Return the poses, those behind keyframe k moved as one so that a loop fits."""
+def mended(graph: FactorGraph, poses: Array, loop: int, step: int) -> Array:
+    """Return the poses, those behind a step of the odometry moved as one so that a loop fits."""
+    manifold, factors = graph.manifold, graph.between
     i, j, measurement = factors.i[loop], factors.j[loop], factors.measurement[loop][None]
     if i > j:
         i, j, measurement = j, i, manifold.inverse(measurement)
     wanted = manifold.compose(poses[i][None], measurement)
     motion = manifold.compose(wanted, manifold.inverse(poses[j][None]))
-    behind = poses[k + 1:]
+    behind = poses[step + 1:]
     moved = manifold.compose(np.broadcast_to(motion, behind.shape), behind)
-    return np.concatenate((poses[: k + 1], moved))
+    return np.concatenate((poses[: step + 1], moved))
+
+
+def agreement(
+    graph: FactorGraph, poses: Array, posterior: Posterior, log_volume: float, limit: float,
+    least: float,
+) -> tuple[Indices, Indices]:
+    """
+    Return the pairs of between factors of a graph that agree, each both ways round, (pairs,) twice.
+
+    From the one factor follows the other, if the map is right about how their first ends lie to
+    each other, and their second ends; whatever it says of the factors themselves.
+
+    Parameters
+    ----------
+    log_volume : see `claimed_volume`
+    limit : of the squared difference of what follows and what is measured, over its covariance
+    least : logarithm of how much likelier than by chance the difference must be
+
+    """
+    from l1slam_ros.core.kernels.prediction import normalise
+
+    manifold, (a, b) = graph.manifold, np.triu_indices(len(graph.between), 1)
+    error = _difference(graph, poses, a, b)
+    scatter = np.linalg.inv(error.T @ error)
+    near = np.argsort(np.einsum('mi,ij,mj->m', error, scatter, error), kind='stable')
+    near = near[: _NEAREST * len(graph.between)]
+    a, b, error = a[near], b[near], error[near]
+    roots, fixed = graph.between.sqrt_information[b], anchor(graph)
+    there = manifold.retract(manifold.identity(len(a)), error)
+    k, steps = manifold.TANGENT_SIZE, posterior.samples[:-1].transpose(2, 0, 1)
+    covariance = np.tile(2 * np.eye(k), (len(a), 1, 1))
+    for step in steps:
+        moved = np.concatenate((poses[:fixed], manifold.retract(poses[fixed:], step)))
+        here = manifold.retract(manifold.identity(len(a)), _difference(graph, moved, a, b))
+        change = whiten(roots, manifold.local(there, here))
+        covariance += change[:, :, None] * change[:, None, :] / len(steps)
+    square, log_det = normalise(covariance, whiten(roots, error))
+    claim = log_volume + np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
+    good = (square < limit) & (log_likelihood_ratio(square, log_det, claim, k) > least)
+    return np.concatenate((a[good], b[good])), np.concatenate((b[good], a[good]))
+
+
+def _difference(graph: FactorGraph, poses: Array, a: Indices, b: Indices) -> Array:
+    """Return t2v(Z_b^-1 Z) for pairs of factors, (pairs, k); Z : what follows from a for b."""
+    manifold, factors = graph.manifold, graph.between
+    backwards = (factors.i > factors.j)[:, None]
+    Z = np.where(backwards, manifold.inverse(factors.measurement), factors.measurement)
+    low, high = np.minimum(factors.i, factors.j), np.maximum(factors.i, factors.j)
+    first = manifold.between(poses[low[b]], poses[low[a]])
+    second = manifold.between(poses[high[a]], poses[high[b]])
+    return manifold.local(Z[b], manifold.compose(manifold.compose(first, Z[a]), second))

@@ -14,7 +14,7 @@ import numpy as np
 from l1slam_ros.core.kernels.compiled import compiled
 
 # A pivot that is left with less than this part of its diagonal entry is rounding.
-_SINGULAR = 1e-15
+_SINGULAR = 1e-13
 
 
 @compiled

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The rounds of a robust solve: predict, believe, solve, doubt.
+
+In: a graph and what is believed of it. Out: the same with more loops believed. See `robust`.
+"""
+
+import copy
+
+import numpy as np
+
+from l1slam_ros.core.belief import (
+    DOUBT,
+    believable,
+    common_scale,
+    log_odds_of_false,
+    one_of_each_group,
+)
+from l1slam_ros.core.cholesky import BlockCholesky, cholesky_of
+from l1slam_ros.core.graph import FactorGraph, component_labels
+from l1slam_ros.core.initial import odometry_poses
+from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
+from l1slam_ros.core.least_squares import weighted_least_squares
+from l1slam_ros.core.linearise import anchor, linearise, step_poses, whitened_residual
+from l1slam_ros.core.manifold import Array, Indices
+from l1slam_ros.core.noise import Mask
+from l1slam_ros.core.optimality import l2_cost
+from l1slam_ros.core.prediction import (
+    Innovations,
+    Posterior,
+    chi2_quantile,
+    claimed_volume,
+    innovations,
+    left_out_quantile,
+    sample_posterior,
+)
+from l1slam_ros.core.subgraph import SubGraph
+
+# One in so many true loops may be refused for its noise alone; and of accepted ones, dropped.
+REFUSED = 1e-3
+_DROPPED = 2e-5
+# Probability that any true factor of a round is doubted for what the others say.
+_DOUBTED = 0.01
+# Steps of Gauss-Newton at most in one round.
+_STEPS = 60
+# A loop that was dropped that often is not tried again.
+_CHANCES = 2
+# What is measured of the noise counts against as many factors on which it was measured before.
+_KNOWN = 20
+# Pairs are formed of so many loops that fit best.
+_CANDIDATES = 200
+# [keyframes] Loops whose ends are nearer to each other, in sum, may be one and the same mistake.
+_APART = 40
+
+
+class Growth:
+    """
+    The state of a robust solve.
+
+    accepted, is_loop, trusted : (m,) bool of the between factors; poses : (n, p) the L2 map of the
+    accepted; posterior : of these; variance : (2,) of odometry and loops in units of what they
+    state.
+    """
+
+    def __init__(self, graph: FactorGraph, trusted: Mask, rng: np.random.Generator):
+        self.graph, self.factors, self.trusted, self.rng = graph, graph.between, trusted, rng
+        self.is_loop: Mask = ~self.factors.is_odometry
+        self.accepted: Mask = ~self.is_loop | trusted
+        self.poses = odometry_poses(graph)
+        self.variance = np.ones(2)
+        self.posterior: Posterior
+        self._drops = np.zeros(len(self.factors), np.int64)
+        self.settle()
+        rows = self.undecided()
+        if len(rows):
+            self.variance = self.variance * common_scale(self.innovations(rows))
+            self.settle()
+
+    def copy(self) -> 'Growth':
+        """Return a state to try something in."""
+        clone = copy.copy(self)
+        clone.accepted, clone._drops = self.accepted.copy(), self._drops.copy()
+        return clone
+
+    def part(self, rows: Indices) -> SubGraph:
+        """Return the graph of some factors, with the noise as it was found."""
+        return SubGraph(self.graph, rows, self.variance[self.is_loop[rows].astype(np.int64)])
+
+    def undecided(self) -> Indices:
+        """Return the factors that may yet be accepted, (k,)."""
+        return np.flatnonzero(~self.accepted & (self._drops < _CHANCES))
+
+    def gate(self, factors: int = 1) -> float:
+        """Return what the squared innovation of so many true factors stays below."""
+        return chi2_quantile(1 - REFUSED, factors * self.graph.manifold.TANGENT_SIZE)
+
+    def settle(self) -> None:
+        """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
+        drop = np.zeros(1, np.int64)
+        while len(drop):
+            self._keep_connected()
+            rows = np.flatnonzero(self.accepted)
+            part = self.part(rows)
+            cholesky = cholesky_of(part)
+            self.poses = solve(part, self.poses, cholesky)
+            self.posterior = sample_posterior(part, self.poses, cholesky, self.rng)
+            drop = self._misfits(rows)
+            self.accepted[drop] = False
+            self._drops[drop] += 1
+        self._learn_variance(rows)
+
+    def _keep_connected(self) -> None:
+        """Take all odometry back where the graph would fall apart without it."""
+        if component_labels(self.part(np.flatnonzero(self.accepted))).any():
+            self.accepted |= ~self.is_loop
+
+    def _misfits(self, rows: Indices) -> Indices:
+        """Return the accepted loops that do not fit, or that all others speak against."""
+        k = self.graph.manifold.TANGENT_SIZE
+        may_go = self.is_loop[rows] & ~self.trusted[rows]
+        far = (self.posterior.residual**2).sum(axis=1) > chi2_quantile(1 - _DROPPED, k)
+        against = np.where(may_go, self.posterior.left_out(), 0.0)
+        # Next to a false loop the true ones look bad too: only the worst go.
+        far |= against > max(self.doubted(), against.max(initial=0.0) / 2)
+        return rows[far & may_go]
+
+    def doubted(self) -> float:
+        """Return what `Posterior.left_out` of no factor exceeds if all accepted ones are true."""
+        accepted = int(np.count_nonzero(self.accepted))
+        return left_out_quantile(1 - _DOUBTED / accepted, self.graph.manifold.TANGENT_SIZE)
+
+    def _learn_variance(self, rows: Indices) -> None:
+        """Compare the residuals with what the noise makes of them, for odometry and for loops."""
+        kind, known = self.is_loop[rows], _KNOWN * self.graph.manifold.TANGENT_SIZE
+        found = np.bincount(kind, (self.posterior.residual**2).sum(axis=1), 2)
+        stated = np.bincount(kind, np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
+        self.variance = self.variance * (found + known) / (stated + known)
+
+    def innovations(self, rows: Indices) -> Innovations:
+        """Return how factors that are not accepted fit the map."""
+        volume = claimed_volume(self.graph.manifold, self.poses, self.rng)
+        return innovations(self.part(rows), self.poses, self.posterior, volume)
+
+    def believable(self, rows: Indices) -> Indices:
+        """Return which factors that are not accepted may be believed: each, or as pairs, (k,)."""
+        if not len(rows):
+            return rows
+        found = self.innovations(rows)
+        fits = np.flatnonzero(found.square < self.gate())
+        log_ratio = found.log_ratio()[fits]
+        odds = log_odds_of_false(log_ratio, len(rows) - len(fits))
+        good = believable(log_ratio, odds)
+        if not len(good):
+            best = fits[np.argsort(-log_ratio, kind='stable')[:_CANDIDATES]]
+            return self._pairs(found, rows, best, odds)
+        believed: Indices = rows[fits[good]]
+        return believed
+
+    def _pairs(self, found: Innovations, rows: Indices, best: Indices, odds: float) -> Indices:
+        """Return those of the best that vouch for each other, far from each other, (k,)."""
+        a, b = (best[side] for side in np.triu_indices(len(best), 1))
+        i, j = self.factors.i[rows], self.factors.j[rows]
+        apart = np.abs(i[a] - i[b]) + np.abs(j[a] - j[b]) > _APART
+        a, b = a[apart], b[apart]
+        if not len(a):
+            return a
+        square, log_ratio = found.joint(self.posterior, a, b)
+        # To both being false by chance, the second one being so is as likely as the first.
+        sure = log_ratio > np.log(1 / DOUBT - 1) + odds + max(odds, 0.0)
+        good = sure & (square < self.gate(2))
+        believed: Indices = rows[np.unique(np.concatenate((a[good], b[good])))]
+        return believed
+
+    def groups(self, rows: Indices) -> int:
+        """Return how many votes factors have: one for each group of them."""
+        return len(one_of_each_group(self.factors.i[rows], self.factors.j[rows], _APART))
+
+
+def solve(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:
+    """
+    Return the L2 map of a graph to within its noise: chi2 one above the optimum or less.
+
+    From poses (n, p) that may be far off: rotations alone, then translations, each of which is
+    linear; then Gauss-Newton.
+    """
+    manifold, linear = graph.manifold, poses
+    for part in (manifold.ROTATION, manifold.TRANSLATION):
+        system = linearise(graph, linear).part(part)
+        x = weighted_least_squares(system, cholesky, np.ones_like(system.b))
+        step = np.zeros((graph.n_poses - anchor(graph), manifold.TANGENT_SIZE))
+        step[:, part] = x.reshape(len(step), -1)
+        linear = step_poses(graph, linear, step)
+    if _chi2(graph, linear) < _chi2(graph, poses):
+        poses = linear
+    # In units of its noise, chi2 is about as large as there are spare measurements.
+    spare = manifold.TANGENT_SIZE * max(len(graph.between) - graph.n_poses + 1, 1)
+    return minimise_l2(graph, poses, LeastSquaresOptions(_STEPS, 1 / spare), cholesky).poses
+
+
+def _chi2(graph: FactorGraph, poses: Array) -> float:
+    return l2_cost(whitened_residual(graph, poses))
