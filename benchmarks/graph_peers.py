@@ -8,8 +8,8 @@ t2v(e): the optima differ by less than the digits shown.
 
 gtsam's L1 is by reweighting: plain Gauss-Newton, then Huber's kernel, whose weight is k / |e| for
 each whitened component beyond k ("Scalar" reweighting: the L1 cost is a sum over components, not
-over factors), with smaller and smaller k. Twice: four kernels, each to the tolerance of all others;
-and a dozen kernels of two steps each, the best ladder we found for little time.
+over factors), with smaller and smaller k. Twice: four kernels, each to the tolerance of all the
+others; and a dozen kernels of two steps each, the best ladder we found for little time.
 """
 
 from collections.abc import Callable

@@ -42,7 +42,13 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument('--compare', action='store_true',
                         help='print the ratios to baseline.json')
     parser.add_argument('--keep', action='store_true', help='make these results the baseline')
-    return parser.parse_args(words)
+    arguments = parser.parse_args(words)
+    public = arguments.graphs != (DENSE,) and set(arguments.only) != {'growth'}
+    if public and not (arguments.datasets and arguments.datasets.is_dir()):
+        parser.error('expected --datasets, the folder of the public graphs')
+    if arguments.compare and not BASELINE.exists():
+        parser.error('there is no baseline.json to compare with; --keep makes one')
+    return arguments
 
 
 def main() -> None:

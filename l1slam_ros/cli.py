@@ -117,6 +117,8 @@ def _add_solve(parser: argparse.ArgumentParser) -> None:
         help='what is minimised (default: %(default)s)')
     add('--solver', choices=SOLVERS, default=SOLVERS[0],
         help='for l1; auto: interior-point on sparse graphs (default: %(default)s)')
+    add('--robust', action='store_true',
+        help='refuse loops that cannot be believed, and say which')
     add('--outer', type=int, metavar='N', help='most linearisations')
     add('--inner', type=int, metavar='N', help='most primal-dual iterations of each')
     add('--output', type=Path, metavar='OUT', help=_OUTPUT)

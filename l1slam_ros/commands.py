@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from l1slam_ros import offline
-from l1slam_ros.core.choice import AUTO
 from l1slam_ros.core.errors import FileError, GraphError, OptionError
 from l1slam_ros.core.false_loops import FALSE_LOOPS, insert_loops, without_factors
 from l1slam_ros.core.l2 import LeastSquaresOptions
@@ -29,15 +28,15 @@ from l1slam_ros.progress import Progress
 def solve(arguments: argparse.Namespace) -> str:
     """Optimise a graph; print, write and draw what came out."""
     _check_outputs(arguments)
-    solver, least_squares = _solver_options(arguments)
+    wish = _wish(arguments)
     record = _read(arguments, arguments.input)
     _warn(record, arguments.quiet)
     reference = arguments.reference and offline.matching_rows(record, arguments.reference)
     _make_ready(arguments.quiet)
-    steps = solver.outer_iterations if arguments.norm == 'l1' else least_squares.iterations
+    steps = (wish.options.outer_iterations if wish.norm == 'l1'
+             else wish.least_squares.iterations)
     with _named(arguments.input), Progress(steps, 'step', arguments.quiet) as progress:
-        outcome = offline.solve(record, arguments.start, arguments.norm, arguments.solver,
-                                solver, least_squares, progress.report)
+        outcome = offline.solve(record, wish, progress.report)
     poses = outcome.solution.poses
     report = _solve_report(record, arguments.norm, outcome)
     if reference:
@@ -71,9 +70,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
         check_picture(arguments.plot)
 
 
-def _solver_options(
-    arguments: argparse.Namespace,
-) -> tuple[OptimiserOptions, LeastSquaresOptions]:
+def _wish(arguments: argparse.Namespace) -> offline.Wish:
     solver, least_squares = OptimiserOptions(), LeastSquaresOptions()
     if arguments.params_file:
         solver = read_params_file(arguments.params_file).solver
@@ -82,7 +79,8 @@ def _solver_options(
         least_squares = replace(least_squares, iterations=arguments.outer)
     if arguments.inner is not None:
         solver = replace(solver, inner=replace(solver.inner, iterations=arguments.inner))
-    return solver, least_squares
+    return offline.Wish(arguments.start, arguments.norm, arguments.solver, arguments.robust,
+                        solver, least_squares)
 
 
 def _solve_report(record: GraphRecord, norm: str, outcome: offline.Outcome) -> dict[str, object]:
@@ -99,8 +97,17 @@ def _solve_report(record: GraphRecord, norm: str, outcome: offline.Outcome) -> d
         'solver': outcome.solver,
         'outer_iterations': solution.outer_iterations,
         'inner_iterations': solution.inner_iterations,
-        'rejected': [],
+        'rejected': _refused(record, outcome).tolist(),
     }
+
+
+def _refused(record: GraphRecord, outcome: offline.Outcome) -> Indices:
+    """Return the vertices i, j of each edge that is not in the map, in file order, (k, 2)."""
+    factors, judgement = record.graph.between, outcome.judgement
+    if judgement is None:
+        return np.zeros((0, 2), np.int64)
+    pairs: Indices = record.ids[np.stack((factors.i, factors.j), axis=1)[~judgement.accepted]]
+    return pairs
 
 
 def _print_report(report: dict[str, object], norm: str, status: str, reason: str) -> None:
@@ -179,7 +186,7 @@ def corrupt(arguments: argparse.Namespace) -> str:
     options = LeastSquaresOptions()
     _make_ready()
     with _named(arguments.input), Progress(options.iterations, 'step') as progress:
-        solution = offline.solve(believed, 'seed', 'l2', AUTO, OptimiserOptions(), options,
+        solution = offline.solve(believed, offline.Wish(norm='l2', least_squares=options),
                                  progress.report).solution
     loops = FALSE_LOOPS[arguments.kind](record.graph, solution.poses, arguments.false_loops,
                                         np.random.default_rng(arguments.seed))

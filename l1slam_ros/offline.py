@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from l1slam_ros.core.choice import choose, minimise_by
+from l1slam_ros.core.choice import AUTO, Choice, choose, minimise_by
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.errors import FileError, GraphError
-from l1slam_ros.core.graph import component_labels
+from l1slam_ros.core.graph import FactorGraph, component_labels
 from l1slam_ros.core.growth import GrowthOptions
 from l1slam_ros.core.initial import odometry_poses, tree_poses
 from l1slam_ros.core.inspection import odometry_gaps
@@ -21,6 +21,7 @@ from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.metrics import absolute_trajectory_error
 from l1slam_ros.core.optimality import l1_cost, l2_cost
 from l1slam_ros.core.optimiser import OptimiserOptions, Report, Solution
+from l1slam_ros.core.robust_map import RobustMap, accepted_graph, minimise_robustly
 from l1slam_ros.core.seed import seed_poses
 from l1slam_ros.graph_from_bag import DEFAULT_TOPICS, Topics, graph_from_bag
 from l1slam_ros.io.bag import BAG_SUFFIXES
@@ -97,11 +98,29 @@ def with_poses(record: GraphRecord) -> GraphRecord:
 
 
 @dataclass(frozen=True)
+class Wish:
+    """
+    How a graph is to be solved.
+
+    start : of `STARTS`; norm : of `NORMS`; solver : of `choice.SOLVERS`, for L1; robust : refuse
+    loops that cannot be believed.
+    """
+
+    start: str = 'seed'
+    norm: str = 'l1'
+    solver: str = AUTO
+    robust: bool = False
+    options: OptimiserOptions = OptimiserOptions()
+    least_squares: LeastSquaresOptions = LeastSquaresOptions()
+
+
+@dataclass(frozen=True)
 class Outcome:
     """
     What `solve` did; costs are of the norm that was asked for, seed_cost None without one.
 
-    solver : what found the solution, by its name; reason : a clause that says why it.
+    solver : what found the solution, by its name; reason : a clause that says why it; judgement :
+    of a robust solve, whose costs count the accepted factors.
     """
 
     solution: Solution
@@ -110,61 +129,85 @@ class Outcome:
     initial_cost: float
     seed_cost: float | None
     seconds: float
+    judgement: RobustMap | None = None
 
 
-def solve(
-    record: GraphRecord, start: str, norm: str, solver: str, options: OptimiserOptions,
-    least_squares: LeastSquaresOptions, report: Report
-) -> Outcome:
+def solve(record: GraphRecord, wish: Wish, report: Report) -> Outcome:
     """
-    Solve a graph from a start (of `STARTS`) for a norm (of `NORMS`); seconds: solving alone.
-
-    The solver (of `choice.SOLVERS`) is for L1; the other norms have Gauss-Newton.
+    Solve a graph; seconds: solving alone.
 
     Raises
     ------
     GraphError : the graph is not connected, has no such start, or numbers beyond all measure.
 
     """
-    require_start(record, start)
-    graph, cost = record.graph, cost_function(record, norm, least_squares)
-    initial = odometry_poses(graph) if start == 'odometry' else stored_poses(record)
+    require_start(record, wish)
+    graph, judgement, seed = record.graph, None, None
+    initial = odometry_poses(graph) if wish.start == 'odometry' else stored_poses(record)
+    minimiser = _Minimiser(wish, report)
     began = time.perf_counter()
-    if norm == 'l1':
-        choice = choose(solver, graph)
-        poses = seed_poses(graph, choice.cholesky) if start == 'seed' else initial
-        solution, solver = minimise_by(choice, graph, poses, options, report)
-        reason = choice.reason if solver == choice.solver else f'the {choice.solver} method did not converge'
+    if wish.robust:
+        judgement = minimise_robustly(graph, minimiser.minimise)
+        solution, seed = judgement.solution, judgement.seed
+        graph = accepted_graph(graph, judgement.accepted)
     else:
-        cholesky = cholesky_of(graph)
-        poses = seed_poses(graph, cholesky) if start == 'seed' else initial
-        minimise_norm = minimise_l2 if norm == 'l2' else minimise_huber
-        solution = minimise_norm(graph, poses, least_squares, cholesky, report)
-        solver, reason = 'gauss-newton', f'the norm is {norm}'
+        choice = minimiser.choose(graph)
+        seed = seed_poses(graph, choice.cholesky) if wish.start == 'seed' else None
+        solution = minimiser.minimise_by(choice, graph, initial if seed is None else seed)
     seconds = time.perf_counter() - began
-    seed_cost = cost(poses) if start == 'seed' else None
+    cost = cost_function(graph, wish)
+    seed_cost = None if seed is None else cost(seed)
     if not np.isfinite([cost(initial), seed_cost or 0.0, solution.cost]).all():
         raise GraphError('the cost leaves double precision: measurements and information of the '
                          'graph are too large, or too different from each other')
-    return Outcome(solution, solver, reason, cost(initial), seed_cost, seconds)
+    return Outcome(solution, minimiser.solver, minimiser.reason, cost(initial), seed_cost, seconds,
+                   judgement)
 
 
-def cost_function(
-    record: GraphRecord, norm: str, least_squares: LeastSquaresOptions
-) -> Callable[[Array], float]:
-    """Return what `norm` minimises, as a function of the poses."""
-    graph, delta = record.graph, least_squares.huber_delta
+class _Minimiser:
+    """Minimises the norm that was wished for; solver, reason : what did it last, and why."""
+
+    def __init__(self, wish: Wish, report: Report):
+        self._wish, self._report = wish, report
+        self.solver = self.reason = ''
+
+    def choose(self, graph: FactorGraph) -> Choice:
+        """Return what the graph is solved by."""
+        if self._wish.norm == 'l1':
+            return choose(self._wish.solver, graph)
+        return Choice(cholesky_of(graph), 'gauss-newton', f'the norm is {self._wish.norm}')
+
+    def minimise(self, graph: FactorGraph, poses: Array) -> Solution:
+        """Return the solution from poses (n, p)."""
+        return self.minimise_by(self.choose(graph), graph, poses)
+
+    def minimise_by(self, choice: Choice, graph: FactorGraph, poses: Array) -> Solution:
+        """Return the solution by what was chosen."""
+        wish, self.solver, self.reason = self._wish, choice.solver, choice.reason
+        if wish.norm == 'l1':
+            solution, self.solver = minimise_by(choice, graph, poses, wish.options, self._report)
+            if self.solver != choice.solver:
+                self.reason = f'the {choice.solver} method did not converge'
+            return solution
+        assert choice.cholesky is not None
+        minimise_norm = minimise_l2 if wish.norm == 'l2' else minimise_huber
+        return minimise_norm(graph, poses, wish.least_squares, choice.cholesky, self._report)
+
+
+def cost_function(graph: FactorGraph, wish: Wish) -> Callable[[Array], float]:
+    """Return what is to be minimised, as a function of the poses."""
+    size, delta = graph.manifold.TANGENT_SIZE, wish.least_squares.huber_delta
     of_residual: dict[str, Callable[[Array], float]] = {
         'l1': l1_cost,
         'l2': l2_cost,
-        'huber': lambda r: huber_cost(r, graph.manifold.TANGENT_SIZE, delta),
+        'huber': lambda r: huber_cost(r, size, delta),
     }
-    return lambda poses: of_residual[norm](whitened_residual(graph, poses))
+    return lambda poses: of_residual[wish.norm](whitened_residual(graph, poses))
 
 
-def require_start(record: GraphRecord, start: str) -> None:
+def require_start(record: GraphRecord, wish: Wish) -> None:
     """
-    Refuse, before any work is done, a graph that cannot be solved from a start (of `STARTS`).
+    Refuse, before any work is done, a graph that cannot be solved as wished.
 
     Raises
     ------
@@ -172,14 +215,15 @@ def require_start(record: GraphRecord, start: str) -> None:
 
     """
     require_connected(record)
-    if start == 'file' and record.poses is None:
+    if wish.start == 'file' and record.poses is None:
         raise GraphError('the input stores no poses to start from; expected --start seed or '
                          'odometry')
     gaps = odometry_gaps(record.graph)
-    if start == 'odometry' and len(gaps):
+    if len(gaps) and (wish.start == 'odometry' or wish.robust):
+        remedy = 'expected a graph without gaps' if wish.robust else 'expected --start seed'
         raise GraphError(f'no edge between the consecutive vertices {record.ids[gaps[0]]} and '
                          f'{record.ids[gaps[0] + 1]}, so no chain of odometry to start from; '
-                         'expected --start seed')
+                         f'{remedy}')
 
 
 def require_connected(record: GraphRecord) -> None:

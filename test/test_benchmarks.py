@@ -209,8 +209,13 @@ def test_ours_solves_a_case(solver):
     assert answer.seconds > 0 and answer.x.shape == (60, 3)
 
 
-def test_unknown_parts_are_refused(capsys):
-    assert solvers.parse(['--only', 'inner,growth']).only == ('inner', 'growth')
+def test_unknown_parts_and_missing_graphs_are_refused_before_any_work(capsys, tmp_path):
+    datasets = ['--datasets', str(tmp_path)]
+    assert solvers.parse(['--only', 'inner,growth', *datasets]).only == ('inner', 'growth')
+    assert solvers.parse(['--only', 'growth']).datasets is None
+    with pytest.raises(SystemExit):
+        solvers.parse(['--only', 'inner'])
+    assert 'expected --datasets' in capsys.readouterr().err
     with pytest.raises(SystemExit):
         solvers.parse(['--only', 'inner,speed'])
     assert "'speed' is none of inner, whole" in capsys.readouterr().err

@@ -14,7 +14,8 @@ from l1slam_ros.core.graph import BetweenFactors, FactorGraph, PriorFactors, com
 def between(i, j):
     """Return factors between the given keyframes that measure nothing in particular."""
     m = len(i)
-    return BetweenFactors(np.array(i), np.array(j), np.zeros((m, 3)), np.zeros((m, 3, 3)))
+    return BetweenFactors(np.array(i), np.array(j), np.zeros((m, 3)), np.zeros((m, 3, 3)),
+                          np.zeros(m, bool))
 
 
 def graph_with(n, pairs):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The interior-point method: linear problems against HiGHS, graphs near their map, its account."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -10,7 +12,7 @@ from systems import SHAPES, cholesky_of_system, random_system, system_of
 from l1slam_ros.core import se2
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.interior_point import GraphProblem, LinearProblem, interior_point
+from l1slam_ros.core.interior_point import GraphProblem, LinearProblem, interior_point, prove
 from l1slam_ros.core.kernels import interior_point as kernels
 from l1slam_ros.core.linearise import linearise, whitened_residual
 from l1slam_ros.core.optimality import Status, l1_cost
@@ -18,13 +20,28 @@ from l1slam_ros.core.optimality import Status, l1_cost
 TOLERANCE = 1e-8
 
 
+@dataclass
+class Proved:
+    """What a run ended with, and the proof of it."""
+
+    poses: np.ndarray
+    costs: list
+    y: np.ndarray
+    gap: float
+    status: Status
+
+
+def proved(problem, poses, cholesky, *limits):
+    optimum = interior_point(problem, poses, cholesky, *limits)
+    return Proved(optimum.poses, optimum.costs, *prove(optimum, cholesky))
+
+
 def solve_linear(system, x, iterations=60, tolerance=TOLERANCE):
-    return interior_point(LinearProblem(system), x, cholesky_of_system(system), iterations,
-                          tolerance)
+    return proved(LinearProblem(system), x, cholesky_of_system(system), iterations, tolerance)
 
 
 def solve_graph(graph, poses, iterations=100, tolerance=TOLERANCE):
-    return interior_point(GraphProblem(graph), poses, cholesky_of(graph), iterations, tolerance)
+    return proved(GraphProblem(graph), poses, cholesky_of(graph), iterations, tolerance)
 
 
 def cost_of(graph, poses):

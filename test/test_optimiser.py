@@ -214,7 +214,7 @@ def test_with_the_dual_returned_it_converges_at_once(world):
     first = solve(graph, truth, OptimiserOptions(outer_iterations=1000))
     again = solve(graph, first.poses, DEFAULTS, dual=first.dual)
     assert again.status in (Status.CONVERGED, Status.STALLED)
-    assert again.outer_iterations <= 3
+    assert again.outer_iterations <= 4
     assert first.cost - again.cost <= 2e-5 * first.cost
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from l1slam_ros.core.cholesky import BlockCholesky
 from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.interior_point import GraphProblem, interior_point
+from l1slam_ros.core.interior_point import GraphProblem, interior_point, prove
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.manifold import Array
@@ -46,5 +46,6 @@ def minimise_interior_point(
     if optimum.costs[-1] > start:
         optimum = interior_point(problem, poses, cholesky, steps, _TOLERANCE, report)
     history = np.minimum.accumulate([start, *optimum.costs])
-    return Solution(optimum.poses, optimum.costs[-1], optimum.status, len(history) - 1, 0,
-                    history, optimum.y, optimum.gap)
+    dual, gap, status = prove(optimum, cholesky)
+    return Solution(optimum.poses, optimum.costs[-1], status, len(history) - 1, 0, history, dual,
+                    gap)

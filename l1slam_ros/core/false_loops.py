@@ -60,7 +60,8 @@ def insert_loops(graph: FactorGraph, loops: Loops) -> FactorGraph:
     longer.add_between(
         np.insert(factors.i, place, loops.i), np.insert(factors.j, place, loops.j),
         np.insert(factors.measurement, place, loops.measurement, axis=0),
-        np.insert(_information(factors.sqrt_information), place, loops.information, axis=0))
+        np.insert(_information(factors.sqrt_information), place, loops.information, axis=0),
+        np.insert(factors.trusted, place, False))
     return longer
 
 
@@ -71,7 +72,7 @@ def without_factors(graph: FactorGraph, left_out: np.ndarray) -> FactorGraph:
     shorter.add_poses(graph.n_poses)
     shorter.add_prior(prior.i, prior.measurement, _information(prior.sqrt_information))
     shorter.add_between(factors.i[kept], factors.j[kept], factors.measurement[kept],
-                        _information(factors.sqrt_information[kept]))
+                        _information(factors.sqrt_information[kept]), factors.trusted[kept])
     return shorter
 
 

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.growing import GrowingArray
 from l1slam_ros.core.manifold import Array, Indices, Manifold
-from l1slam_ros.core.noise import square_root_information
+from l1slam_ros.core.noise import Mask, square_root_information
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,15 @@ class BetweenFactors:
     Measurements of the pose of keyframe j seen from keyframe i.
 
     i, j : (m,) keyframe indices; measurement : (m, p) relative poses;
-    sqrt_information : (m, d, d) upper triangular roots, see `noise`.
+    sqrt_information : (m, d, d) upper triangular roots, see `noise`; trusted : (m,) bool, a person
+    or a marker vouches for it.
     """
 
     i: Indices
     j: Indices
     measurement: Array
     sqrt_information: Array
+    trusted: Mask
 
     def __len__(self) -> int:
         return len(self.i)
@@ -78,7 +80,7 @@ class FactorGraph:
         self.n_poses = 0
         p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
         self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
-                         GrowingArray((p,)), GrowingArray((d, d))]
+                         GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_)]
         self._prior = [GrowingArray((), np.int64), GrowingArray((p,)), GrowingArray((d, d))]
 
     def copy(self) -> 'FactorGraph':
@@ -103,9 +105,12 @@ class FactorGraph:
         """Let `count` more keyframes exist; the next index is `n_poses` before the call."""
         self.n_poses += count
 
-    def add_between(self, i: Indices, j: Indices, measurement: Array, information: Array) -> None:
+    def add_between(
+        self, i: Indices, j: Indices, measurement: Array, information: Array,
+        trusted: Mask | bool = False,
+    ) -> None:
         """
-        Append between factors: i, j (m,), measurement (m, p), information (m, d, d).
+        Append between factors: i, j (m,), measurement (m, p), information (m, d, d), trusted (m,).
 
         Raises
         ------
@@ -120,7 +125,8 @@ class FactorGraph:
         if (i == j).any():
             raise GraphError(f'keyframe {i[np.argmax(i == j)]} has a factor to itself')
         self._check(np.concatenate((i, j)), measurement)
-        self._append(self._between, (i, j, measurement, square_root_information(information)))
+        self._append(self._between, (i, j, measurement, square_root_information(information),
+                                    np.broadcast_to(trusted, len(i))))
 
     def add_prior(self, i: Indices, measurement: Array, information: Array) -> None:
         """Append prior factors: i (m,), measurement (m, p), information (m, d, d); as above."""

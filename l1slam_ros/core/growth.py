@@ -193,7 +193,8 @@ class GraphGrowth:
         covariance = Ad @ self._covariances(loops) @ Ad.transpose(0, 2, 1)
         # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
         covariance = self._or_model(covariance, usable(covariance))
-        self.graph.add_between(i, j, measurement, information_from_covariance(covariance))
+        self.graph.add_between(i, j, measurement, information_from_covariance(covariance),
+                               np.array([loop.trusted for loop in loops]))
         return len(loops)
 
     def _covariances(self, loops: list[LoopClosure]) -> Array:

@@ -205,6 +205,7 @@ class _Run:
         self._set_origin()
         self._y[:] = self._y0[:] = self._y_bar
         self._g[:] = self._g_bar
+        self._x_bar[:] = 0  # the origin is the candidate now
 
     def candidate(self) -> tuple[Array, Array]:
         """Return x (columns,) and y (rows,) as of the last look."""

@@ -54,8 +54,8 @@ _CURVATURE, _RECOVERY = 0.7, 1.3
 _DAMPING_PIVOT, _DAMPING_STEP = 0.1, 3.0
 _DAMPING_FACTOR = 10.0
 # Of the dual at the end: most projections to make it feasible (each costs a solution, none a
-# factorisation), and when it is so.
-_PROJECTIONS, _FEASIBLE = 10, 1 + 1e-6
+# factorisation), and the part of the cost that is a gap small enough.
+_PROJECTIONS, _CLOSE = 10, 1e-4
 # A row at its bound still gives way a little, or there might be no feasible dual nearby.
 _LEAST_WEIGHT = 1e-9
 
@@ -124,22 +124,6 @@ class LinearProblem:
         """See `Problem`."""
 
 
-@dataclass(frozen=True)
-class Optimum:
-    """
-    What a run ended with: the best poses met, never worse than the start.
-
-    costs : (steps + 1,) the lowest so far; y : (rows,) a dual with A'y = 0, |y| <= 1; gap : by how
-    much a step of the linear problem at the poses could lower their cost at most.
-    """
-
-    poses: Array
-    costs: list[float]
-    status: Status
-    y: Array
-    gap: float
-
-
 @dataclass
 class _Iterate:
     """Poses and their linearisation; the splitting u, v of the residual, slacks s, t, dual y."""
@@ -175,6 +159,21 @@ class _Iterate:
     def is_solved(self, cost: float, tolerance: float) -> bool:
         split = l1_cost(self.residual - self.u + self.v)
         return split <= tolerance * cost and self.gap <= tolerance * cost
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """
+    What a run ended with: the best poses met, never worse than the start.
+
+    costs : (steps + 1,) the lowest so far; ends : the best iterate, and the last one's dual where
+    that is another, for `prove`.
+    """
+
+    poses: Array
+    costs: list[float]
+    status: Status
+    ends: list[_Iterate]
 
 
 @dataclass(frozen=True)
@@ -242,8 +241,7 @@ def interior_point(
         if at.is_solved(cost, tolerance) or fits_exactly(cost, len(at.y)):
             status = Status.CONVERGED if cost <= worst * costs[-1] else Status.STALLED
         if cost <= costs[-1]:
-            best = replace(at, u=at.u.copy(), v=at.v.copy(), s=at.s.copy(), t=at.t.copy(),
-                           y=at.y.copy())
+            best = replace(at, s=at.s.copy(), t=at.t.copy(), y=at.y.copy())
         if iteration:
             costs.append(min(cost, costs[-1]))
             report(iteration, costs[-1])
@@ -252,38 +250,44 @@ def interior_point(
         if not _step(problem, at, cholesky, regularisation):
             status = Status.STALLED
             break
-    # The last dual is the better one, unless the poses moved on from the best ones.
-    lasts = [best] if best.system is at.system else [best, replace(at, system=best.system)]
-    duals = [_feasible_dual(last, cholesky) for last in lasts]
-    gaps = [max(costs[-1] - float((y * best.residual).sum()), 0.0) for y in duals]
-    y, gap = duals[int(np.argmin(gaps))], min(gaps)
-    if status is Status.CONVERGED and _is_unproven(gap, costs[-1], len(y)):
-        status = Status.STALLED
-    return Optimum(best.poses, costs, status, y, gap)
+    ends = [best] if best.system is at.system else [best, replace(at, system=best.system)]
+    return Optimum(best.poses, costs, status, ends)
 
 
-def _is_unproven(gap: float, cost: float, rows: int) -> bool:
-    return gap > _PROVEN * cost and not fits_exactly(cost, rows)
-
-
-def _feasible_dual(at: _Iterate, cholesky: BlockCholesky) -> Array:
+def prove(optimum: Optimum, cholesky: BlockCholesky) -> tuple[Array, float, Status]:
     """
-    Return a dual near y with A'y = 0, |y| <= 1.
+    Return a dual y (rows,) with A'y = 0, |y| <= 1, what it proves, and what that makes of the status.
+
+    No step of the linear problem at the poses can lower their cost by more than the second number,
+    |b|_1 + b'y. A run that came to rest where one might lower it by a percent has not converged.
+    """
+    cost = optimum.costs[-1]
+    y, gap = min((_feasible_dual(end, cost, cholesky) for end in optimum.ends),
+                 key=lambda proof: proof[1])
+    unproven = gap > _PROVEN * cost and not fits_exactly(cost, len(y))
+    stalls = unproven and optimum.status is Status.CONVERGED
+    return y, gap, Status.STALLED if stalls else optimum.status
+
+
+def _feasible_dual(at: _Iterate, cost: float, cholesky: BlockCholesky) -> tuple[Array, float]:
+    """
+    Return a dual near y with A'y = 0, |y| <= 1, and by how much the cost exceeds its value.
 
     By turns projected on the one, along the slack each row has left, and clipped to the other; at
     the end shrunk by what is missing.
     """
     slack = np.maximum(np.minimum(at.s, at.t), _LEAST_WEIGHT)
     if not cholesky.factorise(at.system, slack):
-        return np.zeros_like(at.y)
+        return np.zeros_like(at.y), cost
     y = at.y
     for _ in range(_PROJECTIONS):
         x = cholesky.solve(at.system.transposed_times(np.clip(y, -1, 1)))
         y = np.clip(y, -1, 1) - slack * at.system.times(x)
-        largest = float(np.abs(y).max(initial=0.0))
-        if largest <= _FEASIBLE:
+        feasible = y / max(1.0, float(np.abs(y).max(initial=0.0)))
+        gap = max(cost - float((feasible * at.residual).sum()), 0.0)
+        if gap <= _CLOSE * cost:
             break
-    return y / max(1.0, largest)
+    return feasible, gap
 
 
 def _start(problem: Problem, poses: Array) -> _Iterate:

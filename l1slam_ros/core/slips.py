@@ -49,15 +49,53 @@ def without_slip(growth: Growth) -> Growth | None:
 
 def _without_worst(growth: Growth) -> Indices:
     """Leave out the odometry factor that all others speak against; return who agrees, (k,)."""
-    inside = np.flatnonzero(growth.accepted)
+    inside, factors = np.flatnonzero(growth.accepted), growth.factors
     against = np.where(growth.is_loop[inside], 0.0, growth.posterior.left_out())
     k = growth.graph.manifold.TANGENT_SIZE
     if against.max() < chi2_quantile(1 - DOUBT / len(inside), k):
         return np.zeros(0, np.int64)
-    growth.accepted[inside[np.argmax(against)]] = False
-    rows = growth.undecided()
+    worst = int(inside[np.argmax(against)])
+    # Those between which no believed loop ends share what speaks against them.
+    suspects = _run_about(worst, np.minimum(factors.i, factors.j), inside[against > against.max() / 2])
+    growth.accepted[worst] = False
     growth.settle()
-    return growth.believable(rows[growth.is_loop[rows]])
+    rows = growth.undecided()
+    rows = rows[growth.is_loop[rows]]
+    low, high = np.minimum(factors.i, factors.j), np.maximum(factors.i, factors.j)
+    first, last = low[suspects].min(), low[suspects].max()
+    ends = ((low[rows] > first) & (low[rows] <= last)) | ((high[rows] > first) & (high[rows] <= last))
+    jury = _some(growth, rows[ends], _JURY)
+    places = {int(factor): _slipped_elsewhere(growth, worst, int(low[factor])) for factor in suspects}
+    factor = max(places, key=lambda factor: _support(growth, jury, places[factor]).sum())
+    growth.accepted[worst], growth.accepted[factor] = True, False
+    growth.poses = places[factor]
+    growth.settle()
+    return growth.believable(rows)
+
+
+def _run_about(worst: int, low: Indices, suspects: Indices) -> Indices:
+    """Return those of some odometry factors that follow one another up to the worst and on."""
+    suspects = suspects[np.argsort(low[suspects])]
+    runs = np.cumsum(np.diff(low[suspects], prepend=-1) > 1)
+    run: Indices = suspects[runs == runs[suspects == worst]]
+    return run
+
+
+def _slipped_elsewhere(growth: Growth, worst: int, step: int) -> Array:
+    """Return the poses if the odometry did not slip at the factor `worst` but at another step."""
+    manifold, factors, poses = growth.graph.manifold, growth.factors, growth.poses
+    i, j = factors.i[worst], factors.j[worst]
+    measurement = factors.measurement[worst][None]
+    if i > j:
+        i, j, measurement = j, i, manifold.inverse(measurement)
+    ahead = manifold.compose(poses[i][None], measurement)
+    if step < i:
+        part, motion = slice(step + 1, j), manifold.compose(poses[j][None], manifold.inverse(ahead))
+    else:
+        part, motion = slice(j, step + 1), manifold.compose(ahead, manifold.inverse(poses[j][None]))
+    moved = poses.copy()
+    moved[part] = manifold.compose(np.broadcast_to(motion, poses[part].shape), poses[part])
+    return moved
 
 
 def _mended(growth: Growth) -> Indices:
@@ -75,13 +113,14 @@ def _mended(growth: Growth) -> Indices:
     affected &= ~growth.accepted
     jury = _some(growth, np.flatnonzero(affected), _JURY)
     proposals = _some(growth, agreed, _PROPOSALS).tolist()
-    loop, _ = _most_votes(growth, jury, [(loop, int(steps[0])) for loop in proposals])
+    loop, _ = _most_support(growth, jury, [(loop, int(steps[0])) for loop in proposals])
     # Where exactly it is, only those tell that span some of the steps.
-    jury = np.flatnonzero(affected & ((low > steps[0]) | (high <= steps[-1])))
-    loop, step = _most_votes(growth, jury, [(loop, step) for step in steps.tolist()])
+    jury = _some(growth, np.flatnonzero(affected & ((low > steps[0]) | (high <= steps[-1]))), _JURY)
+    loop, step = _most_support(growth, jury, [(loop, step) for step in steps.tolist()])
     growth.poses = mended(growth.graph, growth.poses, loop, step)
     growth.accepted &= growth.is_loop | (low != step)
-    return _votes(growth, np.flatnonzero(affected), growth.poses)
+    rows = np.flatnonzero(affected)
+    return rows[_support(growth, rows, growth.poses) > 0]
 
 
 def _accord(growth: Growth) -> Indices:
@@ -106,18 +145,18 @@ def _some(growth: Growth, rows: Indices, count: int) -> Indices:
     return chosen
 
 
-def _most_votes(
+def _most_support(
     growth: Growth, jury: Indices, proposals: list[tuple[int, int]]
 ) -> tuple[int, int]:
-    """Return the loop and the step after which most of a jury fit, see `mended`."""
-    return max(proposals, key=lambda proposal: len(
-        _votes(growth, jury, mended(growth.graph, growth.poses, *proposal))))
+    """Return the loop and the step after which a jury fits best, see `mended`."""
+    return max(proposals, key=lambda proposal: _support(
+        growth, jury, mended(growth.graph, growth.poses, *proposal)).sum())
 
 
-def _votes(growth: Growth, rows: Indices, poses: Array) -> Indices:
-    """Return the factors that may be believed at mended poses, (k,)."""
+def _support(growth: Growth, rows: Indices, poses: Array) -> Array:
+    """Return the log odds of factors to be true at mended poses, 0 for those not believed, (k,)."""
     if not len(rows):
-        return rows
+        return np.zeros(0)
     graph = growth.part(rows)
     volume = claimed_volume(graph.manifold, poses, np.random.default_rng(0))
     found = innovations(graph, poses, growth.posterior, volume)
@@ -125,8 +164,7 @@ def _votes(growth: Growth, rows: Indices, poses: Array) -> Indices:
     fits = found.square < 2 * growth.gate()
     log_ratio = found.log_ratio(2.0)
     odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)))
-    votes: Indices = rows[fits & (log_ratio > odds + np.log(1 / DOUBT - 1))]
-    return votes
+    return np.where(fits & (log_ratio > odds + np.log(1 / DOUBT - 1)), log_ratio - odds, 0.0)
 
 
 def spanned(i: Indices, j: Indices, n: int) -> Indices:

@@ -31,7 +31,8 @@ class SubGraph(FactorGraph):
         self._prior = graph._prior
         self._chosen = BetweenFactors(
             factors.i[rows], factors.j[rows], factors.measurement[rows],
-            factors.sqrt_information[rows] / np.sqrt(variance)[:, None, None])
+            factors.sqrt_information[rows] / np.sqrt(variance)[:, None, None],
+            factors.trusted[rows])
 
     @property
     def between(self) -> BetweenFactors:

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A robust map in the norm that was asked for.
+
+In: a graph and a solver. Out: the solver's map of the loops that may be believed, and which these
+are. The loops are chosen by a robust solve, in L2; then map and choice follow each other until
+nothing changes.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.manifold import Array, Indices
+from l1slam_ros.core.noise import Mask
+from l1slam_ros.core.optimiser import Solution
+from l1slam_ros.core.robust import Report, minimise_accepted, reconsidered, robust_solve
+from l1slam_ros.core.subgraph import SubGraph
+
+# Measured: one or two until the choice stands; this ends one that swings.
+_MOST_ROUNDS = 10
+
+
+@dataclass(frozen=True)
+class RobustMap:
+    """
+    The map of the believed factors, and the judgement on all.
+
+    seed : (n, p) the L2 map it began with; accepted : (m,) bool of the between factors; suspect :
+    (m,) bool, loops that are not accepted though they fit: nothing vouches for them; sigmas : (m,)
+    how far off each factor is, see `RobustSolution`; slips : (k,) odometry factors that lie.
+    """
+
+    solution: Solution
+    seed: Array
+    accepted: Mask
+    suspect: Mask
+    sigmas: Array
+    slips: Indices
+
+
+def accepted_graph(graph: FactorGraph, accepted: Mask) -> SubGraph:
+    """Return the graph of the accepted between factors, accepted : (m,) bool."""
+    return SubGraph(graph, np.flatnonzero(accepted), np.ones(np.count_nonzero(accepted)))
+
+
+def minimise_robustly(
+    graph: FactorGraph, minimise: Callable[[FactorGraph, Array], Solution],
+    report: Report = lambda round_, accepted: None,
+) -> RobustMap:
+    """
+    Return the map that `minimise` makes of the factors that may be believed.
+
+    minimise : from a graph and poses (n, p) to its solution; report : see `robust_solve`
+    """
+    trusted = graph.between.trusted
+    found = robust_solve(graph, trusted, report)
+    accepted = found.accepted
+    seed = poses = minimise_accepted(graph, found.poses, accepted)
+    for _ in range(_MOST_ROUNDS):
+        solution = minimise(accepted_graph(graph, accepted), poses)
+        poses, before = solution.poses, accepted
+        accepted = reconsidered(graph, poses, before, trusted)
+        if (accepted == before).all():
+            break
+    return RobustMap(solution, seed, before, found.suspect & ~before, found.sigmas, found.slips)
