@@ -3,8 +3,8 @@
 Maps that survive lies: which loops to believe, by growing outward from the odometry.
 
 In: a graph, of which nothing is believed but the odometry and the trusted loops. Out: the loops
-that are believed, and the L2 map of these. No loop is factored before it is believed, so none bends
-what it is judged by. Each round
+that are believed, and the L2 map of these. No loop is factored before it is believed, so none
+bends what it is judged by. Each round
 
 1. predicts every undecided loop with its covariance (`prediction`),
 2. accepts those that hardly can be false (`belief`), the share of false ones being what the loops
@@ -13,9 +13,10 @@ what it is judged by. Each round
    factor lies (`slips`),
 3. solves for all that is accepted, and drops the loops that all others speak against.
 
-What fits where it stands, but could as well be chance, stays suspect. The noise of odometry and of
-loops is measured on the way: files are often off by a constant. Source: ours, defended by
-`test_robust.py`.
+The noise of odometry and of loops is measured on the way: files are often off by a constant. In the
+last rounds factors may be as noisy as they say, so that none is refused for being worse than its
+like. What fits where it stands, but could as well be chance, stays suspect. Source: ours, defended
+by `test_robust.py`.
 """
 
 from collections.abc import Callable
@@ -90,10 +91,13 @@ def robust_solve(
         news = growth.believable(growth.undecided())
         growth.accepted[news] = True
         if not len(news):
+            if growth.takes_at_their_word:
+                break
             repaired = without_slip(growth)
             if repaired is None:
-                break
-            growth = repaired
+                growth.take_at_their_word()
+            else:
+                growth = repaired
         growth.settle()
         rounds += 1
         report(rounds, int(np.count_nonzero(growth.accepted & growth.is_loop)))

@@ -57,17 +57,21 @@ class Growth:
     """
     The state of a robust solve.
 
-    accepted, is_loop, trusted : (m,) bool of the between factors; poses : (n, p) the L2 map of the
+    accepted, is_loop, trusted : (m,) bool of the between factors; low, high : (m,) the earlier and
+    the later keyframe of each; poses : (n, p) the L2 map of the
     accepted; posterior : of these; variance : (2,) of odometry and loops in units of what they
     state.
     """
 
     def __init__(self, graph: FactorGraph, trusted: Mask, rng: np.random.Generator):
         self.graph, self.factors, self.trusted, self.rng = graph, graph.between, trusted, rng
+        self.low = np.minimum(self.factors.i, self.factors.j)
+        self.high = np.maximum(self.factors.i, self.factors.j)
         self.is_loop: Mask = ~self.factors.is_odometry
         self.accepted: Mask = ~self.is_loop | trusted
         self.poses = odometry_poses(graph)
         self.variance = np.ones(2)
+        self._least_variance = 0.0
         self.posterior: Posterior
         self._drops = np.zeros(len(self.factors), np.int64)
         self.settle()
@@ -84,11 +88,23 @@ class Growth:
 
     def part(self, rows: Indices) -> SubGraph:
         """Return the graph of some factors, with the noise as it was found."""
-        return SubGraph(self.graph, rows, self.variance[self.is_loop[rows].astype(np.int64)])
+        variance = np.maximum(self.variance, self._least_variance)
+        return SubGraph(self.graph, rows, variance[self.is_loop[rows].astype(np.int64)])
+
+    def take_at_their_word(self) -> None:
+        """From now on let factors be as noisy as they say, if they are not noisier."""
+        self._least_variance = 1.0
+        self._drops[:] = 0
+
+    @property
+    def takes_at_their_word(self) -> bool:
+        """Whether `take_at_their_word` was called."""
+        return self._least_variance > 0
 
     def undecided(self) -> Indices:
         """Return the factors that may yet be accepted, (k,)."""
-        return np.flatnonzero(~self.accepted & (self._drops < _CHANCES))
+        undecided: Indices = np.flatnonzero(~self.accepted & (self._drops < _CHANCES))
+        return undecided
 
     def gate(self, factors: int = 1) -> float:
         """Return what the squared innovation of so many true factors stays below."""
@@ -122,7 +138,8 @@ class Growth:
         against = np.where(may_go, self.posterior.left_out(), 0.0)
         # Next to a false loop the true ones look bad too: only the worst go.
         far |= against > max(self.doubted(), against.max(initial=0.0) / 2)
-        return rows[far & may_go]
+        misfits: Indices = rows[far & may_go]
+        return misfits
 
     def doubted(self) -> float:
         """Return what `Posterior.left_out` of no factor exceeds if all accepted ones are true."""
@@ -134,7 +151,8 @@ class Growth:
         kind, known = self.is_loop[rows], _KNOWN * self.graph.manifold.TANGENT_SIZE
         found = np.bincount(kind, (self.posterior.residual**2).sum(axis=1), 2)
         stated = np.bincount(kind, np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
-        self.variance = self.variance * (found + known) / (stated + known)
+        used = np.maximum(self.variance, self._least_variance)
+        self.variance = used * (found + known) / (stated + known)
 
     def innovations(self, rows: Indices) -> Innovations:
         """Return how factors that are not accepted fit the map."""
@@ -159,11 +177,11 @@ class Growth:
     def _pairs(self, found: Innovations, rows: Indices, best: Indices, odds: float) -> Indices:
         """Return those of the best that vouch for each other, far from each other, (k,)."""
         a, b = (best[side] for side in np.triu_indices(len(best), 1))
-        i, j = self.factors.i[rows], self.factors.j[rows]
-        apart = np.abs(i[a] - i[b]) + np.abs(j[a] - j[b]) > _APART
+        low, high = self.low[rows], self.high[rows]
+        apart = np.abs(low[a] - low[b]) + np.abs(high[a] - high[b]) > _APART
         a, b = a[apart], b[apart]
         if not len(a):
-            return a
+            return rows[:0]
         square, log_ratio = found.joint(self.posterior, a, b)
         # To both being false by chance, the second one being so is as likely as the first.
         sure = log_ratio > np.log(1 / DOUBT - 1) + odds + max(odds, 0.0)
@@ -173,7 +191,7 @@ class Growth:
 
     def groups(self, rows: Indices) -> int:
         """Return how many votes factors have: one for each group of them."""
-        return len(one_of_each_group(self.factors.i[rows], self.factors.j[rows], _APART))
+        return len(one_of_each_group(self.low[rows], self.high[rows], _APART))
 
 
 def solve(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:

@@ -3,8 +3,8 @@
 A robust map in the norm that was asked for.
 
 In: a graph and a solver. Out: the solver's map of the loops that may be believed, and which these
-are. The loops are chosen by a robust solve, in L2; then map and choice follow each other until
-nothing changes.
+are. The loops are chosen in L2, which spreads a doubt over all factors near it, where L1 leaves it on
+a few; L2 map and choice follow each other until nothing changes.
 """
 
 from collections.abc import Callable
@@ -57,12 +57,11 @@ def minimise_robustly(
     """
     trusted = graph.between.trusted
     found = robust_solve(graph, trusted, report)
-    accepted = found.accepted
-    seed = poses = minimise_accepted(graph, found.poses, accepted)
+    accepted, poses = found.accepted, found.poses
     for _ in range(_MOST_ROUNDS):
-        solution = minimise(accepted_graph(graph, accepted), poses)
-        poses, before = solution.poses, accepted
+        poses, before = minimise_accepted(graph, poses, accepted), accepted
         accepted = reconsidered(graph, poses, before, trusted)
         if (accepted == before).all():
             break
-    return RobustMap(solution, seed, before, found.suspect & ~before, found.sigmas, found.slips)
+    solution = minimise(accepted_graph(graph, before), poses)
+    return RobustMap(solution, poses, before, found.suspect & ~before, found.sigmas, found.slips)

@@ -5,9 +5,9 @@ Odometry that lies: found by what the loops across a slip have in common.
 In: a robust solve in which nothing more can be believed. Out: one in which an odometry factor is
 left out, and the loops that were refused because of it are accepted.
 
-A slip that believed loops span makes all others speak against it. Where none does, the two sides
-of it are pieces of their own; every true loop across is refused, but from one of them, and from how
-its ends lie to those of another, follows the other one.
+Where believed loops span a slip, they speak against it. Where none does, the two sides of it are
+pieces of their own; every true loop across is refused, but from one of them, and from how its ends
+lie to those of another, follows the other one.
 """
 
 import numpy as np
@@ -49,28 +49,32 @@ def without_slip(growth: Growth) -> Growth | None:
 
 def _without_worst(growth: Growth) -> Indices:
     """Leave out the odometry factor that all others speak against; return who agrees, (k,)."""
-    inside, factors = np.flatnonzero(growth.accepted), growth.factors
+    inside = np.flatnonzero(growth.accepted)
     against = np.where(growth.is_loop[inside], 0.0, growth.posterior.left_out())
     k = growth.graph.manifold.TANGENT_SIZE
     if against.max() < chi2_quantile(1 - DOUBT / len(inside), k):
         return np.zeros(0, np.int64)
     worst = int(inside[np.argmax(against)])
-    # Those between which no believed loop ends share what speaks against them.
-    suspects = _run_about(worst, np.minimum(factors.i, factors.j), inside[against > against.max() / 2])
     growth.accepted[worst] = False
     growth.settle()
     rows = growth.undecided()
     rows = rows[growth.is_loop[rows]]
-    low, high = np.minimum(factors.i, factors.j), np.maximum(factors.i, factors.j)
-    first, last = low[suspects].min(), low[suspects].max()
-    ends = ((low[rows] > first) & (low[rows] <= last)) | ((high[rows] > first) & (high[rows] <= last))
-    jury = _some(growth, rows[ends], _JURY)
-    places = {int(factor): _slipped_elsewhere(growth, worst, int(low[factor])) for factor in suspects}
-    factor = max(places, key=lambda factor: _support(growth, jury, places[factor]).sum())
-    growth.accepted[worst], growth.accepted[factor] = True, False
-    growth.poses = places[factor]
+    # Steps between which no believed loop ends share what speaks against them.
+    run = _run_about(worst, growth.low, inside[against > against.max() / 2])
+    slipped = _best_place(growth, worst, run, rows)
+    growth.accepted[worst], growth.accepted[slipped] = True, False
+    growth.poses = _slipped_elsewhere(growth, worst, int(growth.low[slipped]))
     growth.settle()
     return growth.believable(rows)
+
+
+def _best_place(growth: Growth, worst: int, run: Indices, rows: Indices) -> int:
+    """Return at which of a run of odometry factors the refused loops that end there fit best."""
+    first, last, ends = growth.low[run[0]], growth.low[run[-1]], (growth.low, growth.high)
+    inside = np.any([(end[rows] > first) & (end[rows] <= last) for end in ends], axis=0)
+    jury = _some(growth, rows[inside], _JURY)
+    return int(max(run, key=lambda factor: _support(
+        growth, jury, _slipped_elsewhere(growth, worst, int(growth.low[factor]))).sum()))
 
 
 def _run_about(worst: int, low: Indices, suspects: Indices) -> Indices:
@@ -89,10 +93,10 @@ def _slipped_elsewhere(growth: Growth, worst: int, step: int) -> Array:
     if i > j:
         i, j, measurement = j, i, manifold.inverse(measurement)
     ahead = manifold.compose(poses[i][None], measurement)
+    motion = manifold.compose(ahead, manifold.inverse(poses[j][None]))
+    part = slice(j, step + 1)
     if step < i:
-        part, motion = slice(step + 1, j), manifold.compose(poses[j][None], manifold.inverse(ahead))
-    else:
-        part, motion = slice(j, step + 1), manifold.compose(ahead, manifold.inverse(poses[j][None]))
+        motion, part = manifold.inverse(motion), slice(step + 1, j)
     moved = poses.copy()
     moved[part] = manifold.compose(np.broadcast_to(motion, poses[part].shape), poses[part])
     return moved
@@ -103,10 +107,9 @@ def _mended(growth: Growth) -> Indices:
     agreed = _accord(growth)
     if growth.groups(agreed) < _VOTES:
         return agreed
-    factors = growth.factors
-    across = spanned(factors.i[agreed], factors.j[agreed], growth.graph.n_poses)
+    low, high = growth.low, growth.high
+    across = spanned(low[agreed], high[agreed], growth.graph.n_poses)
     steps = np.flatnonzero(across == across.max())
-    low, high = np.minimum(factors.i, factors.j), np.maximum(factors.i, factors.j)
     affected = growth.is_loop & (low <= steps[-1]) & (high > steps[0])
     growth.accepted &= ~affected | growth.trusted
     growth.settle()
@@ -115,7 +118,8 @@ def _mended(growth: Growth) -> Indices:
     proposals = _some(growth, agreed, _PROPOSALS).tolist()
     loop, _ = _most_support(growth, jury, [(loop, int(steps[0])) for loop in proposals])
     # Where exactly it is, only those tell that span some of the steps.
-    jury = _some(growth, np.flatnonzero(affected & ((low > steps[0]) | (high <= steps[-1]))), _JURY)
+    telling = affected & ((low > steps[0]) | (high <= steps[-1]))
+    jury = _some(growth, np.flatnonzero(telling), _JURY)
     loop, step = _most_support(growth, jury, [(loop, step) for step in steps.tolist()])
     growth.poses = mended(growth.graph, growth.poses, loop, step)
     growth.accepted &= growth.is_loop | (low != step)
@@ -154,7 +158,7 @@ def _most_support(
 
 
 def _support(growth: Growth, rows: Indices, poses: Array) -> Array:
-    """Return the log odds of factors to be true at mended poses, 0 for those not believed, (k,)."""
+    """Return the log odds of factors to be true at mended poses, 0 where not believed, (k,)."""
     if not len(rows):
         return np.zeros(0)
     graph = growth.part(rows)
@@ -167,11 +171,11 @@ def _support(growth: Growth, rows: Indices, poses: Array) -> Array:
     return np.where(fits & (log_ratio > odds + np.log(1 / DOUBT - 1)), log_ratio - odds, 0.0)
 
 
-def spanned(i: Indices, j: Indices, n: int) -> Indices:
-    """Return how many of the factors (i, j) span the step from each of n keyframes, (n - 1,)."""
+def spanned(low: Indices, high: Indices, n: int) -> Indices:
+    """Return how many factors span the step from each of n keyframes to the next, (n - 1,)."""
     change = np.zeros(n, np.int64)
-    np.add.at(change, np.minimum(i, j), 1)
-    np.add.at(change, np.maximum(i, j), -1)
+    np.add.at(change, low, 1)
+    np.add.at(change, high, -1)
     count: Indices = np.cumsum(change)[:-1]
     return count
 
@@ -194,7 +198,7 @@ def agreement(
     least: float,
 ) -> tuple[Indices, Indices]:
     """
-    Return the pairs of between factors of a graph that agree, each both ways round, (pairs,) twice.
+    Return the pairs of between factors of a graph that agree, each both ways round, two (pairs,).
 
     From the one factor follows the other, if the map is right about how their first ends lie to
     each other, and their second ends; whatever it says of the factors themselves.
