@@ -23,6 +23,7 @@ from l1slam_ros.io.graph_file import GraphRecord
 from l1slam_ros.io.side_files import false_loop_lines, false_loops_path, truth_path
 from l1slam_ros.node_options import read_params_file
 from l1slam_ros.progress import Progress
+from l1slam_ros.verdict import verdict
 
 
 def solve(arguments: argparse.Namespace) -> str:
@@ -49,6 +50,8 @@ def solve(arguments: argparse.Namespace) -> str:
         print(json.dumps(report))
     elif not arguments.quiet:
         _print_report(report, arguments.norm, SENTENCES[outcome.solution.status], outcome.reason)
+        if outcome.judgement:
+            print('\n'.join(verdict(record, outcome.judgement)))
     return record.damage
 
 
@@ -128,8 +131,9 @@ def _plot_solution(arguments: argparse.Namespace, record: GraphRecord,
     from l1slam_ros.io.plot import plot_solution
 
     note = f'{arguments.norm} cost {outcome.solution.cost:.6g}'
+    accepted = outcome.judgement.accepted if outcome.judgement else None
     plot_solution(arguments.plot, drawing(arguments.input, record, outcome.solution.poses,
-                                          arguments.reference, 'optimised', note),
+                                          arguments.reference, 'optimised', note, accepted),
                   cost_curve(arguments.norm, outcome))
 
 

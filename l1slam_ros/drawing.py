@@ -9,6 +9,7 @@ from l1slam_ros.core.errors import FileError, GraphError
 from l1slam_ros.core.initial import odometry_poses, pair_key
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.metrics import align
+from l1slam_ros.core.noise import Mask
 from l1slam_ros.io.graph_file import GraphRecord
 from l1slam_ros.io.plot import Curve, MapDrawing
 from l1slam_ros.io.side_files import false_loops_path, read_false_loops
@@ -16,13 +17,14 @@ from l1slam_ros.offline import Outcome, matching_rows
 
 
 def drawing(path: Path, record: GraphRecord, poses: Array, truth_path: Path | None,
-            name: str, note: str = '') -> MapDrawing:
+            name: str, note: str = '', accepted: Mask | None = None) -> MapDrawing:
     """
     Return the map of poses (n, p), with its odometry and, from a file, the truth.
 
     name : what the poses are. The odometry sets out from the first of them; the truth is moved
     onto them by rigid alignment, as for the position error. Loops that the file of false loops
-    beside the input `path` names are drawn as such.
+    beside the input `path` names are drawn as such, those that are not accepted, (m,) bool, as
+    rejected.
     """
     graph = record.graph
     factors, positions = graph.between, graph.manifold.positions
@@ -38,9 +40,10 @@ def drawing(path: Path, record: GraphRecord, poses: Array, truth_path: Path | No
         R, t = align(positions(reference), positions(poses)[ours])
         truth = positions(reference) @ R.T + t
     pairs, false = np.stack((factors.i, factors.j), axis=1), known_false(path, record)
+    kept = np.ones(len(factors), bool) if accepted is None else accepted
     return MapDrawing(path.name, positions(poses), odometry, truth,
-                      pairs[~factors.is_odometry & ~false], false=pairs[false], name=name,
-                      note=note)
+                      pairs[~factors.is_odometry & ~false & kept], rejected=pairs[~kept],
+                      false=pairs[false & kept], name=name, note=note)
 
 
 def known_false(path: Path, record: GraphRecord) -> np.ndarray:

@@ -13,10 +13,10 @@ bends what it is judged by. Each round
    factor lies (`slips`),
 3. solves for all that is accepted, and drops the loops that all others speak against.
 
-The noise of odometry and of loops is measured on the way: files are often off by a constant. In the
-last rounds factors may be as noisy as they say, so that none is refused for being worse than its
-like. What fits where it stands, but could as well be chance, stays suspect. Source: ours, defended
-by `test_robust.py`.
+The noise of odometry and of loops is measured on the way: files are often off by a constant. In
+the last rounds factors may be as noisy as they say, so that none is refused for being worse than
+its like. What fits where it stands, but could as well be chance, stays suspect. Source: ours,
+defended by `test_robust.py`.
 """
 
 from collections.abc import Callable
@@ -47,10 +47,10 @@ class RobustSolution:
 
     poses : (n, p) the L2 map of the accepted factors; accepted : (m,) bool of the between factors;
     suspect : (m,) bool, loops that fit but could as well be chance; sigmas : (m,) how far off each
-    factor is, in units of the noise as it was found: the length of the residual, and where it is
-    not accepted, of that over the uncertainty of the map; slips : (k,) the odometry factors that
-    lie, not accepted; variance : (2,) of odometry and of loops, in units of what they state;
-    rounds : how many it took.
+    factor is, in units of its noise, as stated or larger if it was found so: the length of the
+    residual, and where it is not accepted, of that over the uncertainty of the map; slips : (k,)
+    the odometry factors that lie, not accepted; variance : (2,) of odometry and of loops as it was
+    found, in units of what they state; rounds : how many it took.
     """
 
     poses: Array

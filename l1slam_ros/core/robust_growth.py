@@ -123,7 +123,8 @@ class Growth:
             drop = self._misfits(rows)
             self.accepted[drop] = False
             self._drops[drop] += 1
-        self._learn_variance(rows)
+        if not self.takes_at_their_word:
+            self._learn_variance(rows)
 
     def _keep_connected(self) -> None:
         """Take all odometry back where the graph would fall apart without it."""
@@ -151,8 +152,7 @@ class Growth:
         kind, known = self.is_loop[rows], _KNOWN * self.graph.manifold.TANGENT_SIZE
         found = np.bincount(kind, (self.posterior.residual**2).sum(axis=1), 2)
         stated = np.bincount(kind, np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
-        used = np.maximum(self.variance, self._least_variance)
-        self.variance = used * (found + known) / (stated + known)
+        self.variance = self.variance * (found + known) / (stated + known)
 
     def innovations(self, rows: Indices) -> Innovations:
         """Return how factors that are not accepted fit the map."""

@@ -13,10 +13,12 @@ import numpy as np
 from l1slam_ros.core.choice import INTERIOR_POINT, PRIMAL_DUAL, choose, minimise_by
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.optimiser import OptimiserOptions
+from l1slam_ros.core.robust import robust_solve
 from l1slam_ros.core.seed import seed_poses
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
 
-STEPS = ('ordering', 'least squares', 'seed', 'interior point', 'primal-dual')
+STEPS = ('ordering', 'least squares', 'seed', 'interior point', 'primal-dual',
+         'robust solve')
 
 
 def warm_up(report: Callable[[str], None] = lambda step: None) -> None:
@@ -35,3 +37,5 @@ def warm_up(report: Callable[[str], None] = lambda step: None) -> None:
     seed_poses(graph, None)
     minimise_by(choose(PRIMAL_DUAL, graph), graph, poses, OptimiserOptions(outer_iterations=1))
     report(STEPS[4])
+    robust_solve(graph)
+    report(STEPS[5])

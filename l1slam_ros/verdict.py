@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a robust solve refused, in sentences for people."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from l1slam_ros.core.robust_map import RobustMap
+from l1slam_ros.io.graph_file import GraphRecord
+
+# So many edges are named one by one; `--json` lists all.
+_NAMED = 20
+# A gross slip of the odometry: said apart, because nothing that was driven after it can be trusted
+# without the loops across it.
+_SLIP = 'odometry {pair} lies: {sigmas:.1f} sigmas off what the loops say; left out'
+
+
+def verdict(record: GraphRecord, judgement: RobustMap) -> Iterator[str]:
+    """Yield what was refused and why, the worst first."""
+    factors, accepted = record.graph.between, judgement.accepted
+    is_loop = ~factors.is_odometry
+    pairs = record.ids[np.stack((factors.i, factors.j), axis=1)]
+    for row in judgement.slips.tolist():
+        yield _SLIP.format(pair=_named(pairs[row]), sigmas=judgement.sigmas[row])
+    refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect)
+    suspect = np.flatnonzero(is_loop & judgement.suspect)
+    yield f'{len(refused):,} of {np.count_nonzero(is_loop):,} loops refused'
+    worst = refused[np.argsort(-judgement.sigmas[refused], kind='stable')]
+    for row in worst[:_NAMED].tolist():
+        yield f'  {_named(pairs[row])}: {judgement.sigmas[row]:.1f} sigmas off the accepted ones'
+    if len(refused) > _NAMED:
+        yield f'  and {len(refused) - _NAMED:,} more; `--json` lists all'
+    if len(suspect):
+        yield (f'{len(suspect):,} loops are suspect and left out: they fit, but nothing vouches '
+               'for them, and chance alone could have made as many')
+
+
+def _named(pair: np.ndarray) -> str:
+    return f'{pair[0]} - {pair[1]}'
