@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l1slam_ros.core.belief_state import Belief, judge
 from l1slam_ros.core.choice import AUTO, choose, minimise_by
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.graph import FactorGraph
@@ -25,7 +26,18 @@ from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.optimality import Status, l1_cost, smoothing
 from l1slam_ros.core.optimiser import OptimiserOptions, Solution, backtrack, is_far, minimise
+from l1slam_ros.core.options import Options, option
+from l1slam_ros.core.robust_map import accepted_graph, minimise_robustly
 from l1slam_ros.core.seed import seed_poses
+
+
+@dataclass(frozen=True)
+class RobustOptions(Options):
+    """Whether loops are doubted."""
+
+    enabled: bool = option(
+        True, 'believe a loop only once others, or the odometry, vouch for it; without, every '
+        'loop is used at once')
 
 
 @dataclass(frozen=True)
@@ -33,6 +45,7 @@ class BackendOptions(GrowthOptions):
     """Everything the back end can be told."""
 
     solver: OptimiserOptions = OptimiserOptions()
+    robust: RobustOptions = RobustOptions()
 
 
 @dataclass(frozen=True)
@@ -40,12 +53,15 @@ class Problem:
     """
     A snapshot to improve: graph, poses (n, p), dual (rows,) and the cost the last update left.
 
-    settled : nothing has come since an update that converged.
+    belief : of all factors; robust : loops may be doubted; settled : nothing has come since an
+    update that converged.
     """
 
     graph: FactorGraph
     poses: Array
     dual: Array
+    belief: Belief
+    robust: bool
     last_cost: float
     settled: bool
 
@@ -53,15 +69,16 @@ class Problem:
 @dataclass(frozen=True)
 class Improvement:
     """
-    What one update did: new poses (n, p) and dual (rows,), and the account of it.
+    What one update did: new poses (n, p), dual (rows,) and belief, and the account of it.
 
-    cost_before, cost : L1 cost of the snapshot's factors; reweighted_steps : factorisations for
+    cost_before, cost : L1 cost of the accepted factors; reweighted_steps : factorisations for
     the long-range part; outer, inner : iterations of Algorithm 4; gap : of its last linear
     problem; seconds : all of it.
     """
 
     poses: Array
     dual: Array
+    belief: Belief
     cost_before: float
     cost: float
     status: Status
@@ -70,6 +87,26 @@ class Improvement:
     inner_iterations: int
     gap: float
     seconds: float
+
+
+# What can become of a loop; `LoopStates.state` counts in this order.
+LOOP_STATES = ('waiting', 'suspect', 'accepted', 'rejected', 'expired')
+WAITING, SUSPECT, ACCEPTED, REJECTED, EXPIRED = range(len(LOOP_STATES))
+
+
+@dataclass(frozen=True)
+class LoopStates:
+    """
+    What has become of the loops.
+
+    rows : (k,) the between factors of the first k of them; stamps : (l, 2) [ns] reference and end;
+    state : (l,) of `LOOP_STATES`; sigmas : (l,), NaN where a loop was not looked at.
+    """
+
+    rows: Indices
+    stamps: Indices
+    state: Indices
+    sigmas: Array
 
 
 class Backend:
@@ -89,6 +126,7 @@ class Backend:
         self.growth = GraphGrowth(manifold, options)
         self._poses = manifold.identity(0)
         self._dual: Array = np.zeros(0)
+        self._belief = Belief.nothing()
         self._last_cost = 0.0
         self._status = Status.OUT_OF_TIME
 
@@ -139,16 +177,32 @@ class Backend:
         rows = len(graph.between) * self._manifold.TANGENT_SIZE
         # Rows are only ever appended, so the dual of the old ones stays; new ones start at zero.
         dual = np.concatenate((self._dual, np.zeros(rows - len(self._dual))))
+        robust = self._options.robust.enabled
+        belief = self._belief.extended(graph, robust)
         grown = len(self._poses) < graph.n_poses or len(self._dual) < rows
-        settled = not grown and self._status in (Status.CONVERGED, Status.STALLED)
-        return Problem(graph, self.poses, dual, self._last_cost, settled)
+        settled = (not grown and belief.settled
+                   and self._status in (Status.CONVERGED, Status.STALLED))
+        return Problem(graph, self.poses, dual, belief, robust, self._last_cost, settled)
 
     def adopt(self, improvement: Improvement) -> None:
         """Take over what `improve` made of a snapshot; keyframes since then follow along."""
         self._poses = improvement.poses
         self._dual = improvement.dual
+        self._belief = improvement.belief
         self._last_cost = improvement.cost
         self._status = improvement.status
+
+    def loop_states(self) -> LoopStates:
+        """Return what has become of each loop, those of the graph first, in its order."""
+        in_graph, waiting, expired = self.growth.loop_stamps
+        belief = self._belief.extended(self.growth.graph, self._options.robust.enabled)
+        rows = self.growth.loop_rows
+        state = np.where(belief.accepted[rows], ACCEPTED,
+                         np.where(belief.suspect[rows], SUSPECT, REJECTED))
+        others = np.repeat([WAITING, EXPIRED], [len(waiting), len(expired)])
+        sigmas = np.concatenate((belief.sigmas[rows], np.full(len(others), np.nan)))
+        return LoopStates(rows, np.concatenate((in_graph, waiting, expired)),
+                          np.concatenate((state, others)), sigmas)
 
     def update(self, budget: float) -> Improvement | None:
         """Improve the map for about `budget` seconds; None: there was nothing to do."""
@@ -162,7 +216,7 @@ class Backend:
 
 def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Improvement:
     """
-    Lower the L1 cost of a snapshot for about `budget` seconds.
+    Judge the loops that have come, and lower the L1 cost of a snapshot, for about `budget` seconds.
 
     While the cost is far above what the last update left (a loop has closed), reweighted least
     squares steps carry the long-range part: one factorisation bends the whole chain, where a
@@ -171,7 +225,12 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Impro
     """
     start = time.monotonic()
     deadline = start + budget
-    graph, poses, dual = problem.graph, problem.poses, problem.dual
+    belief = problem.belief
+    if not belief.settled:
+        belief = judge(problem.graph, problem.poses, belief, deadline)
+    graph, poses = accepted_graph(problem.graph, belief.accepted), problem.poses
+    size = graph.manifold.TANGENT_SIZE
+    dual = problem.dual.reshape(-1, size)[belief.accepted].ravel()
     before = cost = l1_cost(whitened_residual(graph, poses))
     steps, far = 0, is_far(before, problem.last_cost)
     cholesky = cholesky_of(graph) if far else None
@@ -183,22 +242,38 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Impro
         steps += 1
         far = is_far(previous, cost)
     solution = minimise(graph, poses, options, cholesky, dual, deadline)
-    return _improvement(solution, before, steps, start)
+    return _improvement(solution, belief, size, before, steps, start)
 
 
 def optimise(problem: Problem, options: OptimiserOptions) -> Improvement:
-    """Solve a snapshot to the end: from its own poses and from the seed, whichever ends lower."""
+    """
+    Solve a snapshot to the end; where loops are doubted, after judging all of them anew.
+
+    Else from its own poses and from the seed, whichever ends lower.
+    """
     start = time.monotonic()
-    graph = problem.graph
-    before = l1_cost(whitened_residual(graph, problem.poses))
-    choice = choose(AUTO, graph)
-    starts = (problem.poses, seed_poses(graph, choice.cholesky))
-    solution = min((minimise_by(choice, graph, poses, options)[0] for poses in starts),
-                   key=lambda s: s.cost)
-    return _improvement(solution, before, 0, start)
+    graph, belief = problem.graph, problem.belief
+    if problem.robust:
+        found = minimise_robustly(graph, lambda part, poses: _solved(part, poses, options))
+        solution, belief = found.solution, Belief(
+            found.accepted, found.suspect, found.sigmas, found.variance)
+    else:
+        starts = (problem.poses, seed_poses(graph, choose(AUTO, graph).cholesky))
+        solution = min((_solved(graph, poses, options) for poses in starts), key=lambda s: s.cost)
+    part = accepted_graph(graph, belief.accepted)
+    before = l1_cost(whitened_residual(part, problem.poses))
+    return _improvement(solution, belief, graph.manifold.TANGENT_SIZE, before, 0, start)
 
 
-def _improvement(solution: Solution, before: float, steps: int, start: float) -> Improvement:
-    return Improvement(solution.poses, solution.dual, before, solution.cost, solution.status,
-                       steps, solution.outer_iterations, solution.inner_iterations, solution.gap,
-                       time.monotonic() - start)
+def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions) -> Solution:
+    return minimise_by(choose(AUTO, graph), graph, poses, options)[0]
+
+
+def _improvement(solution: Solution, belief: Belief, size: int, before: float, steps: int,
+                 start: float) -> Improvement:
+    # The rows of what is not believed have no dual yet.
+    dual = np.zeros((len(belief.accepted), size))
+    dual[belief.accepted] = solution.dual.reshape(-1, dual.shape[1])
+    return Improvement(solution.poses, dual.ravel(), belief, before, solution.cost,
+                       solution.status, steps, solution.outer_iterations,
+                       solution.inner_iterations, solution.gap, time.monotonic() - start)

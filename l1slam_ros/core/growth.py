@@ -79,6 +79,9 @@ class GraphGrowth:
         self._glued = True
         self.offset = manifold.identity(1)
         self._waiting: list[tuple[int, LoopClosure]] = []
+        self._expired = GrowingArray((2,), np.int64)
+        self._loop_stamps = GrowingArray((2,), np.int64)
+        self._loop_rows = GrowingArray((), np.int64)
 
     @property
     def stamps(self) -> Indices:
@@ -96,6 +99,22 @@ class GraphGrowth:
     def n_waiting(self) -> int:
         """How many loops are not in the graph yet, nor refused."""
         return len(self._waiting)
+
+    @property
+    def loop_stamps(self) -> tuple[Indices, Indices, Indices]:
+        """
+        Stamps (reference, end) [ns] of the loops in the graph, waiting and expired, (k, 2) each.
+
+        Those in the graph are in the order of `loop_rows`, to which they stay tied.
+        """
+        waiting = [(loop.reference_stamp, loop.stamp) for _, loop in self._waiting]
+        return (self._loop_stamps.view(), np.array(waiting, np.int64).reshape(-1, 2),
+                self._expired.view())
+
+    @property
+    def loop_rows(self) -> Indices:
+        """Which between factors of the graph are loops, (k,)."""
+        return self._loop_rows.view()
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """
@@ -146,6 +165,10 @@ class GraphGrowth:
         self._keyframe_samples.extend(np.arange(len(stamps)))
         self._motion = Motion(graph.manifold, int(stamps[-1]))
         self._glued = False
+        factors = graph.between
+        rows = np.flatnonzero(~factors.is_odometry)
+        ends = stamps[np.stack((factors.i, factors.j), axis=1)[rows]]
+        self._note_loops(rows, np.sort(ends, axis=1))
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Take a loop closure in; it becomes a factor in `add_due_loops`."""
@@ -166,7 +189,10 @@ class GraphGrowth:
         patience = int(self.options.loop.wait * 1e9)
         later = [entry for entry in self._waiting if entry[1].stamp > now]
         self._waiting = [entry for entry in later if now - max(entry[0], first) <= patience]
-        self.refused['expired'] += len(later) - len(self._waiting)
+        gone = [entry[1] for entry in later if now - max(entry[0], first) > patience]
+        self._expired.extend(np.array([(loop.reference_stamp, loop.stamp) for loop in gone],
+                                      np.int64).reshape(-1, 2))
+        self.refused['expired'] += len(gone)
         return self._add_loops(due) if due else 0
 
     def _add_loops(self, due: list[tuple[int, LoopClosure]]) -> int:
@@ -195,7 +221,13 @@ class GraphGrowth:
         covariance = self._or_model(covariance, usable(covariance))
         self.graph.add_between(i, j, measurement, information_from_covariance(covariance),
                                np.array([loop.trusted for loop in loops]))
+        last = len(self.graph.between)
+        self._note_loops(np.arange(last - len(loops), last), stamps)
         return len(loops)
+
+    def _note_loops(self, rows: Indices, stamps: Indices) -> None:
+        self._loop_rows.extend(rows)
+        self._loop_stamps.extend(stamps)
 
     def _covariances(self, loops: list[LoopClosure]) -> Array:
         manifold = self.graph.manifold

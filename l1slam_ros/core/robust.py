@@ -19,7 +19,7 @@ its like. What fits where it stands, but could as well be chance, stays suspect.
 defended by `test_robust.py`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,8 +86,19 @@ def robust_solve(
     if trusted is None:
         trusted = np.zeros(len(graph.between), bool)
     growth = Growth(graph, trusted, np.random.default_rng(_SEED))
-    rounds = 0
-    while rounds < _MOST_ROUNDS:
+    growth.begin()
+    number = 0
+    for number, growth in enumerate(rounds(growth), 1):
+        report(number, int(np.count_nonzero(growth.accepted & growth.is_loop)))
+    square, suspect = outlook(growth)
+    return RobustSolution(growth.poses, growth.accepted, suspect, np.sqrt(square),
+                          np.flatnonzero(~growth.accepted & ~growth.is_loop), growth.variance,
+                          number)
+
+
+def rounds(growth: Growth) -> Iterator[Growth]:
+    """Yield the state after each round, until there is nothing more to believe."""
+    for _ in range(_MOST_ROUNDS):
         news = growth.believable(growth.undecided())
         growth.accepted[news] = True
         if not len(news):
@@ -99,20 +110,21 @@ def robust_solve(
             else:
                 growth = repaired
         growth.settle()
-        rounds += 1
-        report(rounds, int(np.count_nonzero(growth.accepted & growth.is_loop)))
-    return _solution(growth, rounds)
+        yield growth
 
 
-def _solution(growth: Growth, rounds: int) -> RobustSolution:
+def outlook(growth: Growth) -> tuple[Array, Mask]:
+    """
+    Return how well each factor fits: a square (m,) of sigmas, and the loops that are suspect.
+
+    The square is that of the residual, and of what is not accepted, of the innovation. Suspect,
+    (m,) bool, is a loop that fits and yet was not accepted.
+    """
     accepted, square = growth.accepted, np.zeros(len(growth.factors))
     square[accepted] = (growth.posterior.residual**2).sum(axis=1)[: np.count_nonzero(accepted)]
     outside = np.flatnonzero(~accepted)
     square[outside] = growth.innovations(outside).square
-    fits = square < growth.gate()
-    return RobustSolution(
-        growth.poses, accepted, ~accepted & fits & growth.is_loop, np.sqrt(square),
-        np.flatnonzero(~accepted & ~growth.is_loop), growth.variance, rounds)
+    return square, ~accepted & (square < growth.gate()) & growth.is_loop
 
 
 def reconsidered(

@@ -74,11 +74,23 @@ class Growth:
         self._least_variance = 0.0
         self.posterior: Posterior
         self._drops = np.zeros(len(self.factors), np.int64)
+
+    def begin(self) -> None:
+        """Solve for what is accepted, and learn from the loops how large their noise is."""
         self.settle()
         rows = self.undecided()
         if len(rows):
             self.variance = self.variance * common_scale(self.innovations(rows))
             self.settle()
+
+    def resume(self, poses: Array, accepted: Mask, variance: Array) -> None:
+        """Go on from an earlier state: poses (n, p), accepted (m,), variance (2,)."""
+        self.poses, self.variance = poses, variance
+        self.accepted = accepted | self.trusted
+        if (self.accepted & self.is_loop).any():
+            self.settle()
+        else:
+            self.begin()
 
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
@@ -189,9 +201,9 @@ class Growth:
         believed: Indices = rows[np.unique(np.concatenate((a[good], b[good])))]
         return believed
 
-    def groups(self, rows: Indices) -> int:
-        """Return how many votes factors have: one for each group of them."""
-        return len(one_of_each_group(self.low[rows], self.high[rows], _APART))
+    def heads(self, rows: Indices) -> Indices:
+        """Return which of some factors have a vote: the first of each group of them, (k,)."""
+        return one_of_each_group(self.low[rows], self.high[rows], _APART)
 
 
 def solve(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:

@@ -30,7 +30,8 @@ class RobustMap:
 
     seed : (n, p) the L2 map it began with; accepted : (m,) bool of the between factors; suspect :
     (m,) bool, loops that are not accepted though they fit: nothing vouches for them; sigmas : (m,)
-    how far off each factor is, see `RobustSolution`; slips : (k,) odometry factors that lie.
+    how far off each factor is, slips : (k,) odometry factors that lie, variance : (2,), see
+    `RobustSolution`.
     """
 
     solution: Solution
@@ -39,6 +40,7 @@ class RobustMap:
     suspect: Mask
     sigmas: Array
     slips: Indices
+    variance: Array
 
 
 def accepted_graph(graph: FactorGraph, accepted: Mask) -> SubGraph:
@@ -64,4 +66,5 @@ def minimise_robustly(
         if (accepted == before).all():
             break
     solution = minimise(accepted_graph(graph, before), poses)
-    return RobustMap(solution, poses, before, found.suspect & ~before, found.sigmas, found.slips)
+    return RobustMap(solution, poses, before, found.suspect & ~before, found.sigmas, found.slips,
+                     found.variance)

@@ -42,7 +42,7 @@ def without_slip(growth: Growth) -> Growth | None:
         votes = attempt(trial)
         trial.accepted[votes] = True
         gained = np.count_nonzero(trial.accepted) - before
-        if growth.groups(votes) >= _VOTES and gained >= _VOTES:
+        if len(growth.heads(votes)) >= _VOTES and gained >= _VOTES:
             return trial
     return None
 
@@ -105,7 +105,7 @@ def _slipped_elsewhere(growth: Growth, worst: int, step: int) -> Array:
 def _mended(growth: Growth) -> Indices:
     """Leave out the odometry factor that most refused loops span in accord; as above."""
     agreed = _accord(growth)
-    if growth.groups(agreed) < _VOTES:
+    if len(growth.heads(agreed)) < _VOTES:
         return agreed
     low, high = growth.low, growth.high
     across = spanned(low[agreed], high[agreed], growth.graph.n_poses)
@@ -128,7 +128,7 @@ def _mended(growth: Growth) -> Indices:
 
 
 def _accord(growth: Growth) -> Indices:
-    """Return the refused loops of most groups that agree with one of them, (k,)."""
+    """Return the refused loops that agree with one of them, and that one: the surest such camp."""
     rows = growth.undecided()
     rows = rows[growth.is_loop[rows]]
     if not len(rows):
@@ -137,10 +137,18 @@ def _accord(growth: Growth) -> Indices:
     if len(rows) < _VOTES:
         return rows
     volume = claimed_volume(growth.graph.manifold, growth.poses, growth.rng)
-    one, other = agreement(growth.part(rows), growth.poses, growth.posterior, volume,
-                           growth.gate(), np.log(len(rows)))
-    camps = [np.append(rows[other[one == k]], rows[k]) for k in range(len(rows))]
-    return max(camps, key=growth.groups)
+    one, other, log_ratio = agreement(growth.part(rows), growth.poses, growth.posterior, volume,
+                                      growth.gate())
+    camp, surest = rows[:0], float(np.log(growth.graph.n_poses / DOUBT))
+    for k in range(len(rows)):
+        mine = np.flatnonzero(one == k)
+        mine = mine[np.argsort(-log_ratio[mine], kind='stable')]
+        members = rows[other[mine]]
+        # Each of them could have agreed by chance with any of the others.
+        sure = (log_ratio[mine] - np.log(len(rows)))[growth.heads(members)].sum()
+        if sure > surest:
+            camp, surest = np.append(members, rows[k]), sure
+    return camp
 
 
 def _some(growth: Growth, rows: Indices, count: int) -> Indices:
@@ -195,10 +203,12 @@ def mended(graph: FactorGraph, poses: Array, loop: int, step: int) -> Array:
 
 def agreement(
     graph: FactorGraph, poses: Array, posterior: Posterior, log_volume: float, limit: float,
-    least: float,
-) -> tuple[Indices, Indices]:
+) -> tuple[Indices, Indices, Array]:
     """
-    Return the pairs of between factors of a graph that agree, each both ways round, two (pairs,).
+    Return the pairs of between factors of a graph that rather agree than not, three (pairs,).
+
+    The one and the other, each pair both ways round, and the logarithm of how much likelier their
+    difference is if they agree than by chance.
 
     From the one factor follows the other, if the map is right about how their first ends lie to
     each other, and their second ends; whatever it says of the factors themselves.
@@ -207,7 +217,6 @@ def agreement(
     ----------
     log_volume : see `claimed_volume`
     limit : of the squared difference of what follows and what is measured, over its covariance
-    least : logarithm of how much likelier than by chance the difference must be
 
     """
     from l1slam_ros.core.kernels.prediction import normalise
@@ -229,8 +238,10 @@ def agreement(
         covariance += change[:, :, None] * change[:, None, :] / len(steps)
     square, log_det = normalise(covariance, whiten(roots, error))
     claim = log_volume + np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
-    good = (square < limit) & (log_likelihood_ratio(square, log_det, claim, k) > least)
-    return np.concatenate((a[good], b[good])), np.concatenate((b[good], a[good]))
+    log_ratio = log_likelihood_ratio(square, log_det, claim, k)
+    good = (square < limit) & (log_ratio > np.log(len(graph.between)))
+    return (np.concatenate((a[good], b[good])), np.concatenate((b[good], a[good])),
+            np.tile(log_ratio[good], 2))
 
 
 def _difference(graph: FactorGraph, poses: Array, a: Indices, b: Indices) -> Array:

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What is believed of the factors of a graph while it grows.
+
+In: the belief of the last update and the graph as it is now. Out: the belief after new evidence.
+The rounds are those of the batch solve (`robust`), from the state that is there.
+"""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.noise import Mask
+from l1slam_ros.core.robust import outlook, reconsidered
+from l1slam_ros.core.robust_growth import Growth
+
+# The same samples each time: the answer is that of the graph, not of chance.
+_SEED = 2014
+
+
+@dataclass(frozen=True)
+class Belief:
+    """
+    A judgement on the first m between factors of a graph.
+
+    accepted, suspect : (m,) bool, a loop that is neither is rejected; sigmas : (m,), see
+    `RobustSolution`, NaN before a loop was looked at; variance : (2,) of odometry and loops;
+    settled : no more is to be found out from the factors that are there.
+    """
+
+    accepted: Mask
+    suspect: Mask
+    sigmas: Array
+    variance: Array
+    settled: bool = True
+
+    @staticmethod
+    def nothing() -> 'Belief':
+        """Return the belief before there are factors."""
+        none = np.zeros(0, bool)
+        return Belief(none, none, np.zeros(0), np.ones(2))
+
+    def extended(self, graph: FactorGraph, robust: bool) -> 'Belief':
+        """
+        Return the belief of all factors that the graph has by now.
+
+        Of the new ones, odometry and what is trusted is believed; a loop is suspect until it was
+        looked at, or where no loop is to be doubted, believed too.
+        """
+        factors, known = graph.between, len(self.accepted)
+        sure = (factors.is_odometry | factors.trusted)[known:]
+        new_loops = not sure.all()
+        accepted = np.concatenate((self.accepted, sure | (not robust)))
+        if not robust:
+            accepted = np.ones(len(accepted), bool)
+        suspect = np.concatenate((self.suspect, ~sure)) & ~accepted
+        unknown = np.full(len(factors) - known, np.nan)
+        return Belief(accepted, suspect, np.concatenate((self.sigmas, unknown)), self.variance,
+                      not robust or (self.settled and not new_loops))
+
+
+def judge(graph: FactorGraph, poses: Array, belief: Belief, deadline: float) -> Belief:
+    """
+    Return what is to be believed, after looking again at all loops that are not.
+
+    A lie of the odometry is not looked for: that takes too long to do while driving.
+
+    Parameters
+    ----------
+    poses : (n, p) the map of what was believed
+    deadline : `time.monotonic()` [s] after which no further round begins
+
+    """
+    growth = Growth(graph, graph.between.trusted, np.random.default_rng(_SEED))
+    growth.resume(poses, belief.accepted, belief.variance)
+    settled = False
+    while not settled:
+        news = growth.believable(growth.undecided())
+        settled = not len(news)
+        if settled or time.monotonic() > deadline:
+            break
+        growth.accepted[news] = True
+        growth.settle()
+    square, suspect = outlook(growth)
+    accepted = reconsidered(graph, growth.poses, growth.accepted, graph.between.trusted)
+    return Belief(accepted, suspect & ~accepted, np.sqrt(square), growth.variance, settled)
