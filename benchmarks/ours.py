@@ -27,7 +27,8 @@ from l1slam_ros.core.choice import AUTO, INTERIOR_POINT, PRIMAL_DUAL, choose, mi
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.halpern import minimise_l1_halpern
-from l1slam_ros.core.interior_point import LinearProblem, interior_point
+from l1slam_ros.core.interior_point import interior_point
+from l1slam_ros.core.l1_problem import LinearProblem
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.least_squares import weighted_least_squares
 from l1slam_ros.core.manifold import Array

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path as PathMessage
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -26,6 +27,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.metrics import absolute_trajectory_error, aligned_positions
 from l1slam_ros.io.bag import read_messages
+from l1slam_ros.io.files import stamp_from_text
 from l1slam_ros.io.graph_bag import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
 from l1slam_ros.io.messages import stamp_of
 from l1slam_ros.io.plot import MapDrawing, plot_maps
@@ -40,26 +42,42 @@ LONGEST = 120.0  # [s] for the node to come up, and to become quiet
 
 
 @dataclass
-class Listener:
-    """Keeps the last Path and counts how many came."""
+class Heard:
+    """The last Path, when each one came, and the loops (reference, end) [ns] not in the map."""
 
-    node: Node
-    last: PathMessage | None = None
+    path: PathMessage | None = None
     times: list[float] = field(default_factory=list)
+    refused: set[tuple[int, int]] = field(default_factory=set)
 
-    def __post_init__(self) -> None:
-        """Subscribe."""
+
+class Listener:
+    """Keeps what the back end publishes."""
+
+    def __init__(self, node: Node):
+        self.node, self.heard = node, Heard()
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.node.create_subscription(PathMessage, 'path', self._hear, latched)
+        node.create_subscription(PathMessage, 'path', self._hear, latched)
+        every = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        node.create_subscription(DiagnosticArray, 'loop_status', self._hear_of_loops, every)
 
     def _hear(self, message: PathMessage) -> None:
-        self.last = message
-        self.times.append(time.monotonic())
+        self.heard.path = message
+        self.heard.times.append(time.monotonic())
+
+    def _hear_of_loops(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            ends = stamp_from_text(values['reference_stamp']), stamp_from_text(values['stamp'])
+            if values['state'] == 'accepted':
+                self.heard.refused.discard(ends)
+            else:
+                self.heard.refused.add(ends)
 
     def wait_until_quiet(self) -> None:
         """Wait until no Path came for `QUIET` seconds."""
         deadline = time.monotonic() + LONGEST
-        while not self.times or time.monotonic() - self.times[-1] < QUIET:
+        times = self.heard.times
+        while not times or time.monotonic() - times[-1] < QUIET:
             if time.monotonic() > deadline:
                 raise TimeoutError(f'the map has not come to rest within {LONGEST:.0f} s')
             rclpy.spin_once(self.node, timeout_sec=0.1)
@@ -124,8 +142,8 @@ def executable(name: str) -> str:
     return str(Path(sysconfig.get_path('scripts')) / name)
 
 
-def record_map(bag: Path) -> tuple[PathMessage, float]:
-    """Play the bag into `backend`; return its last Path and how often it published one [1/s]."""
+def record_map(bag: Path) -> Heard:
+    """Play the bag into `backend`; return what it published."""
     rclpy.init()
     try:
         listener = Listener(rclpy.create_node('demo'))
@@ -136,31 +154,35 @@ def record_map(bag: Path) -> tuple[PathMessage, float]:
             if replay.returncode:
                 raise RuntimeError(f'replay ended with exit code {replay.returncode}')
             listener.wait_until_quiet()
-        assert listener.last is not None
-        rate = (len(listener.times) - 1) / max(listener.times[-1] - listener.times[0], 1e-9)
-        return listener.last, rate
+        return listener.heard
     finally:
         rclpy.try_shutdown()
 
 
-def summarise(recording: Recording, path: PathMessage, rate: float, picture: Path) -> str:
+def summarise(recording: Recording, heard: Heard, picture: Path) -> str:
     """Draw the map and return what to print about it."""
-    stamps = np.array([stamp_of(pose.header) for pose in path.poses])
-    positions = np.array([(p.pose.position.x, p.pose.position.y) for p in path.poses])
+    assert heard.path is not None
+    stamps = np.array([stamp_of(pose.header) for pose in heard.path.poses])
+    positions = np.array([(p.pose.position.x, p.pose.position.y) for p in heard.path.poses])
     rows = np.searchsorted(recording.stamps, stamps)
     truth, odometry = recording.truth[rows], recording.odometry[rows]
     errors = (absolute_trajectory_error(odometry, truth),
               absolute_trajectory_error(positions, truth))
     note = f'position error {errors[0]:.2f} m by odometry, {errors[1]:.2f} m optimised'
-    loops = np.searchsorted(stamps, recording.stamps[recording.loops])
-    true, false = loops[~recording.is_false], loops[recording.is_false]
+    ends = recording.stamps[recording.loops]
+    refused = np.array([tuple(pair) in heard.refused for pair in ends.tolist()], bool)
+    loops, false = np.searchsorted(stamps, ends), recording.is_false
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot_maps(picture, [MapDrawing('l1slam_ros demo', positions, odometry,
-                                   aligned_positions(truth, positions), true, false=false,
+                                   aligned_positions(truth, positions), loops[~refused & ~false],
+                                   rejected=loops[refused], false=loops[~refused & false],
                                    note=note)])
+    rate = (len(heard.times) - 1) / max(heard.times[-1] - heard.times[0], 1e-9)
     return '\n'.join((
         f'position error  {errors[0]:.3f} m by odometry, {errors[1]:.3f} m in the map (RMSE)',
-        f'graph           {len(stamps)} keyframes, {len(loops)} loops, {len(false)} of them false',
+        f'graph           {len(stamps)} keyframes, {len(loops)} loops, {false.sum()} of them false',
+        f'refused         {(refused & false).sum()} false loops, {(refused & ~false).sum()} true '
+        'ones',
         f'node            {rate:.1f} updates per second',
         f'picture         {picture}'))
 
@@ -171,8 +193,7 @@ def main() -> int:
     os.environ.setdefault('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     recording = read_recording(BAG)
-    path, rate = record_map(BAG)
-    print(summarise(recording, path, rate, PICTURE))
+    print(summarise(recording, record_map(BAG), PICTURE))
     return 0
 
 

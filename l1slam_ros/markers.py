@@ -6,27 +6,34 @@ from geometry_msgs.msg import Point, Vector3
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from l1slam_ros.core.backend import ACCEPTED, REJECTED, SUSPECT, LoopStates
 from l1slam_ros.core.graph import BetweenFactors
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.publishing import header
 
 # Okabe and Ito's colours, as in the pictures.
 _BLUE, _GREY, _GREEN = (0.0, 0.447, 0.698), (0.5, 0.5, 0.5), (0.0, 0.62, 0.451)
+_YELLOW, _RED = (0.902, 0.624, 0.0), (0.835, 0.369, 0.0)
 _POINT, _LINE = 0.1, 0.03  # [m]
 
 
-def graph_markers(frame: str, stamp: int, pose3: Array, factors: BetweenFactors) -> MarkerArray:
+def graph_markers(frame: str, stamp: int, pose3: Array, factors: BetweenFactors,
+                  loops: LoopStates) -> MarkerArray:
     """
-    Return one marker for each namespace: `keyframes`, `odometry`, `loops`.
+    Return one marker for each namespace.
+
+    They are `keyframes`, `odometry`, `loops`, `suspect_loops` and `rejected_loops`.
 
     Parameters
     ----------
     frame, stamp : of the markers; stamp [ns]
     pose3 : (n, 7) optimised keyframes, x y z qx qy qz qw
     factors : which keyframes are tied to each other
+    loops : what has become of the loops among them
 
     """
     points = [Point(x=x, y=y, z=z) for x, y, z in pose3[:, :3].tolist()]
+    state = loops.state[: len(loops.rows)]
     pairs, is_odometry = np.stack((factors.i, factors.j), axis=1), factors.is_odometry
 
     def marker(namespace: str, kind: int, size: float, colour: tuple[float, float, float],
@@ -39,5 +46,9 @@ def graph_markers(frame: str, stamp: int, pose3: Array, factors: BetweenFactors)
     return MarkerArray(markers=[
         marker('keyframes', Marker.POINTS, _POINT, _BLUE, list(range(len(points)))),
         marker('odometry', Marker.LINE_LIST, _LINE, _GREY, pairs[is_odometry].ravel().tolist()),
-        marker('loops', Marker.LINE_LIST, _LINE, _GREEN, pairs[~is_odometry].ravel().tolist()),
+        *(marker(namespace, Marker.LINE_LIST, _LINE, colour,
+                 pairs[loops.rows[state == kind]].ravel().tolist())
+          for namespace, kind, colour in (('loops', ACCEPTED, _GREEN),
+                                          ('suspect_loops', SUSPECT, _YELLOW),
+                                          ('rejected_loops', REJECTED, _RED))),
     ])

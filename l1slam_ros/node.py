@@ -30,6 +30,7 @@ from l1slam_ros.core.errors import L1SlamError, MessageError
 from l1slam_ros.core.warm_up import warm_up
 from l1slam_ros.diagnosis import Diagnosis
 from l1slam_ros.io.messages import loop_closure, odometry_sample
+from l1slam_ros.loop_status import LoopStatus
 from l1slam_ros.markers import graph_markers
 from l1slam_ros.node_options import NodeOptions
 from l1slam_ros.orders import Orders
@@ -118,6 +119,7 @@ class BackendNode(Node):
         if TFMessage is not None and self.options.publish_tf:
             self._tf = self.create_publisher(TFMessage, '/tf', 100)
         self._diagnosis = Diagnosis(self)
+        self._loop_status = LoopStatus(self)
 
     def _make_subscriptions(self) -> None:
         reliable = QoSProfile(depth=_DEPTH)
@@ -206,6 +208,8 @@ class BackendNode(Node):
         if improvement is not None:
             self._publish_map()
             self._report(improvement)
+        else:  # nothing new in the map, but a loop can have come for later, or expired
+            self._loop_status.publish(self._backend.state().loops)
 
     def _publish_map(self) -> None:
         state = self._backend.state()
@@ -214,9 +218,10 @@ class BackendNode(Node):
         pose3 = self._manifold.to_pose3(state.poses)
         self._path.publish(path_bytes(frame, stamp, state.stamps, pose3))
         self._publish_transform()
+        self._loop_status.publish(state.loops)
         # Markers are slow to make: not unless somebody looks.
         if self._graph.get_subscription_count():
-            self._graph.publish(graph_markers(frame, stamp, pose3, state.factors))
+            self._graph.publish(graph_markers(frame, stamp, pose3, state.factors, state.loops))
 
     def _publish_transform(self) -> None:
         options = self.options

@@ -45,3 +45,10 @@ GRAPHS = (MANHATTAN_3500, MANHATTAN_10K, INTEL, CITY_10K, MANHATTAN_50K)
 FILES = tuple(graph.file for graph in GRAPHS if graph.file)
 # By the word that asks for them: the worlds that are simulated anew.
 WORLDS = {'all': (MANHATTAN_10K, MANHATTAN_50K), '10k': (MANHATTAN_10K,), 'none': ()}
+
+# Figure 4: the graph whose start is noise; Algorithm 4 took so many linearisations, and so many
+# iterations of each.
+NOISY = INTEL
+NOISY_OUTER, NOISY_INNER = 5, 500
+# Figure 6: how many loops that measure nothing were put between far poses, by graph.
+FALSE_LOOPS = {INTEL.name: 10, MANHATTAN_3500.name: 2}

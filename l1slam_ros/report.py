@@ -15,7 +15,9 @@ import scipy
 
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.reproduction import PROBLEMS, Costs, Seconds
+from l1slam_ros.core.trials import LoopTrials, StartTrials
 from l1slam_ros.io.plot import MapDrawing
+from l1slam_ros.markdown import bullets, cost, listed, milliseconds, percent, table
 from l1slam_ros.paper import PaperGraph
 
 WORLD_SEED = 0
@@ -66,12 +68,15 @@ class Results:
     Everything there is to report.
 
     missing : graphs of the paper that were not run; convergence : of Figure 2, problem -> method
-    -> (k, 2) rows (iteration, cost), empty where its graph was not run.
+    -> (k, 2) rows (iteration, cost), empty where its graph was not run; starts : of Figure 4;
+    false_loops : of Figure 6, by the name of the graph.
     """
 
     graphs: Sequence[GraphResult]
     missing: Sequence[PaperGraph] = ()
     convergence: dict[str, dict[str, Array]] = field(default_factory=dict)
+    starts: StartTrials | None = None
+    false_loops: dict[str, LoopTrials] = field(default_factory=dict)
 
 
 def head(results: Results) -> list[str]:
@@ -94,13 +99,13 @@ def _on_missing(missing: Sequence[PaperGraph]) -> Iterator[str]:
     files = [graph for graph in missing if graph.file]
     worlds = [graph for graph in missing if not graph.file]
     if files:
-        yield (f"**Not run: {_listed([g.name for g in files])}**, the paper's own graphs. They "
+        yield (f"**Not run: {listed([g.name for g in files])}**, the paper's own graphs. They "
                f'come with Vertigo ({_SOURCE_OF_FILES}, folder `datasets`; its '
                '`manhattanOlson3500.g2o` is `manhattan3500.g2o` here). Put '
-               f'{_listed([f"`{g.file}`" for g in files])} into one folder and name it with '
+               f'{listed([f"`{g.file}`" for g in files])} into one folder and name it with '
                '`--datasets`.')
     if worlds:
-        yield (f'**Not run: {_listed([g.name for g in worlds])}**; `--worlds all` simulates all '
+        yield (f'**Not run: {listed([g.name for g in worlds])}**; `--worlds all` simulates all '
                'such worlds.')
 
 
@@ -108,18 +113,18 @@ def table_1(results: Results) -> list[str]:
     """Return Table I, the L1 costs, and what they say."""
     header = ['L1 cost', 'poses, edges', 'start: paper', 'start: ours', 'seed: ours',
               'final: paper', 'final: as printed', 'final: ours', 'solver', 'of the L2 map']
-    rows = [[r.title, f'{r.poses:,}, {r.edges:,}', _cost(r.paper.initial), _cost(r.costs.initial),
-             _cost(r.costs.seed), _cost(r.paper.final), _cost(r.costs.printed[-1]),
-             f'**{_cost(r.costs.solution.cost)}**', r.costs.solver, _cost(r.costs.l2)]
+    rows = [[r.title, f'{r.poses:,}, {r.edges:,}', cost(r.paper.initial), cost(r.costs.initial),
+             cost(r.costs.seed), cost(r.paper.final), cost(r.costs.printed[-1]),
+             f'**{cost(r.costs.solution.cost)}**', r.costs.solver, cost(r.costs.l2)]
             for r in results.graphs]
-    return [*_table(header, rows), *_note(results), '', *_list(_on_costs(results.graphs))]
+    return [*table(header, rows), *_note(results), '', *bullets(_on_costs(results.graphs))]
 
 
 def _on_costs(graphs: Sequence[GraphResult]) -> Iterator[str]:
     own = [r for r in graphs if r.is_of_paper]
     if own:
         difference = max(abs(r.costs.initial / r.paper.initial - 1) for r in own)
-        yield (f"{_names(own)}: the cost at the start is the paper's to {_percent(difference)}, "
+        yield (f"{_names(own)}: the cost at the start is the paper's to {percent(difference)}, "
                "so these are the paper's own graphs.")
     for r in graphs:
         yield _on_final(r)
@@ -136,6 +141,11 @@ def _on_costs(graphs: Sequence[GraphResult]) -> Iterator[str]:
     for sentence, found in groups:
         if found:
             yield f'{sentence}: {_names(found)}.'
+    for r in graphs:
+        if r.costs.cut_short:
+            yield (f'{r.paper.name}: Algorithm 4 as printed was ended after '
+                   f'{len(r.costs.printed) - 1} linearisations, before it had settled, because '
+                   'the graph is so large.')
 
 
 def _on_final(r: GraphResult) -> str:
@@ -152,7 +162,7 @@ def _on_final(r: GraphResult) -> str:
                     'is compared')
     if r.truth_cost is not None:
         said.append(f'our final is {compared(ours, r.truth_cost)} the cost of the true poses, '
-                    f'{_cost(r.truth_cost)}')
+                    f'{cost(r.truth_cost)}')
     return f'{r.paper.name}: {"; ".join(said)}.'
 
 
@@ -167,9 +177,9 @@ def table_2(results: Results) -> list[str]:
     for r in results.graphs:
         row = [r.title]
         for k in range(len(PROBLEMS)):
-            row += [_ms(r.paper.seconds[k]), *(_ms(r.seconds.methods[m][k]) for m in methods)]
-        rows.append([*row, _ms(r.paper.l2_seconds), _ms(r.seconds.l2)])
-    return [*_table(header, rows), *_note(results), '', *_list(_on_seconds(results.graphs))]
+            row += [milliseconds(r.paper.seconds[k]), *(milliseconds(r.seconds.methods[m][k]) for m in methods)]
+        rows.append([*row, milliseconds(r.paper.l2_seconds), milliseconds(r.seconds.l2)])
+    return [*table(header, rows), *_note(results), '', *bullets(_on_seconds(results.graphs))]
 
 
 def _on_seconds(graphs: Sequence[GraphResult]) -> Iterator[str]:
@@ -208,10 +218,10 @@ def figure_2(results: Results) -> list[str]:
     for problem, methods in results.convergence.items():
         lowest = min(history[:, 1].min() for history in methods.values())
         for method, history in methods.items():
-            rows.append([problem, method, f'{history[-1, 0]:,.0f}', _cost(history[0, 1]),
-                         _cost(history[-1, 1]), compared(history[-1, 1], lowest),
+            rows.append([problem, method, f'{history[-1, 0]:,.0f}', cost(history[0, 1]),
+                         cost(history[-1, 1]), compared(history[-1, 1], lowest),
                          _arrival(history, (1 + _ARRIVED) * lowest)])
-    return _table(header, rows, words=2)
+    return table(header, rows, words=2)
 
 
 def _arrival(history: Array, bound: float) -> str:
@@ -228,7 +238,7 @@ def compared(value: float, reference: float) -> str:
         return 'level with'
     if ratio >= _TIMES:
         return f'{ratio:,.3g} times'
-    return f'{_percent(abs(ratio - 1))} {"above" if ratio > 1 else "below"}'
+    return f'{percent(abs(ratio - 1))} {"above" if ratio > 1 else "below"}'
 
 
 def _note(results: Results) -> list[str]:
@@ -237,33 +247,5 @@ def _note(results: Results) -> list[str]:
     return []
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> list[str]:
-    """Return a table whose first columns hold words, the others numbers."""
-    lines = [header, ['---'] * words + ['---:'] * (len(header) - words), *rows]
-    return [f'| {" | ".join(cells)} |' for cells in lines]
-
-
-def _list(sentences: Iterator[str]) -> list[str]:
-    return [f'- {sentence}' for sentence in sentences]
-
-
 def _names(graphs: Sequence[GraphResult]) -> str:
-    return _listed([r.paper.name for r in graphs])
-
-
-def _listed(words: Sequence[str]) -> str:
-    return ' and '.join(filter(None, (', '.join(words[:-1]), words[-1])))
-
-
-def _cost(cost: float) -> str:
-    return f'{cost:.6g}'.replace('e+0', 'e')
-
-
-def _percent(part: float) -> str:
-    return f'{100 * part:.2g}%'
-
-
-def _ms(seconds: float | None) -> str:
-    if seconds is None:
-        return 'did not finish'
-    return f'{1e3 * seconds:.3g}' if seconds < 1 else f'{1e3 * seconds:.0f}'
+    return listed([r.paper.name for r in graphs])

@@ -12,7 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from l1slam_ros.core.backend import Backend, BackendOptions, Improvement, improve, optimise
+from l1slam_ros.core.backend import (
+    LOOP_STATES,
+    Backend,
+    BackendOptions,
+    Improvement,
+    LoopStates,
+    improve,
+    optimise,
+)
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.graph import BetweenFactors
 from l1slam_ros.core.manifold import Array, Indices, Manifold
@@ -22,12 +30,18 @@ from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, write_graph_f
 
 @dataclass(frozen=True)
 class MapState:
-    """stamps (n,) [ns] and poses (n, p) of all keyframes; map_to_odom (1, p); the factors."""
+    """
+    The map as it is.
+
+    stamps (n,) [ns] and poses (n, p) of all keyframes; map_to_odom (1, p); the factors, and what
+    has become of the loops.
+    """
 
     stamps: Indices
     poses: Array
     map_to_odom: Array
     factors: BetweenFactors
+    loops: LoopStates
 
 
 class SharedBackend:
@@ -68,14 +82,16 @@ class SharedBackend:
         with self._lock:
             backend = self._backend
             return MapState(backend.growth.stamps, backend.poses, backend.map_to_odom,
-                            backend.growth.graph.between)
+                            backend.growth.graph.between, backend.loop_states())
 
     def counts(self) -> tuple[dict[str, int], dict[str, int]]:
         """Return the sizes of the graph, and how many loops were refused for which cause."""
         with self._lock:
             growth = self._backend.growth
-            sizes = {'keyframes': growth.graph.n_poses, 'factors': len(growth.graph.between),
-                     'waiting_loops': growth.n_waiting}
+            sizes = {'keyframes': growth.graph.n_poses, 'factors': len(growth.graph.between)}
+            loops = np.bincount(self._backend.loop_states().state, minlength=len(LOOP_STATES))
+            sizes |= {f'{name}_loops': int(count)
+                      for name, count in zip(LOOP_STATES, loops, strict=True)}
             return sizes, dict(growth.refused)
 
     def update(self, budget: float) -> Improvement | None:

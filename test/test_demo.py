@@ -11,7 +11,7 @@ pytest.importorskip('rclpy')
 from nav_msgs.msg import Path as PathMessage
 
 from l1slam_ros.cli import main
-from l1slam_ros.demo import BAG, read_recording, summarise
+from l1slam_ros.demo import BAG, Heard, read_recording, summarise
 from l1slam_ros.io.bag import read_messages
 from l1slam_ros.publishing import pose_stamped
 
@@ -46,8 +46,12 @@ def test_the_summary_of_a_perfect_map_is_an_error_of_zero(tmp_path):
     path = PathMessage(poses=[
         pose_stamped('map', int(stamp), np.array([x, y, 0, 0, 0, 0, 1.0]))
         for stamp, (x, y) in zip(recording.stamps, turned, strict=True)])
-    text = summarise(recording, path, 4.0, tmp_path / 'demo' / 'map.png')
+    false, true = (tuple(recording.stamps[recording.loops[np.argmax(recording.is_false == kind)]])
+                   for kind in (True, False))
+    heard = Heard(path, [0.0, 0.25, 0.5], {false, true})
+    text = summarise(recording, heard, tmp_path / 'demo' / 'map.png')
     assert '0.000 m in the map' in text and '2.880 m by odometry' in text
     assert '1000 keyframes, 611 loops, 10 of them false' in text
+    assert '1 false loops, 1 true ones' in text
     assert '4.0 updates per second' in text
     assert (tmp_path / 'demo' / 'map.png').read_bytes().startswith(b'\x89PNG')

@@ -12,8 +12,9 @@ from systems import SHAPES, cholesky_of_system, random_system, system_of
 from l1slam_ros.core import se2
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.interior_point import GraphProblem, LinearProblem, interior_point, prove
+from l1slam_ros.core.interior_point import interior_point, prove
 from l1slam_ros.core.kernels import interior_point as kernels
+from l1slam_ros.core.l1_problem import GraphProblem, LinearProblem
 from l1slam_ros.core.linearise import linearise, whitened_residual
 from l1slam_ros.core.optimality import Status, l1_cost
 

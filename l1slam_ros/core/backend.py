@@ -216,7 +216,7 @@ class Backend:
 
 def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Improvement:
     """
-    Judge the loops that have come, and lower the L1 cost of a snapshot, for about `budget` seconds.
+    Judge the loops that have come and lower the L1 cost of a snapshot, for about `budget` seconds.
 
     While the cost is far above what the last update left (a loop has closed), reweighted least
     squares steps carry the long-range part: one factorisation bends the whole chain, where a

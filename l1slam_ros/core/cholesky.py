@@ -103,7 +103,7 @@ class BlockCholesky:
         blocks.add_normal(panels, system.blocks, weights.reshape(-1, k), *layout.places, sizes)
         if curvature is not None and share:
             blocks.add_blocks(panels, curvature, share, *layout.places, sizes)
-        added = np.ascontiguousarray(np.broadcast_to(diagonal, system.size * k)).reshape(-1, k)
+        added = np.full(system.size * k, diagonal, float).reshape(-1, k)
         cholesky.add_diagonal(panels, *layout.diagonal, self.pattern.position, added, sizes)
         self._factored = layout
         return bool(cholesky.factorise(panels, *layout.shape, sizes) == system.size)

@@ -9,7 +9,8 @@ import numpy as np
 
 from l1slam_ros.core.cholesky import BlockCholesky
 from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.interior_point import GraphProblem, interior_point, prove
+from l1slam_ros.core.interior_point import interior_point, prove
+from l1slam_ros.core.l1_problem import GraphProblem
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.manifold import Array

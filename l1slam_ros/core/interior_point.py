@@ -22,26 +22,19 @@ Source: Mehrotra (1992) for the predictor and corrector; the rest is ours, defen
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
 from l1slam_ros.core.cholesky import BlockCholesky
-from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.linearise import (
-    LinearSystem,
-    ends,
-    linearise,
-    step_poses,
-    whitened_residual,
-)
+from l1slam_ros.core.l1_problem import Problem
+from l1slam_ros.core.linearise import LinearSystem
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.optimality import Status, fits_exactly, l1_cost, smoothing
 
 # How far to go towards the nearest bound.
 _FRACTION = 0.9995
-# Converged must also mean that no step of the last linear problem would lower the cost by more than
-# this part: with many false loops it can come to rest where one would.
+# Converged must also mean that no step of the last linear problem would lower the cost by more
+# than this part: with many false loops it can come to rest where one would.
 _PROVEN = 1e-2
 # Slacks are kept above this and never recomputed as 1 -+ y, which would cancel.
 _SMALLEST_SLACK = 1e-15
@@ -60,68 +53,6 @@ _PROJECTIONS, _CLOSE = 10, 1e-4
 _LEAST_WEIGHT = 1e-9
 
 Report = Callable[[int, float], None]
-
-
-class Problem(Protocol):
-    """What is minimised: the L1 norm of a residual, over poses that move by steps."""
-
-    def residual(self, poses: Array) -> Array:
-        """Return the whitened residual, (rows,)."""
-
-    def linearise(self, poses: Array, residual: Array) -> LinearSystem:
-        """Return the linear system whose b is minus the residual."""
-
-    def step(self, poses: Array, x: Array) -> Array:
-        """Return the poses moved by x (columns,)."""
-
-    def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> Array | None:
-        """Return the Hessian of dual'e for each of the first factors, (m', 2 k, 2 k)."""
-
-
-@dataclass(frozen=True)
-class GraphProblem:
-    """The poses of a graph."""
-
-    graph: FactorGraph
-
-    def residual(self, poses: Array) -> Array:
-        """See `Problem`."""
-        return whitened_residual(self.graph, poses)
-
-    def linearise(self, poses: Array, residual: Array) -> LinearSystem:
-        """See `Problem`."""
-        return linearise(self.graph, poses, residual)
-
-    def step(self, poses: Array, x: Array) -> Array:
-        """See `Problem`."""
-        return step_poses(self.graph, poses, x)
-
-    def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> Array:
-        """See `Problem`."""
-        gradient = system.gradients(dual)[: len(self.graph.between)]
-        return self.graph.manifold.residual_curvature(*ends(self.graph, poses), gradient)
-
-
-@dataclass(frozen=True)
-class LinearProblem:
-    """A step x (columns,) in the place of poses: |A x - b|."""
-
-    system: LinearSystem
-
-    def residual(self, poses: Array) -> Array:
-        """See `Problem`."""
-        return self.system.times(poses) - self.system.b
-
-    def linearise(self, poses: Array, residual: Array) -> LinearSystem:
-        """See `Problem`."""
-        return replace(self.system, b=-residual)
-
-    def step(self, poses: Array, x: Array) -> Array:
-        """See `Problem`."""
-        return poses + x
-
-    def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> None:
-        """See `Problem`."""
 
 
 @dataclass
@@ -256,7 +187,7 @@ def interior_point(
 
 def prove(optimum: Optimum, cholesky: BlockCholesky) -> tuple[Array, float, Status]:
     """
-    Return a dual y (rows,) with A'y = 0, |y| <= 1, what it proves, and what that makes of the status.
+    Return a dual y (rows,) with A'y = 0, |y| <= 1, what it proves, and the status in its light.
 
     No step of the linear problem at the poses can lower their cost by more than the second number,
     |b|_1 + b'y. A run that came to rest where one might lower it by a percent has not converged.

@@ -124,8 +124,7 @@ def minimise(
         if time.monotonic() > deadline:
             status = Status.OUT_OF_TIME
             break
-    if dual is None:
-        dual = np.zeros(len(residual))
+    dual = np.zeros(len(residual)) if dual is None else dual
     return Solution(poses, history[-1], status, len(history) - 1, inner, np.array(history), dual,
                     gap)
 

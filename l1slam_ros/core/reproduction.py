@@ -10,7 +10,7 @@ weight, and in Algorithm 4 the full step, with a dual that restarts from zero.
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 
@@ -47,6 +47,9 @@ _REPETITIONS, _LONGEST = 5, 10.0
 # Algorithm 4 as printed has settled after so many steps, each changing the cost by less than this
 # part of itself. From there on it only cycles, on a large world for minutes.
 _SETTLED_STEPS, _SETTLED = 5, 1e-4
+# It may pass over so many factors in all. Measured, that is a minute and a half for 700,000 edges,
+# where 30 linearisations would be nine minutes; the smaller graphs of the paper stay below it.
+_MOST_PASSES = 1.5e9
 # Gauss-Newton is timed over so many steps; from the seed it needs about as many.
 _TIMED_L2_STEPS = 3
 
@@ -57,13 +60,15 @@ class Effort:
     How long the experiments run; the defaults are those of the report.
 
     outer : most linearisations of Algorithm 4 as printed, inner : iterations of each; iterations :
-    of the angle and translation problems of Figure 2; timed : what one time is taken of.
+    of the angle and translation problems of Figure 2; timed : what one time is taken of; draws :
+    of each random trial of Figures 4 and 6.
     """
 
     outer: int = 30
     inner: int = 400
     iterations: int = 10_000
     timed: int = 40
+    draws: int = 5
 
 
 @dataclass(frozen=True)
@@ -72,13 +77,15 @@ class Costs:
     The L1 costs of one graph.
 
     initial, seed, l2 : of the start, the seed and the L2 map; printed : (k,) after each step of
-    Algorithm 4 as printed, the seed's first; solution : of the default solver, and its name.
+    Algorithm 4 as printed, the seed's first; cut_short : it had not settled, and the graph was too
+    large to go on; solution : of the default solver, and its name.
     """
 
     initial: float
     seed: float
     l2: float
     printed: Array
+    cut_short: bool
     solution: Solution
     solver: str
 
@@ -97,25 +104,35 @@ def measure_costs(
     """Return what the solvers make of a graph from its seed; start, seed : (n, p) poses."""
     solution, solver = minimise_by(choose(AUTO, graph), graph, seed, OptimiserOptions(),
                                    report)
-    printed = printed_costs(graph, seed, effort, report)
+    bearable = replace(effort, outer=min(effort.outer, _most_linearisations(graph, effort)))
+    printed = printed_costs(graph, seed, bearable, report)
+    cut_short = bearable.outer < effort.outer and not _has_settled(printed)
     l2 = minimise_l2(graph, seed, LeastSquaresOptions(), cholesky_of(graph), report)
     return Costs(_cost(graph, start), _cost(graph, seed), _cost(graph, l2.poses), printed,
-                 solution, solver)
+                 cut_short, solution, solver)
+
+
+def _most_linearisations(graph: FactorGraph, effort: Effort) -> int:
+    return max(1, int(_MOST_PASSES / (effort.inner * max(len(graph.between), 1))))
 
 
 def printed_costs(graph: FactorGraph, poses: Array, effort: Effort, report: Report) -> Array:
     """Return the cost of the poses, then after each step of Algorithm 4 as printed, (k,)."""
-    costs = [_cost(graph, poses)]
+    costs = np.array([_cost(graph, poses)])
     for outer in range(effort.outer):
         system = linearise(graph, poses)
         iterates = printed_iterates(system, np.zeros(system.A.shape[1]))
         poses = step_poses(graph, poses, _last(iterates, effort.inner)[0])
-        costs.append(_cost(graph, poses))
+        costs = np.append(costs, _cost(graph, poses))
         report(outer + 1, costs[-1])
-        changes = np.abs(np.diff(costs[-_SETTLED_STEPS - 1:]))
-        if len(changes) == _SETTLED_STEPS and (changes < _SETTLED * costs[-1]).all():
+        if _has_settled(costs):
             break
-    return np.array(costs)
+    return costs
+
+
+def _has_settled(costs: Array) -> bool:
+    changes = np.abs(np.diff(costs[-_SETTLED_STEPS - 1:]))
+    return len(changes) == _SETTLED_STEPS and bool((changes < _SETTLED * costs[-1]).all())
 
 
 def printed_iterates(system: LinearSystem, x: Array) -> Iterator[tuple[Array, Array]]:

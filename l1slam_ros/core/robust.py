@@ -85,10 +85,10 @@ def robust_solve(
     """
     if trusted is None:
         trusted = np.zeros(len(graph.between), bool)
-    growth = Growth(graph, trusted, np.random.default_rng(_SEED))
-    growth.begin()
+    first = growth = Growth(graph, trusted, np.random.default_rng(_SEED))
+    first.begin()
     number = 0
-    for number, growth in enumerate(rounds(growth), 1):
+    for number, growth in enumerate(rounds(first), 1):
         report(number, int(np.count_nonzero(growth.accepted & growth.is_loop)))
     square, suspect = outlook(growth)
     return RobustSolution(growth.poses, growth.accepted, suspect, np.sqrt(square),

@@ -3,8 +3,8 @@
 A robust map in the norm that was asked for.
 
 In: a graph and a solver. Out: the solver's map of the loops that may be believed, and which these
-are. The loops are chosen in L2, which spreads a doubt over all factors near it, where L1 leaves it on
-a few; L2 map and choice follow each other until nothing changes.
+are. The loops are chosen in L2, which spreads a doubt over all factors near it, where L1 leaves it
+on a few; L2 map and choice follow each other until nothing changes.
 """
 
 from collections.abc import Callable

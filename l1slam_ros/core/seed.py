@@ -13,7 +13,8 @@ from l1slam_ros.core.cholesky import BlockCholesky
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.halpern import minimise_l1_halpern
 from l1slam_ros.core.initial import odometry_poses, tree_poses
-from l1slam_ros.core.interior_point import LinearProblem, interior_point
+from l1slam_ros.core.interior_point import interior_point
+from l1slam_ros.core.l1_problem import LinearProblem
 from l1slam_ros.core.least_squares import weighted_least_squares
 from l1slam_ros.core.linearise import (
     LinearSystem,

@@ -2,7 +2,8 @@
 """
 The row-wise work of one interior-point step, in single passes; names as in `interior_point`.
 
-All arrays are (rows,). q = 1 / (u/s + v/t); c1, c2 are what the products u s and v t are to become.
+All arrays are (rows,). q = 1 / (u/s + v/t); c1, c2 are what the products u s and v t are to
+become.
 """
 
 import numpy as np

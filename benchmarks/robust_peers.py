@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+gtsam's robust solvers: Levenberg-Marquardt with a kernel, GNC, ISAM2 with a kernel.
+
+Kernels are on the loops alone, the odometry of the graph is not doubted, and GNC is told that it
+need not be. Graphs are built before the clock starts. None but GNC says which loops it believes,
+so for all of them a loop counts as kept when the map that comes out agrees with it: see
+`robust_runs`.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from graph_peers import _PRIOR_SIGMA, _gtsam_values, _information
+from graph_solvers import MOST_ITERATIONS, SAME_TOLERANCE
+from measuring import clock
+from robust_solvers import Driven, Found, OnlineSolver, RobustSolver
+
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.manifold import Array
+
+# The parameter of each kernel [sigma, for DCS sigma^2], the best of several that were tried.
+KERNELS = {'DCS': 1.0, 'GemanMcClure': 1.0, 'Huber': 0.1, 'Cauchy': 0.1}
+# GNC takes a loop for an outlier beyond this quantile of chi2.
+_GNC_PROBABILITY = 0.999
+# [m or rad] ISAM2 linearises again what has moved by more, after each pose.
+_RELINEARISE = 0.01
+
+
+def _noises(graph: FactorGraph, kernel: str | None) -> list[Any]:
+    """Return gtsam's noise of each between factor, with the kernel where it is a loop."""
+    import gtsam
+
+    kernels, noises = gtsam.noiseModel.mEstimator, gtsam.noiseModel
+    robust = getattr(kernels, kernel).Create(KERNELS[kernel]) if kernel else None
+    plain = [noises.Gaussian.Information(each) for each in _information(graph)]
+    if robust is None:
+        return plain
+    return [noise if sure else noises.Robust.Create(robust, noise)
+            for noise, sure in zip(plain, graph.between.is_odometry.tolist(), strict=True)]
+
+
+def _factors(graph: FactorGraph, kernel: str | None) -> list[Any]:
+    import gtsam
+
+    factors = graph.between
+    return [gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*z), noise) for i, j, z, noise in zip(
+        factors.i.tolist(), factors.j.tolist(), factors.measurement.tolist(),
+        _noises(graph, kernel), strict=True)]
+
+
+def _prior(pose: Array) -> Any:
+    import gtsam
+
+    tight = gtsam.noiseModel.Isotropic.Sigma(3, _PRIOR_SIGMA)
+    return gtsam.PriorFactorPose2(0, gtsam.Pose2(*pose), tight)
+
+
+def _graph(graph: FactorGraph, poses: Array, kernel: str | None) -> Any:
+    import gtsam
+
+    built = gtsam.NonlinearFactorGraph()
+    for factor in _factors(graph, kernel):
+        built.add(factor)
+    built.add(_prior(poses[0]))
+    return built
+
+
+def _parameters() -> Any:
+    import gtsam
+
+    options = gtsam.LevenbergMarquardtParams()
+    options.setRelativeErrorTol(SAME_TOLERANCE)
+    options.setMaxIterations(MOST_ITERATIONS)
+    return options
+
+
+def _timed(optimise: Callable[[], Any]) -> Found:
+    import gtsam
+
+    began = clock()
+    values = optimise()
+    seconds = clock() - began
+    return Found(np.array(gtsam.utilities.extractPose2(values)), seconds)
+
+
+def _by_kernel(kernel: str) -> Callable[[FactorGraph, Array], Found]:
+    def solve(graph: FactorGraph, poses: Array) -> Found:
+        import gtsam
+
+        built, values = _graph(graph, poses, kernel), _gtsam_values(poses)
+        return _timed(lambda: gtsam.LevenbergMarquardtOptimizer(
+            built, values, _parameters()).optimize())
+
+    return solve
+
+
+def _by_gnc(graph: FactorGraph, poses: Array) -> Found:
+    """Solve by graduated non-convexity, truncated least squares, from L2 on all loops."""
+    import gtsam
+
+    built, values = _graph(graph, poses, None), _gtsam_values(poses)
+    options = gtsam.GncLMParams(_parameters())
+    options.setLossType(gtsam.GncLossType.TLS)
+    sure = [*np.flatnonzero(graph.between.is_odometry).tolist(), len(graph.between)]
+    options.setKnownInliers(sure)
+
+    def optimise() -> Any:
+        gnc = gtsam.GncLMOptimizer(built, values, options)
+        gnc.setInlierCostThresholdsAtProbability(_GNC_PROBABILITY)
+        return gnc.optimize()
+
+    return _timed(optimise)
+
+
+def _isam2(kernel: str) -> Callable[[FactorGraph, int], Driven]:
+    def drive(graph: FactorGraph, every: int) -> Driven:
+        """Add pose by pose, each with the factors that end there."""
+        import gtsam
+
+        options = gtsam.ISAM2Params()
+        options.setRelinearizeThreshold(_RELINEARISE)
+        options.relinearizeSkip = 1
+        isam, at = gtsam.ISAM2(options), gtsam.Pose2()
+        maps, seconds = [], 0.0
+        for k, (new, step) in enumerate(_by_time(graph, kernel)):
+            values = gtsam.Values()
+            values.insert(k, at.compose(step))
+            began = clock()
+            isam.update(new, values)
+            at = isam.calculateEstimatePose2(k)
+            seconds += clock() - began
+            if (k + 1) % every == 0:
+                maps.append(_map(isam))
+        return Driven(maps, _map(isam), seconds)
+
+    return drive
+
+
+def _by_time(graph: FactorGraph, kernel: str) -> Iterator[tuple[Any, Any]]:
+    """Yield, for each pose, the factors that end there, and its odometry."""
+    import gtsam
+
+    factors = graph.between
+    built, ends = _factors(graph, kernel), np.maximum(factors.i, factors.j)
+    forward = factors.i < factors.j
+    order = np.argsort(ends, kind='stable')
+    for k, rows in enumerate(np.split(order, np.searchsorted(ends[order], range(1, graph.n_poses)))):
+        new, step = gtsam.NonlinearFactorGraph(), gtsam.Pose2()
+        if not k:
+            new.add(_prior(np.zeros(3)))
+        for row in rows.tolist():
+            new.add(built[row])
+            if factors.is_odometry[row]:
+                measured = gtsam.Pose2(*factors.measurement[row])
+                step = measured if forward[row] else measured.inverse()
+        yield new, step
+
+
+def _map(isam: Any) -> Array:
+    import gtsam
+
+    poses: Array = np.array(gtsam.utilities.extractPose2(isam.calculateEstimate()))
+    return poses
+
+
+# From where each is started; the second start is there where it helps.
+_METHODS = {'DCS': _by_kernel('DCS'), 'GM': _by_kernel('GemanMcClure'), 'GNC': _by_gnc,
+            'Huber': _by_kernel('Huber'), 'Cauchy': _by_kernel('Cauchy')}
+PEERS = tuple(RobustSolver(f'gtsam {name}, {start}', False, start, solve)
+              for name, solve in _METHODS.items() for start in ('odometry', 'seed', 'stored'))
+ONLINE_PEERS = tuple(OnlineSolver(f'ISAM2 {name}', False, _isam2(kernel))
+                     for name, kernel in (('DCS', 'DCS'), ('GM', 'GemanMcClure')))

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The paper's two trials: starts that are mostly noise (Figure 4), and loops that lie (Figure 6).
+
+In: a graph and its stored poses. Out: what the methods make of each trial, how far off the map of
+the untouched input that is, and which loops were refused.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.choice import AUTO, choose, minimise_by
+from l1slam_ros.core.cholesky import cholesky_of
+from l1slam_ros.core.false_loops import Loops, identity_false_loops, insert_loops
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.initial import pair_key
+from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_huber, minimise_l2
+from l1slam_ros.core.linearise import whitened_residual
+from l1slam_ros.core.manifold import Array, Indices
+from l1slam_ros.core.metrics import absolute_trajectory_error, aligned_positions
+from l1slam_ros.core.noise import Mask
+from l1slam_ros.core.optimality import l1_cost
+from l1slam_ros.core.optimiser import OptimiserOptions, Solution
+from l1slam_ros.core.reproduction import Effort, printed_costs
+from l1slam_ros.core.robust_map import minimise_robustly
+from l1slam_ros.core.seed import seed_poses
+
+START, L2, L1, SEED, ROBUST = 'the start itself', 'L2', 'L1', 'seed alone', '`--robust`'
+# Standard deviations of the noise on every stored pose, each [m] and [rad] alike.
+NOISES = (0.25, 0.5, 1.0, 2.0)
+# Where Huber turns linear [sigmas]; the narrow ones are nearly L1, 1 is the default of g2o.
+HUBER_WIDTHS = (0.01, 0.1, 1.0, 10.0)
+# A map that is further off than this part of its diagonal looks bent to the eye.
+_BENT = 0.02
+
+
+@dataclass(frozen=True)
+class Map:
+    """positions : (n, k) [m], on the map compared with; cost : L1; error : RMSE off it [m]."""
+
+    positions: Array
+    cost: float
+    error: float
+
+
+@dataclass(frozen=True)
+class StartTrial:
+    """What comes of one start; noise : one of `NOISES`; maps : by method, START among them."""
+
+    noise: float
+    maps: dict[str, Map]
+
+
+@dataclass(frozen=True)
+class StartTrials:
+    """
+    What comes of noisy starts.
+
+    seed, solution : from no start at all; the trials are compared with the solution; l2_cost : L1
+    cost of the L2 map from the seed; printed : (k,) costs of Algorithm 4 as printed, from the seed;
+    bent : [m] error from which on a map has lost its shape.
+    """
+
+    seed: Map
+    solution: Map
+    l2_cost: float
+    printed: Array
+    trials: Sequence[StartTrial]
+    bent: float
+
+
+@dataclass(frozen=True)
+class LoopTrial:
+    """
+    What comes of one draw of false loops.
+
+    false : (k, 2) the pairs they join; maps : by method, each compared with its own of the clean
+    graph; kept : how many false loops the robust method kept; lost : how many true ones it did not.
+    """
+
+    false: Indices
+    maps: dict[str, Map]
+    kept: int
+    lost: int
+
+
+@dataclass(frozen=True)
+class LoopTrials:
+    """
+    What comes of false loops.
+
+    clean : by method, of the graph without; loops : (m, 2) its true ones; trials : one for each
+    draw; bent : as of `StartTrials`, of the clean L1 map.
+    """
+
+    clean: dict[str, Map]
+    loops: Indices
+    trials: Sequence[LoopTrial]
+    bent: float
+
+
+def huber_name(width: float) -> str:
+    """Return the method's name for one of `HUBER_WIDTHS`."""
+    return f'Huber, width {width:g}'
+
+
+def try_noisy_starts(
+    graph: FactorGraph, stored: Array, effort: Effort, printed: Effort,
+    rng: np.random.Generator, advance: Callable[[], None] = lambda: None,
+) -> StartTrials:
+    """
+    Return what comes of the stored poses (n, p) under every noise, as often as `effort` says.
+
+    printed : the effort of Algorithm 4 as printed; advance : called after each trial
+    """
+    cholesky = cholesky_of(graph)
+    seed = seed_poses(graph, cholesky)
+    solution = _minimise_l1(graph, seed)
+    trials = []
+    for noise in (noise for noise in NOISES for _ in range(effort.draws)):
+        start = with_noise(graph, stored, noise, rng)
+        maps = {START: start,
+                L2: minimise_l2(graph, start, LeastSquaresOptions(), cholesky).poses,
+                L1: _minimise_l1(graph, start).poses}
+        trials.append(StartTrial(noise, {method: _compared(graph, poses, solution.poses)
+                                         for method, poses in maps.items()}))
+        advance()
+    l2 = minimise_l2(graph, seed, LeastSquaresOptions(), cholesky)
+    return StartTrials(_compared(graph, seed, solution.poses),
+                       _compared(graph, solution.poses, solution.poses),
+                       l1_cost(whitened_residual(graph, l2.poses)),
+                       printed_costs(graph, seed, printed), trials,
+                       _bent(graph, solution.poses))
+
+
+def with_noise(
+    graph: FactorGraph, poses: Array, sigma: float, rng: np.random.Generator
+) -> Array:
+    """Return the poses (n, p), each moved at random by sigma [m] and [rad] in its own axes."""
+    size = graph.manifold.TANGENT_SIZE
+    return graph.manifold.retract(poses, sigma * rng.standard_normal((len(poses), size)))
+
+
+def try_false_loops(
+    graph: FactorGraph, stored: Array, count: int, effort: Effort,
+    rng: np.random.Generator, advance: Callable[[], None] = lambda: None,
+) -> LoopTrials:
+    """
+    Return what comes of `count` loops between far poses that measure no motion at all.
+
+    stored : (n, p) where Huber starts, the other methods read no start; advance : called after each
+    draw, and once for the clean graph
+
+    Raises
+    ------
+    GraphError : too few far pairs are free, or the graph is no chain of odometry with loops.
+
+    """
+    clean, _ = _maps(graph, stored)
+    advance()
+    trials = []
+    for _ in range(effort.draws):
+        loops = identity_false_loops(graph, clean[L1], count, rng)
+        trials.append(_try_loops(graph, stored, loops, clean))
+        advance()
+    factors = graph.between
+    pairs = np.stack((factors.i, factors.j), axis=1)
+    return LoopTrials({method: _compared(graph, poses, clean[L1])
+                       for method, poses in clean.items()},
+                      pairs[~factors.is_odometry], trials, _bent(graph, clean[L1]))
+
+
+def _try_loops(
+    graph: FactorGraph, stored: Array, loops: Loops, clean: dict[str, Array]
+) -> LoopTrial:
+    lying = insert_loops(graph, loops)
+    maps, accepted = _maps(lying, stored)
+    factors, n = lying.between, graph.n_poses
+    false = np.isin(pair_key(factors.i, factors.j, n), pair_key(loops.i, loops.j, n))
+    compared = {method: _compared(lying, poses, clean[method]) for method, poses in maps.items()}
+    return LoopTrial(np.stack((loops.i, loops.j), axis=1), compared,
+                     int(np.count_nonzero(false & accepted)),
+                     int(np.count_nonzero(~false & ~accepted)))
+
+
+def _maps(graph: FactorGraph, stored: Array) -> tuple[dict[str, Array], Mask]:
+    """Return the poses by every method, and which factors the robust one accepted."""
+    cholesky = cholesky_of(graph)
+    seed, robust = seed_poses(graph, cholesky), minimise_robustly(graph, _minimise_l1)
+    hubers = {huber_name(width): minimise_huber(
+        graph, stored, LeastSquaresOptions(huber_delta=width), cholesky).poses
+        for width in HUBER_WIDTHS}
+    return {SEED: seed, L1: _minimise_l1(graph, seed).poses, **hubers,
+            ROBUST: robust.solution.poses}, robust.accepted
+
+
+def _minimise_l1(graph: FactorGraph, poses: Array) -> Solution:
+    return minimise_by(choose(AUTO, graph), graph, poses, OptimiserOptions())[0]
+
+
+def _compared(graph: FactorGraph, poses: Array, reference: Array) -> Map:
+    """Return the map of poses (n, p), laid on those of the reference."""
+    mine, other = graph.manifold.positions(poses), graph.manifold.positions(reference)
+    return Map(aligned_positions(mine, other), l1_cost(whitened_residual(graph, poses)),
+               absolute_trajectory_error(mine, other))
+
+
+def _bent(graph: FactorGraph, poses: Array) -> float:
+    size = np.ptp(graph.manifold.positions(poses), axis=0)
+    return float(_BENT * np.linalg.norm(size))
