@@ -71,19 +71,20 @@ def judge(graph: FactorGraph, poses: Array, belief: Belief, deadline: float) -> 
     Parameters
     ----------
     poses : (n, p) the map of what was believed
-    deadline : `time.monotonic()` [s] after which no further round begins
+    deadline : `time.monotonic()` [s] after which no second round begins
 
     """
     growth = Growth(graph, graph.between.trusted, np.random.default_rng(_SEED))
     growth.resume(poses, belief.accepted, belief.variance)
-    settled = False
-    while not settled:
-        news = growth.believable(growth.undecided())
-        settled = not len(news)
-        if settled or time.monotonic() > deadline:
-            break
+    news = growth.believable(growth.undecided())
+    # One round is always finished, or short budgets would never get anywhere.
+    while len(news):
         growth.accepted[news] = True
         growth.settle()
+        news = growth.believable(growth.undecided())
+        if time.monotonic() > deadline:
+            break
     square, suspect = outlook(growth)
     accepted = reconsidered(graph, growth.poses, growth.accepted, graph.between.trusted)
-    return Belief(accepted, suspect & ~accepted, np.sqrt(square), growth.variance, settled)
+    return Belief(accepted, suspect & ~accepted, np.sqrt(square), growth.variance,
+                  not len(news))

@@ -30,8 +30,9 @@ from l1slam_ros.core.seed import seed_poses
 START, L2, L1, SEED, ROBUST = 'the start itself', 'L2', 'L1', 'seed alone', '`--robust`'
 # Standard deviations of the noise on every stored pose, each [m] and [rad] alike.
 NOISES = (0.25, 0.5, 1.0, 2.0)
-# Where Huber turns linear [sigmas]; the narrow ones are nearly L1, 1 is the default of g2o.
-HUBER_WIDTHS = (0.01, 0.1, 1.0, 10.0)
+# Where Huber turns linear [sigmas]; the narrower, the nearer to L1.
+HUBER_OF_G2O = 1.0
+HUBER_WIDTHS = (0.01, 0.1, HUBER_OF_G2O, 10.0)
 # A map that is further off than this part of its diagonal looks bent to the eye.
 _BENT = 0.02
 
@@ -76,14 +77,20 @@ class LoopTrial:
     """
     What comes of one draw of false loops.
 
-    false : (k, 2) the pairs they join; maps : by method, each compared with its own of the clean
-    graph; kept : how many false loops the robust method kept; lost : how many true ones it did not.
+    maps : by method, each compared with its own of the clean graph; refused, kept : (k, 2) pairs
+    that the false loops join, by what the robust method did; lost : (l, 2) those of the true factors
+    that it refused.
     """
 
-    false: Indices
     maps: dict[str, Map]
-    kept: int
-    lost: int
+    refused: Indices
+    kept: Indices
+    lost: Indices
+
+    @property
+    def false(self) -> Indices:
+        """The pairs (k, 2) that all the false loops join."""
+        return np.concatenate((self.refused, self.kept))
 
 
 @dataclass(frozen=True)
@@ -165,11 +172,9 @@ def try_false_loops(
         loops = identity_false_loops(graph, clean[L1], count, rng)
         trials.append(_try_loops(graph, stored, loops, clean))
         advance()
-    factors = graph.between
-    pairs = np.stack((factors.i, factors.j), axis=1)
     return LoopTrials({method: _compared(graph, poses, clean[L1])
                        for method, poses in clean.items()},
-                      pairs[~factors.is_odometry], trials, _bent(graph, clean[L1]))
+                      _pairs(graph)[~graph.between.is_odometry], trials, _bent(graph, clean[L1]))
 
 
 def _try_loops(
@@ -180,9 +185,9 @@ def _try_loops(
     factors, n = lying.between, graph.n_poses
     false = np.isin(pair_key(factors.i, factors.j, n), pair_key(loops.i, loops.j, n))
     compared = {method: _compared(lying, poses, clean[method]) for method, poses in maps.items()}
-    return LoopTrial(np.stack((loops.i, loops.j), axis=1), compared,
-                     int(np.count_nonzero(false & accepted)),
-                     int(np.count_nonzero(~false & ~accepted)))
+    pairs = _pairs(lying)
+    return LoopTrial(compared, refused=pairs[false & ~accepted], kept=pairs[false & accepted],
+                     lost=pairs[~false & ~accepted])
 
 
 def _maps(graph: FactorGraph, stored: Array) -> tuple[dict[str, Array], Mask]:
@@ -194,6 +199,10 @@ def _maps(graph: FactorGraph, stored: Array) -> tuple[dict[str, Array], Mask]:
         for width in HUBER_WIDTHS}
     return {SEED: seed, L1: _minimise_l1(graph, seed).poses, **hubers,
             ROBUST: robust.solution.poses}, robust.accepted
+
+
+def _pairs(graph: FactorGraph) -> Indices:
+    return np.stack((graph.between.i, graph.between.j), axis=1)
 
 
 def _minimise_l1(graph: FactorGraph, poses: Array) -> Solution:
