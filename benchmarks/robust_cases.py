@@ -7,10 +7,11 @@ drawn by a seed, false loops by the package's own `false_loops`.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from robust_kinds import CLEAN, DEGREES, HEADING, KINDS, METRES, OWN_SHARE, TENTH
 
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.false_loops import FALSE_LOOPS, insert_loops, without_factors
@@ -22,19 +23,6 @@ from l1slam_ros.core.noise import Mask
 from l1slam_ros.core.seed import seed_poses
 from l1slam_ros.io.graph_file import read_graph_file
 
-SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
-CLEAN = 'clean'
-ONLINE = 'online-'
-# Kinds beside those of `FALSE_LOOPS`: how they are disturbed, what false loops, which share.
-_TENTH, _METRES, _DEGREES, _HEADING = 'tenth', 'slip 5 m', 'slip 90 deg', 'heading'
-OWN_SHARE = {
-    **{f'{_TENTH}-{kind}': (_TENTH, kind, 0.5) for kind in FALSE_LOOPS},
-    'slip-translation': (_METRES, 'random', 0.3),
-    'slip-rotation': (_DEGREES, 'random', 0.3),
-    'heading': (_HEADING, 'random', 0.3),
-    **{f'{ONLINE}{kind}': ('', kind, 0.3) for kind in FALSE_LOOPS},
-}
-KINDS = (CLEAN, *FALSE_LOOPS, *OWN_SHARE)
 _KEPT_TRUE = 0.1
 _SLIP_TRANSLATION, _SLIP_ROTATION = 5.0, math.pi / 2
 _HEADING_SIGMA = math.radians(1)
@@ -48,7 +36,7 @@ class Place:
     A graph without lies.
 
     stored : (n, p) poses of its file; best : (n, p) its L2 map; truth : (n, k) positions [m], None
-    where nobody knows them.
+    where nobody knows them; maps : (n, p) that solvers made of the graph, by the solver's name.
     """
 
     name: str
@@ -56,6 +44,7 @@ class Place:
     stored: Array
     best: Array
     truth: Array | None
+    maps: dict[str, Array | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -94,13 +83,6 @@ def place_of(name: str, graph: FactorGraph, stored: Array, truth: Array | None) 
     return Place(name, graph, stored, best, truth)
 
 
-def shares_of(kind: str, shares: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the shares that a kind is measured at."""
-    if kind == CLEAN:
-        return (0.0,)
-    return (OWN_SHARE[kind][2],) if kind in OWN_SHARE else shares
-
-
 def false_case(place: Place, kind: str, share: float, seed: int) -> FalseCase:
     """Return a graph of which `share` of all loops are false; count = true share / (1 - share)."""
     disturbance, lie, _ = OWN_SHARE.get(kind, ('', kind, share))
@@ -125,20 +107,20 @@ def _disturbed(
 ) -> tuple[FactorGraph, int]:
     """Return the graph before false loops, and the step at which its odometry slips, or -1."""
     graph, factors = place.graph, place.graph.between
-    if disturbance == _TENTH:
+    if disturbance == TENTH:
         loops = np.flatnonzero(~factors.is_odometry)
         kept = rng.choice(loops, round(len(loops) * _KEPT_TRUE), replace=False)
         left_out = ~factors.is_odometry
         left_out[kept] = False
         return without_factors(graph, left_out), -1
-    if disturbance == _HEADING:
+    if disturbance == HEADING:
         return _with_heading_noise(graph, rng), -1
-    if disturbance in (_METRES, _DEGREES):
+    if disturbance in (METRES, DEGREES):
         rows = np.flatnonzero(factors.is_odometry)
         edge = int(len(rows) * _EDGE)
         row = rows[rng.integers(edge, len(rows) - edge)]
         slip = np.zeros((1, graph.manifold.TANGENT_SIZE))
-        slip[0] = _slip(graph.manifold, disturbance == _METRES, rng)
+        slip[0] = _slip(graph.manifold, disturbance == METRES, rng)
         moved = factors.measurement.copy()
         moved[row] = graph.manifold.retract(moved[row][None], slip)[0]
         step = int(min(factors.i[row], factors.j[row]))

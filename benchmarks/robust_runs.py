@@ -7,14 +7,16 @@ system when it has used up its time: a solver that cannot be stopped is stopped 
 """
 
 import multiprocessing
-import resource
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
-from robust_cases import FalseCase
+from measuring import report_progress
+from robust_cases import FalseCase, Place, false_case
+from robust_kinds import CLEAN
 from robust_solvers import Driven, Found, OnlineSolver, RobustSolver
 
 from l1slam_ros.core.choice import AUTO, choose
@@ -96,22 +98,46 @@ def within(limit: float, work: Callable[[], Any]) -> Any:
 
 
 def _send(there: Connection, limit: float, work: Callable[[], Any]) -> None:
-    seconds = max(int(np.ceil(limit)), 1)
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+    # No handler: the signal ends the process wherever it is, in a foreign library too.
+    signal.setitimer(signal.ITIMER_PROF, limit)
     try:
         there.send(work())
     except Exception as error:
         there.send(error)
 
 
-def batch_run(case: FalseCase, solver: RobustSolver, reference: Array, limit: float) -> Run:
-    """
-    Return the run of a solver.
+def measure(place: Place, kind: str, share: float, seeds: int,
+            solvers: Sequence[RobustSolver | OnlineSolver], limit: float) -> list[Run]:
+    """Return the runs of all seeds; a solver whose time was up does not run again."""
+    runs: list[Run] = []
+    left = list(solvers)
+    for seed in range(1 if kind == CLEAN else seeds):
+        report_progress(f'{place.name}, {kind} {share:.0%}, seed {seed}')
+        case = false_case(place, kind, share, seed)
+        for solver in tuple(left):
+            run = (online_run(case, solver, limit) if isinstance(solver, OnlineSolver)
+                   else batch_run(case, solver, limit))
+            if run.seconds is None:
+                left.remove(solver)
+            runs.append(run)
+    return runs
 
-    reference : (n, p) its map of the clean graph; limit : [s] of start, building and solving
+
+def merged(before: Iterable[Run], runs: Iterable[Run]) -> list[Run]:
+    """Return all runs, the later where there are two of the same."""
+    by_key = {run.key: run for run in (*before, *runs)}
+    return [by_key[key] for key in sorted(by_key)]
+
+
+def batch_run(case: FalseCase, solver: RobustSolver, limit: float) -> Run:
     """
+    Return the run of a solver, judged by its own map of the clean graph.
+
+    limit : [s] of start, building and solving together
+    """
+    reference = _clean_map(case, solver, limit)
     found = within(limit, lambda: solver.solve(case.graph, STARTS[solver.start](case)))
-    if found is None:
+    if found is None or reference is None:
         return Run(*_name(case), solver.name, solver.ours)
     positions = case.graph.manifold.positions
     error = absolute_trajectory_error(positions(found.poses), positions(reference))
@@ -119,21 +145,28 @@ def batch_run(case: FalseCase, solver: RobustSolver, reference: Array, limit: fl
     return _judged(case, solver, found, error, error <= HOLDS.get(case.place.name, MORE), numbers)
 
 
-def clean_map(case: FalseCase, solver: RobustSolver, limit: float) -> Array | None:
+def _clean_map(case: FalseCase, solver: RobustSolver, limit: float) -> Array | None:
     """Return the solver's map (n, p) of the clean graph, from the L2 map; None: no time left."""
+    maps, name = case.place.maps, solver.name
+    if case.clean is case.place.graph and name in maps:
+        return maps[name]
     found = within(limit, lambda: solver.solve(case.clean, case.place.best))
-    return None if found is None else found.poses
+    poses = None if found is None else found.poses
+    if case.clean is case.place.graph:
+        maps[name] = poses
+    return poses
 
 
-def online_run(case: FalseCase, solver: OnlineSolver, clean: Driven, limit: float) -> Run:
-    """Return the run of a back end; clean : what it did on the clean graph."""
+def online_run(case: FalseCase, solver: OnlineSolver, limit: float) -> Run:
+    """Return the run of a back end, judged by its own run on the clean graph."""
+    clean = within(limit, lambda: solver.drive(case.clean, EVERY))
     driven = within(limit, lambda: solver.drive(case.graph, EVERY))
-    if driven is None:
+    if driven is None or clean is None:
         return Run(*_name(case), solver.name, solver.ours)
     errors, before = _running(case, driven), _running(case, clean)
     over = float((errors - TIMES * before - MORE).max(initial=-MORE))
     numbers = {'largest': float(errors.max(initial=0)), 'over': over,
-               'clean': float(before.mean())}
+               'clean': float(before.mean()), 'clean_seconds': clean.seconds}
     found = Found(driven.last, driven.seconds, driven.accepted)
     return _judged(case, solver, found, float(errors.mean()), over <= 0, numbers)
 

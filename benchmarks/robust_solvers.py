@@ -34,8 +34,8 @@ class Found:
     """
     A map and what it took.
 
-    poses : (n, p); seconds : [s]; accepted : (m,) bool, None where the solver does not say; slips :
-    rows of odometry factors it takes for lies.
+    poses : (n, p); seconds : [s]; accepted : (m,) bool, None where the solver does not say;
+    slips : rows of odometry factors it takes for lies.
     """
 
     poses: Array

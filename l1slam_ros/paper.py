@@ -51,4 +51,4 @@ WORLDS = {'all': (MANHATTAN_10K, MANHATTAN_50K), '10k': (MANHATTAN_10K,), 'none'
 NOISY = INTEL
 NOISY_OUTER, NOISY_INNER = 5, 500
 # Figure 6: how many loops that measure nothing were put between far poses, by graph.
-FALSE_LOOPS = {INTEL.name: 10, MANHATTAN_3500.name: 2}
+FALSE_LOOPS = {INTEL: 10, MANHATTAN_3500: 2}

@@ -12,7 +12,7 @@ from tempfile import mkdtemp
 
 import numpy as np
 
-from l1slam_ros import offline, paper, report, trials_report
+from l1slam_ros import figures, offline, paper, report
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.errors import FileError, GraphError, OptionError
 from l1slam_ros.core.graph import FactorGraph
@@ -31,24 +31,15 @@ from l1slam_ros.core.reproduction import (
 from l1slam_ros.core.seed import seed_poses
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
 from l1slam_ros.core.trials import (
-    HUBER_OF_G2O,
-    L1,
-    L2,
     NOISES,
-    ROBUST,
-    SEED,
-    START,
     LoopTrials,
-    Map,
     StartTrials,
-    huber_name,
     try_false_loops,
     try_noisy_starts,
 )
 from l1slam_ros.io.files import put_lines, require_folder
 from l1slam_ros.io.graph_file import GraphRecord
-from l1slam_ros.io.plot import Curve, MapDrawing, plot_curves, plot_maps
-from l1slam_ros.markdown import metres
+from l1slam_ros.io.plot import MapDrawing
 from l1slam_ros.paper import PaperGraph
 from l1slam_ros.progress import Progress
 from l1slam_ros.report import WORLD_SEED, GraphResult, Results
@@ -107,11 +98,18 @@ def read_datasets(datasets: Path) -> dict[str, GraphRecord]:
 
 def _read(path: Path) -> GraphRecord:
     record = offline.read_input(path)
-    try:
+    with _named(path):
         offline.require_connected(record)
-    except GraphError as error:
-        raise FileError(path, str(error)) from error
     return record
+
+
+@contextmanager
+def _named(file: Path | str) -> Iterator[None]:
+    """Let what is wrong with a graph name the file it came from."""
+    try:
+        yield
+    except GraphError as error:
+        raise FileError(file, str(error)) from error
 
 
 def run(
@@ -150,13 +148,14 @@ def _run_false_loops(
     records: dict[str, GraphRecord], effort: Effort
 ) -> dict[str, LoopTrials]:
     trials = {}
-    for name, count in paper.FALSE_LOOPS.items():
-        if name not in records:
+    for graph, count in paper.FALSE_LOOPS.items():
+        record = records.get(graph.name)
+        if record is None:
             continue
-        print(f'l1slam: {name} with false loops', file=sys.stderr)
-        with Progress(1 + effort.draws, 'draw') as progress:
-            trials[name] = try_false_loops(
-                records[name].graph, offline.stored_poses(records[name]), count, effort,
+        print(f'l1slam: {graph.name} with false loops', file=sys.stderr)
+        with _named(graph.file), Progress(1 + effort.draws, 'draw') as progress:
+            trials[graph.name] = try_false_loops(
+                record.graph, offline.stored_poses(record), count, effort,
                 np.random.default_rng(WORLD_SEED), progress.advance)
     return trials
 
@@ -215,87 +214,14 @@ def _table_2(results: Results, folder: Path) -> list[str]:
     return report.table_2(results)
 
 
-def _figure_2(results: Results, folder: Path) -> list[str]:
-    """Draw cost against iterations, one picture for each problem."""
-    if not results.convergence:
-        return [f'Not run: it is of {paper.MANHATTAN_10K.name}, which `--worlds 10k` makes.']
-    lines = [f'Of our world in the place of {paper.MANHATTAN_10K.name}. The paper shows 100,000 '
-             'iterations of the angle and translation problems and 10,000 outer ones of 400 for '
-             'the global one; how many are shown here is in the table. *Weighted* is with the '
-             'primal weight that this package adds, *least squares* its start from reweighted '
-             'ones. An iteration of the global problem is one linearisation.', '']
-    for problem, methods in results.convergence.items():
-        name = f'figure_2_{problem}.png'
-        curves = [Curve(method, history[:, 0], history[:, 1])
-                  for method, history in methods.items()]
-        plot_curves(folder / name, curves, f'{problem} problem, L1 cost')
-        lines.append(f'![cost against iterations of the {problem} problem]({name})')
-    return [*lines, '', *report.figure_2(results)]
-
-
-def _figure_3(results: Results, folder: Path) -> list[str]:
-    """Draw the maps that our default solver ended with."""
-    plot_maps(folder / 'figure_3.png', [r.drawing for r in results.graphs])
-    return ['The maps that our default solver ended with.', '', '![maps](figure_3.png)']
-
-
-def _figure_4(results: Results, folder: Path) -> list[str]:
-    """Draw the first start that L2 does not recover from, and what came of it."""
-    trials = results.starts
-    if trials is None:
-        return [f'Not run: it is of {paper.NOISY.name}.']
-    noise = trials_report.drawn_noise(trials)
-    maps = next(trial.maps for trial in trials.trials if trial.noise == noise)
-    panels = {f'Start: noise of {noise:g} m, {noise:g} rad': maps[START],
-              'L2 from that start': maps[L2], 'Seed (reads no start)': trials.seed,
-              'Seed, then L1': trials.solution}
-    plot_maps(folder / 'figure_4.png', [
-        MapDrawing(title, shown.positions, note=f'L1 cost {shown.cost:.6g}')
-        for title, shown in panels.items()])
-    return [trials_report.intro_4(), '',
-            '![a noisy start, and the maps made of it](figure_4.png)', '',
-            *trials_report.figure_4(trials)]
-
-
-def _figure_6(results: Results, folder: Path) -> list[str]:
-    """Draw the maps of the first draw, one picture for each graph."""
-    if not results.false_loops:
-        return [f'Not run: it is of {" and ".join(paper.FALSE_LOOPS)}.']
-    lines = [trials_report.intro_6(results.false_loops), '']
-    for name, trials in results.false_loops.items():
-        picture = f'figure_6_{name.lower()}.png'
-        plot_maps(folder / picture, _false_loop_panels(name, trials))
-        lines += [f'![{name} with false loops]({picture})', '']
-    return [*lines, *trials_report.figure_6(results.false_loops)]
-
-
-def _false_loop_panels(name: str, trials: LoopTrials) -> list[MapDrawing]:
-    """Return the clean map, and what each method made of the first draw."""
-    first, loops = trials.trials[0], trials.loops
-    hubers = dict.fromkeys((trials_report.best_huber(trials), huber_name(HUBER_OF_G2O)))
-    clean = trials.clean[L1].positions
-    drawings = [MapDrawing(f'{name} without false loops: L1', clean, loops=loops)]
-    for method in (SEED, L1, *hubers):
-        shown = first.maps[method]
-        drawings.append(MapDrawing(method, shown.positions, loops=loops, false=first.false,
-                                   note=_off(shown)))
-    shown, refused = first.maps[ROBUST], np.concatenate((first.refused, first.lost))
-    return [*drawings, MapDrawing(ROBUST.strip('`'), shown.positions, loops=loops,
-                                  rejected=refused, false=first.kept, note=_off(shown))]
-
-
-def _off(shown: Map) -> str:
-    return f'{metres(shown.error)} off'
-
-
 # Title -> what draws the section's pictures into a folder and returns its lines.
 SECTIONS: dict[str, Callable[[Results, Path], list[str]]] = {
     'Table I: the cost': _table_1,
     'Table II: the time per iteration': _table_2,
-    'Figure 2: cost against iterations': _figure_2,
-    'Figure 3: the maps': _figure_3,
-    'Figure 4: a start that is mostly noise': _figure_4,
-    'Figure 6: loops that lie': _figure_6,
+    'Figure 2: cost against iterations': figures.figure_2,
+    'Figure 3: the maps': figures.figure_3,
+    'Figure 4: a start that is mostly noise': figures.figure_4,
+    'Figure 6: loops that lie': figures.figure_6,
 }
 
 

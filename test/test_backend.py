@@ -6,12 +6,34 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lies import (
+    careful_world,
+    drive_roundabout,
+    is_false,
+    position_error,
+    roundabout,
+    seen,
+    spoilt,
+)
 from numpy.testing import assert_allclose, assert_array_equal
-from problems import PERIOD, loop, odometry, play
+from problems import PERIOD, loop, odometry, play, seconds
 
 from l1slam_ros.core import se2
-from l1slam_ros.core.backend import Backend, BackendOptions, RobustOptions, improve, optimise
+from l1slam_ros.core.backend import (
+    ACCEPTED,
+    EXPIRED,
+    LOOP_STATES,
+    REJECTED,
+    SUSPECT,
+    WAITING,
+    Backend,
+    BackendOptions,
+    RobustOptions,
+    improve,
+    optimise,
+)
 from l1slam_ros.core.cholesky import cholesky_of
+from l1slam_ros.core.growth import LoopOptions
 from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.optimality import Status, l1_cost
@@ -144,7 +166,8 @@ def test_the_budget_is_kept(budget):
 
 
 def test_small_budgets_add_up(world):
-    backend = Backend(se2, EVERY)
+    """The costs of one set of loops: those that are yet to be believed would add theirs."""
+    backend = Backend(se2, CREDULOUS)
     play(backend, world)
     costs = []
     for _ in range(400):
@@ -156,6 +179,16 @@ def test_small_budgets_add_up(world):
     assert (np.diff(costs) <= 1e-9).all()
     batch = batch_of(world.graph)
     assert costs[-1] == pytest.approx(batch.cost, rel=1e-3)
+
+
+def test_small_budgets_judge_to_the_end(world):
+    """A budget too short for one look at the loops still gets on with every update."""
+    backend = Backend(se2, EVERY)
+    play(backend, world)
+    for _ in range(20):
+        backend.update(0.0)
+    assert (backend.loop_states().state == ACCEPTED).all()
+    assert backend.problem().belief.settled
 
 
 # What is seen from outside
@@ -247,6 +280,199 @@ def test_several_loops_at_once_bring_a_drifted_drive_back():
                                                                    backend.poses[j]))
     assert np.abs(error).max() < 0.05
     assert_allclose(backend.poses[0], drifted[0], atol=1e-12)
+
+
+# Lies
+
+N = 300  # keyframes of the worlds with lies in them
+
+
+@pytest.fixture(scope='module')
+def careful():
+    return careful_world(N, 2 * N)
+
+
+def drive(world, backend, look):
+    """Play a world in time order, an update every 15 keyframes; look after each one."""
+    for k in range(0, N, 15):
+        play(backend, world, k, k + 15)
+        backend.update(PLENTY)
+        look(backend)
+
+
+def errors_on_the_way(world, backend, look=lambda backend: None):
+    """Return the position error [m] after each update."""
+    errors = []
+
+    def note(backend):
+        errors.append(position_error(backend.poses, world.truth))
+        look(backend)
+
+    drive(world, backend, note)
+    return np.array(errors)
+
+
+@pytest.fixture(scope='module')
+def clean_errors(careful):
+    return errors_on_the_way(careful, Backend(se2, EVERY))
+
+
+def states_by_truth(backend, world):
+    """Return the states of the false loops of the graph, and those of the true ones."""
+    states = backend.loop_states()
+    false = is_false(world, backend.growth.graph.between)[states.rows]
+    in_graph = states.state[: len(states.rows)]
+    return in_graph[false], in_graph[~false]
+
+
+@pytest.mark.parametrize('kind', ['random', 'identity', 'grouped'])
+def test_no_lie_is_believed_at_any_time(careful, clean_errors, kind):
+    """With 30% of the loops false the map never bends, and the loops believed are batch's."""
+    world = spoilt(careful, kind, 130)
+
+    def look(backend):
+        lies, truths = states_by_truth(backend, world)
+        assert not (lies == ACCEPTED).any()
+        assert np.count_nonzero(truths == REJECTED) <= 0.01 * len(truths) + 1
+
+    backend = Backend(se2, EVERY)
+    errors = errors_on_the_way(world, backend, look)
+    assert (errors < 1.2 * clean_errors + 0.1).all()
+    lies, truths = states_by_truth(backend, world)
+    assert len(lies) == 130 and (lies == REJECTED).mean() > 0.95
+    assert np.count_nonzero(truths != ACCEPTED) <= 0.01 * len(truths)
+    online = backend.problem().belief.accepted
+    backend.adopt(optimise(backend.problem(), EVERY.solver))
+    assert np.count_nonzero(backend.problem().belief.accepted != online) <= 0.01 * len(truths)
+
+
+def test_who_does_not_doubt_is_led_astray(careful, clean_errors):
+    """The same lies, believed: what the tests above would not survive."""
+    world = spoilt(careful, 'grouped', 130)
+
+    def look(backend):
+        assert (backend.loop_states().state == ACCEPTED).all()
+
+    errors = errors_on_the_way(world, Backend(se2, CREDULOUS), look)
+    assert errors.max() > 1 > 3 * clean_errors.max()
+
+
+def test_a_trusted_loop_is_accepted_however_absurd(careful):
+    """And the other loops are judged by the map that it makes."""
+    backend = Backend(se2, EVERY)
+    absurd = replace(loop(10 * PERIOD, 40 * PERIOD, (50.0, -20.0, 2.0), 1e-6 * np.eye(6)),
+                     trusted=True)
+    mine = [seconds(10 * PERIOD), seconds(40 * PERIOD)]
+    backend.add_loop(absurd)
+    for k in range(0, 120, 20):
+        play(backend, careful, k, k + 20)
+        backend.update(PLENTY)
+        states = backend.loop_states()
+        (row,) = np.flatnonzero((states.stamps == mine).all(axis=1))
+        assert states.state[row] == (WAITING if k < 40 else ACCEPTED)
+    backend.adopt(optimise(backend.problem(), EVERY.solver))
+    assert backend.loop_states().state[row] == ACCEPTED
+    error = se2.local(se2.between(backend.poses[10:11], backend.poses[40:41]),
+                      np.array([[50.0, -20.0, 2.0]]))
+    assert np.abs(error).max() < 0.1
+
+
+def test_a_loop_is_suspect_until_others_vouch_for_it():
+    """Loops beside each other may be one mistake; one at another place says they are none."""
+    backend, truth = Backend(se2, EVERY), roundabout(220)
+    drive_roundabout(backend, truth)
+    settled(backend)
+    drifted = position_error(backend.poses, truth)
+    for i in (3, 5, 10):
+        backend.add_loop(seen(truth, i, i + 200))
+        settled(backend)
+        states = backend.loop_states()
+        assert (states.state == SUSPECT).all() and (states.sigmas < 4).all()
+        assert position_error(backend.poses, truth) == pytest.approx(drifted, rel=1e-6)
+    backend.add_loop(seen(truth, 30, 140))
+    settled(backend)
+    assert (backend.loop_states().state == ACCEPTED).all()
+    assert position_error(backend.poses, truth) < 0.5 * drifted
+
+
+def test_a_solve_to_the_end_leaves_a_lone_loop_suspect_too():
+    backend, truth = Backend(se2, EVERY), roundabout(220)
+    drive_roundabout(backend, truth)
+    backend.add_loop(seen(truth, 3, 203))
+    backend.adopt(optimise(backend.problem(), EVERY.solver))
+    assert backend.loop_states().state.tolist() == [SUSPECT]
+
+
+def test_what_is_not_believed_costs_nothing_and_pulls_at_nothing():
+    backend, truth = Backend(se2, EVERY), roundabout(220)
+    drive_roundabout(backend, truth)
+    backend.add_loop(seen(truth, 3, 203))
+    improvement = backend.update(PLENTY)
+    assert improvement.cost == pytest.approx(0.0, abs=1e-6)
+    rows = backend.loop_states().rows
+    assert_array_equal(improvement.dual.reshape(-1, 3)[rows], 0)
+    assert len(improvement.dual) == 3 * len(backend.growth.graph.between)
+
+
+def test_the_dual_of_each_factor_is_at_its_own_rows(careful):
+    """What is believed pulls this way or that, wherever lies stand between it."""
+    backend, world = Backend(se2, EVERY), spoilt(careful, 'random', 130)
+    play(backend, world, 0, 150)
+    improvement = backend.update(PLENTY)
+    graph, accepted = backend.problem().graph, improvement.belief.accepted
+    assert 20 < np.count_nonzero(~accepted) == np.count_nonzero(is_false(world, graph.between))
+    dual = improvement.dual.reshape(-1, 3)
+    residual = whitened_residual(graph, backend.poses).reshape(-1, 3)
+    assert_array_equal(dual[~accepted], 0)
+    clear = np.abs(residual[accepted]) > 0.2
+    assert (np.sign(dual) == np.sign(residual))[accepted][clear].mean() > 0.95
+
+
+def test_each_loop_has_a_state_and_its_own_stamps(careful):
+    backend = Backend(se2, replace(EVERY, loop=LoopOptions(wait=3.0)))
+    assert [LOOP_STATES[k] for k in (WAITING, SUSPECT, ACCEPTED, REJECTED, EXPIRED)] == [
+        'waiting', 'suspect', 'accepted', 'rejected', 'expired']
+    assert len(backend.loop_states().state) == 0
+    backend.add_loop(loop(0.0, 1e6, (1.0, 0.0, 0.0)))
+    backend.add_loop(loop(1.0, 20.0, (1.0, 0.0, 0.0)))
+    play(backend, careful, 0, 25)
+    backend.update(PLENTY)
+    states = backend.loop_states()
+    loops = len(states.rows)
+    assert (states.state[loops:] == WAITING).all() and np.isnan(states.sigmas[loops:]).all()
+    play(backend, careful, 25, 60)
+    backend.add_loop(loop(2.0, 50.0, (1.0, 0.0, 0.0)))
+    backend.update(PLENTY)
+    states = backend.loop_states()
+    factors, loops = backend.growth.graph.between, len(states.rows)
+    assert_array_equal(states.rows, np.flatnonzero(~factors.is_odometry))
+    ends = np.stack((factors.i, factors.j), axis=1)[states.rows]
+    assert_array_equal(states.stamps[:loops], ends * seconds(PERIOD))
+    assert set(states.state[:loops]) <= {SUSPECT, ACCEPTED, REJECTED}
+    assert np.isfinite(states.sigmas[:loops]).all()
+    others = dict(zip(map(tuple, states.stamps[loops:]), states.state[loops:], strict=True))
+    assert others == {(0, seconds(1e6)): EXPIRED, (seconds(1.0), seconds(20.0)): EXPIRED,
+                      (seconds(2.0), seconds(50.0)): WAITING}
+
+
+def test_a_loop_just_come_is_suspect_and_has_no_sigmas(careful):
+    backend = Backend(se2, EVERY)
+    play(backend, careful, 0, 60)
+    backend.problem()
+    states = backend.loop_states()
+    assert len(states.rows) and (states.state == SUSPECT).all()
+    assert np.isnan(states.sigmas).all()
+
+
+def test_who_stops_doubting_believes_the_loops_to_come(careful):
+    backend, world = Backend(se2, EVERY), spoilt(careful, 'random', 130)
+    play(backend, world, 0, 150)
+    settled(backend)
+    assert (backend.loop_states().state == REJECTED).any()
+    backend.set_options(CREDULOUS)
+    play(backend, world, 150, 180)
+    settled(backend)
+    assert (backend.loop_states().state == ACCEPTED).all()
 
 
 # An earlier run
@@ -359,3 +585,19 @@ def test_a_variance_of_nearly_zero_does_not_end_the_map():
     backend.add_loop(loop(0.0, 4.0, (4.1, 0.0, 0.0)))
     with np.errstate(over='ignore', invalid='ignore'):
         assert backend.update(PLENTY) is not None
+
+
+def test_whether_loops_are_doubted_can_be_changed_while_it_runs():
+    backend = Backend(se2, CREDULOUS)
+    for k in range(60):
+        backend.add_odometry(odometry(k * PERIOD, (float(k), 0.1 * (k % 3), 0.01 * (k % 5)),
+                                      1e-4 * np.eye(6)))
+    backend.add_loop(loop(5 * PERIOD, 50 * PERIOD, (0.0, 0.0, 0.0), 1e-4 * np.eye(6)))
+    settled(backend)
+    assert LOOP_STATES[backend.loop_states().state[0]] == 'accepted'
+    backend.set_options(EVERY)
+    settled(backend)
+    assert LOOP_STATES[backend.loop_states().state[0]] == 'rejected'
+    backend.set_options(CREDULOUS)
+    settled(backend)
+    assert LOOP_STATES[backend.loop_states().state[0]] == 'accepted'

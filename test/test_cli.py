@@ -73,6 +73,164 @@ def test_a_chosen_solver_is_the_one_that_solves(capsys, world, solver):
     assert (report['inner_iterations'] > 0) == (solver == 'primal-dual')
 
 
+REPORTED = [
+    'poses', 'factors', 'loops', 'initial_cost', 'seed_cost', 'final_cost', 'status', 'seconds',
+    'solver', 'outer_iterations', 'inner_iterations', 'rejected']
+
+
+@pytest.mark.parametrize('more', [(), ('--robust',), ('--robust', '--norm', 'l2')])
+def test_the_names_of_a_report_stay(capsys, world, more):
+    assert list(solve_json(capsys, world, *more)) == REPORTED
+    truth = ('--reference', f'{world}.truth.txt')
+    assert list(solve_json(capsys, world, *more, *truth)) == [*REPORTED, 'ate']
+
+
+# Robust
+
+
+@pytest.fixture(params=['random', 'identity', 'grouped'])
+def lies(tmp_path, request):
+    """A world with 100 false loops, its edges in no order, and its ids 10, 13, 16, ..."""
+    path = tmp_path / 'lies.g2o'
+    assert main(['simulate', str(path), '--poses', '300', '--edges', '600', '--seed', '4',
+                 '--false-loops', '100', '--kind', request.param]) == 0
+    lines = [line.split() for line in path.read_text().splitlines()]
+    for fields in lines:
+        for k in (1,) if fields[0] == 'VERTEX_SE2' else (1, 2):
+            fields[k] = str(10 + 3 * int(fields[k]))
+    np.random.default_rng(0).shuffle(lines)
+    path.write_text('\n'.join(' '.join(fields) for fields in lines) + '\n')
+    false = Path(f'{path}.false.txt')
+    pairs = 10 + 3 * np.loadtxt(false, dtype=int)
+    false.write_text('\n'.join(f'{i} {j}' for i, j in pairs))
+    return path
+
+
+def edges_of(path):
+    """Return the pairs of ids of the edges of a g2o file, in its order."""
+    rows = [line.split() for line in path.read_text().splitlines() if line.startswith('EDGE')]
+    return [[int(row[1]), int(row[2])] for row in rows]
+
+
+def test_what_is_rejected_are_the_false_loops_in_the_order_of_the_file(capsys, lies):
+    false = np.loadtxt(f'{lies}.false.txt', dtype=int).tolist()
+    report = solve_json(capsys, lies, '--robust')
+    assert report['rejected'] == [pair for pair in edges_of(lies) if pair in false]
+    assert len(report['rejected']) == 100
+    assert (report['factors'], report['loops']) == (700, 401)
+
+
+def clean_copy(path):
+    """Write the graph without its false loops; return its path."""
+    false = np.loadtxt(f'{path}.false.txt', dtype=int).tolist()
+    clean = path.with_name('clean.g2o')
+    clean.write_text('\n'.join(
+        line for line in path.read_text().splitlines()
+        if not (line.startswith('EDGE') and [int(n) for n in line.split()[1:3]] in false)))
+    return clean
+
+
+@pytest.mark.parametrize('norm', ['l1', 'l2', 'huber'])
+@pytest.mark.parametrize('lies', ['grouped'], indirect=True)
+def test_costs_count_what_is_accepted(capsys, lies, norm):
+    """They are those of a file without the false loops."""
+    robust = solve_json(capsys, lies, '--robust', '--norm', norm)
+    honest = solve_json(capsys, clean_copy(lies), '--norm', norm)
+    for name in ('initial_cost', 'final_cost'):
+        assert robust[name] == pytest.approx(honest[name], rel=1e-3)
+    credulous = solve_json(capsys, lies, '--norm', norm)
+    assert credulous['final_cost'] > 2 * robust['final_cost']
+    assert robust['final_cost'] <= robust['seed_cost'] < robust['initial_cost']
+
+
+@pytest.mark.parametrize('lies', ['grouped'], indirect=True)
+def test_every_start_is_the_same_to_a_robust_solve(capsys, lies, tmp_path):
+    """Its own seed reads no start, so not even a start of garbage can spoil it."""
+    spoiled, rng = tmp_path / 'garbage.g2o', np.random.default_rng(1)
+    spoiled.write_text('\n'.join(
+        ' '.join([*line.split()[:2], *map(str, 1e3 * rng.standard_normal(3))])
+        if line.startswith('VERTEX') else line for line in lies.read_text().splitlines()))
+    reports, poses = [], []
+    for path, start in ((lies, 'seed'), (lies, 'odometry'), (lies, 'file'), (spoiled, 'file')):
+        output = tmp_path / f'{len(reports)}.tum'
+        reports.append(solve_json(capsys, path, '--robust', '--start', start, '--output', output))
+        poses.append(np.loadtxt(output))
+    for name in ('seed_cost', 'final_cost', 'rejected', 'status', 'outer_iterations'):
+        assert [report[name] for report in reports[1:]] == [reports[0][name]] * 3
+    for other in poses[1:]:
+        np.testing.assert_array_equal(other, poses[0])
+    assert reports[3]['initial_cost'] > 100 * reports[2]['initial_cost']
+
+
+@pytest.mark.parametrize('lies', ['random'], indirect=True)
+def test_the_output_has_the_robust_map_and_every_edge(capsys, lies, tmp_path):
+    output = tmp_path / 'out.g2o'
+    report = solve_json(capsys, lies, '--robust', '--output', output)
+    assert edges_of(output) == edges_of(lies)
+    kept = [pair not in report['rejected'] for pair in edges_of(output)]
+    record = read_graph_file(output)
+    residual = whitened_residual(record.graph, record.poses).reshape(-1, 3)
+    assert l1_cost(residual[kept]) == pytest.approx(report['final_cost'], rel=1e-9)
+
+
+@pytest.mark.parametrize('lies', ['random'], indirect=True)
+def test_people_are_told_which_loops_were_refused_and_why(capsys, lies):
+    said = run(capsys, 'solve', lies, '--robust')[0].splitlines()
+    at = said.index('100 of 401 loops refused')
+    named = [re.fullmatch(r'  (\d+) - (\d+): (\d+\.\d) sigmas off the accepted ones', line)
+             for line in said[at + 1 : at + 21]]
+    false = np.loadtxt(f'{lies}.false.txt', dtype=int).tolist()
+    assert all([int(match[1]), int(match[2])] in false for match in named)
+    sigmas = [float(match[3]) for match in named]
+    assert sigmas == sorted(sigmas, reverse=True) and sigmas[-1] > 4
+    assert said[at + 21 :] == ['  and 80 more; `--json` lists all']
+    assert run(capsys, 'solve', lies, '--robust', '--quiet') == ('', '')
+    assert 'refused' not in run(capsys, 'solve', lies)[0]
+
+
+def test_of_an_honest_graph_nothing_is_refused(capsys, world):
+    robust, plain = solve_json(capsys, world, '--robust'), solve_json(capsys, world)
+    assert robust['rejected'] == plain['rejected'] == []
+    assert robust['final_cost'] == pytest.approx(plain['final_cost'], rel=1e-5)
+    assert '\n0 of 101 loops refused\n' in run(capsys, 'solve', world, '--robust')[0]
+
+
+@pytest.mark.parametrize('lies', ['random'], indirect=True)
+def test_odometry_that_lies_is_refused_and_named(capsys, lies):
+    lines = lies.read_text().splitlines()
+    step = next(k for k, line in enumerate(lines) if line.startswith('EDGE_SE2 610 613 '))
+    fields = lines[step].split()
+    fields[3] = str(float(fields[3]) + 6)
+    lies.write_text('\n'.join([*lines[:step], ' '.join(fields), *lines[step + 1:]]))
+    rejected = solve_json(capsys, lies, '--robust')['rejected']
+    (slip,) = [[i, j] for i, j in rejected if j - i == 3]
+    assert abs(slip[0] - 610) <= 9  # between loops nobody can tell which of the steps it was
+    assert len(rejected) == 101
+    said = run(capsys, 'solve', lies, '--robust')[0]
+    assert re.search(rf'\nodometry {slip[0]} - {slip[1]} lies: \d+\.\d sigmas off what the loops '
+                     'say; left out\n100 of 401 loops refused\n', said)
+
+
+@pytest.mark.parametrize('lies', ['random'], indirect=True)
+def test_the_picture_shows_what_was_refused(capsys, lies, tmp_path):
+    run(capsys, 'solve', lies, '--robust', '--quiet', '--plot', tmp_path / 'map.svg')
+    said = words(tmp_path / 'map.svg')
+    assert 'rejected loops' in said and 'false loops' not in said
+    assert any('300 poses, 301 loops, 100 rejected' in word for word in said)
+
+
+@pytest.mark.parametrize('start', ['seed', 'file', 'odometry'])
+def test_a_gap_in_the_odometry_leaves_nothing_to_judge_loops_by(capsys, tmp_path, start):
+    path = graph_file(tmp_path, [*VERTICES, EDGES[0], EDGES[2]])
+    assert main(['solve', str(path), '--robust', '--start', start, '--json',
+                 '--output', str(tmp_path / 'out.g2o')]) == 2
+    out, err = capsys.readouterr()
+    assert out == '' and err == (
+        f'l1slam: {path}: no edge between the consecutive vertices 1 and 2, so no chain of '
+        'odometry to start from; expected a graph without gaps\n')
+    assert sorted(tmp_path.iterdir()) == [path]
+
+
 def test_ate_of_the_odometry_is_that_of_zero_steps(capsys, world):
     truth = f'{world}.truth.txt'
     odometry = solve_json(capsys, world, '--start', 'odometry', '--outer', 0, '--reference', truth)

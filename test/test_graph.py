@@ -50,6 +50,34 @@ def test_factors_are_kept_in_the_order_they_came(rng):
     assert_allclose(root.transpose(0, 2, 1) @ root, information)
 
 
+def test_trust_is_of_each_factor_and_none_where_nobody_speaks():
+    graph = graph_with(4, [(0, 1)])
+    z, information = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
+    graph.add_between(np.array([0, 1, 0]), np.array([2, 2, 3]), z, information,
+                      np.array([True, False, True]))
+    graph.add_between(np.array([1, 2, 2]), np.array([3, 3, 0]), z, information, True)
+    assert graph.between.trusted.dtype == bool
+    assert graph.between.trusted.tolist() == [False, True, False, True, True, True, True]
+
+
+def test_trust_grows_apart_in_copies_and_stays_in_snapshots():
+    original = graph_with(3, [(0, 1)])
+    copy, before = original.copy(), original.between
+    copy.add_between(0, 2, np.zeros((1, 3)), np.eye(3)[None], True)
+    original.add_between(0, 2, np.zeros((1, 3)), np.eye(3)[None])
+    assert copy.between.trusted.tolist() == [False, True]
+    assert original.between.trusted.tolist() == [False, False]
+    assert before.trusted.tolist() == [False]
+
+
+def test_trust_of_too_few_factors_is_refused():
+    graph = graph_with(3, [])
+    with pytest.raises(ValueError):
+        graph.add_between(np.array([0, 1, 0]), np.array([1, 2, 2]), np.zeros((3, 3)),
+                          np.tile(np.eye(3), (3, 1, 1)), np.array([True, False]))
+    assert {len(column) for column in vars(graph.between).values()} == {0}
+
+
 def test_priors_are_kept_apart(rng):
     graph = graph_with(3, [(0, 1)])
     measurement, information = random_poses(2, rng), random_information(2, rng)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From samples and loops to keyframes and factors, whatever comes in whichever order."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -259,6 +261,85 @@ def test_good_loops_among_bad_ones_keep_their_order():
     i, j, _ = loops_of(growth)
     pairs = keyframe_samples(growth)[np.stack((i, j), axis=1)]
     assert np.abs(pairs - good).max() <= 4
+
+
+# What became of which loop
+
+
+def stamps_of(*loops):
+    return [[one.reference_stamp, one.stamp] for one in loops]
+
+
+def test_no_loops_have_no_stamps():
+    growth = GraphGrowth(se2, DEFAULTS)
+    assert [part.shape for part in growth.loop_stamps] == [(0, 2)] * 3
+    assert growth.loop_rows.shape == (0,)
+
+
+def test_each_loop_of_the_graph_has_its_row_and_the_stamps_it_came_with():
+    """Its own, not those of the keyframes it was carried to; refused ones leave no row."""
+    poses = curve(200)
+    growth = grown(poses, DEFAULTS)
+    good = [true_loop(poses, *pair) for pair in ((7, 151), (33, 188), (2, 90))]
+    early, same = loop(-1.0, 5.0, (1.0, 0.0, 0.0)), loop(5.0, 5.01, (0.1, 0.0, 0.0))
+    for one in (good[0], early, good[1], same):
+        growth.add_loop(one)
+    growth.add_due_loops()
+    drive_on(growth, np.concatenate((poses, poses[-1] + np.outer(np.arange(1, 30), [1, 0, 0]))),
+             200)
+    growth.add_loop(good[2])
+    growth.add_due_loops()
+    in_graph, waiting, expired = growth.loop_stamps
+    assert in_graph.tolist() == stamps_of(*good)
+    assert len(waiting) == len(expired) == 0
+    factors = growth.graph.between
+    assert_array_equal(growth.loop_rows, np.flatnonzero(~factors.is_odometry))
+    ends = growth.stamps[np.stack((factors.i, factors.j), axis=1)[growth.loop_rows]]
+    assert 0 < np.abs(ends - in_graph).max() < seconds(0.5)
+
+
+def test_loops_that_wait_and_loops_that_expired_keep_their_stamps():
+    poses = curve(100)
+    growth = grown(poses[:20], GrowthOptions(loop=LoopOptions(wait=2.0)))
+    loops = [true_loop(poses, 3, 95), true_loop(poses, 3, 30), true_loop(poses, 4, 99)]
+    for one in loops:
+        growth.add_loop(one)
+    growth.add_due_loops()
+    assert [part.tolist() for part in growth.loop_stamps] == [[], stamps_of(*loops), []]
+    drive_on(growth, poses[:50], 20)
+    late = true_loop(poses, 5, 60)
+    growth.add_loop(late)
+    growth.add_due_loops()
+    assert [part.tolist() for part in growth.loop_stamps] == [
+        stamps_of(loops[1]), stamps_of(late), stamps_of(loops[0], loops[2])]
+    assert +growth.refused == {'expired': 2} and growth.n_waiting == 1
+
+
+def test_a_trusted_loop_becomes_a_trusted_factor():
+    poses = curve(200)
+    growth = grown(poses, DEFAULTS)
+    growth.add_loop(true_loop(poses, 7, 151))
+    growth.add_loop(replace(true_loop(poses, 33, 188), trusted=True))
+    growth.add_due_loops()
+    trusted = growth.graph.between.trusted
+    assert trusted[growth.loop_rows].tolist() == [False, True] and trusted.sum() == 1
+
+
+def test_the_loops_of_an_earlier_run_are_those_of_its_keyframes():
+    poses = curve(60)
+    first = grown(poses, EVERY)
+    for pair in ((4, 40), (3, 55)):
+        first.add_loop(true_loop(poses, *pair))
+    first.add_due_loops()
+    second = GraphGrowth(se2, EVERY)
+    second.restore(first.graph, first.stamps, poses)
+    second.add_loop(loop(0.0, 6.2, (1.0, 0.0, 0.0)))
+    for k in range(60, 64):
+        second.add_odometry(odometry(k * PERIOD, (k, 0.0, 0.0)))
+    second.add_due_loops()
+    assert second.loop_stamps[0].tolist() == [
+        *first.loop_stamps[0].tolist(), [0, seconds(6.2)]]
+    assert_array_equal(second.loop_rows, np.flatnonzero(~second.graph.between.is_odometry))
 
 
 # The covariance of loops

@@ -14,6 +14,7 @@ from problems import linprog_l1
 
 from l1slam_ros import paper, report, reproduce
 from l1slam_ros.cli import main
+from l1slam_ros.core import reproduction
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.linearise import linearise, step_poses, whitened_residual
@@ -35,9 +36,10 @@ from l1slam_ros.core.reproduction import (
 from l1slam_ros.core.se2 import wrap
 from l1slam_ros.core.seed import rotation_system, seed_poses, translation_system
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.graph_file import GraphRecord, write_graph_file
 from l1slam_ros.io.plot import MapDrawing
 
-LITTLE = Effort(outer=4, inner=60, iterations=400, timed=3)
+LITTLE = Effort(outer=4, inner=60, iterations=400, timed=3, draws=2)
 TINY_10K = replace(paper.MANHATTAN_10K, poses=80, edges=160)
 TINY_50K = replace(paper.MANHATTAN_50K, poses=60, edges=150)
 
@@ -152,7 +154,33 @@ def test_a_report_is_whole_and_its_pictures_are_there(tmp_path):
     assert 'Not run: Manhattan3500, Intel and City10k' in text
     assert all(name in text for name in (*paper.FILES, '--datasets'))
     assert '--worlds' not in text
+    assert 'Not run: it is of Intel.' in text
+    assert 'Not run: it is of Intel and Manhattan3500.' in text
     assert list(tmp_path.iterdir()) == [output]
+
+
+def write_world(path, poses, edges, seed=3):
+    """Write a little world under the name of one of the paper's graphs."""
+    world = simulate_world(poses, edges, WorldOptions(), np.random.default_rng(seed))
+    write_graph_file(path, GraphRecord(world.graph, world.odometry, np.arange(poses)))
+
+
+def test_figures_4_and_6_are_of_the_files_that_are_there(tmp_path):
+    write_world(tmp_path / 'intel.g2o', 80, 160)
+    write_world(tmp_path / 'manhattan3500.g2o', 70, 150)
+    output = tmp_path / 'out'
+    reproduce.reproduce(tmp_path, [], output, LITTLE)
+    assert sorted(path.name for path in output.iterdir()) == [
+        'figure_3.png', 'figure_4.png', 'figure_6_intel.png', 'figure_6_manhattan3500.png',
+        'report.md']
+    for name in ('figure_4.png', 'figure_6_intel.png', 'figure_6_manhattan3500.png'):
+        with Image.open(output / name) as image:
+            assert image.format == 'PNG' and min(image.size) > 600
+    text = (output / 'report.md').read_text()
+    assert '10 in Intel (81 true loops' in text and '2 in Manhattan3500 (81 true loops' in text
+    assert '20 false loops in all draws' in text and '4 false loops in all draws' in text
+    assert all(f'| {method} |' in text for method in ('seed alone', 'seed, then L1', '`--robust`'))
+    assert 'it is of Intel' not in text
 
 
 def cells(lines):
@@ -165,7 +193,7 @@ def cells(lines):
 
 def test_the_papers_own_graph_is_known_by_its_cost(datasets, tmp_path):
     shutil.copy(datasets / 'intel.g2o', tmp_path)
-    results = reproduce.run(reproduce.read_datasets(tmp_path), [], LITTLE)
+    results = reproduce.run(reproduce.read_datasets(tmp_path), [], replace(LITTLE, draws=1))
     header, row = cells(report.table_1(results))
     at = dict(zip(header, row, strict=True))
     assert at['poses, edges'] == '943, 1,837'
@@ -185,7 +213,8 @@ def result(graph, initial, seed, printed, final, l2, truth=None, plain=2e-3):
     """What a graph of three poses would have given, had these been its numbers."""
     solution = Solution(np.zeros((3, 3)), final, Status.CONVERGED, 1, 0,
                         np.array([seed, final]), np.zeros(0))
-    costs = Costs(initial, seed, l2, np.array([seed, printed]), solution, 'interior-point')
+    costs = Costs(initial, seed, l2, np.array([seed, printed]), False, solution,
+                  'interior-point')
     seconds = Seconds({'plain': [plain] * 3, 'fused': [plain / 8] * 3}, 10 * plain)
     return report.GraphResult(graph, 3, 2, costs, seconds,
                               MapDrawing('map', np.zeros((3, 2))), truth)
@@ -251,13 +280,36 @@ def test_compared(value, words):
     assert report.compared(value, 100.0) == words
 
 
+def test_a_graph_without_room_for_false_loops_is_named(tmp_path):
+    write_world(tmp_path / 'intel.g2o', 4, 4)
+    with pytest.raises(FileError, match=r'intel\.g2o: 10 false loops asked for, found'):
+        reproduce.run(reproduce.read_datasets(tmp_path), [], LITTLE)
+
+
+def test_algorithm_4_as_printed_is_cut_short_on_the_largest_graphs(world, seed, monkeypatch):
+    whole = measure_costs(world.graph, world.odometry, seed, LITTLE, silent)
+    assert not whole.cut_short and len(whole.printed) == 1 + LITTLE.outer
+    monkeypatch.setattr(reproduction, '_MOST_PASSES', 2.5 * LITTLE.inner * 160)
+    cut = measure_costs(world.graph, world.odometry, seed, LITTLE, silent)
+    assert cut.cut_short and cut.printed.tolist() == whole.printed[:3].tolist()
+    few = measure_costs(world.graph, world.odometry, seed, replace(LITTLE, outer=2), silent)
+    assert not few.cut_short
+
+
+def test_a_cut_is_reported():
+    large = result(paper.MANHATTAN_50K, 9e8, 110.0, 120.0, 100.0, 105.0)
+    assert 'was ended after' not in said_of(large)
+    cut = replace(large, costs=replace(large.costs, cut_short=True))
+    assert 'Manhattan50k: Algorithm 4 as printed was ended after 1 linearisation' in said_of(cut)
+
+
 def fails(results, folder):
-    raise FileError(folder / 'figure_4.png', 'cannot be drawn')
+    raise FileError(folder / 'figure_5.png', 'cannot be drawn')
 
 
 def test_nothing_is_left_of_a_report_that_fails(tmp_path, monkeypatch):
-    monkeypatch.setitem(reproduce.SECTIONS, 'Figure 4: what another issue will add', fails)
-    with pytest.raises(FileError, match=r'figure_4\.png: cannot be drawn'):
+    monkeypatch.setitem(reproduce.SECTIONS, 'Figure 5: what another issue will add', fails)
+    with pytest.raises(FileError, match=r'figure_5\.png: cannot be drawn'):
         reproduce.reproduce(None, [TINY_50K], tmp_path / 'out', LITTLE)
     assert list(tmp_path.iterdir()) == []
 

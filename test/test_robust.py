@@ -151,3 +151,13 @@ def test_sigmas_say_how_far_off_a_loop_is(world):
     assert solution.sigmas[~true].min() > 4
     assert np.median(solution.sigmas[true]) < 3
     assert not (solution.suspect & solution.accepted).any()
+
+
+def test_a_prior_does_not_stand_in_its_way():
+    world = simulate_world(100, 180, WorldOptions(), np.random.default_rng(5))
+    graph = world.graph
+    without = robust_solve(graph)
+    graph.add_prior(np.array([3]), world.truth[3:4], np.eye(3)[None] * 1e4)
+    found = robust_solve(graph)
+    assert len(found.accepted) == len(graph.between)
+    assert found.accepted.sum() == without.accepted.sum()

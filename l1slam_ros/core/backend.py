@@ -79,6 +79,7 @@ class Improvement:
     poses: Array
     dual: Array
     belief: Belief
+    robust: bool
     cost_before: float
     cost: float
     status: Status
@@ -153,7 +154,14 @@ class Backend:
         return manifold.compose(to_kept, self.growth.offset)
 
     def set_options(self, options: BackendOptions) -> None:
-        """Work by other options from now on; what is in the graph stays."""
+        """
+        Work by other options from now on; what is in the graph stays.
+
+        Where loops are to be doubted that were not before, or the other way round, all are judged
+        anew.
+        """
+        if options.robust != self._options.robust:
+            self._belief, self._status = Belief.nothing(), Status.OUT_OF_TIME
         self._options = options
         self.growth.options = options
 
@@ -185,7 +193,13 @@ class Backend:
         return Problem(graph, self.poses, dual, belief, robust, self._last_cost, settled)
 
     def adopt(self, improvement: Improvement) -> None:
-        """Take over what `improve` made of a snapshot; keyframes since then follow along."""
+        """
+        Take over what `improve` made of a snapshot; keyframes since then follow along.
+
+        What was made when loops were judged otherwise is left.
+        """
+        if improvement.robust != self._options.robust.enabled:
+            return
         self._poses = improvement.poses
         self._dual = improvement.dual
         self._belief = improvement.belief
@@ -242,7 +256,7 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Impro
         steps += 1
         far = is_far(previous, cost)
     solution = minimise(graph, poses, options, cholesky, dual, deadline)
-    return _improvement(solution, belief, size, before, steps, start)
+    return _improvement(solution, problem, belief, before, steps, start)
 
 
 def optimise(problem: Problem, options: OptimiserOptions) -> Improvement:
@@ -262,18 +276,19 @@ def optimise(problem: Problem, options: OptimiserOptions) -> Improvement:
         solution = min((_solved(graph, poses, options) for poses in starts), key=lambda s: s.cost)
     part = accepted_graph(graph, belief.accepted)
     before = l1_cost(whitened_residual(part, problem.poses))
-    return _improvement(solution, belief, graph.manifold.TANGENT_SIZE, before, 0, start)
+    return _improvement(solution, problem, belief, before, 0, start)
 
 
 def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions) -> Solution:
     return minimise_by(choose(AUTO, graph), graph, poses, options)[0]
 
 
-def _improvement(solution: Solution, belief: Belief, size: int, before: float, steps: int,
+def _improvement(solution: Solution, problem: Problem, belief: Belief, before: float, steps: int,
                  start: float) -> Improvement:
+    size = problem.graph.manifold.TANGENT_SIZE
     # The rows of what is not believed have no dual yet.
     dual = np.zeros((len(belief.accepted), size))
     dual[belief.accepted] = solution.dual.reshape(-1, dual.shape[1])
-    return Improvement(solution.poses, dual.ravel(), belief, before, solution.cost,
-                       solution.status, steps, solution.outer_iterations,
+    return Improvement(solution.poses, dual.ravel(), belief, problem.robust, before,
+                       solution.cost, solution.status, steps, solution.outer_iterations,
                        solution.inner_iterations, solution.gap, time.monotonic() - start)

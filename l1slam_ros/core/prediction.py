@@ -32,7 +32,7 @@ class Posterior:
     A graph at its optimum.
 
     samples : (free keyframes + 1, k, SAMPLES) steps from it, as probable as the noise makes them,
-    the last one of what is held fixed; residual : (m, k) whitened, of each factor of the graph;
+    the last one of what is held fixed; residual : (m, k) whitened, of each between factor;
     moment : (m, k, k) what noise as stated would make of it.
     """
 
@@ -81,7 +81,8 @@ def sample_posterior(
     samples = np.zeros_like(right)
     samples[:-1] = cholesky.solve_many(right[:-1])
     moment = left_over(system.keyframe, system.blocks, samples, noise, sizes)
-    return Posterior(samples, -system.b.reshape(m, k), moment)
+    count = len(graph.between)
+    return Posterior(samples, -system.b.reshape(m, k)[:count], moment[:count])
 
 
 def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array, size: int) -> Array:

@@ -121,7 +121,7 @@ def outlook(growth: Growth) -> tuple[Array, Mask]:
     (m,) bool, is a loop that fits and yet was not accepted.
     """
     accepted, square = growth.accepted, np.zeros(len(growth.factors))
-    square[accepted] = (growth.posterior.residual**2).sum(axis=1)[: np.count_nonzero(accepted)]
+    square[accepted] = (growth.posterior.residual**2).sum(axis=1)
     outside = np.flatnonzero(~accepted)
     square[outside] = growth.innovations(outside).square
     return square, ~accepted & (square < growth.gate()) & growth.is_loop

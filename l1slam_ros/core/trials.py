@@ -27,7 +27,8 @@ from l1slam_ros.core.reproduction import Effort, printed_costs
 from l1slam_ros.core.robust_map import minimise_robustly
 from l1slam_ros.core.seed import seed_poses
 
-START, L2, L1, SEED, ROBUST = 'the start itself', 'L2', 'L1', 'seed alone', '`--robust`'
+START, L2, L1 = 'the start itself', 'L2', 'L1'
+SEED, JOINT, ROBUST = 'seed alone', 'seed, then L1', '`--robust`'
 # Standard deviations of the noise on every stored pose, each [m] and [rad] alike.
 NOISES = (0.25, 0.5, 1.0, 2.0)
 # Where Huber turns linear [sigmas]; the narrower, the nearer to L1.
@@ -39,7 +40,7 @@ _BENT = 0.02
 
 @dataclass(frozen=True)
 class Map:
-    """positions : (n, k) [m], on the map compared with; cost : L1; error : RMSE off it [m]."""
+    """positions : (n, k) [m], laid on the other map; error : RMSE off it [m]; cost : in L1."""
 
     positions: Array
     cost: float
@@ -59,16 +60,18 @@ class StartTrials:
     """
     What comes of noisy starts.
 
-    seed, solution : from no start at all; the trials are compared with the solution; l2_cost : L1
-    cost of the L2 map from the seed; printed : (k,) costs of Algorithm 4 as printed, from the seed;
-    bent : [m] error from which on a map has lost its shape.
+    seed, solution : from no start at all; the trials are compared with the solution; l2 : the L2
+    map from the seed; printed : (k,) costs of Algorithm 4 as printed, from the seed; trials : the
+    draws of one noise after those of the other; loops : (m, 2); bent : [m] error from which on a
+    map has lost its shape.
     """
 
     seed: Map
     solution: Map
-    l2_cost: float
+    l2: Map
     printed: Array
     trials: Sequence[StartTrial]
+    loops: Indices
     bent: float
 
 
@@ -78,8 +81,8 @@ class LoopTrial:
     What comes of one draw of false loops.
 
     maps : by method, each compared with its own of the clean graph; refused, kept : (k, 2) pairs
-    that the false loops join, by what the robust method did; lost : (l, 2) those of the true factors
-    that it refused.
+    that the false loops join, by what the robust method did; lost : (l, 2) those of the true
+    factors that it refused.
     """
 
     maps: dict[str, Map]
@@ -124,22 +127,21 @@ def try_noisy_starts(
     """
     cholesky = cholesky_of(graph)
     seed = seed_poses(graph, cholesky)
-    solution = _minimise_l1(graph, seed)
+    solution = _minimise_l1(graph, seed).poses
+    ours = graph.manifold.positions(solution)
     trials = []
     for noise in (noise for noise in NOISES for _ in range(effort.draws)):
         start = with_noise(graph, stored, noise, rng)
         maps = {START: start,
                 L2: minimise_l2(graph, start, LeastSquaresOptions(), cholesky).poses,
                 L1: _minimise_l1(graph, start).poses}
-        trials.append(StartTrial(noise, {method: _compared(graph, poses, solution.poses)
+        trials.append(StartTrial(noise, {method: _compared(graph, poses, ours)
                                          for method, poses in maps.items()}))
         advance()
-    l2 = minimise_l2(graph, seed, LeastSquaresOptions(), cholesky)
-    return StartTrials(_compared(graph, seed, solution.poses),
-                       _compared(graph, solution.poses, solution.poses),
-                       l1_cost(whitened_residual(graph, l2.poses)),
-                       printed_costs(graph, seed, printed), trials,
-                       _bent(graph, solution.poses))
+    l2 = minimise_l2(graph, seed, LeastSquaresOptions(), cholesky).poses
+    return StartTrials(_compared(graph, seed, ours), _compared(graph, solution, ours),
+                       _compared(graph, l2, ours), printed_costs(graph, seed, printed), trials,
+                       _loops(graph), _bent(ours))
 
 
 def with_noise(
@@ -157,34 +159,35 @@ def try_false_loops(
     """
     Return what comes of `count` loops between far poses that measure no motion at all.
 
-    stored : (n, p) where Huber starts, the other methods read no start; advance : called after each
-    draw, and once for the clean graph
+    stored : (n, p) where Huber starts, the other methods read no start; advance : called after
+    each draw, and once for the clean graph
 
     Raises
     ------
     GraphError : too few far pairs are free, or the graph is no chain of odometry with loops.
 
     """
-    clean, _ = _maps(graph, stored)
+    poses, _ = _maps(graph, stored)
+    reference = graph.manifold.positions(poses[JOINT])
+    clean = {method: _compared(graph, p, reference) for method, p in poses.items()}
     advance()
     trials = []
     for _ in range(effort.draws):
-        loops = identity_false_loops(graph, clean[L1], count, rng)
+        loops = identity_false_loops(graph, poses[JOINT], count, rng)
         trials.append(_try_loops(graph, stored, loops, clean))
         advance()
-    return LoopTrials({method: _compared(graph, poses, clean[L1])
-                       for method, poses in clean.items()},
-                      _pairs(graph)[~graph.between.is_odometry], trials, _bent(graph, clean[L1]))
+    return LoopTrials(clean, _loops(graph), trials, _bent(reference))
 
 
 def _try_loops(
-    graph: FactorGraph, stored: Array, loops: Loops, clean: dict[str, Array]
+    graph: FactorGraph, stored: Array, loops: Loops, clean: dict[str, Map]
 ) -> LoopTrial:
     lying = insert_loops(graph, loops)
     maps, accepted = _maps(lying, stored)
     factors, n = lying.between, graph.n_poses
     false = np.isin(pair_key(factors.i, factors.j, n), pair_key(loops.i, loops.j, n))
-    compared = {method: _compared(lying, poses, clean[method]) for method, poses in maps.items()}
+    compared = {method: _compared(lying, poses, clean[method].positions)
+                for method, poses in maps.items()}
     pairs = _pairs(lying)
     return LoopTrial(compared, refused=pairs[false & ~accepted], kept=pairs[false & accepted],
                      lost=pairs[~false & ~accepted])
@@ -197,12 +200,18 @@ def _maps(graph: FactorGraph, stored: Array) -> tuple[dict[str, Array], Mask]:
     hubers = {huber_name(width): minimise_huber(
         graph, stored, LeastSquaresOptions(huber_delta=width), cholesky).poses
         for width in HUBER_WIDTHS}
-    return {SEED: seed, L1: _minimise_l1(graph, seed).poses, **hubers,
+    return {SEED: seed, JOINT: _minimise_l1(graph, seed).poses, **hubers,
             ROBUST: robust.solution.poses}, robust.accepted
 
 
 def _pairs(graph: FactorGraph) -> Indices:
-    return np.stack((graph.between.i, graph.between.j), axis=1)
+    pairs: Indices = np.stack((graph.between.i, graph.between.j), axis=1)
+    return pairs
+
+
+def _loops(graph: FactorGraph) -> Indices:
+    loops: Indices = _pairs(graph)[~graph.between.is_odometry]
+    return loops
 
 
 def _minimise_l1(graph: FactorGraph, poses: Array) -> Solution:
@@ -210,12 +219,11 @@ def _minimise_l1(graph: FactorGraph, poses: Array) -> Solution:
 
 
 def _compared(graph: FactorGraph, poses: Array, reference: Array) -> Map:
-    """Return the map of poses (n, p), laid on those of the reference."""
-    mine, other = graph.manifold.positions(poses), graph.manifold.positions(reference)
-    return Map(aligned_positions(mine, other), l1_cost(whitened_residual(graph, poses)),
-               absolute_trajectory_error(mine, other))
+    """Return the map of poses (n, p), laid on the positions (n, k) of the reference."""
+    positions = graph.manifold.positions(poses)
+    return Map(aligned_positions(positions, reference), l1_cost(whitened_residual(graph, poses)),
+               absolute_trajectory_error(positions, reference))
 
 
-def _bent(graph: FactorGraph, poses: Array) -> float:
-    size = np.ptp(graph.manifold.positions(poses), axis=0)
-    return float(_BENT * np.linalg.norm(size))
+def _bent(positions: Array) -> float:
+    return float(_BENT * np.linalg.norm(np.ptp(positions, axis=0)))

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Worlds with false loops in them, and a drive on which nothing is known until a loop says it."""
+
+import numpy as np
+from problems import PERIOD, covariance6, loop, odometry
+
+from l1slam_ros.core import se2
+from l1slam_ros.core.false_loops import FALSE_LOOPS
+from l1slam_ros.core.initial import pair_key
+from l1slam_ros.core.metrics import absolute_trajectory_error
+from l1slam_ros.core.simulate import WorldOptions, simulate_world, with_false_loops
+
+# Odometry good enough for a drive of some hundred metres to come back near where it was.
+CAREFUL = WorldOptions(odometry_sigma_rotation=0.005)
+
+
+def careful_world(n, n_edges, seed=0):
+    """Return a world whose odometry can tell true loops from false ones."""
+    return simulate_world(n, n_edges, CAREFUL, np.random.default_rng(seed))
+
+
+def spoilt(world, kind, count, seed=1):
+    """Return the world with false loops of one of `FALSE_LOOPS`."""
+    loops = FALSE_LOOPS[kind](world.graph, world.truth, count, np.random.default_rng(seed))
+    return with_false_loops(world, loops)
+
+
+def is_false(world, factors):
+    """Tell which between factors are false loops of the world, (m,) bool."""
+    n = world.graph.n_poses
+    return np.isin(pair_key(factors.i, factors.j, n), pair_key(*world.false_loops.T, n))
+
+
+def position_error(poses, truth):
+    """Return the RMSE of the positions [m] after rigid alignment."""
+    return absolute_trajectory_error(se2.positions(poses), se2.positions(truth[:len(poses)]))
+
+
+ROUND = 200  # keyframes of one round of the roundabout
+_SIGMA = np.array([0.3, 0.3, 0.03])
+
+
+def roundabout(n):
+    """Return the true poses of a drive in a circle, 1 m a step, (n, 3)."""
+    truth, step = np.zeros((n, 3)), np.array([[1.0, 0.0, 2 * np.pi / ROUND]])
+    for k in range(1, n):
+        truth[k] = se2.compose(truth[k - 1 : k], step)[0]
+    return truth
+
+
+def drive_roundabout(backend, truth, seed=0):
+    """Add keyframes that drift so far that one loop back to the start could be chance."""
+    noise = _SIGMA * np.random.default_rng(seed).standard_normal((len(truth) - 1, 3))
+    steps, pose = se2.retract(se2.between(truth[:-1], truth[1:]), noise), truth[:1]
+    backend.add_odometry(odometry(0.0, pose[0]))
+    for k, step in enumerate(steps, 1):
+        pose = se2.compose(pose, step[None])
+        backend.add_odometry(odometry(k * PERIOD, pose[0], covariance6(np.diag(_SIGMA**2))))
+
+
+def seen(truth, i, j):
+    """Return the loop that sees keyframe j from keyframe i as they are in truth."""
+    pose = se2.between(truth[i : i + 1], truth[j : j + 1])[0]
+    return loop(i * PERIOD, j * PERIOD, pose, covariance6(np.diag([1e-2, 1e-2, 1e-3])))

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""After the warm-up nothing is compiled any more: a robot would stand still meanwhile."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+from l1slam_ros.core.warm_up import STEPS, warm_up
+
+# Prints what a process compiles, or reads from the cache, when it is warm.
+WORK = """
+import importlib
+import itertools
+import pkgutil
+from dataclasses import replace
+
+import numpy as np
+from lies import careful_world, drive_roundabout, roundabout, seen, spoilt
+from problems import play
+
+from l1slam_ros import offline
+from l1slam_ros.core import kernels, se2
+from l1slam_ros.core.backend import Backend, BackendOptions, RobustOptions, optimise
+from l1slam_ros.core.cholesky import cholesky_of
+from l1slam_ros.core.inspection import connected_parts
+from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
+from l1slam_ros.core.least_squares import weighted_least_squares
+from l1slam_ros.core.linearise import linearise
+from l1slam_ros.core.warm_up import warm_up
+from l1slam_ros.io.graph_file import GraphRecord
+
+MODULES = [importlib.import_module(f'{kernels.__name__}.{module.name}')
+           for module in pkgutil.iter_modules(kernels.__path__)]
+
+
+def signatures():
+    return {(kernel.py_func.__module__, kernel.py_func.__name__, signature)
+            for module in MODULES for kernel in vars(module).values()
+            if hasattr(kernel, 'signatures') for signature in kernel.signatures}
+
+
+def look(what):
+    global known
+    for module, name, signature in sorted(signatures() - known, key=str):
+        print(f'{what}: {module}.{name}{signature}')
+    known |= signatures()
+
+
+warm_up()
+known = signatures()
+assert len(known) > 50, 'are the kernels not where this test looks for them?'
+
+every = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
+world = spoilt(careful_world(150, 300), 'grouped', 60)
+for enabled in (True, False):
+    options = replace(every, robust=RobustOptions(enabled))
+    backend = Backend(se2, options)
+    for k in range(0, 150, 15):
+        play(backend, world, k, k + 15)
+        backend.update(0.001 if k % 2 else 60.0)
+    backend.loop_states()
+    look(f'updates, robust {enabled}')
+    backend.adopt(optimise(backend.problem(), options.solver))
+    look(f'optimise, robust {enabled}')
+    after = Backend(se2, options)
+    after.restore(backend.growth.graph, backend.poses, backend.growth.stamps)
+    after.update(60.0)
+    look(f'restored, robust {enabled}')
+
+truth = roundabout(220)
+backend = Backend(se2, every)
+drive_roundabout(backend, truth)
+for i, j in ((3, 203), (30, 140)):
+    backend.add_loop(seen(truth, i, j))
+    backend.update(60.0)
+look('pairs of loops')
+
+def slipped(world):
+    factors, graph = world.graph.between, type(world.graph)(se2)
+    graph.add_poses(world.graph.n_poses)
+    measurement = factors.measurement.copy()
+    measurement[np.flatnonzero(factors.is_odometry)[80]] += [5.0, 0.0, 0.0]
+    roots = factors.sqrt_information
+    graph.add_between(factors.i, factors.j, measurement, roots.transpose(0, 2, 1) @ roots)
+    return graph
+
+def solved(graph, poses, **wish):
+    record = GraphRecord(graph, poses, np.arange(graph.n_poses))
+    offline.solve(record, offline.Wish(**wish), lambda iteration, cost: None)
+
+solved(slipped(world), None, robust=True)
+look('a slip')
+for start, norm, robust in itertools.product(offline.STARTS, offline.NORMS, (False, True)):
+    for poses in (world.odometry, np.asfortranarray(world.odometry)):
+        solved(world.graph, poses, start=start, norm=norm, robust=robust)
+        look(f'{start}, {norm}, robust {robust}')
+for solver in ('primal-dual', 'interior-point'):
+    solved(world.graph, world.odometry, solver=solver)
+    look(solver)
+
+cholesky = cholesky_of(world.graph)
+system = linearise(world.graph, world.odometry)
+weighted_least_squares(system, cholesky, np.ones_like(system.b), 0.1)
+scattered = 20 * np.random.default_rng(0).standard_normal((150, 3))
+minimise_l2(world.graph, scattered, LeastSquaresOptions(), cholesky)
+look('damped steps')
+connected_parts(world.graph)
+world.graph.add_prior(np.array([7]), world.truth[7:8], np.eye(3)[None])
+for norm in offline.NORMS:
+    solved(world.graph, world.odometry, norm=norm)
+look('a prior')
+"""
+
+
+def test_nothing_is_compiled_after_the_warm_up():
+    done = subprocess.run([sys.executable, '-c', WORK], capture_output=True, text=True,
+                          timeout=120, cwd=Path(__file__).parent)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ''
+
+
+def test_each_step_is_reported_once_it_is_done():
+    said = []
+    warm_up(said.append)
+    assert tuple(said) == STEPS
