@@ -180,7 +180,8 @@ def summarise(recording: Recording, heard: Heard, picture: Path) -> str:
     rate = (len(heard.times) - 1) / max(heard.times[-1] - heard.times[0], 1e-9)
     return '\n'.join((
         f'position error  {errors[0]:.3f} m by odometry, {errors[1]:.3f} m in the map (RMSE)',
-        f'graph           {len(stamps)} keyframes, {len(loops)} loops, {false.sum()} of them false',
+        f'graph           {len(stamps)} keyframes, {len(loops)} loops, {false.sum()} of them '
+        'false',
         f'refused         {(refused & false).sum()} false loops, {(refused & ~false).sum()} true '
         'ones',
         f'node            {rate:.1f} updates per second',

@@ -31,8 +31,8 @@ def verdict(record: GraphRecord, judgement: RobustMap) -> Iterator[str]:
     if len(refused) > _NAMED:
         yield f'  and {len(refused) - _NAMED:,} more; `--json` lists all'
     if len(suspect):
-        yield (f'suspect and left out, because nothing vouches for them: {len(suspect):,} that fit '
-               'where they stand, but could as well do so by chance')
+        yield (f'suspect and left out, because nothing vouches for them: {len(suspect):,} that '
+               'fit where they stand, but could as well do so by chance')
 
 
 def _named(pair: np.ndarray) -> str:
