@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from l1slam_ros.core import se2
+from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.errors import GraphError, OptionError
 from l1slam_ros.core.false_loops import FALSE_LOOPS
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
@@ -106,7 +107,8 @@ def test_a_seed_makes_one_world():
 @pytest.mark.parametrize('seed', range(4))
 def test_by_default_odometry_drifts_by_metres_and_loops_mend_it(seed):
     world = simulate_world(1000, 2000, OPTIONS, np.random.default_rng(seed))
-    poses = minimise_l2(world.graph, world.odometry, LeastSquaresOptions()).poses
+    poses = minimise_l2(world.graph, world.odometry, LeastSquaresOptions(),
+                        cholesky_of(world.graph)).poses
     truth = se2.positions(world.truth)
     assert 1 < absolute_trajectory_error(se2.positions(world.odometry), truth) < 15
     assert absolute_trajectory_error(se2.positions(poses), truth) < 0.15

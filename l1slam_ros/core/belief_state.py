@@ -76,15 +76,22 @@ def judge(graph: FactorGraph, poses: Array, belief: Belief, deadline: float) -> 
     """
     growth = Growth(graph, graph.between.trusted, np.random.default_rng(_SEED))
     growth.resume(poses, belief.accepted, belief.variance)
-    news = growth.believable(growth.undecided())
-    # One round is always finished, or short budgets would never get anywhere.
-    while len(news):
-        growth.accepted[news] = True
-        growth.settle()
+    settled = False
+    while not settled:
         news = growth.believable(growth.undecided())
-        if time.monotonic() > deadline:
+        growth.accepted[news] = True
+        if not growth.takes_at_their_word:
+            variance = growth.variance  # as measured: where the next judgement begins
+            if not len(news):
+                growth.take_at_their_word()
+        elif not len(news):
+            settled = True
+            break
+        growth.settle()
+        # The end is not put off once it is in sight, or short budgets would never get there.
+        if time.monotonic() > deadline and not growth.takes_at_their_word:
             break
     square, suspect = outlook(growth)
-    accepted = reconsidered(graph, growth.poses, growth.accepted, graph.between.trusted)
-    return Belief(accepted, suspect & ~accepted, np.sqrt(square), growth.variance,
-                  not len(news))
+    # What fits the map as it is may come in; what was believed stays until evidence is against it.
+    accepted = growth.accepted | reconsidered(graph, growth.poses, growth.accepted)
+    return Belief(accepted, suspect & ~accepted, np.sqrt(square), variance, settled)
