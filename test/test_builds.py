@@ -195,7 +195,8 @@ def test_every_python_comes_to_the_same_costs(
     found = json.loads(fresh.run('python', '-c', SMOKE, cwd=tmp_path))
     assert found['python'] == version and not found['ros']
     assert found['numpy'].startswith('1.26.' if oldest else '2.')
-    assert found['costs'] == pytest.approx(smoke['costs'], rel=1e-9)
+    # Compilers order sums differently, and a solver stops within 10^-6 of the optimum.
+    assert found['costs'] == pytest.approx(smoke['costs'], rel=1e-6)
 
 
 @pytest.fixture(scope='module', params=[[], ['--symlink-install']], ids=['plain', 'symlink'])
