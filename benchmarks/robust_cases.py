@@ -14,7 +14,7 @@ import numpy as np
 from robust_kinds import CLEAN, DEGREES, HEADING, KINDS, METRES, OWN_SHARE, TENTH
 
 from l1slam_ros.core.cholesky import cholesky_of
-from l1slam_ros.core.false_loops import FALSE_LOOPS, insert_loops, without_factors
+from l1slam_ros.core.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.initial import pair_key
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
@@ -112,7 +112,7 @@ def _disturbed(
         kept = rng.choice(loops, round(len(loops) * _KEPT_TRUE), replace=False)
         left_out = ~factors.is_odometry
         left_out[kept] = False
-        return without_factors(graph, left_out), -1
+        return graph.subset(~left_out), -1
     if disturbance == HEADING:
         return _with_heading_noise(graph, rng), -1
     if disturbance in (METRES, DEGREES):

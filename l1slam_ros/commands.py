@@ -13,7 +13,7 @@ import numpy as np
 
 from l1slam_ros import offline
 from l1slam_ros.core.errors import FileError, GraphError, OptionError
-from l1slam_ros.core.false_loops import FALSE_LOOPS, insert_loops, without_factors
+from l1slam_ros.core.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.l2 import LeastSquaresOptions
 from l1slam_ros.core.manifold import Indices
 from l1slam_ros.core.optimality import SENTENCES
@@ -186,7 +186,7 @@ def corrupt(arguments: argparse.Namespace) -> str:
     record = _read(arguments, arguments.input)
     _warn(record)
     former = known_false(arguments.input, record)
-    believed = replace(record, graph=without_factors(record.graph, former))
+    believed = replace(record, graph=record.graph.subset(~former))
     options = LeastSquaresOptions()
     _make_ready()
     with _named(arguments.input), Progress(options.iterations, 'step') as progress:

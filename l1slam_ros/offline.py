@@ -21,7 +21,7 @@ from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.metrics import absolute_trajectory_error
 from l1slam_ros.core.optimality import l1_cost, l2_cost
 from l1slam_ros.core.optimiser import OptimiserOptions, Report, Solution
-from l1slam_ros.core.robust_map import RobustMap, accepted_graph, minimise_robustly
+from l1slam_ros.core.robust_map import RobustMap, minimise_robustly
 from l1slam_ros.core.seed import seed_poses
 from l1slam_ros.graph_from_bag import DEFAULT_TOPICS, Topics, graph_from_bag
 from l1slam_ros.io.bag import BAG_SUFFIXES
@@ -149,7 +149,7 @@ def solve(record: GraphRecord, wish: Wish, report: Report) -> Outcome:
     if wish.robust:
         judgement = minimise_robustly(graph, minimiser.minimise)
         solution, seed = judgement.solution, judgement.seed
-        graph = accepted_graph(graph, judgement.accepted)
+        graph = graph.subset(judgement.accepted)
     else:
         choice = minimiser.choose(graph)
         seed = seed_poses(graph, choice.cholesky) if wish.start == 'seed' else None

@@ -15,7 +15,7 @@ from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.optimality import l1_cost, l2_cost
 from l1slam_ros.core.optimiser import OptimiserOptions
 from l1slam_ros.core.robust import robust_solve
-from l1slam_ros.core.robust_map import accepted_graph, minimise_robustly
+from l1slam_ros.core.robust_map import minimise_robustly
 
 
 def in_l1(graph, poses):
@@ -52,7 +52,7 @@ def rebuilt(graph, measurement):
 
 def test_the_accepted_graph_has_the_accepted_factors_as_they_were(bad):
     accepted = ~is_false(bad, bad.graph.between)
-    part, factors = accepted_graph(bad.graph, accepted), bad.graph.between
+    part, factors = bad.graph.subset(accepted), bad.graph.between
     assert part.n_poses == bad.graph.n_poses and len(part.between) == accepted.sum()
     for name in ('i', 'j', 'measurement', 'sqrt_information', 'trusted', 'is_odometry'):
         assert_array_equal(getattr(part.between, name), getattr(factors, name)[accepted])
@@ -76,7 +76,7 @@ def test_its_cost_counts_the_accepted_factors_only(bad, found):
 @pytest.mark.parametrize('minimise, cost', [(in_l1, l1_cost), (in_l2, l2_cost)])
 def test_the_map_is_an_optimum_of_the_norm_asked_for(bad, minimise, cost):
     found = minimise_robustly(bad.graph, minimise)
-    part = accepted_graph(bad.graph, found.accepted)
+    part = bad.graph.subset(found.accepted)
     best = cost(whitened_residual(part, found.solution.poses))
     again = minimise(part, found.solution.poses)
     assert best == pytest.approx(found.solution.cost) == pytest.approx(again.cost, rel=1e-4)
@@ -101,7 +101,7 @@ def test_the_solver_is_asked_once_and_from_the_seed(bad):
 
 
 def test_the_seed_is_the_l2_map_of_what_is_accepted(bad, found):
-    part = accepted_graph(bad.graph, found.accepted)
+    part = bad.graph.subset(found.accepted)
     best = in_l2(part, found.seed)
     assert l2_cost(whitened_residual(part, found.seed)) <= best.cost + 1
 

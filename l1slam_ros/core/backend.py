@@ -27,7 +27,7 @@ from l1slam_ros.core.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.optimality import Status, l1_cost, smoothing
 from l1slam_ros.core.optimiser import OptimiserOptions, Solution, backtrack, is_far, minimise
 from l1slam_ros.core.options import Options, option
-from l1slam_ros.core.robust_map import accepted_graph, minimise_robustly
+from l1slam_ros.core.robust_map import minimise_robustly
 from l1slam_ros.core.seed import seed_poses
 
 
@@ -242,7 +242,7 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Impro
     belief = problem.belief
     if not belief.settled:
         belief = judge(problem.graph, problem.poses, belief, deadline)
-    graph, poses = accepted_graph(problem.graph, belief.accepted), problem.poses
+    graph, poses = problem.graph.subset(belief.accepted), problem.poses
     size = graph.manifold.TANGENT_SIZE
     dual = problem.dual.reshape(-1, size)[belief.accepted].ravel()
     before = cost = l1_cost(whitened_residual(graph, poses))
@@ -274,7 +274,7 @@ def optimise(problem: Problem, options: OptimiserOptions) -> Improvement:
     else:
         starts = (problem.poses, seed_poses(graph, choose(AUTO, graph).cholesky))
         solution = min((_solved(graph, poses, options) for poses in starts), key=lambda s: s.cost)
-    part = accepted_graph(graph, belief.accepted)
+    part = graph.subset(belief.accepted)
     before = l1_cost(whitened_residual(part, problem.poses))
     return _improvement(solution, problem, belief, before, 0, start)
 

@@ -65,17 +65,6 @@ def insert_loops(graph: FactorGraph, loops: Loops) -> FactorGraph:
     return longer
 
 
-def without_factors(graph: FactorGraph, left_out: np.ndarray) -> FactorGraph:
-    """Return a new graph without some between factors, left_out : (m,) bool."""
-    factors, prior, kept = graph.between, graph.prior, ~left_out
-    shorter = FactorGraph(graph.manifold)
-    shorter.add_poses(graph.n_poses)
-    shorter.add_prior(prior.i, prior.measurement, _information(prior.sqrt_information))
-    shorter.add_between(factors.i[kept], factors.j[kept], factors.measurement[kept],
-                        _information(factors.sqrt_information[kept]), factors.trusted[kept])
-    return shorter
-
-
 def random_false_loops(
     graph: FactorGraph, poses: Array, count: int, rng: np.random.Generator
 ) -> Loops:

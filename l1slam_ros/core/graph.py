@@ -91,6 +91,25 @@ class FactorGraph:
         clone._prior = [column.copy() for column in self._prior]
         return clone
 
+    def subset(self, chosen: Indices | Mask, variance: Array | None = None) -> 'FactorGraph':
+        """
+        Return a graph of all keyframes, all priors and some of the between factors.
+
+        Parameters
+        ----------
+        chosen : rows (k,), or (m,) bool
+        variance : (k,) by which to multiply the covariance of each, none: as they are
+
+        """
+        part = FactorGraph(self.manifold)
+        part.n_poses = self.n_poses
+        part._prior = [column.copy() for column in self._prior]
+        i, j, measurement, root, trusted = (column.view()[chosen] for column in self._between)
+        if variance is not None:
+            root = root / np.sqrt(variance)[:, None, None]
+        self._append(part._between, (i, j, measurement, root, trusted))
+        return part
+
     @property
     def between(self) -> BetweenFactors:
         """All between factors so far: a snapshot that later appends do not change."""

@@ -32,7 +32,6 @@ from l1slam_ros.core.noise import Mask
 from l1slam_ros.core.prediction import chi2_quantile
 from l1slam_ros.core.robust_growth import REFUSED, Growth, solve
 from l1slam_ros.core.slips import without_slip
-from l1slam_ros.core.subgraph import SubGraph
 
 # Every round accepts a loop, hence there is an end; this one is for the patience of people.
 _MOST_ROUNDS = 200
@@ -148,5 +147,5 @@ def reconsidered(
 
 def minimise_accepted(graph: FactorGraph, poses: Array, accepted: Mask) -> Array:
     """Return the L2 map (n, p) of the accepted factors, in the units that they state."""
-    part = SubGraph(graph, np.flatnonzero(accepted), np.ones(np.count_nonzero(accepted)))
+    part = graph.subset(accepted)
     return solve(part, poses, cholesky_of(part))

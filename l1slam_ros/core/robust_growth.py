@@ -34,7 +34,6 @@ from l1slam_ros.core.prediction import (
     left_out_quantile,
     sample_posterior,
 )
-from l1slam_ros.core.subgraph import SubGraph
 
 # One in so many true loops may be refused for its noise alone; and of accepted ones, dropped.
 REFUSED = 1e-3
@@ -98,10 +97,10 @@ class Growth:
         clone.accepted, clone._drops = self.accepted.copy(), self._drops.copy()
         return clone
 
-    def part(self, rows: Indices) -> SubGraph:
+    def part(self, rows: Indices) -> FactorGraph:
         """Return the graph of some factors, with the noise as it was found."""
         variance = np.maximum(self.variance, self._least_variance)
-        return SubGraph(self.graph, rows, variance[self.is_loop[rows].astype(np.int64)])
+        return self.graph.subset(rows, variance[self.is_loop[rows].astype(np.int64)])
 
     def take_at_their_word(self) -> None:
         """From now on let factors be as noisy as they say, if they are not noisier."""

@@ -10,14 +10,11 @@ on a few; L2 map and choice follow each other until nothing changes.
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.noise import Mask
 from l1slam_ros.core.optimiser import Solution
 from l1slam_ros.core.robust import Report, minimise_accepted, reconsidered, robust_solve
-from l1slam_ros.core.subgraph import SubGraph
 
 # Measured: one or two until the choice stands; this ends one that swings.
 _MOST_ROUNDS = 10
@@ -43,11 +40,6 @@ class RobustMap:
     variance: Array
 
 
-def accepted_graph(graph: FactorGraph, accepted: Mask) -> SubGraph:
-    """Return the graph of the accepted between factors, accepted : (m,) bool."""
-    return SubGraph(graph, np.flatnonzero(accepted), np.ones(np.count_nonzero(accepted)))
-
-
 def minimise_robustly(
     graph: FactorGraph, minimise: Callable[[FactorGraph, Array], Solution],
     report: Report = lambda round_, accepted: None,
@@ -65,6 +57,6 @@ def minimise_robustly(
         accepted = reconsidered(graph, poses, before, trusted)
         if (accepted == before).all():
             break
-    solution = minimise(accepted_graph(graph, before), poses)
+    solution = minimise(graph.subset(before), poses)
     return RobustMap(solution, poses, before, found.suspect & ~before, found.sigmas, found.slips,
                      found.variance)
