@@ -12,26 +12,25 @@ import numpy as np
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.prediction import Innovations
 
-# A factor is believed when it is false with at most this probability.
+# Of factors that are believed at one time, any is false with at most this probability.
 DOUBT = 0.01
-# So many false ones may be expected among all that are believed at one time.
-_EXPECTED_FALSE = 1.0
 # The noise is judged by so many of the best predicted factors.
 _BEST_PREDICTED = 1000
 _ROUNDS = 100
 _SAME = 1e-3
 
 
-def log_odds_of_false(log_ratio: Array, others: int) -> float:
+def log_odds_of_false(log_ratio: Array, others: int, believed: int = 0) -> float:
     """
     Return ln (false / true) of a crowd of factors, by expectation and maximisation.
 
-    log_ratio : (m,) of those that fit; others : how many do not, all false. One of each kind is
-    added, so that a crowd without a true or a false one still says how sure that is.
+    log_ratio : (m,) of those that fit; others : how many do not, all false; believed : how many
+    are true for sure. One of each kind is added, so that a crowd without a true or a false one
+    still says how sure that is.
     """
-    count, odds = len(log_ratio) + others, 0.0
+    count, odds = len(log_ratio) + others + believed, 0.0
     for _ in range(_ROUNDS):
-        true = float(probability(log_ratio - odds).sum()) + 1
+        true = float(probability(log_ratio - odds).sum()) + believed + 1
         before, odds = odds, float(np.log((count + 2 - true) / true))
         if abs(odds - before) < _SAME:
             break
@@ -45,11 +44,11 @@ def probability(log_odds: Array) -> Array:
 
 
 def believable(log_ratio: Array, log_odds: float) -> Indices:
-    """Return the factors that may be believed, the surest first, (k,)."""
+    """Return the factors that may be believed, all of them at once, the surest first, (k,)."""
     doubt = probability(log_odds - log_ratio)
     order = np.argsort(doubt, kind='stable')
     doubt = doubt[order]
-    good = (doubt < DOUBT) & (np.cumsum(doubt) < _EXPECTED_FALSE)
+    good = np.cumsum(doubt) < DOUBT
     believed: Indices = order[good]
     return believed
 

@@ -12,7 +12,7 @@ the covariance of the residual of one inside. Two dozen samples cost a few ordin
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import betaincinv, gammaincinv
+from scipy.special import betaincinv, gammaincinv, gammaln
 
 from l1slam_ros.core.cholesky import BlockCholesky
 from l1slam_ros.core.errors import GraphError
@@ -86,8 +86,16 @@ def sample_posterior(
 
 
 def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array, size: int) -> Array:
-    """Return ln N(residual; 0, C) + ln(volume of a false one's), (m,); size : of a residual."""
-    ratio: Array = log_claim - (size * np.log(2 * np.pi) + log_det + square) / 2
+    """
+    Return ln p(residual) + ln(volume of a false one's), (m,); size : of a residual.
+
+    p is Student's: what a covariance from `SAMPLES` samples says of one more (Jeffreys' prior).
+    Where nothing but the noise speaks, that is a little generous.
+    """
+    q = SAMPLES
+    constant = gammaln((q + 1) / 2) - gammaln((q + 1 - size) / 2) - size * np.log(np.pi * q) / 2
+    density = constant - (log_det + (q + 1) * np.log1p(square / q)) / 2
+    ratio: Array = log_claim + density
     return ratio
 
 
@@ -110,7 +118,7 @@ class Innovations:
         """
         Return how much more probable each residual is if its factor is true, (m,) logarithms.
 
-        ln N(residual; 0, scale C) + ln(volume of a false one's)
+        scale : of C; see `log_likelihood_ratio`
         """
         k = self.system.block_size
         return log_likelihood_ratio(self.square / scale, self.log_det + k * np.log(scale),
@@ -181,11 +189,11 @@ def chi2_quantile(probability: float, freedom: int) -> float:
     return float(2 * gammaincinv(freedom / 2, probability))
 
 
-def left_out_quantile(probability: float, freedom: int) -> float:
+def sampled_quantile(probability: float, freedom: int) -> float:
     """
-    Return what `Posterior.left_out` of a true factor stays below.
+    Return what r'C^-1 r of normal numbers r (freedom,) stays below.
 
-    Its covariance is that of `SAMPLES` samples, so it has Hotelling's distribution:
+    C is the covariance of `SAMPLES` samples, so that has Hotelling's distribution:
     T^2 (q - k + 1) / (q k) is Fisher's F of k and q - k + 1 degrees of freedom.
     """
     rest = SAMPLES - freedom + 1

@@ -31,8 +31,8 @@ from l1slam_ros.core.prediction import (
     chi2_quantile,
     claimed_volume,
     innovations,
-    left_out_quantile,
     sample_posterior,
+    sampled_quantile,
 )
 
 # One in so many true loops may be refused for its noise alone; and of accepted ones, dropped.
@@ -119,7 +119,7 @@ class Growth:
 
     def gate(self, factors: int = 1) -> float:
         """Return what the squared innovation of so many true factors stays below."""
-        return chi2_quantile(1 - REFUSED, factors * self.graph.manifold.TANGENT_SIZE)
+        return sampled_quantile(1 - REFUSED, factors * self.graph.manifold.TANGENT_SIZE)
 
     def settle(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
@@ -156,7 +156,7 @@ class Growth:
     def doubted(self) -> float:
         """Return what `Posterior.left_out` of no factor exceeds if all accepted ones are true."""
         accepted = int(np.count_nonzero(self.accepted))
-        return left_out_quantile(1 - _DOUBTED / accepted, self.graph.manifold.TANGENT_SIZE)
+        return sampled_quantile(1 - _DOUBTED / accepted, self.graph.manifold.TANGENT_SIZE)
 
     def _learn_variance(self, rows: Indices) -> None:
         """Compare the residuals with what the noise makes of them, for odometry and for loops."""
@@ -177,7 +177,10 @@ class Growth:
         found = self.innovations(rows)
         fits = np.flatnonzero(found.square < self.gate())
         log_ratio = found.log_ratio()[fits]
-        odds = log_odds_of_false(log_ratio, len(rows) - len(fits))
+        # Taken at their word all are noisier than they are, so that more fit by chance: then only
+        # the rest says how many of the rest are false.
+        true = 0 if self.takes_at_their_word else np.count_nonzero(self.accepted & self.is_loop)
+        odds = log_odds_of_false(log_ratio, len(rows) - len(fits), int(true))
         good = believable(log_ratio, odds)
         if not len(good):
             best = fits[np.argsort(-log_ratio, kind='stable')[:_CANDIDATES]]
@@ -203,6 +206,11 @@ class Growth:
     def heads(self, rows: Indices) -> Indices:
         """Return which of some factors have a vote: the first of each group of them, (k,)."""
         return one_of_each_group(self.low[rows], self.high[rows], _APART)
+
+    def some(self, rows: Indices, count: int) -> Indices:
+        """Return so many of some factors, at random, or all, (k,)."""
+        chosen: Indices = self.rng.permutation(rows)[:count]
+        return chosen
 
 
 def solve(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:

@@ -5,76 +5,159 @@ Odometry that lies: found by what the loops across a slip have in common.
 In: a robust solve in which nothing more can be believed. Out: one in which an odometry factor is
 left out, and the loops that were refused because of it are accepted.
 
-Where believed loops span a slip, they speak against it. Where none does, the two sides of it are
-pieces of their own; every true loop across is refused, but from one of them, and from how its ends
-lie to those of another, follows the other one.
+Three ways lead to a factor that may lie: it moves as the robot never did; believed loops across
+speak against it; or refused loops across agree with each other (`accord`). Each is tried, and
+counts when leaving it out brings more loops in than it costs, of several places.
 """
+
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from l1slam_ros.core.accord import accord, ends_in_time
 from l1slam_ros.core.belief import DOUBT, log_odds_of_false
 from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.linearise import anchor
 from l1slam_ros.core.manifold import Array, Indices
-from l1slam_ros.core.noise import whiten
-from l1slam_ros.core.prediction import (
-    Posterior,
-    chi2_quantile,
-    claimed_volume,
-    innovations,
-    log_likelihood_ratio,
-)
+from l1slam_ros.core.noise import Mask
+from l1slam_ros.core.prediction import chi2_quantile, claimed_volume, innovations
 from l1slam_ros.core.robust_growth import Growth
 
-# Loops of that many groups have to agree upon a slip.
-_VOTES = 3
-# So many refused loops are asked, and of those that agree so many say how the slip is mended.
+# So many loops more have to come in without the factor, and loops of that many groups to span it.
+VOTES = 3
+# So many steps of unusual motion are tried.
+_TRIED = 3
+# So many loops judge where a slip is, and of those that agree so many say how it is mended.
 _JURY, _PROPOSALS = 500, 20
-# Of each one so many pairs are looked at closely, those that differ least.
-_NEAREST = 20
+# A long way is searched by so many places at a time.
+_AT_A_TIME = 20
 
 
 def without_slip(growth: Growth) -> Growth | None:
     """Return a state without an odometry factor that loops agree is wrong; None: there is none."""
+    if np.count_nonzero(growth.is_loop[growth.undecided()]) < VOTES:
+        return None
     before = np.count_nonzero(growth.accepted)
-    for attempt in (_without_worst, _mended):
-        trial = growth.copy()
-        votes = attempt(trial)
-        trial.accepted[votes] = True
-        gained = np.count_nonzero(trial.accepted) - before
-        if len(growth.heads(votes)) >= _VOTES and gained >= _VOTES:
-            return trial
+    for attempt in (_without_unusual, _without_worst, _mended):
+        for trial in attempt(growth):
+            _believe(trial)
+            gained = np.count_nonzero(trial.accepted) - before
+            across = _across(trial, growth.accepted & ~trial.accepted & ~growth.is_loop)
+            if gained >= VOTES and len(growth.heads(across)) >= VOTES:
+                return trial
     return None
 
 
-def _without_worst(growth: Growth) -> Indices:
-    """Leave out the odometry factor that all others speak against; return who agrees, (k,)."""
+def _believe(growth: Growth) -> None:
+    """Accept the loops that can be believed, round by round."""
+    news = growth.undecided()
+    while len(news):
+        rows = growth.undecided()
+        news = growth.believable(rows[growth.is_loop[rows]])
+        growth.accepted[news] = True
+        if len(news):
+            growth.settle()
+
+
+def _across(growth: Growth, left_out: Mask) -> Indices:
+    """Return the accepted loops across any of the factors left out, (k,)."""
+    steps = np.sort(growth.low[left_out])
+    spans = np.searchsorted(steps, growth.low) < np.searchsorted(steps, growth.high)
+    across: Indices = np.flatnonzero(growth.accepted & growth.is_loop & spans)
+    return across
+
+
+def _without_unusual(growth: Growth) -> Iterator[Growth]:
+    """Leave out an odometry factor that moves as the robot never did."""
+    rows = np.flatnonzero(growth.accepted & ~growth.is_loop)
+    square = unusual_motion(growth.graph, ends_in_time(growth.graph)[2][rows])
+    most = np.argsort(-square, kind='stable')[:_TRIED]
+    limit = chi2_quantile(1 - DOUBT / len(rows), growth.graph.manifold.TANGENT_SIZE)
+    for row in rows[most[square[most] > limit]].tolist():
+        trial = growth.copy()
+        trial.accepted[row] = False
+        trial.settle()
+        yield trial
+
+
+def unusual_motion(graph: FactorGraph, Z: Array) -> Array:
+    """
+    Return how far motions Z (k, p) are from how the odometry moves, (k,) squared sigmas.
+
+    Motions are taken to be normal: a robot does not jump.
+    """
+    manifold, measured = graph.manifold, ends_in_time(graph)[2][graph.between.is_odometry]
+    usual = manifold.local(manifold.identity(len(measured)), measured)
+    precision = np.linalg.pinv(np.cov(usual, rowvar=False), hermitian=True)
+    off = manifold.local(manifold.identity(len(Z)), Z) - usual.mean(axis=0)
+    square: Array = np.einsum('mi,ij,mj->m', off, precision, off)
+    return square
+
+
+def _without_worst(growth: Growth) -> Iterator[Growth]:
+    """Leave out the odometry factor that all others speak against."""
     inside = np.flatnonzero(growth.accepted)
     against = np.where(growth.is_loop[inside], 0.0, growth.posterior.left_out())
     k = growth.graph.manifold.TANGENT_SIZE
     if against.max() < chi2_quantile(1 - DOUBT / len(inside), k):
-        return np.zeros(0, np.int64)
-    worst = int(inside[np.argmax(against)])
-    growth.accepted[worst] = False
-    growth.settle()
-    rows = growth.undecided()
-    rows = rows[growth.is_loop[rows]]
+        return
+    trial, worst = growth.copy(), int(inside[np.argmax(against)])
     # Steps between which no believed loop ends share what speaks against them.
-    run = _run_about(worst, growth.low, inside[against > against.max() / 2])
-    slipped = _best_place(growth, worst, run, rows)
-    growth.accepted[worst], growth.accepted[slipped] = True, False
-    growth.poses = _slipped_elsewhere(growth, worst, int(growth.low[slipped]))
-    growth.settle()
-    return growth.believable(rows)
+    run = _run_about(worst, trial.low, inside[against > against.max() / 2])
+    within = _ending_within(trial, run)
+    trial.accepted[worst] = False
+    trial.accepted[within] = trial.trusted[within]
+    trial.settle()
+    jury = trial.some(within[~trial.accepted[within]], _JURY)
+    slipped = _likeliest(trial, jury, run, lambda step: _slipped_elsewhere(trial, worst, step))
+    trial.accepted[worst], trial.accepted[slipped] = True, False
+    trial.poses = _slipped_elsewhere(trial, worst, int(trial.low[slipped]))
+    trial.settle()
+    yield trial
 
 
-def _best_place(growth: Growth, worst: int, run: Indices, rows: Indices) -> int:
-    """Return at which of a run of odometry factors the refused loops that end there fit best."""
-    first, last, ends = growth.low[run[0]], growth.low[run[-1]], (growth.low, growth.high)
-    inside = np.any([(end[rows] > first) & (end[rows] <= last) for end in ends], axis=0)
-    jury = _some(growth, rows[inside], _JURY)
-    return int(max(run, key=lambda factor: _support(
-        growth, jury, _slipped_elsewhere(growth, worst, int(growth.low[factor]))).sum()))
+def _ending_within(growth: Growth, run: Indices) -> Indices:
+    """Return the loops that end between the steps of a run of odometry factors, (k,)."""
+    first, last = growth.low[run[0]], growth.low[run[-1]]
+    within = [(end > first) & (end <= last) for end in (growth.low, growth.high)]
+    ending: Indices = np.flatnonzero(growth.is_loop & np.any(within, axis=0))
+    return ending
+
+
+def _likeliest(
+    growth: Growth, jury: Indices, run: Indices, slipped_at: Callable[[int], Array]
+) -> int:
+    """
+    Return which of a run of odometry factors slipped.
+
+    That with whose poses, `slipped_at(step)` (n, p), a jury of loops fits best; of those between
+    which none of these loops ends, the one whose motion is more usual so than as measured.
+    """
+    steps = growth.low[run]
+    first = np.unique(_places(growth, jury, steps), return_index=True)[1]
+    while len(first) > 1:
+        stride = -(-len(first) // _AT_A_TIME)
+        support = [_support(growth, jury, slipped_at(step)).sum()
+                   for step in steps[first[::stride]].tolist()]
+        best = stride * int(np.argmax(support))
+        first = first[max(best - stride + 1, 0):best + stride]
+    fits = _support(growth, jury, slipped_at(int(steps[first[0]]))) > 0
+    place = _places(growth, jury[fits], steps)
+    alike = np.flatnonzero(place == place[first[0]])
+    moved = np.concatenate([_step_of(growth, slipped_at(step), step)
+                            for step in steps[alike].tolist()])
+    measured = ends_in_time(growth.graph)[2][run[alike]]
+    gain = unusual_motion(growth.graph, measured) - unusual_motion(growth.graph, moved)
+    return int(run[alike[np.argmax(gain)]])
+
+
+def _places(growth: Growth, loops: Indices, steps: Indices) -> Indices:
+    """Return of steps (k,) a number each, the same where no loop ends between them, (k,)."""
+    ends = np.unique(np.concatenate((growth.low[loops], growth.high[loops])))
+    return np.searchsorted(ends, steps, side='right')
+
+
+def _step_of(growth: Growth, poses: Array, step: int) -> Array:
+    return growth.graph.manifold.between(poses[step, None], poses[step + 1, None])
 
 
 def _run_about(worst: int, low: Indices, suspects: Indices) -> Indices:
@@ -87,82 +170,43 @@ def _run_about(worst: int, low: Indices, suspects: Indices) -> Indices:
 
 def _slipped_elsewhere(growth: Growth, worst: int, step: int) -> Array:
     """Return the poses if the odometry did not slip at the factor `worst` but at another step."""
-    manifold, factors, poses = growth.graph.manifold, growth.factors, growth.poses
-    i, j = factors.i[worst], factors.j[worst]
-    measurement = factors.measurement[worst][None]
-    if i > j:
-        i, j, measurement = j, i, manifold.inverse(measurement)
-    ahead = manifold.compose(poses[i][None], measurement)
-    motion = manifold.compose(ahead, manifold.inverse(poses[j][None]))
-    part = slice(j, step + 1)
-    if step < i:
-        motion, part = manifold.inverse(motion), slice(step + 1, j)
+    manifold, poses = growth.graph.manifold, growth.poses
+    motion = _motion_to_fit(growth.graph, poses, worst)
+    part = slice(growth.high[worst], step + 1)
+    if step < growth.low[worst]:
+        motion, part = manifold.inverse(motion), slice(step + 1, growth.high[worst])
     moved = poses.copy()
     moved[part] = manifold.compose(np.broadcast_to(motion, poses[part].shape), poses[part])
     return moved
 
 
-def _mended(growth: Growth) -> Indices:
-    """Leave out the odometry factor that most refused loops span in accord; as above."""
-    agreed = _accord(growth)
-    if len(growth.heads(agreed)) < _VOTES:
-        return agreed
-    low, high = growth.low, growth.high
+def _mended(growth: Growth) -> Iterator[Growth]:
+    """Leave out the odometry factor that most refused loops span in accord."""
+    agreed = accord(growth)
+    if len(growth.heads(agreed)) < VOTES:
+        return
+    trial, low, high = growth.copy(), growth.low, growth.high
     across = spanned(low[agreed], high[agreed], growth.graph.n_poses)
     steps = np.flatnonzero(across == across.max())
     affected = growth.is_loop & (low <= steps[-1]) & (high > steps[0])
-    growth.accepted &= ~affected | growth.trusted
-    growth.settle()
-    affected &= ~growth.accepted
-    jury = _some(growth, np.flatnonzero(affected), _JURY)
-    proposals = _some(growth, agreed, _PROPOSALS).tolist()
-    loop, _ = _most_support(growth, jury, [(loop, int(steps[0])) for loop in proposals])
+    trial.accepted &= ~affected | growth.trusted
+    trial.settle()
+    affected &= ~trial.accepted
+    jury, poses = trial.some(np.flatnonzero(affected), _JURY), trial.poses
+    loop = max(trial.some(agreed, _PROPOSALS).tolist(), key=lambda loop: _support(
+        trial, jury, mended(trial.graph, poses, loop, int(steps[0]))).sum())
     # Where exactly it is, only those tell that span some of the steps.
     telling = affected & ((low > steps[0]) | (high <= steps[-1]))
-    jury = _some(growth, np.flatnonzero(telling), _JURY)
-    loop, step = _most_support(growth, jury, [(loop, step) for step in steps.tolist()])
-    growth.poses = mended(growth.graph, growth.poses, loop, step)
-    growth.accepted &= growth.is_loop | (low != step)
+    jury = trial.some(np.flatnonzero(telling), _JURY)
+    odometry = np.flatnonzero(~growth.is_loop & (low >= steps[0]) & (low <= steps[-1]))
+    run = odometry[np.argsort(low[odometry], kind='stable')]
+    slipped = _likeliest(trial, jury, run, lambda step: mended(trial.graph, poses, loop, step))
+    trial.poses = mended(trial.graph, poses, loop, int(low[slipped]))
+    trial.accepted[slipped] = False
     rows = np.flatnonzero(affected)
-    return rows[_support(growth, rows, growth.poses) > 0]
-
-
-def _accord(growth: Growth) -> Indices:
-    """Return the refused loops that agree with one of them, and that one: the surest such camp."""
-    rows = growth.undecided()
-    rows = rows[growth.is_loop[rows]]
-    if not len(rows):
-        return rows
-    rows = _some(growth, rows[growth.innovations(rows).square > growth.gate()], _JURY)
-    if len(rows) < _VOTES:
-        return rows
-    volume = claimed_volume(growth.graph.manifold, growth.poses, growth.rng)
-    one, other, log_ratio = agreement(growth.part(rows), growth.poses, growth.posterior, volume,
-                                      growth.gate())
-    camp, surest = rows[:0], float(np.log(growth.graph.n_poses / DOUBT))
-    for k in range(len(rows)):
-        mine = np.flatnonzero(one == k)
-        mine = mine[np.argsort(-log_ratio[mine], kind='stable')]
-        members = rows[other[mine]]
-        # Each of them could have agreed by chance with any of the others.
-        sure = (log_ratio[mine] - np.log(len(rows)))[growth.heads(members)].sum()
-        if sure > surest:
-            camp, surest = np.append(members, rows[k]), sure
-    return camp
-
-
-def _some(growth: Growth, rows: Indices, count: int) -> Indices:
-    """Return so many factors of these, at random, or all."""
-    chosen: Indices = growth.rng.permutation(rows)[:count]
-    return chosen
-
-
-def _most_support(
-    growth: Growth, jury: Indices, proposals: list[tuple[int, int]]
-) -> tuple[int, int]:
-    """Return the loop and the step after which a jury fits best, see `mended`."""
-    return max(proposals, key=lambda proposal: _support(
-        growth, jury, mended(growth.graph, growth.poses, *proposal)).sum())
+    trial.accepted[rows[_support(trial, rows, trial.poses) > 0]] = True
+    trial.settle()
+    yield trial
 
 
 def _support(growth: Growth, rows: Indices, poses: Array) -> Array:
@@ -190,66 +234,13 @@ def spanned(low: Indices, high: Indices, n: int) -> Indices:
 
 def mended(graph: FactorGraph, poses: Array, loop: int, step: int) -> Array:
     """Return the poses, those behind a step of the odometry moved as one so that a loop fits."""
-    manifold, factors = graph.manifold, graph.between
-    i, j, measurement = factors.i[loop], factors.j[loop], factors.measurement[loop][None]
-    if i > j:
-        i, j, measurement = j, i, manifold.inverse(measurement)
-    wanted = manifold.compose(poses[i][None], measurement)
-    motion = manifold.compose(wanted, manifold.inverse(poses[j][None]))
-    behind = poses[step + 1:]
-    moved = manifold.compose(np.broadcast_to(motion, behind.shape), behind)
+    motion, behind = _motion_to_fit(graph, poses, loop), poses[step + 1:]
+    moved = graph.manifold.compose(np.broadcast_to(motion, behind.shape), behind)
     return np.concatenate((poses[: step + 1], moved))
 
 
-def agreement(
-    graph: FactorGraph, poses: Array, posterior: Posterior, log_volume: float, limit: float,
-) -> tuple[Indices, Indices, Array]:
-    """
-    Return the pairs of between factors of a graph that rather agree than not, three (pairs,).
-
-    The one and the other, each pair both ways round, and the logarithm of how much likelier their
-    difference is if they agree than by chance.
-
-    From the one factor follows the other, if the map is right about how their first ends lie to
-    each other, and their second ends; whatever it says of the factors themselves.
-
-    Parameters
-    ----------
-    log_volume : see `claimed_volume`
-    limit : of the squared difference of what follows and what is measured, over its covariance
-
-    """
-    from l1slam_ros.core.kernels.prediction import normalise
-
-    manifold, (a, b) = graph.manifold, np.triu_indices(len(graph.between), 1)
-    error = _difference(graph, poses, a, b)
-    scatter = np.linalg.inv(error.T @ error)
-    near = np.argsort(np.einsum('mi,ij,mj->m', error, scatter, error), kind='stable')
-    near = near[: _NEAREST * len(graph.between)]
-    a, b, error = a[near], b[near], error[near]
-    roots, fixed = graph.between.sqrt_information[b], anchor(graph)
-    there = manifold.retract(manifold.identity(len(a)), error)
-    k, steps = manifold.TANGENT_SIZE, posterior.samples[:-1].transpose(2, 0, 1)
-    covariance = np.tile(2 * np.eye(k), (len(a), 1, 1))
-    for step in steps:
-        moved = np.concatenate((poses[:fixed], manifold.retract(poses[fixed:], step)))
-        here = manifold.retract(manifold.identity(len(a)), _difference(graph, moved, a, b))
-        change = whiten(roots, manifold.local(there, here))
-        covariance += change[:, :, None] * change[:, None, :] / len(steps)
-    square, log_det = normalise(covariance, whiten(roots, error))
-    claim = log_volume + np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
-    log_ratio = log_likelihood_ratio(square, log_det, claim, k)
-    good = (square < limit) & (log_ratio > np.log(len(graph.between)))
-    return (np.concatenate((a[good], b[good])), np.concatenate((b[good], a[good])),
-            np.tile(log_ratio[good], 2))
-
-
-def _difference(graph: FactorGraph, poses: Array, a: Indices, b: Indices) -> Array:
-    """Return t2v(Z_b^-1 Z) for pairs of factors, (pairs, k); Z : what follows from a for b."""
-    manifold, factors = graph.manifold, graph.between
-    backwards = (factors.i > factors.j)[:, None]
-    Z = np.where(backwards, manifold.inverse(factors.measurement), factors.measurement)
-    low, high = np.minimum(factors.i, factors.j), np.maximum(factors.i, factors.j)
-    first = manifold.between(poses[low[b]], poses[low[a]])
-    second = manifold.between(poses[high[a]], poses[high[b]])
-    return manifold.local(Z[b], manifold.compose(manifold.compose(first, Z[a]), second))
+def _motion_to_fit(graph: FactorGraph, poses: Array, factor: int) -> Array:
+    """Return how the later end of a factor is to be moved for the factor to fit, (1, p)."""
+    manifold, (low, high, Z) = graph.manifold, ends_in_time(graph)
+    wanted = manifold.compose(poses[low[factor], None], Z[factor, None])
+    return manifold.compose(wanted, manifold.inverse(poses[high[factor], None]))

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Refused loops that agree with each other.
+
+In: a robust solve. Out: the largest camp of refused loops from one of which, and from how its ends
+lie to those of the others, the others follow. Where no believed loop spans a slip of the odometry,
+the two sides of it are pieces of their own, each right in itself: every true loop across is
+refused, but all of them agree.
+"""
+
+import numpy as np
+
+from l1slam_ros.core.belief import DOUBT
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.linearise import anchor
+from l1slam_ros.core.manifold import Array, Indices
+from l1slam_ros.core.noise import whiten
+from l1slam_ros.core.prediction import Posterior, claimed_volume, log_likelihood_ratio
+from l1slam_ros.core.robust_growth import Growth
+
+# So many refused loops are asked.
+_ASKED = 500
+# Of each one so many pairs are looked at closely, those that differ least.
+_NEAREST = 20
+
+
+def accord(growth: Growth) -> Indices:
+    """Return the refused loops that agree with one of them, and that one: the surest such camp."""
+    rows = growth.undecided()
+    rows = rows[growth.is_loop[rows]]
+    if not len(rows):
+        return rows
+    rows = growth.some(rows[growth.innovations(rows).square > growth.gate()], _ASKED)
+    if not len(rows):
+        return rows
+    volume = claimed_volume(growth.graph.manifold, growth.poses, growth.rng)
+    one, other, log_ratio = agreement(growth.part(rows), growth.poses, growth.posterior, volume,
+                                      growth.gate())
+    camp, surest = rows[:0], float(np.log(growth.graph.n_poses / DOUBT))
+    for k in range(len(rows)):
+        mine = np.flatnonzero(one == k)
+        mine = mine[np.argsort(-log_ratio[mine], kind='stable')]
+        members = rows[other[mine]]
+        # Each of them could have agreed by chance with any of the others.
+        sure = (log_ratio[mine] - np.log(len(rows)))[growth.heads(members)].sum()
+        if sure > surest:
+            camp, surest = np.append(members, rows[k]), sure
+    return camp
+
+
+def agreement(
+    graph: FactorGraph, poses: Array, posterior: Posterior, log_volume: float, limit: float,
+) -> tuple[Indices, Indices, Array]:
+    """
+    Return the pairs of between factors of a graph that rather agree than not, three (pairs,).
+
+    The one and the other, each pair both ways round, and the logarithm of how much likelier their
+    difference is if they agree than by chance.
+
+    From the one factor follows the other, if the map is right about how their first ends lie to
+    each other, and their second ends; whatever it says of the factors themselves.
+
+    Parameters
+    ----------
+    log_volume : see `claimed_volume`
+    limit : of the squared difference of what follows and what is measured, over its covariance
+
+    """
+    from l1slam_ros.core.kernels.prediction import normalise
+
+    manifold, (a, b) = graph.manifold, np.triu_indices(len(graph.between), 1)
+    error = _difference(graph, poses, a, b)
+    scatter = np.linalg.inv(error.T @ error)
+    near = np.argsort(np.einsum('mi,ij,mj->m', error, scatter, error), kind='stable')
+    near = near[: _NEAREST * len(graph.between)]
+    a, b, error = a[near], b[near], error[near]
+    roots, fixed = graph.between.sqrt_information[b], anchor(graph)
+    there = manifold.retract(manifold.identity(len(a)), error)
+    k, steps = manifold.TANGENT_SIZE, posterior.samples[:-1].transpose(2, 0, 1)
+    covariance = np.tile(2 * np.eye(k), (len(a), 1, 1))
+    for step in steps:
+        moved = np.concatenate((poses[:fixed], manifold.retract(poses[fixed:], step)))
+        here = manifold.retract(manifold.identity(len(a)), _difference(graph, moved, a, b))
+        change = whiten(roots, manifold.local(there, here))
+        covariance += change[:, :, None] * change[:, None, :] / len(steps)
+    square, log_det = normalise(covariance, whiten(roots, error))
+    claim = log_volume + np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
+    log_ratio = log_likelihood_ratio(square, log_det, claim, k)
+    good = (square < limit) & (log_ratio > np.log(len(graph.between)))
+    return (np.concatenate((a[good], b[good])), np.concatenate((b[good], a[good])),
+            np.tile(log_ratio[good], 2))
+
+
+def _difference(graph: FactorGraph, poses: Array, a: Indices, b: Indices) -> Array:
+    """Return t2v(Z_b^-1 Z) for pairs of factors, (pairs, k); Z : what follows from a for b."""
+    manifold, (low, high, Z) = graph.manifold, ends_in_time(graph)
+    first = manifold.between(poses[low[b]], poses[low[a]])
+    second = manifold.between(poses[high[a]], poses[high[b]])
+    return manifold.local(Z[b], manifold.compose(manifold.compose(first, Z[a]), second))
+
+
+def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:
+    """Return of all between factors the earlier and later keyframe (m,), and that from this."""
+    i, j, Z = graph.between.i, graph.between.j, graph.between.measurement
+    forward = np.where((i > j)[:, None], graph.manifold.inverse(Z), Z)
+    return np.minimum(i, j), np.maximum(i, j), forward
