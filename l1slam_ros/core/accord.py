@@ -70,7 +70,7 @@ def agreement(
 
     manifold, (a, b) = graph.manifold, np.triu_indices(len(graph.between), 1)
     error = _difference(graph, poses, a, b)
-    scatter = np.linalg.inv(error.T @ error)
+    scatter = np.linalg.pinv(error.T @ error, hermitian=True)
     near = np.argsort(np.einsum('mi,ij,mj->m', error, scatter, error), kind='stable')
     near = near[: _NEAREST * len(graph.between)]
     a, b, error = a[near], b[near], error[near]

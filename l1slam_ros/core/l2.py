@@ -107,7 +107,7 @@ def _gauss_newton(
         candidate = step_poses(graph, poses, step)
         moved = whitened_residual(graph, candidate)
         cost = cost_of(moved)
-        decrease = history[-1] - cost
+        decrease, full = history[-1] - cost, not damping
         if decrease >= 0:
             poses, residual = candidate, moved
             damping = damping / 10 if damping > _FIRST_DAMPING else 0.0
@@ -115,10 +115,10 @@ def _gauss_newton(
             damping, cost = max(10 * damping, _FIRST_DAMPING), history[-1]
         history.append(cost)
         report(len(history) - 1, cost)
-        if 0 <= decrease <= options.tolerance * cost and not damping:
+        # At the optimum rounding may let the cost rise by its last digits.
+        if full and abs(decrease) <= options.tolerance * cost:
             status = Status.CONVERGED
             break
-        # Rounding alone can keep the last digits from falling: that is the optimum too.
         if damping > _MOST_DAMPING:
             status = Status.STALLED
             break

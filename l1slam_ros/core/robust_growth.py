@@ -40,6 +40,8 @@ REFUSED = 1e-3
 _DROPPED = 2e-5
 # Probability that any true factor of a round is doubted for what the others say.
 _DOUBTED = 0.01
+# Gauss-Newton begins where chi2 is at most so many times what the noise makes of it.
+_FITS = 3
 # Steps of Gauss-Newton at most in one round.
 _STEPS = 60
 # A loop that was dropped that often is not tried again.
@@ -217,21 +219,28 @@ def solve(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:
     """
     Return the L2 map of a graph to within its noise: chi2 one above the optimum or less.
 
-    From poses (n, p) that may be far off: rotations alone, then translations, each of which is
-    linear; then Gauss-Newton.
+    From poses (n, p) that may be far off: where they do not fit to within the noise, first
+    rotations alone, then translations, each of which is linear; then Gauss-Newton.
     """
-    manifold, linear = graph.manifold, poses
+    # In units of its noise, chi2 is about as large as there are spare measurements.
+    k = graph.manifold.TANGENT_SIZE
+    spare = k * max(len(graph.between) - graph.n_poses + 1, 1)
+    chi2 = _chi2(graph, poses)
+    if chi2 > _FITS * spare:
+        linear = _two_linear_steps(graph, poses, cholesky)
+        poses = linear if _chi2(graph, linear) < chi2 else poses
+    return minimise_l2(graph, poses, LeastSquaresOptions(_STEPS, 1 / spare), cholesky).poses
+
+
+def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:
+    manifold = graph.manifold
     for part in (manifold.ROTATION, manifold.TRANSLATION):
-        system = linearise(graph, linear).part(part)
+        system = linearise(graph, poses).part(part)
         x = weighted_least_squares(system, cholesky, np.ones_like(system.b))
         step = np.zeros((graph.n_poses - anchor(graph), manifold.TANGENT_SIZE))
         step[:, part] = x.reshape(len(step), -1)
-        linear = step_poses(graph, linear, step)
-    if _chi2(graph, linear) < _chi2(graph, poses):
-        poses = linear
-    # In units of its noise, chi2 is about as large as there are spare measurements.
-    spare = manifold.TANGENT_SIZE * max(len(graph.between) - graph.n_poses + 1, 1)
-    return minimise_l2(graph, poses, LeastSquaresOptions(_STEPS, 1 / spare), cholesky).poses
+        poses = step_poses(graph, poses, step)
+    return poses
 
 
 def _chi2(graph: FactorGraph, poses: Array) -> float:

@@ -25,7 +25,7 @@ from l1slam_ros.core.robust_growth import Growth
 # So many loops more have to come in without the factor, and loops of that many groups to span it.
 VOTES = 3
 # So many steps of unusual motion are tried.
-_TRIED = 3
+_TRIED = 2
 # So many loops judge where a slip is, and of those that agree so many say how it is mended.
 _JURY, _PROPOSALS = 500, 20
 # A long way is searched by so many places at a time.
@@ -181,13 +181,24 @@ def _slipped_elsewhere(growth: Growth, worst: int, step: int) -> Array:
 
 
 def _mended(growth: Growth) -> Iterator[Growth]:
-    """Leave out the odometry factor that most refused loops span in accord."""
+    """Leave out an odometry factor that most refused loops span in accord."""
     agreed = accord(growth)
     if len(growth.heads(agreed)) < VOTES:
         return
+    low, high, n = growth.low, growth.high, growth.graph.n_poses
+    refused_across = spanned(low[agreed], high[agreed], n)
+    common = np.flatnonzero(refused_across == refused_across.max())
+    believed = growth.accepted & growth.is_loop
+    across = spanned(low[believed], high[believed], n)[common]
+    # Hardly any loop across a slip was believed.
+    weakest = common[across == across.min()]
+    for steps in np.split(weakest, np.flatnonzero(np.diff(weakest) > 1) + 1)[:_TRIED]:
+        yield _mended_within(growth, agreed, steps)
+
+
+def _mended_within(growth: Growth, agreed: Indices, steps: Indices) -> Growth:
+    """Leave out the odometry factor of one of some steps, so that most loops across agree."""
     trial, low, high = growth.copy(), growth.low, growth.high
-    across = spanned(low[agreed], high[agreed], growth.graph.n_poses)
-    steps = np.flatnonzero(across == across.max())
     affected = growth.is_loop & (low <= steps[-1]) & (high > steps[0])
     trial.accepted &= ~affected | growth.trusted
     trial.settle()
@@ -206,7 +217,7 @@ def _mended(growth: Growth) -> Iterator[Growth]:
     rows = np.flatnonzero(affected)
     trial.accepted[rows[_support(trial, rows, trial.poses) > 0]] = True
     trial.settle()
-    yield trial
+    return trial
 
 
 def _support(growth: Growth, rows: Indices, poses: Array) -> Array:
