@@ -18,7 +18,6 @@ from l1slam_ros.core.accord import accord, ends_in_time
 from l1slam_ros.core.belief import DOUBT, log_odds_of_false
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.manifold import Array, Indices
-from l1slam_ros.core.noise import Mask
 from l1slam_ros.core.prediction import chi2_quantile, claimed_volume, innovations
 from l1slam_ros.core.robust_growth import Growth
 
@@ -41,10 +40,19 @@ def without_slip(growth: Growth) -> Growth | None:
         for trial in attempt(growth):
             _believe(trial)
             gained = np.count_nonzero(trial.accepted) - before
-            across = _across(trial, growth.accepted & ~trial.accepted & ~growth.is_loop)
-            if gained >= VOTES and len(growth.heads(across)) >= VOTES:
+            left_out = np.flatnonzero(growth.accepted & ~trial.accepted & ~growth.is_loop)
+            voters = trial.heads(_across(trial, left_out))
+            if gained >= VOTES and len(voters) >= VOTES and _is_gross(trial, left_out):
                 return trial
     return None
+
+
+def _is_gross(growth: Growth, left_out: Indices) -> bool:
+    """Return whether odometry factors left out would be refused with all taken at their word."""
+    trial = growth.copy()
+    trial.take_at_their_word()
+    trial.settle()
+    return bool((trial.innovations(left_out).square > trial.gate()).all())
 
 
 def _believe(growth: Growth) -> None:
@@ -58,8 +66,8 @@ def _believe(growth: Growth) -> None:
             growth.settle()
 
 
-def _across(growth: Growth, left_out: Mask) -> Indices:
-    """Return the accepted loops across any of the factors left out, (k,)."""
+def _across(growth: Growth, left_out: Indices) -> Indices:
+    """Return the accepted loops across any of the odometry factors left out, (k,)."""
     steps = np.sort(growth.low[left_out])
     spans = np.searchsorted(steps, growth.low) < np.searchsorted(steps, growth.high)
     across: Indices = np.flatnonzero(growth.accepted & growth.is_loop & spans)
