@@ -10,7 +10,7 @@ import numpy as np
 
 from l1slam_ros.core.choice import AUTO, Choice, choose, minimise_by
 from l1slam_ros.core.cholesky import cholesky_of
-from l1slam_ros.core.errors import FileError, GraphError
+from l1slam_ros.core.errors import FileError, GraphError, InconsistentError
 from l1slam_ros.core.graph import FactorGraph, component_labels
 from l1slam_ros.core.growth import GrowthOptions
 from l1slam_ros.core.initial import odometry_poses, tree_poses
@@ -139,6 +139,7 @@ def solve(record: GraphRecord, wish: Wish, report: Report) -> Outcome:
     Raises
     ------
     GraphError : the graph is not connected, has no such start, or numbers beyond all measure.
+    InconsistentError : see `robust_solve`.
 
     """
     require_start(record, wish)
@@ -147,7 +148,7 @@ def solve(record: GraphRecord, wish: Wish, report: Report) -> Outcome:
     minimiser = _Minimiser(wish, report)
     began = time.perf_counter()
     if wish.robust:
-        judgement = minimise_robustly(graph, minimiser.minimise)
+        judgement = _robust_map(record, minimiser)
         solution, seed = judgement.solution, judgement.seed
         graph = graph.subset(judgement.accepted)
     else:
@@ -192,6 +193,14 @@ class _Minimiser:
         assert choice.cholesky is not None
         minimise_norm = minimise_l2 if wish.norm == 'l2' else minimise_huber
         return minimise_norm(graph, poses, wish.least_squares, choice.cholesky, self._report)
+
+
+def _robust_map(record: GraphRecord, minimiser: _Minimiser) -> RobustMap:
+    try:
+        return minimise_robustly(record.graph, minimiser.minimise)
+    except InconsistentError as error:
+        first, last = record.ids[[error.first, error.last]].tolist()
+        raise InconsistentError(error.loops, first, last) from None
 
 
 def cost_function(graph: FactorGraph, wish: Wish) -> Callable[[Array], float]:

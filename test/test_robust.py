@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from l1slam_ros.core import se2
+from l1slam_ros.core.errors import InconsistentError
 from l1slam_ros.core.false_loops import FALSE_LOOPS
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.initial import pair_key
@@ -86,6 +87,24 @@ def test_a_slip_of_the_odometry_is_found_and_named(world, offset):
     assert abs(factors.i[solution.slips[0]] - factors.i[slip]) <= 3
     assert not (solution.accepted & ~true).any()
     assert error(solution.poses, world.truth) < 0.3
+
+
+def test_a_map_that_loops_agree_is_wrong_is_refused(world):
+    # Two slips, and no single step explains what the loops across both agree upon.
+    graph, _ = spoilt(world, 'random', 170)
+    rng = np.random.default_rng(5)
+    slipped = rng.choice(np.flatnonzero(graph.between.is_odometry), 2, replace=False)
+    off = rng.normal(size=(2, 3)) * [4, 4, 1.5]
+
+    def change(measurement):
+        measurement[slipped] = se2.retract(measurement[slipped], off)
+        return measurement
+
+    steps = graph.between.i[np.sort(slipped)]
+    with pytest.raises(InconsistentError) as refused:
+        robust_solve(with_measurements(graph, change))
+    assert refused.value.loops > 10
+    assert steps[0] - 20 < refused.value.first < refused.value.last < steps[1] + 20
 
 
 def test_a_trusted_loop_is_never_refused(world):

@@ -9,6 +9,7 @@ refused, but all of them agree.
 """
 
 import numpy as np
+from scipy.special import gammainc
 
 from l1slam_ros.core.belief import DOUBT
 from l1slam_ros.core.graph import FactorGraph
@@ -24,28 +25,58 @@ _ASKED = 500
 _NEAREST = 20
 
 
-def accord(growth: Growth) -> Indices:
-    """Return the refused loops that agree with one of them, and that one: the surest such camp."""
+def accord(growth: Growth) -> tuple[Indices, float]:
+    """
+    Return the refused loops that agree with one of them, and that one: the surest such camp.
+
+    None, where the volume that false loops could fill says that it is chance. Else also how
+    probable so large a camp is by what loops outside of it agree upon: lies can have a pattern.
+    """
     rows = growth.undecided()
     rows = rows[growth.is_loop[rows]]
     if not len(rows):
-        return rows
+        return rows, 1.0
     rows = growth.some(rows[growth.innovations(rows).square > growth.gate()], _ASKED)
     if not len(rows):
-        return rows
+        return rows, 1.0
     volume = claimed_volume(growth.graph.manifold, growth.poses, growth.rng)
     one, other, log_ratio = agreement(growth.part(rows), growth.poses, growth.posterior, volume,
                                       growth.gate())
-    camp, surest = rows[:0], float(np.log(growth.graph.n_poses / DOUBT))
-    for k in range(len(rows)):
-        mine = np.flatnonzero(one == k)
-        mine = mine[np.argsort(-log_ratio[mine], kind='stable')]
-        members = rows[other[mine]]
-        # Each of them could have agreed by chance with any of the others.
-        sure = (log_ratio[mine] - np.log(len(rows)))[growth.heads(members)].sum()
-        if sure > surest:
-            camp, surest = np.append(members, rows[k]), sure
-    return camp
+    # Each could have agreed by chance with any of the others.
+    sure, camps = log_ratio - np.log(len(rows)), [rows[other[one == k]] for k in range(len(rows))]
+    votes = [sure[one == k][growth.heads(camp)].sum() for k, camp in enumerate(camps)]
+    k = int(np.argmax(votes))
+    if votes[k] < np.log(growth.graph.n_poses / DOUBT):
+        return rows[:0], 1.0
+    places = np.array([len(growth.heads(np.append(row, camp))) - 1
+                       for row, camp in zip(rows, camps, strict=True)])
+    camp = np.append(camps[k], rows[k])
+    rest = places[~np.isin(rows, camp)]
+    # Poisson's rate is below its median and ln 2; where there are more camps, the mean is above.
+    rate = min((rest.sum() + 1) / (len(rest) + 1), np.median(places) + np.log(2))
+    return camp, len(rows) * float(gammainc(max(places[k], 1), rate))
+
+
+def weakest_steps(growth: Growth, camp: Indices) -> Indices:
+    """Return the steps that most of a camp span, and of these the fewest believed loops, (k,)."""
+    if not len(camp):
+        return camp
+    low, high, n = growth.low, growth.high, growth.graph.n_poses
+    against = spanned(low[camp], high[camp], n)
+    common = np.flatnonzero(against == against.max())
+    believed = growth.accepted & growth.is_loop
+    across = spanned(low[believed], high[believed], n)[common]
+    weakest: Indices = common[across == across.min()]
+    return weakest
+
+
+def spanned(low: Indices, high: Indices, n: int) -> Indices:
+    """Return how many factors span the step from each of n keyframes to the next, (n - 1,)."""
+    change = np.zeros(n, np.int64)
+    np.add.at(change, low, 1)
+    np.add.at(change, high, -1)
+    count: Indices = np.cumsum(change)[:-1]
+    return count
 
 
 def agreement(
@@ -54,8 +85,8 @@ def agreement(
     """
     Return the pairs of between factors of a graph that rather agree than not, three (pairs,).
 
-    The one and the other, each pair both ways round, and the logarithm of how much likelier their
-    difference is if they agree than by chance.
+    The one and the other, each pair both ways round, those that agree best first, and the
+    logarithm of how much likelier their difference is if they agree than by chance.
 
     From the one factor follows the other, if the map is right about how their first ends lie to
     each other, and their second ends; whatever it says of the factors themselves.
@@ -86,9 +117,10 @@ def agreement(
     square, log_det = normalise(covariance, whiten(roots, error))
     claim = log_volume + np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
     log_ratio = log_likelihood_ratio(square, log_det, claim, k)
-    good = (square < limit) & (log_ratio > np.log(len(graph.between)))
-    return (np.concatenate((a[good], b[good])), np.concatenate((b[good], a[good])),
-            np.tile(log_ratio[good], 2))
+    good = np.flatnonzero((square < limit) & (log_ratio > np.log(len(graph.between))))
+    good = good[np.argsort(-log_ratio[good], kind='stable')]
+    a, b, log_ratio = a[good], b[good], log_ratio[good]
+    return np.stack((a, b), 1).ravel(), np.stack((b, a), 1).ravel(), np.repeat(log_ratio, 2)
 
 
 def _difference(graph: FactorGraph, poses: Array, a: Indices, b: Indices) -> Array:

@@ -14,6 +14,16 @@ class FillError(GraphError):
     """A graph whose factorisation would take more memory than is sensible."""
 
 
+class InconsistentError(GraphError):
+    """Refused loops that agree with each other: either they or the map are wrong."""
+
+    def __init__(self, loops: int, first: int, last: int):
+        super().__init__(f'inconsistent: {loops} refused loops agree with each other, but not '
+                         f'with the odometry between the keyframes {first} and {last}, and no '
+                         'single step of it explains that; a map of the rest would be bent')
+        self.loops, self.first, self.last = loops, first, last
+
+
 class NoiseError(L1SlamError):
     """A covariance or information matrix that is none."""
 

@@ -24,14 +24,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l1slam_ros.core.accord import accord, weakest_steps
+from l1slam_ros.core.belief import DOUBT
 from l1slam_ros.core.cholesky import cholesky_of
+from l1slam_ros.core.errors import InconsistentError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.noise import Mask
 from l1slam_ros.core.prediction import chi2_quantile
 from l1slam_ros.core.robust_growth import REFUSED, Growth, solve
-from l1slam_ros.core.slips import without_slip
+from l1slam_ros.core.slips import VOTES, without_slip
 
 # Every round accepts a loop, hence there is an end; this one is for the patience of people.
 _MOST_ROUNDS = 200
@@ -80,6 +83,7 @@ def robust_solve(
     Raises
     ------
     GraphError : the odometry has a gap.
+    InconsistentError : refused loops agree with each other, so the map is not to be trusted.
 
     """
     if trusted is None:
@@ -89,6 +93,7 @@ def robust_solve(
     number = 0
     for number, growth in enumerate(rounds(first), 1):
         report(number, int(np.count_nonzero(growth.accepted & growth.is_loop)))
+    _require_consistent(growth)
     square, suspect = outlook(growth)
     return RobustSolution(growth.poses, growth.accepted, suspect, np.sqrt(square),
                           np.flatnonzero(~growth.accepted & ~growth.is_loop), growth.variance,
@@ -110,6 +115,18 @@ def rounds(growth: Growth) -> Iterator[Growth]:
                 growth = repaired
         growth.settle()
         yield growth
+
+
+def _require_consistent(growth: Growth) -> None:
+    """Raise where refused loops of several places agree with each other: they may be right."""
+    camp, chance = accord(growth)
+    if len(growth.heads(camp)) < VOTES or chance > DOUBT:
+        return
+    steps = weakest_steps(growth, camp)
+    first, last = int(steps[0]), int(steps[-1])
+    # What is trusted is right, whatever else speaks against it.
+    if not (growth.trusted & (growth.low <= last) & (growth.high > first)).any():
+        raise InconsistentError(len(camp), first, last + 1)
 
 
 def outlook(growth: Growth) -> tuple[Array, Mask]:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from l1slam_ros.core.accord import accord, ends_in_time
+from l1slam_ros.core.accord import accord, ends_in_time, weakest_steps
 from l1slam_ros.core.belief import DOUBT, log_odds_of_false
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.manifold import Array, Indices
@@ -190,35 +190,31 @@ def _slipped_elsewhere(growth: Growth, worst: int, step: int) -> Array:
 
 def _mended(growth: Growth) -> Iterator[Growth]:
     """Leave out an odometry factor that most refused loops span in accord."""
-    agreed = accord(growth)
+    agreed, _ = accord(growth)
     if len(growth.heads(agreed)) < VOTES:
         return
-    low, high, n = growth.low, growth.high, growth.graph.n_poses
-    refused_across = spanned(low[agreed], high[agreed], n)
-    common = np.flatnonzero(refused_across == refused_across.max())
-    believed = growth.accepted & growth.is_loop
-    across = spanned(low[believed], high[believed], n)[common]
-    # Hardly any loop across a slip was believed.
-    weakest = common[across == across.min()]
-    for steps in np.split(weakest, np.flatnonzero(np.diff(weakest) > 1) + 1)[:_TRIED]:
-        yield _mended_within(growth, agreed, steps)
+    low, weakest = growth.low, weakest_steps(growth, agreed)
+    odometry = np.flatnonzero(~growth.is_loop & np.isin(low, weakest))
+    odometry = odometry[np.argsort(low[odometry], kind='stable')]
+    runs = np.split(odometry, np.flatnonzero(np.diff(low[odometry]) > 1) + 1)
+    square = unusual_motion(growth.graph, ends_in_time(growth.graph)[2])
+    for run in sorted(runs, key=lambda run: -square[run].max())[:_TRIED]:
+        yield _mended_within(growth, agreed, run)
 
 
-def _mended_within(growth: Growth, agreed: Indices, steps: Indices) -> Growth:
-    """Leave out the odometry factor of one of some steps, so that most loops across agree."""
+def _mended_within(growth: Growth, agreed: Indices, run: Indices) -> Growth:
+    """Leave out one of a run of odometry factors, so that most loops across agree."""
     trial, low, high = growth.copy(), growth.low, growth.high
-    affected = growth.is_loop & (low <= steps[-1]) & (high > steps[0])
+    first, last = int(low[run[0]]), int(low[run[-1]])
+    affected = growth.is_loop & (low <= last) & (high > first)
     trial.accepted &= ~affected | growth.trusted
     trial.settle()
     affected &= ~trial.accepted
     jury, poses = trial.some(np.flatnonzero(affected), _JURY), trial.poses
     loop = max(trial.some(agreed, _PROPOSALS).tolist(), key=lambda loop: _support(
-        trial, jury, mended(trial.graph, poses, loop, int(steps[0]))).sum())
+        trial, jury, mended(trial.graph, poses, loop, first)).sum())
     # Where exactly it is, only those tell that span some of the steps.
-    telling = affected & ((low > steps[0]) | (high <= steps[-1]))
-    jury = trial.some(np.flatnonzero(telling), _JURY)
-    odometry = np.flatnonzero(~growth.is_loop & (low >= steps[0]) & (low <= steps[-1]))
-    run = odometry[np.argsort(low[odometry], kind='stable')]
+    jury = trial.some(np.flatnonzero(affected & ((low > first) | (high <= last))), _JURY)
     slipped = _likeliest(trial, jury, run, lambda step: mended(trial.graph, poses, loop, step))
     trial.poses = mended(trial.graph, poses, loop, int(low[slipped]))
     trial.accepted[slipped] = False
@@ -240,15 +236,6 @@ def _support(growth: Growth, rows: Indices, poses: Array) -> Array:
     log_ratio = found.log_ratio(2.0)
     odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)))
     return np.where(fits & (log_ratio > odds + np.log(1 / DOUBT - 1)), log_ratio - odds, 0.0)
-
-
-def spanned(low: Indices, high: Indices, n: int) -> Indices:
-    """Return how many factors span the step from each of n keyframes to the next, (n - 1,)."""
-    change = np.zeros(n, np.int64)
-    np.add.at(change, low, 1)
-    np.add.at(change, high, -1)
-    count: Indices = np.cumsum(change)[:-1]
-    return count
 
 
 def mended(graph: FactorGraph, poses: Array, loop: int, step: int) -> Array:
