@@ -111,11 +111,14 @@ def test_a_trusted_loop_is_never_refused(world):
     graph, true = spoilt(world, 'random', 10)
     lie = int(np.flatnonzero(~true)[4])
     assert not robust_solve(graph).accepted[lie]
-    trusted = np.zeros(len(true), bool)
-    trusted[lie] = True
-    solution = robust_solve(graph, trusted)
+    trusting, factors = FactorGraph(graph.manifold), graph.between
+    trusting.add_poses(graph.n_poses)
+    information = factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information
+    trusting.add_between(factors.i, factors.j, factors.measurement, information,
+                         trusted=np.arange(len(true)) == lie)
+    solution = robust_solve(trusting)
     assert solution.accepted[lie]
-    assert reconsidered(graph, solution.poses, solution.accepted, trusted)[lie]
+    assert reconsidered(trusting, solution.poses, solution.accepted)[lie]
 
 
 def test_the_same_graph_gives_the_same_answer(world):

@@ -14,11 +14,8 @@ import numpy as np
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.noise import Mask
-from l1slam_ros.core.robust import outlook, reconsidered
+from l1slam_ros.core.robust import outlook, reconsidered, rounds
 from l1slam_ros.core.robust_growth import Growth
-
-# The same samples each time: the answer is that of the graph, not of chance.
-_SEED = 2014
 
 
 @dataclass(frozen=True)
@@ -74,24 +71,15 @@ def judge(graph: FactorGraph, poses: Array, belief: Belief, deadline: float) -> 
     deadline : `time.monotonic()` [s] after which no second round begins
 
     """
-    growth = Growth(graph, graph.between.trusted, np.random.default_rng(_SEED))
-    growth.resume(poses, belief.accepted, belief.variance)
-    settled = False
-    while not settled:
-        news = growth.believable(growth.undecided())
-        growth.accepted[news] = True
-        if not growth.takes_at_their_word:
-            variance = growth.variance  # as measured: where the next judgement begins
-            if not len(news):
-                growth.take_at_their_word()
-        elif not len(news):
-            settled = True
-            break
-        growth.settle()
+    first, settled = Growth(graph), True
+    first.resume(poses, belief.accepted, belief.variance)
+    growth = first
+    for growth in rounds(first, lambda _: None):
         # The end is not put off once it is in sight, or short budgets would never get there.
         if time.monotonic() > deadline and not growth.takes_at_their_word:
+            settled = False
             break
     square, suspect = outlook(growth)
     # What fits the map as it is may come in; what was believed stays until evidence is against it.
     accepted = growth.accepted | reconsidered(graph, growth.poses, growth.accepted)
-    return Belief(accepted, suspect & ~accepted, np.sqrt(square), variance, settled)
+    return Belief(accepted, suspect & ~accepted, np.sqrt(square), growth.variance, settled)

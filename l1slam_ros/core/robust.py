@@ -38,8 +38,6 @@ from l1slam_ros.core.slips import VOTES, without_slip
 
 # Every round accepts a loop, hence there is an end; this one is for the patience of people.
 _MOST_ROUNDS = 200
-# The same samples each time: the answer is that of the graph, not of chance.
-_SEED = 2014
 
 
 @dataclass(frozen=True)
@@ -69,15 +67,13 @@ Report = Callable[[int, int], None]
 
 
 def robust_solve(
-    graph: FactorGraph, trusted: Mask | None = None,
-    report: Report = lambda round_, accepted: None,
+    graph: FactorGraph, report: Report = lambda round_, accepted: None
 ) -> RobustSolution:
     """
     Find out which loops to believe, from the graph alone.
 
     Parameters
     ----------
-    trusted : (m,) bool, the between factors that are never doubted
     report : called with the round and the loops accepted so far
 
     Raises
@@ -86,12 +82,10 @@ def robust_solve(
     InconsistentError : refused loops agree with each other, so the map is not to be trusted.
 
     """
-    if trusted is None:
-        trusted = np.zeros(len(graph.between), bool)
-    first = growth = Growth(graph, trusted, np.random.default_rng(_SEED))
+    first = growth = Growth(graph)
     first.begin()
     number = 0
-    for number, growth in enumerate(rounds(first), 1):
+    for number, growth in enumerate(rounds(first, without_slip), 1):
         report(number, int(np.count_nonzero(growth.accepted & growth.is_loop)))
     _require_consistent(growth)
     square, suspect = outlook(growth)
@@ -100,19 +94,23 @@ def robust_solve(
                           number)
 
 
-def rounds(growth: Growth) -> Iterator[Growth]:
-    """Yield the state after each round, until there is nothing more to believe."""
+def rounds(growth: Growth, repaired: Callable[[Growth], Growth | None]) -> Iterator[Growth]:
+    """
+    Yield the state after each round, until there is nothing more to believe.
+
+    repaired : asked for another state where nothing more can be believed; None: there is none.
+    """
     for _ in range(_MOST_ROUNDS):
         news = growth.believable(growth.undecided())
         growth.accepted[news] = True
         if not len(news):
             if growth.takes_at_their_word:
                 break
-            repaired = without_slip(growth)
-            if repaired is None:
+            other = repaired(growth)
+            if other is None:
                 growth.take_at_their_word()
             else:
-                growth = repaired
+                growth = other
         growth.settle()
         yield growth
 
@@ -143,9 +141,7 @@ def outlook(growth: Growth) -> tuple[Array, Mask]:
     return square, ~accepted & (square < growth.gate()) & growth.is_loop
 
 
-def reconsidered(
-    graph: FactorGraph, poses: Array, accepted: Mask, trusted: Mask | None = None
-) -> Mask:
+def reconsidered(graph: FactorGraph, poses: Array, accepted: Mask) -> Mask:
     """
     Return which factors to keep at a finished map of the accepted ones, (m,) bool.
 
@@ -158,8 +154,8 @@ def reconsidered(
     is_loop = ~factors.is_odometry
     believed = square[accepted & is_loop]
     scale = max(1.0, float(believed.mean()) / k) if len(believed) else 1.0
-    keep = np.where(is_loop, square < scale * chi2_quantile(1 - REFUSED, k), accepted)
-    return keep if trusted is None else keep | trusted
+    fits = square < scale * chi2_quantile(1 - REFUSED, k)
+    return np.where(is_loop, fits | factors.trusted, accepted)
 
 
 def minimise_accepted(graph: FactorGraph, poses: Array, accepted: Mask) -> Array:

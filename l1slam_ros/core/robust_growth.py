@@ -35,6 +35,8 @@ from l1slam_ros.core.prediction import (
     sampled_quantile,
 )
 
+# The same samples each time: the answer is that of the graph, not of chance.
+_SEED = 2014
 # One in so many true loops may be refused for its noise alone; and of accepted ones, dropped.
 REFUSED = 1e-3
 _DROPPED = 2e-5
@@ -64,12 +66,13 @@ class Growth:
     state.
     """
 
-    def __init__(self, graph: FactorGraph, trusted: Mask, rng: np.random.Generator):
-        self.graph, self.factors, self.trusted, self.rng = graph, graph.between, trusted, rng
+    def __init__(self, graph: FactorGraph):
+        self.graph, self.factors, self.trusted = graph, graph.between, graph.between.trusted
+        self.rng = np.random.default_rng(_SEED)
         self.low = np.minimum(self.factors.i, self.factors.j)
         self.high = np.maximum(self.factors.i, self.factors.j)
         self.is_loop: Mask = ~self.factors.is_odometry
-        self.accepted: Mask = ~self.is_loop | trusted
+        self.accepted: Mask = ~self.is_loop | self.trusted
         self.poses = odometry_poses(graph)
         self.variance = np.ones(2)
         self._least_variance = 0.0

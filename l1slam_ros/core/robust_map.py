@@ -49,12 +49,11 @@ def minimise_robustly(
 
     minimise : from a graph and poses (n, p) to its solution; report : see `robust_solve`
     """
-    trusted = graph.between.trusted
-    found = robust_solve(graph, trusted, report)
+    found = robust_solve(graph, report)
     accepted, poses = found.accepted, found.poses
     for _ in range(_MOST_ROUNDS):
         poses, before = minimise_accepted(graph, poses, accepted), accepted
-        accepted = reconsidered(graph, poses, before, trusted)
+        accepted = reconsidered(graph, poses, before)
         if (accepted == before).all():
             break
     solution = minimise(graph.subset(before), poses)
