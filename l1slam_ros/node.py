@@ -209,7 +209,7 @@ class BackendNode(Node):
             self._publish_map()
             self._report(improvement)
         else:  # nothing new in the map, but a loop can have come for later, or expired
-            self._loop_status.publish(self._backend.state().loops)
+            self._loop_status.publish(self._backend.loop_states())
 
     def _publish_map(self) -> None:
         state = self._backend.state()

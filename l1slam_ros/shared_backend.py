@@ -84,6 +84,11 @@ class SharedBackend:
             return MapState(backend.growth.stamps, backend.poses, backend.map_to_odom,
                             backend.growth.graph.between, backend.loop_states())
 
+    def loop_states(self) -> LoopStates:
+        """Return what has become of the loops by now."""
+        with self._lock:
+            return self._backend.loop_states()
+
     def counts(self) -> tuple[dict[str, int], dict[str, int]]:
         """Return the sizes of the graph, and how many loops were refused for which cause."""
         with self._lock:

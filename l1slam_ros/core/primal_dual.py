@@ -39,7 +39,7 @@ class PrimalDualOptions(Options):
 
     iterations: int = option(400, 'most iterations of one primal-dual solve', '', 1, 10**7)
     tolerance: float = option(
-        1e-5, 'stop when the duality gap, in the box |x_j|, is below this part of the cost', '1',
+        1e-5, 'stop when the duality gap is below this part of the cost', '1',
         0, 1)
 
 
