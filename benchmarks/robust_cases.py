@@ -9,9 +9,10 @@ drawn by a seed, false loops by the package's own `false_loops`.
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from robust_kinds import CLEAN, DEGREES, HEADING, KINDS, METRES, OWN_SHARE, TENTH
+from robust_kinds import CLEAN, DEGREES, HEADING, KINDS, METRES, NOISIER, OWN_SHARE, TENTH
 
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.false_loops import FALSE_LOOPS, insert_loops
@@ -36,7 +37,7 @@ class Place:
     A graph without lies.
 
     stored : (n, p) poses of its file; best : (n, p) its L2 map; truth : (n, k) positions [m], None
-    where nobody knows them; maps : (n, p) that solvers made of the graph, by the solver's name.
+    where nobody knows them; maps : what solvers made of the graph, by the solver's name.
     """
 
     name: str
@@ -44,7 +45,7 @@ class Place:
     stored: Array
     best: Array
     truth: Array | None
-    maps: dict[str, Array | None] = field(default_factory=dict)
+    maps: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,8 @@ def _disturbed(
         return graph.subset(~left_out), -1
     if disturbance == HEADING:
         return _with_heading_noise(graph, rng), -1
+    if disturbance in NOISIER:
+        return _simulated_anew(place, NOISIER[disturbance], rng), -1
     if disturbance in (METRES, DEGREES):
         rows = np.flatnonzero(factors.is_odometry)
         edge = int(len(rows) * _EDGE)
@@ -151,6 +154,18 @@ def _with_heading_noise(graph: FactorGraph, rng: np.random.Generator) -> FactorG
     more[manifold.ROTATION] = _HEADING_SIGMA**2
     information[rows] = np.linalg.inv(np.linalg.inv(information[rows]) + np.diag(more))
     return _with_measurements(graph, measurement, information)
+
+
+def _simulated_anew(place: Place, times: float, rng: np.random.Generator) -> FactorGraph:
+    """Return the graph, its odometry that of the L2 map with so many times the stated noise."""
+    factors, manifold = place.graph.between, place.graph.manifold
+    rows = np.flatnonzero(factors.is_odometry)
+    white = rng.standard_normal((len(rows), manifold.TANGENT_SIZE, 1))
+    noise = times * np.linalg.solve(factors.sqrt_information[rows], white)[:, :, 0]
+    measurement = factors.measurement.copy()
+    true = manifold.between(place.best[factors.i[rows]], place.best[factors.j[rows]])
+    measurement[rows] = manifold.retract(true, noise)
+    return _with_measurements(place.graph, measurement, _information(place.graph))
 
 
 def _with_measurements(

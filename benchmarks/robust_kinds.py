@@ -7,10 +7,12 @@ SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
 CLEAN = 'clean'
 ONLINE = 'online-'
 TENTH, METRES, DEGREES, HEADING = 'tenth', 'slip-translation', 'slip-rotation', 'heading'
+# Odometry drawn anew with so many times the noise that it states.
+NOISIER = {'odometry-3': 3.0, 'odometry-10': 10.0}
 # What else is wrong, the kind of false loops, and which share of all loops they are.
 OWN_SHARE = {
     **{f'{TENTH}-{lie}': (TENTH, lie, 0.5) for lie in LIES},
-    **{kind: (kind, 'random', 0.3) for kind in (METRES, DEGREES, HEADING)},
+    **{kind: (kind, 'random', 0.3) for kind in (METRES, DEGREES, HEADING, *NOISIER)},
     **{f'{ONLINE}{lie}': ('', lie, 0.3) for lie in LIES},
 }
 BATCH = (CLEAN, *LIES, *(kind for kind in OWN_SHARE if not kind.startswith(ONLINE)))

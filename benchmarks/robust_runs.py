@@ -140,21 +140,32 @@ def batch_run(case: FalseCase, solver: RobustSolver, limit: float) -> Run:
     if found is None or reference is None:
         return Run(*_name(case), solver.name, solver.ours)
     positions = case.graph.manifold.positions
-    error = absolute_trajectory_error(positions(found.poses), positions(reference))
-    numbers = {'named': case.slip in found.slips} if case.slip >= 0 and solver.ours else {}
-    return _judged(case, solver, found, error, error <= HOLDS.get(case.place.name, MORE), numbers)
+    error = absolute_trajectory_error(positions(found.poses), positions(reference.poses))
+    holds = error <= HOLDS.get(case.place.name, MORE) and not found.refused
+    return _judged(case, solver, found, error, holds, _own_numbers(case, found, reference))
 
 
-def _clean_map(case: FalseCase, solver: RobustSolver, limit: float) -> Array | None:
-    """Return the solver's map (n, p) of the clean graph, from the L2 map; None: no time left."""
+def _own_numbers(case: FalseCase, found: Found, clean: Found) -> dict[str, Any]:
+    """Return what only a solver says that judges the factors."""
+    if found.accepted is None or clean.accepted is None:
+        return {}
+    of_loops = ~case.clean.between.is_odometry
+    numbers: dict[str, Any] = {'refused': found.refused,
+                               'clean_lost': int((~clean.accepted & of_loops).sum())}
+    if case.slip >= 0:
+        numbers['named'] = case.slip in found.slips
+    return numbers
+
+
+def _clean_map(case: FalseCase, solver: RobustSolver, limit: float) -> Found | None:
+    """Return what the solver makes of the clean graph, from the L2 map; None: no time left."""
     maps, name = case.place.maps, solver.name
     if case.clean is case.place.graph and name in maps:
         return maps[name]
-    found = within(limit, lambda: solver.solve(case.clean, case.place.best))
-    poses = None if found is None else found.poses
+    found: Found | None = within(limit, lambda: solver.solve(case.clean, case.place.best))
     if case.clean is case.place.graph:
-        maps[name] = poses
-    return poses
+        maps[name] = found
+    return found
 
 
 def online_run(case: FalseCase, solver: OnlineSolver, limit: float) -> Run:

@@ -12,9 +12,10 @@ from l1slam_ros.core import se2
 from l1slam_ros.core.backend import ACCEPTED, Backend, BackendOptions
 from l1slam_ros.core.choice import AUTO, choose, minimise_by
 from l1slam_ros.core.cholesky import cholesky_of
+from l1slam_ros.core.errors import InconsistentError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.growth import GrowthOptions
-from l1slam_ros.core.initial import pair_key
+from l1slam_ros.core.initial import odometry_poses, pair_key
 from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.manifold import Array, Indices
@@ -35,13 +36,14 @@ class Found:
     A map and what it took.
 
     poses : (n, p); seconds : [s]; accepted : (m,) bool, None where the solver does not say;
-    slips : rows of odometry factors it takes for lies.
+    slips : rows of odometry factors it takes for lies; refused : it says that there is no map.
     """
 
     poses: Array
     seconds: float
     accepted: Mask | None = None
     slips: tuple[int, ...] = ()
+    refused: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,11 @@ def _robust(
 
     def solve(graph: FactorGraph, poses: Array) -> Found:
         began = clock()
-        found = minimise_robustly(graph, minimise)
+        try:
+            found = minimise_robustly(graph, minimise)
+        except InconsistentError:
+            return Found(odometry_poses(graph), clock() - began, graph.between.is_odometry.copy(),
+                         refused=True)
         return Found(found.solution.poses, clock() - began, found.accepted,
                      tuple(found.slips.tolist()))
 

@@ -45,7 +45,8 @@ def _introduction(recorded: Mapping[str, Any]) -> Lines:
         'Kinds: `random` (says two far poses are near), `identity` (says they are the same), '
         '`grouped` (10 to 20 that agree with each other); `tenth-`: only a random tenth of the '
         'true loops is there; `slip-`: one odometry factor is off by 5 m or 90 degrees; '
-        '`heading`: 1 degree more noise in each odometry factor; `online-`: pose by pose.',
+        '`heading`: 1 degree more noise in each odometry factor; `odometry-`: drawn anew with 3 '
+        'or 10 times the noise that it states; `online-`: pose by pose.',
         '- **error**: position, RMSE after alignment, to the map that the same solver makes of '
         'the clean graph (from its L2 map: the optimum, not where a bad start leads). A map '
         f'**holds** when that is at most: {limits}.',
@@ -81,6 +82,7 @@ _GROUPS: dict[str, Callable[[str], bool]] = {
     'identity': lambda kind: kind == 'identity', 'grouped': lambda kind: kind == 'grouped',
     'tenth': lambda kind: kind.startswith('tenth'),
     'slip': lambda kind: kind.startswith('slip'), 'heading': lambda kind: kind == 'heading',
+    'odometry': lambda kind: kind.startswith('odometry'),
     'online': lambda kind: kind.startswith(ONLINE),
 }
 
@@ -118,9 +120,13 @@ def _precision(run: Run) -> float:
 
 
 def _named(ended: list[Run]) -> str:
-    """Return how many of the slips were named, where there is one and the solver names any."""
-    named = [run.numbers['named'] for run in ended if 'named' in run.numbers]
-    return f'; slip named {sum(named)}/{len(named)}' if named else ''
+    """Return what only a solver says that judges the factors: slips, refusals, clean loops."""
+    said = {name: [run.numbers[name] for run in ended if name in run.numbers]
+            for name in ('named', 'refused', 'clean_lost')}
+    words = [f'; slip named {sum(said["named"])}/{len(said["named"])}' if said['named'] else '',
+             f'; refused {sum(said["refused"])}' if any(said['refused']) else '',
+             f'; clean lost {max(said["clean_lost"])}' if any(said['clean_lost']) else '']
+    return ''.join(words)
 
 
 def _held(runs: list[Run], field: str) -> str:
