@@ -51,7 +51,7 @@ def bad():
 def judged(world, belief=None, deadline=np.inf):
     """Return the belief after looking at all of a world's graph, from the odometry on."""
     belief = Belief.nothing() if belief is None else belief
-    return judge(world.graph, world.odometry, belief.extended(world.graph, True), deadline)
+    return judge(world.graph, world.odometry, belief.extended(world.graph, True), deadline)[0]
 
 
 # What is believed before anything was looked at
@@ -138,7 +138,7 @@ def test_it_ends_where_the_batch_solve_does(bad):
 def test_judging_again_changes_nothing(bad):
     once = judged(bad)
     poses = minimise_accepted(bad.graph, bad.odometry, once.accepted)
-    twice = judge(bad.graph, poses, once, np.inf)
+    twice, _ = judge(bad.graph, poses, once, np.inf)
     assert_array_equal(twice.accepted, once.accepted)
     assert twice.settled
 
@@ -166,7 +166,7 @@ def test_others_may_lean_on_what_is_trusted(trusted):
     for vouched in (trusted, False):
         graph.add_between(np.array([10]), np.array([100]), off,
                           np.diag([100.0, 100.0, 1e3])[None], vouched)
-    belief = judge(graph, poses, Belief.nothing().extended(graph, True), np.inf)
+    belief, _ = judge(graph, poses, Belief.nothing().extended(graph, True), np.inf)
     assert belief.accepted[-2:].tolist() == [trusted, trusted]
 
 

@@ -61,9 +61,11 @@ class Belief:
                       not robust or (self.settled and not new_loops))
 
 
-def judge(graph: FactorGraph, poses: Array, belief: Belief, deadline: float) -> Belief:
+def judge(
+    graph: FactorGraph, poses: Array, belief: Belief, deadline: float
+) -> tuple[Belief, Array]:
     """
-    Return what is to be believed, after looking again at all loops that are not.
+    Return what is to be believed, after looking again at all loops that are not, and its L2 map.
 
     A lie of the odometry is not looked for: that takes too long to do while driving.
 
@@ -84,4 +86,5 @@ def judge(graph: FactorGraph, poses: Array, belief: Belief, deadline: float) -> 
     square, suspect = outlook(growth)
     # What fits the map as it is may come in; what was believed stays until evidence is against it.
     accepted = growth.accepted | reconsidered(graph, growth.poses, growth.accepted)
-    return Belief(accepted, suspect & ~accepted, np.sqrt(square), growth.variance, settled)
+    judged = Belief(accepted, suspect & ~accepted, np.sqrt(square), growth.variance, settled)
+    return judged, growth.poses
