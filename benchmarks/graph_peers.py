@@ -27,10 +27,11 @@ from l1slam_ros.core.manifold import Array
 _CONVERGED = (1.0, 0.1, 0.01, 0.001), MOST_ITERATIONS
 _QUICK = tuple(0.3 / 2**k for k in range(12)), 2
 # [m, rad] gtsam holds the first pose by a prior this tight.
-_PRIOR_SIGMA = 1e-6
+PRIOR_SIGMA = 1e-6
 
 
-def _information(graph: FactorGraph) -> Array:
+def information_of(graph: FactorGraph) -> Array:
+    """Return the information of the between factors, (m, d, d)."""
     root = graph.between.sqrt_information
     product: Array = root.transpose(0, 2, 1) @ root
     return product
@@ -45,18 +46,19 @@ def _gtsam_graph(graph: FactorGraph, poses: Array, kernel: float | None = None) 
     scalar = kernels.Base.ReweightScheme.Scalar
     robust = kernels.Huber.Create(kernel, scalar) if kernel else None
     for i, j, z, information in zip(factors.i.tolist(), factors.j.tolist(),
-                                    factors.measurement.tolist(), _information(graph),
+                                    factors.measurement.tolist(), information_of(graph),
                                     strict=True):
         noise = gtsam.noiseModel.Gaussian.Information(information)
         if robust:
             noise = gtsam.noiseModel.Robust.Create(robust, noise)
         built.add(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*z), noise))
-    tight = gtsam.noiseModel.Isotropic.Sigma(3, _PRIOR_SIGMA)
+    tight = gtsam.noiseModel.Isotropic.Sigma(3, PRIOR_SIGMA)
     built.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*poses[0]), tight))
     return built
 
 
-def _gtsam_values(poses: Array) -> Any:
+def gtsam_values(poses: Array) -> Any:
+    """Return poses (n, p) as gtsam's, keys 0 to n - 1."""
     import gtsam
 
     values = gtsam.Values()
@@ -79,7 +81,7 @@ def _gtsam_by(optimiser: str, parameters: str) -> Callable[[Case, Array], Callab
     def prepare(case: Case, poses: Array) -> Callable[[], Answer]:
         import gtsam
 
-        graph, values = _gtsam_graph(case.graph, poses), _gtsam_values(poses)
+        graph, values = _gtsam_graph(case.graph, poses), gtsam_values(poses)
         options = getattr(gtsam, parameters)()
         options.setRelativeErrorTol(SAME_TOLERANCE)
         options.setMaxIterations(MOST_ITERATIONS)
@@ -95,7 +97,7 @@ def _gtsam_l1(
     def prepare(case: Case, poses: Array) -> Callable[[], Answer]:
         import gtsam
 
-        values = _gtsam_values(poses)
+        values = gtsam_values(poses)
         graphs = [_gtsam_graph(case.graph, poses, kernel) for kernel in (None, *kernels)]
         options = gtsam.GaussNewtonParams()
         options.setRelativeErrorTol(SAME_TOLERANCE)
@@ -165,7 +167,7 @@ def _g2o_graph(graph: FactorGraph, poses: Array, algorithm: str) -> tuple[Any, A
         optimiser.add_vertex(vertex)
     factors = graph.between
     for i, j, z, information in zip(factors.i.tolist(), factors.j.tolist(),
-                                    factors.measurement.tolist(), _information(graph),
+                                    factors.measurement.tolist(), information_of(graph),
                                     strict=True):
         edge = g2o.EdgeSE2()
         edge.set_vertex(0, optimiser.vertex(i))

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-from graph_peers import _PRIOR_SIGMA, _gtsam_values, _information
+from graph_peers import PRIOR_SIGMA, gtsam_values, information_of
 from graph_solvers import MOST_ITERATIONS, SAME_TOLERANCE
 from measuring import clock
 from robust_solvers import Driven, Found, OnlineSolver, RobustSolver
@@ -36,7 +36,7 @@ def _noises(graph: FactorGraph, kernel: str | None) -> list[Any]:
 
     kernels, noises = gtsam.noiseModel.mEstimator, gtsam.noiseModel
     robust = getattr(kernels, kernel).Create(KERNELS[kernel]) if kernel else None
-    plain = [noises.Gaussian.Information(each) for each in _information(graph)]
+    plain = [noises.Gaussian.Information(each) for each in information_of(graph)]
     if robust is None:
         return plain
     return [noise if sure else noises.Robust.Create(robust, noise)
@@ -55,7 +55,7 @@ def _factors(graph: FactorGraph, kernel: str | None) -> list[Any]:
 def _prior(pose: Array) -> Any:
     import gtsam
 
-    tight = gtsam.noiseModel.Isotropic.Sigma(3, _PRIOR_SIGMA)
+    tight = gtsam.noiseModel.Isotropic.Sigma(3, PRIOR_SIGMA)
     return gtsam.PriorFactorPose2(0, gtsam.Pose2(*pose), tight)
 
 
@@ -91,7 +91,7 @@ def _by_kernel(kernel: str) -> Callable[[FactorGraph, Array], Found]:
     def solve(graph: FactorGraph, poses: Array) -> Found:
         import gtsam
 
-        built, values = _graph(graph, poses, kernel), _gtsam_values(poses)
+        built, values = _graph(graph, poses, kernel), gtsam_values(poses)
         return _timed(lambda: gtsam.LevenbergMarquardtOptimizer(
             built, values, _parameters()).optimize())
 
@@ -102,7 +102,7 @@ def _by_gnc(graph: FactorGraph, poses: Array) -> Found:
     """Solve by graduated non-convexity, truncated least squares, from L2 on all loops."""
     import gtsam
 
-    built, values = _graph(graph, poses, None), _gtsam_values(poses)
+    built, values = _graph(graph, poses, None), gtsam_values(poses)
     options = gtsam.GncLMParams(_parameters())
     options.setLossType(gtsam.GncLossType.TLS)
     sure = [*np.flatnonzero(graph.between.is_odometry).tolist(), len(graph.between)]

@@ -173,15 +173,16 @@ def _between_part(system: LinearSystem, count: int) -> LinearSystem:
 
 def claimed_volume(manifold: Manifold, poses: Array, rng: np.random.Generator) -> float:
     """
-    Return the logarithm of the volume that the relative poses of random pairs fill.
+    Return the logarithm of the volume that the claims of false factors fill.
 
-    It is that of the Gaussian of their second moment, (2 pi)^(k/2) sqrt(det M): a false factor is
-    anywhere in there.
+    That of a Gaussian, (2 pi)^(k/2) sqrt(det M), as wide in each direction as the positions of
+    random pairs lie apart (a false factor need not know of the corridor), with any rotation.
     """
     apart = manifold.local(poses, poses[rng.permutation(len(poses))])
-    k = manifold.TANGENT_SIZE
-    log_det = np.linalg.slogdet(apart.T @ apart / len(apart))[1]
-    return float(k * np.log(2 * np.pi) + log_det) / 2
+    variance = np.full(manifold.TANGENT_SIZE, np.pi**2 / 3)
+    variance[manifold.TRANSLATION] = (apart[:, manifold.TRANSLATION] ** 2).mean()
+    with np.errstate(divide='ignore'):
+        return float(np.log(2 * np.pi * variance).sum()) / 2
 
 
 def chi2_quantile(probability: float, freedom: int) -> float:
