@@ -95,8 +95,9 @@ def unusual_motion(graph: FactorGraph, Z: Array) -> Array:
     """
     manifold, measured = graph.manifold, ends_in_time(graph)[2][graph.between.is_odometry]
     usual = manifold.local(manifold.identity(len(measured)), measured)
-    precision = np.linalg.pinv(np.cov(usual, rowvar=False), hermitian=True)
-    off = manifold.local(manifold.identity(len(Z)), Z) - usual.mean(axis=0)
+    mean = usual.mean(axis=0)
+    precision = np.linalg.pinv((usual - mean).T @ (usual - mean) / len(usual), hermitian=True)
+    off = manifold.local(manifold.identity(len(Z)), Z) - mean
     square: Array = np.einsum('mi,ij,mj->m', off, precision, off)
     return square
 

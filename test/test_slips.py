@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry factors that lie are left out, others stay; the rest of it is in `test_robust.py`."""
+
+import numpy as np
+import pytest
+from lies import careful_world, spoilt
+from test_accord import STEP, grown, slipped
+
+from l1slam_ros.core import se2
+from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.slips import unusual_motion, without_slip
+
+
+@pytest.fixture(scope='module')
+def bad():
+    return spoilt(careful_world(400, 800), 'random', 100)
+
+
+def test_a_slip_is_left_out_and_loops_come_in(bad):
+    growth = grown(slipped(bad.graph, STEP))
+    before = growth.accepted.copy()
+    mended = without_slip(growth)
+    left_out = np.flatnonzero(before & ~mended.accepted & ~growth.is_loop)
+    assert len(left_out) == 1 and abs(growth.low[left_out[0]] - STEP) <= 3
+    assert mended.accepted.sum() > before.sum() + 10
+    np.testing.assert_array_equal(growth.accepted, before)  # the trial was made in a copy
+
+
+def test_without_a_slip_nothing_is_left_out(bad):
+    assert without_slip(grown(bad.graph)) is None
+
+
+def test_a_jump_is_unusual_and_what_all_do_is_not():
+    graph = careful_world(200, 200).graph
+    usual = unusual_motion(graph, graph.between.measurement)
+    jump = unusual_motion(graph, np.array([[30.0, 0.0, 0.0]]))
+    assert jump[0] > 10 * usual.max()
+    assert 0 < np.median(usual) < 10
+
+
+def test_one_step_alone_is_not_unusual():
+    graph = FactorGraph(se2)
+    graph.add_poses(2)
+    graph.add_between(np.zeros(1, int), np.ones(1, int), np.array([[1.0, 0, 0]]), np.eye(3)[None])
+    np.testing.assert_array_equal(unusual_motion(graph, graph.between.measurement), [0.0])
