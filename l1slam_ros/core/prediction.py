@@ -31,11 +31,12 @@ class Posterior:
     """
     A graph at its optimum.
 
-    samples : (free keyframes + 1, k, SAMPLES) steps from it, as probable as the noise makes them,
-    the last one of what is held fixed; residual : (m, k) whitened, of each between factor;
-    moment : (m, k, k) what noise as stated would make of it.
+    cholesky : of its normal matrix; samples : (free keyframes + 1, k, SAMPLES) steps from it, as
+    probable as the noise makes them, the last one of what is held fixed; residual : (m, k)
+    whitened, of each between factor; moment : (m, k, k) what noise as stated would make of it.
     """
 
+    cholesky: BlockCholesky
     samples: Array
     residual: Array
     moment: Array
@@ -82,7 +83,7 @@ def sample_posterior(
     samples[:-1] = cholesky.solve_many(right[:-1])
     moment = left_over(system.keyframe, system.blocks, samples, noise, sizes)
     count = len(graph.between)
-    return Posterior(samples, -system.b.reshape(m, k)[:count], moment[:count])
+    return Posterior(cholesky, samples, -system.b.reshape(m, k)[:count], moment[:count])
 
 
 def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array, size: int) -> Array:
@@ -163,6 +164,29 @@ def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
     square, log_det = prediction.normalise(covariance, -system.b.reshape(count, k))
     roots = np.diagonal(graph.between.sqrt_information, axis1=1, axis2=2)
     return Innovations(system, square, log_det, log_volume + np.log(roots).sum(axis=1))
+
+
+def exact_squares(graph: FactorGraph, poses: Array, posterior: Posterior) -> Array:
+    """
+    Return the squared innovations of the few between factors of a graph, (m,), without samples.
+
+    The covariance is I + J H^-1 J', from as many solutions as there are rows.
+    """
+    from l1slam_ros.core.kernels import prediction
+
+    count = len(graph.between)
+    system = _between_part(linearise(graph, poses), count)
+    k = system.block_size
+    right = np.zeros((system.size + 1, k, count * k))
+    rows = np.eye(count * k).reshape(count, k, count * k)
+    prediction.gather(system.keyframe, system.blocks, rows, right, (0,) * k)
+    solved = np.zeros_like(right)
+    solved[:-1] = posterior.cholesky.solve_many(right[:-1])
+    every = prediction.moved(system.keyframe, system.blocks, solved, (0,) * k)
+    own = np.arange(count)
+    covariance = np.eye(k) + every.reshape(count, k, count, k)[own, :, own]
+    square: Array = prediction.normalise(covariance, -system.b.reshape(count, k))[0]
+    return square
 
 
 def _between_part(system: LinearSystem, count: int) -> LinearSystem:

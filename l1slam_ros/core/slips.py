@@ -18,7 +18,12 @@ from l1slam_ros.core.accord import accord, ends_in_time, weakest_steps
 from l1slam_ros.core.belief import DOUBT, log_odds_of_false
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.manifold import Array, Indices
-from l1slam_ros.core.prediction import chi2_quantile, claimed_volume, innovations
+from l1slam_ros.core.prediction import (
+    chi2_quantile,
+    claimed_volume,
+    exact_squares,
+    innovations,
+)
 from l1slam_ros.core.robust_growth import Growth
 
 # So many loops more have to come in without the factor, and loops of that many groups to span it.
@@ -48,11 +53,13 @@ def without_slip(growth: Growth) -> Growth | None:
 
 
 def _is_gross(growth: Growth, left_out: Indices) -> bool:
-    """Return whether odometry factors left out would be refused with all taken at their word."""
+    """Return whether odometry factors lie, all others being as noisy as they say at least."""
     trial = growth.copy()
     trial.take_at_their_word()
     trial.settle()
-    return bool((trial.innovations(left_out).square > trial.gate()).all())
+    square = exact_squares(trial.part(left_out), trial.poses, trial.posterior)
+    steps, k = np.count_nonzero(~growth.is_loop), growth.graph.manifold.TANGENT_SIZE
+    return bool(square.min() > chi2_quantile(1 - DOUBT / steps, k))
 
 
 def _believe(growth: Growth) -> None:
