@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from measuring import report_progress
 from robust_cases import FalseCase, Place, false_case
-from robust_kinds import CLEAN
+from robust_kinds import CLEAN, NOISIER
+from robust_oracle import undecidable
 from robust_solvers import Driven, Found, OnlineSolver, RobustSolver
 
 from l1slam_ros.core.choice import AUTO, choose
@@ -154,6 +155,8 @@ def _own_numbers(case: FalseCase, found: Found, clean: Found) -> dict[str, Any]:
                                'clean_lost': int((~clean.accepted & of_loops).sum())}
     if case.slip >= 0:
         numbers['named'] = case.slip in found.slips
+    if case.kind in NOISIER:
+        numbers['undecidable'] = undecidable(case)
     return numbers
 
 

@@ -46,7 +46,8 @@ def _introduction(recorded: Mapping[str, Any]) -> Lines:
         '`grouped` (10 to 20 that agree with each other); `tenth-`: only a random tenth of the '
         'true loops is there; `slip-`: one odometry factor is off by 5 m or 90 degrees; '
         '`heading`: 1 degree more noise in each odometry factor; `odometry-`: drawn anew with 3 '
-        'or 10 times the noise that it states; `online-`: pose by pose.',
+        'or 10 times the noise that it states (**undecidable**: part of the true loops that would '
+        'look like chance to one who knew all others and the noise); `online-`: pose by pose.',
         '- **error**: position, RMSE after alignment, to the map that the same solver makes of '
         'the clean graph (from its L2 map: the optimum, not where a bad start leads). A map '
         f'**holds** when that is at most: {limits}.',
@@ -120,12 +121,14 @@ def _precision(run: Run) -> float:
 
 
 def _named(ended: list[Run]) -> str:
-    """Return what only a solver says that judges the factors: slips, refusals, clean loops."""
+    """Return what only runs of solvers have that judge the factors."""
     said = {name: [run.numbers[name] for run in ended if name in run.numbers]
-            for name in ('named', 'refused', 'clean_lost')}
+            for name in ('named', 'refused', 'clean_lost', 'undecidable')}
     words = [f'; slip named {sum(said["named"])}/{len(said["named"])}' if said['named'] else '',
              f'; refused {sum(said["refused"])}' if any(said['refused']) else '',
-             f'; clean lost {max(said["clean_lost"])}' if any(said['clean_lost']) else '']
+             f'; clean lost {max(said["clean_lost"])}' if any(said['clean_lost']) else '',
+             f'; undecidable {_percent(statistics.median(said["undecidable"]))}'
+             if said['undecidable'] else '']
     return ''.join(words)
 
 
