@@ -30,7 +30,7 @@ def accord(growth: Growth) -> tuple[Indices, float]:
     Return the refused loops that agree with one of them, and that one: the surest such camp.
 
     None, where the volume that false loops could fill says that it is chance. Else also how
-    probable so large a camp is by what loops outside of it agree upon: lies can have a pattern.
+    probable so large a camp is by what loops elsewhere agree upon: lies can have a pattern.
     """
     rows = growth.undecided()
     rows = rows[growth.is_loop[rows]]
@@ -51,9 +51,11 @@ def accord(growth: Growth) -> tuple[Indices, float]:
     places = np.array([len(growth.heads(np.append(row, camp))) - 1
                        for row, camp in zip(rows, camps, strict=True)])
     camp = np.append(camps[k], rows[k])
-    rest = places[~np.isin(rows, camp)]
-    # Poisson's rate is below its median and ln 2; where there are more camps, the mean is above.
-    rate = min((rest.sum() + 1) / (len(rest) + 1), np.median(places) + np.log(2))
+    # How many agree by chance, those say that are not across what the camp is about.
+    steps = weakest_steps(growth, camp)
+    rest = places[(growth.low[rows] > steps[-1]) | (growth.high[rows] <= steps[0])]
+    # Where all agree with more than one other, that is no chance but another camp.
+    rate = min((rest.sum() + 1) / (len(rest) + 1), 1.0)
     return camp, len(rows) * float(gammainc(max(places[k], 1), rate))
 
 

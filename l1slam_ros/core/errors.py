@@ -19,8 +19,8 @@ class InconsistentError(GraphError):
 
     def __init__(self, loops: int, first: int, last: int):
         super().__init__(f'inconsistent: {loops} refused loops agree with each other, but not '
-                         f'with the odometry between the keyframes {first} and {last}, and no '
-                         'single step of it explains that; a map of the rest would be bent')
+                         f'with the odometry between {first} and {last}, and to leave out one '
+                         'step of it does not reconcile them; a map of the rest would be bent')
         self.loops, self.first, self.last = loops, first, last
 
 
