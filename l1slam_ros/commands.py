@@ -20,7 +20,7 @@ from l1slam_ros.core.optimality import SENTENCES
 from l1slam_ros.core.optimiser import OptimiserOptions
 from l1slam_ros.graph_from_bag import Topics
 from l1slam_ros.io.graph_file import GraphRecord
-from l1slam_ros.io.side_files import false_loop_lines, false_loops_path, truth_path
+from l1slam_ros.io.side_files import false_loops_path, pair_lines, truth_path
 from l1slam_ros.node_options import read_params_file
 from l1slam_ros.progress import Progress
 from l1slam_ros.verdict import verdict
@@ -219,7 +219,7 @@ def _write_spoiled(output: Path, pairs: Indices, write_graph: Callable[[], None]
     from l1slam_ros.io.files import put_lines, replacing
 
     with replacing(false_loops_path(output)) as temporary:
-        put_lines(temporary, false_loop_lines(pairs))
+        put_lines(temporary, pair_lines(pairs))
         write_graph()
 
 

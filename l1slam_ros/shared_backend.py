@@ -128,7 +128,7 @@ class SharedBackend:
             self._backend = Backend(self._manifold, self._options)
 
     def save(self, path: Path) -> int:
-        """Write graph, poses and stamps as g2o; return how many keyframes."""
+        """Write graph, poses, stamps and trust as g2o and beside it; return how many keyframes."""
         with self._lock:
             graph, poses = self._backend.growth.graph.copy(), self._backend.poses
             stamps = self._backend.growth.stamps

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a robust solve refused, in sentences for people."""
+"""What a robust solve refused, and what it found of the noise, in sentences for people."""
 
 from collections.abc import Iterator
 
@@ -13,10 +13,19 @@ _NAMED = 20
 # A gross slip of the odometry: said apart, because nothing that was driven after it can be trusted
 # without the loops across it.
 _SLIP = 'odometry {pair} lies: {sigmas:.1f} sigmas off what the loops say; left out'
+# Sigmas so many times the stated ones are worth a word; less is what people are wrong by.
+_NOISY = 2.0
+# Of odometry and of loops, as `RobustMap.variance` has them.
+_NOISE = (
+    'the odometry is about {times:.1f} times as noisy as it says: loops far apart in time are '
+    'judged by little',
+    'the loops are about {times:.1f} times as noisy as they say: a false one that is little off '
+    'passes for noise',
+)
 
 
 def verdict(record: GraphRecord, judgement: RobustMap) -> Iterator[str]:
-    """Yield what was refused and why, the worst first."""
+    """Yield what was refused and why, the worst first; then what is noisier than it says."""
     factors, accepted = record.graph.between, judgement.accepted
     is_loop = ~factors.is_odometry
     pairs = record.ids[np.stack((factors.i, factors.j), axis=1)]
@@ -33,6 +42,9 @@ def verdict(record: GraphRecord, judgement: RobustMap) -> Iterator[str]:
     if len(suspect):
         yield (f'suspect and left out, because nothing vouches for them: {len(suspect):,} that '
                'fit where they stand, but could as well do so by chance')
+    for sentence, times in zip(_NOISE, np.sqrt(judgement.variance).tolist(), strict=True):
+        if times >= _NOISY:
+            yield sentence.format(times=times)
 
 
 def _named(pair: np.ndarray) -> str:

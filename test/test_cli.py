@@ -12,12 +12,16 @@ import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from torn import torn_graph
 
 from l1slam_ros.cli import main
 from l1slam_ros.core import se2
+from l1slam_ros.core.errors import InconsistentError
+from l1slam_ros.core.initial import odometry_poses
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.optimality import l1_cost
-from l1slam_ros.io.graph_file import read_graph_file
+from l1slam_ros.core.robust import robust_solve
+from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, write_graph_file
 
 VERTICES = ['VERTEX_SE2 0 0 0 0', 'VERTEX_SE2 1 1 0 0', 'VERTEX_SE2 2 2 0 0']
 EDGES = ['EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1',
@@ -217,6 +221,24 @@ def test_the_picture_shows_what_was_refused(capsys, lies, tmp_path):
     said = words(tmp_path / 'map.svg')
     assert 'rejected loops' in said and 'false loops' not in said
     assert any('300 poses, 301 loops, 100 rejected' in word for word in said)
+
+
+@pytest.mark.parametrize('norm', ['l1', 'l2'])
+def test_a_map_that_loops_agree_is_wrong_is_refused_by_its_vertices(capsys, tmp_path, norm):
+    path, (graph, slips) = tmp_path / 'torn.g2o', torn_graph()
+    ids = 100 + np.arange(graph.n_poses)
+    write_graph_file(path, GraphRecord(graph, odometry_poses(graph), ids))
+    with pytest.raises(InconsistentError) as refused:
+        robust_solve(graph)
+    assert main(['solve', str(path), '--robust', '--norm', norm, '--json', '--output',
+                 str(tmp_path / 'out.g2o'), '--plot', str(tmp_path / 'map.png')]) == 2
+    out, err = capsys.readouterr()
+    assert out == '' and err.count('\n') == 1
+    assert err.startswith(f'l1slam: {path}: inconsistent: ')
+    first, last = map(int, re.search(r' between (\d+) and (\d+),', err).groups())
+    assert (first, last) == (refused.value.first + 100, refused.value.last + 100)
+    assert slips[0] + 80 < first < last < slips[1] + 120
+    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize('start', ['seed', 'file', 'odometry'])

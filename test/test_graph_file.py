@@ -16,7 +16,7 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.noise import square_root_information
 from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, read_vertices, write_graph_file
-from l1slam_ros.io.side_files import stamps_path
+from l1slam_ros.io.side_files import stamps_path, trusted_path
 
 SQUARE = """\
 # a comment
@@ -343,6 +343,76 @@ def test_a_graph_without_stamps_does_not_inherit_those_of_its_predecessor(tmp_pa
     write_graph_file(path, replace(record, stamps=None))
     assert read_graph_file(path).stamps is None
     assert list(tmp_path.iterdir()) == [path]
+
+
+def with_trust(record, rows):
+    """Return the record with only these rows of its factors trusted."""
+    graph, factors = FactorGraph(se2), record.graph.between
+    graph.add_poses(record.graph.n_poses)
+    graph.add_between(factors.i, factors.j, factors.measurement, information_of(factors),
+                      np.isin(np.arange(len(factors)), rows))
+    return replace(record, graph=graph)
+
+
+@pytest.mark.parametrize('name', ['a.g2o', 'a.graph'])
+def test_trust_comes_back_with_the_graph(tmp_path, rng, name):
+    path, record = tmp_path / name, random_record(rng)
+    factors = record.graph.between
+    pairs = np.stack((factors.i, factors.j), axis=1)
+    rows = [row for row in range(len(factors) - 1, 39, -7)  # loops that nothing runs along
+            if (pairs == pairs[row]).all(axis=1).sum() == 1]
+    assert len(rows) > 3
+    write_graph_file(path, with_trust(record, rows))
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        name, f'{name}.stamps.txt', f'{name}.trusted.txt']
+    assert sorted(tuple(map(int, line.split()))
+                  for line in trusted_path(path).read_text().splitlines()) == sorted(
+        map(tuple, record.ids[pairs[rows]].tolist()))
+    back = read_graph_file(path)
+    assert sorted(rows) == np.flatnonzero(back.graph.between.trusted).tolist()
+    assert (back.poses == record.poses).all() and (back.stamps == record.stamps).all()
+
+
+def test_trust_joins_loops_either_way_round_and_leaves_odometry(write):
+    path = write(SQUARE + 'EDGE_SE2 7 3 1 0 0 1 0 0 1 0 1\nEDGE_SE2 3 9 1 0 0 1 0 0 1 0 1\n')
+    trusted_path(path).write_text('3 7\n7 9\n')
+    assert read_graph_file(path).graph.between.trusted.tolist() == [False] * 3 + [True, False]
+    trusted_path(path).write_text('3 9\n')
+    assert read_graph_file(path).graph.between.trusted.tolist() == [
+        False, False, True, False, True]
+
+
+@pytest.mark.parametrize(('text', 'message'), [
+    ('3 9\n\n3 x\n', ":3: trusted loop: 'x' is not a whole number of 64 bits; expected 2 whole"),
+    ('3 9 1\n', ':1: trusted loop: 3 fields; expected 2 whole numbers'),
+    ('9 3\n3 8\n', ':2: no edge between 3 and 8 in '),
+    ('9 3\n0 1\n', ':2: no edge between 0 and 1 in '),
+])
+def test_damaged_trust_is_named(write, text, message):
+    path = write(SQUARE)
+    trusted_path(path).write_text(text)
+    assert message_of(path).startswith(f'.trusted.txt{message}')
+
+
+def test_a_graph_without_trust_is_not_lent_that_of_its_predecessor(tmp_path, rng):
+    path, record = tmp_path / 'a.g2o', random_record(rng)
+    write_graph_file(path, with_trust(record, [50, 60]))
+    assert trusted_path(path).exists()
+    write_graph_file(path, record)
+    assert not trusted_path(path).exists()
+    assert not read_graph_file(path).graph.between.trusted.any()
+
+
+def test_graph_stamps_and_trust_are_replaced_together_or_not_at_all(tmp_path, rng):
+    path, record = tmp_path / 'a.g2o', random_record(rng)
+    other = replace(record, poses=record.poses + 1, stamps=record.stamps + 1)
+    write_graph_file(path, record)
+    trusted_path(path).mkdir()
+    before = {p: p.is_dir() or p.read_bytes() for p in tmp_path.iterdir()}
+    for changed, word in (with_trust(other, [50]), 'written'), (other, 'removed'):
+        with pytest.raises(FileError, match=f'{trusted_path(path)}: cannot be {word}'):
+            write_graph_file(path, changed)
+        assert {p: p.is_dir() or p.read_bytes() for p in tmp_path.iterdir()} == before
 
 
 def test_the_graph_survives_a_failing_replacement(tmp_path, rng):

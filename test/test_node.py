@@ -15,15 +15,19 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool, Trigger
+from torn import torn_graph
 from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core import se2
+from l1slam_ros.core.backend import ACCEPTED, REJECTED
 from l1slam_ros.core.cholesky import cholesky_of
-from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.errors import InconsistentError, OptionError
 from l1slam_ros.core.exact import minimise_interior_point
+from l1slam_ros.core.initial import odometry_poses
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.optimality import l1_cost
 from l1slam_ros.core.optimiser import OptimiserOptions
+from l1slam_ros.core.robust import robust_solve
 from l1slam_ros.core.seed import seed_poses
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bag import read_raw
@@ -236,6 +240,31 @@ def test_a_saved_map_is_loaded_and_odometry_goes_on_from_its_end(bench, tmp_path
     assert b.received['pose'][-1].pose.position.x == pytest.approx(3.1)
 
 
+def test_a_loaded_map_trusts_the_loop_that_was_vouched_for(bench, tmp_path):
+    b = bench(save_path=str(tmp_path / 'map.g2o'))
+    vouch = b.peer.create_publisher(PoseWithCovarianceStamped, 'trusted_loop_closures', 10)
+    b.until(vouch.get_subscription_count, 'the node listens to who vouches')
+    for k in range(6):
+        b.send('/odom', odometry((k + 1) * 10**9, 1.0 * k))
+    # Nobody else would believe that the robot stands where it began, five metres back.
+    loop = PoseWithCovarianceStamped(header=header('base_link@1.000000000', 6 * 10**9))
+    loop.pose.pose.orientation.w = 1.0
+    loop.pose.covariance = (1e-4 * np.eye(6)).ravel()
+    vouch.publish(loop)
+
+    def states():
+        return b.backend._backend.loop_states().state.tolist()
+
+    b.until(lambda: states() == [ACCEPTED], 'the loop is believed')
+    assert call(b, 'save').success and call(b, 'reset').success
+    assert call(b, 'load').success and states() == [ACCEPTED]
+    b.until(lambda: len(b.path().poses) == 6, 'the map is back')
+    assert b.backend._backend.state().factors.trusted.tolist() == [False] * 5 + [True]
+    (tmp_path / 'map.g2o.trusted.txt').unlink()
+    assert call(b, 'load').success
+    b.until(lambda: states() == [REJECTED], 'without the file the loop is doubted')
+
+
 def test_optimize_answers_with_the_cost_and_a_broken_file_leaves_the_map(bench, tmp_path, rng):
     world = simulate_world(60, 90, WorldOptions(), rng)
     write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(60)))
@@ -249,6 +278,28 @@ def test_optimize_answers_with_the_cost_and_a_broken_file_leaves_the_map(bench, 
     answer = call(b, 'load')
     assert not answer.success and 'broken.g2o:1' in answer.message
     assert len(b.path().poses) == 60
+
+
+def test_optimize_refuses_what_loops_agree_is_wrong_and_keeps_the_map(bench, tmp_path):
+    graph, _ = torn_graph()
+    poses = odometry_poses(graph)
+    write_graph_file(tmp_path / 'map.g2o', GraphRecord(
+        graph, poses, np.arange(400), (1 + np.arange(400)) * 10**9))
+    b = bench(save_path=str(tmp_path / 'map.g2o'))
+    # Or an update could change the map before the service does not.
+    assert call(b, 'pause', SetBool.Request(data=True)).success
+    assert call(b, 'load').success
+    b.until(lambda: len(b.path().poses) == 400, 'the map is there')
+    before = b.backend._backend.state()
+    answer = call(b, 'optimize')
+    assert not answer.success
+    with pytest.raises(InconsistentError) as refused:
+        robust_solve(graph)
+    assert answer.message == str(refused.value) and 'inconsistent' in answer.message
+    after = b.backend._backend.state()
+    np.testing.assert_array_equal(after.poses, before.poses)
+    np.testing.assert_array_equal(after.loops.state, before.loops.state)
+    np.testing.assert_allclose(poses_of(b.path()), poses, atol=1e-9)
 
 
 def test_a_map_with_priors_is_refused_and_the_node_goes_on(bench, tmp_path, rng):

@@ -94,6 +94,58 @@ def test_axes_are_equal(tmp_path):
     assert width / height == pytest.approx(3, rel=0.03)
 
 
+def places(path):
+    """The texts of an SVG and where their lines begin, (x, y) [points], y downwards."""
+    found = re.findall(r'<!-- (.*?) -->\s*<g [^>]*?translate\((\S+) (\S+)\)', path.read_text())
+    return [(word, float(x), float(y)) for word, x, y in found]
+
+
+CURVE = Curve('l1 cost', np.arange(2), np.array([2.0, 1.0]))
+# How wide and how high the map is.
+SHAPES = [(1, 1), (4, 1), (1000, 1), (1, 1000)]
+
+
+@pytest.mark.parametrize('shape', SHAPES)
+@pytest.mark.parametrize('draw', [
+    lambda path, drawing: plot_maps(path, [drawing]),
+    lambda path, drawing: plot_maps(path, [drawing, MapDrawing('', SQUARE), drawing]),
+    lambda path, drawing: plot_solution(path, drawing, CURVE)], ids=['one', 'three', 'solution'])
+def test_whatever_the_shape_the_legend_is_below_the_name_of_the_axis(tmp_path, shape, draw):
+    path = tmp_path / 'map.svg'
+    world = SQUARE * shape
+    draw(path, MapDrawing('street', world, world, world, loops=np.array([[0, 4]]),
+                          rejected=np.array([[0, 2]])))
+    found = places(path)
+    # Where there are several maps: of the one on the left.
+    legend = [min((x, y) for word, x, y in found if word == entry)
+              for entry in ('odometry', 'truth', 'loops', 'optimised', 'rejected loops')]
+    label_x, label = min((x, y) for word, x, y in found if word == 'x [m]')
+    assert len({y for _, y in legend}) == 1
+    below = legend[0][1]
+    # A capital is 7 points high here, and the brackets of the label go 3 below their line.
+    assert 12 < below - label < 30
+    above = max(y for word, x, y in found
+                if re.fullmatch('[−0-9.]+', word) and y < label - 1 and x < legend[-1][0])
+    assert 10 < label - above < 20
+    assert legend[0][0] < label_x < legend[-1][0]
+    width, height = map(float, re.search(r'width="(\S+)pt" height="(\S+)pt"',
+                                         path.read_text()).groups())
+    assert legend[0][0] > 0 and legend[-1][0] + 50 < width and below + 3 < height
+
+
+@pytest.mark.parametrize('shape', SHAPES)
+def test_whatever_the_shape_no_number_lies_over_the_next(tmp_path, shape):
+    path = tmp_path / 'map.svg'
+    plot_maps(path, [MapDrawing('', SQUARE * shape - 1.5)])
+    numbers = [place for place in places(path) if re.fullmatch('[−0-9.]+', place[0])]
+    lowest = max(y for _, _, y in numbers)
+    row = sorted((x, word) for word, x, y in numbers if y == lowest)
+    assert row
+    for (x, word), (following, _) in zip(row, row[1:], strict=False):
+        # A digit is 6.4 points wide, a point 3.2 and a minus 8.4.
+        assert following > x + 6 * len(word.replace('.', ''))
+
+
 def test_odometry_astray_does_not_shrink_the_map(tmp_path):
     path = tmp_path / 'map.png'
     plot_maps(path, [MapDrawing('', SQUARE, odometry=SQUARE * 1000)])

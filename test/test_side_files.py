@@ -1,42 +1,116 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The files beside a graph: stamps (more in `test_graph_file`) and false loops."""
+"""The files beside a graph: stamps, trusted loops (more in `test_graph_file`) and false loops."""
 
 import numpy as np
 import pytest
 
 from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.graph import BetweenFactors
 from l1slam_ros.io.files import write_lines
 from l1slam_ros.io.side_files import (
-    false_loop_lines,
     false_loops_path,
+    pair_lines,
     read_false_loops,
     read_stamps,
+    read_trusted,
     stamps_path,
+    trusted_path,
     truth_path,
-    write_stamps,
+    write_beside,
 )
+
+# The largest ids there are: as floats, the last two would be one.
+IDS = np.array([-7, 3, 9, 2**63 - 2, 2**63 - 1])
+STAMPS = np.array([1, 5, 1305031102175300121, 2**62 - 1, 2**62])
+CHAIN = [(0, 1), (1, 2), (2, 3), (3, 4)]
+
+
+def factors(*loops, trusted=()):
+    """Return odometry along `IDS` and then loops; trusted : rows."""
+    pairs = np.array([*CHAIN, *loops])
+    m = len(pairs)
+    return BetweenFactors(*pairs.T, np.zeros((m, 3)), np.tile(np.eye(3), (m, 1, 1)),
+                          np.isin(np.arange(m), trusted))
 
 
 def test_names(tmp_path):
     assert stamps_path(tmp_path / 'a.g2o') == tmp_path / 'a.g2o.stamps.txt'
+    assert trusted_path(tmp_path / 'a.g2o') == tmp_path / 'a.g2o.trusted.txt'
     assert truth_path('b') .name == 'b.truth.txt'
     assert false_loops_path('bag.v2').name == 'bag.v2.false.txt'
 
 
 def test_stamps_come_back_to_the_nanosecond(tmp_path):
-    path, ids = tmp_path / 'stamps.txt', np.array([-3, 5, 2**62])
-    stamps = np.array([1, 1305031102175300121, 2**62])
-    write_stamps(path, ids, stamps)
-    assert path.read_text().splitlines()[1] == '5 1305031102.175300121'
-    assert read_stamps(path, ids).tolist() == stamps.tolist()
-    assert read_stamps(tmp_path / 'none.txt', ids) is None
+    path = tmp_path / 'a.g2o'
+    write_beside(path, IDS, STAMPS, factors())
+    assert stamps_path(path).read_text().splitlines()[2] == '9 1305031102.175300121'
+    assert read_stamps(path, IDS).tolist() == STAMPS.tolist()
+    assert read_stamps(tmp_path / 'none.g2o', IDS) is None
+    assert [p.name for p in tmp_path.iterdir()] == ['a.g2o.stamps.txt']
+
+
+def test_trust_comes_back(tmp_path):
+    path, loops = tmp_path / 'a.g2o', [(0, 3), (4, 0), (2, 1), (0, 4), (1, 4)]
+    # Rows 5 and 7 join the same vertices; row 6 goes along the odometry, which is row 1.
+    written = factors(*loops, trusted=[1, 5, 6])
+    write_beside(path, IDS, None, written)
+    assert trusted_path(path).read_text() == f'{2**63 - 1} -7\n9 3\n'
+    assert np.flatnonzero(read_trusted(path, IDS, factors(*loops))).tolist() == [5, 6, 7]
+    assert [p.name for p in tmp_path.iterdir()] == ['a.g2o.trusted.txt']
+    assert not read_trusted(tmp_path / 'none.g2o', IDS, written).any()
+
+
+def test_odometry_alone_lends_its_pair_no_trust(tmp_path):
+    path = tmp_path / 'a.g2o'
+    write_beside(path, IDS, None, factors((2, 1), trusted=[1]))
+    assert not trusted_path(path).exists()
+    trusted_path(path).write_text('3 9\n')
+    assert not read_trusted(path, IDS, factors()).any()
+
+
+def test_a_file_without_loops_trusts_none(tmp_path):
+    trusted_path(tmp_path / 'a.g2o').write_text('# nobody vouched\n\n')
+    assert read_trusted(tmp_path / 'a.g2o', IDS, factors((0, 2))).tolist() == [False] * 5
+
+
+@pytest.mark.parametrize(('line', 'words'), [
+    ('1', ':4: trusted loop: 1 fields; expected 2 whole numbers'),
+    ('1 2.5', ":4: trusted loop: '2.5' is not a whole number of 64 bits; expected 2"),
+    ('-7 8', ':4: no edge between -7 and 8 in '), ('9 -7', ':4: no edge between 9 and -7 in '),
+    ('3 3', ':4: no edge between 3 and 3 in '),
+    (f'-7 {2**63 - 2}', f':4: no edge between -7 and {2**63 - 2} in ')])
+def test_damaged_trust_is_named(tmp_path, line, words):
+    path = tmp_path / 'a.g2o'
+    trusted_path(path).write_text(f'# of a graph\n3 {2**63 - 2}\n\n{line}\n-7 12\n')
+    with pytest.raises(FileError) as caught:
+        read_trusted(path, IDS, factors((1, 3), (0, 4)))
+    assert str(caught.value).startswith(f'{trusted_path(path)}{words}')
+    assert '; expected' in str(caught.value) and '\n' not in str(caught.value)
+
+
+def test_what_is_no_more_is_removed(tmp_path):
+    path = tmp_path / 'a.g2o'
+    write_beside(path, IDS, STAMPS, factors((0, 2), trusted=[4]))
+    assert len(list(tmp_path.iterdir())) == 2
+    write_beside(path, IDS, None, factors((0, 2)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_both_are_written_or_neither(tmp_path):
+    path = tmp_path / 'a.g2o'
+    trusting, doubting = factors((0, 2), trusted=[4]), factors((0, 2))
+    trusted_path(path).mkdir()
+    for found, word in (trusting, 'written'), (doubting, 'removed'):
+        with pytest.raises(FileError, match=f'^{trusted_path(path)}: cannot be {word}: '):
+            write_beside(path, IDS, STAMPS, found)
+        assert list(tmp_path.iterdir()) == [trusted_path(path)]
 
 
 @pytest.mark.parametrize('pairs', [[], [[1, 5]], [[2**62, -7], [9, 2], [9, 2]]])
 def test_false_loops_come_back(tmp_path, pairs):
     pairs = np.array(pairs, np.int64).reshape(-1, 2)
     path = tmp_path / 'false.txt'
-    write_lines(path, false_loop_lines(pairs))
+    write_lines(path, pair_lines(pairs))
     assert path.read_text() == ''.join(f'{i} {j}\n' for i, j in pairs)
     np.testing.assert_array_equal(read_false_loops(path), pairs)
 

@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What people are told of the loops that were refused."""
+"""What people are told of the loops that were refused, and of the noise."""
+
+import re
 
 import numpy as np
 import pytest
 
 from l1slam_ros.core import se2
+from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.optimality import Status
 from l1slam_ros.core.optimiser import Solution
-from l1slam_ros.core.robust_map import RobustMap
+from l1slam_ros.core.robust_map import RobustMap, minimise_robustly
+from l1slam_ros.core.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graph_file import GraphRecord
 from l1slam_ros.verdict import verdict
 
@@ -26,7 +31,7 @@ def record():
     return GraphRecord(graph, None, 10 + 3 * np.arange(N))
 
 
-def judgement(refused=(), suspect=(), slips=()):
+def judgement(refused=(), suspect=(), slips=(), variance=(1.0, 1.0)):
     """Return a judgement; refused : sigmas of loops; suspect : loops; slips : steps."""
     poses, m = np.zeros((N, 3)), N - 1 + LOOPS
     sigmas, doubtful = np.ones(m), np.zeros(m, bool)
@@ -39,7 +44,7 @@ def judgement(refused=(), suspect=(), slips=()):
         sigmas[step], accepted[step] = 40.0 + step, False
     solution = Solution(poses, 0.0, Status.CONVERGED, 0, 0, np.zeros(1), np.zeros(3 * m))
     return RobustMap(solution, poses, accepted, doubtful, sigmas, np.array(slips, np.int64),
-                     np.ones(2))
+                     np.array(variance))
 
 
 def test_nothing_refused_is_one_sentence(record):
@@ -78,3 +83,35 @@ def test_odometry_that_lies_is_said_first_and_is_no_loop(record):
         'odometry 16 - 19 lies: 42.0 sigmas off what the loops say; left out',
         'odometry 37 - 40 lies: 49.0 sigmas off what the loops say; left out',
         '1 of 27 loops refused', '  10 - 16: 8.0 sigmas off the accepted ones']
+
+
+NOISY_ODOMETRY = ('the odometry is about {} times as noisy as it says: loops far apart in time '
+                  'are judged by little')
+NOISY_LOOPS = ('the loops are about {} times as noisy as they say: a false one that is little '
+               'off passes for noise')
+
+
+@pytest.mark.parametrize('variance, said', [
+    ((3.99, 3.99), []), ((1e-4, 0.0), []),
+    ((4.0, 3.0), [NOISY_ODOMETRY.format('2.0')]),
+    ((9.61, 0.01), [NOISY_ODOMETRY.format('3.1')]),
+    ((1.0, 1e4), [NOISY_LOOPS.format('100.0')]),
+    ((6.25, 20.25), [NOISY_ODOMETRY.format('2.5'), NOISY_LOOPS.format('4.5')])])
+def test_what_is_twice_as_noisy_as_it_says_or_more_is_told_last(record, variance, said):
+    assert list(verdict(record, judgement(suspect=[5], variance=variance)))[2:] == said
+
+
+def test_what_a_solve_finds_of_the_noise_is_told():
+    world = simulate_world(200, 400, WorldOptions(), np.random.default_rng(2))
+    factors = world.graph.between
+    information = factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information
+    # The odometry boasts of a fifth of its sigmas, the loops tell the truth.
+    boast = np.where(factors.is_odometry, 25.0, 1.0)[:, None, None]
+    graph = FactorGraph(se2)
+    graph.add_poses(world.graph.n_poses)
+    graph.add_between(factors.i, factors.j, factors.measurement, information * boast)
+    found = minimise_robustly(graph, lambda part, poses: minimise_l2(
+        part, poses, LeastSquaresOptions(), cholesky_of(part)))
+    said = list(verdict(GraphRecord(graph, None, np.arange(200)), found))[-1]
+    times = re.fullmatch(re.escape(NOISY_ODOMETRY).replace(r'\{\}', r'(\d+\.\d)'), said)
+    assert 3 < float(times[1]) < 6

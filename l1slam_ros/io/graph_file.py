@@ -9,7 +9,7 @@ A line is a tag, one or two vertex ids, a pose, and the upper triangle of an inf
     EDGE_PRIOR_SE2 id x y theta xx xy xt yy yt tt
 
 **TORO orders the information otherwise** (forward, sideways, rotation: `ff fs ss rr fr sr`).
-Stamps, which neither format knows, live beside the graph in `<path>.stamps.txt`.
+Stamps and trust in loops, which neither format knows, live beside the graph: see `side_files`.
 """
 
 import os
@@ -21,7 +21,7 @@ import numpy as np
 
 from l1slam_ros.core import se2
 from l1slam_ros.core.errors import FileError, NoiseError
-from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.noise import square_root_information
 from l1slam_ros.io.files import (
@@ -35,7 +35,7 @@ from l1slam_ros.io.files import (
     replacing,
     settled,
 )
-from l1slam_ros.io.side_files import read_stamps, stamps_path, write_stamps
+from l1slam_ros.io.side_files import read_stamps, read_trusted, write_beside
 
 
 @dataclass(frozen=True)
@@ -126,14 +126,14 @@ class _Rows:
 
 def read_graph_file(path: str | os.PathLike[str]) -> GraphRecord:
     """
-    Read a g2o or TORO file, and the stamps beside it.
+    Read a g2o or TORO file, and beside it the stamps and which loops are trusted.
 
     Vertices may stand anywhere and in any order, or not at all: then they are those the edges
     name, and `poses` is None. Whether the graph is connected is not looked at.
 
     Raises
     ------
-    FileError : naming the line, when the file is no such graph.
+    FileError : naming the line, when the file is no such graph or those beside it are of another.
 
     """
     groups = _group(path)
@@ -147,7 +147,7 @@ def read_graph_file(path: str | os.PathLike[str]) -> GraphRecord:
     _add_edges(path, graph, ids, edges)
     _add_priors(path, graph, ids, priors)
     return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
-                       read_stamps(stamps_path(path), ids), _skipped(groups, ids))
+                       read_stamps(path, ids), _skipped(groups, ids))
 
 
 def read_vertices(path: str | os.PathLike[str]) -> tuple[Indices, Array]:
@@ -169,8 +169,8 @@ def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
     """
     Write a graph with its own ids, every number such that it reads back the same.
 
-    TORO for the suffix `.graph`, else g2o. Stamps, if any, go to the side file; a side file of
-    a former graph of this name is removed with that graph.
+    TORO for the suffix `.graph`, else g2o. Stamps and trusted loops, if any, go to side files;
+    those of a former graph of this name are removed with that graph.
 
     Raises
     ------
@@ -181,11 +181,8 @@ def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
     lines = _text(path, record)
     with replacing(path) as temporary:
         put_lines(temporary, lines)
-        # Before the graph takes its place: a graph must never meet the stamps of another.
-        if record.stamps is None:
-            stamps_path(path).unlink(missing_ok=True)
-        else:
-            write_stamps(stamps_path(path), record.ids, record.stamps)
+        # Before the graph takes its place: it must never meet the stamps or the trust of another.
+        write_beside(path, record.ids, record.stamps, record.graph.between)
 
 
 def _group(path: str | os.PathLike[str]) -> dict[str, TextLines]:
@@ -251,20 +248,21 @@ def _vertices(path: object, groups: dict[str, TextLines]) -> _Rows:
     return _Rows(lines, ids, rows.pose[order], rows.information[order])
 
 
-def _add_edges(path: object, graph: FactorGraph, ids: Indices, edges: _Rows) -> None:
+def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices,
+               edges: _Rows) -> None:
     loop = edges.ids[:, 0] == edges.ids[:, 1]
     if loop.any():
         k = int(np.argmax(loop))
         raise FileError(path, f'an edge from vertex {edges.ids[k, 0]} to itself; '
                         'expected two vertices', int(edges.lines[k]))
-    index = _index(path, ids, edges)
-    _check_information(path, edges)
-    graph.add_between(index[:, 0], index[:, 1], edges.pose, edges.information)
+    i, j = _index(path, ids, edges).T
+    doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), np.zeros(len(edges), bool))
+    graph.add_between(i, j, edges.pose, edges.information, read_trusted(path, ids, doubted))
 
 
 def _add_priors(path: object, graph: FactorGraph, ids: Indices, priors: _Rows) -> None:
     index = _index(path, ids, priors)
-    _check_information(path, priors)
+    _roots(path, priors)
     graph.add_prior(index[:, 0], priors.pose, priors.information)
 
 
@@ -280,7 +278,8 @@ def _index(path: object, ids: Indices, rows: _Rows) -> Indices:
     return index
 
 
-def _check_information(path: object, rows: _Rows) -> None:
+def _roots(path: object, rows: _Rows) -> Array:
+    """Return the square roots of the information, (m, d, d); each must have one."""
     def works(part: slice) -> bool:
         try:
             square_root_information(rows.information[part])
@@ -288,11 +287,13 @@ def _check_information(path: object, rows: _Rows) -> None:
             return False
         return True
 
-    if not works(slice(None)):
+    try:
+        return square_root_information(rows.information)
+    except NoiseError as error:
         k = first_failure(len(rows), works)
         entries = ' '.join(f'{v:g}' for v in rows.information[k].ravel())
         raise FileError(path, f'information [{entries}]; expected a positive definite matrix',
-                        int(rows.lines[k]))
+                        int(rows.lines[k])) from error
 
 
 def _skipped(groups: dict[str, TextLines], ids: Indices) -> tuple[str, ...]:

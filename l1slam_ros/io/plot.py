@@ -35,6 +35,10 @@ _PANEL = 5.6  # [inch]
 # Lowest and highest a diagram beside a map may be, of its width.
 _ASPECTS = 0.6, 1.4
 _DOTS_PER_INCH = 150
+_POINT = 1 / 72  # [inch]
+# [inch] From the x axis down to the legend of a map: ticks, their numbers and the name of the axis
+# are in between, and as high in every map, however flat that is.
+_LEGEND_BELOW = 38 * _POINT
 
 
 def _no_pairs() -> Indices:
@@ -192,8 +196,17 @@ def _draw_map(axes: 'Axes', drawing: MapDrawing) -> None:
     axes.set_xlabel('x [m]')
     axes.set_ylabel('y [m]')
     _tidy(axes)
-    axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.1), ncols=5, frameon=False,
-                fontsize='small', columnspacing=1.4, handlelength=1.4)
+    _draw_legend(axes)
+
+
+def _draw_legend(axes: 'Axes') -> None:
+    """Draw the legend below the map and the name of its x axis."""
+    from matplotlib.transforms import ScaledTranslation
+
+    below = ScaledTranslation(0, -_LEGEND_BELOW, axes.figure.dpi_scale_trans)
+    axes.legend(loc='upper center', bbox_to_anchor=(0.5, 0), borderaxespad=0, ncols=5,
+                bbox_transform=axes.transAxes + below, frameon=False, fontsize='small',
+                columnspacing=1.4, handlelength=1.4)
 
 
 def _small_print(drawing: MapDrawing) -> str:
@@ -239,6 +252,8 @@ def _opacity(count: int) -> float:
 
 def _set_view(axes: 'Axes', drawing: MapDrawing) -> None:
     """Show the map and the truth whole, the odometry as far as it stays in their neighbourhood."""
+    from matplotlib.ticker import MaxNLocator
+
     seen = [drawing.positions] if drawing.truth is None else [drawing.positions, drawing.truth]
     points = np.concatenate([positions[:, :2] for positions in seen])
     low, high = points.min(axis=0), points.max(axis=0)
@@ -250,6 +265,8 @@ def _set_view(axes: 'Axes', drawing: MapDrawing) -> None:
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
     axes.set_aspect('equal')
+    # Below a map so narrow that two numbers would lie over each other, one has to do.
+    axes.xaxis.set_major_locator(MaxNLocator('auto', steps=[1, 2, 2.5, 5, 10], min_n_ticks=1))
 
 
 def _tidy(axes: 'Axes') -> None:

@@ -2,32 +2,42 @@
 """
 What lies beside a graph because no graph format has a place for it.
 
-    <path>.stamps.txt   `id seconds`, one line for each vertex
-    <path>.truth.txt    `id x y theta`, true poses; see `trajectory`
-    <path>.false.txt    `i j`, the vertex ids of each edge known to be a false loop
+    <path>.stamps.txt    `id seconds`, one line for each vertex
+    <path>.trusted.txt   `i j`, the vertex ids of each loop that is never doubted
+    <path>.truth.txt     `id x y theta`, true poses; see `trajectory`
+    <path>.false.txt     `i j`, the vertex ids of each edge known to be a false loop
 """
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.graph import BetweenFactors
 from l1slam_ros.core.manifold import Indices
+from l1slam_ros.core.noise import Mask
 from l1slam_ros.io.files import (
     parse_rows,
+    put_lines,
     quoted,
     read_lines,
+    replacing,
     stamp_from_text,
     stamp_text,
-    write_lines,
 )
 
 
 def stamps_path(path: str | os.PathLike[str]) -> Path:
     """Return the name of the file with the stamps of a graph."""
     return _beside(path, 'stamps')
+
+
+def trusted_path(path: str | os.PathLike[str]) -> Path:
+    """Return the name of the file with the trusted loops of a graph."""
+    return _beside(path, 'trusted')
 
 
 def truth_path(path: str | os.PathLike[str]) -> Path:
@@ -40,48 +50,111 @@ def false_loops_path(path: str | os.PathLike[str]) -> Path:
     return _beside(path, 'false')
 
 
-def write_stamps(path: Path, ids: Indices, stamps: Indices) -> None:
+def write_beside(path: str | os.PathLike[str], ids: Indices, stamps: Indices | None,
+                 factors: BetweenFactors) -> None:
     """
-    Write the stamp [ns] of each vertex: ids, stamps (n,).
+    Write the files beside a graph: ids, stamps [ns] (n,), and its factors, for trusted loops.
+
+    Without stamps, or without a trusted loop, there will be no such file. Odometry is no loop, and
+    trusted anyway.
 
     Raises
     ------
-    FileError : the file cannot be written.
+    FileError : one of them cannot be written or removed.
 
     """
-    write_lines(path, (f'{k} {stamp_text(stamp)}' for k, stamp
-                       in zip(ids.tolist(), stamps.tolist(), strict=True)))
+    stamp_lines = [] if stamps is None else _stamp_lines(ids, stamps)
+    trusted = _pairs(ids, factors)[factors.trusted & ~factors.is_odometry]
+    with (_replaced(stamps_path(path), stamp_lines),
+          _replaced(trusted_path(path), pair_lines(trusted))):
+        pass  # both are on the disk before either takes its place
 
 
-def read_stamps(path: Path, ids: Indices) -> Indices | None:
+@contextmanager
+def _replaced(path: Path, lines: list[str]) -> Iterator[None]:
+    """Let a file of these lines take its place when the block succeeds; no lines, no file."""
+    if lines:
+        with replacing(path) as temporary:
+            put_lines(temporary, lines)
+            yield
+        return
+    yield
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise FileError(path, f'cannot be removed: {error.strerror or error}') from error
+
+
+def _stamp_lines(ids: Indices, stamps: Indices) -> list[str]:
+    return [f'{k} {stamp_text(stamp)}' for k, stamp
+            in zip(ids.tolist(), stamps.tolist(), strict=True)]
+
+
+def read_stamps(path: str | os.PathLike[str], ids: Indices) -> Indices | None:
     """
-    Return the stamps [ns] of the vertices `ids` (n,), or None where there is no such file.
+    Return the stamps [ns] of the vertices `ids` (n,) of a graph; None without a file of them.
 
     Raises
     ------
     FileError : the file is damaged, or is not about these vertices.
 
     """
-    if not path.exists():
+    side = stamps_path(path)
+    if not side.exists():
         return None
-    lines = read_lines(path)
+    lines = read_lines(side)
     stamp_of = {}
     for number, text in zip(lines.numbers, lines.texts, strict=True):
         try:
             name, stamp = text.split()
             stamp_of[int(name)] = stamp_from_text(stamp)
         except ValueError as error:
-            raise FileError(path, f'{quoted(text)}; expected a vertex id and seconds',
+            raise FileError(side, f'{quoted(text)}; expected a vertex id and seconds',
                             number) from error
     if len(lines.texts) != len(ids) or stamp_of.keys() != set(ids.tolist()):
-        raise FileError(path, f'{len(lines.texts)} stamps that are not those of the {len(ids)} '
+        raise FileError(side, f'{len(lines.texts)} stamps that are not those of the {len(ids)} '
                         'vertices; expected one for each, or no such file')
     return np.array([stamp_of[k] for k in ids.tolist()], np.int64)
 
 
-def false_loop_lines(pairs: Indices) -> Iterable[str]:
-    """Return the lines of a file of false loops: pairs (k, 2) of vertex ids."""
-    return (f'{i} {j}' for i, j in pairs.tolist())
+def read_trusted(path: str | os.PathLike[str], ids: Indices, factors: BetweenFactors) -> Mask:
+    """
+    Return which factors of a graph are trusted loops, (m,) bool; none without a file of them.
+
+    All loops between two vertices that the file names are, either way round; ids : (n,) of the
+    keyframes.
+
+    Raises
+    ------
+    FileError : naming the line, when the file is damaged or names vertices without an edge.
+
+    """
+    side = trusted_path(path)
+    if not side.exists():
+        return np.zeros(len(factors), bool)
+    lines = read_lines(side)
+    named = parse_rows(side, 'trusted loop', lines, ids=2, values=0)[0]
+    # Ids may be any 64 bits, so pairs of them are numbered anew.
+    both = np.sort(np.concatenate((_pairs(ids, factors), named)), axis=1)
+    number = np.unique(both, axis=0, return_inverse=True)[1].ravel()  # NumPy 2.0: (m, 1)
+    edges, trusted = number[:len(factors)], number[len(factors):]
+    unknown = ~np.isin(trusted, edges)
+    if unknown.any():
+        k = int(np.argmax(unknown))
+        raise FileError(side, f'no edge between {named[k, 0]} and {named[k, 1]} in {path}; '
+                        'expected its trusted loops, or no such file', lines.numbers[k])
+    return np.asarray(np.isin(edges, trusted) & ~factors.is_odometry)
+
+
+def _pairs(ids: Indices, factors: BetweenFactors) -> Indices:
+    """Return the vertex ids i, j of each factor, (m, 2)."""
+    pairs: Indices = ids[np.stack((factors.i, factors.j), axis=1)]
+    return pairs
+
+
+def pair_lines(pairs: Indices) -> list[str]:
+    """Return the lines of a file of loops, false or trusted: pairs (k, 2) of vertex ids."""
+    return [f'{i} {j}' for i, j in pairs.tolist()]
 
 
 def read_false_loops(path: Path) -> Indices:
