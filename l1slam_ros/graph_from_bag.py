@@ -12,11 +12,10 @@ from l1slam_ros.core.errors import FileError, MessageError
 from l1slam_ros.core.growth import GraphGrowth, GrowthOptions
 from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.io.bag import BagMessage, bag_summary, read_messages, read_note
-from l1slam_ros.io.graph_bag import GRAPH_NOTE, LOOP_TOPIC, ODOMETRY_TOPIC
+from l1slam_ros.io.graph_bag import GRAPH_NOTE, LOOP_TOPIC, ODOMETRY_TOPIC, TRUSTED_LOOP_TOPIC
 from l1slam_ros.io.graph_file import GraphRecord
 from l1slam_ros.io.messages import loop_closure, odometry_sample
 
-TRUSTED_LOOP_TOPIC = '/trusted_loop_closures'
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 _LOOP = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 

@@ -14,6 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from l1slam_ros.core import se2
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.graph_from_bag import DEFAULT_TOPICS, graph_from_bag
 from l1slam_ros.io.bag import read_note
 from l1slam_ros.io.graph_bag import GRAPH_NOTE, write_graph_bag
 from l1slam_ros.io.graph_file import GraphRecord, read_graph_file
@@ -102,6 +103,23 @@ def test_a_graph_comes_back(tmp_path, rng, read):
     assert all(time == stamp_of(m.header) for _, time, m in messages)
     frames = [(m.header.frame_id, m.child_frame_id) for t, _, m in messages if t == '/odom']
     assert set(frames) == {('odom', 'base_link')}
+
+
+def test_loops_that_are_trusted_have_their_own_topic(tmp_path, rng):
+    record = record_of([(0, 1), (1, 2), (0, 2), (2, 3), (1, 3)], rng)
+    factors, trusting = record.graph.between, FactorGraph(se2)
+    trusting.add_poses(4)
+    trusting.add_between(factors.i, factors.j, factors.measurement,
+                         factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information,
+                         np.array([True, False, False, False, True]))
+    write_graph_bag(tmp_path / 'bag', replace(record, graph=trusting))
+    topics = [topic for topic, _, _ in read_with_rosbags(tmp_path / 'bag')]
+    assert topics == ['/odom', '/odom', '/odom', '/loop_closures', '/odom',
+                      '/trusted_loop_closures']
+    read = graph_from_bag(tmp_path / 'bag', None, DEFAULT_TOPICS).graph.between
+    pairs = zip(read.i.tolist(), read.j.tolist(), strict=True)
+    loops = dict(zip(pairs, read.trusted.tolist(), strict=True))
+    assert loops[0, 2] is False and loops[1, 3] is True
 
 
 @pytest.mark.parametrize('name', ['intel', 'city10000'])

@@ -3,7 +3,8 @@
 A graph as the messages of a bag, such that it can be had back exactly.
 
     /odom            one nav_msgs/Odometry per keyframe: the odometry factors, chained
-    /loop_closures   one geometry_msgs/PoseWithCovarianceStamped per other factor
+    /loop_closures   one geometry_msgs/PoseWithCovarianceStamped per other factor;
+                     /trusted_loop_closures for those that are never doubted
     /ground_truth    geometry_msgs/PoseStamped, where the truth is known
 
 Covariances are those of the factors, in the axes of the measured pose: of an odometry message
@@ -26,6 +27,7 @@ from l1slam_ros.io.trajectory import invented_stamps
 
 ODOMETRY_TOPIC = '/odom'
 LOOP_TOPIC = '/loop_closures'
+TRUSTED_LOOP_TOPIC = '/trusted_loop_closures'
 TRUTH_TOPIC = '/ground_truth'
 # What `bag.read_note` returns for a graph.
 GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
@@ -84,10 +86,13 @@ class _FactorWriter:
         self._covariances = roots @ roots.transpose(0, 2, 1)
         rows = np.array(manifold.COVARIANCE_ROWS)
         self._entries = (6 * rows[:, None] + rows).ravel()
+        self._topics = [TRUSTED_LOOP_TOPIC if trusted else LOOP_TOPIC
+                        for trusted in (graph.between.trusted & ~graph.between.is_odometry)]
         self._odometry = _blank_odometry(writer.types, odom_frame, base_frame)
         self._loop = _blank_loop(writer.types)
-        for topic, message in ((ODOMETRY_TOPIC, self._odometry), (LOOP_TOPIC, self._loop)):
-            writer.add_topic(topic, message.__msgtype__)
+        writer.add_topic(ODOMETRY_TOPIC, self._odometry.__msgtype__)
+        for topic in sorted({LOOP_TOPIC, *self._topics}):
+            writer.add_topic(topic, self._loop.__msgtype__)
 
     def write_odometry(self, stamp: int, pose3: list[float], step: int | None) -> None:
         """Write a pose of the odometry; step : the factor that leads there, None at the start."""
@@ -100,7 +105,7 @@ class _FactorWriter:
         _fill(self._loop.header, self._loop.pose.pose, stamp, self._measured[loop])
         self._loop.header.frame_id = reference_frame_id(self._base_frame, reference_stamp)
         self._loop.pose.covariance = self._covariance(loop)
-        self._writer.write(LOOP_TOPIC, stamp, self._loop)
+        self._writer.write(self._topics[loop], stamp, self._loop)
 
     def _covariance(self, factor: int | None) -> Array:
         """Return the 36 entries of a message; zero without a factor."""
