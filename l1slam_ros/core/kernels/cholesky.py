@@ -116,7 +116,11 @@ def _subtract(panels, top, inner, height, columns, place, target, size):
             r1, r2 = min(r + 1, height - 1), min(r + 2, height - 1)
             left = (source[r * inner:(r + 1) * inner], source[r1 * inner:(r1 + 1) * inner],
                     source[r2 * inner:(r2 + 1) * inner])
-            tile = _narrow_tile(left, right, size) if inner == len(size) else _tile(left, right)
+            # Most panels of sparse graphs are as wide as a block.
+            if inner == len(size):
+                tile = _tile(left, right, size)
+            else:
+                tile = _tile(left, right, left[0])
             _write(panels[place[r]:], target[c], target[c1], target[c2], c1 > c, c2 > c1, tile[0])
             if r1 > r:
                 _write(panels[place[r1]:], target[c], target[c1], target[c2], c1 > c, c2 > c1,
@@ -137,33 +141,16 @@ def _write(row, t0, t1, t2, has_second, has_third, values):
 
 
 @compiled
-def _tile(left, right):
-    """Return the nine inner products of three rows with three rows."""
+def _tile(left, right, along):
+    """
+    Return the nine inner products of three rows with three rows, each as long as `along`.
+
+    A row, or a tuple, whose length the compiler knows: then the loop is unrolled.
+    """
     left0, left1, left2 = left
     right0, right1, right2 = right
     s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = 0.0
-    for q in range(len(left0)):
-        x0, x1, x2 = left0[q], left1[q], left2[q]
-        y0, y1, y2 = right0[q], right1[q], right2[q]
-        s00 += x0 * y0
-        s01 += x0 * y1
-        s02 += x0 * y2
-        s10 += x1 * y0
-        s11 += x1 * y1
-        s12 += x1 * y2
-        s20 += x2 * y0
-        s21 += x2 * y1
-        s22 += x2 * y2
-    return (s00, s01, s02), (s10, s11, s12), (s20, s21, s22)
-
-
-@compiled
-def _narrow_tile(left, right, size):
-    """Return `_tile` of rows as long as a block, most of them on sparse graphs: unrolled."""
-    left0, left1, left2 = left
-    right0, right1, right2 = right
-    s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = 0.0
-    for q in range(len(size)):
+    for q in range(len(along)):
         x0, x1, x2 = left0[q], left1[q], left2[q]
         y0, y1, y2 = right0[q], right1[q], right2[q]
         s00 += x0 * y0
@@ -216,7 +203,7 @@ def _update_strip(panel, height, width, c, strip):
         r1, r2 = min(r + 1, height - 1), min(r + 2, height - 1)
         left = (panel[r * width:r * width + c], panel[r1 * width:r1 * width + c],
                 panel[r2 * width:r2 * width + c])
-        tile = _tile(left, right)
+        tile = _tile(left, right, left[0])
         _write(panel[r * width:], c, c1, c2, strip > 1, strip > 2, tile[0])
         if r1 > r:
             _write(panel[r1 * width:], c, c1, c2, strip > 1, strip > 2, tile[1])
