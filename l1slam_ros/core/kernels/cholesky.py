@@ -117,10 +117,7 @@ def _subtract(panels, top, inner, height, columns, place, target, size):
             left = (source[r * inner:(r + 1) * inner], source[r1 * inner:(r1 + 1) * inner],
                     source[r2 * inner:(r2 + 1) * inner])
             # Most panels of sparse graphs are as wide as a block.
-            if inner == len(size):
-                tile = _tile(left, right, size)
-            else:
-                tile = _tile(left, right, left[0])
+            tile = _tile(left, right, size) if inner == len(size) else _tile(left, right, left[0])
             _write(panels[place[r]:], target[c], target[c1], target[c2], c1 > c, c2 > c1, tile[0])
             if r1 > r:
                 _write(panels[place[r1]:], target[c], target[c1], target[c2], c1 > c, c2 > c1,
