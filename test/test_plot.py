@@ -118,7 +118,7 @@ def test_whatever_the_shape_the_legend_is_below_the_name_of_the_axis(tmp_path, s
     found = places(path)
     # Where there are several maps: of the one on the left.
     legend = [min((x, y) for word, x, y in found if word == entry)
-              for entry in ('odometry', 'truth', 'loops', 'optimised', 'rejected loops')]
+              for entry in ('odometry', 'truth', 'rejected loops', 'loops', 'optimised')]
     label_x, label = min((x, y) for word, x, y in found if word == 'x [m]')
     assert len({y for _, y in legend}) == 1
     below = legend[0][1]

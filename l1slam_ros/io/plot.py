@@ -178,16 +178,19 @@ def _draw_mark(axes: 'Axes', iteration: float, cost: float, word: str, colour: s
 
 
 def _draw_map(axes: 'Axes', drawing: MapDrawing) -> None:
-    """Draw from the ground up: what was believed, what is true, what came out, what did not."""
+    """Draw from the ground up: what was believed, what is true, what is refused, what came out."""
     if drawing.odometry is not None:
         _draw_path(axes, drawing.odometry, 'odometry', _GREY, 0.7, zorder=1,
                    opacity=_opacity(len(drawing.odometry)))
     if drawing.truth is not None:
         _draw_path(axes, drawing.truth, 'truth', _ORANGE, 2.8, zorder=2)
-    _draw_pairs(axes, drawing.positions, drawing.loops, 'loops', _GREEN, zorder=3)
-    _draw_path(axes, drawing.positions, drawing.name, _BLUE, 1.0, zorder=4)
-    _draw_pairs(axes, drawing.positions, drawing.false, 'false loops', _RED, zorder=5)
-    _draw_pairs(axes, drawing.positions, drawing.rejected, 'rejected loops', _RED, zorder=5)
+    # Lines right across the map are under it, and the fainter the more there are.
+    for pairs, label in ((drawing.false, 'false loops'), (drawing.rejected, 'rejected loops')):
+        _draw_pairs(axes, drawing.positions, pairs, label, _RED, zorder=3,
+                    opacity=float(np.clip(50 / max(len(pairs), 1), 0.08, 0.8)))
+    _draw_pairs(axes, drawing.positions, drawing.loops, 'loops', _GREEN, zorder=4,
+                opacity=_opacity(len(drawing.loops)))
+    _draw_path(axes, drawing.positions, drawing.name, _BLUE, 1.0, zorder=5)
     axes.plot(*drawing.positions[0, :2], 'o', color=_BLUE, markersize=5, zorder=6)
     axes.set_title(drawing.title, loc='left', fontweight='bold', pad=24)
     axes.annotate(_small_print(drawing), (0, 1), (0, 7), xycoords='axes fraction',
@@ -229,7 +232,8 @@ def _draw_path(
 
 
 def _draw_pairs(
-    axes: 'Axes', positions: Array, pairs: Indices, label: str, colour: str, zorder: int
+    axes: 'Axes', positions: Array, pairs: Indices, label: str, colour: str, zorder: int,
+    opacity: float,
 ) -> None:
     """Draw loops as lines between the positions they join, evenly thinned out if too many."""
     from matplotlib.collections import LineCollection
@@ -240,14 +244,14 @@ def _draw_pairs(
     shown = pairs[np.linspace(0, len(pairs) - 1, count).astype(np.int64)]
     # Without `rasterized` an .svg or .pdf of a large graph takes minutes to open.
     axes.add_collection(LineCollection(list(positions[shown][:, :, :2]), colors=colour,
-                                       linewidths=0.8, alpha=_opacity(count), zorder=zorder,
+                                       linewidths=0.8, alpha=opacity, zorder=zorder,
                                        rasterized=True), autolim=False)
     axes.plot([], [], color=colour, linewidth=1.2, label=label)
 
 
 def _opacity(count: int) -> float:
     """Return a fainter opacity the more lines there are, so that none drowns the others."""
-    return float(np.clip(25 / math.sqrt(count), 0.3, 0.8))
+    return float(np.clip(25 / math.sqrt(max(count, 1)), 0.3, 0.8))
 
 
 def _set_view(axes: 'Axes', drawing: MapDrawing) -> None:
