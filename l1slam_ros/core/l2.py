@@ -107,7 +107,7 @@ def _gauss_newton(
         candidate = step_poses(graph, poses, step)
         moved = whitened_residual(graph, candidate)
         cost = cost_of(moved)
-        decrease, full = history[-1] - cost, not damping
+        decrease, full = history[-1] - cost, damping <= _FIRST_DAMPING
         if decrease >= 0:
             poses, residual = candidate, moved
             damping = damping / 10 if damping > _FIRST_DAMPING else 0.0
@@ -115,7 +115,7 @@ def _gauss_newton(
             damping, cost = max(10 * damping, _FIRST_DAMPING), history[-1]
         history.append(cost)
         report(len(history) - 1, cost)
-        # At the optimum rounding may let the cost rise by its last digits.
+        # By a step as good as undamped; at the optimum rounding may let the cost rise a little.
         if full and abs(decrease) <= options.tolerance * cost:
             status = Status.CONVERGED
             break
