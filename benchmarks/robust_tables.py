@@ -50,8 +50,8 @@ def _introduction(recorded: Mapping[str, Any]) -> Lines:
         'look like chance to one who knew all others and the noise); `online-`: pose by pose.',
         '- **error**: position, RMSE after alignment, to the map that the same solver makes of '
         'the clean graph (from its L2 map: the optimum, not where a bad start leads). A map '
-        f'**holds** when that is at most: {limits}. (Where no loop is believed at all, both are the '
-        'odometry, and that says nothing: see **told apart**.)',
+        f'**holds** when that is at most: {limits}. (Where no loop is believed at all, both are '
+        'the odometry, and that says nothing: see **told apart**.)',
         '- **told apart**: runs that keep no more than '
         f'{MOST_KEPT:.1%} of the false loops and lose no more than {MOST_LOST:.0%} of the true '
         'ones. **Precision**: part of what is believed that is true; **recall**: part of the true '
