@@ -239,12 +239,17 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Impro
     """
     start = time.monotonic()
     deadline = start + budget
-    belief, poses = _judged(problem, deadline)
+    belief, starts = problem.belief, [problem.poses]
+    if not belief.settled:
+        belief, judged = judge(problem.graph, problem.poses, belief, deadline)
+        # After a loop has closed, the L2 map of the judgement is nearer.
+        starts.append(judged)
     graph = problem.graph.subset(belief.accepted)
     size = graph.manifold.TANGENT_SIZE
     dual = problem.dual.reshape(-1, size)[belief.accepted].ravel()
-    before = l1_cost(whitened_residual(graph, problem.poses))
-    cost = l1_cost(whitened_residual(graph, poses))
+    costs = [l1_cost(whitened_residual(graph, poses)) for poses in starts]
+    before, cost = costs[0], min(costs)
+    poses = starts[costs.index(cost)]
     steps, far = 0, is_far(cost, problem.last_cost)
     cholesky = cholesky_of(graph) if far else None
     while cholesky and far and (not steps or time.monotonic() < deadline):
@@ -256,18 +261,6 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Impro
         far = is_far(previous, cost)
     solution = minimise(graph, poses, options, cholesky, dual, deadline)
     return _improvement(solution, problem, belief, before, steps, start)
-
-
-def _judged(problem: Problem, deadline: float) -> tuple[Belief, Array]:
-    """Return what to believe of the loops, those that have come judged, and poses to begin at."""
-    belief, poses = problem.belief, problem.poses
-    if belief.settled:
-        return belief, poses
-    belief, judged = judge(problem.graph, poses, belief, deadline)
-    graph = problem.graph.subset(belief.accepted)
-    # After a loop has closed, the L2 map of the judgement is nearer.
-    costs = [l1_cost(whitened_residual(graph, each)) for each in (poses, judged)]
-    return belief, judged if costs[1] < costs[0] else poses
 
 
 def optimise(problem: Problem, options: OptimiserOptions) -> Improvement:
