@@ -6,9 +6,9 @@ import pytest
 from lies import careful_world, is_false, spoilt
 
 from l1slam_ros.core import se2
-from l1slam_ros.core.accord import accord, ends_in_time, spanned, weakest_steps
+from l1slam_ros.core.accord import accord, spanned, weakest_steps
 from l1slam_ros.core.belief import DOUBT
-from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.graph import FactorGraph, ends_in_time
 from l1slam_ros.core.robust_growth import Growth
 
 STEP = 200

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.special import gammainc
 
 from l1slam_ros.core.belief import DOUBT
-from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.graph import FactorGraph, ends_in_time
 from l1slam_ros.core.linearise import anchor
-from l1slam_ros.core.manifold import Array, Indices
+from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.noise import whiten
 from l1slam_ros.core.prediction import Posterior, claimed_volume, log_likelihood_ratio
 from l1slam_ros.core.robust_growth import Growth
@@ -32,8 +32,7 @@ def accord(growth: Growth) -> tuple[Indices, float]:
     None, where the volume that false loops could fill says that it is chance. Else also how
     probable so large a camp is by what loops elsewhere agree upon: lies can have a pattern.
     """
-    rows = growth.undecided()
-    rows = rows[growth.is_loop[rows]]
+    rows = growth.undecided_loops()
     if not len(rows):
         return rows, 1.0
     rows = growth.some(rows[growth.innovations(rows).square > growth.gate()], _ASKED)
@@ -102,18 +101,20 @@ def agreement(
     from l1slam_ros.core.kernels.prediction import normalise
 
     manifold, (a, b) = graph.manifold, np.triu_indices(len(graph.between), 1)
-    error = _difference(graph, poses, a, b)
+    ends = ends_in_time(graph)
+    error = _difference(manifold, ends, poses, a, b)
     scatter = np.linalg.pinv(error.T @ error, hermitian=True)
     near = np.argsort(np.einsum('mi,ij,mj->m', error, scatter, error), kind='stable')
     near = near[: _NEAREST * len(graph.between)]
     a, b, error = a[near], b[near], error[near]
     roots, fixed = graph.between.sqrt_information[b], anchor(graph)
-    there = manifold.retract(manifold.identity(len(a)), error)
+    start = manifold.identity(len(a))
+    there = manifold.retract(start, error)
     k, steps = manifold.TANGENT_SIZE, posterior.samples[:-1].transpose(2, 0, 1)
     covariance = np.tile(2 * np.eye(k), (len(a), 1, 1))
     for step in steps:
         moved = np.concatenate((poses[:fixed], manifold.retract(poses[fixed:], step)))
-        here = manifold.retract(manifold.identity(len(a)), _difference(graph, moved, a, b))
+        here = manifold.retract(start, _difference(manifold, ends, moved, a, b))
         change = whiten(roots, manifold.local(there, here))
         covariance += change[:, :, None] * change[:, None, :] / len(steps)
     square, log_det = normalise(covariance, whiten(roots, error))
@@ -125,16 +126,15 @@ def agreement(
     return np.stack((a, b), 1).ravel(), np.stack((b, a), 1).ravel(), np.repeat(log_ratio, 2)
 
 
-def _difference(graph: FactorGraph, poses: Array, a: Indices, b: Indices) -> Array:
-    """Return t2v(Z_b^-1 Z) for pairs of factors, (pairs, k); Z : what follows from a for b."""
-    manifold, (low, high, Z) = graph.manifold, ends_in_time(graph)
+def _difference(
+    manifold: Manifold, ends: tuple[Indices, Indices, Array], poses: Array, a: Indices, b: Indices
+) -> Array:
+    """
+    Return t2v(Z_b^-1 Z) for pairs of factors, (pairs, k); Z : what follows from a for b.
+
+    ends : of `ends_in_time`
+    """
+    low, high, Z = ends
     first = manifold.between(poses[low[b]], poses[low[a]])
     second = manifold.between(poses[high[a]], poses[high[b]])
     return manifold.local(Z[b], manifold.compose(manifold.compose(first, Z[a]), second))
-
-
-def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:
-    """Return of all between factors the earlier and later keyframe (m,), and that from this."""
-    i, j, Z = graph.between.i, graph.between.j, graph.between.measurement
-    forward = np.where((i > j)[:, None], graph.manifold.inverse(Z), Z)
-    return np.minimum(i, j), np.maximum(i, j), forward

@@ -184,3 +184,10 @@ def component_labels(graph: FactorGraph) -> Indices:
                           shape=(graph.n_poses, graph.n_poses))
     labels: Indices = connected_components(adjacency, directed=False)[1]
     return labels
+
+
+def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:
+    """Return of all between factors the earlier and later keyframe (m,), and that from this."""
+    i, j, Z = graph.between.i, graph.between.j, graph.between.measurement
+    forward = np.where((i > j)[:, None], graph.manifold.inverse(Z), Z)
+    return np.minimum(i, j), np.maximum(i, j), forward

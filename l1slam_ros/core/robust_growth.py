@@ -6,6 +6,7 @@ In: a graph and what is believed of it. Out: the same with more loops believed. 
 """
 
 import copy
+from functools import cached_property
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from l1slam_ros.core.belief import (
     one_of_each_group,
 )
 from l1slam_ros.core.cholesky import BlockCholesky, cholesky_of
-from l1slam_ros.core.graph import FactorGraph, component_labels
+from l1slam_ros.core.graph import FactorGraph, component_labels, ends_in_time
 from l1slam_ros.core.initial import odometry_poses
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.least_squares import weighted_least_squares
@@ -61,9 +62,8 @@ class Growth:
     The state of a robust solve.
 
     accepted, is_loop, trusted : (m,) bool of the between factors; low, high : (m,) the earlier and
-    the later keyframe of each; poses : (n, p) the L2 map of the
-    accepted; posterior : of these; variance : (2,) of odometry and loops in units of what they
-    state.
+    the later keyframe of each; poses : (n, p) the L2 map of the accepted; posterior : of these;
+    variance : (2,) of odometry and loops in units of what they state.
     """
 
     def __init__(self, graph: FactorGraph):
@@ -78,6 +78,11 @@ class Growth:
         self._least_variance = 0.0
         self.posterior: Posterior
         self._drops = np.zeros(len(self.factors), np.int64)
+
+    @cached_property
+    def forward(self) -> Array:
+        """The measurement of the later keyframe from the earlier one, (m, p)."""
+        return ends_in_time(self.graph)[2]
 
     def begin(self) -> None:
         """Solve for what is accepted, and learn from the loops how large their noise is."""
@@ -121,6 +126,11 @@ class Growth:
         """Return the factors that may yet be accepted, (k,)."""
         undecided: Indices = np.flatnonzero(~self.accepted & (self._drops < _CHANCES))
         return undecided
+
+    def undecided_loops(self) -> Indices:
+        """Return the loops among them, (k,)."""
+        rows = self.undecided()
+        return rows[self.is_loop[rows]]
 
     def gate(self, factors: int = 1) -> float:
         """Return what the squared innovation of so many true factors stays below."""

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from l1slam_ros.core.accord import accord, ends_in_time, weakest_steps
+from l1slam_ros.core.accord import accord, weakest_steps
 from l1slam_ros.core.belief import DOUBT, log_odds_of_false
-from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.graph import FactorGraph, ends_in_time
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.prediction import (
     chi2_quantile,
@@ -38,7 +38,7 @@ _AT_A_TIME = 20
 
 def without_slip(growth: Growth) -> Growth | None:
     """Return a state without an odometry factor that loops agree is wrong; None: there is none."""
-    if np.count_nonzero(growth.is_loop[growth.undecided()]) < VOTES:
+    if len(growth.undecided_loops()) < VOTES:
         return None
     before = np.count_nonzero(growth.accepted)
     for attempt in (_without_unusual, _without_worst, _mended):
@@ -64,13 +64,9 @@ def _is_gross(growth: Growth, left_out: Indices) -> bool:
 
 def _believe(growth: Growth) -> None:
     """Accept the loops that can be believed, round by round."""
-    news = growth.undecided()
-    while len(news):
-        rows = growth.undecided()
-        news = growth.believable(rows[growth.is_loop[rows]])
+    while len(news := growth.believable(growth.undecided_loops())):
         growth.accepted[news] = True
-        if len(news):
-            growth.settle()
+        growth.settle()
 
 
 def _across(growth: Growth, left_out: Indices) -> Indices:
@@ -84,7 +80,7 @@ def _across(growth: Growth, left_out: Indices) -> Indices:
 def _without_unusual(growth: Growth) -> Iterator[Growth]:
     """Leave out an odometry factor that moves as the robot never did."""
     rows = np.flatnonzero(growth.accepted & ~growth.is_loop)
-    square = unusual_motion(growth.graph, ends_in_time(growth.graph)[2][rows])
+    square = unusual_motion(growth.graph, growth.forward[rows])
     most = np.argsort(-square, kind='stable')[:_TRIED]
     limit = chi2_quantile(1 - DOUBT / len(rows), growth.graph.manifold.TANGENT_SIZE)
     for row in rows[most[square[most] > limit]].tolist():
@@ -161,9 +157,9 @@ def _likeliest(
     alike = np.flatnonzero(place == place[first[0]])
     moved = np.concatenate([_step_of(growth, slipped_at(step), step)
                             for step in steps[alike].tolist()])
-    measured = ends_in_time(growth.graph)[2][run[alike]]
-    gain = unusual_motion(growth.graph, measured) - unusual_motion(growth.graph, moved)
-    return int(run[alike[np.argmax(gain)]])
+    motions = np.concatenate((growth.forward[run[alike]], moved))
+    measured, mended = unusual_motion(growth.graph, motions).reshape(2, -1)
+    return int(run[alike[np.argmax(measured - mended)]])
 
 
 def _places(growth: Growth, loops: Indices, steps: Indices) -> Indices:
@@ -187,7 +183,7 @@ def _run_about(worst: int, low: Indices, suspects: Indices) -> Indices:
 def _slipped_elsewhere(growth: Growth, worst: int, step: int) -> Array:
     """Return the poses if the odometry did not slip at the factor `worst` but at another step."""
     manifold, poses = growth.graph.manifold, growth.poses
-    motion = _motion_to_fit(growth.graph, poses, worst)
+    motion = _motion_to_fit(growth, poses, worst)
     part = slice(growth.high[worst], step + 1)
     if step < growth.low[worst]:
         motion, part = manifold.inverse(motion), slice(step + 1, growth.high[worst])
@@ -205,7 +201,7 @@ def _mended(growth: Growth) -> Iterator[Growth]:
     odometry = np.flatnonzero(~growth.is_loop & np.isin(low, weakest))
     odometry = odometry[np.argsort(low[odometry], kind='stable')]
     runs = np.split(odometry, np.flatnonzero(np.diff(low[odometry]) > 1) + 1)
-    square = unusual_motion(growth.graph, ends_in_time(growth.graph)[2])
+    square = unusual_motion(growth.graph, growth.forward)
     for run in sorted(runs, key=lambda run: -square[run].max())[:_TRIED]:
         yield _mended_within(growth, agreed, run)
 
@@ -220,11 +216,11 @@ def _mended_within(growth: Growth, agreed: Indices, run: Indices) -> Growth:
     affected &= ~trial.accepted
     jury, poses = trial.some(np.flatnonzero(affected), _JURY), trial.poses
     loop = max(trial.some(agreed, _PROPOSALS).tolist(), key=lambda loop: _support(
-        trial, jury, mended(trial.graph, poses, loop, first)).sum())
+        trial, jury, _mended_poses(trial, poses, loop, first)).sum())
     # Where exactly it is, only those tell that span some of the steps.
     jury = trial.some(np.flatnonzero(affected & ((low > first) | (high <= last))), _JURY)
-    slipped = _likeliest(trial, jury, run, lambda step: mended(trial.graph, poses, loop, step))
-    trial.poses = mended(trial.graph, poses, loop, int(low[slipped]))
+    slipped = _likeliest(trial, jury, run, lambda step: _mended_poses(trial, poses, loop, step))
+    trial.poses = _mended_poses(trial, poses, loop, int(low[slipped]))
     trial.accepted[slipped] = False
     rows = np.flatnonzero(affected)
     trial.accepted[rows[_support(trial, rows, trial.poses) > 0]] = True
@@ -246,15 +242,15 @@ def _support(growth: Growth, rows: Indices, poses: Array) -> Array:
     return np.where(fits & (log_ratio > odds + np.log(1 / DOUBT - 1)), log_ratio - odds, 0.0)
 
 
-def mended(graph: FactorGraph, poses: Array, loop: int, step: int) -> Array:
+def _mended_poses(growth: Growth, poses: Array, loop: int, step: int) -> Array:
     """Return the poses, those behind a step of the odometry moved as one so that a loop fits."""
-    motion, behind = _motion_to_fit(graph, poses, loop), poses[step + 1:]
-    moved = graph.manifold.compose(np.broadcast_to(motion, behind.shape), behind)
+    motion, behind = _motion_to_fit(growth, poses, loop), poses[step + 1:]
+    moved = growth.graph.manifold.compose(np.broadcast_to(motion, behind.shape), behind)
     return np.concatenate((poses[: step + 1], moved))
 
 
-def _motion_to_fit(graph: FactorGraph, poses: Array, factor: int) -> Array:
+def _motion_to_fit(growth: Growth, poses: Array, factor: int) -> Array:
     """Return how the later end of a factor is to be moved for the factor to fit, (1, p)."""
-    manifold, (low, high, Z) = graph.manifold, ends_in_time(graph)
-    wanted = manifold.compose(poses[low[factor], None], Z[factor, None])
-    return manifold.compose(wanted, manifold.inverse(poses[high[factor], None]))
+    manifold, low, high = growth.graph.manifold, growth.low[factor], growth.high[factor]
+    wanted = manifold.compose(poses[low, None], growth.forward[factor, None])
+    return manifold.compose(wanted, manifold.inverse(poses[high, None]))
