@@ -109,7 +109,7 @@ def _refused(record: GraphRecord, outcome: offline.Outcome) -> Indices:
     factors, judgement = record.graph.between, outcome.judgement
     if judgement is None:
         return np.zeros((0, 2), np.int64)
-    pairs: Indices = record.ids[np.stack((factors.i, factors.j), axis=1)[~judgement.accepted]]
+    pairs: Indices = record.ids[factors.pairs[~judgement.accepted]]
     return pairs
 
 
@@ -195,7 +195,7 @@ def corrupt(arguments: argparse.Namespace) -> str:
     loops = FALSE_LOOPS[arguments.kind](record.graph, solution.poses, arguments.false_loops,
                                         np.random.default_rng(arguments.seed))
     factors = record.graph.between
-    pairs = np.concatenate((np.stack((factors.i, factors.j), axis=1)[former],
+    pairs = np.concatenate((factors.pairs[former],
                             np.stack((loops.i, loops.j), axis=1)))
     spoiled = offline.with_poses(replace(record, graph=insert_loops(record.graph, loops)))
     # A bag has no vertex ids: read back, it counts its keyframes from 0.

@@ -39,7 +39,7 @@ def drawing(path: Path, record: GraphRecord, poses: Array, truth_path: Path | No
         ours, reference = matching_rows(record, truth_path)
         R, t = align(positions(reference), positions(poses)[ours])
         truth = positions(reference) @ R.T + t
-    pairs, false = np.stack((factors.i, factors.j), axis=1), known_false(path, record)
+    pairs, false = factors.pairs, known_false(path, record)
     kept = np.ones(len(factors), bool) if accepted is None else accepted
     return MapDrawing(path.name, positions(poses), odometry, truth,
                       pairs[~factors.is_odometry & ~false & kept], rejected=pairs[~kept],

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The graph as RViz and Foxglove draw it: keyframes as points, factors as lines."""
 
-import numpy as np
 from geometry_msgs.msg import Point, Vector3
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
@@ -34,7 +33,7 @@ def graph_markers(frame: str, stamp: int, pose3: Array, factors: BetweenFactors,
     """
     points = [Point(x=x, y=y, z=z) for x, y, z in pose3[:, :3].tolist()]
     state = loops.state[: len(loops.rows)]
-    pairs, is_odometry = np.stack((factors.i, factors.j), axis=1), factors.is_odometry
+    pairs, is_odometry = factors.pairs, factors.is_odometry
 
     def marker(namespace: str, kind: int, size: float, colour: tuple[float, float, float],
                rows: list[int]) -> Marker:

@@ -195,7 +195,7 @@ def _measured(
 
 def _map(paper_graph: PaperGraph, graph: FactorGraph, costs: Costs) -> MapDrawing:
     factors, solution = graph.between, costs.solution
-    loops = np.stack((factors.i, factors.j), axis=1)[~factors.is_odometry]
+    loops = factors.pairs[~factors.is_odometry]
     return MapDrawing(paper_graph.name, graph.manifold.positions(solution.poses), loops=loops,
                       note=f'L1 cost {solution.cost:.6g}')
 

@@ -28,7 +28,7 @@ def verdict(record: GraphRecord, judgement: RobustMap) -> Iterator[str]:
     """Yield what was refused and why, the worst first; then what is noisier than it says."""
     factors, accepted = record.graph.between, judgement.accepted
     is_loop = ~factors.is_odometry
-    pairs = record.ids[np.stack((factors.i, factors.j), axis=1)]
+    pairs = record.ids[factors.pairs]
     for row in judgement.slips.tolist():
         yield _SLIP.format(pair=_named(pairs[row]), sigmas=judgement.sigmas[row])
     refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect)

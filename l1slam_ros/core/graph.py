@@ -39,6 +39,11 @@ class BetweenFactors:
     def __len__(self) -> int:
         return len(self.i)
 
+    @property
+    def pairs(self) -> Indices:
+        """The keyframes i and j of each, (m, 2)."""
+        return np.stack((self.i, self.j), axis=1)
+
     @cached_property
     def is_odometry(self) -> np.ndarray:
         """(m,) bool: the first factor between each two consecutive keyframes, either way round."""

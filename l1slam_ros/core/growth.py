@@ -167,7 +167,7 @@ class GraphGrowth:
         self._glued = False
         factors = graph.between
         rows = np.flatnonzero(~factors.is_odometry)
-        ends = stamps[np.stack((factors.i, factors.j), axis=1)[rows]]
+        ends = stamps[factors.pairs[rows]]
         self._note_loops(rows, np.sort(ends, axis=1))
 
     def add_loop(self, loop: LoopClosure) -> None:

@@ -188,7 +188,7 @@ def _try_loops(
     false = np.isin(pair_key(factors.i, factors.j, n), pair_key(loops.i, loops.j, n))
     compared = {method: _compared(lying, poses, clean[method].positions)
                 for method, poses in maps.items()}
-    pairs = _pairs(lying)
+    pairs = lying.between.pairs
     return LoopTrial(compared, refused=pairs[false & ~accepted], kept=pairs[false & accepted],
                      lost=pairs[~false & ~accepted])
 
@@ -204,13 +204,8 @@ def _maps(graph: FactorGraph, stored: Array) -> tuple[dict[str, Array], Mask]:
             ROBUST: robust.solution.poses}, robust.accepted
 
 
-def _pairs(graph: FactorGraph) -> Indices:
-    pairs: Indices = np.stack((graph.between.i, graph.between.j), axis=1)
-    return pairs
-
-
 def _loops(graph: FactorGraph) -> Indices:
-    loops: Indices = _pairs(graph)[~graph.between.is_odometry]
+    loops: Indices = graph.between.pairs[~graph.between.is_odometry]
     return loops
 
 

@@ -321,7 +321,7 @@ def _text(path: Path, record: GraphRecord) -> list[str]:
     if len(graph.prior):
         lines += _lines(path, graph, 'prior', ids[graph.prior.i][:, None],
                         graph.prior.measurement, graph.prior.sqrt_information)
-    pairs = ids[np.stack((graph.between.i, graph.between.j), axis=1)]
+    pairs = ids[graph.between.pairs]
     return lines + _lines(path, graph, 'between', pairs, graph.between.measurement,
                           graph.between.sqrt_information)
 

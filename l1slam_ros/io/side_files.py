@@ -64,7 +64,7 @@ def write_beside(path: str | os.PathLike[str], ids: Indices, stamps: Indices | N
 
     """
     stamp_lines = [] if stamps is None else _stamp_lines(ids, stamps)
-    trusted = _pairs(ids, factors)[factors.trusted & ~factors.is_odometry]
+    trusted = ids[factors.pairs][factors.trusted & ~factors.is_odometry]
     with (_replaced(stamps_path(path), stamp_lines),
           _replaced(trusted_path(path), pair_lines(trusted))):
         pass  # both are on the disk before either takes its place
@@ -135,7 +135,7 @@ def read_trusted(path: str | os.PathLike[str], ids: Indices, factors: BetweenFac
     lines = read_lines(side)
     named = parse_rows(side, 'trusted loop', lines, ids=2, values=0)[0]
     # Ids may be any 64 bits, so pairs of them are numbered anew.
-    both = np.sort(np.concatenate((_pairs(ids, factors), named)), axis=1)
+    both = np.sort(np.concatenate((ids[factors.pairs], named)), axis=1)
     number = np.unique(both, axis=0, return_inverse=True)[1].ravel()  # NumPy 2.0: (m, 1)
     edges, trusted = number[:len(factors)], number[len(factors):]
     unknown = ~np.isin(trusted, edges)
@@ -144,12 +144,6 @@ def read_trusted(path: str | os.PathLike[str], ids: Indices, factors: BetweenFac
         raise FileError(side, f'no edge between {named[k, 0]} and {named[k, 1]} in {path}; '
                         'expected its trusted loops, or no such file', lines.numbers[k])
     return np.asarray(np.isin(edges, trusted) & ~factors.is_odometry)
-
-
-def _pairs(ids: Indices, factors: BetweenFactors) -> Indices:
-    """Return the vertex ids i, j of each factor, (m, 2)."""
-    pairs: Indices = ids[np.stack((factors.i, factors.j), axis=1)]
-    return pairs
 
 
 def pair_lines(pairs: Indices) -> list[str]:
