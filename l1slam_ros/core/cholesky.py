@@ -10,7 +10,6 @@ every size: of the rotations alone, of the translations, of whole poses.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
 
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.graph import FactorGraph
@@ -48,21 +47,26 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int) -> Pattern:
 
     """
     from l1slam_ros.core.kernels.ordering import minimum_degree
-    from l1slam_ros.core.kernels.symbolic import panel_rows, postorder, supernodes
+    from l1slam_ros.core.kernels.symbolic import lay_out
 
-    i, j = keyframe[(keyframe < size).all(axis=1)].T
-    both = (np.concatenate((i, j)), np.concatenate((j, i)))
-    adjacency = coo_array((np.ones(2 * len(i)), both), shape=(size, size)).tocsr()
-    adjacency.sum_duplicates()
-    order, column, rows = minimum_degree(
-        adjacency.indptr.astype(np.int32), adjacency.indices.astype(np.int32), most_blocks)
+    order, column, rows = minimum_degree(*neighbours(keyframe, size), most_blocks)
     if len(order) < size:
         raise FillError(f'the factor of {size} keyframes and {len(keyframe)} factors would have '
                         f'more than {most_blocks} blocks: too many far places are joined')
-    position, parent, below, step = postorder(order, column, rows)
-    first = supernodes(parent, below)
-    start, pattern = panel_rows(first, column, rows, step, position)
-    return Pattern(position, first, start, pattern, float(((below + 1.0) ** 2).sum() / 2))
+    return Pattern(*lay_out(order, column, rows))
+
+
+def neighbours(keyframe: Indices, size: int) -> tuple[Indices, Indices]:
+    """
+    Return the neighbours of each free keyframe k, adjacent[start[k]:start[k + 1]], int32.
+
+    Each once, ascending, both ways round; keyframe, size : as in `LinearSystem`
+    """
+    i, j = keyframe[(keyframe < size).all(axis=1)].T
+    row, adjacent = np.divmod(np.unique(np.concatenate((i * size + j, j * size + i))),
+                              max(size, 1))
+    start = np.searchsorted(row, np.arange(size + 1)).astype(np.int32)
+    return start, adjacent.astype(np.int32)
 
 
 class BlockCholesky:
@@ -92,30 +96,28 @@ class BlockCholesky:
         weights : (rows,); diagonal : (columns,) or one number; curvature : (m', 2 k, 2 k) of the
         first m' factors, C their sum
         """
-        from l1slam_ros.core.kernels import blocks, cholesky
+        from l1slam_ros.core.kernels import cholesky
 
         k = system.block_size
         layout = self._layouts.get(k)
         if layout is None:
             layout = self._layouts[k] = _Layout(self.pattern, self._keyframe, k)
-        panels, sizes = layout.panels, layout.sizes
-        panels[:] = 0.0
-        blocks.add_normal(panels, system.blocks, weights.reshape(-1, k), *layout.places, sizes)
-        if curvature is not None and share:
-            blocks.add_blocks(panels, curvature, share, *layout.places, sizes)
+        if curvature is None:
+            curvature, share = np.empty((0, 2 * k, 2 * k)), 0.0
         added = np.full(system.size * k, diagonal, float).reshape(-1, k)
-        cholesky.add_diagonal(panels, *layout.diagonal, self.pattern.position, added, sizes)
+        cholesky.assemble(layout.panels, *layout.places, system.blocks, weights.reshape(-1, k),
+                          added, curvature, share, layout.size)
         self._factored = layout
-        return bool(cholesky.factorise(panels, *layout.shape, sizes) == system.size)
+        return bool(cholesky.factorise(layout.panels, *layout.shape, layout.size) == system.size)
 
     def solve(self, right: Array) -> Array:
         """Return the solution for a right hand side (columns,) by the last factorisation."""
-        from l1slam_ros.core.kernels import cholesky
+        from l1slam_ros.core.kernels.substitution import solve
 
         layout = self._factored
         assert layout is not None, 'solve before factorise'
-        x: Array = cholesky.solve(layout.panels, *layout.shape, self.pattern.position,
-                                  right.reshape(-1, len(layout.sizes)), layout.sizes)
+        x: Array = solve(layout.panels, *layout.shape, self.pattern.position,
+                         right.reshape(-1, len(layout.size)), layout.size)
         return x.ravel()
 
     def solve_many(self, right: Array) -> Array:
@@ -124,8 +126,7 @@ class BlockCholesky:
 
         layout = self._factored
         assert layout is not None, 'solve before factorise'
-        x: Array = solve_many(layout.panels, *layout.shape, self.pattern.position, right,
-                              layout.sizes)
+        x: Array = solve_many(layout.panels, *layout.shape, self.pattern.position, right)
         return x
 
 
@@ -133,32 +134,21 @@ class _Layout:
     """
     Where in memory the blocks of one size lie.
 
-    panels : all entries; shape : what describes the panels to the kernels; diagonal : address and
-    panel's width of each diagonal block, (n,); places : address and width of the three blocks of
-    each factor, (m, 3), and if the last one is turned, see `kernels.blocks.add_normal`.
+    panels : all entries; shape : what describes the panels to the kernels; places : where in them
+    the blocks of factors and keyframes are, see `kernels.symbolic.block_addresses`; size : see
+    `kernels.cholesky`.
     """
 
     def __init__(self, pattern: Pattern, keyframe: Indices, block_size: int):
-        from l1slam_ros.core.kernels.cholesky import block_addresses
+        from l1slam_ros.core.kernels.symbolic import block_addresses
 
-        k, n = block_size, len(pattern.position)
-        areas = np.diff(pattern.first) * np.diff(pattern.start) * k * k
+        # Blocks of whole poses are worth loops of their own.
+        self.size = (0,) * 3 if block_size == 3 else np.zeros(block_size)
+        areas = np.diff(pattern.first) * np.diff(pattern.start) * block_size**2
         offset = np.concatenate(([0], np.cumsum(areas))).astype(np.int64)
-        self.sizes = (0,) * k
         self.panels = np.empty(offset[-1])
         self.shape = (pattern.first, pattern.start, pattern.rows, offset)
-        row = np.arange(n)
-        self.diagonal = block_addresses(row, row, *self.shape, k)
-        free = keyframe < n
-        position = np.append(pattern.position, 0)[np.minimum(keyframe, n)]
-        address = np.full((len(keyframe), 3), -1)
-        width = np.zeros((len(keyframe), 3), np.int64)
-        address[:, :2] = np.where(free, np.append(self.diagonal[0], -1)[position], -1)
-        width[:, :2] = np.append(self.diagonal[1], 0)[position]
-        pair = np.flatnonzero(free.all(axis=1))
-        row, col = position[pair].max(axis=1), position[pair].min(axis=1)
-        address[pair, 2], width[pair, 2] = block_addresses(row, col, *self.shape, k)
-        self.places = (address, width, position[:, 0] > position[:, 1])
+        self.places = block_addresses(keyframe, pattern.position, *self.shape, block_size)
 
 
 def cholesky_of(graph: FactorGraph) -> BlockCholesky:

@@ -30,16 +30,18 @@ restarts Applegate et al. (2021), see `primal_dual`. Scaling and refinement are 
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from l1slam_ros.core.linearise import LinearSystem
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.optimality import Status, l1_cost
 from l1slam_ros.core.primal_dual import CHECK_EVERY, PrimalDualOptions, PrimalDualSolution
 from l1slam_ros.core.tiles import Single, Tiles
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 # Restart when the residual fell to this part of what it was at the first look, ...
 _ENOUGH = 0.2
@@ -60,7 +62,7 @@ _UNMEASURED = 1e-12
 
 
 def halpern_step(
-    A: csr_array, b: Array, x: Array, y: Array, y0: Array, weight: float, k: int
+    A: 'csr_array', b: Array, x: Array, y: Array, y0: Array, weight: float, k: int
 ) -> tuple[Array, Array]:
     """
     Return the next (x, y): one iteration as the page above has it, k after the restart.

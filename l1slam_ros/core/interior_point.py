@@ -73,9 +73,8 @@ class _Iterate:
 
     @property
     def gap(self) -> float:
-        from l1slam_ros.core.kernels.interior_point import gap_after
-
-        return float(gap_after(*self.bounded, self.y, self.u, self.v, 0.0, 0.0))
+        """u's + v't."""
+        return float((self.u * self.s + self.v * self.t).sum())
 
     @property
     def weights(self) -> Array:
@@ -109,7 +108,11 @@ class Optimum:
 
 @dataclass(frozen=True)
 class _Direction:
-    """A step of the poses, of the linearised residual, of y, u, v; and how far it can go."""
+    """
+    A step of the poses, of the linearised residual, of y, u, v.
+
+    primal, dual : how far it can go; gap : u's + v't there
+    """
 
     x: Array
     residual: Array
@@ -118,6 +121,7 @@ class _Direction:
     v: Array
     primal: float
     dual: float
+    gap: float
 
 
 class _Regularisation:
@@ -236,15 +240,14 @@ def _start(problem: Problem, poses: Array) -> _Iterate:
 def _step(problem: Problem, at: _Iterate, cholesky: BlockCholesky,
           regularisation: _Regularisation) -> bool:
     """Move `at` by one predictor and corrector step; False: there was no direction."""
-    from l1slam_ros.core.kernels.interior_point import advance, gap_after
+    from l1slam_ros.core.kernels.interior_point import advance
 
     n, Q = len(at.y), at.weights
     if not regularisation.factorise(problem, at, Q, cholesky):
         return False
     predictor = _direction(at, cholesky, Q, np.zeros(n), np.zeros(n))
-    reached = gap_after(*at.bounded, predictor.y, predictor.u, predictor.v, predictor.primal,
-                        predictor.dual)
-    mu = at.gap / (2 * n) * (reached / at.gap) ** 3
+    gap = at.gap
+    mu = gap / (2 * n) * (predictor.gap / gap) ** 3
     corrector = _direction(at, cholesky, Q, mu + predictor.u * predictor.y,
                            mu - predictor.v * predictor.y)
     if not np.isfinite(corrector.x).all():
@@ -265,19 +268,18 @@ def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, c1: Array,
     g, z = right_side(at.residual, *at.bounded, at.y, Q, c1, c2)
     x = cholesky.solve(-at.system.transposed_times(z))
     moved = at.system.times(x)
-    y, u, v, primal, dual = complete(*at.bounded, Q, c1, c2, g, moved)
-    return _Direction(x, moved, y, u, v, min(1.0, _FRACTION * primal),
-                      min(1.0, _FRACTION * dual))
+    y, u, v, primal, dual, gap = complete(*at.bounded, Q, c1, c2, g, moved, _FRACTION)
+    return _Direction(x, moved, y, u, v, primal, dual, gap)
 
 
 def _trusted(problem: Problem, at: _Iterate, direction: _Direction) -> tuple[float, Array, Array]:
     """Halve the primal step while the residual departs too far from its linearisation."""
-    length = direction.primal
+    length, allowed = direction.primal, _DEPARTURE * at.gap
     while True:
         poses = problem.step(at.poses, length * direction.x)
         linear = at.residual + length * direction.residual
         residual = problem.residual(poses)
         departure = l1_cost(residual - linear)
-        if departure <= _DEPARTURE * at.gap or length < _SHORTEST:
+        if departure <= allowed or length < _SHORTEST:
             return length, poses, residual
         length /= 2

@@ -9,12 +9,15 @@ the free keyframes.
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.manifold import Array, Indices
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 
 @dataclass(frozen=True)
@@ -39,8 +42,10 @@ class LinearSystem:
         return int(self.blocks.shape[-1])
 
     @cached_property
-    def A(self) -> csr_array:
+    def A(self) -> 'csr_array':
         """(rows, columns) CSR without the zeros of the blocks."""
+        from scipy.sparse import csr_array
+
         m, _, k, _ = self.blocks.shape
         values = self.blocks.transpose(0, 2, 1, 3).reshape(m * k, 2 * k)
         column = (self.keyframe[:, :, None] * k + np.arange(k)).reshape(m, 1, 2 * k)
@@ -58,7 +63,7 @@ class LinearSystem:
         padded = np.zeros((self.size + 1, k))
         padded[:-1] = x.reshape(-1, k)
         product = np.empty((len(self.blocks), k))
-        multiply(self.keyframe, self.blocks, padded, product, (0,) * k)
+        multiply(self.keyframe, self.blocks, padded, product)
         return product.ravel()
 
     def transposed_times(self, y: Array) -> Array:
@@ -67,7 +72,7 @@ class LinearSystem:
 
         k = self.block_size
         product = np.zeros((self.size + 1, k))
-        multiply_transposed(self.keyframe, self.blocks, y.reshape(-1, k), product, (0,) * k)
+        multiply_transposed(self.keyframe, self.blocks, y.reshape(-1, k), product)
         return product[:-1].ravel()
 
     def gradients(self, y: Array) -> Array:

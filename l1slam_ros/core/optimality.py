@@ -6,11 +6,14 @@ Nothing here trusts what a solver says of its own result.
 """
 
 from enum import Enum
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from l1slam_ros.core.manifold import Array
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 
 class Status(str, Enum):
@@ -52,7 +55,7 @@ def fits_exactly(cost: float, rows: int) -> bool:
     return cost <= 1e-9 * rows
 
 
-def duality_gap(A: csr_array, b: Array, x: Array, y: Array, box: Array) -> float:
+def duality_gap(A: 'csr_array', b: Array, x: Array, y: Array, box: Array) -> float:
     """
     Bound how far x is from the best step inside a box: |x_j| <= box_j.
 

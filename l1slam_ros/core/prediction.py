@@ -74,14 +74,13 @@ def sample_posterior(
         raise GraphError('the normal matrix is singular: a part of the graph is not tied to '
                          'the anchor, or weights differ beyond double precision')
     m, k = len(system.blocks), system.block_size
-    sizes = (0,) * k
     # Signs have the covariance of white noise, and are quicker to draw.
     noise = 2.0 * rng.integers(0, 2, (m, k, SAMPLES), dtype=np.int8) - 1.0
     right = np.zeros((system.size + 1, k, SAMPLES))
-    gather(system.keyframe, system.blocks, noise, right, sizes)
+    gather(system.keyframe, system.blocks, noise, right)
     samples = np.zeros_like(right)
     samples[:-1] = cholesky.solve_many(right[:-1])
-    moment = left_over(system.keyframe, system.blocks, samples, noise, sizes)
+    moment = left_over(system.keyframe, system.blocks, samples, noise)
     count = len(graph.between)
     return Posterior(cholesky, samples, -system.b.reshape(m, k)[:count], moment[:count])
 
@@ -135,8 +134,7 @@ class Innovations:
 
         system, k = self.system, self.system.block_size
         rows, place = np.unique(np.concatenate((first, second)), return_inverse=True)
-        moved = prediction.moved(system.keyframe[rows], system.blocks[rows], posterior.samples,
-                                 (0,) * k)
+        moved = prediction.moved(system.keyframe[rows], system.blocks[rows], posterior.samples)
         residual = -system.b.reshape(-1, k)[rows]
         pairs = place.reshape(2, -1)
         both = np.concatenate((moved[pairs[0]], moved[pairs[1]]), axis=1)
@@ -159,7 +157,7 @@ def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
     count = len(graph.between)
     system = _between_part(linearise(graph, poses), count)
     k = system.block_size
-    covariance = prediction.spreads(system.keyframe, system.blocks, posterior.samples, (0,) * k)
+    covariance = prediction.spreads(system.keyframe, system.blocks, posterior.samples)
     covariance += np.eye(k)
     square, log_det = prediction.normalise(covariance, -system.b.reshape(count, k))
     roots = np.diagonal(graph.between.sqrt_information, axis1=1, axis2=2)
@@ -179,10 +177,10 @@ def exact_squares(graph: FactorGraph, poses: Array, posterior: Posterior) -> Arr
     k = system.block_size
     right = np.zeros((system.size + 1, k, count * k))
     rows = np.eye(count * k).reshape(count, k, count * k)
-    prediction.gather(system.keyframe, system.blocks, rows, right, (0,) * k)
+    prediction.gather(system.keyframe, system.blocks, rows, right)
     solved = np.zeros_like(right)
     solved[:-1] = posterior.cholesky.solve_many(right[:-1])
-    every = prediction.moved(system.keyframe, system.blocks, solved, (0,) * k)
+    every = prediction.moved(system.keyframe, system.blocks, solved)
     own = np.arange(count)
     covariance = np.eye(k) + every.reshape(count, k, count, k)[own, :, own]
     square: Array = prediction.normalise(covariance, -system.b.reshape(count, k))[0]

@@ -19,13 +19,16 @@ Pock and Chambolle (2011), lemma 2 with alpha = 1, for the diagonal step sizes. 
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.core.optimality import Status, duality_gap, l1_cost
 from l1slam_ros.core.options import Options, option
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 # Iterations between two looks at the stopping test, which costs as much as one iteration.
 CHECK_EVERY = 40
@@ -63,7 +66,7 @@ class PrimalDualSolution:
 
 
 def primal_dual(
-    K: csr_array,
+    K: 'csr_array',
     dual_resolvent: Resolvent,
     primal_resolvent: Resolvent,
     x: Array,
@@ -97,7 +100,7 @@ def primal_dual(
         yield x, y
 
 
-def diagonal_step_sizes(A: csr_array) -> tuple[Array, Array]:
+def diagonal_step_sizes(A: 'csr_array') -> tuple[Array, Array]:
     """Return tau_j = 1 / sum_i |A_ij| (columns,), sigma_i = 1 / sum_j |A_ij| (rows,)."""
     magnitude = abs(A)
     # Nothing moves with an empty column; an empty row's dual is to jump to its bound.
@@ -105,7 +108,7 @@ def diagonal_step_sizes(A: csr_array) -> tuple[Array, Array]:
             _inverse(magnitude.sum(axis=1), where_zero=1 / np.finfo(float).eps))
 
 
-def primal_weight(A: csr_array, b: Array, x: Array) -> float:
+def primal_weight(A: 'csr_array', b: Array, x: Array) -> float:
     """
     Return omega = 1 / mean_i(|A x - b|_i / max_j |A_ij|) [1/m, 1/rad].
 
@@ -118,7 +121,7 @@ def primal_weight(A: csr_array, b: Array, x: Array) -> float:
 
 
 def minimise_l1(
-    A: csr_array,
+    A: 'csr_array',
     b: Array,
     x: Array,
     y: Array,

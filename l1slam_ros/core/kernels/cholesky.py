@@ -1,36 +1,98 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Supernodal Cholesky of a sparse matrix of d x d blocks: factorisation and solution.
+Supernodal Cholesky of a sparse matrix of k x k blocks: assembly and factorisation.
 
 Panels are dense, row after row: entry (r, c) of panel s is panels[offset[s] + r width + c].
 Left-looking: each supernode gathers what all earlier ones subtract from it, then is factored; all
 the work is done in tiles of 3 x 3 inner products, which reuse what they load and suit blocks of
-three and of six. Source: Ng and Peyton, "Block sparse Cholesky algorithms on advanced uniprocessor
-computers" (1993).
+three and of six.
+
+`size` is k zeros. As a tuple its length is known when a loop is compiled, so that loops over the
+rows of a block are unrolled; as an array it serves blocks of every other size.
+
+Source: Ng and Peyton, "Block sparse Cholesky algorithms on advanced uniprocessor computers"
+(1993).
 """
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import compiled
+from l1slam_ros.core.kernels.compiled import compiled, loop
 
 # A pivot that is left with less than this part of its diagonal entry is rounding.
 _SINGULAR = 1e-13
 
 
-@compiled
-def block_addresses(row, col, first, start, pattern, offset, d):
-    """Return where the blocks (row, col) lie in the panels, and the panel's width, (m,) each."""
-    address, width = np.empty(len(row), np.int64), np.empty(len(row), np.int64)
-    supernode = np.searchsorted(first, col, side='right') - 1
-    for k in range(len(row)):
-        s = supernode[k]
-        place = np.searchsorted(pattern[start[s]:start[s + 1]], row[k])
-        width[k] = (first[s + 1] - first[s]) * d
-        address[k] = offset[s] + place * d * width[k] + (col[k] - first[s]) * d
-    return address, width
+_PANELS = 'f8[::1], i4[::1], i8[::1], i4[::1], i8[::1]'
+_FACTORS = ('f8[::1], i8[:, ::1], i8[:, ::1], b1[::1], i8[::1], i8[::1], f8[:, :, :, ::1], '
+            'f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8')
+
+
+@loop(f'({_FACTORS}, UniTuple(i8, 3))', f'({_FACTORS}, f8[::1])')
+def assemble(panels, address, width, turned, corner, stride, blocks, weights, diagonal, curvature,
+             share, size):
+    """
+    Write the lower triangle of J'WJ + diag(diagonal) + share C to the panels.
+
+    corner, stride : (n,) where each keyframe's own block begins, and its panel's width;
+    diagonal : (n, k); curvature : C, see `add_blocks`; others as of `add_normal`
+    """
+    for at in range(len(panels)):
+        panels[at] = 0.0
+    add_normal(panels, blocks, weights, address, width, turned, size)
+    if share != 0:
+        add_blocks(panels, curvature, share, address, width, turned, size)
+    for v in range(len(diagonal)):
+        for a in range(len(size)):
+            panels[corner[v] + a * (stride[v] + 1)] += diagonal[v, a]
 
 
 @compiled
+def add_normal(panels, blocks, weights, address, width, turned, size):
+    """
+    Add J' W J of every factor to the panels of a lower triangle.
+
+    blocks : (m, 2, k, k) J_i and J_j; weights : (m, k)
+    address, width : (m, 3) where the blocks (i, i), (j, j) and the one between i and j lie, and
+    the width of their panels; address -1: there is none
+    turned : (m,) bool, the block between them is that of row i and column j
+    """
+    k = len(size)
+    scaled = np.empty((2, k, k))
+    for f in range(len(blocks)):
+        for side in range(2):
+            for r in range(k):
+                for c in range(k):
+                    scaled[side, r, c] = weights[f, r] * blocks[f, side, r, c]
+        for part in range(3):
+            if address[f, part] < 0:
+                continue
+            left = part if part < 2 else (0 if turned[f] else 1)
+            right = part if part < 2 else 1 - left
+            for r in range(k):
+                for c in range(k):
+                    total = 0.0
+                    for a in range(k):
+                        total += blocks[f, left, a, r] * scaled[right, a, c]
+                    panels[address[f, part] + r * width[f, part] + c] += total
+
+
+@compiled
+def add_blocks(panels, values, factor, address, width, turned, size):
+    """Add factor values, (m, 2 k, 2 k), the lower part of it, to the panels; see `add_normal`."""
+    k = len(size)
+    for f in range(len(values)):
+        for part in range(3):
+            if address[f, part] < 0:
+                continue
+            left = part if part < 2 else (0 if turned[f] else 1)
+            right = part if part < 2 else 1 - left
+            for r in range(k):
+                for c in range(k):
+                    panels[address[f, part] + r * width[f, part] + c] += (
+                        factor * values[f, left * k + r, right * k + c])
+
+
+@loop(f'({_PANELS}, UniTuple(i8, 3))', f'({_PANELS}, f8[::1])')
 def factorise(panels, first, start, pattern, offset, size):
     """
     Turn the lower triangle in `panels` into its Cholesky factor.
@@ -40,12 +102,14 @@ def factorise(panels, first, start, pattern, offset, size):
     count, n, d = len(first) - 1, first[-1], len(size)
     # Supernodes that have something to subtract from s are a linked list; reach: from which of
     # their rows on.
-    waiting, following = np.full(count, -1, np.int32), np.full(count, -1, np.int32)
-    reach = np.zeros(count, np.int64)
+    waiting, following = np.empty(count, np.int32), np.empty(count, np.int32)
+    reach = np.empty(count, np.int64)
     owner, local = np.empty(n, np.int32), np.empty(n, np.int64)
     tallest = 0
     for s in range(count):
-        owner[first[s]:first[s + 1]] = s
+        waiting[s] = following[s] = -1
+        for column in range(first[s], first[s + 1]):
+            owner[column] = s
         tallest = max(tallest, (start[s + 1] - start[s]) * d)
     place, target = np.empty(tallest, np.int64), np.empty(tallest, np.int64)
     least = np.empty(tallest)
@@ -226,94 +290,3 @@ def _solve_strip(below, diagonal, height, width, strip):
             row[1] = y
             if strip > 2:
                 row[2] = (row[2] - x * f20 - y * f21) * f22
-
-
-@compiled
-def add_diagonal(panels, address, width, position, added, size):
-    """Add to the diagonal of the panels; added : (n, d) in the order of the keyframes."""
-    for k in range(len(added)):
-        at = address[position[k]]
-        for a in range(len(size)):
-            panels[at + a * (width[position[k]] + 1)] += added[k, a]
-
-
-@compiled
-def solve(panels, first, start, pattern, offset, position, right, size):
-    """Return the solution of L L' x = right; both (n, d) in the order of the keyframes."""
-    x = np.empty_like(right)
-    for k in range(len(right)):
-        for a in range(len(size)):
-            x[position[k], a] = right[k, a]
-    tallest = 0
-    for s in range(len(first) - 1):
-        tallest = max(tallest, start[s + 1] - start[s])
-    local = np.empty(tallest * len(size))
-    for s in range(len(first) - 1):
-        _forward(panels[offset[s]:offset[s + 1]], pattern[start[s]:start[s + 1]],
-                 first[s], first[s + 1] - first[s], x, local, size)
-    for s in range(len(first) - 2, -1, -1):
-        _backward(panels[offset[s]:offset[s + 1]], pattern[start[s]:start[s + 1]],
-                  first[s], first[s + 1] - first[s], x, local, size)
-    solution = np.empty_like(x)
-    for k in range(len(right)):
-        for a in range(len(size)):
-            solution[k, a] = x[position[k], a]
-    return solution
-
-
-@compiled
-def _forward(panel, rows, first, columns, x, local, size):
-    """Solve for the supernode's own rows, and subtract what they do to the rows below."""
-    d = len(size)
-    width = columns * d
-    at = 0
-    for k in range(columns):
-        for a in range(d):
-            total = x[first + k, a]
-            for c in range(k * d + a):
-                total -= panel[at + c] * local[c]
-            local[k * d + a] = total / panel[at + k * d + a]
-            x[first + k, a] = local[k * d + a]
-            at += width
-    below = panel[at:]
-    for k in range(len(rows) - columns):
-        row = rows[columns + k]
-        for a in range(d):
-            line = below[(k * d + a) * width:(k * d + a + 1) * width]
-            total = 0.0
-            if columns == 1:
-                for c in range(d):
-                    total += line[c] * local[c]
-            else:
-                for c in range(width):
-                    total += line[c] * local[c]
-            x[row, a] -= total
-
-
-@compiled
-def _backward(panel, rows, first, columns, x, local, size):
-    """Solve with the transpose for the supernode's own rows, once all below are known."""
-    d = len(size)
-    width = columns * d
-    for k in range(columns):
-        for a in range(d):
-            local[k * d + a] = x[first + k, a]
-    below = panel[width * width:]
-    for k in range(len(rows) - columns):
-        row = rows[columns + k]
-        for a in range(d):
-            line = below[(k * d + a) * width:(k * d + a + 1) * width]
-            value = x[row, a]
-            if columns == 1:
-                for c in range(d):
-                    local[c] -= line[c] * value
-            else:
-                for c in range(width):
-                    local[c] -= line[c] * value
-    for r in range(width - 1, -1, -1):
-        local[r] /= panel[r * width + r]
-        for c in range(r):
-            local[c] -= panel[r * width + c] * local[r]
-    for k in range(columns):
-        for a in range(d):
-            x[first + k, a] = local[k * d + a]

@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The decorator of every compiled loop.
+The decorators of every compiled loop.
 
-The modules beside this one import numba, which takes half a second, so the core imports them
-where it calls them. A loop is compiled at its first call, once per machine: numba keeps the result
-beside the package, or where that is read-only in the user's cache folder.
+The modules beside this one import numba, which takes a third of a second, so the core imports
+them where it calls them. A loop is compiled once per machine: numba keeps the result beside the
+package, or where that is read-only in the user's cache folder. Reading one back takes some 4 ms,
+however small it is, so loops that follow each other are one loop.
+
+A loop may call only functions of its own module: of others numba would not see that they changed.
 """
 
 from collections.abc import Callable
 from typing import Any
 
 import numba
+from numba.np import linalg
 
 Kernel = Callable[..., Any]
 
@@ -22,9 +26,44 @@ def compiled(function: Kernel) -> Kernel:
     Sums may be reordered (that is what lets them be vectorised); NaN and infinity keep their
     meaning. Where no folder can be written the result is not kept, and every process compiles.
     """
-    options = {'nogil': True, 'error_model': 'numpy', 'fastmath': {'contract', 'reassoc', 'nsz'}}
+    options = {'nogil': True, 'error_model': 'numpy', 'fastmath': {'contract', 'reassoc', 'nsz'},
+               'no_cfunc_wrapper': True, 'no_cpython_wrapper': function.__name__.startswith('_')}
     try:
         kernel: Kernel = numba.njit(cache=True, **options)(function)
     except RuntimeError:
         kernel = numba.njit(**options)(function)
     return kernel
+
+
+def loop(*takes: str) -> Callable[[Kernel], Kernel]:
+    """
+    Compile, as `compiled`, a function that the interpreter calls.
+
+    takes : the types of its arguments in numba's words, so that it can be compiled without them;
+    f8[:, ::1] is an array of doubles, rows one after the other. Several: one version for each
+    """
+    def decorate(function: Kernel) -> Kernel:
+        kernel: Any = compiled(function)
+        kernel.takes = takes
+        named: Kernel = kernel
+        return named
+
+    return decorate
+
+
+def _spare_blas() -> None:
+    """
+    Let numba not import SciPy's linear algebra to find out that it is there.
+
+    It would before it reads its first loop, which takes a fifth of a second; no loop uses it.
+    """
+    asked = linalg.ensure_blas
+    linalg.ensure_blas = lambda: None
+    try:
+        from numba.np import arraymath
+    finally:
+        linalg.ensure_blas = asked
+    arraymath.ensure_blas = asked
+
+
+_spare_blas()

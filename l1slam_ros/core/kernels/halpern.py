@@ -16,14 +16,19 @@ overlap. K is a tuple of k zeros; its length is a constant to the compiler, an a
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import compiled
+from l1slam_ros.core.kernels.compiled import compiled, loop
 
 # One cache line of single precision. Below 16 the loop vectoriser takes a loop for a short one,
 # where it does not check that arrays are apart, and gives up.
 LANES = 16
 
 
-@compiled
+def _for_each_size(takes: str) -> list[str]:
+    """Return the types of the arguments with K for blocks of angles, positions and poses."""
+    return [f'({takes}, UniTuple(i8, {k}))' for k in (1, 2, 3)]
+
+
+@loop(*_for_each_size('i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]'))
 def add_squares(keyframe, blocks, gram, K):
     """Add 2 A_fv'A_fv of every factor to its keyframes' gram (size + 1, k, k)."""
     k = len(K)
@@ -36,7 +41,7 @@ def add_squares(keyframe, blocks, gram, K):
                         total[a, b] += 2 * block[r, a] * block[r, b]
 
 
-@compiled
+@loop(*_for_each_size('i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, :, ::1]'))
 def scale(keyframe, blocks, inverse, scaled, K):
     """Set each block of `scaled` to that of `blocks` times its keyframe's inverse."""
     k = len(K)
@@ -51,7 +56,7 @@ def scale(keyframe, blocks, inverse, scaled, K):
                     scaled[f, side, r, c] = total
 
 
-@compiled
+@loop(*_for_each_size('f4[:, ::1], u4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f8, i8, i8'))
 def iterate(tiles, keyframes, x, z, g, weight, first, count, K):
     """
     Advance x, the y of the tiles and g = A'y by `count` iterations of `halpern.halpern_step`.
@@ -86,7 +91,7 @@ def iterate(tiles, keyframes, x, z, g, weight, first, count, K):
             _scatter(local, tile, g, keyframes[t], K)
 
 
-@compiled
+@loop(*_for_each_size('f4[:, ::1], u4[:, ::1], f4[:, ::1], f4[:, ::1], f8, f4[:, ::1], f4[:, ::1], f4[:, ::1]'))
 def look(tiles, keyframes, x, g, weight, x_bar, g_bar, y_bar, K):
     """
     Find the next point without the pull to the restart, and what the tests want to know.
@@ -102,14 +107,15 @@ def look(tiles, keyframes, x, g, weight, x_bar, g_bar, y_bar, K):
     k, number = len(K), tiles.dtype.type
     dual = 2 * k * k + k
     local = np.empty(5 * k * LANES, tiles.dtype)
-    d = g * number(1 / weight)
-    w, one = number(weight), number(1)
+    d = np.empty_like(g)
+    w, one, rest = number(weight), number(1), number(1 / weight)
     moved, turned, crossed, cost, value = 0.0, 0.0, 0.0, 0.0, 0.0
     for v in range(len(x)):
         for c in range(k):
+            d[v, c] = rest * g[v, c]
             x_bar[v, c] = x[v, c] - d[v, c]
             moved += d[v, c] * d[v, c]
-    g_bar[:] = number(0)
+            g_bar[v, c] = 0
     for t in range(len(tiles)):
         tile = tiles[t]
         _gather(local, 0, x_bar, keyframes[t], K)
@@ -130,21 +136,24 @@ def look(tiles, keyframes, x, g, weight, x_bar, g_bar, y_bar, K):
                 cost += abs(residual)
                 value -= b * new
                 local[(4 * k + r) * LANES + lane] = new
-        y_bar[t] = local[4 * k * LANES:]
-        local[2 * k * LANES: 3 * k * LANES] = y_bar[t]
+        for at in range(k * LANES):
+            y_bar[t, at] = local[2 * k * LANES + at] = local[4 * k * LANES + at]
         _scatter(local, tile, g_bar, keyframes[t], K)
     return weight * moved + turned / weight + 2 * crossed, cost, value
 
 
-@compiled
+@loop(*_for_each_size('f4[:, ::1], u4[:, ::1], f4[:, ::1]'))
 def adjoint(tiles, keyframes, g, K):
     """Set g = A'y for the y of the tiles."""
     k = len(K)
     local = np.empty(3 * k * LANES, tiles.dtype)
-    g[:] = 0
+    for v in range(len(g)):
+        for c in range(k):
+            g[v, c] = 0
     for t in range(len(tiles)):
         row = (2 * k * k + k) * LANES
-        local[2 * k * LANES:] = tiles[t, row: row + k * LANES]
+        for at in range(k * LANES):
+            local[2 * k * LANES + at] = tiles[t, row + at]
         _scatter(local, tiles[t], g, keyframes[t], K)
 
 

@@ -8,10 +8,10 @@ become.
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import compiled
+from l1slam_ros.core.kernels.compiled import loop
 
 
-@compiled
+@loop('(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])')
 def right_side(e, u, v, s, t, y, q, c1, c2):
     """Return g = e - (u - v) - (c1/s - u) + (c2/t - v), and y + q g."""
     g, z = np.empty_like(e), np.empty_like(e)
@@ -21,12 +21,13 @@ def right_side(e, u, v, s, t, y, q, c1, c2):
     return g, z
 
 
-@compiled
-def complete(u, v, s, t, q, c1, c2, g, moved):
+@loop('(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8)')
+def complete(u, v, s, t, q, c1, c2, g, moved, fraction):
     """
     Return the step of y, u and v that belongs to a step of the residual, and how far to go.
 
-    moved : J dx; the lengths are those at which a bound is met, of primal and dual.
+    moved : J dx; fraction : of the way to the nearest bound, which is never more than the step.
+    The last two are the lengths of the primal and of the dual step; then u's + v't after them.
     """
     dy, du, dv = np.empty_like(g), np.empty_like(g), np.empty_like(g)
     primal = dual = np.inf
@@ -42,20 +43,15 @@ def complete(u, v, s, t, q, c1, c2, g, moved):
             dual = min(dual, s[k] / dy[k])
         if dy[k] < 0:
             dual = min(dual, -t[k] / dy[k])
-    return dy, du, dv, primal, dual
-
-
-@compiled
-def gap_after(u, v, s, t, dy, du, dv, primal, dual):
-    """Return u's + v't after a step of these lengths."""
+    primal, dual = min(1.0, fraction * primal), min(1.0, fraction * dual)
     total = 0.0
     for k in range(len(u)):
         total += ((u[k] + primal * du[k]) * (s[k] - dual * dy[k])
                   + (v[k] + primal * dv[k]) * (t[k] + dual * dy[k]))
-    return total
+    return dy, du, dv, primal, dual, total
 
 
-@compiled
+@loop('(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8, f8, f8)')
 def advance(u, v, s, t, y, dy, du, dv, primal, dual, smallest):
     """Take the step in place; the slacks stay at `smallest` or above."""
     for k in range(len(u)):

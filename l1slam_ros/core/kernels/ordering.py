@@ -13,10 +13,10 @@ its supervariables: a pose's block plays that part.
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import compiled
+from l1slam_ros.core.kernels.compiled import compiled, loop
 
 
-@compiled
+@loop('(i4[::1], i4[::1], i8)')
 def minimum_degree(start, adjacent, limit):
     """
     Order the nodes of a graph; stop when the factor would have more than `limit` blocks.
@@ -31,18 +31,23 @@ def minimum_degree(start, adjacent, limit):
 
     """
     n = len(start) - 1
-    lists = adjacent.copy()  # of each node: variables, then elements
-    n_variables = start[1:] - start[:-1]
-    n_elements = np.zeros(n, np.int32)
-    degree = n_variables.copy()
-    head = np.full(n + 1, -1, np.int32)
+    lists = np.empty_like(adjacent)  # of each node: variables, then elements
+    for at in range(len(adjacent)):
+        lists[at] = adjacent[at]
+    n_variables, n_elements = np.empty(n, np.int32), np.empty(n, np.int32)
+    degree, head = np.empty(n, np.int32), np.empty(n + 1, np.int32)
     after, before = np.empty(n, np.int32), np.empty(n, np.int32)
+    seen, absorbed = np.empty(n, np.int32), np.empty(n, np.bool_)
+    outside, counted = np.empty(n, np.int32), np.empty(n, np.int32)
+    order, place = np.empty(n, np.int32), np.empty(n, np.int32)
+    column, rows = np.empty(n + 1, np.int64), np.empty(limit, np.int32)
+    column[0], head[n] = 0, -1
+    for k in range(n):
+        degree[k] = n_variables[k] = start[k + 1] - start[k]
+        n_elements[k], outside[k], absorbed[k] = 0, 0, False
+        head[k] = seen[k] = counted[k] = place[k] = -1
     for k in range(n):
         _put(head, after, before, k, degree[k])
-    seen, absorbed = np.full(n, -1, np.int32), np.zeros(n, np.bool_)
-    outside, counted = np.zeros(n, np.int32), np.full(n, -1, np.int32)
-    order, place = np.empty(n, np.int32), np.full(n, -1, np.int32)
-    column, rows = np.zeros(n + 1, np.int64), np.empty(limit, np.int32)
     lowest = 0
     for step in range(n):
         while head[lowest] < 0:
@@ -55,7 +60,7 @@ def minimum_degree(start, adjacent, limit):
         if end < 0:
             return order[:step], column[: step + 1], rows[: column[step]]
         column[step + 1] = end
-        size = np.int32(end - column[step])
+        size = end - column[step]
         _count_outside(rows[column[step]:end], start, lists, n_variables, n_elements, column,
                        place, absorbed, outside, counted, pivot)
         for k in rows[column[step]:end]:

@@ -3,19 +3,19 @@
 Many steps of all keyframes at once, and what they say of each factor.
 
 Arrays of steps are (n, k, q): q samples of the k numbers of each of n keyframes, the last keyframe
-standing for all that are held fixed. `size` is a tuple of k zeros, see `blocks`; other arrays are
-those of `LinearSystem` and of `cholesky`.
+standing for all that are held fixed. Other arrays are those of `LinearSystem` and of
+`cholesky`.
 """
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import compiled
+from l1slam_ros.core.kernels.compiled import compiled, loop
 
 
-@compiled
-def gather(keyframe, blocks, y, product, size):
+@loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, ::1])')
+def gather(keyframe, blocks, y, product):
     """Add A'y of all samples to product (n + 1, k, q); y : (m, k, q)."""
-    k, q = len(size), product.shape[2]
+    k, q = product.shape[1:]
     for f in range(len(blocks)):
         for side in range(2):
             at = product[keyframe[f, side]]
@@ -26,45 +26,57 @@ def gather(keyframe, blocks, y, product, size):
                         at[c, t] += value * y[f, r, t]
 
 
-@compiled
-def solve_many(panels, first, start, pattern, offset, position, right, size):
+@loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i4[::1], f8[:, :, ::1])')
+def solve_many(panels, first, start, pattern, offset, position, right):
     """Return the solutions of L L' x = right, (n, k, q) in the order of the keyframes."""
     n, k, q = right.shape
     x = np.empty((n * k, q))
     for f in range(n):
         for a in range(k):
-            x[position[f] * k + a] = right[f, a]
+            _copy(right[f, a], x[position[f] * k + a])
     for s in range(len(first) - 1):
         width, own = (first[s + 1] - first[s]) * k, x[first[s] * k:first[s + 1] * k]
         at = offset[s]
         for c in range(width):
             for e in range(c):
                 _subtract(own[c], panels[at + e], own[e])
-            own[c] /= panels[at + c]
+            _divide(own[c], panels[at + c])
             at += width
-        for row in pattern[start[s] + width // k:start[s + 1]]:
+        for below in range(start[s] + width // k, start[s + 1]):
             for a in range(k):
                 for c in range(width):
-                    _subtract(x[row * k + a], panels[at + c], own[c])
+                    _subtract(x[pattern[below] * k + a], panels[at + c], own[c])
                 at += width
     for s in range(len(first) - 2, -1, -1):
         width, own = (first[s + 1] - first[s]) * k, x[first[s] * k:first[s + 1] * k]
         at = offset[s] + width * width
-        for row in pattern[start[s] + width // k:start[s + 1]]:
+        for below in range(start[s] + width // k, start[s + 1]):
             for a in range(k):
                 for c in range(width):
-                    _subtract(own[c], panels[at + c], x[row * k + a])
+                    _subtract(own[c], panels[at + c], x[pattern[below] * k + a])
                 at += width
         for c in range(width - 1, -1, -1):
             at = offset[s] + c * width
-            own[c] /= panels[at + c]
+            _divide(own[c], panels[at + c])
             for e in range(c):
                 _subtract(own[e], panels[at + e], own[c])
     solution = np.empty((n, k, q))
     for f in range(n):
         for a in range(k):
-            solution[f, a] = x[position[f] * k + a]
+            _copy(x[position[f] * k + a], solution[f, a])
     return solution
+
+
+@compiled
+def _copy(row, to):
+    for t in range(len(row)):
+        to[t] = row[t]
+
+
+@compiled
+def _divide(row, by):
+    for t in range(len(row)):
+        row[t] /= by
 
 
 @compiled
@@ -73,10 +85,10 @@ def _subtract(row, factor, other):
         row[t] -= factor * other[t]
 
 
-@compiled
-def left_over(keyframe, blocks, x, y, size):
+@loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, ::1])')
+def left_over(keyframe, blocks, x, y):
     """Return the second moment of y - A x for each factor, (m, k, k); y : (m, k, q)."""
-    k, q = len(size), x.shape[2]
+    k, q = x.shape[1:]
     moment, d = np.empty((len(blocks), k, k)), np.empty((k, q))
     for f in range(len(blocks)):
         for r in range(k):
@@ -87,21 +99,24 @@ def left_over(keyframe, blocks, x, y, size):
     return moment
 
 
-@compiled
-def spreads(keyframe, blocks, x, size):
+@loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1])')
+def spreads(keyframe, blocks, x):
     """Return the second moment of A x for each factor, (m, k, k)."""
-    moment, d = np.empty((len(blocks), len(size), len(size))), np.empty((len(size), x.shape[2]))
+    k, q = x.shape[1:]
+    moment, d = np.empty((len(blocks), k, k)), np.empty((k, q))
     for f in range(len(blocks)):
-        d[:] = 0.0
+        for r in range(k):
+            for t in range(q):
+                d[r, t] = 0.0
         _add_moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], 1.0, d)
         _second_moment(d, moment[f])
     return moment
 
 
-@compiled
-def moved(keyframe, blocks, x, size):
+@loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1])')
+def moved(keyframe, blocks, x):
     """Return A x of each factor and sample, (m, k, q)."""
-    d = np.zeros((len(blocks), len(size), x.shape[2]))
+    d = np.zeros((len(blocks), *x.shape[1:]))
     for f in range(len(blocks)):
         _add_moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], 1.0, d[f])
     return d
@@ -126,7 +141,7 @@ def _second_moment(d, moment):
             moment[r, c] = moment[c, r] = total / d.shape[1]
 
 
-@compiled
+@loop('(f8[:, :, ::1], f8[:, ::1])')
 def normalise(covariance, residual):
     """
     Return r'C^-1 r and ln det C of each factor, (m,); C (m, k, k) is overwritten.
@@ -134,10 +149,10 @@ def normalise(covariance, residual):
     Cholesky; where C is not definite beyond rounding, infinity and minus infinity.
     """
     m, k = residual.shape
-    square, log_det = np.zeros(m), np.zeros(m)
-    u = np.empty(k)
+    square, log_det, u = np.empty(m), np.empty(m), np.empty(k)
     for f in range(m):
         C = covariance[f]
+        square[f] = log_det[f] = 0.0
         for r in range(k):
             least = 1e-14 * C[r, r]
             for c in range(r):

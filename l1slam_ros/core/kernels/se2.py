@@ -7,7 +7,7 @@ z, x_i, x_j : (m, 3) measurements and poses. Formulas: see `se2`.
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import compiled
+from l1slam_ros.core.kernels.compiled import compiled, loop
 
 
 @compiled
@@ -18,7 +18,7 @@ def _seen(x_i, x_j):
     return c * dx + s * dy, c * dy - s * dx
 
 
-@compiled
+@loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1])')
 def residual(z, x_i, x_j):
     """Return e (m, 3), its angle not yet wrapped."""
     e = np.empty_like(z)
@@ -31,7 +31,7 @@ def residual(z, x_i, x_j):
     return e
 
 
-@compiled
+@loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1])')
 def jacobians(z, x_i, x_j):
     """Return J_e_i and J_e_j, (m, 3, 3) each."""
     J_i, J_j = np.zeros((len(x_i), 3, 3)), np.zeros((len(x_i), 3, 3))
@@ -48,7 +48,7 @@ def jacobians(z, x_i, x_j):
     return J_i, J_j
 
 
-@compiled
+@loop('(f8[:, ::1], f8[:, ::1], f8[:, :, ::1])')
 def curvature(x_i, x_j, gradient):
     """Return the Hessian of dual'e over (step of i, step of j), (m, 6, 6); gradient (m, 2, 3)."""
     H = np.zeros((len(x_i), 6, 6))

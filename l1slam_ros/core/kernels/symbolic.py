@@ -9,10 +9,32 @@ merging of supernodes that costs few zeros.
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import compiled
+from l1slam_ros.core.kernels.compiled import compiled, loop
 
 # A panel may hold this part of zeros for the sake of being larger.
 _ZEROS = 0.2
+
+
+@loop('(i4[::1], i8[::1], i4[::1])')
+def lay_out(order, column, rows):
+    """
+    Return the layout of a factor; arguments as of `postorder`.
+
+    Returns
+    -------
+    position : (n,) of each node in the new order
+    first : (supernodes + 1,), see `supernodes`
+    start, pattern : see `panel_rows`
+    work : multiplications of entries that one factorisation takes
+
+    """
+    position, parent, below, old = postorder(order, column, rows)
+    first = supernodes(parent, below)
+    start, pattern = panel_rows(first, column, rows, old, position)
+    work = 0.0
+    for k in range(len(below)):
+        work += (below[k] + 1.0) ** 2 / 2
+    return position, first, start, pattern, work
 
 
 @compiled
@@ -34,11 +56,13 @@ def postorder(order, column, rows):
     step = np.empty(n, np.int32)
     for k in range(n):
         step[order[k]] = k
-    parent = np.full(n, n, np.int32)
-    child, sibling = np.full(n + 1, -1, np.int32), np.empty(n, np.int32)
+    parent = np.empty(n, np.int32)
+    child, sibling = np.empty(n + 1, np.int32), np.empty(n, np.int32)
+    child[n] = -1
     for k in range(n - 1, -1, -1):
-        for row in rows[column[k]:column[k + 1]]:
-            parent[k] = min(parent[k], step[row])
+        parent[k], child[k] = n, -1
+        for at in range(column[k], column[k + 1]):
+            parent[k] = min(parent[k], step[rows[at]])
         # The child with the longest column comes last, next to its parent, to be merged with it.
         sibling[k], child[parent[k]] = child[parent[k]], k
     old, stack, place, top = np.empty(n, np.int32), np.empty(n + 1, np.int32), 0, 0
@@ -58,11 +82,12 @@ def postorder(order, column, rows):
     new[n] = n
     for k in range(n):
         new[old[k]] = k
-    position = np.empty(n, np.int32)
+    position, above, below = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int64)
     for k in range(n):
         position[order[k]] = new[k]
-    below = (column[1:] - column[:-1])[old]
-    return position, new[parent[old]], below, old
+        above[k] = new[parent[old[k]]]
+        below[k] = column[old[k] + 1] - column[old[k]]
+    return position, above, below, old
 
 
 @compiled
@@ -74,7 +99,7 @@ def supernodes(parent, below):
     stored for it.
     """
     n = len(parent)
-    first, zeros = np.empty(n + 1, np.int32), np.zeros(n, np.int64)
+    first, zeros = np.empty(n + 1, np.int32), np.empty(n, np.int64)
     count = 0
     for k in range(n):
         first[count], zeros[count] = k, 0
@@ -93,7 +118,10 @@ def supernodes(parent, below):
             count -= 1
             zeros[count - 1] = total
     first[count] = n
-    return first[: count + 1].copy()
+    shorter = np.empty(count + 1, np.int32)
+    for s in range(count + 1):
+        shorter[s] = first[s]
+    return shorter
 
 
 @compiled
@@ -103,17 +131,88 @@ def panel_rows(first, column, rows, old, position):
 
     The columns of the supernode themselves come first; those of its last column follow.
     """
-    count = len(first) - 1
-    start = np.zeros(count + 1, np.int64)
+    count, n = len(first) - 1, len(position)
+    start, end = np.empty(count + 1, np.int64), np.empty(count, np.int64)
+    start[0] = 0
+    # Sorted by going through all rows in order: each is in the lower part of these supernodes.
+    member = np.empty(n + 1, np.int64)
+    for k in range(n + 1):
+        member[k] = 0
+    for s in range(count):
+        last, end[s] = old[first[s + 1] - 1], start[s] + first[s + 1] - first[s]
+        start[s + 1] = end[s] + column[last + 1] - column[last]
+        for at in range(column[last], column[last + 1]):
+            member[position[rows[at]] + 1] += 1
+    for k in range(n):
+        member[k + 1] += member[k]
+    owner = np.empty(member[n], np.int32)
     for s in range(count):
         last = old[first[s + 1] - 1]
-        start[s + 1] = start[s] + first[s + 1] - first[s] + column[last + 1] - column[last]
+        for at in range(column[last], column[last + 1]):
+            row = position[rows[at]]
+            owner[member[row]] = s
+            member[row] += 1
     pattern = np.empty(start[count], np.int32)
     for s in range(count):
-        width = first[s + 1] - first[s]
-        last = old[first[s + 1] - 1]
-        for k in range(width):
-            pattern[start[s] + k] = first[s] + k
-        lower = position[rows[column[last]:column[last + 1]]]
-        pattern[start[s] + width:start[s + 1]] = np.sort(lower)
+        for k in range(first[s], first[s + 1]):
+            pattern[start[s] + k - first[s]] = k
+    at = 0
+    for row in range(n):
+        while at < member[row]:
+            s = owner[at]
+            pattern[end[s]] = row
+            end[s] += 1
+            at += 1
     return start, pattern
+
+
+@loop('(i8[:, ::1], i4[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8)')
+def block_addresses(keyframe, position, first, start, pattern, offset, k):
+    """
+    Find where the blocks of a matrix of k x k blocks lie in the panels.
+
+    keyframe : (m, 2) what each factor joins, the number of keyframes for none; position : (n,)
+
+    Returns
+    -------
+    address, width, turned : of the three blocks of each factor, (m, 3), (m, 3) and (m,), see
+        `cholesky.add_normal`
+    corner, stride : where each keyframe's own block begins and its panel's width, (n,)
+
+    """
+    n, m = len(position), len(keyframe)
+    corner, stride = np.empty(n, np.int64), np.empty(n, np.int64)
+    owner, free = np.empty(n, np.int64), np.empty(n, np.int64)
+    for s in range(len(first) - 1):
+        for column in range(first[s], first[s + 1]):
+            owner[column] = s
+    for v in range(n):
+        column = position[v]
+        s = owner[column]
+        stride[v] = (first[s + 1] - first[s]) * k
+        corner[v] = offset[s] + (column - first[s]) * k * (stride[v] + 1)
+    address, width = np.empty((m, 3), np.int64), np.empty((m, 3), np.int64)
+    turned = np.empty(m, np.bool_)
+    for f in range(m):
+        turned[f], width[f, 2], address[f, 2] = False, 0, -1
+        for side in range(2):
+            v = keyframe[f, side]
+            address[f, side], width[f, side] = -1, 0
+            if v < n:
+                address[f, side], width[f, side] = corner[v], stride[v]
+        i, j = keyframe[f, 0], keyframe[f, 1]
+        if i < n and j < n:
+            turned[f] = position[i] > position[j]
+            row, v = (position[i], j) if turned[f] else (position[j], i)
+            s = owner[position[v]]
+            low, high = start[s], start[s + 1]
+            while low < high:
+                middle = (low + high) // 2
+                if pattern[middle] < row:
+                    low = middle + 1
+                else:
+                    high = middle
+            width[f, 2] = stride[v]
+            address[f, 2] = (offset[s] + (low - start[s]) * k * stride[v]
+                             + (position[v] - first[s]) * k)
+    return address, width, turned, corner, stride

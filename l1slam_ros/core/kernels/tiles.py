@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values of factors into tiles, factors side by side, and back; see `core.tiles`."""
 
-from l1slam_ros.core.kernels.compiled import compiled
+from l1slam_ros.core.kernels.compiled import loop
 
 
-@compiled
+@loop('(f8[:, ::1], i8[::1], f4[:, :, ::1])')
 def pack(values, order, tiles):
     """Write values (m, c), taken in `order` (m,), to tiles (t, c, lanes)."""
     lanes = tiles.shape[2]
@@ -13,7 +13,7 @@ def pack(values, order, tiles):
             tiles[place // lanes, c, place % lanes] = values[order[place], c]
 
 
-@compiled
+@loop('(f4[:, :, ::1], i8[::1], f8[:, ::1])')
 def unpack(tiles, order, values):
     """Undo `pack`: write the tiles to values (m, c)."""
     lanes = tiles.shape[2]
