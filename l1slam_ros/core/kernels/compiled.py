@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numba
+from numba.core.sigutils import normalize_signature
 from numba.np import linalg
 
 Kernel = Callable[..., Any]
@@ -45,10 +46,18 @@ def loop(*takes: str) -> Callable[[Kernel], Kernel]:
     def decorate(function: Kernel) -> Kernel:
         kernel: Any = compiled(function)
         kernel.takes = takes
-        named: Kernel = kernel
-        return named
+        ready: Kernel = kernel
+        return ready
 
     return decorate
+
+
+def make_ready(kernel: Any) -> str:
+    """Compile a loop, or read it from the cache; return the cache's folder, empty: none."""
+    for takes in kernel.takes:
+        # As the types of a call, for these are what the cache goes by.
+        kernel.compile(tuple(normalize_signature(takes)[0]))
+    return kernel.stats.cache_path or ''
 
 
 def _spare_blas() -> None:
