@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from systems import SHAPES, random_system
 
 from l1slam_ros.core.kernels import blocks as kernels
+from l1slam_ros.core.kernels import cholesky
 
 SIZES = [1, 2, 3, 6]
 
@@ -115,7 +116,7 @@ def test_normal_matrices_are_summed_up(system, k, rng):
     weights = rng.uniform(0.1, 3, len(system.b))
     dense, A = Dense(system, k), system.A.toarray()
     for total in (1, 2):  # added to what is there
-        kernels.add_normal(dense.panels, system.blocks, weights.reshape(-1, k), *dense.places)
+        cholesky.add_normal(dense.panels, system.blocks, weights.reshape(-1, k), *dense.places)
         expected = total * A.T @ (weights[:, None] * A)
         assert_allclose(dense.lower, lower_blocks(expected, k), atol=1e-11)
         assert_allclose(dense.panels.reshape(expected.shape), dense.lower)
@@ -130,5 +131,5 @@ def test_blocks_of_curvature_are_summed_up(system, k, rng):
         rows = (system.keyframe[f][:, None] * k + np.arange(k)).ravel()
         np.add.at(expected, np.ix_(rows, rows), 0.7 * values[f])
     dense = Dense(system, k)
-    kernels.add_blocks(dense.panels, values, 0.7, *dense.places)
+    cholesky.add_blocks(dense.panels, values, 0.7, *dense.places)
     assert_allclose(dense.lower, lower_blocks(expected[:-k, :-k], k), atol=1e-12)

@@ -219,21 +219,35 @@ def test_the_step_solves_the_newton_equations(rows, rng):
     e, (u, v, s, t), y, q, c1, c2 = rows
     moved = rng.standard_normal(50)
     g, _ = kernels.right_side(e, u, v, s, t, y, q, c1, c2)
-    dy, du, dv, primal, dual = kernels.complete(u, v, s, t, q, c1, c2, g, moved)
+    dy, du, dv, primal, dual, _ = kernels.complete(u, v, s, t, q, c1, c2, g, moved, 1.0)
     assert_allclose(u * s + s * du - u * dy, c1)
     assert_allclose(v * t + t * dv + v * dy, c2)
     assert_allclose((u + du) - (v + dv), e + moved, atol=1e-12)
     # At these lengths the first bound is met, and none is passed.
+    assert primal < 1 and dual < 1
     assert min((u + primal * du).min(), (v + primal * dv).min()) == pytest.approx(0, abs=1e-12)
     assert min((s - dual * dy).min(), (t + dual * dy).min()) == pytest.approx(0, abs=1e-12)
 
 
-def test_the_gap_after_a_step_and_the_step(rows, rng):
+@pytest.mark.parametrize('scale', [1.0, 1e-3])
+def test_a_step_goes_a_part_of_the_way_and_says_its_gap(rows, rng, scale):
+    """Small steps meet no bound: they are taken whole."""
+    _, (u, v, s, t), y, q, *_ = rows
+    g, moved = scale * rng.standard_normal((2, 50))
+    c1, c2 = u * s, v * t  # so that a step is as small as g and moved
+    found = kernels.complete(u, v, s, t, q, c1, c2, g, moved, 0.9)
+    dy, du, dv, primal, dual, gap = found
+    all_the_way = kernels.complete(u, v, s, t, q, c1, c2, g, moved, 1.0)
+    expected = (1.0, 1.0) if scale < 1 else (0.9 * all_the_way[3], 0.9 * all_the_way[4])
+    assert (primal, dual) == pytest.approx(expected)
+    after = u + primal * du, v + primal * dv, s - dual * dy, t + dual * dy
+    assert gap == pytest.approx(after[0] @ after[2] + after[1] @ after[3])
+
+
+def test_a_step_is_taken(rows, rng):
     _, (u, v, s, t), y, *_ = rows
     dy, du, dv = rng.standard_normal((3, 50))
     after = u + 0.3 * du, v + 0.3 * dv, s - 0.2 * dy, t + 0.2 * dy
-    gap = after[0] @ after[2] + after[1] @ after[3]
-    assert kernels.gap_after(u, v, s, t, dy, du, dv, 0.3, 0.2) == pytest.approx(gap)
     expected_y = y + 0.2 * dy
     kernels.advance(u, v, s, t, y, dy, du, dv, 0.3, 0.2, 0.4)
     assert_allclose(u, after[0])

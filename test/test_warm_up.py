@@ -1,13 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""After the warm-up nothing is compiled any more: a robot would stand still meanwhile."""
+"""Once the cache is full nothing is compiled any more: a robot would stand still meanwhile."""
 
+import pkgutil
 import subprocess
 import sys
 from pathlib import Path
 
-from l1slam_ros.core.warm_up import STEPS, warm_up
+import numpy as np
+import pytest
 
-# Prints what a process compiles, or reads from the cache, when it is warm.
+from l1slam_ros.compilation import fill_cache
+from l1slam_ros.core import kernels
+from l1slam_ros.core.simulate import WorldOptions, simulate_world
+from l1slam_ros.core.warm_up import DENSE, JUDGEMENT, SPARSE, STEPS, warm_up
+from l1slam_ros.io.graph_file import GraphRecord, write_graph_file
+
+# Prints what a process compiles.
 WORK = """
 import importlib
 import itertools
@@ -19,6 +27,7 @@ from lies import careful_world, drive_roundabout, roundabout, seen, spoilt
 from problems import play
 
 from l1slam_ros import offline
+from l1slam_ros.compilation import fill_cache
 from l1slam_ros.core import kernels, se2
 from l1slam_ros.core.backend import Backend, BackendOptions, RobustOptions, optimise
 from l1slam_ros.core.cholesky import cholesky_of
@@ -27,29 +36,25 @@ from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.least_squares import weighted_least_squares
 from l1slam_ros.core.linearise import linearise
-from l1slam_ros.core.warm_up import warm_up
 from l1slam_ros.io.graph_file import GraphRecord
 
 MODULES = [importlib.import_module(f'{kernels.__name__}.{module.name}')
            for module in pkgutil.iter_modules(kernels.__path__)]
 
 
-def signatures():
-    return {(kernel.py_func.__module__, kernel.py_func.__name__, signature)
+def compiled_here():
+    return {(kernel.py_func.__module__, kernel.py_func.__name__, str(signature))
             for module in MODULES for kernel in vars(module).values()
-            if hasattr(kernel, 'signatures') for signature in kernel.signatures}
+            if hasattr(kernel, 'signatures') for signature in kernel.stats.cache_misses}
 
 
 def look(what):
-    global known
-    for module, name, signature in sorted(signatures() - known, key=str):
+    for module, name, signature in sorted(compiled_here()):
         print(f'{what}: {module}.{name}{signature}')
-    known |= signatures()
 
 
-warm_up()
-known = signatures()
-assert len(known) > 50, 'are the kernels not where this test looks for them?'
+assert fill_cache(lambda done, total: None, lambda: False)
+assert not compiled_here()
 
 every = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 world = spoilt(careful_world(150, 300), 'grouped', 60)
@@ -110,17 +115,72 @@ world.graph.add_prior(np.array([7]), world.truth[7:8], np.eye(3)[None])
 for norm in offline.NORMS:
     solved(world.graph, world.odometry, norm=norm)
 look('a prior')
+used = [kernel for module in MODULES for kernel in vars(module).values()
+        if hasattr(kernel, 'takes') and kernel.stats.cache_hits]
+assert len(used) > 25, 'are the kernels not where this test looks for them?'
+"""
+
+# What somebody does with a file first; prints what it imports, and how many loops it reads.
+LOOK = """
+import sys
+from pathlib import Path
+import numpy as np
+from l1slam_ros import offline
+from l1slam_ros.core.inspection import noise_scales
+
+record = offline.read_input(Path(sys.argv[1]))
+if sys.argv[2] == 'info':
+    noise_scales(record.graph, np.random.default_rng(0))
+else:
+    wish = offline.Wish(robust=sys.argv[2] == 'robust')
+    offline.solve(record, wish, lambda iteration, cost: None)
+kernels = [kernel for name in list(sys.modules) if name.startswith('l1slam_ros.core.kernels.')
+           for kernel in vars(sys.modules[name]).values() if hasattr(kernel, 'takes')]
+print(sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels))
+print(*sys.modules)
 """
 
 
-def test_nothing_is_compiled_after_the_warm_up():
+def test_nothing_is_compiled_once_the_cache_is_full():
     done = subprocess.run([sys.executable, '-c', WORK], capture_output=True, text=True,
-                          timeout=120, cwd=Path(__file__).parent)
+                          timeout=240, cwd=Path(__file__).parent)
     assert done.returncode == 0, done.stderr
     assert done.stdout == ''
+
+
+@pytest.fixture(scope='module')
+def world(tmp_path_factory):
+    """A graph file; the cache is full."""
+    fill_cache(lambda done, total: None, lambda: False)
+    path = tmp_path_factory.mktemp('world') / 'world.g2o'
+    made = simulate_world(150, 300, WorldOptions(), np.random.default_rng(0))
+    write_graph_file(path, GraphRecord(made.graph, made.odometry, np.arange(150)))
+    return path
+
+
+@pytest.mark.parametrize('what, most_loops, missing', [
+    ('info', 0, {'numba', 'llvmlite', 'scipy.special', 'scipy.sparse.csgraph._shortest_path'}),
+    ('plain', 20, {'l1slam_ros.core.kernels.prediction', 'l1slam_ros.core.kernels.halpern',
+                   'scipy.sparse', 'scipy.special', 'scipy.linalg'}),
+    ('robust', 27, {'l1slam_ros.core.kernels.halpern', 'scipy.sparse', 'scipy.special',
+                    'scipy.linalg'}),
+])
+def test_only_what_is_needed_is_read(world, what, most_loops, missing):
+    done = subprocess.run([sys.executable, '-c', LOOK, str(world), what], capture_output=True,
+                          text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    loops, modules = done.stdout.splitlines()
+    assert int(loops) <= most_loops
+    assert not missing & set(modules.split())
 
 
 def test_each_step_is_reported_once_it_is_done():
     said = []
     warm_up(said.append)
     assert tuple(said) == STEPS
+
+
+def test_every_module_of_loops_is_a_step():
+    modules = {module.name for module in pkgutil.iter_modules(kernels.__path__)}
+    assert sorted(STEPS) == sorted(modules - {'compiled'})
+    assert set(STEPS) == {*SPARSE, *JUDGEMENT, *DENSE}

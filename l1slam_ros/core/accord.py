@@ -9,7 +9,6 @@ refused, but all of them agree.
 """
 
 import numpy as np
-from scipy.special import gammainc
 
 from l1slam_ros.core.belief import DOUBT
 from l1slam_ros.core.graph import FactorGraph, ends_in_time
@@ -17,6 +16,7 @@ from l1slam_ros.core.linearise import anchor
 from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.noise import whiten
 from l1slam_ros.core.prediction import Posterior, claimed_volume, log_likelihood_ratio
+from l1slam_ros.core.quantiles import gamma_probability
 from l1slam_ros.core.robust_growth import Growth
 
 # So many refused loops are asked.
@@ -55,7 +55,7 @@ def accord(growth: Growth) -> tuple[Indices, float]:
     rest = places[(growth.low[rows] > steps[-1]) | (growth.high[rows] <= steps[0])]
     # Where all agree with more than one other, that is no chance but another camp.
     rate = min((rest.sum() + 1) / (len(rest) + 1), 1.0)
-    return camp, len(rows) * float(gammainc(max(places[k], 1), rate))
+    return camp, len(rows) * gamma_probability(float(max(places[k], 1)), rate)
 
 
 def weakest_steps(growth: Growth, camp: Indices) -> Indices:

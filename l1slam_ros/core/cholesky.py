@@ -10,11 +10,14 @@ every size: of the rotations alone, of the translations, of whole poses.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.linearise import LinearSystem, anchor, keyframes_of
 from l1slam_ros.core.manifold import Array, Indices
+
+Places = NDArray[np.int32]
 
 # Blocks of SE(2) that one gigabyte holds.
 MOST_BLOCKS = 15_000_000
@@ -56,7 +59,7 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int) -> Pattern:
     return Pattern(*lay_out(order, column, rows))
 
 
-def neighbours(keyframe: Indices, size: int) -> tuple[Indices, Indices]:
+def neighbours(keyframe: Indices, size: int) -> tuple[Places, Places]:
     """
     Return the neighbours of each free keyframe k, adjacent[start[k]:start[k + 1]], int32.
 

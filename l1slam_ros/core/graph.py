@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.growing import GrowingArray
@@ -183,12 +181,23 @@ class FactorGraph:
 
 
 def component_labels(graph: FactorGraph) -> Indices:
-    """Return a component number for each keyframe, (n,); one component: all zero."""
-    factors = graph.between
-    adjacency = coo_array((np.ones(len(factors)), (factors.i, factors.j)),
-                          shape=(graph.n_poses, graph.n_poses))
-    labels: Indices = connected_components(adjacency, directed=False)[1]
-    return labels
+    """
+    Return a component number for each keyframe, (n,), in the order of their first keyframes.
+
+    Every keyframe points to a lower one of its component, or to itself; factors pull what both
+    ends point to down to the lower one, and pointers are doubled, until nothing moves.
+    """
+    i, j = graph.between.i, graph.between.j
+    lowest = np.arange(graph.n_poses)
+    while True:
+        a, b = lowest[i], lowest[j]
+        apart = a != b
+        if not apart.any():
+            return np.unique(lowest, return_inverse=True)[1]
+        i, j, a, b = i[apart], j[apart], a[apart], b[apart]
+        np.minimum.at(lowest, np.maximum(a, b), np.minimum(a, b))
+        while (lowest[lowest] != lowest).any():
+            lowest = lowest[lowest]
 
 
 def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:

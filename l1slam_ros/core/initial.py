@@ -6,8 +6,6 @@ In: a factor graph. Out: (n, p) poses, keyframe 0 at the identity.
 """
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.graph import FactorGraph
@@ -39,14 +37,27 @@ def tree_poses(graph: FactorGraph, root: int) -> Array:
     GraphError : a keyframe without a path to the root.
 
     """
-    factors = graph.between
-    n = graph.n_poses
-    adjacency = coo_array((np.ones(len(factors)), (factors.i, factors.j)), shape=(n, n)).tocsr()
-    _, parent = breadth_first_order(adjacency, root, directed=False)
-    parent[root] = root
-    poses = _compose_along(graph, parent.astype(np.int64), np.arange(len(factors)))
+    poses = _compose_along(graph, _breadth_first(graph, root), np.arange(len(graph.between)))
     manifold = graph.manifold
     return manifold.between(np.broadcast_to(poses[0], poses.shape), poses)
+
+
+def _breadth_first(graph: FactorGraph, root: int) -> Indices:
+    """Return the parent of each keyframe, (n,), the root its own; -1: it has no path to it."""
+    i, j, n = graph.between.i, graph.between.j, graph.n_poses
+    near, far = np.concatenate((i, j)), np.concatenate((j, i))
+    order = np.lexsort((far, np.arange(len(near)) >= len(i), near))
+    start = np.searchsorted(near[order], np.arange(n + 1)).tolist()
+    neighbours = far[order].tolist()
+    # One by one: a graph is often nearly a chain, with as many levels as keyframes.
+    parent, reached = [-1] * n, [root]
+    parent[root] = root
+    for k in reached:
+        for other in neighbours[start[k]:start[k + 1]]:
+            if parent[other] < 0:
+                parent[other] = k
+                reached.append(other)
+    return np.array(parent)
 
 
 def compose_tree(manifold: Manifold, parent: Indices, relative: Array) -> Array:

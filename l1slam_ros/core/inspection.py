@@ -6,18 +6,17 @@ In: a graph. Out: which keyframes and factors are suspicious, and by how much; s
 of them elsewhere. All but `noise_scales` look at each factor once.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from l1slam_ros.core.cholesky import BlockCholesky, cholesky_of
+from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.graph import FactorGraph, component_labels
-from l1slam_ros.core.initial import pair_key
-from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.least_squares import weighted_least_squares
-from l1slam_ros.core.linearise import LinearSystem, linearise
+from l1slam_ros.core.initial import pair_key, tree_poses
+from l1slam_ros.core.linearise import LinearSystem, ends, keyframes_of, step_poses
 from l1slam_ros.core.manifold import Array, Indices
-from l1slam_ros.core.seed import seed_poses
+from l1slam_ros.core.noise import whiten
+from l1slam_ros.core.optimality import l2_cost
 
 # A step this many times as long as nine in ten of all steps is no step of the same robot.
 _LONG = 10.0
@@ -26,8 +25,10 @@ _PART = 2000
 # Fewer spare measurements than this tell nothing of their noise.
 _FEWEST_SPARE = 20
 _ROUNDS = 8
-# Solving for a look: the poses need not be exact for their residuals to have the right size.
-_SOLVE = LeastSquaresOptions(iterations=20, tolerance=1e-3)
+# The poses need not be exact for their residuals to have the right size: steps of Gauss-Newton at
+# most, each halved so often, and the part of chi2 that no longer matters; nor the ratios.
+_STEPS, _HALVINGS, _TOLERANCE = 20, 5, 1e-3
+_SAME_RATIO = 0.01
 
 
 def repeated_factors(graph: FactorGraph) -> Indices:
@@ -150,28 +151,85 @@ def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
     ends = int(keyframes[0]), int(keyframes[-1])
     if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < _FEWEST_SPARE:
         return NoiseScales(np.nan, np.nan, *ends)
-    cholesky = cholesky_of(part)
-    poses = minimise_l2(part, seed_poses(part, cholesky), _SOLVE, cholesky).poses
-    system, d = linearise(part, poses), graph.manifold.TANGENT_SIZE
-    group = np.repeat(is_loop.astype(np.int64), d)
+    system = _system(part, _l2_poses(part))
+    group = np.repeat(is_loop.astype(np.int64), graph.manifold.TANGENT_SIZE)
     noise = rng.standard_normal(len(group))
     variance, spare = np.ones(2), np.zeros(2)
     for _ in range(_ROUNDS):
-        found, drawn = (
-            np.bincount(group, _left(replace(system, b=b), cholesky, 1 / variance[group]) ** 2,
-                        minlength=2)
-            for b in (system.b, np.sqrt(variance)[group] * noise))
+        both = np.stack((system.b, np.sqrt(variance)[group] * noise), axis=1)
+        left = both - system.A @ _least_squares(system, both, 1 / variance[group])
+        found, drawn = (np.bincount(group, column**2, minlength=2) for column in left.T)
         spare = drawn / variance
         ratio = np.divide(found, drawn, out=np.ones(2), where=spare >= _FEWEST_SPARE)
         variance = np.clip(variance * ratio, 1e-12, 1e12)
+        if (np.abs(ratio - 1) < _SAME_RATIO).all():
+            break
     odometry, loops = np.where(spare >= _FEWEST_SPARE, np.sqrt(variance), np.nan).tolist()
     return NoiseScales(odometry, loops, *ends)
 
 
-def _left(system: LinearSystem, cholesky: BlockCholesky, weights: Array) -> Array:
-    """Return b - A x at the weighted least squares solution x, (rows,)."""
-    x = weighted_least_squares(system, cholesky, weights)
-    return system.b - system.times(x)
+def _l2_poses(graph: FactorGraph) -> Array:
+    """Return the L2 map of a graph without priors, (n, p): rotations, positions, then both."""
+    manifold, poses = graph.manifold, tree_poses(graph, 0)
+    for part in (manifold.ROTATION, manifold.TRANSLATION):
+        system = _system(graph, poses).part(part)
+        step = np.zeros((system.size, manifold.TANGENT_SIZE))
+        step[:, part] = _least_squares(system, system.b).reshape(system.size, -1)
+        poses = step_poses(graph, poses, step)
+    system = _system(graph, poses)
+    for _ in range(_STEPS):
+        step, chi2 = _least_squares(system, system.b), l2_cost(system.b)
+        for halvings in range(_HALVINGS + 1):
+            candidate = step_poses(graph, poses, step / 2**halvings)
+            moved = _system(graph, candidate)
+            if l2_cost(moved.b) < chi2:
+                poses, system = candidate, moved
+                break
+        if chi2 - l2_cost(system.b) <= _TOLERANCE * chi2:
+            break
+    return poses
+
+
+def _system(graph: FactorGraph, poses: Array) -> LinearSystem:
+    """
+    Return `linearise` of a graph without priors by the verbs of its manifold, nothing compiled.
+
+    A look at a graph is over before compiled loops are there. With B = Xi^-1 Xj the residual is
+    that of B seen from Z; a step s of i moves B on the right by -Ad(B^-1) s.
+    """
+    manifold, factors = graph.manifold, graph.between
+    B = manifold.between(*ends(graph, poses))
+    J_j = manifold.local_jacobian(factors.measurement, B)
+    J_i = -J_j @ manifold.adjoint(manifold.inverse(B))
+    roots = factors.sqrt_information
+    b = -whiten(roots, manifold.local(factors.measurement, B))
+    blocks = np.stack((whiten(roots, J_i), whiten(roots, J_j)), axis=1)
+    return LinearSystem(keyframes_of(graph), blocks, b.ravel(), graph.n_poses - 1)
+
+
+def _least_squares(system: LinearSystem, b: Array, weights: Array | float = 1.0) -> Array:
+    """
+    Return argmin_x sum_i w_i (A x - b)_i^2, (columns,) or (columns, k) for as many b.
+
+    Raises
+    ------
+    GraphError : the matrix is singular.
+
+    """
+    from scipy.sparse import csc_array
+    from scipy.sparse.linalg import splu
+
+    root = np.sqrt(np.broadcast_to(weights, len(system.b)))
+    A = system.A.copy()
+    A.data = A.data * np.repeat(root, np.diff(A.indptr))
+    b = b * (root if b.ndim == 1 else root[:, None])
+    try:
+        factor = splu(csc_array(A.T @ A), permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
+                      options={'SymmetricMode': True})
+    except RuntimeError as error:
+        raise GraphError('the normal matrix is singular') from error
+    x: Array = factor.solve(A.T @ b)
+    return x
 
 
 def _densest_part(graph: FactorGraph) -> tuple[FactorGraph, Indices, np.ndarray]:

@@ -73,7 +73,7 @@ class _Iterate:
 
     @property
     def gap(self) -> float:
-        """u's + v't."""
+        """The complementarity u's + v't."""
         return float((self.u * self.s + self.v * self.t).sum())
 
     @property

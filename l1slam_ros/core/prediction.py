@@ -10,15 +10,17 @@ the covariance of the residual of one inside. Two dozen samples cost a few ordin
 """
 
 from dataclasses import dataclass
+from functools import cache
+from math import lgamma
 
 import numpy as np
-from scipy.special import betaincinv, gammaincinv, gammaln
 
 from l1slam_ros.core.cholesky import BlockCholesky
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.linearise import LinearSystem, linearise
 from l1slam_ros.core.manifold import Array, Indices, Manifold
+from l1slam_ros.core.quantiles import beta_quantile, gamma_quantile
 
 # A covariance from that many samples has standard deviations right to 15% (1 / sqrt(2 SAMPLES)).
 SAMPLES = 24
@@ -93,7 +95,7 @@ def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array, size: 
     Where nothing but the noise speaks, that is a little generous.
     """
     q = SAMPLES
-    constant = gammaln((q + 1) / 2) - gammaln((q + 1 - size) / 2) - size * np.log(np.pi * q) / 2
+    constant = lgamma((q + 1) / 2) - lgamma((q + 1 - size) / 2) - size * np.log(np.pi * q) / 2
     density = constant - (log_det + (q + 1) * np.log1p(square / q)) / 2
     ratio: Array = log_claim + density
     return ratio
@@ -207,11 +209,13 @@ def claimed_volume(manifold: Manifold, poses: Array, rng: np.random.Generator) -
         return float(np.log(2 * np.pi * variance).sum()) / 2
 
 
+@cache
 def chi2_quantile(probability: float, freedom: int) -> float:
     """Return what a sum of `freedom` squared standard normal numbers stays below."""
-    return float(2 * gammaincinv(freedom / 2, probability))
+    return 2 * gamma_quantile(freedom / 2, probability)
 
 
+@cache
 def sampled_quantile(probability: float, freedom: int) -> float:
     """
     Return what r'C^-1 r of normal numbers r (freedom,) stays below.
@@ -220,5 +224,5 @@ def sampled_quantile(probability: float, freedom: int) -> float:
     T^2 (q - k + 1) / (q k) is Fisher's F of k and q - k + 1 degrees of freedom.
     """
     rest = SAMPLES - freedom + 1
-    x = float(betaincinv(freedom / 2, rest / 2, probability))
+    x = beta_quantile(freedom / 2, rest / 2, probability)
     return SAMPLES * x / (1 - x)

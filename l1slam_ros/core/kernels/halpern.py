@@ -91,7 +91,8 @@ def iterate(tiles, keyframes, x, z, g, weight, first, count, K):
             _scatter(local, tile, g, keyframes[t], K)
 
 
-@loop(*_for_each_size('f4[:, ::1], u4[:, ::1], f4[:, ::1], f4[:, ::1], f8, f4[:, ::1], f4[:, ::1], f4[:, ::1]'))
+@loop(*_for_each_size('f4[:, ::1], u4[:, ::1], f4[:, ::1], f4[:, ::1], f8, f4[:, ::1], '
+                      'f4[:, ::1], f4[:, ::1]'))
 def look(tiles, keyframes, x, g, weight, x_bar, g_bar, y_bar, K):
     """
     Find the next point without the pull to the restart, and what the tests want to know.

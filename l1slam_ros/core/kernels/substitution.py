@@ -5,7 +5,6 @@ import numpy as np
 
 from l1slam_ros.core.kernels.compiled import compiled, loop
 
-
 _TAKES = 'f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i4[::1], f8[:, ::1]'
 
 

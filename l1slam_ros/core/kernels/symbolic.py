@@ -182,7 +182,7 @@ def block_addresses(keyframe, position, first, start, pattern, offset, k):
     """
     n, m = len(position), len(keyframe)
     corner, stride = np.empty(n, np.int64), np.empty(n, np.int64)
-    owner, free = np.empty(n, np.int64), np.empty(n, np.int64)
+    owner = np.empty(n, np.int64)
     for s in range(len(first) - 1):
         for column in range(first[s], first[s + 1]):
             owner[column] = s
