@@ -57,9 +57,7 @@ def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
         return True
     if stopped() or not any(map(_is_writable, _folders())):
         return False
-    done = 0
-    for step, files in _compiled(missing, stopped):
-        done += 1
+    for done, (step, files) in enumerate(_compiled(missing, stopped), 1):
         if files:
             known[step] = files
             _note(known)
