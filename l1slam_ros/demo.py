@@ -133,7 +133,7 @@ class Listener:
 
     def __init__(self, node: Node, recording: Recording):
         self.node, self.recording, self.heard = node, recording, Heard()
-        self._moved = time.monotonic()
+        self.moved = time.monotonic()
         self._said: tuple[str, ...] = ()
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         node.create_subscription(PathMessage, 'path', self._hear, latched)
@@ -164,7 +164,7 @@ class Listener:
             self.heard.calm += 1
 
     def _move(self) -> None:
-        self.heard.calm, self._moved = 0, time.monotonic()
+        self.heard.calm, self.moved = 0, time.monotonic()
 
     def is_final(self) -> bool:
         """Return whether all of the recording is in the map, and the map at rest."""
@@ -188,15 +188,15 @@ class Listener:
         DemoError : the node has ended, or nothing has moved for `PATIENCE` seconds.
 
         """
-        self._moved = time.monotonic()
-        tell = self._moved + _TELL
+        self.moved = time.monotonic()
+        tell = self.moved + _TELL
         while not ready():
             rclpy.spin_once(self.node, timeout_sec=0.1)
             now = time.monotonic()
             if backend.poll() is not None:
                 raise DemoError(f'backend ended with exit code {backend.returncode}; '
                                 f'{self.how_far()}')
-            if now > self._moved + PATIENCE:
+            if now > self.moved + PATIENCE:
                 raise DemoError(f'nothing has moved for {PATIENCE:.0f} s; {self.how_far()}')
             if now > tell:
                 tell = now + _TELL
