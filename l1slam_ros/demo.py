@@ -23,7 +23,9 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path as PathMessage
+from rcl_interfaces.msg import Log
 from rclpy.executors import ExternalShutdownException
+from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
@@ -40,6 +42,7 @@ from l1slam_ros.io.side_files import false_loops_path, read_false_loops
 Process = subprocess.Popen[bytes]
 
 BAG = Path('bags/demo')
+BACKEND = 'backend'  # the executable, and the node
 PICTURE = Path('demo/map.png')
 RATE = 10.0
 # The map is final when the node has said so often [diagnostics, one a second] the same of it.
@@ -140,6 +143,7 @@ class Listener:
         every = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         node.create_subscription(DiagnosticArray, 'loop_status', self._hear_of_loops, every)
         node.create_subscription(DiagnosticArray, '/diagnostics', self._hear_of_the_map, 10)
+        node.create_subscription(Log, '/rosout', self._hear_it_log, every)
 
     def _hear(self, message: PathMessage) -> None:
         self.heard.path = message
@@ -162,6 +166,11 @@ class Listener:
                 self._said = said
                 self._move()
             self.heard.calm += 1
+
+    def _hear_it_log(self, message: Log) -> None:
+        # How far it is with compiling is news, but not of the map; that it failed again is none.
+        if message.name == BACKEND and message.level == LoggingSeverity.INFO:
+            self.moved = time.monotonic()
 
     def _move(self) -> None:
         self.heard.calm, self.moved = 0, time.monotonic()
@@ -194,7 +203,7 @@ class Listener:
             rclpy.spin_once(self.node, timeout_sec=0.1)
             now = time.monotonic()
             if backend.poll() is not None:
-                raise DemoError(f'backend ended with exit code {backend.returncode}; '
+                raise DemoError(f'{BACKEND} ended with exit code {backend.returncode}; '
                                 f'{self.how_far()}')
             if now > self.moved + PATIENCE:
                 raise DemoError(f'nothing has moved for {PATIENCE:.0f} s; {self.how_far()}')
@@ -234,7 +243,7 @@ def record_map(bag: Path, recording: Recording) -> Heard:
     rclpy.init()
     try:
         listener = Listener(rclpy.create_node('demo'), recording)
-        with running('backend') as backend:
+        with running(BACKEND) as backend:
             print(f'demo: playing {bag}, {RATE:g} times as fast as recorded', flush=True)
             with running('replay', str(bag), '--rate', str(RATE)) as replay:
                 listener.wait(backend, lambda: replay.poll() is not None)

@@ -144,6 +144,20 @@ def test_the_map_is_final_when_it_is_whole_and_the_node_says_the_same_of_it(list
     assert not listener.is_final()  # another update
 
 
+def test_what_the_node_logs_of_its_work_is_a_move_and_its_complaints_are_none(listener, ros):
+    began, backend = listener.moved, ros.create_node('backend')
+    backend.get_logger().warning('update failed')
+    backend.get_logger().info('compiled 3 of 12')
+    moves, deadline = set(), time.monotonic() + DEADLINE
+    while not moves:
+        assert time.monotonic() < deadline
+        rclpy.spin_once(listener.node, timeout_sec=0.1)
+        moves |= {listener.moved} - {began}
+    rclpy.spin_once(listener.node, timeout_sec=0.1)
+    assert moves == {listener.moved} and listener.heard.calm == 0
+    backend.destroy_node()
+
+
 def test_the_demo_ends_with_a_sentence_when_the_node_has_died(listener):
     process = subprocess.Popen([sys.executable, '-c', 'raise SystemExit(7)'])
     with pytest.raises(DemoError, match='^backend ended with exit code 7; 0 of 1000 keyframes'):
