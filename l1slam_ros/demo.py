@@ -137,7 +137,7 @@ class Listener:
     def __init__(self, node: Node, recording: Recording):
         self.node, self.recording, self.heard = node, recording, Heard()
         self.moved = time.monotonic()
-        self._said: tuple[str, ...] = ()
+        self._said: dict[str, str] = {}
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         node.create_subscription(PathMessage, 'path', self._hear, latched)
         every = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -160,8 +160,11 @@ class Listener:
     def _hear_of_the_map(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
-            self.heard.sentence = status.message
-            said = (status.message, *(values.get(key, '') for key in OF_THE_MAP))
+            said = {key: values[key] for key in OF_THE_MAP if key in values}
+            if not said:
+                continue
+            if status.message != self.heard.sentence:
+                self.heard.sentence, self.moved = status.message, time.monotonic()
             if said != self._said:
                 self._said = said
                 self._move()
