@@ -3,29 +3,53 @@
 
 PYTHON ?= python3
 VENV := .venv
+# What there is so far: what the demo needs, and on top of it what the tests need.
 STAMP := $(VENV)/installed
+TESTS := $(VENV)/installed-tests
+# Is there while packages are being installed. What an interrupted pip leaves half done it takes
+# for complete the next time, so after that the environment is made anew.
+HALF := $(VENV)/half-installed
 
 # A ROS that the shell has sourced, or another venv's ROS wheels, must not mix with this venv's.
 unexport PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: demo test clean
+# Says what is being installed, and installs it. On a terminal pip shows its progress, in a log it
+# would fill pages. What fails by itself is not half done.
+define install
+	@echo '$(1)'
+	@touch $(HALF)
+	@quiet=; test -t 1 || quiet=--quiet; PYTHONWARNINGS=ignore \
+	  $(VENV)/bin/python -m pip install $$quiet $(2) || \
+	  { test $$? -ge 128 || rm $(HALF); exit 1; }
+endef
+
+.PHONY: demo test clean anew
 
 demo: $(STAMP)
 	$(VENV)/bin/python -m l1slam_ros.demo
 
-test: $(STAMP)
+test: $(TESTS)
 	$(VENV)/bin/python -m pytest
 
 clean:
 	rm -rf $(VENV) build demo dist install log *.egg-info
 	rm -rf .pytest_cache .ruff_cache .mypy_cache .hypothesis
 
-# Editable, so that every process, whoever starts it, runs the checkout; an editable install
-# leaves the data files out, so they are put in place by a command of their own. Setuptools
-# warns at length about other uses of either.
-$(STAMP): setup.py setup.cfg pyproject.toml package.xml $(wildcard config/* resource/* resource/run/*)
-	test -x $(VENV)/bin/pip || $(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install --quiet --upgrade pip
-	PYTHONWARNINGS=ignore $(VENV)/bin/python -m pip install --quiet --editable '.[ros,test]'
-	PYTHONWARNINGS=ignore $(VENV)/bin/python setup.py --quiet install_data
-	touch $@
+# Editable, so that every process, whoever starts it, runs the checkout.
+$(STAMP): setup.py setup.cfg pyproject.toml package.xml $(if $(wildcard $(HALF)),anew)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2> /dev/null || { echo \
+	  '$(PYTHON) is no Python 3.10 or newer; expected one: make PYTHON=python3.12' >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2> /dev/null || { echo \
+	  '$(PYTHON) makes no environments; expected its venv: apt install python3-venv' >&2; exit 1; }
+	@if test -e $(HALF) || ! $(VENV)/bin/python -m pip --version > /dev/null 2>&1; then \
+	  echo 'Making a Python environment in $(VENV)'; \
+	  rm -rf $(VENV) && mkdir $(VENV) && touch $(HALF) && $(PYTHON) -m venv $(VENV); fi
+	$(call install,Installing what the demo needs; the first time it is downloaded,--editable '.[ros]')
+	@rm $(HALF) && touch $@
+
+# An editable install leaves the data files out, so they are put in place by a command of their
+# own. Setuptools warns at length about other uses of it.
+$(TESTS): $(STAMP) $(wildcard config/* resource/* resource/run/*)
+	$(call install,Installing what the tests need,'l1slam_ros[test]')
+	@PYTHONWARNINGS=ignore $(VENV)/bin/python setup.py --quiet install_data
+	@rm $(HALF) && touch $@

@@ -52,12 +52,14 @@ setup(
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         # Newer style tools find other things, and a test asserts that they find none.
         # setuptools: a test builds the wheel, and from 70.1 on it can do so by itself.
+        # pip: tests install into other environments, which from 22.3 on it can do.
         'test': [
             'pytest>=7.4',
             'hypothesis>=6.98',
             'ruff~=0.17.5',
             'mypy~=2.4.1',
             'packaging',
+            'pip>=22.3',
             'setuptools>=70.1',
         ],
     },

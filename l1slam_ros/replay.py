@@ -13,6 +13,7 @@ from importlib import import_module
 from pathlib import Path
 
 import rclpy
+from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -29,10 +30,10 @@ _BAD_INPUT = 2
 _DAMAGED = 3
 _DEPTH = 1000
 _SECOND = 1_000_000_000
-# A publisher sends nothing to whom it has not met. Meeting takes part of a second, but where a
-# first announcement is lost (a busy machine), as many times 3 s as it takes.
-_DISCOVERY = 10.0  # [s] longest wait for anybody to subscribe
-_REST = 0.5  # [s] then, for the other topics of the same node
+# A publisher sends nothing to whom it has not met. A node is met one subscription at a time, so
+# once there is any, no other has come for this long [s] before messages go out.
+_REST = 1.0
+_SOON, _AGAIN = 2.0, 30.0  # [s] when it is said that nobody subscribes, and how often from then on
 _CLOCK_PERIOD = 0.01  # [s] of the bag's time
 _PAUSE = 0.05  # [s] longest sleep at a time, so that an interrupt is seen
 
@@ -78,18 +79,41 @@ class Player:
                 kind, remap.get(topic.name, topic.name), QoSProfile(depth=_DEPTH))
         self._clock = node.create_publisher(Clock, '/clock', 10) if clock else None
 
-    def wait_for_subscribers(self) -> None:
-        """Wait until anybody subscribes, then a little for the rest; play to nobody in the end."""
+    def wait_for_subscribers(self, longest: float | None) -> None:
+        """
+        Wait until anybody subscribes, then until nobody else does.
+
+        longest : [s] then play to nobody; None: as long as it takes; 0: do not wait at all
+
+        """
+        if longest == 0:
+            return
         began = time.monotonic()
-        while not any(p.get_subscription_count() for p in self.publishers.values()):
-            if time.monotonic() > began + _DISCOVERY:
-                self._node.get_logger().warning('nobody subscribes; playing all the same')
+        say = began + _SOON
+        while not self._subscribed():
+            now = time.monotonic()
+            if longest is not None and now > began + longest:
+                self._node.get_logger().warning(
+                    f'nobody subscribed for {longest:g} s; playing all the same')
                 return
+            if now > say:
+                say = now + _AGAIN
+                names = ', '.join(publisher.topic_name for publisher in self.publishers.values())
+                self._node.get_logger().info(f'waiting for a subscriber of {names}')
+            _sleep_until(now + _PAUSE)
+        self._wait_for_others()
+
+    def _subscribed(self) -> int:
+        """Return how many of the topics have a subscriber."""
+        return sum(publisher.get_subscription_count() > 0
+                   for publisher in self.publishers.values())
+
+    def _wait_for_others(self) -> None:
+        known, quiet = self._subscribed(), time.monotonic() + _REST
+        while time.monotonic() < quiet and known < len(self.publishers):
             _sleep_until(time.monotonic() + _PAUSE)
-        rest = time.monotonic() + _REST
-        while time.monotonic() < rest and not all(
-                p.get_subscription_count() for p in self.publishers.values()):
-            _sleep_until(time.monotonic() + _PAUSE)
+            if self._subscribed() > known:
+                known, quiet = self._subscribed(), time.monotonic() + _REST
 
     def play(self, messages: Iterable[RawMessage], rate: float, progress: Progress) -> None:
         """Publish the messages, `rate` times as fast as they were recorded."""
@@ -105,8 +129,13 @@ class Player:
             self.publishers[message.topic].publish(message.data)
             progress.advance(recorded - shown)
             shown = recorded
-        for publisher in self.publishers.values():
-            publisher.wait_for_all_acked()
+        self._wait_until_received()
+
+    def _wait_until_received(self) -> None:
+        """Wait until every subscriber has the last messages, or is gone."""
+        moment = Duration(seconds=_PAUSE)
+        while not all(p.wait_for_all_acked(moment) for p in self.publishers.values()):
+            _sleep_until(time.monotonic())  # an interrupt is seen between the waits
 
     def _publish_clock(self, stamp: int) -> None:
         assert self._clock is not None
@@ -166,7 +195,7 @@ def _play(arguments: argparse.Namespace, damage: _Damage) -> None:
         player = Player(node, summary, arguments.topics, arguments.remap, arguments.clock)
         if not player.publishers:
             raise FileError(arguments.bag, 'no topic of this bag can be played')
-        player.wait_for_subscribers()
+        player.wait_for_subscribers(arguments.wait)
         seconds = max(summary.duration / _SECOND - arguments.start, 0)
         for messages in _rounds(arguments, summary, list(player.publishers), damage):
             with Progress(min(seconds, arguments.duration or seconds), 's') as progress:
@@ -200,6 +229,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog='replay', description='Play a bag onto topics.')
     add = parser.add_argument
     add('bag', type=Path, help='.mcap, .db3, .bag (ROS 1) or a rosbag2 directory')
+    add('--wait', type=_not_negative, metavar='SECONDS',
+        help='play after so long even if nobody subscribes; 0: at once (default: until somebody '
+             'does)')
     add('--rate', type=_positive, default=1.0, help='times as fast as recorded')
     add('--start', type=_not_negative, default=0.0, help='skip so much of the bag [s]')
     add('--duration', type=_positive, help='play only so much of the bag [s]')

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from disk import Disk
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.stream_reader import StreamReader
 
@@ -140,6 +141,37 @@ def test_a_former_bag_stays_until_the_new_one_is_complete(bag):
     assert [m.topic for m in read_messages(bag)] == ['/a', '/b']
     assert {p.name for p in bag.iterdir()} == {'metadata.yaml', 'bag.mcap'}
     assert list(bag.parent.iterdir()) == [bag]
+
+
+def contents(bag):
+    return {file.name: file.read_bytes() for file in bag.iterdir()}
+
+
+# Both files, then their folder; the two renamings, then the folder around it.
+CALLS = ['open', 'open', 'fsync', 'fsync', 'fsync', 'rename', 'rename', 'fsync']
+
+
+@pytest.mark.parametrize('failing', range(len(CALLS) + 1))
+def test_a_disk_that_fails_leaves_the_old_bag_or_the_new_one(tmp_path, bag, monkeypatch, failing):
+    old = contents(bag)
+    disk = Disk(monkeypatch, tmp_path, failing)
+    if failing in (4, 7, 8):  # that a folder cannot be synced is no reason to fail
+        write_strings(bag, 3)
+        assert contents(bag) != old and len(list(read_messages(bag))) == 4
+    else:
+        with pytest.raises(FileError, match='cannot be written: Input/output error'):
+            write_strings(bag, 3)
+        assert contents(bag) == old
+    assert disk.calls[:failing + 1] == CALLS[:failing + 1]
+    assert list(tmp_path.iterdir()) == [bag]
+
+
+def test_a_power_cut_after_a_bag_is_written_takes_none_of_it(tmp_path, bag, monkeypatch):
+    disk = Disk(monkeypatch, tmp_path)
+    write_strings(bag, 3)
+    for early in True, False:
+        kept = {file.name: disk.after_a_power_cut(file, tmp_path, early) for file in bag.iterdir()}
+        assert kept == contents(bag)
 
 
 def test_what_is_no_bag_is_not_overwritten(tmp_path, bag):

@@ -5,6 +5,7 @@ import stat
 
 import numpy as np
 import pytest
+from disk import Disk
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.files import (
@@ -43,6 +44,32 @@ def test_the_file_appears_only_when_the_block_has_succeeded(tmp_path):
         assert not path.exists()
     assert path.read_text() == 'whole'
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize('failing', range(5))
+def test_a_disk_that_fails_leaves_the_old_file_or_the_new_one(tmp_path, monkeypatch, failing):
+    path = tmp_path / 'a.txt'
+    write_lines(path, ['old'])
+    disk = Disk(monkeypatch, tmp_path, failing)
+    # File opened, synced, renamed; that the folder cannot be synced is no reason to fail.
+    if failing < 3:
+        with pytest.raises(FileError, match='cannot be written: Input/output error'):
+            write_lines(path, ['new'])
+    else:
+        write_lines(path, ['new'])
+    assert disk.calls[:4] == ['open', 'fsync', 'replace', 'fsync'][:failing + 1]
+    assert path.read_text() == ('old\n' if failing < 3 else 'new\n')
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize('early', [True, False])
+def test_a_power_cut_leaves_the_old_file_or_the_new_one(tmp_path, monkeypatch, early):
+    path, found = tmp_path / 'a.txt', []
+    write_lines(path, ['old'])
+    disk = Disk(monkeypatch, tmp_path,
+                seen=lambda: found.append(disk.after_a_power_cut(path, tmp_path, early)))
+    write_lines(path, ['new'])
+    assert set(found) == {b'old\n', b'new\n'} and found[-1] == b'new\n'
 
 
 def test_others_may_read_what_is_written(tmp_path):

@@ -30,6 +30,20 @@ def test_without_a_slip_nothing_is_left_out(bad):
     assert without_slip(grown(bad.graph)) is None
 
 
+@pytest.mark.parametrize('stated', [1.0, 10.0])
+def test_what_is_within_the_noise_as_stated_is_no_slip(stated):
+    """40 sigmas are a slip; 4 are none, though loops that know better all speak against it."""
+    world, turn = spoilt(careful_world(400, 800), 'random', 100), np.array([[0.0, 0.0, 0.2]])
+    factors, graph = world.graph.between, FactorGraph(se2)
+    row, measurement = factors.is_odometry & (factors.i == STEP), factors.measurement.copy()
+    measurement[row] = se2.retract(measurement[row], turn)
+    roots = factors.sqrt_information / stated
+    graph.add_poses(world.graph.n_poses)
+    graph.add_between(factors.i, factors.j, measurement, roots.transpose(0, 2, 1) @ roots)
+    mended = without_slip(grown(graph))
+    assert (mended is None) == (stated > 1)
+
+
 def test_a_jump_is_unusual_and_what_all_do_is_not():
     graph = careful_world(200, 200).graph
     usual = unusual_motion(graph, graph.between.measurement)

@@ -18,6 +18,7 @@ from tempfile import mkdtemp
 from typing import Any
 
 from l1slam_ros.core.errors import FileError
+from l1slam_ros.io.files import sync_folder
 from l1slam_ros.io.salvage import METADATA
 
 NOTE_KEY = 'l1slam'
@@ -175,7 +176,9 @@ def _replacing_directory(target: Path) -> Iterator[Path]:
         for file in made.iterdir():
             with file.open('rb') as written:
                 os.fsync(written.fileno())
+        sync_folder(made)
         _swap(made, target, scratch / f'{target.name}.former')
+        sync_folder(target.parent)
     except OSError as error:
         raise FileError(target, f'cannot be written: {error.strerror or error}') from error
     finally:

@@ -51,11 +51,22 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, target)
+        sync_folder(target.parent)
     except OSError as error:
         raise FileError(path, f'cannot be written: {error.strerror or error}') from error
     finally:
         with suppress(OSError):
             temporary.unlink()
+
+
+def sync_folder(folder: Path) -> None:
+    """Let no power cut undo what was renamed in a folder, where its file system can do that."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def require_folder(path: str | os.PathLike[str]) -> None:
