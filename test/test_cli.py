@@ -465,7 +465,7 @@ def test_plot_shows_false_loops_where_they_are_known(capsys, world, tmp_path):
 
 @pytest.mark.parametrize('line, words', [
     ('3 5', 'no edge between 3 and 5'), ('3 999', 'no edge between 3 and 999'),
-    ('3', '1 fields; expected 2 whole numbers'), ('3 x', "'x' is not a whole number"),
+    ('3', '1 field; expected 2 whole numbers'), ('3 x', "'x' is not a whole number"),
 ])
 def test_a_file_of_other_false_loops_is_refused(capsys, tmp_path, line, words):
     path = graph_file(tmp_path, [*VERTICES, *EDGES])

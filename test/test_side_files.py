@@ -74,7 +74,7 @@ def test_a_file_without_loops_trusts_none(tmp_path):
 
 
 @pytest.mark.parametrize(('line', 'words'), [
-    ('1', ':4: trusted loop: 1 fields; expected 2 whole numbers'),
+    ('1', ':4: trusted loop: 1 field; expected 2 whole numbers'),
     ('1 2.5', ":4: trusted loop: '2.5' is not a whole number of 64 bits; expected 2"),
     ('-7 8', ':4: no edge between -7 and 8 in '), ('9 -7', ':4: no edge between 9 and -7 in '),
     ('3 3', ':4: no edge between 3 and 3 in '),
@@ -120,7 +120,7 @@ def test_without_the_file_no_loop_is_false(tmp_path):
 
 
 @pytest.mark.parametrize(('line', 'found'), [
-    ('1', '1 fields'), ('1 2 3', '3 fields'), ('1 2.5', "'2.5' is not a whole number"),
+    ('1', '1 field'), ('1 2 3', '3 fields'), ('1 2.5', "'2.5' is not a whole number"),
     ('a b', "'a' is not a whole number")])
 def test_damaged_false_loops_are_named(tmp_path, line, found):
     path = tmp_path / 'false.txt'
