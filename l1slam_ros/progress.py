@@ -49,7 +49,9 @@ class Progress:
             self._advance_bar(now, steps, note)
         elif now >= self._next_line:
             self._next_line = now + _APART
-            of_all = f' of {self._total:,.0f}' if self._total is not None else ''
+            # Another solver may go on where one came no further.
+            within = self._total is not None and self._done <= self._total
+            of_all = f' of {self._total:,.0f}' if within else ''
             print(f'l1slam: {self._label}: {self._unit} {self._done:,.0f}{of_all}'
                   f'{", " if note else ""}{note}', file=sys.stderr, flush=True)
 

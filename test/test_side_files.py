@@ -49,6 +49,19 @@ def test_stamps_come_back_to_the_nanosecond(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ['a.g2o.stamps.txt']
 
 
+def test_stamps_alone_are_those_of_the_vertices_in_their_order(tmp_path):
+    path = tmp_path / 'a.g2o'
+    stamps_path(path).write_text('# seconds\n 5.25\n7\n6.5 \n8\n9.125\n')
+    assert read_stamps(path, IDS).tolist() == [
+        5_250_000_000, 7_000_000_000, 6_500_000_000, 8_000_000_000, 9_125_000_000]
+    for text, said in (('1\n2\n', '2 stamps that are not'),
+                       ('1\n2 3\n', "'2 3'; expected seconds"),
+                       ('1\n' * 6, '6 stamps that are not'), ('x\n', "'x'; expected seconds")):
+        stamps_path(path).write_text(text)
+        with pytest.raises(FileError, match=said):
+            read_stamps(path, IDS)
+
+
 def test_trust_comes_back(tmp_path):
     path, loops = tmp_path / 'a.g2o', [(0, 3), (4, 0), (2, 1), (0, 4), (1, 4)]
     # Rows 5 and 7 join the same vertices; row 6 goes along the odometry, which is row 1.

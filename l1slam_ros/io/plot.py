@@ -228,7 +228,7 @@ def _small_print(drawing: MapDrawing) -> str:
     kinds = {'refused': drawing.rejected, 'suspect': drawing.suspect, 'false': drawing.false}
     parts = [f'{len(pairs):,} {word}' for word, pairs in kinds.items() if len(pairs)]
     if len(drawing.loops) > _MOST_LOOPS:
-        parts.append(f'{_MOST_LOOPS:,} of the others drawn')
+        parts.append(f'{_MOST_LOOPS:,} drawn')
     loops = len(drawing.loops) + sum(map(len, kinds.values()))
     said = f'{counted(len(drawing.positions), "pose")}, {counted(loops, "loop")}'
     return (said + (f' ({", ".join(parts)})' if parts else '')
