@@ -232,9 +232,9 @@ def test_the_picture_shows_what_was_refused(capsys, lies, tmp_path):
 # Doubtful
 
 
-DOUBT = re.compile(r'doubtful: (\d+) refused loops agree with each other, but not with the odometry '
-                   r'between (\d+) and (\d+)( \([0-9.]+ s to [0-9.]+ s\))?, and to leave out one '
-                   'step of it does not reconcile them; the map may be bent there')
+DOUBT = re.compile(r'doubtful: (\d+) refused loops agree with each other, but not with the '
+                   r'odometry between (\d+) and (\d+)( \([0-9.]+ s to [0-9.]+ s\))?, and to leave '
+                   'out one step of it does not reconcile them; the map may be bent there')
 
 
 @pytest.fixture
@@ -303,7 +303,8 @@ GAP = 'no edge between the consecutive vertices 1 and 2, so no chain of odometry
 @pytest.mark.parametrize('start', ['seed', 'file'])
 def test_a_gap_in_the_odometry_leaves_nothing_to_judge_loops_by(capsys, tmp_path, start):
     path = graph_file(tmp_path, [*VERTICES, EDGES[0], EDGES[2]])
-    asked = ['solve', str(path), '--start', start, '--json', '--output', str(tmp_path / 'out.g2o')]
+    output = str(tmp_path / 'out.g2o')
+    asked = ['solve', str(path), '--start', start, '--json', '--output', output]
     assert main([*asked, '--robust']) == 2
     assert capsys.readouterr() == ('', f'l1slam: {path}: {GAP} to judge loops by\n')
     assert sorted(tmp_path.iterdir()) == [path]

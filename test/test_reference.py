@@ -63,8 +63,9 @@ def true_at(stamps):
 KEYFRAMES = 100 * SECOND + np.arange(0, 60 * SECOND, 730_000_000)
 TRUE = 110 * SECOND + np.arange(0, 40 * SECOND, 250_000_000)
 TRUE = TRUE[(TRUE < 120 * SECOND) | (TRUE > 125 * SECOND)]
-SCORED = ((TRUE[0] <= KEYFRAMES) & (TRUE[-1] >= KEYFRAMES)
-          & ((TRUE[TRUE < 120 * SECOND][-1] >= KEYFRAMES) | (KEYFRAMES >= 125 * SECOND + 250_000_000)))
+BEFORE, AFTER = TRUE[TRUE < 120 * SECOND], TRUE[TRUE > 125 * SECOND]
+SCORED = (((BEFORE[0] <= KEYFRAMES) & (BEFORE[-1] >= KEYFRAMES))
+          | ((AFTER[0] <= KEYFRAMES) & (AFTER[-1] >= KEYFRAMES)))
 
 
 def test_truth_is_interpolated_at_the_stamps_of_the_poses(tmp_path):
@@ -103,7 +104,8 @@ def write_bag(path, topics):
 
 
 def message_of(kind, stamp, pose):
-    header = Header(stamp=Time(sec=int(stamp) // SECOND, nanosec=int(stamp) % SECOND), frame_id='w')
+    sec, nanosec = divmod(int(stamp), SECOND)
+    header = Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id='map')
     x, y, z, *q = se2.to_pose3(pose[None])[0].tolist()
     name = f'geometry_msgs/msg/{kind}'
     if kind == 'TransformStamped':
@@ -142,7 +144,7 @@ def test_a_topic_is_a_truth(tmp_path, kind):
 
 @pytest.mark.parametrize('source, said', [
     ('bag:/nothing', 'no poses on /nothing; expected true poses; there are poses on /pose'),
-    ('bag:/time', '/time is of builtin_interfaces/msg/Time; expected one of geometry_msgs/msg/Pose'),
+    ('bag:/time', '/time is of builtin_interfaces/msg/Time; expected one of geometry_'),
     ('missing:/pose', 'missing: no such file or directory'),
     ('bag:/pose', 'shares 0 poses with the graph, expected 2 or more$'),
 ])
@@ -160,8 +162,8 @@ def test_a_graph_without_stamps_is_said_to_have_none(tmp_path):
     record, _ = drive(KEYFRAMES)
     record = GraphRecord(record.graph, record.poses, record.ids)
     (tmp_path / 'truth.csv').write_text('5, 0, 0, 0\n6, 1, 0, 0\n')
-    with pytest.raises(FileError, match='0 poses with the graph, expected 2 or more; the graph has '
-                                        'no stamps, so its poses are 0.1 s apart from 1000 s on'):
+    with pytest.raises(FileError, match='shares 0 poses with the graph, expected 2 or more; '
+                       'the graph has no stamps, so its poses are 0.1 s apart from 1000 s on'):
         read_truth(str(tmp_path / 'truth.csv'), record, Path('graph.g2o'))
 
 

@@ -218,9 +218,12 @@ def _draw_legend(axes: 'Axes') -> None:
     order = [*(label for label in _LEGEND if label in shown),
              *(label for label in shown if label not in _LEGEND)]
     below = ScaledTranslation(0, -_LEGEND_BELOW, axes.figure.dpi_scale_trans)
+    # Matplotlib fills column by column; people read row by row.
+    columns = 5 if len(order) <= 5 else 4
+    order = [label for k in range(columns) for label in order[k::columns]]
     axes.legend([shown[label] for label in order], order, loc='upper center',
                 bbox_to_anchor=(0.5, 0), borderaxespad=0, bbox_transform=axes.transAxes + below,
-                ncols=5 if len(order) <= 5 else 4, frameon=False, fontsize='small',
+                ncols=columns, frameon=False, fontsize='small',
                 columnspacing=1.4, handlelength=1.4)
 
 
