@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return BROKEN_PIPE
     except OSError as error:
         _forget_output()
-        _say(f'cannot write what is to be said: {error.strerror or error}')
+        _say(_in_words(error))
         return BAD_INPUT
 
 
@@ -80,8 +80,11 @@ def _answer(arguments: Sequence[str] | None) -> int:
         ending = _run(options)
     except BrokenPipeError:
         raise
-    except (L1SlamError, OSError) as error:
+    except L1SlamError as error:
         _say(str(error))
+        return BAD_INPUT
+    except OSError as error:
+        _say(_in_words(error))
         return BAD_INPUT
     except MemoryError:
         _say('not enough memory for a graph of this size')
@@ -102,6 +105,11 @@ def _run(options: argparse.Namespace) -> Any:
     # Numbers beyond all measure end in an error that says so, not in NumPy's warnings.
     with np.errstate(all='ignore'):
         return getattr(module, options.command)(options)
+
+
+def _in_words(error: OSError) -> str:
+    what = error.strerror or str(error)
+    return what if error.filename is None else f'{error.filename}: {what}'
 
 
 def _say(sentence: str) -> None:
