@@ -114,6 +114,8 @@ def check_output(path: Path) -> None:
         raise FileError(path, f'unknown suffix; expected {", ".join(GRAPH_SUFFIXES)}, .tum, or '
                         'none for a bag directory')
     require_folder(path)
+    if path.suffix and path.is_dir():
+        raise FileError(path, 'cannot be written: it is a directory')
 
 
 def check_graph_output(path: Path) -> None:

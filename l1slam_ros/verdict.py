@@ -40,7 +40,8 @@ def verdict(record: GraphRecord, judgement: RobustMap) -> Iterator[str]:
         yield _SLIP.format(pair=_named(pairs[row]), sigmas=judgement.sigmas[row])
     refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect)
     suspect = np.flatnonzero(is_loop & judgement.suspect)
-    yield f'{len(refused):,} of {counted(int(np.count_nonzero(is_loop)), "loop")} refused'
+    if is_loop.any():
+        yield f'{len(refused):,} of {counted(int(np.count_nonzero(is_loop)), "loop")} refused'
     worst = refused[np.argsort(-judgement.sigmas[refused], kind='stable')]
     for row in worst[:_NAMED].tolist():
         yield f'  {_named(pairs[row])}: {judgement.sigmas[row]:.1f} sigmas off the accepted ones'

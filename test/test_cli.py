@@ -320,6 +320,7 @@ def test_a_graph_without_loops_is_its_odometry(capsys, tmp_path):
     report = solve_json(capsys, graph_file(tmp_path, EDGES[:2]))
     assert report['status'] == 'converged' and report['final_cost'] < 1e-6
     assert report['warnings'] == report['rejected'] == report['suspect'] == []
+    assert 'refused' not in run(capsys, 'solve', tmp_path / 'graph.g2o')[0]
 
 
 def test_a_parameter_file_may_say_that_all_loops_are_believed(capsys, tmp_path, lies):
@@ -718,6 +719,7 @@ def test_bad_input_is_one_line_exit_code_2_and_no_output(capsys, tmp_path, lines
     (['solve', 'graph.g2o', '--inner', '0'], 'iterations'),
     (['solve', 'graph.g2o', '--output', 'out.doc'], 'suffix'),
     (['solve', 'graph.g2o', '--output', 'missing/out.g2o'], 'missing is no folder'),
+    (['solve', 'graph.g2o', '--output', 'taken.g2o', '--plot', 'a.png'], 'it is a directory'),
     (['solve', 'graph.g2o', '--plot', 'missing/out.png'], 'missing is no folder'),
     (['solve', 'gap.g2o', '--start', 'odometry'], 'consecutive vertices 1 and 2'),
     (['convert', 'graph.g2o', 'out.doc'], 'suffix'),
@@ -740,11 +742,13 @@ def test_bad_arguments_are_one_line_and_exit_code_2(
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'graph.g2o').write_text('\n'.join(EDGES))
     (tmp_path / 'graph.txt').write_text('{}')
+    (tmp_path / 'taken.g2o').mkdir()
     (tmp_path / 'gap.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 0 5 1 '))
     assert main([*arguments]) == 2
     _, err = capsys.readouterr()
     assert err.count('\n') == 1 and words in err, err
-    assert sorted(p.name for p in tmp_path.iterdir()) == ['gap.g2o', 'graph.g2o', 'graph.txt']
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        'gap.g2o', 'graph.g2o', 'graph.txt', 'taken.g2o']
 
 
 def test_a_graph_with_gaps_and_without_poses_is_solved_from_its_tree(capsys, tmp_path):

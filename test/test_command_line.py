@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """`l1slam` as a process: what it imports; readers that have gone; TAB key, terminal and log."""
 
+import fcntl
 import json
 import os
 import pty
 import re
 import select
+import struct
 import subprocess
 import sys
+import termios
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -124,6 +127,7 @@ def test_the_help_says_how_to_switch_completion_on_and_what_exit_codes_mean():
 def on_a_terminal(code):
     """Run code with standard error on a terminal; return what it showed there."""
     ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack('HHHH', 24, 80, 0, 0))
     process = subprocess.Popen([sys.executable, '-c', code], stderr=theirs, cwd=ROOT)
     os.close(theirs)
     shown, deadline = b'', time.monotonic() + DEADLINE
