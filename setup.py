@@ -50,6 +50,8 @@ setup(
     extras_require={
         # The distribution must be named: the wheels' unpinned `ros-rclpy` is not Jazzy.
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
+        # The TAB key: commands and options of l1slam; see `l1slam --help`.
+        'completion': ['argcomplete>=3.1'],
         # Newer style tools find other things, and a test asserts that they find none.
         # setuptools: a test builds the wheel, and from 70.1 on it can do so by itself.
         # pip: tests install into other environments, which from 22.3 on it can do.
@@ -59,6 +61,7 @@ setup(
             'ruff~=0.17.5',
             'mypy~=2.4.1',
             'packaging',
+            'argcomplete>=3.1',
             'pip>=22.3',
             'setuptools>=70.1',
         ],

@@ -12,7 +12,6 @@ from l1slam_ros.core import se2
 from l1slam_ros.core.backend import ACCEPTED, Backend, BackendOptions
 from l1slam_ros.core.choice import AUTO, choose, minimise_by
 from l1slam_ros.core.cholesky import cholesky_of
-from l1slam_ros.core.errors import InconsistentError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.growth import GrowthOptions
 from l1slam_ros.core.initial import odometry_poses, pair_key
@@ -21,6 +20,7 @@ from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.noise import Mask
 from l1slam_ros.core.optimiser import OptimiserOptions, Solution
+from l1slam_ros.core.robust import INCONSISTENT
 from l1slam_ros.core.robust_map import minimise_robustly
 from l1slam_ros.io.graph_file import GraphRecord
 
@@ -95,9 +95,8 @@ def _robust(
 
     def solve(graph: FactorGraph, poses: Array) -> Found:
         began = clock()
-        try:
-            found = minimise_robustly(graph, minimise)
-        except InconsistentError:
+        found = minimise_robustly(graph, minimise)
+        if found.doubt and found.doubt.kind == INCONSISTENT:
             return Found(odometry_poses(graph), clock() - began, graph.between.is_odometry.copy(),
                          refused=True)
         return Found(found.solution.poses, clock() - began, found.accepted,

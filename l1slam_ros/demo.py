@@ -34,10 +34,10 @@ from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.metrics import absolute_trajectory_error, aligned_positions
 from l1slam_ros.io.bag import read_messages
 from l1slam_ros.io.files import stamp_from_text
-from l1slam_ros.io.graph_bag import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
 from l1slam_ros.io.messages import stamp_of
 from l1slam_ros.io.plot import MapDrawing, plot_maps
 from l1slam_ros.io.side_files import false_loops_path, read_false_loops
+from l1slam_ros.io.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
 
 Process = subprocess.Popen[bytes]
 

@@ -2,29 +2,30 @@
 """A graph and its poses -> what a map shows; a solution -> the curve of its costs."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from l1slam_ros.core.errors import FileError, GraphError
 from l1slam_ros.core.initial import odometry_poses, pair_key
 from l1slam_ros.core.manifold import Array
-from l1slam_ros.core.metrics import align
-from l1slam_ros.core.noise import Mask
 from l1slam_ros.io.graph_file import GraphRecord
 from l1slam_ros.io.plot import Curve, MapDrawing
 from l1slam_ros.io.side_files import false_loops_path, read_false_loops
-from l1slam_ros.offline import Outcome, matching_rows
+
+if TYPE_CHECKING:
+    from l1slam_ros.core.robust_map import RobustMap
+    from l1slam_ros.offline import Outcome
 
 
-def drawing(path: Path, record: GraphRecord, poses: Array, truth_path: Path | None,
-            name: str, note: str = '', accepted: Mask | None = None) -> MapDrawing:
+def drawing(path: Path, record: GraphRecord, poses: Array, truth: Array | None,
+            name: str, note: str = '', judgement: 'RobustMap | None' = None) -> MapDrawing:
     """
-    Return the map of poses (n, p), with its odometry and, from a file, the truth.
+    Return the map of poses (n, p), with its odometry, and the path of the truth (l, k) if known.
 
-    name : what the poses are. The odometry sets out from the first of them; the truth is moved
-    onto them by rigid alignment, as for the position error. Loops that the file of false loops
-    beside the input `path` names are drawn as such, those that are not accepted, (m,) bool, as
-    rejected.
+    name : what the poses are. The odometry sets out from the first of them. Loops that are not
+    accepted are drawn as refused or as suspect; of those that are, the ones that the file of false
+    loops beside the input `path` names, as false.
     """
     graph = record.graph
     factors, positions = graph.between, graph.manifold.positions
@@ -34,16 +35,15 @@ def drawing(path: Path, record: GraphRecord, poses: Array, truth_path: Path | No
         odometry = positions(graph.manifold.compose(first, chain))
     except GraphError:  # a graph without a whole chain can still be drawn
         odometry = None
-    truth = None
-    if truth_path is not None:
-        ours, reference = matching_rows(record, truth_path)
-        R, t = align(positions(reference), positions(poses)[ours])
-        truth = positions(reference) @ R.T + t
-    pairs, false = factors.pairs, known_false(path, record)
-    kept = np.ones(len(factors), bool) if accepted is None else accepted
-    return MapDrawing(path.name, positions(poses), odometry, truth,
-                      pairs[~factors.is_odometry & ~false & kept], rejected=pairs[~kept],
-                      false=pairs[false & kept], name=name, note=note)
+    false, is_loop = known_false(path, record), ~factors.is_odometry
+    kept, suspect = np.ones(len(factors), bool), np.zeros(len(factors), bool)
+    if judgement is not None:
+        kept, suspect = judgement.accepted, judgement.suspect
+    pairs = factors.pairs
+    return MapDrawing(
+        path.name, positions(poses), odometry, truth, pairs[is_loop & kept & ~false],
+        suspect=pairs[suspect], rejected=pairs[is_loop & ~kept & ~suspect],
+        false=pairs[false & kept], name=name, note=note)
 
 
 def known_false(path: Path, record: GraphRecord) -> np.ndarray:
@@ -68,7 +68,7 @@ def known_false(path: Path, record: GraphRecord) -> np.ndarray:
     return ~factors.is_odometry & np.isin(pairs, false)
 
 
-def cost_curve(norm: str, outcome: Outcome) -> Curve:
+def cost_curve(norm: str, outcome: 'Outcome') -> Curve:
     """Return the costs of a solve, iteration by iteration, its beginning and end named."""
     costs = outcome.solution.history
     iterations = np.arange(len(costs), dtype=float)

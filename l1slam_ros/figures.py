@@ -94,7 +94,8 @@ def _false_loop_panels(name: str, trials: LoopTrials) -> list[MapDrawing]:
         drawings.append(MapDrawing(method, shown.positions, loops=loops, false=first.false,
                                    note=_off(shown)))
     shown, refused = first.maps[ROBUST], np.concatenate((first.refused, first.lost))
-    return [*drawings, MapDrawing('l1slam solve --robust', shown.positions, loops=loops,
+    lost = (loops[:, None] == first.lost).all(axis=2).any(axis=1)
+    return [*drawings, MapDrawing('l1slam solve', shown.positions, loops=loops[~lost],
                                   rejected=refused, false=first.kept, note=_off(shown))]
 
 

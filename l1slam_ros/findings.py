@@ -23,6 +23,7 @@ from l1slam_ros.core.manifold import Indices
 from l1slam_ros.core.optimality import l1_cost
 from l1slam_ros.io.files import NANOSECONDS, stamp_text
 from l1slam_ros.io.graph_file import GraphRecord
+from l1slam_ros.io.wording import counted
 
 # Errors that many times as large, or as small, as their information says are worth a sentence.
 _OFF_SCALE = 3.0
@@ -77,7 +78,8 @@ def complaints(record: GraphRecord) -> list[str]:
 
 
 def _on_ids(record: GraphRecord) -> Iterator[str]:
-    jumps = np.flatnonzero(np.diff(record.ids) > 1)
+    # A difference of two ids may be beyond 64 bits.
+    jumps = np.flatnonzero(record.ids[1:] != record.ids[:-1] + 1)
     if len(jumps):
         pairs = [f'{record.ids[k]} to {record.ids[k + 1]}' for k in jumps[:_NAMED]]
         yield f'vertex ids are not consecutive: {_listed("jump", pairs, len(jumps))}'
@@ -143,14 +145,17 @@ def _on_noise(record: GraphRecord) -> Iterator[str]:
     except L1SlamError as error:
         yield f'the noise cannot be judged: {error}'
         return
-    found = [scale for scale in (scales.odometry, scales.loops) if not math.isnan(scale)]
-    if all(1 / _OFF_SCALE <= scale <= _OFF_SCALE for scale in found):
+    # Of too few factors nothing can be said.
+    both = {'odometry': scales.odometry, 'loops': scales.loops}
+    found = {name: scale for name, scale in both.items() if not math.isnan(scale)}
+    if all(1 / _OFF_SCALE <= scale <= _OFF_SCALE for scale in found.values()):
         return
-    reason = 'too large, or some loops are false' if max(found) > _OFF_SCALE else 'too small'
+    most = max(found.values())
+    reason = 'too large, or some loops are false' if most > _OFF_SCALE else 'too small'
+    times = ' and '.join(f'{scale:.2g} ({name})' for name, scale in found.items())
     yield (f'errors at the L2 map of vertices {record.ids[scales.first]} to '
-           f'{record.ids[scales.last]} are {scales.odometry:.2g} (odometry) and '
-           f'{scales.loops:.2g} (loops) times what the information says; expected about 1: '
-           f'the information is {reason}')
+           f'{record.ids[scales.last]} are {times} times what the information says; expected '
+           f'about 1: the information is {reason}')
 
 
 def _edges(record: GraphRecord, factors: Indices) -> list[str]:
@@ -161,6 +166,5 @@ def _edges(record: GraphRecord, factors: Indices) -> list[str]:
 
 def _listed(name: str, examples: list[str], count: int, plural: str = '') -> str:
     """Return e.g. `2 gaps (3 and 4, 8 and 9)`; of many, the first few and dots."""
-    noun = name if count == 1 else plural or f'{name}s'
     dots = ', ...' if count > len(examples) else ''
-    return f'{count:,} {noun} ({", ".join(examples)}{dots})'
+    return f'{counted(count, name, plural)} ({", ".join(examples)}{dots})'

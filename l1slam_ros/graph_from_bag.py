@@ -2,7 +2,7 @@
 """A bag -> a graph, grown by the code that the node grows with: live and offline see one graph."""
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,28 +12,12 @@ from l1slam_ros.core.errors import FileError, MessageError
 from l1slam_ros.core.growth import GraphGrowth, GrowthOptions
 from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.io.bag import BagMessage, bag_summary, read_messages, read_note
-from l1slam_ros.io.graph_bag import GRAPH_NOTE, LOOP_TOPIC, ODOMETRY_TOPIC, TRUSTED_LOOP_TOPIC
+from l1slam_ros.io.graph_bag import GRAPH_NOTE
 from l1slam_ros.io.graph_file import GraphRecord
 from l1slam_ros.io.messages import loop_closure, odometry_sample
+from l1slam_ros.io.topics import DEFAULT_TOPICS, Topics
 
 _ODOMETRY = 'nav_msgs/msg/Odometry'
-_LOOP = 'geometry_msgs/msg/PoseWithCovarianceStamped'
-
-
-@dataclass(frozen=True)
-class Topics:
-    """Where a bag has its odometry, its loop closures, and those that somebody vouches for."""
-
-    odometry: str = ODOMETRY_TOPIC
-    loops: str = LOOP_TOPIC
-    trusted: str = TRUSTED_LOOP_TOPIC
-
-    def types(self) -> dict[str, str]:
-        """Return the topics with the types of their messages."""
-        return {self.loops: _LOOP, self.trusted: _LOOP, self.odometry: _ODOMETRY}
-
-
-DEFAULT_TOPICS = Topics()
 
 
 def graph_from_bag(path: Path, options: GrowthOptions | None, topics: Topics) -> GraphRecord:

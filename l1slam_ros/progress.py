@@ -1,43 +1,78 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress on standard error: a bar on a terminal, nothing elsewhere or when asked to be quiet."""
+"""Progress on standard error: a bar on a terminal, in a log a line now and then."""
 
+import sys
+import time
 from types import TracebackType
+from typing import Any
+
+# [s] What takes less is not worth a line in a log; the next ones are so far apart.
+_PATIENCE, _APART = 3.0, 5.0
 
 
 class Progress:
     """
-    A bar that counts to a total; a context manager.
+    Shows how far some work is; a context manager.
 
     Parameters
     ----------
-    total : how many steps there are at most
+    total : how many steps there are at most; None: nobody knows
     unit : what one step is called
-    quiet : show nothing, even on a terminal
-    label : what is being done
-    delay : [s] show nothing of what is done sooner
+    quiet : show nothing
+    label : what is being done; without, there is no line in a log
+    delay : [s] show no bar of what is done sooner
 
     """
 
-    def __init__(self, total: float, unit: str, quiet: bool = False, label: str = '',
+    def __init__(self, total: float | None, unit: str, quiet: bool = False, label: str = '',
                  delay: float = 0.0):
-        from tqdm import tqdm
-
-        # None: tqdm looks whether standard error is a terminal.
-        self._bar = tqdm(total=total, unit=unit, disable=True if quiet else None, leave=False,
-                         desc=label or None, delay=delay)
+        self._total, self._unit, self._label, self._done = total, unit, label, 0.0
+        now = time.monotonic()
+        self._show_from = now + delay
+        self._next_line = now + _PATIENCE if label and not quiet else float('inf')
+        self._on_terminal = not quiet and sys.stderr is not None and sys.stderr.isatty()
+        self._bar: Any = None
 
     def __enter__(self) -> 'Progress':
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
-        self._bar.close()
+        if self._bar is not None:
+            self._bar.close()
 
-    def advance(self, steps: float = 1) -> None:
-        """Count some steps."""
+    def advance(self, steps: float = 1, note: str = '') -> None:
+        """Count some steps; note : what came of them."""
+        self._done += steps
+        now = time.monotonic()
+        if self._on_terminal:
+            self._advance_bar(now, steps, note)
+        elif now >= self._next_line:
+            self._next_line = now + _APART
+            # Another solver may go on where one came no further.
+            within = self._total is not None and self._done <= self._total
+            of_all = f' of {self._total:,.0f}' if within else ''
+            print(f'l1slam: {self._label}: {self._unit} {self._done:,.0f}{of_all}'
+                  f'{", " if note else ""}{note}', file=sys.stderr, flush=True)
+
+    def _advance_bar(self, now: float, steps: float, note: str) -> None:
+        if self._bar is None:
+            if now < self._show_from:
+                return
+            from tqdm import tqdm
+
+            steps = self._done
+            self._bar = tqdm(total=self._total, unit=self._unit, leave=False,
+                             desc=self._label or None)
+        self._bar.total = self._total
+        self._bar.set_postfix_str(note, refresh=False)
         self._bar.update(steps)
+
+    def reach(self, steps: float, total: float) -> None:
+        """Go on to so many steps of a total that is known by now."""
+        self._total = total
+        self.advance(steps - self._done)
 
     def report(self, iteration: int, cost: float) -> None:
         """Count one iteration of a solver and show its cost."""
-        self._bar.set_postfix_str(f'cost {cost:.6g}', refresh=False)
-        self._bar.update(1)
+        self.advance(1, f'cost {cost:.6g}')

@@ -12,7 +12,7 @@ from tempfile import mkdtemp
 
 import numpy as np
 
-from l1slam_ros import figures, offline, paper, report
+from l1slam_ros import figures, formats, paper, report
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.errors import FileError, GraphError, OptionError
 from l1slam_ros.core.graph import FactorGraph
@@ -97,9 +97,9 @@ def read_datasets(datasets: Path) -> dict[str, GraphRecord]:
 
 
 def _read(path: Path) -> GraphRecord:
-    record = offline.read_input(path)
+    record = formats.read_input(path)
     with _named(path):
-        offline.require_connected(record)
+        formats.require_connected(record)
     return record
 
 
@@ -140,7 +140,7 @@ def _run_starts(records: dict[str, GraphRecord], effort: Effort) -> StartTrials 
     print(f'l1slam: {paper.NOISY.name} from noisy starts', file=sys.stderr)
     as_in_paper = replace(effort, outer=paper.NOISY_OUTER, inner=paper.NOISY_INNER)
     with Progress(len(NOISES) * effort.draws, 'start') as progress:
-        return try_noisy_starts(record.graph, offline.stored_poses(record), effort, as_in_paper,
+        return try_noisy_starts(record.graph, formats.stored_poses(record), effort, as_in_paper,
                                 np.random.default_rng(WORLD_SEED), progress.advance)
 
 
@@ -155,14 +155,14 @@ def _run_false_loops(
         print(f'l1slam: {graph.name} with false loops', file=sys.stderr)
         with _named(graph.file), Progress(1 + effort.draws, 'draw') as progress:
             trials[graph.name] = try_false_loops(
-                record.graph, offline.stored_poses(record), count, effort,
+                record.graph, formats.stored_poses(record), count, effort,
                 np.random.default_rng(WORLD_SEED), progress.advance)
     return trials
 
 
 def _run_record(graph: PaperGraph, record: GraphRecord, effort: Effort) -> GraphResult:
     seed = seed_poses(record.graph, cholesky_of(record.graph))
-    return _measured(graph, record.graph, offline.stored_poses(record), seed, effort)
+    return _measured(graph, record.graph, formats.stored_poses(record), seed, effort)
 
 
 def _run_world(

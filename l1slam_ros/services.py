@@ -4,13 +4,15 @@
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
+import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
-from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.errors import DoubtfulError, OptionError
 from l1slam_ros.orders import Orders
 from l1slam_ros.shared_backend import SharedBackend
+from l1slam_ros.verdict import doubt_sentence
 
 
 class MapServices:
@@ -58,6 +60,9 @@ class MapServices:
         improvement = self._backend.optimise()
         if improvement is None:
             return 'there are no factors yet'
+        if improvement.doubt:
+            stamps = self._backend.state().stamps
+            raise DoubtfulError(doubt_sentence(improvement.doubt, np.arange(len(stamps)), stamps))
         return (f'L1 cost {improvement.cost_before:.6g} -> {improvement.cost:.6g}, '
                 f'{improvement.status.value}, {improvement.seconds:.2f} s')
 

@@ -5,8 +5,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from l1slam_ros.core.manifold import Indices
+from l1slam_ros.core.robust import INCONSISTENT, Doubt
 from l1slam_ros.core.robust_map import RobustMap
+from l1slam_ros.io.files import stamp_text
 from l1slam_ros.io.graph_file import GraphRecord
+from l1slam_ros.io.wording import counted
+
+# The status of a map that is not to be relied on.
+DOUBTFUL = 'doubtful'
 
 # So many edges are named one by one; `--json` lists all.
 _NAMED = 20
@@ -33,7 +40,8 @@ def verdict(record: GraphRecord, judgement: RobustMap) -> Iterator[str]:
         yield _SLIP.format(pair=_named(pairs[row]), sigmas=judgement.sigmas[row])
     refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect)
     suspect = np.flatnonzero(is_loop & judgement.suspect)
-    yield f'{len(refused):,} of {np.count_nonzero(is_loop):,} loops refused'
+    if is_loop.any():
+        yield f'{len(refused):,} of {counted(int(np.count_nonzero(is_loop)), "loop")} refused'
     worst = refused[np.argsort(-judgement.sigmas[refused], kind='stable')]
     for row in worst[:_NAMED].tolist():
         yield f'  {_named(pairs[row])}: {judgement.sigmas[row]:.1f} sigmas off the accepted ones'
@@ -45,6 +53,19 @@ def verdict(record: GraphRecord, judgement: RobustMap) -> Iterator[str]:
     for sentence, times in zip(_NOISE, np.sqrt(judgement.variance).tolist(), strict=True):
         if times >= _NOISY:
             yield sentence.format(times=times)
+
+
+def doubt_sentence(doubt: Doubt, ids: Indices, stamps: Indices | None) -> str:
+    """Return why and where a map is not to be relied on; ids, stamps : (n,) of the keyframes."""
+    where = f'between {ids[doubt.first]} and {ids[doubt.last]}'
+    if stamps is not None:
+        where += f' ({stamp_text(stamps[doubt.first])} s to {stamp_text(stamps[doubt.last])} s)'
+    if doubt.kind == INCONSISTENT:
+        return (f'{DOUBTFUL}: {doubt.loops:,} refused loops agree with each other, but not with '
+                f'the odometry {where}, and to leave out one step of it does not reconcile them; '
+                'the map may be bent there')
+    return (f'{DOUBTFUL}: {doubt.loops:,} loops, most of all, are refused or suspect, {where}; '
+            'either they are false, or the odometry is worse than it says')
 
 
 def _named(pair: np.ndarray) -> str:

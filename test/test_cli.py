@@ -16,16 +16,18 @@ from torn import torn_graph
 
 from l1slam_ros.cli import main
 from l1slam_ros.core import se2
-from l1slam_ros.core.errors import InconsistentError
 from l1slam_ros.core.initial import odometry_poses
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.optimality import l1_cost
-from l1slam_ros.core.robust import robust_solve
 from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, write_graph_file
 
 VERTICES = ['VERTEX_SE2 0 0 0 0', 'VERTEX_SE2 1 1 0 0', 'VERTEX_SE2 2 2 0 0']
 EDGES = ['EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1',
          'EDGE_SE2 0 2 2.1 0 0 1 0 0 1 0 1']
+
+
+# The costs of the odometry as it stands, every loop counted.
+ODOMETRY = ('--no-robust', '--start', 'odometry', '--outer', 0)
 
 
 def graph_file(folder, lines):
@@ -79,14 +81,16 @@ def test_a_chosen_solver_is_the_one_that_solves(capsys, world, solver):
 
 REPORTED = [
     'poses', 'factors', 'loops', 'initial_cost', 'seed_cost', 'final_cost', 'status', 'seconds',
-    'solver', 'outer_iterations', 'inner_iterations', 'rejected']
+    'solver', 'outer_iterations', 'inner_iterations', 'rejected', 'suspect', 'slips', 'parts',
+    'warnings']
 
 
-@pytest.mark.parametrize('more', [(), ('--robust',), ('--robust', '--norm', 'l2')])
+@pytest.mark.parametrize('more', [(), ('--no-robust',), ('--robust', '--norm', 'l2')])
 def test_the_names_of_a_report_stay(capsys, world, more):
     assert list(solve_json(capsys, world, *more)) == REPORTED
     truth = ('--reference', f'{world}.truth.txt')
-    assert list(solve_json(capsys, world, *more, *truth)) == [*REPORTED, 'ate']
+    assert list(solve_json(capsys, world, *more, *truth)) == [
+        *REPORTED, 'ate', 'ate_poses']
 
 
 # Robust
@@ -118,7 +122,7 @@ def edges_of(path):
 
 def test_what_is_rejected_are_the_false_loops_in_the_order_of_the_file(capsys, lies):
     false = np.loadtxt(f'{lies}.false.txt', dtype=int).tolist()
-    report = solve_json(capsys, lies, '--robust')
+    report = solve_json(capsys, lies)
     assert report['rejected'] == [pair for pair in edges_of(lies) if pair in false]
     assert len(report['rejected']) == 100
     assert (report['factors'], report['loops']) == (700, 401)
@@ -138,11 +142,12 @@ def clean_copy(path):
 @pytest.mark.parametrize('lies', ['grouped'], indirect=True)
 def test_costs_count_what_is_accepted(capsys, lies, norm):
     """They are those of a file without the false loops."""
-    robust = solve_json(capsys, lies, '--robust', '--norm', norm)
-    honest = solve_json(capsys, clean_copy(lies), '--norm', norm)
+    robust = solve_json(capsys, lies, '--norm', norm)
+    honest = solve_json(capsys, clean_copy(lies), '--norm', norm, '--no-robust')
     for name in ('initial_cost', 'final_cost'):
         assert robust[name] == pytest.approx(honest[name], rel=1e-3)
-    credulous = solve_json(capsys, lies, '--norm', norm)
+    credulous = solve_json(capsys, lies, '--norm', norm, '--no-robust')
+    assert credulous['rejected'] == credulous['suspect'] == credulous['slips'] == []
     assert credulous['final_cost'] > 2 * robust['final_cost']
     assert robust['final_cost'] <= robust['seed_cost'] < robust['initial_cost']
 
@@ -157,7 +162,7 @@ def test_every_start_is_the_same_to_a_robust_solve(capsys, lies, tmp_path):
     reports, poses = [], []
     for path, start in ((lies, 'seed'), (lies, 'odometry'), (lies, 'file'), (spoiled, 'file')):
         output = tmp_path / f'{len(reports)}.tum'
-        reports.append(solve_json(capsys, path, '--robust', '--start', start, '--output', output))
+        reports.append(solve_json(capsys, path, '--start', start, '--output', output))
         poses.append(np.loadtxt(output))
     for name in ('seed_cost', 'final_cost', 'rejected', 'status', 'outer_iterations'):
         assert [report[name] for report in reports[1:]] == [reports[0][name]] * 3
@@ -169,7 +174,7 @@ def test_every_start_is_the_same_to_a_robust_solve(capsys, lies, tmp_path):
 @pytest.mark.parametrize('lies', ['random'], indirect=True)
 def test_the_output_has_the_robust_map_and_every_edge(capsys, lies, tmp_path):
     output = tmp_path / 'out.g2o'
-    report = solve_json(capsys, lies, '--robust', '--output', output)
+    report = solve_json(capsys, lies, '--output', output)
     assert edges_of(output) == edges_of(lies)
     kept = [pair not in report['rejected'] for pair in edges_of(output)]
     record = read_graph_file(output)
@@ -179,7 +184,7 @@ def test_the_output_has_the_robust_map_and_every_edge(capsys, lies, tmp_path):
 
 @pytest.mark.parametrize('lies', ['random'], indirect=True)
 def test_people_are_told_which_loops_were_refused_and_why(capsys, lies):
-    said = run(capsys, 'solve', lies, '--robust')[0].splitlines()
+    said = run(capsys, 'solve', lies)[0].splitlines()
     at = said.index('100 of 401 loops refused')
     named = [re.fullmatch(r'  (\d+) - (\d+): (\d+\.\d) sigmas off the accepted ones', line)
              for line in said[at + 1 : at + 21]]
@@ -188,15 +193,15 @@ def test_people_are_told_which_loops_were_refused_and_why(capsys, lies):
     sigmas = [float(match[3]) for match in named]
     assert sigmas == sorted(sigmas, reverse=True) and sigmas[-1] > 4
     assert said[at + 21 :] == ['  and 80 more; `--json` lists all']
-    assert run(capsys, 'solve', lies, '--robust', '--quiet') == ('', '')
-    assert 'refused' not in run(capsys, 'solve', lies)[0]
+    assert run(capsys, 'solve', lies, '--quiet') == ('', '')
+    assert 'refused' not in run(capsys, 'solve', lies, '--no-robust')[0]
 
 
 def test_of_an_honest_graph_nothing_is_refused(capsys, world):
-    robust, plain = solve_json(capsys, world, '--robust'), solve_json(capsys, world)
+    robust, plain = solve_json(capsys, world), solve_json(capsys, world, '--no-robust')
     assert robust['rejected'] == plain['rejected'] == []
     assert robust['final_cost'] == pytest.approx(plain['final_cost'], rel=1e-5)
-    assert '\n0 of 101 loops refused\n' in run(capsys, 'solve', world, '--robust')[0]
+    assert '\n0 of 101 loops refused\n' in run(capsys, 'solve', world)[0]
 
 
 @pytest.mark.parametrize('lies', ['random'], indirect=True)
@@ -206,56 +211,130 @@ def test_odometry_that_lies_is_refused_and_named(capsys, lies):
     fields = lines[step].split()
     fields[3] = str(float(fields[3]) + 6)
     lies.write_text('\n'.join([*lines[:step], ' '.join(fields), *lines[step + 1:]]))
-    rejected = solve_json(capsys, lies, '--robust')['rejected']
-    (slip,) = [[i, j] for i, j in rejected if j - i == 3]
+    report = solve_json(capsys, lies)
+    rejected, (slip,) = report['rejected'], report['slips']
+    assert [[i, j] for i, j in rejected if j - i == 3] == [slip]
     assert abs(slip[0] - 610) <= 9  # between loops nobody can tell which of the steps it was
-    assert len(rejected) == 101
-    said = run(capsys, 'solve', lies, '--robust')[0]
+    assert len(rejected) == 101 and report['parts'] == 1
+    said = run(capsys, 'solve', lies)[0]
     assert re.search(rf'\nodometry {slip[0]} - {slip[1]} lies: \d+\.\d sigmas off what the loops '
                      'say; left out\n100 of 401 loops refused\n', said)
 
 
 @pytest.mark.parametrize('lies', ['random'], indirect=True)
 def test_the_picture_shows_what_was_refused(capsys, lies, tmp_path):
-    run(capsys, 'solve', lies, '--robust', '--quiet', '--plot', tmp_path / 'map.svg')
+    run(capsys, 'solve', lies, '--quiet', '--plot', tmp_path / 'map.svg')
     said = words(tmp_path / 'map.svg')
-    assert 'rejected loops' in said and 'false loops' not in said
-    assert any('300 poses, 301 loops, 100 rejected' in word for word in said)
+    assert 'refused loops' in said and 'false loops' not in said
+    assert any('300 poses, 401 loops (100 refused)' in word for word in said)
+
+
+# Doubtful
+
+
+DOUBT = re.compile(r'doubtful: (\d+) refused loops agree with each other, but not with the '
+                   r'odometry between (\d+) and (\d+)( \([0-9.]+ s to [0-9.]+ s\))?, and to leave '
+                   'out one step of it does not reconcile them; the map may be bent there')
+
+
+@pytest.fixture
+def torn(tmp_path):
+    """Return a graph that no map is made of, ids from 100 on; and the ids before its two slips."""
+    path, (graph, slips) = tmp_path / 'torn.g2o', torn_graph()
+    write_graph_file(path, GraphRecord(graph, odometry_poses(graph), 100 + np.arange(400)))
+    return path, slips + 100
 
 
 @pytest.mark.parametrize('norm', ['l1', 'l2'])
-def test_a_map_that_loops_agree_is_wrong_is_refused_by_its_vertices(capsys, tmp_path, norm):
-    path, (graph, slips) = tmp_path / 'torn.g2o', torn_graph()
-    ids = 100 + np.arange(graph.n_poses)
-    write_graph_file(path, GraphRecord(graph, odometry_poses(graph), ids))
-    with pytest.raises(InconsistentError) as refused:
-        robust_solve(graph)
-    assert main(['solve', str(path), '--robust', '--norm', norm, '--json', '--output',
-                 str(tmp_path / 'out.g2o'), '--plot', str(tmp_path / 'map.png')]) == 2
+def test_a_map_that_loops_agree_is_wrong_is_given_as_doubtful(capsys, torn, tmp_path, norm):
+    path, slips = torn
+    output, picture = tmp_path / 'out.g2o', tmp_path / 'map.png'
+    assert main(['solve', str(path), '--norm', norm, '--json', '--output', str(output),
+                 '--plot', str(picture)]) == 4
     out, err = capsys.readouterr()
-    assert out == '' and err.count('\n') == 1
-    assert err.startswith(f'l1slam: {path}: inconsistent: ')
-    first, last = map(int, re.search(r' between (\d+) and (\d+),', err).groups())
-    assert (first, last) == (refused.value.first + 100, refused.value.last + 100)
-    assert slips[0] + 80 < first < last < slips[1] + 120
-    assert list(tmp_path.iterdir()) == [path]
+    report = json.loads(out)
+    said = DOUBT.fullmatch(err.removeprefix('l1slam: ').rstrip('\n'))
+    loops, first, last = map(int, said.groups()[:3])
+    assert slips[0] - 20 < first < last < slips[1] + 20 and 10 < loops < len(report['rejected'])
+    assert report['status'] == 'doubtful' and report['warnings'] == [said[0]]
+    record = read_graph_file(output)
+    kept = [pair not in report['rejected'] + report['suspect'] for pair in edges_of(output)]
+    residual = whitened_residual(record.graph, record.poses).reshape(-1, 3)[kept]
+    cost = l1_cost(residual) if norm == 'l1' else (residual**2).sum()
+    assert cost == pytest.approx(report['final_cost'], rel=1e-9)
+    assert picture.exists()
 
 
-@pytest.mark.parametrize('start', ['seed', 'file', 'odometry'])
+def test_a_doubt_is_said_even_quietly_and_with_the_times_of_a_bag(capsys, torn, tmp_path):
+    run(capsys, 'convert', torn[0], tmp_path / 'bag')
+    assert main(['solve', str(tmp_path / 'bag'), '--quiet']) == 4
+    out, err = capsys.readouterr()
+    said = DOUBT.fullmatch(err.removeprefix('l1slam: ').rstrip('\n'))
+    first, last = int(said[2]), int(said[3])
+    assert out == '' and said[4] == (
+        f' ({1000 + first / 10:.9f} s to {1000 + last / 10:.9f} s)')
+
+
+def test_a_damaged_bag_with_a_doubtful_map_says_both(capsys, torn, tmp_path):
+    run(capsys, 'convert', torn[0], tmp_path / 'bag')
+    whole = (tmp_path / 'bag' / 'bag.mcap').read_bytes()
+    (tmp_path / 'cut.mcap').write_bytes(whole[:-20])
+    assert main(['solve', str(tmp_path / 'cut.mcap'), '--quiet']) == 4
+    damage, doubt = capsys.readouterr().err.splitlines()
+    assert 'is damaged' in damage and DOUBT.fullmatch(doubt.removeprefix('l1slam: '))
+
+
+def test_most_loops_refused_is_a_doubt(capsys, world, tmp_path):
+    """Three false loops to two true ones: the map is right, but who could know."""
+    bad = tmp_path / 'bad.g2o'
+    run(capsys, 'corrupt', world, bad, '--false-loops', 150)
+    assert main(['solve', str(bad), '--json']) == 4
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    left_out = len(report['rejected'] + report['suspect'])
+    assert report['status'] == 'doubtful' and left_out >= 150
+    assert err.startswith(f'l1slam: doubtful: {left_out} loops, most of all, are refused or ')
+    assert len(err.splitlines()) == 1
+
+
+GAP = 'no edge between the consecutive vertices 1 and 2, so no chain of odometry'
+
+
+@pytest.mark.parametrize('start', ['seed', 'file'])
 def test_a_gap_in_the_odometry_leaves_nothing_to_judge_loops_by(capsys, tmp_path, start):
     path = graph_file(tmp_path, [*VERTICES, EDGES[0], EDGES[2]])
-    assert main(['solve', str(path), '--robust', '--start', start, '--json',
-                 '--output', str(tmp_path / 'out.g2o')]) == 2
-    out, err = capsys.readouterr()
-    assert out == '' and err == (
-        f'l1slam: {path}: no edge between the consecutive vertices 1 and 2, so no chain of '
-        'odometry to start from; expected a graph without gaps\n')
+    output = str(tmp_path / 'out.g2o')
+    asked = ['solve', str(path), '--start', start, '--json', '--output', output]
+    assert main([*asked, '--robust']) == 2
+    assert capsys.readouterr() == ('', f'l1slam: {path}: {GAP} to judge loops by\n')
     assert sorted(tmp_path.iterdir()) == [path]
+    assert main(asked) == 0
+    out, err = capsys.readouterr()
+    warning = f'no loop was doubted: {GAP} to judge loops by'
+    assert err == f'l1slam: {warning}\n' and json.loads(out)['warnings'] == [warning]
+    assert main([*asked, '--quiet', '--no-robust']) == 0
+    assert capsys.readouterr().err == ''
+
+
+def test_a_graph_without_loops_is_its_odometry(capsys, tmp_path):
+    report = solve_json(capsys, graph_file(tmp_path, EDGES[:2]))
+    assert report['status'] == 'converged' and report['final_cost'] < 1e-6
+    assert report['warnings'] == report['rejected'] == report['suspect'] == []
+    assert 'refused' not in run(capsys, 'solve', tmp_path / 'graph.g2o')[0]
+
+
+def test_a_parameter_file_may_say_that_all_loops_are_believed(capsys, tmp_path, lies):
+    params = tmp_path / 'params.yaml'
+    params.write_text('/**: {ros__parameters: {robust: {enabled: false}}}')
+    asked = (lies, '--norm', 'l2', '--params-file', params)
+    assert solve_json(capsys, *asked)['rejected'] == []
+    assert len(solve_json(capsys, *asked, '--robust')['rejected']) == 100
 
 
 def test_ate_of_the_odometry_is_that_of_zero_steps(capsys, world):
     truth = f'{world}.truth.txt'
-    odometry = solve_json(capsys, world, '--start', 'odometry', '--outer', 0, '--reference', truth)
+    odometry = solve_json(capsys, world, '--no-robust', '--start', 'odometry', '--outer', 0,
+                          '--reference', truth)
     assert odometry['outer_iterations'] == 0
     assert odometry['final_cost'] == odometry['initial_cost']
     assert odometry['ate'] > 3 * solve_json(capsys, world, '--reference', truth)['ate']
@@ -264,7 +343,7 @@ def test_ate_of_the_odometry_is_that_of_zero_steps(capsys, world):
 @pytest.mark.parametrize('start', ['seed', 'file', 'odometry'])
 @pytest.mark.parametrize('norm', ['l1', 'l2', 'huber'])
 def test_every_start_leads_every_norm_to_one_cost(capsys, world, start, norm):
-    report = solve_json(capsys, world, '--start', start, '--norm', norm)
+    report = solve_json(capsys, world, '--no-robust', '--start', start, '--norm', norm)
     best = solve_json(capsys, world, '--norm', norm)
     assert report['final_cost'] == pytest.approx(best['final_cost'], rel=1e-3)
     assert (report['seed_cost'] is None) == (start != 'seed')
@@ -279,7 +358,7 @@ def test_without_json_there_is_a_summary_and_with_quiet_nothing(capsys, world):
 def test_graph_to_bag_to_graph_is_one_graph(capsys, world, tmp_path):
     run(capsys, 'convert', world, tmp_path / 'bag')
     run(capsys, 'convert', tmp_path / 'bag', tmp_path / 'back.g2o')
-    costs = [solve_json(capsys, path, '--start', 'odometry', '--outer', 0)['initial_cost']
+    costs = [solve_json(capsys, path, *ODOMETRY)['initial_cost']
              for path in (world, tmp_path / 'bag', tmp_path / 'back.g2o')]
     assert np.ptp(costs) <= 1e-9 * costs[0]
 
@@ -313,8 +392,8 @@ def doors(capsys, world, tmp_path):
 
 def test_every_door_leads_to_the_same_costs(capsys, doors):
     for norm in 'l1', 'l2', 'huber':
-        costs = [solve_json(capsys, door, '--start', 'odometry', '--norm', norm, '--outer', 0)
-                 ['initial_cost'] for door in doors]
+        costs = [solve_json(capsys, door, *ODOMETRY, '--norm', norm)['initial_cost']
+                 for door in doors]
         np.testing.assert_allclose(costs, costs[0], rtol=1e-9)
         assert costs[0] > 100
 
@@ -323,8 +402,8 @@ def test_every_door_leads_to_the_same_costs(capsys, doors):
 def test_every_door_leads_to_the_same_poses(capsys, doors, tmp_path, norm):
     outputs = []
     for k, door in enumerate(doors):
-        run(capsys, 'solve', door, '--start', 'odometry', '--norm', norm, '--quiet',
-            '--output', tmp_path / f'{k}.tum')
+        run(capsys, 'solve', door, '--no-robust', '--start', 'odometry', '--norm', norm,
+            '--quiet', '--output', tmp_path / f'{k}.tum')
         outputs.append(np.loadtxt(tmp_path / f'{k}.tum'))
     moved = np.linalg.norm(outputs[0][:, 1:3] - np.loadtxt(f'{doors[0]}.truth.txt')[:, 1:3])
     assert moved > 0.1
@@ -386,7 +465,7 @@ def test_a_cut_bag_is_read_in_part_and_exits_with_3(capsys, world, tmp_path):
 
 def test_intel_as_a_bag_is_the_same_graph(capsys, datasets, tmp_path):
     run(capsys, 'convert', datasets / 'intel.g2o', tmp_path / 'bag')
-    costs = [solve_json(capsys, path, '--start', 'odometry', '--outer', 0)['initial_cost']
+    costs = [solve_json(capsys, path, *ODOMETRY)['initial_cost']
              for path in (datasets / 'intel.g2o', tmp_path / 'bag')]
     assert costs[0] == pytest.approx(16108.59, abs=0.005)
     assert costs[1] == pytest.approx(costs[0], abs=1e-6)
@@ -406,7 +485,7 @@ def test_stamps_rounded_to_microseconds_still_match(capsys, world, tmp_path):
     lines = [line.split() for line in output.read_text().splitlines()]
     output.write_text('\n'.join(' '.join([f'{float(stamp) + 2e-7:.6f}', *rest])
                                 for stamp, *rest in lines))
-    assert solve_json(capsys, world, '--reference', output)['ate'] == pytest.approx(0, abs=1e-8)
+    assert solve_json(capsys, world, '--reference', output)['ate'] == pytest.approx(0, abs=1e-5)
 
 
 def test_simulate_writes_truth_and_false_loops(capsys, tmp_path):
@@ -460,12 +539,12 @@ def test_plot_shows_false_loops_where_they_are_known(capsys, world, tmp_path):
     run(capsys, 'plot', world, tmp_path / 'bad.g2o', '--output', tmp_path / 'maps.svg')
     said = words(tmp_path / 'maps.svg')
     assert said.count('false loops') == 1
-    assert '150 poses, 101 loops' in said and '150 poses, 101 loops, 12 false' in said
+    assert '150 poses, 101 loops' in said and '150 poses, 113 loops (12 false)' in said
 
 
 @pytest.mark.parametrize('line, words', [
     ('3 5', 'no edge between 3 and 5'), ('3 999', 'no edge between 3 and 999'),
-    ('3', '1 fields; expected 2 whole numbers'), ('3 x', "'x' is not a whole number"),
+    ('3', '1 field; expected 2 whole numbers'), ('3 x', "'x' is not a whole number"),
 ])
 def test_a_file_of_other_false_loops_is_refused(capsys, tmp_path, line, words):
     path = graph_file(tmp_path, [*VERTICES, *EDGES])
@@ -480,7 +559,7 @@ def test_solve_draws_the_costs_beside_the_map(capsys, world, tmp_path):
     report = solve_json(capsys, world, '--plot', picture, '--reference', f'{world}.truth.txt')
     said = words(picture)
     for word in ('world.g2o', 'optimised', 'truth', 'odometry', 'l1 cost', 'iteration',
-                 f'seed {report["seed_cost"]:.6g}', f'initial {report["initial_cost"]:.6g}',
+                 f'initial {report["initial_cost"]:.6g}, seed {report["seed_cost"]:.6g}, '
                  f'final {report["final_cost"]:.6g}'):
         assert word in said
 
@@ -589,7 +668,7 @@ def test_corrupting_to_a_bag_counts_as_the_bag_does(capsys, odd, tmp_path):
     pairs = np.loadtxt(tmp_path / 'bad.false.txt', dtype=int)
     assert pairs.shape == (7, 2) and pairs.max() < 150
     run(capsys, 'plot', tmp_path / 'bad', '--output', tmp_path / 'map.svg')
-    assert '150 poses, 101 loops, 7 false' in words(tmp_path / 'map.svg')
+    assert '150 poses, 108 loops (7 false)' in words(tmp_path / 'map.svg')
 
 
 def test_a_graph_that_cannot_be_written_leaves_no_file_of_false_loops(capsys, world, tmp_path):
@@ -615,7 +694,6 @@ def test_a_parameter_file_speaks_to_both_growth_and_solver(capsys, world, tmp_pa
     ([*VERTICES, 'EDGE_SE2 0 1 nan 0 0 1 0 0 1 0 1'], 4, 'nan'),
     ([*VERTICES, *EDGES[:2], 'EDGE_SE2 0 2 2 0 0 1 2 0 1 0 1'], 6, 'positive definite'),
     ([*VERTICES, *EDGES, 'EDGE_SE2 0 9 1 0 0 1 0 0 1 0 1'], 7, '9'),
-    ([*VERTICES, *EDGES, 'EDGE_SE2 1 1 1 0 0 1 0 0 1 0 1'], 7, 'itself'),
     ([*VERTICES, 'VERTEX_SE2 1 0 0 0', *EDGES], 4, '1'),
     (VERTICES, None, 'edge'),
     ([*VERTICES, 'EDGE_SE2 0 1 1 0 0 1 0 0 1 0'], 4, 'expected'),
@@ -641,6 +719,7 @@ def test_bad_input_is_one_line_exit_code_2_and_no_output(capsys, tmp_path, lines
     (['solve', 'graph.g2o', '--inner', '0'], 'iterations'),
     (['solve', 'graph.g2o', '--output', 'out.doc'], 'suffix'),
     (['solve', 'graph.g2o', '--output', 'missing/out.g2o'], 'missing is no folder'),
+    (['solve', 'graph.g2o', '--output', 'taken.g2o', '--plot', 'a.png'], 'it is a directory'),
     (['solve', 'graph.g2o', '--plot', 'missing/out.png'], 'missing is no folder'),
     (['solve', 'gap.g2o', '--start', 'odometry'], 'consecutive vertices 1 and 2'),
     (['convert', 'graph.g2o', 'out.doc'], 'suffix'),
@@ -663,11 +742,13 @@ def test_bad_arguments_are_one_line_and_exit_code_2(
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'graph.g2o').write_text('\n'.join(EDGES))
     (tmp_path / 'graph.txt').write_text('{}')
+    (tmp_path / 'taken.g2o').mkdir()
     (tmp_path / 'gap.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 0 5 1 '))
     assert main([*arguments]) == 2
     _, err = capsys.readouterr()
     assert err.count('\n') == 1 and words in err, err
-    assert sorted(p.name for p in tmp_path.iterdir()) == ['gap.g2o', 'graph.g2o', 'graph.txt']
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        'gap.g2o', 'graph.g2o', 'graph.txt', 'taken.g2o']
 
 
 def test_a_graph_with_gaps_and_without_poses_is_solved_from_its_tree(capsys, tmp_path):

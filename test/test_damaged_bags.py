@@ -33,11 +33,11 @@ from bags import (
 )
 from l1slam_ros.cli import main
 from l1slam_ros.core.errors import FileError
+from l1slam_ros.formats import read_input
 from l1slam_ros.io.bag import bag_summary, read_messages, read_note, read_raw
 from l1slam_ros.io.graph_bag import GRAPH_NOTE
 from l1slam_ros.io.graph_file import read_graph_file
 from l1slam_ros.io.salvage import Salvage
-from l1slam_ros.offline import read_input
 
 LONGEST = 2.0  # [s] a command may take on a damaged bag
 

@@ -57,6 +57,25 @@ def test_each_thing_that_looks_wrong_is_one_sentence(record_of, more, sentence):
     assert sentence in complaints(record_of(*LINES, *more))
 
 
+def test_ids_of_all_64_bits_are_not_consecutive(record_of):
+    least, most = -2**63, 2**63 - 1
+    assert complaints(record_of(f'EDGE_SE2 {least} {most} 1 0 0 1 0 0 1 0 1')) == [
+        f'vertex ids are not consecutive: 1 jump ({least} to {most})']
+
+
+def test_a_ratio_that_is_none_is_not_named(record_of):
+    """Of as few loops as these nothing is known but that the odometry suffers from them."""
+    world = simulate_world(600, 630, WorldOptions(), np.random.default_rng(0))
+    factors, graph = world.graph.between, FactorGraph(se2)
+    noisy = factors.measurement.copy()
+    noisy[~factors.is_odometry] += 1.0
+    graph.add_poses(600)
+    roots = factors.sqrt_information
+    graph.add_between(factors.i, factors.j, noisy, roots.transpose(0, 2, 1) @ roots)
+    said, = complaints(GraphRecord(graph, None, np.arange(600)))
+    assert re.search(r' are [0-9.]+ \(odometry\) times what the information says; ', said)
+
+
 def test_vertices_without_an_edge(record_of):
     lonely = [f'VERTEX_SE2 {k} 0 0 0' for k in range(10, 20)]
     assert complaints(record_of(*lonely, *LINES, LOOP)) == [

@@ -178,7 +178,6 @@ MALFORMED = [
     ('EDGE 3 7 1 0 0 0 0 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected a positive'),
     ('EDGE 3 8 1 0 0 1 0 0 1 0 1', 'vertex 8 is unknown; expected one of the 3 vertices'),
     ('EDGE 100 3 1 0 0 1 0 0 1 0 1', 'vertex 100 is unknown; expected one of the 3 vertices'),
-    ('EDGE 7 7 1 0 0 1 0 0 1 0 1', 'an edge from vertex 7 to itself; expected two vertices'),
     ('VERTEX 7 0 0 0', 'vertex 7 stands twice, before at line 2; expected each once'),
     ('EGDE_SE2 3 7 1 0 0 1 0 0 1 0 1', "unknown tag 'EGDE_SE2'; expected VERTEX_SE2, EDGE_SE2, "),
     ('vertex_se2 5 0 0 0', "unknown tag 'vertex_se2'; expected VERTEX_SE2, EDGE_SE2, "),
@@ -270,6 +269,26 @@ def assert_same(a, b):
         assert (x.i == y.i).all()
         assert (x.measurement == y.measurement).all()
         np.testing.assert_allclose(x.sqrt_information, y.sqrt_information, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize('suffix, tag, information', [
+    ('g2o', 'EDGE_SE2', '1 0 0 1 0 1'), ('graph', 'EDGE2', '1 0 1 1 0 0')])
+def test_edges_from_a_vertex_to_itself_are_left_out(tmp_path, suffix, tag, information):
+    """Whatever else is wrong with them; and a vertex that has no other edge is none."""
+    path, edge = tmp_path / f'a.{suffix}', f'{tag} {{}} 1 0 0 {information}'.format
+    circles = [edge('7 7'), f'{tag} 99 99 1 0 0 0 0 0 0 0 0', edge('3 3'), edge('3 3')]
+    for count, said in (
+            (1, '1 edge from a vertex to itself not used: line 2'),
+            (3, '3 edges from a vertex to itself not used: lines 2, 3, 4'),
+            (4, '4 edges from a vertex to itself not used: lines 2, 3, 4, ...')):
+        path.write_text('\n'.join([edge('3 7'), *circles[:count], edge('7 11')]))
+        record = read_graph_file(path)
+        assert record.skipped == (said,)
+        assert record.ids.tolist() == [3, 7, 11]
+        assert record.ids[record.graph.between.pairs].tolist() == [[3, 7], [7, 11]]
+    path.write_text(edge('3 3'))
+    with pytest.raises(FileError, match='no edges; expected'):
+        read_graph_file(path)
 
 
 def test_round_trip(tmp_path, rng):

@@ -51,11 +51,13 @@ def test_everything_given_is_drawn_and_named(tmp_path):
     path = tmp_path / 'map.svg'
     plot_maps(path, [MapDrawing(
         'Some street', SQUARE, odometry=SQUARE * 1.1, truth=SQUARE * 0.9,
-        loops=np.array([[0, 4], [1, 3]]), rejected=np.array([[0, 2]]), note='cost 12.5')])
+        loops=np.array([[0, 4], [1, 3]]), rejected=np.array([[0, 2]]),
+        suspect=np.array([[2, 4]]), note='cost 12.5')])
     ElementTree.parse(path)
     said = words(path)
-    for word in ('Some street', 'optimised', 'odometry', 'truth', 'loops', 'rejected loops',
-                 'x [m]', 'y [m]', '5 poses, 2 loops, 1 rejected; cost 12.5'):
+    for word in ('Some street', 'optimised', 'odometry', 'truth', 'loops', 'refused loops',
+                 'suspect loops', 'x [m]', 'y [m]',
+                 '5 poses, 4 loops (1 refused, 1 suspect); cost 12.5'):
         assert word in said
 
 
@@ -63,25 +65,50 @@ def test_what_is_not_given_is_not_named(tmp_path):
     path = tmp_path / 'map.svg'
     plot_maps(path, [MapDrawing('Some street', SQUARE)])
     assert '5 poses, 0 loops' in words(path)
-    assert not {'odometry', 'truth', 'rejected'} & set(words(path).split())
+    assert not {'odometry', 'truth', 'refused', 'suspect'} & set(words(path).split())
 
 
-def test_rejected_loops_are_red(tmp_path):
+def test_refused_loops_are_red(tmp_path):
     for name, rejected in ('none', np.zeros((0, 2), int)), ('one', np.array([[0, 2]])):
         plot_maps(tmp_path / f'{name}.png', [MapDrawing('', SQUARE, rejected=rejected)])
     assert reddish(tmp_path / 'none.png') == 0
     assert reddish(tmp_path / 'one.png') > 300
 
 
-def test_false_loops_are_red_and_named_as_such(tmp_path):
+def test_false_loops_are_not_those_refused_and_named_as_such(tmp_path):
     drawing = MapDrawing('', SQUARE, loops=np.array([[1, 3]]), false=np.array([[0, 2], [0, 3]]),
                          name='stored')
     plot_maps(tmp_path / 'map.png', [drawing])
-    assert reddish(tmp_path / 'map.png') > 300
+    assert reddish(tmp_path / 'map.png') == 0
     plot_maps(tmp_path / 'map.svg', [drawing])
     said = words(tmp_path / 'map.svg')
-    assert '5 poses, 1 loops, 2 false' in said and 'false loops' in said and 'stored' in said
-    assert 'rejected' not in said and 'optimised' not in said
+    assert '5 poses, 3 loops (2 false)' in said and 'false loops' in said and 'stored' in said
+    assert 'refused' not in said and 'optimised' not in said
+
+
+def test_the_truth_is_a_path_with_its_gaps(tmp_path):
+    """Of any length, and no line across a gap."""
+    truth = np.array([[0.0, 0.0], [0.0, 10.0], [np.nan, np.nan], [10.0, 10.0], [10.0, 0.0]])
+    orange = []
+    for path in truth, truth[[0, 1, 3, 4]]:
+        plot_maps(tmp_path / 'map.png', [MapDrawing('', SQUARE / 9, truth=path)])
+        r, g, b = np.moveaxis(pixels(tmp_path / 'map.png'), -1, 0)
+        orange.append(((r > 200) & (g > 130) & (g < 190) & (b < 90)).sum())
+    assert 0 < 1.3 * orange[0] < orange[1]
+
+
+def test_the_order_of_every_legend_is_the_same(tmp_path):
+    pair = np.array([[0, 2]])
+    everything = {'odometry': SQUARE, 'truth': SQUARE, 'loops': pair, 'suspect loops': pair,
+                  'refused loops': pair, 'false loops': pair}
+    field_of = {name: name.split()[0] for name in everything} | {'refused loops': 'rejected'}
+    for left_out in everything:
+        shown = {field_of[name]: value for name, value in everything.items() if name != left_out}
+        plot_maps(tmp_path / 'map.svg', [MapDrawing('', SQUARE, **shown)])
+        expected = [*(name for name in everything if name != left_out), 'optimised']
+        read = sorted((y, x, word) for word, x, y in places(tmp_path / 'map.svg')
+                      if word in expected)
+        assert [word for _, _, word in read] == expected
 
 
 def test_axes_are_equal(tmp_path):
@@ -118,7 +145,7 @@ def test_whatever_the_shape_the_legend_is_below_the_name_of_the_axis(tmp_path, s
     found = places(path)
     # Where there are several maps: of the one on the left.
     legend = [min((x, y) for word, x, y in found if word == entry)
-              for entry in ('odometry', 'truth', 'rejected loops', 'loops', 'optimised')]
+              for entry in ('odometry', 'truth', 'loops', 'refused loops', 'optimised')]
     label_x, label = min((x, y) for word, x, y in found if word == 'x [m]')
     assert len({y for _, y in legend}) == 1
     below = legend[0][1]
@@ -198,7 +225,7 @@ def test_a_solution_is_a_map_and_the_way_there(tmp_path):
     alone, both = (pixels(tmp_path / f'{name}.png').shape for name in ('alone', 'both'))
     assert both[1] > 1.6 * alone[1] and both[0] < 1.2 * alone[0]
     plot_solution(tmp_path / 'both.svg', MapDrawing('square', SQUARE), curve_of([1158.0, 972.0]))
-    for word in 'square', 'l1 cost', 'iteration', 'initial 5940', 'final 972', '3000':
+    for word in 'square', 'l1 cost', 'iteration', 'initial 5940, final 972', '3000':
         assert word in words(tmp_path / 'both.svg')
 
 

@@ -13,9 +13,9 @@ from l1slam_ros.cli import main
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.growth import GrowthOptions
 from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.formats import read_input
 from l1slam_ros.graph_from_bag import Topics
 from l1slam_ros.io.bag import bag_summary, read_messages, read_raw
-from l1slam_ros.offline import read_input
 
 EVERY = GrowthOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 ODOMETRY = 'nav_msgs/msg/Odometry'

@@ -5,12 +5,19 @@ import numpy as np
 import pytest
 
 from l1slam_ros.core import se2
-from l1slam_ros.core.errors import InconsistentError
 from l1slam_ros.core.false_loops import FALSE_LOOPS
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.initial import pair_key
 from l1slam_ros.core.metrics import absolute_trajectory_error
-from l1slam_ros.core.robust import minimise_accepted, reconsidered, robust_solve
+from l1slam_ros.core.robust import (
+    INCONSISTENT,
+    MOSTLY_REFUSED,
+    Doubt,
+    minimise_accepted,
+    mostly_refused,
+    reconsidered,
+    robust_solve,
+)
 from l1slam_ros.core.simulate import WorldOptions, simulate_world, with_false_loops
 
 # Odometry good enough for a drive of 400 m to come back near where it was.
@@ -89,7 +96,7 @@ def test_a_slip_of_the_odometry_is_found_and_named(world, offset):
     assert error(solution.poses, world.truth) < 0.3
 
 
-def test_a_map_that_loops_agree_is_wrong_is_refused(world):
+def test_a_map_that_loops_agree_is_wrong_is_doubtful(world):
     # Two slips, and no single step explains what the loops across both agree upon.
     graph, _ = spoilt(world, 'random', 170)
     rng = np.random.default_rng(5)
@@ -101,10 +108,23 @@ def test_a_map_that_loops_agree_is_wrong_is_refused(world):
         return measurement
 
     steps = graph.between.i[np.sort(slipped)]
-    with pytest.raises(InconsistentError) as refused:
-        robust_solve(with_measurements(graph, change))
-    assert refused.value.loops > 10
-    assert steps[0] - 20 < refused.value.first < refused.value.last < steps[1] + 20
+    doubt = robust_solve(with_measurements(graph, change)).doubt
+    assert doubt.kind == INCONSISTENT and doubt.loops > 10
+    assert steps[0] - 20 < doubt.first < doubt.last < steps[1] + 20
+
+
+@pytest.mark.parametrize('refused, doubtful', [(0, False), (2, False), (3, True), (5, True)])
+def test_most_loops_refused_is_a_doubt(refused, doubtful):
+    graph, n = FactorGraph(se2), 10
+    graph.add_poses(n)
+    i = np.concatenate((np.arange(n - 1), np.arange(5)))
+    j = np.concatenate((np.arange(1, n), np.arange(5) + 4))
+    graph.add_between(i, j, np.zeros((len(i), 3)), np.tile(np.eye(3), (len(i), 1, 1)))
+    accepted = np.arange(len(i)) < len(i) - refused
+    expected = Doubt(MOSTLY_REFUSED, refused, 5 - refused, 8) if doubtful else None
+    assert mostly_refused(graph, accepted) == expected
+    # Of less than a handful most may be refused.
+    assert mostly_refused(graph.subset(np.arange(n + 3)), accepted[:n + 3]) is None
 
 
 def test_a_trusted_loop_is_never_refused(world):

@@ -49,6 +49,19 @@ def test_stamps_come_back_to_the_nanosecond(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ['a.g2o.stamps.txt']
 
 
+def test_stamps_alone_are_those_of_the_vertices_in_their_order(tmp_path):
+    path = tmp_path / 'a.g2o'
+    stamps_path(path).write_text('# seconds\n 5.25\n7\n6.5 \n8\n9.125\n')
+    assert read_stamps(path, IDS).tolist() == [
+        5_250_000_000, 7_000_000_000, 6_500_000_000, 8_000_000_000, 9_125_000_000]
+    for text, said in (('1\n2\n', '2 stamps that are not'),
+                       ('1\n2 3\n', "'2 3'; expected seconds"),
+                       ('1\n' * 6, '6 stamps that are not'), ('x\n', "'x'; expected seconds")):
+        stamps_path(path).write_text(text)
+        with pytest.raises(FileError, match=said):
+            read_stamps(path, IDS)
+
+
 def test_trust_comes_back(tmp_path):
     path, loops = tmp_path / 'a.g2o', [(0, 3), (4, 0), (2, 1), (0, 4), (1, 4)]
     # Rows 5 and 7 join the same vertices; row 6 goes along the odometry, which is row 1.
@@ -74,7 +87,7 @@ def test_a_file_without_loops_trusts_none(tmp_path):
 
 
 @pytest.mark.parametrize(('line', 'words'), [
-    ('1', ':4: trusted loop: 1 fields; expected 2 whole numbers'),
+    ('1', ':4: trusted loop: 1 field; expected 2 whole numbers'),
     ('1 2.5', ":4: trusted loop: '2.5' is not a whole number of 64 bits; expected 2"),
     ('-7 8', ':4: no edge between -7 and 8 in '), ('9 -7', ':4: no edge between 9 and -7 in '),
     ('3 3', ':4: no edge between 3 and 3 in '),
@@ -120,7 +133,7 @@ def test_without_the_file_no_loop_is_false(tmp_path):
 
 
 @pytest.mark.parametrize(('line', 'found'), [
-    ('1', '1 fields'), ('1 2 3', '3 fields'), ('1 2.5', "'2.5' is not a whole number"),
+    ('1', '1 field'), ('1 2 3', '3 fields'), ('1 2.5', "'2.5' is not a whole number"),
     ('a b', "'a' is not a whole number")])
 def test_damaged_false_loops_are_named(tmp_path, line, found):
     path = tmp_path / 'false.txt'

@@ -75,6 +75,25 @@ def test_the_vertices_of_a_graph_file_are_a_reference(tmp_path):
     assert reference.poses.tolist() == [[4, 5, 6], [1, 2, 3]]
 
 
+def test_a_graph_with_stamps_is_a_reference_by_them_where_both_have_some(tmp_path):
+    path = tmp_path / 'a.g2o'
+    path.write_text('VERTEX_SE2 4 1 2 3\nVERTEX_SE2 2 4 5 6\n')
+    (tmp_path / 'a.g2o.stamps.txt').write_text('4 10.5\n2 11\n')
+    reference = read_reference(path, by_stamps=True)
+    assert reference.stamped and reference.keys.tolist() == [10_500_000_000, 11_000_000_000]
+    assert reference.poses.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert not read_reference(path).stamped
+
+
+@pytest.mark.parametrize('text', [
+    '2.5, 3, 4, 0.5\n1.5, 1, 2, 0\n', 'stamp,x,y,theta\n2.5,3,4,.5\n1.5,1,2,0\n',
+    f'2.5,3,4,0,0,0,{float(np.sin(.25))!r},{float(np.cos(.25))!r}\n1.5,1,2,0,0,0,0,1\n'])
+def test_a_csv_file_has_stamps(tmp_path, text):
+    reference = read_reference(write(tmp_path, text))
+    assert reference.stamped and reference.keys.tolist() == [1_500_000_000, 2_500_000_000]
+    np.testing.assert_allclose(reference.poses, [[1, 2, 0], [3, 4, 0.5]], atol=1e-15)
+
+
 def test_the_papers_truth(datasets):
     reference = read_reference(datasets / 'city10000.truth.txt')
     assert reference.keys.tolist() == list(range(10000))
@@ -94,6 +113,11 @@ def test_the_papers_truth(datasets):
     ('1 0 0 0 0 0 0 1\n2 0 inf 0 0 0 0 1\n', ":2: TUM pose: 'inf' is not a finite number"),
     ('1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n', ':2: quaternion [0.0, 0.0, 0.0, 0.0]; expected one of'),
     ('1 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n', ':2: the same id or stamp a second time'),
+    ('1,2,3\n', ':1: 3 columns; expected 8 (TUM) or 4 (stamp and pose)'),
+    ('stamp, x, y, theta\n', ':1: 0 columns; expected 8 (TUM) or 4 (stamp and pose)'),
+    ('1,0,0,0\n2,0,x,0\n', ":2: pose: 'x' is not a finite number"),
+    ('1,0,0,0\nnan,0,0,0\n', ":2: stamp 'nan'; expected seconds"),
+    ('7\n', ':1: 1 column; expected 8 (TUM), 4 (id and pose) or a graph file'),
     ('VERTEX_SE2 0 0 0\n', ':1: VERTEX_SE2: 3 fields; expected'),
 ])
 def test_each_malformed_reference_is_named(tmp_path, text, message):

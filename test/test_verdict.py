@@ -2,6 +2,7 @@
 """What people are told of the loops that were refused, and of the noise."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,10 +13,11 @@ from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.optimality import Status
 from l1slam_ros.core.optimiser import Solution
+from l1slam_ros.core.robust import INCONSISTENT, MOSTLY_REFUSED, Doubt
 from l1slam_ros.core.robust_map import RobustMap, minimise_robustly
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graph_file import GraphRecord
-from l1slam_ros.verdict import verdict
+from l1slam_ros.verdict import doubt_sentence, verdict
 
 N, LOOPS = 30, 27  # keyframes k with the ids 10 + 3 k; loops (k, k + 2)
 
@@ -44,7 +46,7 @@ def judgement(refused=(), suspect=(), slips=(), variance=(1.0, 1.0)):
         sigmas[step], accepted[step] = 40.0 + step, False
     solution = Solution(poses, 0.0, Status.CONVERGED, 0, 0, np.zeros(1), np.zeros(3 * m))
     return RobustMap(solution, poses, accepted, doubtful, sigmas, np.array(slips, np.int64),
-                     np.array(variance))
+                     np.array(variance), None)
 
 
 def test_nothing_refused_is_one_sentence(record):
@@ -99,6 +101,31 @@ NOISY_LOOPS = ('the loops are about {} times as noisy as they say: a false one t
     ((6.25, 20.25), [NOISY_ODOMETRY.format('2.5'), NOISY_LOOPS.format('4.5')])])
 def test_what_is_twice_as_noisy_as_it_says_or_more_is_told_last(record, variance, said):
     assert list(verdict(record, judgement(suspect=[5], variance=variance)))[2:] == said
+
+
+@pytest.mark.parametrize('stamps, when', [
+    (None, ''), (10**9 * np.arange(N), ' (2.000000000 s to 7.000000000 s)')])
+def test_a_doubt_says_why_and_where(stamps, when):
+    ids, where = 10 + 3 * np.arange(N), f'between 16 and 31{when}'
+    said = [doubt_sentence(Doubt(kind, 1234, 2, 7), ids, stamps)
+            for kind in (INCONSISTENT, MOSTLY_REFUSED)]
+    assert said == [
+        'doubtful: 1,234 refused loops agree with each other, but not with the odometry '
+        f'{where}, and to leave out one step of it does not reconcile them; the map may be bent '
+        'there',
+        f'doubtful: 1,234 loops, most of all, are refused or suspect, {where}; either they are '
+        'false, or the odometry is worse than it says']
+
+
+def test_a_lone_loop_is_one_loop(record):
+    graph = FactorGraph(se2)
+    graph.add_poses(3)
+    graph.add_between(np.array([0, 1, 0]), np.array([1, 2, 2]), np.zeros((3, 3)),
+                      np.tile(np.eye(3), (3, 1, 1)))
+    believed = replace(judgement(), accepted=np.ones(3, bool), suspect=np.zeros(3, bool),
+                       sigmas=np.ones(3))
+    said = list(verdict(GraphRecord(graph, None, np.arange(3)), believed))
+    assert said == ['0 of 1 loop refused']
 
 
 def test_what_a_solve_finds_of_the_noise_is_told():

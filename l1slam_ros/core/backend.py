@@ -11,7 +11,7 @@ caller with threads need hold its lock for the first and the last only, which ar
 """
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from l1slam_ros.core.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.optimality import Status, l1_cost, smoothing
 from l1slam_ros.core.optimiser import OptimiserOptions, Solution, backtrack, is_far, minimise
 from l1slam_ros.core.options import Options, option
+from l1slam_ros.core.robust import Doubt
 from l1slam_ros.core.robust_map import minimise_robustly
 from l1slam_ros.core.seed import seed_poses
 
@@ -73,7 +74,7 @@ class Improvement:
 
     cost_before, cost : L1 cost of the accepted factors; reweighted_steps : factorisations for
     the long-range part; outer, inner : iterations of Algorithm 4; gap : of its last linear
-    problem; seconds : all of it.
+    problem; seconds : all of it; doubt : why the map is not to be relied on, if so.
     """
 
     poses: Array
@@ -88,6 +89,7 @@ class Improvement:
     inner_iterations: int
     gap: float
     seconds: float
+    doubt: Doubt | None = None
 
 
 # What can become of a loop; `LoopStates.state` counts in this order.
@@ -270,17 +272,17 @@ def optimise(problem: Problem, options: OptimiserOptions) -> Improvement:
     Else from its own poses and from the seed, whichever ends lower.
     """
     start = time.monotonic()
-    graph, belief = problem.graph, problem.belief
+    graph, belief, doubt = problem.graph, problem.belief, None
     if problem.robust:
         found = minimise_robustly(graph, lambda part, poses: _solved(part, poses, options))
-        solution, belief = found.solution, Belief(
+        solution, doubt, belief = found.solution, found.doubt, Belief(
             found.accepted, found.suspect, found.sigmas, found.variance)
     else:
         starts = (problem.poses, seed_poses(graph, choose(AUTO, graph).cholesky))
         solution = min((_solved(graph, poses, options) for poses in starts), key=lambda s: s.cost)
     part = graph.subset(belief.accepted)
     before = l1_cost(whitened_residual(part, problem.poses))
-    return _improvement(solution, problem, belief, before, 0, start)
+    return replace(_improvement(solution, problem, belief, before, 0, start), doubt=doubt)
 
 
 def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions) -> Solution:

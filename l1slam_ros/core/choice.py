@@ -12,14 +12,19 @@ from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.exact import minimise_interior_point
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.names import SOLVERS
 from l1slam_ros.core.optimality import Status
 from l1slam_ros.core.optimiser import OptimiserOptions, Report, Solution, minimise
 
-AUTO, PRIMAL_DUAL, INTERIOR_POINT = SOLVERS = ('auto', 'primal-dual', 'interior-point')
+AUTO, PRIMAL_DUAL, INTERIOR_POINT = SOLVERS
 # Multiplications of blocks in one factorisation that a factor of the graph may cost before the
 # primal-dual method is the quicker one: measured, some 25 factorisations against some 6,000
 # iterations, each of which passes once over the factors.
 _WORK_PER_FACTOR = 700.0
+# Why a solver was chosen.
+_SPARSE = 'the graph is sparse'
+_DENSE = 'the graph is dense'
+_TOO_DENSE = 'the graph is too dense to be factorised'
 
 
 @dataclass(frozen=True)
@@ -51,14 +56,13 @@ def choose(solver: str, graph: FactorGraph) -> Choice:
     except FillError:
         if solver == INTERIOR_POINT:
             raise
-        return Choice(None, PRIMAL_DUAL, 'the graph fills in')
+        return Choice(None, PRIMAL_DUAL, _TOO_DENSE)
     if solver != AUTO:
         return Choice(cholesky, solver, 'asked for')
     work = cholesky.pattern.work / max(len(graph.between), 1)
-    reason = (f'a factorisation takes {work:.3g} block products per factor, '
-              f'{_WORK_PER_FACTOR:.3g} would be too many')
-    chosen = INTERIOR_POINT if work <= _WORK_PER_FACTOR else PRIMAL_DUAL
-    return Choice(cholesky, chosen, reason, falls_back=True)
+    if work <= _WORK_PER_FACTOR:
+        return Choice(cholesky, INTERIOR_POINT, _SPARSE, falls_back=True)
+    return Choice(cholesky, PRIMAL_DUAL, _DENSE, falls_back=True)
 
 
 def minimise_by(

@@ -14,14 +14,8 @@ class FillError(GraphError):
     """A graph whose factorisation would take more memory than is sensible."""
 
 
-class InconsistentError(GraphError):
-    """Refused loops that agree with each other: either they or the map are wrong."""
-
-    def __init__(self, loops: int, first: int, last: int):
-        super().__init__(f'inconsistent: {loops} refused loops agree with each other, but not '
-                         f'with the odometry between {first} and {last}, and to leave out one '
-                         'step of it does not reconcile them; a map of the rest would be bent')
-        self.loops, self.first, self.last = loops, first, last
+class DoubtfulError(L1SlamError):
+    """A map that was made all the same, and is not to be relied on."""
 
 
 class NoiseError(L1SlamError):

@@ -17,6 +17,7 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.initial import odometry_poses, pair_key
 from l1slam_ros.core.manifold import Array, Indices, Manifold
+from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS
 
 # Two poses are far apart when they are so in time and in space: by this part of all keyframes
 # and by this part of the diagonal of the box the trajectory fills.
@@ -118,11 +119,9 @@ def grouped_false_loops(
     return _loops(graph, i, j, manifold.compose(back_along_i, manifold.compose(wrong, along_j)))
 
 
-FALSE_LOOPS: dict[str, Callable[[FactorGraph, Array, int, np.random.Generator], Loops]] = {
-    'random': random_false_loops,
-    'identity': identity_false_loops,
-    'grouped': grouped_false_loops,
-}
+FALSE_LOOPS: dict[str, Callable[[FactorGraph, Array, int, np.random.Generator], Loops]] = dict(zip(
+    KINDS_OF_FALSE_LOOPS, (random_false_loops, identity_false_loops, grouped_false_loops),
+    strict=True))
 
 
 def _require_room(graph: FactorGraph, count: int) -> None:

@@ -1,10 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far an estimated trajectory is from the truth, once both lie in the same frame."""
+"""
+How far an estimated trajectory is from the truth, once both are of the same times and frame.
+
+In: poses, or positions [m]. Out: the truth at the times of the estimate; the error.
+"""
 
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
-from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.manifold import Array, Indices, Manifold
+
+
+def poses_at(
+    manifold: Manifold, times: Indices, poses: Array, at: Indices, longest: int, tolerance: int
+) -> tuple[Indices, Array]:
+    """
+    Return which of some times have poses between those known, and these: (k,) and (k, p).
+
+    Linear in position and along the shorter arc in heading; nothing is extrapolated.
+
+    Parameters
+    ----------
+    times, poses : (n,) ascending and (n, p), n >= 2, what is known
+    at : (m,) the times that are asked about
+    longest : between known times further apart nothing is interpolated
+    tolerance : so near to a known time the pose is known
+
+    """
+    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    since, until = at - times[after - 1], times[after] - at
+    gap = since + until
+    inside = (since >= 0) & (until >= 0) & (gap <= longest)
+    rows = np.flatnonzero(inside | (np.minimum(np.abs(since), np.abs(until)) <= tolerance))
+    part = np.clip(since[rows] / gap[rows], 0.0, 1.0)
+    later = after[rows]
+    return rows, manifold.interpolate(poses[later - 1], poses[later], part)
 
 
 def align(estimate: Array, truth: Array) -> tuple[Array, Array]:

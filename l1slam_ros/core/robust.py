@@ -27,7 +27,6 @@ import numpy as np
 from l1slam_ros.core.accord import accord, weakest_steps
 from l1slam_ros.core.belief import DOUBT
 from l1slam_ros.core.cholesky import cholesky_of
-from l1slam_ros.core.errors import InconsistentError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.manifold import Array, Indices
@@ -38,6 +37,25 @@ from l1slam_ros.core.slips import VOTES, without_slip
 
 # Every round accepts a loop, hence there is an end; this one is for the patience of people.
 _MOST_ROUNDS = 200
+# Refused loops of several places agree with each other; hardly a loop is believed.
+INCONSISTENT, MOSTLY_REFUSED = KINDS_OF_DOUBT = ('inconsistent', 'mostly refused')
+# Of fewer loops most may well be refused.
+_HANDFUL = 5
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """
+    Why a map is not to be relied on.
+
+    kind : of `KINDS_OF_DOUBT`; loops : how many speak against it; first, last : the keyframes
+    between which they do.
+    """
+
+    kind: str
+    loops: int
+    first: int
+    last: int
 
 
 @dataclass(frozen=True)
@@ -50,7 +68,7 @@ class RobustSolution:
     factor is, in units of its noise, as stated or larger if it was found so: the length of the
     residual, and where it is not accepted, of that over the uncertainty of the map; slips : (k,)
     the odometry factors that lie, not accepted; variance : (2,) of odometry and of loops as it was
-    found, in units of what they state; rounds : how many it took.
+    found, in units of what they state; rounds : how many it took; doubt : None where all is well.
     """
 
     poses: Array
@@ -60,6 +78,7 @@ class RobustSolution:
     slips: Indices
     variance: Array
     rounds: int
+    doubt: Doubt | None
 
 
 # From the round and the loops accepted so far.
@@ -79,7 +98,6 @@ def robust_solve(
     Raises
     ------
     GraphError : the odometry has a gap.
-    InconsistentError : refused loops agree with each other, so the map is not to be trusted.
 
     """
     first = growth = Growth(graph)
@@ -87,11 +105,10 @@ def robust_solve(
     number = 0
     for number, growth in enumerate(rounds(first, without_slip), 1):
         report(number, int(np.count_nonzero(growth.accepted & growth.is_loop)))
-    _require_consistent(growth)
     square, suspect = outlook(growth)
     return RobustSolution(growth.poses, growth.accepted, suspect, np.sqrt(square),
                           np.flatnonzero(~growth.accepted & ~growth.is_loop), growth.variance,
-                          number)
+                          number, _contradiction(growth))
 
 
 def rounds(growth: Growth, repaired: Callable[[Growth], Growth | None]) -> Iterator[Growth]:
@@ -115,16 +132,28 @@ def rounds(growth: Growth, repaired: Callable[[Growth], Growth | None]) -> Itera
         yield growth
 
 
-def _require_consistent(growth: Growth) -> None:
-    """Raise where refused loops of several places agree with each other: they may be right."""
+def _contradiction(growth: Growth) -> Doubt | None:
+    """Return a doubt where refused loops of several places agree: they may be right."""
     camp, chance = accord(growth)
     if len(growth.heads(camp)) < VOTES or chance > DOUBT:
-        return
+        return None
     steps = weakest_steps(growth, camp)
     first, last = int(steps[0]), int(steps[-1])
     # What is trusted is right, whatever else speaks against it.
-    if not (growth.trusted & (growth.low <= last) & (growth.high > first)).any():
-        raise InconsistentError(len(camp), first, last + 1)
+    if (growth.trusted & (growth.low <= last) & (growth.high > first)).any():
+        return None
+    return Doubt(INCONSISTENT, len(camp), first, last + 1)
+
+
+def mostly_refused(graph: FactorGraph, accepted: Mask) -> Doubt | None:
+    """Return a doubt where more than half of a handful of loops or more are not accepted."""
+    factors = graph.between
+    is_loop = ~factors.is_odometry
+    left_out = factors.pairs[is_loop & ~accepted]
+    loops = np.count_nonzero(is_loop)
+    if loops < _HANDFUL or 2 * len(left_out) <= loops:
+        return None
+    return Doubt(MOSTLY_REFUSED, len(left_out), int(left_out.min()), int(left_out.max()))
 
 
 def outlook(growth: Growth) -> tuple[Array, Mask]:

@@ -14,7 +14,14 @@ from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.noise import Mask
 from l1slam_ros.core.optimiser import Solution
-from l1slam_ros.core.robust import Report, minimise_accepted, reconsidered, robust_solve
+from l1slam_ros.core.robust import (
+    Doubt,
+    Report,
+    minimise_accepted,
+    mostly_refused,
+    reconsidered,
+    robust_solve,
+)
 
 # Measured: one or two until the choice stands; this ends one that swings.
 _MOST_ROUNDS = 10
@@ -27,8 +34,8 @@ class RobustMap:
 
     seed : (n, p) the L2 map it began with; accepted : (m,) bool of the between factors; suspect :
     (m,) bool, loops that are not accepted though they fit: nothing vouches for them; sigmas : (m,)
-    how far off each factor is, slips : (k,) odometry factors that lie, variance : (2,), see
-    `RobustSolution`.
+    how far off each factor is, slips : (k,) odometry factors that lie, variance : (2,), doubt :
+    None where all is well, see `RobustSolution`.
     """
 
     solution: Solution
@@ -38,6 +45,7 @@ class RobustMap:
     sigmas: Array
     slips: Indices
     variance: Array
+    doubt: Doubt | None
 
 
 def minimise_robustly(
@@ -57,5 +65,6 @@ def minimise_robustly(
         if (accepted == before).all():
             break
     solution = minimise(graph.subset(before), poses)
+    doubt = found.doubt or mostly_refused(graph, before)
     return RobustMap(solution, poses, before, found.suspect & ~before, found.sigmas, found.slips,
-                     found.variance)
+                     found.variance, doubt)

@@ -28,7 +28,7 @@ from l1slam_ros.core.robust_map import minimise_robustly
 from l1slam_ros.core.seed import seed_poses
 
 START, L2, L1 = 'the start itself', 'L2', 'L1'
-SEED, JOINT, ROBUST = 'seed alone', 'seed, then L1', '`--robust`'
+SEED, JOINT, ROBUST = 'seed alone', 'seed, then L1', 'loops doubted, then L1'
 # Standard deviations of the noise on every stored pose, each [m] and [rad] alike.
 NOISES = (0.25, 0.5, 1.0, 2.0)
 # Where Huber turns linear [sigmas]; the narrower, the nearer to L1.

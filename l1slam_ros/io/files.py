@@ -19,6 +19,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.manifold import Array, Indices
+from l1slam_ros.io.wording import counted
 
 NANOSECONDS = 10**9
 # No pose or information is beyond this, and with less no square of one leaves the doubles.
@@ -230,7 +231,7 @@ def _complaint(text: str, ids: int, values: int) -> str:
     """Say what is wrong with one line."""
     fields = text.split('#', 1)[0].split()
     if len(fields) != ids + values:
-        return f'{len(fields)} fields'
+        return counted(len(fields), 'field')
     for field in fields[:ids]:
         if _numbers([field], np.dtype([('values', np.int64, (1,))])) is None:
             return f'{quoted(field)} is not a whole number of 64 bits'

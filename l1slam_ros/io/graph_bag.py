@@ -23,12 +23,9 @@ from l1slam_ros.io.bag_writer import BagWriter, new_bag
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.graph_file import GraphRecord
 from l1slam_ros.io.messages import reference_frame_id
+from l1slam_ros.io.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUSTED_LOOP_TOPIC, TRUTH_TOPIC
 from l1slam_ros.io.trajectory import invented_stamps
 
-ODOMETRY_TOPIC = '/odom'
-LOOP_TOPIC = '/loop_closures'
-TRUSTED_LOOP_TOPIC = '/trusted_loop_closures'
-TRUTH_TOPIC = '/ground_truth'
 # What `bag.read_note` returns for a graph.
 GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
 

@@ -36,6 +36,8 @@ from l1slam_ros.io.files import (
     settled,
 )
 from l1slam_ros.io.side_files import read_stamps, read_trusted, write_beside
+from l1slam_ros.io.tags_left_out import SENSORS, TAGS_3D, TAGS_LEFT_OUT
+from l1slam_ros.io.wording import counted
 
 
 @dataclass(frozen=True)
@@ -84,27 +86,8 @@ _TAGS = {
     'EDGE2': _Tag('toro', 'between', se2, 2, _TORO_2D),
 }
 _FORMAT_OF_SUFFIX = {'.graph': 'toro'}
-
-# Besides all that have SE3 or SIM3 in their names.
-_TAGS_3D = frozenset({
-    'VERTEX3', 'EDGE3', 'VERTEX_TRACKXYZ', 'EDGE_POINTXYZ', 'EDGE_XYZPRIOR', 'EDGE_PROJECT_DEPTH',
-    'EDGE_PROJECT_DISPARITY',
-})
-_LANDMARKS = 'landmarks are no part of a pose graph'
-_SENSORS = 'sensor data and calibration are no part of a pose graph'
-# Known and left out, with the reason that is told; PARAMS_... and FIX are, too.
-_TAGS_SKIPPED = {
-    **dict.fromkeys((
-        'VERTEX_XY', 'EDGE_SE2_XY', 'EDGE_BEARING_SE2_XY', 'EDGE_SE2_XY_CALIB', 'EDGE_POINTXY',
-        'EDGE_SE2_POINTXY_OFFSET', 'EDGE_SE2_TWOPOINTSXY', 'EDGE_SE2_LOTSOFXY',
-        'VERTEX_SEGMENT2D', 'VERTEX_LINE2D', 'EDGE_SE2_SEGMENT2D', 'EDGE_SE2_SEGMENT2D_LINE',
-        'EDGE_SE2_SEGMENT2D_POINTLINE', 'EDGE_SE2_LINE2D', 'EDGE_LINE2D', 'EDGE_LINE2D_POINTXY',
-    ), _LANDMARKS),
-    **dict.fromkeys((
-        'ROBOTLASER1', 'RAWLASER1', 'FRONTLASER1', 'REARLASER1', 'VERTEX_TAG', 'VERTEX_ELLIPSE',
-    ), _SENSORS),
-    'EDGE_PRIOR_SE2_XY': 'a prior on a position without a heading is not supported',
-}
+# So many lines are named in one sentence.
+_NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -138,6 +121,7 @@ def read_graph_file(path: str | os.PathLike[str]) -> GraphRecord:
     """
     groups = _group(path)
     edges, priors = _rows(path, groups, 'between'), _rows(path, groups, 'prior')
+    edges, skipped = _without_circles(edges)
     if not len(edges):
         raise FileError(path, f'no edges; expected {_expected("between")} lines')
     vertices = _vertices(path, groups)
@@ -147,7 +131,7 @@ def read_graph_file(path: str | os.PathLike[str]) -> GraphRecord:
     _add_edges(path, graph, ids, edges)
     _add_priors(path, graph, ids, priors)
     return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
-                       read_stamps(path, ids), _skipped(groups, ids))
+                       read_stamps(path, ids), (*skipped, *_skipped(groups, ids)))
 
 
 def read_vertices(path: str | os.PathLike[str]) -> tuple[Indices, Array]:
@@ -202,9 +186,9 @@ def _group(path: str | os.PathLike[str]) -> dict[str, TextLines]:
 
 
 def _refuse_unknown(path: object, tag: str, line: int) -> None:
-    if tag in _TAGS or tag in _TAGS_SKIPPED or tag == 'FIX' or tag.startswith('PARAMS_'):
+    if tag in _TAGS or tag in TAGS_LEFT_OUT or tag == 'FIX' or tag.startswith('PARAMS_'):
         return
-    if tag in _TAGS_3D or 'SE3' in tag or 'SIM3' in tag:
+    if tag in TAGS_3D or 'SE3' in tag or 'SIM3' in tag:
         raise FileError(path, f'{quoted(tag)}: 3D graphs are not supported yet; expected a graph '
                         f'in the plane ({_expected("between")} lines)', line)
     raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(_TAGS)}', line)
@@ -248,13 +232,20 @@ def _vertices(path: object, groups: dict[str, TextLines]) -> _Rows:
     return _Rows(lines, ids, rows.pose[order], rows.information[order])
 
 
+def _without_circles(edges: _Rows) -> tuple[_Rows, list[str]]:
+    """Return the edges but for those from a vertex to itself, and a sentence on these, if any."""
+    circle = edges.ids[:, 0] == edges.ids[:, 1]
+    if not circle.any():
+        return edges, []
+    lines, k = edges.lines[circle].tolist(), ~circle
+    names = [str(number) for number in lines[:_NAMED]] + ['...'] * (len(lines) > _NAMED)
+    sentence = (f'{counted(len(lines), "edge")} from a vertex to itself not used: '
+                f'{"line" if len(lines) == 1 else "lines"} {", ".join(names)}')
+    return _Rows(edges.lines[k], edges.ids[k], edges.pose[k], edges.information[k]), [sentence]
+
+
 def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices,
                edges: _Rows) -> None:
-    loop = edges.ids[:, 0] == edges.ids[:, 1]
-    if loop.any():
-        k = int(np.argmax(loop))
-        raise FileError(path, f'an edge from vertex {edges.ids[k, 0]} to itself; '
-                        'expected two vertices', int(edges.lines[k]))
     i, j = _index(path, ids, edges).T
     doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), np.zeros(len(edges), bool))
     graph.add_between(i, j, edges.pose, edges.information, read_trusted(path, ids, doubted))
@@ -305,9 +296,9 @@ def _skipped(groups: dict[str, TextLines], ids: Indices) -> tuple[str, ...]:
                          'is the one held fixed')
     for tag, group in groups.items():
         if tag not in _TAGS and tag != 'FIX':
-            lines = 'line is' if len(group.texts) == 1 else 'lines are'
-            sentences.append(f'{len(group.texts)} {quoted(tag)} {lines} not used: '
-                             f'{_TAGS_SKIPPED.get(tag, _SENSORS)}')
+            lines = counted(len(group.texts), f'{quoted(tag)} line is', f'{quoted(tag)} lines are')
+            sentences.append(f'{lines} not used: '
+                             f'{TAGS_LEFT_OUT.get(tag, SENSORS)}')
     return tuple(sentences)
 
 

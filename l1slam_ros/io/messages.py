@@ -74,6 +74,24 @@ def loop_closure(message: Any, base_frame: str, trusted: bool) -> LoopClosure:
                        _covariance(message.pose.covariance), trusted)
 
 
+def stamped_pose(message: Any) -> tuple[int, Array]:
+    """
+    Return the stamp [ns] and x y z qx qy qz qw (7,) of a message with a pose or a transform.
+
+    Of geometry_msgs a PoseStamped, PoseWithCovarianceStamped or TransformStamped, or an Odometry.
+
+    Raises
+    ------
+    MessageError : it cannot be used.
+
+    """
+    if hasattr(message, 'transform'):
+        pose3 = _checked(message.transform.translation, message.transform.rotation)
+    else:
+        pose3 = _pose3(getattr(message.pose, 'pose', message.pose))
+    return stamp_of(message.header), pose3
+
+
 def reference_frame_id(base_frame: str, stamp: int) -> str:
     """Return the name of the robot's frame at a time [ns]: `<base_frame>@<sec>.<9 digits>`."""
     return f'{base_frame}@{stamp_text(stamp)}'
@@ -110,7 +128,11 @@ def _reference_stamp(frame_id: str, base_frame: str) -> int:
 
 def _pose3(pose: Any) -> Array:
     """Return x y z qx qy qz qw (7,) of a geometry_msgs/Pose, the quaternion normalised."""
-    t, q = pose.position, pose.orientation
+    return _checked(pose.position, pose.orientation)
+
+
+def _checked(t: Any, q: Any) -> Array:
+    """Return translation and rotation as one (7,), the quaternion normalised."""
     position, quaternion = (t.x, t.y, t.z), (q.x, q.y, q.z, q.w)
     if not all(map(math.isfinite, position + quaternion)):
         raise MessageError('not_finite', f'pose {position} {quaternion}; expected finite numbers')

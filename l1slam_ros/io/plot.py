@@ -17,6 +17,7 @@ import numpy as np
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.io.files import replacing, require_folder
+from l1slam_ros.io.wording import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +25,11 @@ if TYPE_CHECKING:
 
 _SUFFIXES = ('.png', '.svg', '.pdf')
 _BLUE, _GREEN, _ORANGE, _RED, _GREY = '#0072B2', '#009E73', '#E69F00', '#D5370E', '#808080'
-_CURVE_COLOURS = (_BLUE, '#D55E00', _GREEN, '#CC79A7', _ORANGE, '#56B4E9', '#000000')
+_PURPLE, _BLACK = '#CC79A7', '#000000'
+_CURVE_COLOURS = (_BLUE, '#D55E00', _GREEN, _PURPLE, _ORANGE, '#56B4E9', _BLACK)
+# What maps show, in the order of every legend; what the positions are comes last.
+_ODOMETRY, _TRUTH, _LOOPS, _SUSPECT, _REFUSED, _FALSE = _LEGEND = (
+    'odometry', 'truth', 'loops', 'suspect loops', 'refused loops', 'false loops')
 # More loops than this make a picture slow and no clearer.
 _MOST_LOOPS = 20_000
 # The view follows odometry astray by no more than this part of the map's size.
@@ -50,9 +55,10 @@ class MapDrawing:
     """
     What one map shows, seen from above.
 
-    positions, odometry, truth : (n, 2 or 3) [m]; loops, rejected, false : (m, 2) pairs of rows
-    of `positions`, `false` those that are known to be and were not rejected; name : what the
-    positions are; note : a line under the title, e.g. costs.
+    positions, odometry : (n, 2 or 3) [m]; truth : (l, 2 or 3) [m] a path, rows of NaN part it;
+    loops, suspect, rejected, false : (m, 2) pairs of rows of `positions`, each loop in one of
+    them: `false` those known to be which were not rejected; name : what the positions are; note :
+    more for the line under the title, e.g. costs.
     """
 
     title: str
@@ -60,6 +66,7 @@ class MapDrawing:
     odometry: Array | None = None
     truth: Array | None = None
     loops: Indices = field(default_factory=_no_pairs)
+    suspect: Indices = field(default_factory=_no_pairs)
     rejected: Indices = field(default_factory=_no_pairs)
     false: Indices = field(default_factory=_no_pairs)
     name: str = 'optimised'
@@ -109,7 +116,7 @@ def plot_curves(path: str | Path, curves: Sequence[Curve], title: str = '') -> N
     figure = _new_figure(path, 1.3, 0.8)
     axes = figure.add_subplot()
     _draw_curves(axes, curves, title)
-    axes.legend(frameon=False)
+    _draw_legend(axes)
     _save(figure, path)
 
 
@@ -147,8 +154,10 @@ def _draw_curves(axes: 'Axes', curves: Sequence[Curve], title: str) -> None:
     for k, curve in enumerate(curves):
         colour = _CURVE_COLOURS[k % len(_CURVE_COLOURS)]
         axes.plot(curve.iterations, curve.costs, label=curve.label, linewidth=1.6, color=colour)
-        for mark in curve.marks:
-            _draw_mark(axes, *mark, colour)
+        # Where they can be: on a logarithmic scale there is no 0.
+        marks = [mark for mark in curve.marks if mark[1] > 0]
+        axes.plot([mark[0] for mark in marks], [mark[1] for mark in marks], 'o', color=colour,
+                  markersize=5)
     if any((curve.costs > 0).any() for curve in curves):
         axes.set_yscale('log')
     low, high = axes.get_ylim()
@@ -161,40 +170,38 @@ def _draw_curves(axes: 'Axes', curves: Sequence[Curve], title: str) -> None:
     axes.margins(0.06, 0.08)
     axes.set_xlim(right=max(1.0, axes.get_xlim()[1]))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_title(title, loc='left', fontweight='bold')
+    _write_title(axes, title, ', '.join(f'{word} {cost:.6g}' for curve in curves
+                                        for _, cost, word in curve.marks))
     axes.set_xlabel('iteration')
     axes.set_ylabel('cost')
     _tidy(axes)
 
 
-def _draw_mark(axes: 'Axes', iteration: float, cost: float, word: str, colour: str) -> None:
-    """Name a point, towards the middle of the picture."""
-    if not cost > 0:  # nowhere on a logarithmic scale
-        return
-    axes.plot(iteration, cost, 'o', color=colour, markersize=5)
-    axes.annotate(f'{word} {cost:.6g}', (iteration, cost), (7 if iteration == 0 else 0, 7),
-                  textcoords='offset points', ha='left' if iteration == 0 else 'right',
-                  color='#555555', fontsize='small')
+def _write_title(axes: 'Axes', title: str, small_print: str) -> None:
+    """Write above a diagram, where nothing is drawn."""
+    axes.set_title(title, loc='left', fontweight='bold', pad=24 if small_print else None)
+    axes.annotate(small_print, (0, 1), (0, 7), xycoords='axes fraction',
+                  textcoords='offset points', color='#555555', fontsize='small')
 
 
 def _draw_map(axes: 'Axes', drawing: MapDrawing) -> None:
     """Draw from the ground up: what was believed, what is true, what is refused, what came out."""
     if drawing.odometry is not None:
-        _draw_path(axes, drawing.odometry, 'odometry', _GREY, 0.7, zorder=1,
+        _draw_path(axes, drawing.odometry, _ODOMETRY, _GREY, 0.7, zorder=1,
                    opacity=_opacity(len(drawing.odometry)))
     if drawing.truth is not None:
-        _draw_path(axes, drawing.truth, 'truth', _ORANGE, 2.8, zorder=2)
+        _draw_path(axes, drawing.truth, _TRUTH, _ORANGE, 2.8, zorder=2)
     # Lines right across the map are under it, and the fainter the more there are.
-    for pairs, label in ((drawing.false, 'false loops'), (drawing.rejected, 'rejected loops')):
-        _draw_pairs(axes, drawing.positions, pairs, label, _RED, zorder=3,
+    for pairs, label, colour in ((drawing.suspect, _SUSPECT, _PURPLE),
+                                 (drawing.rejected, _REFUSED, _RED),
+                                 (drawing.false, _FALSE, _BLACK)):
+        _draw_pairs(axes, drawing.positions, pairs, label, colour, zorder=3,
                     opacity=float(np.clip(50 / max(len(pairs), 1), 0.08, 0.8)))
-    _draw_pairs(axes, drawing.positions, drawing.loops, 'loops', _GREEN, zorder=4,
+    _draw_pairs(axes, drawing.positions, drawing.loops, _LOOPS, _GREEN, zorder=4,
                 opacity=_opacity(len(drawing.loops)))
     _draw_path(axes, drawing.positions, drawing.name, _BLUE, 1.0, zorder=5)
     axes.plot(*drawing.positions[0, :2], 'o', color=_BLUE, markersize=5, zorder=6)
-    axes.set_title(drawing.title, loc='left', fontweight='bold', pad=24)
-    axes.annotate(_small_print(drawing), (0, 1), (0, 7), xycoords='axes fraction',
-                  textcoords='offset points', color='#555555', fontsize='small')
+    _write_title(axes, drawing.title, _small_print(drawing))
     _set_view(axes, drawing)
     axes.set_xlabel('x [m]')
     axes.set_ylabel('y [m]')
@@ -203,24 +210,32 @@ def _draw_map(axes: 'Axes', drawing: MapDrawing) -> None:
 
 
 def _draw_legend(axes: 'Axes') -> None:
-    """Draw the legend below the map and the name of its x axis."""
+    """Draw the legend below a diagram and the name of its x axis, always in the same order."""
     from matplotlib.transforms import ScaledTranslation
 
+    handles, labels = axes.get_legend_handles_labels()
+    shown = dict(zip(labels, handles, strict=True))
+    order = [*(label for label in _LEGEND if label in shown),
+             *(label for label in shown if label not in _LEGEND)]
     below = ScaledTranslation(0, -_LEGEND_BELOW, axes.figure.dpi_scale_trans)
-    axes.legend(loc='upper center', bbox_to_anchor=(0.5, 0), borderaxespad=0, ncols=5,
-                bbox_transform=axes.transAxes + below, frameon=False, fontsize='small',
+    # Matplotlib fills column by column; people read row by row.
+    columns = 5 if len(order) <= 5 else 4
+    order = [label for k in range(columns) for label in order[k::columns]]
+    axes.legend([shown[label] for label in order], order, loc='upper center',
+                bbox_to_anchor=(0.5, 0), borderaxespad=0, bbox_transform=axes.transAxes + below,
+                ncols=columns, frameon=False, fontsize='small',
                 columnspacing=1.4, handlelength=1.4)
 
 
 def _small_print(drawing: MapDrawing) -> str:
-    parts = [f'{len(drawing.positions):,} poses', f'{len(drawing.loops):,} loops']
+    kinds = {'refused': drawing.rejected, 'suspect': drawing.suspect, 'false': drawing.false}
+    parts = [f'{len(pairs):,} {word}' for word, pairs in kinds.items() if len(pairs)]
     if len(drawing.loops) > _MOST_LOOPS:
-        parts[-1] += f' ({_MOST_LOOPS:,} drawn)'
-    if len(drawing.rejected):
-        parts.append(f'{len(drawing.rejected):,} rejected')
-    if len(drawing.false):
-        parts.append(f'{len(drawing.false):,} false')
-    return ', '.join(parts) + (f'; {drawing.note}' if drawing.note else '')
+        parts.append(f'{_MOST_LOOPS:,} drawn')
+    loops = len(drawing.loops) + sum(map(len, kinds.values()))
+    said = f'{counted(len(drawing.positions), "pose")}, {counted(loops, "loop")}'
+    return (said + (f' ({", ".join(parts)})' if parts else '')
+            + (f'; {drawing.note}' if drawing.note else ''))
 
 
 def _draw_path(
@@ -260,7 +275,7 @@ def _set_view(axes: 'Axes', drawing: MapDrawing) -> None:
 
     seen = [drawing.positions] if drawing.truth is None else [drawing.positions, drawing.truth]
     points = np.concatenate([positions[:, :2] for positions in seen])
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     size = max(float((high - low).max()), 1.0)
     if drawing.odometry is not None:
         strayed = drawing.odometry[:, :2].clip(low - _ASTRAY * size, high + _ASTRAY * size)

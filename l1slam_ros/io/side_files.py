@@ -2,7 +2,7 @@
 """
 What lies beside a graph because no graph format has a place for it.
 
-    <path>.stamps.txt    `id seconds`, one line for each vertex
+    <path>.stamps.txt    `id seconds`, one line for each vertex; or `seconds` alone, in their order
     <path>.trusted.txt   `i j`, the vertex ids of each loop that is never doubted
     <path>.truth.txt     `id x y theta`, true poses; see `trajectory`
     <path>.false.txt     `i j`, the vertex ids of each edge known to be a false loop
@@ -103,13 +103,15 @@ def read_stamps(path: str | os.PathLike[str], ids: Indices) -> Indices | None:
     if not side.exists():
         return None
     lines = read_lines(side)
+    in_order = bool(lines.texts) and len(lines.texts[0].split()) == 1
     stamp_of = {}
-    for number, text in zip(lines.numbers, lines.texts, strict=True):
+    for k, (number, text) in enumerate(zip(lines.numbers, lines.texts, strict=True)):
         try:
-            name, stamp = text.split()
-            stamp_of[int(name)] = stamp_from_text(stamp)
+            name, stamp = (ids[k % len(ids)], text) if in_order else text.split()
+            stamp_of[int(name)] = stamp_from_text(stamp.strip())
         except ValueError as error:
-            raise FileError(side, f'{quoted(text)}; expected a vertex id and seconds',
+            raise FileError(side, f'{quoted(text)}; expected '
+                            f'{"seconds" if in_order else "a vertex id and seconds"}',
                             number) from error
     if len(lines.texts) != len(ids) or stamp_of.keys() != set(ids.tolist()):
         raise FileError(side, f'{len(lines.texts)} stamps that are not those of the {len(ids)} '

@@ -25,6 +25,8 @@ from l1slam_ros.io.files import (
 )
 from l1slam_ros.io.graph_file import read_vertices
 from l1slam_ros.io.messages import QUATERNION_NORM_ERROR
+from l1slam_ros.io.side_files import read_stamps
+from l1slam_ros.io.wording import counted
 
 _TUM_COLUMNS = 8
 
@@ -34,12 +36,14 @@ class Reference:
     """
     Poses to compare with.
 
-    keys : (n,) ascending, vertex ids, or stamps [ns] when `stamped`; poses : (n, p).
+    keys : (n,) ascending, vertex ids, or stamps [ns] when `stamped`; poses : (n, p); skipped :
+    sentences on what was not used.
     """
 
     keys: Indices
     poses: Array
     stamped: bool
+    skipped: tuple[str, ...] = ()
 
 
 def invented_stamps(n: int) -> Indices:
@@ -76,11 +80,16 @@ def write_truth(path: str | os.PathLike[str], ids: Indices, poses: Array) -> Non
                        for k, row in zip(ids.tolist(), poses.tolist(), strict=True)))
 
 
-def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2) -> Reference:
+def read_reference(
+    path: str | os.PathLike[str], manifold: Manifold = se2, by_stamps: bool = False
+) -> Reference:
     """
-    Read reference poses: a TUM file, a graph file's vertices, or `id x y theta` lines.
+    Read reference poses: TUM, a graph file's vertices, `id x y theta`, or `stamp, x, y, theta`.
 
-    Which of them it is, the first line tells.
+    Which of them it is, the first line tells: commas make a CSV file, whose first column is a
+    stamp, and which a line of words may head.
+
+    by_stamps : let a graph file go by the stamps beside it, if any
 
     Raises
     ------
@@ -90,23 +99,47 @@ def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2) -> Re
     lines = read_lines(path)
     if not lines.texts:
         raise FileError(path, 'the file is empty; expected reference poses')
+    if ',' in lines.texts[0]:
+        return _read_csv(path, lines, manifold)
     columns = len(lines.texts[0].split())
     if lines.texts[0].split()[0][0].isalpha():
-        return Reference(*read_vertices(path), stamped=False)
+        return _read_vertices(path, by_stamps)
     if columns == _TUM_COLUMNS:
         return _sorted(path, lines, *_read_tum(path, lines, manifold), stamped=True)
     if columns == 1 + manifold.POSE_SIZE:
         ids, poses = parse_rows(path, 'pose', lines, 1, manifold.POSE_SIZE)
         return _sorted(path, lines, ids[:, 0], poses, stamped=False)
-    raise FileError(path, f'{columns} columns; expected {_TUM_COLUMNS} (TUM), '
+    raise FileError(path, f'{counted(columns, "column")}; expected {_TUM_COLUMNS} (TUM), '
                     f'{1 + manifold.POSE_SIZE} (id and pose) or a graph file', lines.numbers[0])
+
+
+def _read_vertices(path: str | os.PathLike[str], by_stamps: bool) -> Reference:
+    ids, poses = read_vertices(path)
+    stamps = read_stamps(path, ids) if by_stamps else None
+    if stamps is None:
+        return Reference(ids, poses, stamped=False)
+    first = np.unique(stamps, return_index=True)[1]
+    return Reference(stamps[first], poses[first], stamped=True)
+
+
+def _read_csv(path: object, lines: TextLines, manifold: Manifold) -> Reference:
+    """Read `stamp, x, y, theta` (the columns of the manifold), or TUM with commas."""
+    heading = lines.texts[0].strip()[0].isalpha()
+    rows = TextLines(lines.numbers[heading:],
+                     [text.replace(',', ' ') for text in lines.texts[heading:]])
+    columns = len(rows.texts[0].split()) if rows.texts else 0
+    if columns == _TUM_COLUMNS:
+        return _sorted(path, rows, *_read_tum(path, rows, manifold), stamped=True)
+    if columns != 1 + manifold.POSE_SIZE:
+        raise FileError(path, f'{counted(columns, "column")}; expected {_TUM_COLUMNS} (TUM) or '
+                        f'{1 + manifold.POSE_SIZE} (stamp and pose)', lines.numbers[0])
+    stamps, poses = parse_rows(path, 'pose', _whole_stamps(path, rows), 1, manifold.POSE_SIZE)
+    return _sorted(path, rows, stamps[:, 0], poses, stamped=True)
 
 
 def _read_tum(path: object, lines: TextLines, manifold: Manifold) -> tuple[Indices, Array]:
     """Return stamps [ns] (n,) and poses (n, p)."""
-    exact = TextLines(lines.numbers, [
-        _whole_stamp(path, number, text)
-        for number, text in zip(lines.numbers, lines.texts, strict=True)])
+    exact = _whole_stamps(path, lines)
     stamps, pose3 = parse_rows(path, 'TUM pose', exact, 1, _TUM_COLUMNS - 1)
     far = np.abs(np.linalg.norm(pose3[:, 3:], axis=1) - 1.0) > QUATERNION_NORM_ERROR
     if far.any():
@@ -114,6 +147,12 @@ def _read_tum(path: object, lines: TextLines, manifold: Manifold) -> tuple[Indic
         raise FileError(path, f'quaternion {pose3[k, 3:].tolist()}; expected one of norm 1',
                         lines.numbers[k])
     return stamps[:, 0], manifold.from_pose3(pose3)
+
+
+def _whole_stamps(path: object, lines: TextLines) -> TextLines:
+    return TextLines(lines.numbers, [
+        _whole_stamp(path, number, text)
+        for number, text in zip(lines.numbers, lines.texts, strict=True)])
 
 
 def _whole_stamp(path: object, number: int, text: str) -> str:

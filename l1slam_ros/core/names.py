@@ -1,0 +1,8 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The names that people choose by. Imports nothing, so that a command line offers them at once."""
+
+# The first of each is the default.
+STARTS = ('seed', 'file', 'odometry')
+NORMS = ('l1', 'l2', 'huber')
+SOLVERS = ('auto', 'primal-dual', 'interior-point')
+KINDS_OF_FALSE_LOOPS = ('random', 'identity', 'grouped')
