@@ -22,6 +22,8 @@ _ASYMMETRY = 1e-4
 _SMALLEST, _LARGEST = 1e-30, 1e30
 # Least eigenvalue of the correlation: below it is rounding, and the root would be noise.
 _SINGULAR = 1e-14
+# [m^2], [rad^2] What messages say is bounded by these: `at_most`, `at_least`.
+LEAST_VARIANCE, MOST_VARIANCE = 1e-10, 1e6
 
 
 def square_root_information(information: Array) -> Array:
@@ -67,11 +69,70 @@ def information_from_covariance(covariance: Array) -> Array:
 
 def usable(covariance: Array) -> Mask:
     """Tell which of (m, d, d) matrices are covariances, (m,): messages carry zeros and worse."""
-    finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
-    safe = np.where(finite[:, None, None], covariance, 0.0)
-    skew = np.abs(safe - safe.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
-    symmetric = np.asarray(skew <= _ASYMMETRY * np.abs(safe).max(axis=(1, 2), initial=0.0))
-    return np.asarray(finite & symmetric & _is_definite(safe) & _is_representable(safe))
+    with np.errstate(over='ignore', invalid='ignore'):
+        finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
+        safe = covariance if finite.all() else np.where(finite[:, None, None], covariance, 0.0)
+        skew = np.abs(safe - safe.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
+        symmetric = skew <= _ASYMMETRY * np.abs(safe).max(axis=(1, 2), initial=0.0)
+    return np.asarray(finite & symmetric & _is_definite(safe))
+
+
+def at_most(covariance: Array) -> tuple[Array, Mask]:
+    """
+    Return covariances (m, d, d) without a variance above `MOST_VARIANCE`, and where one was, (m, d).
+
+    It becomes that, which says as little; correlations are kept.
+    """
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    large = variance > MOST_VARIANCE
+    if large.any():
+        scale = np.where(large, np.sqrt(MOST_VARIANCE) / np.sqrt(variance), 1.0)
+        covariance = scale[:, :, None] * covariance * scale[:, None, :]
+    return covariance, large
+
+
+def at_least(covariance: Array, model: Array) -> tuple[Array, Mask]:
+    """
+    Return covariances (m, d, d) without a variance below `LEAST_VARIANCE`, and where one was, (m, d).
+
+    No measurement is that good, and it would nail whatever it stands at: the model, (d, d),
+    speaks for its component.
+    """
+    small = np.diagonal(covariance, axis1=1, axis2=2) < LEAST_VARIANCE
+    if small.any():
+        kept = np.where(small, 0.0, 1.0)
+        covariance = kept[:, :, None] * covariance * kept[:, None, :]
+        covariance = covariance + (small * np.diagonal(model))[:, :, None] * np.eye(len(model))
+    return covariance, small
+
+
+def bounds(found: Array, used: Array, out: Mask) -> list[tuple[float, float]]:
+    """Return the variances that are out of bounds, out (m, d), as found and as used instead."""
+    if not out.any():
+        return []
+    variances = [np.diagonal(part, axis1=1, axis2=2)[out].tolist() for part in (found, used)]
+    return list(zip(*variances, strict=True))
+
+
+def fingerprint(reference: int, stamp: int, measurement: Array, covariance: Array,
+                trusted: bool) -> bytes:
+    """
+    Return what equal measurements have in common: stamps, pose and, to six digits, covariance.
+
+    Fewer digits than it has: a covariance that went through a file comes back to rounding.
+    """
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)).ravel()
+    correlation = covariance.reshape(len(sigma), -1) / np.outer(sigma, sigma)
+    digits = np.rint(1e6 * np.concatenate((np.log(sigma), correlation.ravel()))).astype(np.int64)
+    return b'%d %d %d ' % (reference, stamp, trusted) + measurement.tobytes() + digits.tobytes()
+
+
+def root_of_inverse(covariance: Array) -> Array:
+    """Return the root L', see `square_root_information`, for sound covariances (m, d, d)."""
+    # Cholesky from the last row up gives U U' with U upper triangular, and L' = U^-1.
+    lower = np.linalg.cholesky(covariance[:, ::-1, ::-1])
+    root: Array = np.linalg.inv(lower[:, ::-1, ::-1])
+    return root
 
 
 def _is_definite(matrices: Array) -> Mask:
