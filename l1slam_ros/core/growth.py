@@ -25,17 +25,19 @@ from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.noise import (
     LEAST_VARIANCE,
+    MOST_OF_ODOMETRY,
     MOST_VARIANCE,
     Mask,
-    at_least,
     at_most,
     bounds,
     fingerprint,
+    or_model,
     root_of_inverse,
     usable,
 )
 from l1slam_ros.core.notes import Notes
 from l1slam_ros.core.odometry_stream import OdometryStream, Point
+from l1slam_ros.core.odometry_track import OdometryTrack
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.waiting_loops import WaitingLoop, WaitingLoops
 
@@ -74,8 +76,8 @@ class GraphGrowth:
     ----------
     manifold : what the poses live on
     options : see `GrowthOptions`; may be replaced at any time
-    verbatim : the messages are those of a graph: each is a measurement of its own, none is taken
-        for a loop sent again or for odometry that jumps
+    verbatim : the messages are those of a graph: each is a measurement as it is stated, none a
+        loop sent again or odometry that jumps
 
     Attributes
     ----------
@@ -92,9 +94,7 @@ class GraphGrowth:
         self.notes = Notes()
         self._verbatim = verbatim
         self._stream = OdometryStream(manifold, self.notes)
-        self._stamps = GrowingArray((), np.int64)
-        self._odometry = GrowingArray((manifold.POSE_SIZE,))
-        self._keyframe_samples = GrowingArray((), np.int64)
+        self._track = OdometryTrack(manifold)
         self._motion: Motion
         self._glued = True
         self.offset = manifold.identity(1)
@@ -113,14 +113,12 @@ class GraphGrowth:
     @property
     def stamps(self) -> Indices:
         """Stamps of the keyframes, (n,) [ns]."""
-        stamps: Indices = self._stamps.view()[self._keyframe_samples.view()]
-        return stamps
+        return self._track.keyframe_stamps
 
     @property
     def odometry(self) -> Array:
         """Poses of the keyframes in the odometry frame, (n, p)."""
-        poses: Array = self._odometry.view()[self._keyframe_samples.view()]
-        return poses
+        return self._track.keyframe_poses
 
     @property
     def n_waiting(self) -> int:
@@ -158,9 +156,9 @@ class GraphGrowth:
         MessageError : `old_stamp`, the stamp is not after the last one; nothing is added.
 
         """
-        if not self._glued and sample.stamp <= self._stamps.view()[-1]:
+        if not self._glued and sample.stamp <= self._track.last:
             raise MessageError('old_stamp', f'odometry stamp {sample.stamp} ns is not after the '
-                               f'last one, {self._stamps.view()[-1]} ns')
+                               f'last one, {self._track.last} ns')
         keyframes = [self._add(point) for point in self._stream.take(sample, self._verbatim)]
         return any(keyframes)
 
@@ -168,17 +166,17 @@ class GraphGrowth:
         """Add a sample of the robot's motion; return whether it made a keyframe."""
         if point.anew:
             self._begin_anew()
-        if not len(self._stamps):
-            self._append_sample(point.stamp, point.pose)
+        if not len(self._track):
+            self._track.append(point.stamp, point.pose)
             self._begin_keyframe(point.stamp, point.pose)
             return True
         manifold, pose = self.graph.manifold, point.pose
         if not self._glued or point.unseen:
-            self.offset = manifold.compose(self._odometry.view()[-1:], manifold.inverse(pose))
+            self.offset = manifold.compose(self._track.last_pose, manifold.inverse(pose))
             self._glued = self._moved = True
         if self._moved:
             pose = manifold.compose(self.offset, pose)
-        self._append_sample(point.stamp, pose)
+        self._track.append(point.stamp, pose)
         if point.unseen:
             self._motion.add_unseen(point.sample, point.unseen, _UNSEEN_TURN * point.seconds)
         else:
@@ -186,8 +184,8 @@ class GraphGrowth:
         if not self._motion.is_keyframe(self.options.keyframe):
             return False
         motion = self._motion
-        covariance = motion.covariance(self.options.odometry)
-        self._note_bounds('odometry at', point.stamp, motion.bounded)
+        covariance = motion.covariance(self.options.odometry, self._verbatim)
+        self._note_bounds('odometry', point.stamp, motion.bounded, MOST_OF_ODOMETRY)
         self._begin_keyframe(point.stamp, pose)
         k = self.graph.n_poses - 1
         self.graph.append_between(np.array([k - 1]), np.array([k]), motion.pose,
@@ -198,9 +196,7 @@ class GraphGrowth:
         """Forget the only sample: a stray."""
         manifold = self.graph.manifold
         self.graph = FactorGraph(manifold)
-        self._stamps = GrowingArray((), np.int64)
-        self._odometry = GrowingArray((manifold.POSE_SIZE,))
-        self._keyframe_samples = GrowingArray((), np.int64)
+        self._track = OdometryTrack(manifold)
         self._waiting.forget_arrivals()
 
     def restore(self, graph: FactorGraph, stamps: Indices, poses: Array) -> None:
@@ -212,9 +208,7 @@ class GraphGrowth:
         were carried there and are not what was sent.
         """
         self.graph = graph
-        self._stamps.extend(stamps)
-        self._odometry.extend(poses)
-        self._keyframe_samples.extend(np.arange(len(stamps)))
+        self._track.extend_by_keyframes(stamps, poses)
         self._motion = Motion(graph.manifold, int(stamps[-1]), poses[-1:])
         self._glued = False
         self._stream = OdometryStream(graph.manifold, self.notes, resumed=True)
@@ -238,7 +232,7 @@ class GraphGrowth:
             self._refuse('repeated', loop, 'was sent before; expected each loop once')
             return
         self._seen.add(key)
-        arrival = int(self._stamps.view()[-1]) if len(self._stamps) else 0
+        arrival = self._track.last if len(self._track) else 0
         self._waiting.add(WaitingLoop(loop, arrival, measurement, covariance, key))
 
     def add_due_loops(self) -> int:
@@ -248,12 +242,12 @@ class GraphGrowth:
         Loops that can never become one are counted in `refused`: `before_start` (a time before
         the first odometry), `same_keyframe`, `expired`.
         """
-        if not len(self._waiting) or not len(self._stamps):
+        if not len(self._waiting) or not len(self._track):
             return 0
-        first, now = (int(stamp) for stamp in self._stamps.view()[[0, -1]])
+        now = self._track.last
         due = self._waiting.due(now)
         since = now - int(self.options.loop.wait * 1e9)
-        for one in self._waiting.expired(since) if first < since else ():
+        for one in self._waiting.expired(since) if self._track.first < since else ():
             self._expired.extend(np.array([(one.loop.reference_stamp, one.loop.stamp)]))
             self._refuse('expired', one.loop, f'waited for odometry until {now} ns; expected '
                          'odometry of its times')
@@ -264,15 +258,15 @@ class GraphGrowth:
     def _add_loops(self, due: list[WaitingLoop]) -> int:
         manifold = self.graph.manifold
         stamps = np.array([(one.loop.reference_stamp, one.loop.stamp) for one in due])
-        known = self._known_until(np.array([one.arrival for one in due]), stamps[:, 1])
-        i, j = (self._nearest_keyframe(end, known) for end in stamps.T)
+        known = self._track.known_until(np.array([one.arrival for one in due]), stamps[:, 1])
+        i, j = (self._track.nearest_keyframe(end, known) for end in stamps.T)
         keep = self._can_be_factors([one.loop for one in due], i, j)
         if not keep.any():
             return 0
         used = [one for one, kept in zip(due, keep, strict=True) if kept]
         i, j, stamps = i[keep], j[keep], stamps[keep]
-        to_reference = manifold.between(self.odometry[i], self._odometry_at(stamps[:, 0]))
-        to_keyframe = manifold.between(self._odometry_at(stamps[:, 1]), self.odometry[j])
+        to_reference = manifold.between(self.odometry[i], self._track.at(stamps[:, 0]))
+        to_keyframe = manifold.between(self._track.at(stamps[:, 1]), self.odometry[j])
         measured = np.concatenate([one.measurement for one in used])
         measurement = manifold.compose(manifold.compose(to_reference, measured), to_keyframe)
         # The error lives in the axes of the measured pose; see it from the keyframe instead.
@@ -289,7 +283,7 @@ class GraphGrowth:
 
     def _can_be_factors(self, loops: list[LoopClosure], i: Indices, j: Indices) -> Mask:
         """Return which loops between the keyframes i, j (m,) can be factors, and note the rest."""
-        first = int(self._stamps.view()[0])
+        first = self._track.first
         early = np.array([loop.reference_stamp < first for loop in loops])
         same = (i == j) & ~early
         for row in np.flatnonzero(early | same).tolist():
@@ -310,10 +304,11 @@ class GraphGrowth:
         self.notes.refuse(
             cause, f'a loop from {loop.reference_stamp} ns to {loop.stamp} ns {why}')
 
-    def _note_bounds(self, what: str, stamp: int, bounded: list[tuple[float, float]]) -> None:
+    def _note_bounds(self, what: str, stamp: int, bounded: list[tuple[float, float]],
+                     most: float) -> None:
         for found, used in bounded:
-            self.notes.warn('variance', f'variance {found:g} of {what} {stamp} ns; expected '
-                            f'{LEAST_VARIANCE:g} to {MOST_VARIANCE:g}; {used:g} is used')
+            self.notes.warn(f'{what}_variance', f'variance {found:g} of {what} at {stamp} ns; '
+                            f'expected {LEAST_VARIANCE:g} to {most:g}; {used:g} is used')
 
     def _loop_covariance(self, loop: LoopClosure) -> Array:
         """Return what a loop states, the model where that is no covariance, (1, d, d)."""
@@ -321,9 +316,11 @@ class GraphGrowth:
         stated = reduced_covariance(self.graph.manifold, loop.covariance[None])
         if self.options.loop.covariance_source == 'model' or not usable(stated)[0]:
             return model[None]
-        cut, large = at_most(stated)
-        used, small = at_least(cut, model)
-        self._note_bounds('a loop to', loop.stamp, bounds(stated, used, large | small))
+        if self._verbatim:
+            return stated
+        cut, large = at_most(stated, MOST_VARIANCE)
+        used, small = or_model(cut, model)
+        self._note_bounds('loop', loop.stamp, bounds(stated, used, large | small), MOST_VARIANCE)
         return used
 
     def _loop_model(self) -> Array:
@@ -331,40 +328,7 @@ class GraphGrowth:
         return diagonal_covariance(
             self.graph.manifold, options.sigma_translation, options.sigma_rotation)
 
-    def _known_until(self, arrivals: Indices, stamps: Indices) -> Indices:
-        """
-        Return up to which stamp odometry had come when each loop could first be used, (m,) [ns].
-
-        Only keyframes of that time are candidates, so a loop becomes the same factor whenever an
-        update happens to look for it.
-        """
-        times = self._stamps.view()
-        reached: Indices = np.maximum(arrivals, times[np.searchsorted(times, stamps)])
-        return reached
-
-    def _nearest_keyframe(self, stamps: Indices, known: Indices) -> Indices:
-        keyframes = self.stamps
-        last = np.searchsorted(keyframes, known, side='right') - 1
-        after = np.minimum(np.searchsorted(keyframes, stamps), last)
-        before = np.maximum(after - 1, 0)
-        nearer_before = stamps - keyframes[before] <= keyframes[after] - stamps
-        nearest: Indices = np.where(nearer_before, before, after)
-        return nearest
-
-    def _odometry_at(self, stamps: Indices) -> Array:
-        """Return the odometry poses at `stamps`, interpolated between samples, (m, p)."""
-        times, poses = self._stamps.view(), self._odometry.view()
-        after = np.clip(np.searchsorted(times, stamps), min(1, len(times) - 1), len(times) - 1)
-        before = np.maximum(after - 1, 0)
-        span = np.maximum(times[after] - times[before], 1)
-        fraction = (stamps - times[before]) / span
-        return self.graph.manifold.interpolate(poses[before], poses[after], fraction)
-
-    def _append_sample(self, stamp: int, pose: Array) -> None:
-        self._stamps.extend(np.array([stamp]))
-        self._odometry.extend(pose)
-
     def _begin_keyframe(self, stamp: int, pose: Array) -> None:
-        self._keyframe_samples.extend(np.array([len(self._stamps) - 1]))
+        self._track.mark_keyframe()
         self.graph.add_poses(1)
         self._motion = Motion(self.graph.manifold, stamp, pose)

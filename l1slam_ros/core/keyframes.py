@@ -12,7 +12,14 @@ import numpy as np
 
 from l1slam_ros.core.manifold import Array, Manifold
 from l1slam_ros.core.measurements import OdometrySample
-from l1slam_ros.core.noise import at_least, at_most, bounds, usable
+from l1slam_ros.core.noise import (
+    MOST_OF_ODOMETRY,
+    MOST_VARIANCE,
+    at_most,
+    bounds,
+    or_model,
+    usable,
+)
 from l1slam_ros.core.options import Options, option
 
 
@@ -117,29 +124,34 @@ class Motion:
         """The relative pose, (1, p)."""
         return self._manifold.between(self._ends[:1], self._ends[1:])
 
-    def covariance(self, options: OdometryOptions) -> Array:
-        """Return the covariance of the motion in the axes of its end, (d, d)."""
+    def covariance(self, options: OdometryOptions, verbatim: bool = False) -> Array:
+        """
+        Return the covariance of the motion in the axes of its end, (d, d).
+
+        verbatim : as stated, though it be more, or less, than any odometry can know
+        """
         model = diagonal_covariance(
             self._manifold,
             float(np.hypot(options.sigma_translation * self._metres, options.floor_translation)),
             float(np.hypot(options.sigma_rotation * self._radians, options.floor_rotation)))
-        stated = self._sum(model) if self._stated else None
+        stated = self._sum(model, verbatim) if self._stated else None
         return (model if stated is None else stated) + self._unseen
 
-    def _sum(self, model: Array) -> Array | None:
+    def _sum(self, model: Array, verbatim: bool) -> Array | None:
         """Return the sum of what the messages state; None where one states no covariance."""
         manifold = self._manifold
         stated = reduced_covariance(manifold, np.array(self._stated))
         if not usable(stated).all():
             return None
-        # A large variance is cut before a lever makes all others as large.
-        total, large = at_most(stated)
-        self.bounded += bounds(stated, total, large)
+        total = stated
         if len(total) > 1:
             # The errors on the way, seen from the end.
             Ad = manifold.adjoint(manifold.between(self._ends[1:], np.concatenate(self._poses)))
             total = (Ad @ total @ Ad.transpose(0, 2, 1)).sum(axis=0, keepdims=True)
-        used, small = at_least(total, model)
-        self.bounded += bounds(total, used, small)
+        if verbatim:
+            return total[0]
+        known, out = or_model(total, model, MOST_VARIANCE)
+        used, large = at_most(known, MOST_OF_ODOMETRY)
+        self.bounded = bounds(total, used, out | large)
         # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
         return used[0] if len(stated) == 1 or usable(used)[0] else None

@@ -20,6 +20,7 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.measurements import FASTEST, LONGEST_PAUSE, SHORTEST_STEP
+from l1slam_ros.core.noise import LEAST_VARIANCE, MOST_OF_ODOMETRY, MOST_VARIANCE
 from l1slam_ros.io.bag_writer import BagWriter, new_bag
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.graph_file import GraphRecord
@@ -172,17 +173,23 @@ def _note(record: GraphRecord, stamps: list[int], steps: Indices) -> dict[str, s
     """
     Return what is noted of a graph in its bag.
 
-    A graph may have factors that are equal in all, steps longer than a robot's, and years between
-    its keyframes: each message is meant then, and the note says so.
+    A graph may have loops that are equal in all, steps longer than a robot's, years between its
+    keyframes, and variances of no measurement: each message is meant then, and the note says so.
     """
     factors = record.graph.between
     loops = np.flatnonzero(~factors.is_odometry)
     equal = np.concatenate((factors.pairs[loops], factors.measurement[loops]), axis=1)
     seconds = np.diff(stamps) * 1e-9
-    metres, _ = record.graph.manifold.motion(record.graph.manifold.local(
-        record.graph.manifold.identity(len(steps)), factors.measurement[steps]))
+    manifold = record.graph.manifold
+    metres, _ = manifold.motion(
+        manifold.local(manifold.identity(len(steps)), factors.measurement[steps]))
+    roots = np.linalg.inv(factors.sqrt_information)
+    variances = (roots**2).sum(axis=2)
     meant = (len(np.unique(equal, axis=0)) < len(equal) or (seconds > LONGEST_PAUSE).any()
-             or (metres > FASTEST * np.maximum(seconds, SHORTEST_STEP)).any())
+             or (metres > FASTEST * np.maximum(seconds, SHORTEST_STEP)).any()
+             or variances.min(initial=1.0) < LEAST_VARIANCE
+             or variances[steps].max(initial=1.0) > MOST_OF_ODOMETRY
+             or variances.max(initial=1.0) > MOST_VARIANCE)
     return GRAPH_NOTE | VERBATIM_NOTE if meant else GRAPH_NOTE
 
 
