@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from problems import UNKNOWN, covariance6, odometry, random_information, seconds
+from problems import UNKNOWN, covariance6, odometry, random_information
 
 from l1slam_ros.core import se2
 from l1slam_ros.core.keyframes import (
