@@ -8,6 +8,7 @@ from problems import (
     PERIOD,
     covariance_of,
     curve,
+    drive_on,
     grown,
     loop,
     loops_of,
@@ -131,6 +132,18 @@ def test_odometry_that_moves_its_frame_goes_on_from_where_the_robot_was(new_fram
     assert (np.sqrt(np.diag(covariance_of(growth, 119))) >= 0.1).all() and known.max() < 1e-3
     assert known.max() >= model.floor_translation**2
     assert_allclose(growth.offset, se2.compose(poses[119:120], se2.inverse(moved[:1])), atol=1e-9)
+
+
+def test_where_the_frame_moves_there_is_a_keyframe():
+    """Or the transform from the map would be that of the old frame until the robot moves on."""
+    growth = GraphGrowth(se2, GrowthOptions())
+    drive_on(growth, np.linspace((0, 0, 0), (2, 0, 0), 20), 0)
+    before = growth.graph.n_poses
+    for k in range(20, 24):
+        growth.add_odometry(odometry(k * PERIOD, (0.0, 0.0, 0.0)))
+    assert growth.graph.n_poses == before + 1 and growth.stamps[-1] == seconds(2.0)
+    assert_allclose(growth.odometry[-1], (2, 0, 0), atol=1e-9)
+    assert_allclose(growth.offset, [(2, 0, 0)], atol=1e-9)
 
 
 @pytest.mark.parametrize('speed, period', [(40.0, 0.1), (40.0, 1.0), (40.0, 0.02), (320.0, 0.1)])

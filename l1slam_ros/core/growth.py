@@ -181,7 +181,8 @@ class GraphGrowth:
             self._motion.add_unseen(point.sample, point.unseen, _UNSEEN_TURN * point.seconds)
         else:
             self._motion.add(point.sample, pose, self.options.odometry)
-        if not self._motion.is_keyframe(self.options.keyframe):
+        # Where the frame has moved there is a keyframe: what is published goes by the last one.
+        if not point.unseen and not self._motion.is_keyframe(self.options.keyframe):
             return False
         motion = self._motion
         covariance = motion.covariance(self.options.odometry, self._verbatim)
