@@ -10,9 +10,8 @@ from l1slam_ros.core import se2
 from l1slam_ros.core.errors import FileError, MessageError
 from l1slam_ros.core.growth import GraphGrowth, GrowthOptions
 from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.measurements import OdometrySample
 from l1slam_ros.io.bag import BagMessage, bag_summary, read_messages, read_note
-from l1slam_ros.io.base_frame import BaseFrame
+from l1slam_ros.io.base_frame import BaseFrame, Sorted
 from l1slam_ros.io.graph_bag import (
     GRAPH_NOTE,
     LOOP_TOPIC,
@@ -95,8 +94,8 @@ class _Growing:
             if message.msgtype != expected:
                 raise MessageError('type', f'{message.msgtype} on {topic}; expected {expected}')
             if topic == self._topics.odometry:
-                sample = odometry_sample(message.message)
-                self._add(*self._base_frame.take(message.message.child_frame_id, sample))
+                self._add_odometry(self._base_frame.take(
+                    message.message.child_frame_id, odometry_sample(message.message)))
             else:
                 self._growth.add_loop(loop_closure(
                     message.message, self._base_frame.name, topic == self._topics.trusted))
@@ -106,20 +105,21 @@ class _Growing:
             # The bag defines the type otherwise: it is damaged there, or of another ROS.
             notes.refuse('fields', f'a message on {topic}; expected the fields of {expected}')
 
-    def _add(self, samples: list[OdometrySample], others: list[MessageError]) -> None:
-        notes = self._growth.notes
-        for error in others:
-            notes.refuse(error.cause, str(error))
-        for sample in samples:
+    def _add_odometry(self, found: Sorted) -> None:
+        if found.anew:
+            self._growth.begin_anew()
+        for error in found.others:
+            self._growth.notes.refuse(error.cause, str(error))
+        for sample in found.ours:
             try:
                 self._growth.add_odometry(sample)
             except MessageError as error:
-                notes.refuse(error.cause, str(error))
+                self._growth.notes.refuse(error.cause, str(error))
 
     def record(self, damage: str) -> GraphRecord:
         """Return the graph that has grown; damage : of the bag."""
         growth = self._growth
-        self._add(*self._base_frame.settle())
+        self._add_odometry(Sorted(others=self._base_frame.rest()))
         growth.add_due_loops()
         skipped = growth.notes.sentences()
         if growth.held:

@@ -147,14 +147,15 @@ class BackendNode(Node):
 
     def _on_odometry(self, message: Odometry) -> None:
         try:
-            samples, others = self._base_frame.take(
-                message.child_frame_id, odometry_sample(message))
+            found = self._base_frame.take(message.child_frame_id, odometry_sample(message))
         except L1SlamError as error:
             self._refuse(error)
             return
-        for other in others:
+        if found.anew:
+            self._backend.begin_anew()
+        for other in found.others:
             self._refuse(other)
-        for sample in samples:
+        for sample in found.ours:
             self._add_odometry(sample)
 
     def _add_odometry(self, sample: OdometrySample) -> None:

@@ -73,6 +73,11 @@ class SharedBackend:
             self._backend.add_odometry(sample)
             return not self._backend.growth.held
 
+    def begin_anew(self) -> None:
+        """Forget the only sample so far; see `GraphGrowth.begin_anew`."""
+        with self._lock:
+            self._backend.growth.begin_anew()
+
     def news(self) -> list[str]:
         """Return what is new in the notes on messages; see `GraphGrowth.notes`."""
         with self._lock:

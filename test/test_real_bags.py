@@ -234,17 +234,14 @@ def test_loops_of_another_frame_are_told_with_what_was_expected(tmp_path, world)
                               'base_link@<sec>.<nanosec, 9 digits>',)
 
 
-@pytest.mark.parametrize('strays', [1, 2])
-def test_a_stray_base_frame_in_the_beginning_is_dropped(tmp_path, world, strays):
+def test_a_stray_base_frame_in_the_beginning_is_dropped(tmp_path, world):
     recording = list(world[1])
     first = next(m for m in recording if m[0] == '/odom')
-    wrong = [(*changed(first, lambda m: setattr(m, 'child_frame_id', 'gripper'))[:2],
-              first[2] - 2 + k, changed(first, lambda m: setattr(
-                  m, 'child_frame_id', 'gripper'))[3]) for k in range(strays)]
-    record = read_input(mcap_file(tmp_path / 'a.mcap', wrong + recording), EVERY)
-    plural = 's' if strays > 1 else ''
-    assert record.skipped == (f"{strays} message{plural} refused: odometry of 'gripper'; "
-                              "expected that of 'base_link'",)
+    wrong = changed(first, lambda m: setattr(m, 'child_frame_id', 'gripper'))
+    record = read_input(mcap_file(tmp_path / 'a.mcap', [
+        (*wrong[:2], first[2] - 1, wrong[3]), *recording]), EVERY)
+    assert record.skipped == ("1 message refused: odometry of 'gripper'; expected that of "
+                              "'base_link'",)
     np.testing.assert_array_equal(record.graph.between.measurement,
                                   world[2].graph.between.measurement)
 

@@ -98,7 +98,7 @@ class GraphGrowth:
         self._motion: Motion
         self._glued = True
         self.offset = manifold.identity(1)
-        self._moved = False
+        self._moved = self._resumed = False
         self._waiting = WaitingLoops()
         self._seen: set[bytes] = set()
         self._expired = GrowingArray((2,), np.int64)
@@ -165,7 +165,7 @@ class GraphGrowth:
     def _add(self, point: Point) -> bool:
         """Add a sample of the robot's motion; return whether it made a keyframe."""
         if point.anew:
-            self._begin_anew()
+            self._forget()
         if not len(self._track):
             self._track.append(point.stamp, point.pose)
             self._begin_keyframe(point.stamp, point.pose)
@@ -193,11 +193,18 @@ class GraphGrowth:
                                   root_of_inverse(covariance[None]))
         return True
 
-    def _begin_anew(self) -> None:
-        """Forget the only sample: a stray."""
-        manifold = self.graph.manifold
-        self.graph = FactorGraph(manifold)
-        self._track = OdometryTrack(manifold)
+    def begin_anew(self) -> None:
+        """Forget the only sample so far, a stray; of a restored map: let odometry begin again."""
+        self._stream = OdometryStream(self.graph.manifold, self.notes, self._resumed)
+        if self._resumed:
+            self._glued = False
+            return
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forget the only sample; loops that came may yet find odometry of their times."""
+        self.graph = FactorGraph(self.graph.manifold)
+        self._track = OdometryTrack(self.graph.manifold)
         self._waiting.forget_arrivals()
 
     def restore(self, graph: FactorGraph, stamps: Indices, poses: Array) -> None:
@@ -211,7 +218,7 @@ class GraphGrowth:
         self.graph = graph
         self._track.extend_by_keyframes(stamps, poses)
         self._motion = Motion(graph.manifold, int(stamps[-1]), poses[-1:])
-        self._glued = False
+        self._glued, self._resumed = False, True
         self._stream = OdometryStream(graph.manifold, self.notes, resumed=True)
         factors = graph.between
         rows = np.flatnonzero(~factors.is_odometry)

@@ -149,7 +149,8 @@ class Motion:
             Ad = manifold.adjoint(manifold.between(self._ends[1:], np.concatenate(self._poses)))
             total = (Ad @ total @ Ad.transpose(0, 2, 1)).sum(axis=0, keepdims=True)
         if verbatim:
-            return total[0]
+            exactly: Array = total[0]
+            return exactly
         known, out = or_model(total, model, MOST_VARIANCE)
         used, large = at_most(known, MOST_OF_ODOMETRY)
         self.bounded = bounds(total, used, out | large)
