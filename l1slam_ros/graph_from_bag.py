@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag -> a graph, grown by the code that the node grows with: live and offline see one graph."""
 
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,8 @@ from l1slam_ros.core.errors import FileError, MessageError
 from l1slam_ros.core.growth import GraphGrowth, GrowthOptions
 from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.io.bag import BagMessage, bag_summary, read_messages, read_note
-from l1slam_ros.io.graph_bag import GRAPH_NOTE
+from l1slam_ros.io.base_frame import BaseFrame, Sorted
+from l1slam_ros.io.graph_bag import GRAPH_NOTE, VERBATIM_NOTE
 from l1slam_ros.io.graph_file import GraphRecord
 from l1slam_ros.io.messages import loop_closure, odometry_sample
 from l1slam_ros.io.topics import DEFAULT_TOPICS, Topics
@@ -36,7 +36,9 @@ def graph_from_bag(path: Path, options: GrowthOptions | None, topics: Topics) ->
     FileError : the bag cannot be read, there is no graph in it, or not the topics asked for.
 
     """
-    growing = _Growing(options or _noted_options(path), topics)
+    note = read_note(path)
+    growing = _Growing(options or _noted_options(note), topics,
+                       note.get('messages') == VERBATIM_NOTE['messages'])
     damage: list[str] = []
     for message in read_messages(path, topics.types(), damage.append):
         growing.take(message)
@@ -53,47 +55,62 @@ def graph_from_bag(path: Path, options: GrowthOptions | None, topics: Topics) ->
 
 
 class _Growing:
-    """A graph that grows message by message, and what was refused on the way."""
+    """A graph that grows message by message."""
 
-    def __init__(self, options: GrowthOptions, topics: Topics):
-        self._growth = GraphGrowth(se2, options)
+    def __init__(self, options: GrowthOptions, topics: Topics, verbatim: bool):
+        self._growth = GraphGrowth(se2, options, verbatim)
         self._topics, self._types = topics, topics.types()
-        self._refused: Counter[str] = Counter()
-        self._base_frame = ''
+        self._base_frame = BaseFrame('')
         self.seen: set[str] = set()
 
     def take(self, message: BagMessage) -> None:
-        """Use a message, or count why not."""
-        self.seen.add(message.topic)
+        """Use a message, or note why not."""
+        topic, expected = message.topic, self._types[message.topic]
+        self.seen.add(topic)
+        notes = self._growth.notes
         try:
-            if message.msgtype != self._types[message.topic]:
-                raise MessageError('type', message.msgtype)
-            if message.topic == self._topics.odometry:
-                self._base_frame = self._base_frame or message.message.child_frame_id
-                self._growth.add_odometry(odometry_sample(message.message))
+            if message.msgtype != expected:
+                raise MessageError('type', f'{message.msgtype} on {topic}; expected {expected}')
+            if topic == self._topics.odometry:
+                self._add_odometry(self._base_frame.take(
+                    message.message.child_frame_id, odometry_sample(message.message)))
             else:
                 self._growth.add_loop(loop_closure(
-                    message.message, self._base_frame, message.topic == self._topics.trusted))
+                    message.message, self._base_frame.name, topic == self._topics.trusted))
         except MessageError as error:
-            self._refused[error.cause] += 1
+            notes.refuse(error.cause, str(error))
         except (AttributeError, TypeError, ValueError):
             # The bag defines the type otherwise: it is damaged there, or of another ROS.
-            self._refused['fields'] += 1
+            notes.refuse('fields', f'a message on {topic}; expected the fields of {expected}')
+
+    def _add_odometry(self, found: Sorted) -> None:
+        if found.anew:
+            self._growth.begin_anew()
+        for error in found.others:
+            self._growth.notes.refuse(error.cause, str(error))
+        for sample in found.ours:
+            try:
+                self._growth.add_odometry(sample)
+            except MessageError as error:
+                self._growth.notes.refuse(error.cause, str(error))
 
     def record(self, damage: str) -> GraphRecord:
         """Return the graph that has grown; damage : of the bag."""
         growth = self._growth
+        self._add_odometry(Sorted(others=self._base_frame.rest()))
         growth.add_due_loops()
-        refused = self._refused + growth.refused
-        skipped = [f'{count} messages refused: {cause}' for cause, count in refused.items()]
-        if growth.n_waiting:
+        skipped = growth.notes.sentences()
+        if growth.held:
+            skipped.append(f'the last message is not used: {growth.held}')
+        if growth.n_waiting == 1:
+            skipped.append('1 loop names a time after the last odometry')
+        elif growth.n_waiting:
             skipped.append(f'{growth.n_waiting} loops name times after the last odometry')
         return GraphRecord(growth.graph, None, np.arange(growth.graph.n_poses), growth.stamps,
                            tuple(skipped), damage)
 
 
-def _noted_options(path: Path) -> GrowthOptions:
-    note = read_note(path)
+def _noted_options(note: dict[str, str]) -> GrowthOptions:
     options = GrowthOptions()
     if note.get('keyframes') == GRAPH_NOTE['keyframes']:
         options = replace(options, keyframe=KeyframeOptions(0.0, 0.0, 0.0))

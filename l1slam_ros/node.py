@@ -27,8 +27,10 @@ from visualization_msgs.msg import MarkerArray
 from l1slam_ros.core import se2
 from l1slam_ros.core.backend import Improvement
 from l1slam_ros.core.errors import L1SlamError, MessageError
+from l1slam_ros.core.measurements import OdometrySample
 from l1slam_ros.core.warm_up import warm_up
 from l1slam_ros.diagnosis import Diagnosis
+from l1slam_ros.io.base_frame import BaseFrame
 from l1slam_ros.io.messages import loop_closure, odometry_sample
 from l1slam_ros.loop_status import LoopStatus
 from l1slam_ros.markers import graph_markers
@@ -69,7 +71,7 @@ class BackendNode(Node):
         options = self.options
         self._manifold = se2
         self._backend = SharedBackend(self._manifold, options)
-        self._base_frame = options.base_frame
+        self._base_frame = BaseFrame(options.base_frame)
         self._refused: Counter[str] = Counter()
         self._last_stamp = 0
         self._map_to_odom = self._manifold.identity(1)
@@ -145,9 +147,21 @@ class BackendNode(Node):
 
     def _on_odometry(self, message: Odometry) -> None:
         try:
-            self._check_base_frame(message.child_frame_id)
-            sample = odometry_sample(message)
-            self._backend.add_odometry(sample)
+            found = self._base_frame.take(message.child_frame_id, odometry_sample(message))
+        except L1SlamError as error:
+            self._refuse(error)
+            return
+        if found.anew:
+            self._backend.begin_anew()
+        for other in found.others:
+            self._refuse(other)
+        for sample in found.ours:
+            self._add_odometry(sample)
+
+    def _add_odometry(self, sample: OdometrySample) -> None:
+        try:
+            if not self._backend.add_odometry(sample):
+                return
         except L1SlamError as error:
             self._refuse(error)
             return
@@ -157,12 +171,6 @@ class BackendNode(Node):
         self._pose.publish(pose_stamped(self.options.map_frame, sample.stamp,
                                         self._manifold.to_pose3(pose)[0]))
 
-    def _check_base_frame(self, frame: str) -> None:
-        self._base_frame = self._base_frame or frame
-        if frame and frame != self._base_frame:
-            raise MessageError('child_frame', f'odometry of {frame!r}, expected that of '
-                               f'{self._base_frame!r}')
-
     def _on_loop(self, message: PoseWithCovarianceStamped) -> None:
         self._add_loop(message, trusted=False)
 
@@ -171,7 +179,7 @@ class BackendNode(Node):
 
     def _add_loop(self, message: PoseWithCovarianceStamped, trusted: bool) -> None:
         try:
-            loop = loop_closure(message, self._base_frame, trusted)
+            loop = loop_closure(message, self._base_frame.name, trusted)
         except L1SlamError as error:
             self._refuse(error)
             return
@@ -187,6 +195,8 @@ class BackendNode(Node):
             self._publish_transform()
 
     def _on_second(self) -> None:
+        for sentence in self._backend.news():
+            self.get_logger().warning(sentence)
         counts, refused = self._backend.counts()
         self._diagnosis.publish(counts, self._refused + Counter(refused))
 

@@ -67,10 +67,21 @@ class SharedBackend:
             self._options = options
             self._backend.set_options(options)
 
-    def add_odometry(self, sample: OdometrySample) -> None:
-        """Add one sample; see `GraphGrowth.add_odometry`."""
+    def add_odometry(self, sample: OdometrySample) -> bool:
+        """Add one sample; return whether it is used: `GraphGrowth.add_odometry` may hold it."""
         with self._lock:
             self._backend.add_odometry(sample)
+            return not self._backend.growth.held
+
+    def begin_anew(self) -> None:
+        """Forget the only sample so far; see `GraphGrowth.begin_anew`."""
+        with self._lock:
+            self._backend.growth.begin_anew()
+
+    def news(self) -> list[str]:
+        """Return what is new in the notes on messages; see `GraphGrowth.notes`."""
+        with self._lock:
+            return self._backend.growth.notes.news()
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Add one loop closure; see `GraphGrowth.add_loop`."""

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from problems import UNKNOWN, covariance6, odometry, random_information, seconds
+from problems import UNKNOWN, covariance6, odometry, random_information
 
 from l1slam_ros.core import se2
 from l1slam_ros.core.keyframes import (
@@ -27,18 +27,19 @@ UNUSABLE_NAMES = ['0', 'diagonal -1', '-1', 'nan', '9999', '1e308', 'one negativ
 
 def motion_of(increments, options, covariances=None, twists=None, period=0.1):
     """Return the motion of increments (k, 3), one message each."""
-    motion = Motion(se2, 0)
+    pose = np.zeros((1, 3))
+    motion = Motion(se2, 0, pose)
     none = [UNKNOWN] * len(increments)
     for k, (increment, covariance, twist) in enumerate(
             zip(increments, covariances or none, twists or none, strict=True), 1):
-        sample = odometry(k * period, (0, 0, 0), covariance, twist)
-        motion.add(sample, np.array([increment], float), period, options)
+        pose = se2.compose(pose, np.array([increment], float))
+        motion.add(odometry(k * period, pose[0], covariance, twist), pose, options)
     return motion
 
 
 def is_keyframe(increments, time=0.0, **options):
-    motion = motion_of(increments, MODEL)
-    return motion.is_keyframe(seconds(time), KeyframeOptions(**{**OFF, **options}))
+    motion = motion_of(increments, MODEL, period=time / len(increments))
+    return motion.is_keyframe(KeyframeOptions(**{**OFF, **options}))
 
 
 @pytest.mark.parametrize('option, increments, due', [
@@ -185,7 +186,7 @@ def test_one_unusable_covariance_and_the_model_speaks_for_the_whole_motion(
 
 
 def test_a_source_changed_on_the_way_falls_back_to_the_model():
-    motion = Motion(se2, 0)
+    motion = Motion(se2, 0, np.zeros((1, 3)))
     for k, options in enumerate([MODEL, INCREMENT], 1):
-        motion.add(odometry(k, (0, 0, 0), np.eye(6)), np.array([[1.0, 0, 0]]), 1.0, options)
+        motion.add(odometry(k, (k, 0, 0), np.eye(6)), np.array([[float(k), 0, 0]]), options)
     assert_allclose(motion.covariance(MODEL)[0, 0], 0.2**2 + 0.03**2)

@@ -2,6 +2,7 @@
 """The real node on real DDS, in this process: messages in, the optimised Path out."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -152,7 +153,12 @@ def test_intel_ends_within_two_percent_of_the_optimum(bench, tmp_path, datasets)
     write_graph_bag(tmp_path / 'bag', record)
     b = bench(**EVERY_MESSAGE)
     play(b, tmp_path / 'bag')
-    assert_near_optimum(b, record, 961.77375, 0.02)
+    # Two loops stand in the file twice, number for number: to the node, sent again.
+    keys = np.concatenate((record.graph.between.pairs, record.graph.between.measurement), axis=1)
+    rows = np.sort(np.unique(keys, axis=0, return_index=True)[1])
+    once = replace(record, graph=record.graph.subset(rows))
+    assert len(once.graph.between) == len(record.graph.between) - 2
+    assert_near_optimum(b, once, 961.77375, 0.02)
 
 
 def test_pose_and_transform_agree_with_the_path(bench, tmp_path, rng):

@@ -8,7 +8,12 @@ from problems import random_information
 
 from l1slam_ros.core.errors import L1SlamError, NoiseError
 from l1slam_ros.core.noise import (
+    LEAST_VARIANCE,
+    MOST_VARIANCE,
+    at_most,
     information_from_covariance,
+    or_model,
+    root_of_inverse,
     square_root_information,
     usable,
     whiten,
@@ -88,7 +93,8 @@ def test_the_print_of_a_file_may_be_a_little_asymmetric():
 
 @pytest.mark.parametrize('covariance', [
     np.eye(3), 9999 * np.eye(3), 0.1 * np.eye(3), 1e-9 * np.eye(3), np.diag([1e-6, 1e-6, 9999.0]),
-], ids=['1', '9999', '.1', '1e-9', 'heading unknown'])
+    1e-300 * np.eye(3), 1e300 * np.eye(3), np.diag([0.1, 1e-300, 1e300]),
+], ids=['1', '9999', '.1', '1e-9', 'heading unknown', '1e-300', '1e300', 'from 1e-300 to 1e300'])
 def test_usable_covariances(covariance):
     assert usable(covariance[None])[0]
 
@@ -96,14 +102,40 @@ def test_usable_covariances(covariance):
 @pytest.mark.parametrize('covariance', [
     np.zeros((3, 3)), -np.eye(3), np.full((3, 3), -1.0), np.full((3, 3), np.nan),
     np.diag([1.0, np.inf, 1.0]), np.full((3, 3), 1e308), np.full((3, 3), 9999.0),
-    np.diag([0.1, 0.1, 0.0]), np.diag([0.1, 0.1, 1e308]), np.diag([1.0, 1.0, -1.0]), ASYMMETRIC,
-    INDEFINITE,
-], ids=['0', 'diagonal -1', '-1', 'nan', 'inf', '1e308', '9999', 'no heading', 'heading 1e308',
-        'flag', 'asymmetric', 'indefinite'])
+    np.diag([0.1, 0.1, 0.0]), np.diag([1.0, 1.0, -1.0]), ASYMMETRIC, INDEFINITE,
+], ids=['0', 'diagonal -1', '-1', 'nan', 'inf', '1e308', '9999', 'no heading', 'flag',
+        'asymmetric', 'indefinite'])
 def test_unusable_covariances(covariance):
     assert not usable(covariance[None])[0]
 
 
-@pytest.mark.parametrize('variance', [1e308, 1e-308])
-def test_a_variance_that_overflows_is_not_usable(variance):
-    assert not usable(variance * np.eye(3)[None])[0]
+def test_a_root_of_the_inverse_whitens_as_that_of_the_information(rng):
+    covariance = random_information(50, rng)
+    root = root_of_inverse(covariance)
+    assert_allclose(root, np.triu(root))
+    assert_allclose(root, square_root_information(np.linalg.inv(covariance)), rtol=1e-7,
+                    atol=1e-9)
+
+
+MODEL = np.diag([0.4, 0.5, 0.6])
+
+
+@pytest.mark.parametrize('stated, most, model', [
+    (1e300, MOST_VARIANCE, 1e300), (1e-300, 1e-300, 0.5), (1e-9, 1e-9, 0.5),
+    (1.1 * MOST_VARIANCE, MOST_VARIANCE, 1.1 * MOST_VARIANCE), (MOST_VARIANCE,) * 3,
+    (LEAST_VARIANCE,) * 3])
+def test_variances_are_bounded_and_the_others_stay(stated, most, model):
+    """One component, correlated with the others by a half."""
+    sigma = np.array([2.0, np.sqrt(stated), 3.0])
+    covariance = np.outer(sigma, sigma) * (0.5 + 0.5 * np.eye(3))
+    cut, large = at_most(covariance[None], MOST_VARIANCE)
+    expected = np.array([2.0, np.sqrt(most), 3.0])
+    assert_allclose(cut[0], np.outer(expected, expected) * (0.5 + 0.5 * np.eye(3)), rtol=1e-12)
+    assert large.tolist() == [[False, stated != most, False]]
+    modelled, out = or_model(covariance[None], MODEL)
+    correlation = 0.5 if stated == model else 0.0
+    expected = np.array([2.0, np.sqrt(model), 3.0])
+    shape = np.eye(3) + (1 - np.eye(3)) * [[0, correlation, 0.5], [correlation, 0, correlation],
+                                           [0.5, correlation, 0]]
+    assert_allclose(modelled[0], np.outer(expected, expected) * shape, rtol=1e-12)
+    assert out.tolist() == [[False, stated != model, False]]

@@ -137,8 +137,10 @@ def test_a_topic_asked_for_that_is_not_there_is_an_error(tmp_path, world):
 
 def test_a_topic_of_another_type_is_told(tmp_path, world):
     swapped = renamed(world[1], {'/odom': '/loop_closures', '/loop_closures': '/odom'})
-    with pytest.raises(FileError, match='0 keyframes from /odom.* on /loop_closures; '
-                                        '181 messages refused: type$'):
+    with pytest.raises(FileError, match=(
+            '0 keyframes from /odom.* on /loop_closures; 181 messages refused: '
+            'nav_msgs/msg/Odometry on /loop_closures; expected '
+            'geometry_msgs/msg/PoseWithCovarianceStamped$')):
         read_input(mcap_file(tmp_path / 'a.mcap', swapped))
 
 
@@ -152,7 +154,8 @@ def test_a_type_defined_otherwise_is_told(tmp_path):
             message = other.types[ODOMETRY](x=float(k))
             writer.write(topic, k, other.serialize_cdr(message, ODOMETRY))
     with pytest.raises(FileError, match='0 keyframes from /odom; expected 2 or more; '
-                                        '5 messages refused: fields$'):
+                                        '5 messages refused: a message on /odom; expected the '
+                                        'fields of nav_msgs/msg/Odometry$'):
         read_input(tmp_path / 'a')
 
 
@@ -174,7 +177,10 @@ def test_duplicates_and_a_clock_set_back_are_counted_and_told(tmp_path, world):
     twice = sorted(recording + odometry[:10], key=lambda m: m[2])
     path = mcap_file(tmp_path / 'a.mcap', twice + again)
     record = read_input(path, EVERY)
-    assert record.skipped == ('40 messages refused: old_stamp',)
+    first, second = (m[2] for m in odometry[:2])
+    assert record.skipped == (f'40 messages refused: odometry stamp {first} ns is not after the '
+                              f'last one, {first} ns',)
+    assert second > first
     assert len(record.graph.between) == len(world[2].graph.between)
 
 
@@ -194,9 +200,13 @@ def test_what_cannot_be_used_is_counted_by_its_cause(tmp_path, world):
     broken(loops[3], lambda m: setattr(m.header, 'frame_id', 'map'))
     broken(loops[4], lambda m: setattr(m.header.stamp, 'sec', 2_000_000))
     record = read_input(mcap_file(tmp_path / 'a.mcap', recording), EVERY)
-    assert sorted(record.skipped) == [
-        '1 loops name times after the last odometry', '1 messages refused: frame',
-        '1 messages refused: not_finite', '1 messages refused: stamp']
+    for said, start in zip(sorted(record.skipped), [
+            '1 loop names a time after the last odometry',
+            "1 message refused: frame 'map' of a loop; expected base_link@",
+            '1 message refused: pose (nan, ', '1 message refused: stamp 0 s 0 ns; expected'],
+            strict=True):
+        assert said.startswith(start)
+    assert all('expected' in sentence for sentence in record.skipped if 'refused' in sentence)
     assert record.graph.n_poses == 118
 
 
@@ -206,3 +216,66 @@ def test_messages_come_in_order_of_time_even_from_a_file_without_order(tmp_path,
         path = mcap_file(tmp_path / 'a.mcap', shuffled, **options)
         times = [m.time for m in read_messages(path)]
         assert times == [m[2] for m in world[1]]
+
+
+def changed(message, change):
+    topic, msgtype, time, data = message
+    decoded = TYPES.deserialize_cdr(data, msgtype)
+    change(decoded)
+    return topic, msgtype, time, bytes(TYPES.serialize_cdr(decoded, msgtype))
+
+
+def test_loops_of_another_frame_are_told_with_what_was_expected(tmp_path, world):
+    recording = [changed(m, lambda m: setattr(m.header, 'frame_id', 'odom'))
+                 if m[0] == '/loop_closures' else m for m in world[1]]
+    record = read_input(mcap_file(tmp_path / 'a.mcap', recording), EVERY)
+    count = sum(m[0] == '/loop_closures' for m in recording)
+    assert record.skipped == (f"{count} messages refused: frame 'odom' of a loop; expected "
+                              'base_link@<sec>.<nanosec, 9 digits>',)
+
+
+def test_a_stray_base_frame_in_the_beginning_is_dropped(tmp_path, world):
+    recording = list(world[1])
+    first = next(m for m in recording if m[0] == '/odom')
+    wrong = changed(first, lambda m: setattr(m, 'child_frame_id', 'gripper'))
+    record = read_input(mcap_file(tmp_path / 'a.mcap', [
+        (*wrong[:2], first[2] - 1, wrong[3]), *recording]), EVERY)
+    assert record.skipped == ("1 message refused: odometry of 'gripper'; expected that of "
+                              "'base_link'",)
+    np.testing.assert_array_equal(record.graph.between.measurement,
+                                  world[2].graph.between.measurement)
+
+
+def test_a_bag_played_twice_is_the_bag(tmp_path, world):
+    """Into one recording: all once more, later, with the stamps it had."""
+    recording = world[1]
+    again = [(*m[:2], m[2] + 1000 * SECOND, m[3]) for m in recording]
+    record = read_input(mcap_file(tmp_path / 'a.mcap', recording + again), EVERY)
+    assert len(record.graph.between) == len(world[2].graph.between)
+    loops = sum(m[0] == '/loop_closures' for m in recording)
+    assert [sentence.split(':')[0] for sentence in record.skipped] == [
+        f'{len(recording) - loops} messages refused', f'{loops} messages refused']
+    assert 'was sent before' in record.skipped[1]
+
+
+def test_faults_of_the_odometry_are_told(tmp_path, world):
+    """A jump, a stamp ahead, a restart, a variance of 1e12, and a last message on its own."""
+    def moved(x, sec, k, index=-1, variance=0.0):
+        def change(m):
+            m.pose.pose.position.x += x
+            m.header.stamp.sec += sec
+            m.pose.covariance = np.where(np.arange(36) == index, variance, m.pose.covariance)
+        recording[k] = changed(recording[k], change)
+
+    recording = [m for m in world[1] if m[0] == '/odom']
+    moved(3e8, 0, 30)
+    moved(0.0, 5000, 40)
+    moved(0.0, 0, 50, 7, 1e12)
+    moved(0.0, 5000, len(recording) - 1)
+    record = read_input(mcap_file(tmp_path / 'a.mcap', recording), EVERY)
+    assert record.graph.n_poses == len(recording) - 3
+    jump, ahead, variance, last = record.skipped
+    assert jump.startswith('1 message refused: odometry 3e+08 m from one message to the next')
+    assert ahead.startswith('1 message refused: odometry stamp ')
+    assert variance.startswith('variance 1e+12 of odometry at ')
+    assert last.startswith('the last message is not used: odometry stamp ')

@@ -147,8 +147,15 @@ class FactorGraph:
         if (i == j).any():
             raise GraphError(f'keyframe {i[np.argmax(i == j)]} has a factor to itself')
         self._check(np.concatenate((i, j)), measurement)
-        self._append(self._between, (i, j, measurement, square_root_information(information),
-                                    np.broadcast_to(trusted, len(i))))
+        self.append_between(i, j, measurement, square_root_information(information), trusted)
+
+    def append_between(
+        self, i: Indices, j: Indices, measurement: Array, sqrt_information: Array,
+        trusted: Mask | bool = False,
+    ) -> None:
+        """Append between factors that are known to be sound, with the roots (m, d, d) at hand."""
+        self._append(self._between, (i, j, measurement, sqrt_information,
+                                     np.broadcast_to(trusted, len(i))))
 
     def add_prior(self, i: Indices, measurement: Array, information: Array) -> None:
         """Append prior factors: i (m,), measurement (m, p), information (m, d, d); as above."""

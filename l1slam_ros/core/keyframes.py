@@ -12,7 +12,14 @@ import numpy as np
 
 from l1slam_ros.core.manifold import Array, Manifold
 from l1slam_ros.core.measurements import OdometrySample
-from l1slam_ros.core.noise import usable
+from l1slam_ros.core.noise import (
+    MOST_OF_ODOMETRY,
+    MOST_VARIANCE,
+    at_most,
+    bounds,
+    or_model,
+    usable,
+)
 from l1slam_ros.core.options import Options, option
 
 
@@ -50,9 +57,9 @@ def diagonal_covariance(manifold: Manifold, translation: float, rotation: float)
 
 
 def reduced_covariance(manifold: Manifold, covariance: Array) -> Array:
-    """Return the rows of a message's (6, 6) covariance that the manifold has, (d, d)."""
-    rows = list(manifold.COVARIANCE_ROWS)
-    part: Array = covariance[np.ix_(rows, rows)]
+    """Return the rows of messages' (..., 6, 6) covariances that the manifold has, (..., d, d)."""
+    rows = np.array(manifold.COVARIANCE_ROWS)
+    part: Array = covariance[..., rows[:, None], rows]
     return part
 
 
@@ -60,60 +67,92 @@ class Motion:
     """
     The motion since the last keyframe, grown message by message.
 
-    pose : (1, p) relative pose; start : stamp of the keyframe [ns]
+    Parameters
+    ----------
+    manifold : what the poses live on
+    stamp, pose : of the keyframe [ns], (1, p) in the odometry frame
+
+    Attributes
+    ----------
+    bounded : of all variances that `covariance` could not take as stated, found and used
+
     """
 
-    def __init__(self, manifold: Manifold, start: int):
+    def __init__(self, manifold: Manifold, stamp: int, pose: Array):
         d = manifold.TANGENT_SIZE
         self._manifold = manifold
-        self._sum: Array | None = np.zeros((d, d))
-        self._metres = 0.0
-        self._radians = 0.0
-        self.start = start
-        self.pose = manifold.identity(1)
+        self._start = self._stamp = stamp
+        # The keyframe and the last sample.
+        self._ends = np.concatenate((pose, pose))
+        self._metres = self._radians = 0.0
+        self._distance = self._turn = 0.0
+        self.bounded: list[tuple[float, float]] = []
+        self._poses: list[Array] = []
+        self._stated: list[Array] | None = []
+        self._unseen = np.zeros((d, d))
 
-    def add(self, sample: OdometrySample, increment: Array, seconds: float,
-            options: OdometryOptions) -> None:
-        """Continue by `increment` (1, p), the motion since the previous message."""
+    def add(self, sample: OdometrySample, pose: Array, options: OdometryOptions) -> None:
+        """Continue to `pose` (1, p) in the odometry frame, that of a sample."""
         manifold = self._manifold
-        length, angle = manifold.motion(manifold.local(manifold.identity(1), increment))
-        self._metres += float(length[0])
-        self._radians += float(angle[0])
-        self.pose = manifold.compose(self.pose, increment)
-        covariance = _message_covariance(manifold, sample, seconds, options)
-        if self._sum is None or covariance is None:
-            self._sum = None  # one message without a covariance: the model speaks for all
-            return
-        # The earlier error, seen from the new body frame: Ad of the inverse increment.
-        Ad = manifold.adjoint(manifold.inverse(increment))[0]
-        self._sum = Ad @ self._sum @ Ad.T + covariance
+        length, angle = manifold.motion(manifold.local(self._ends, pose))
+        (self._distance, metres), (self._turn, radians) = length.tolist(), angle.tolist()
+        self._metres += metres
+        self._radians += radians
+        if options.covariance_source == 'model':
+            self._stated = None  # one message without a covariance: the model speaks for all
+        elif self._stated is not None:
+            self._poses.append(pose)
+            self._stated.append(
+                sample.covariance if options.covariance_source == 'increment'
+                else sample.twist_covariance * ((sample.stamp - self._stamp) * 1e-9) ** 2)
+        self._ends[1], self._stamp = pose[0], sample.stamp
 
-    def is_keyframe(self, stamp: int, options: KeyframeOptions) -> bool:
-        """Tell whether the motion up to `stamp` [ns] passes any threshold that is on."""
-        manifold = self._manifold
-        length, angle = manifold.motion(manifold.local(manifold.identity(1), self.pose))
-        passed = [(options.translation, length[0]), (options.rotation, angle[0]),
-                  (options.period, (stamp - self.start) * 1e-9)]
+    def add_unseen(self, sample: OdometrySample, metres: float, radians: float) -> None:
+        """Continue to a sample at the same place, to which the robot may have gone some way."""
+        self._unseen = self._unseen + diagonal_covariance(self._manifold, metres, radians)
+        self._stamp = sample.stamp
+
+    def is_keyframe(self, options: KeyframeOptions) -> bool:
+        """Tell whether the motion passes any threshold that is on."""
+        passed = ((options.translation, self._distance), (options.rotation, self._turn),
+                  (options.period, (self._stamp - self._start) * 1e-9))
         on = [value >= threshold for threshold, value in passed if threshold > 0]
         return any(on) or not on
 
-    def covariance(self, options: OdometryOptions) -> Array:
-        """Return the covariance of the motion in the axes of its end, (d, d)."""
-        if self._sum is not None and usable(self._sum[None])[0]:
-            return self._sum
-        return diagonal_covariance(
+    @property
+    def pose(self) -> Array:
+        """The relative pose, (1, p)."""
+        return self._manifold.between(self._ends[:1], self._ends[1:])
+
+    def covariance(self, options: OdometryOptions, verbatim: bool = False) -> Array:
+        """
+        Return the covariance of the motion in the axes of its end, (d, d).
+
+        verbatim : as stated, though it be more, or less, than any odometry can know
+        """
+        model = diagonal_covariance(
             self._manifold,
             float(np.hypot(options.sigma_translation * self._metres, options.floor_translation)),
             float(np.hypot(options.sigma_rotation * self._radians, options.floor_rotation)))
+        stated = self._sum(model, verbatim) if self._stated else None
+        return (model if stated is None else stated) + self._unseen
 
-
-def _message_covariance(manifold: Manifold, sample: OdometrySample, seconds: float,
-                        options: OdometryOptions) -> Array | None:
-    """Return what the message says of the motion since the one before; None: nothing usable."""
-    if options.covariance_source == 'model':
-        return None
-    if options.covariance_source == 'increment':
-        covariance = reduced_covariance(manifold, sample.covariance)
-    else:
-        covariance = reduced_covariance(manifold, sample.twist_covariance) * seconds**2
-    return covariance if usable(covariance[None])[0] else None
+    def _sum(self, model: Array, verbatim: bool) -> Array | None:
+        """Return the sum of what the messages state; None where one states no covariance."""
+        manifold = self._manifold
+        stated = reduced_covariance(manifold, np.array(self._stated))
+        if not usable(stated).all():
+            return None
+        total = stated
+        if len(total) > 1:
+            # The errors on the way, seen from the end.
+            Ad = manifold.adjoint(manifold.between(self._ends[1:], np.concatenate(self._poses)))
+            total = (Ad @ total @ Ad.transpose(0, 2, 1)).sum(axis=0, keepdims=True)
+        if verbatim:
+            exactly: Array = total[0]
+            return exactly
+        known, out = or_model(total, model, MOST_VARIANCE)
+        used, large = at_most(known, MOST_OF_ODOMETRY)
+        self.bounded = bounds(total, used, out | large)
+        # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
+        return used[0] if len(stated) == 1 or usable(used)[0] else None

@@ -51,6 +51,10 @@ _STEPS = 60
 _CHANCES = 2
 # What is measured of the noise counts against as many factors on which it was measured before.
 _KNOWN = 20
+# The noise is learnt to be no less than this part of the variance that is stated: factors that
+# fit exactly, as of a simulator, say of ever less that it is still too much. At a thirtieth of
+# the stated deviations the map has long stopped to change.
+_LEAST_VARIANCE = 1e-3
 # Pairs are formed of so many loops that fit best.
 _CANDIDATES = 200
 # [keyframes] Loops whose ends are nearer to each other, in sum, may be one and the same mistake.
@@ -75,7 +79,7 @@ class Growth:
         self.accepted: Mask = ~self.is_loop | self.trusted
         self.poses = odometry_poses(graph)
         self.variance = np.ones(2)
-        self._least_variance = 0.0
+        self._least_variance = _LEAST_VARIANCE
         self.posterior: Posterior
         self._drops = np.zeros(len(self.factors), np.int64)
 
@@ -89,7 +93,7 @@ class Growth:
         self.settle()
         rows = self.undecided()
         if len(rows):
-            self.variance = self.variance * common_scale(self.innovations(rows))
+            self._scale_variance(common_scale(self.innovations(rows)))
             self.settle()
 
     def resume(self, poses: Array, accepted: Mask, variance: Array) -> None:
@@ -120,7 +124,7 @@ class Growth:
     @property
     def takes_at_their_word(self) -> bool:
         """Whether `take_at_their_word` was called."""
-        return self._least_variance > 0
+        return self._least_variance == 1.0
 
     def undecided(self) -> Indices:
         """Return the factors that may yet be accepted, (k,)."""
@@ -178,7 +182,10 @@ class Growth:
         kind, known = self.is_loop[rows], _KNOWN * self.graph.manifold.TANGENT_SIZE
         found = np.bincount(kind, (self.posterior.residual**2).sum(axis=1), 2)
         stated = np.bincount(kind, np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
-        self.variance = self.variance * (found + known) / (stated + known)
+        self._scale_variance((found + known) / (stated + known))
+
+    def _scale_variance(self, scale: Array | float) -> None:
+        self.variance = np.maximum(self.variance * scale, _LEAST_VARIANCE)
 
     def innovations(self, rows: Indices) -> Innovations:
         """Return how factors that are not accepted fit the map."""

@@ -19,6 +19,8 @@ import numpy as np
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.manifold import Array, Indices
+from l1slam_ros.core.measurements import FASTEST, LONGEST_PAUSE, SHORTEST_STEP
+from l1slam_ros.core.noise import LEAST_VARIANCE, MOST_OF_ODOMETRY, MOST_VARIANCE
 from l1slam_ros.io.bag_writer import BagWriter, new_bag
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.graph_file import GraphRecord
@@ -28,6 +30,8 @@ from l1slam_ros.io.trajectory import invented_stamps
 
 # What `bag.read_note` returns for a graph.
 GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
+# And besides, where a reader of messages would take some for faults: see `_note`.
+VERBATIM_NOTE = {'messages': 'verbatim'}
 
 _TRUTH_FRAME = 'map'
 # builtin_interfaces/Time holds its seconds in 32 bits.
@@ -61,7 +65,7 @@ def write_graph_bag(
     steps, loops = _steps(record), _loops(record)
     if truth is not None and len(truth) != len(stamps):
         raise GraphError(f'{len(truth)} true poses; expected {len(stamps)}, one for each vertex')
-    with new_bag(path, GRAPH_NOTE) as writer:
+    with new_bag(path, _note(record, stamps, steps)) as writer:
         factors = _FactorWriter(writer, graph, odom_frame, base_frame)
         chain = graph.manifold.to_pose3(_chain(graph, steps)).tolist()
         true = None if truth is None else _PoseWriter(writer, graph, truth)
@@ -160,6 +164,30 @@ def _fill(header: Any, pose: Any, stamp: int, pose3: list[float]) -> None:
     header.stamp.sec, header.stamp.nanosec = divmod(stamp, NANOSECONDS)
     position.x, position.y, position.z = pose3[:3]
     orientation.x, orientation.y, orientation.z, orientation.w = pose3[3:]
+
+
+def _note(record: GraphRecord, stamps: list[int], steps: Indices) -> dict[str, str]:
+    """
+    Return what is noted of a graph in its bag.
+
+    A graph may have loops that are equal in all, steps longer than a robot's, years between its
+    keyframes, and variances of no measurement: each message is meant then, and the note says so.
+    """
+    factors = record.graph.between
+    loops = np.flatnonzero(~factors.is_odometry)
+    equal = np.concatenate((factors.pairs[loops], factors.measurement[loops]), axis=1)
+    seconds = np.diff(stamps) * 1e-9
+    manifold = record.graph.manifold
+    metres, _ = manifold.motion(
+        manifold.local(manifold.identity(len(steps)), factors.measurement[steps]))
+    roots = np.linalg.inv(factors.sqrt_information)
+    variances = (roots**2).sum(axis=2)
+    meant = (len(np.unique(equal, axis=0)) < len(equal) or (seconds > LONGEST_PAUSE).any()
+             or (metres > FASTEST * np.maximum(seconds, SHORTEST_STEP)).any()
+             or variances.min(initial=1.0) < LEAST_VARIANCE
+             or variances[steps].max(initial=1.0) > MOST_OF_ODOMETRY
+             or variances.max(initial=1.0) > MOST_VARIANCE)
+    return GRAPH_NOTE | VERBATIM_NOTE if meant else GRAPH_NOTE
 
 
 def _steps(record: GraphRecord) -> Indices:

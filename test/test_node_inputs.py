@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Strays of every kind to the real node: counted, told once, and not in the map."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from problems import seconds
+from test_node import Bench, header, odometry, poses_of
+
+NS = 10**9
+
+
+def loop(reference, stamp, x):
+    message = PoseWithCovarianceStamped(header=header(f'base_link@{reference}.000000000', stamp))
+    message.pose.pose.position.x = x
+    return message
+
+
+@pytest.fixture
+def bench(ros):
+    made = Bench(ros, {'robust.enabled': False})
+    yield made
+    made.close()
+
+
+def test_strays_do_not_stop_the_map(bench, capfd):
+    """A first message of another robot, a stamp of tomorrow, a teleport, loops five times."""
+    bench.send('/odom', odometry(5 * NS, 7.0, 'gripper'))
+    for k in range(10, 20):
+        bench.send('/odom', odometry(k * NS, float(k)))
+        if k == 13:
+            bench.send('/odom', odometry(k * NS + 86_400 * NS, float(k)))
+        if k == 15:
+            bench.send('/odom', odometry(k * NS + NS // 2, 5e8))
+    for _ in range(5):
+        bench.send('/loop_closures', loop(11, 18 * NS, 7.0))
+    expected = {'child_frame': 1, 'stamp_ahead': 1, 'jump': 1, 'repeated': 4}
+
+    def refused():
+        node = bench.backend
+        return dict(node._refused + Counter(node._backend.counts()[1]))
+
+    bench.until(lambda: refused() == expected, f'{expected} are counted')
+    bench.until(lambda: len(bench.path().poses) == 10, 'the Path has all poses')
+    assert np.allclose(poses_of(bench.path())[:, 0], np.arange(10, 20), atol=1e-6)
+    assert max(p.header.stamp.sec for p in bench.received['pose']) == 19
+    # The very first was believed for as long as nothing spoke against it.
+    assert {p.pose.position.x for p in bench.received['pose'][1:]} == set(range(10, 20))
+    told = ''
+
+    def is_told(part):
+        nonlocal told
+        told += capfd.readouterr().err
+        return part in told
+
+    for part in ("refused: odometry of 'gripper'; expected that of 'base_link'",
+                 f'odometry stamp {seconds(86_413.0)} ns is 86400 s after the one before',
+                 'odometry 5e+08 m from one message to the next',
+                 'a loop from 11000000000 ns to 18000000000 ns was sent before'):
+        bench.until(lambda part=part: is_told(part), f'it is told: {part}')
