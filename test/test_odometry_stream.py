@@ -248,3 +248,35 @@ def test_loops_across_a_restart_join_the_right_places():
     growth.add_loop(loop(1.7, 1.0 + 150 * PERIOD, se2.between(poses[7:8], poses[150:151])[0]))
     assert growth.add_due_loops() == 1
     assert loops_of(growth)[:2] == ([7], [150])
+
+
+@pytest.mark.parametrize('seed', range(30))
+def test_whatever_comes_each_sample_is_used_held_or_counted(seed):
+    """Stamps, poses and covariances of any size, also in a row and from the second message on."""
+    rng = np.random.default_rng(seed)
+    source = ('model', 'increment', 'twist')[seed % 3]
+    growth, old = GraphGrowth(se2, GrowthOptions(EVERY.keyframe, OdometryOptions(source))), 0
+    for k in range(200):
+        time, pose, kind = 100.0 + k * PERIOD, (0.1 * k, 0.0, 0.0), rng.random()
+        if kind < 0.1:
+            time += rng.choice((-1.0, 1.0)) * 10 ** rng.uniform(-1, 1.9)
+        elif kind < 0.15:
+            time += 10 ** rng.uniform(2, 9)
+        elif kind < 0.25:
+            pose = tuple(rng.normal(size=3) * 10 ** rng.uniform(0, 8))
+        elif kind < 0.28:
+            pose = (0.0, 0.0, 0.0)
+        covariance = np.diag(10 ** rng.uniform(-300, 300, 6))
+        try:
+            growth.add_odometry(odometry(time, pose, covariance, covariance))
+        except MessageError as error:
+            assert error.cause == 'old_stamp'
+            old += 1
+        growth.add_loop(loop(time - 5.0, time, rng.normal(size=3), covariance))
+        growth.add_due_loops()
+    assert growth.refused['jump'] + growth.notes.warned['moved'] > 0
+    lost = sum(growth.refused[cause] for cause in ('stamp_ahead', 'jump', 'old_stamp'))
+    assert growth.graph.n_poses + bool(growth.held) + lost + old == 200
+    assert (np.diff(growth.stamps) > 0).all()
+    factors = growth.graph.between
+    assert np.isfinite(factors.sqrt_information).all() and np.isfinite(factors.measurement).all()

@@ -92,8 +92,7 @@ class OdometryStream:
             self.held = None
             held.anew = held.doubt == 'old_stamp'
             if held.doubt == 'jump':
-                held.unseen = max(_UNSEEN * (held.stamp - last.stamp) * 1e-9,
-                                  *self._recent)
+                held.unseen = max((_UNSEEN * (held.stamp - last.stamp) * 1e-9, *self._recent))
                 self._notes.warn('moved', f'{self._why(last, held)}; the robot is taken to be '
                                  'where it was')
             return self._used(held) + self._used(point)
