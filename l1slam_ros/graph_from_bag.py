@@ -98,6 +98,7 @@ class _Growing:
         """Return the graph that has grown; damage : of the bag."""
         growth = self._growth
         self._add_odometry(Sorted(others=self._base_frame.rest()))
+        growth.finish()
         growth.add_due_loops()
         skipped = growth.notes.sentences()
         if growth.held:

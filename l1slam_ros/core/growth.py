@@ -162,6 +162,11 @@ class GraphGrowth:
         keyframes = [self._add(point) for point in self._stream.take(sample, self._verbatim)]
         return any(keyframes)
 
+    def finish(self) -> None:
+        """Use the last sample of all, if it is held for a pause alone; see `held`."""
+        for point in self._stream.finish():
+            self._add(point)
+
     def _add(self, point: Point) -> bool:
         """Add a sample of the robot's motion; return whether it made a keyframe."""
         if point.anew:

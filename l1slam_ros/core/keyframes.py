@@ -22,6 +22,9 @@ from l1slam_ros.core.noise import (
 )
 from l1slam_ros.core.options import Options, option
 
+# Ten steps of 5 cm are half a metre, though the difference of coordinates be a rounding less.
+_ALMOST = 1 - 1e-9
+
 
 @dataclass(frozen=True)
 class KeyframeOptions(Options):
@@ -116,7 +119,7 @@ class Motion:
         """Tell whether the motion passes any threshold that is on."""
         passed = ((options.translation, self._distance), (options.rotation, self._turn),
                   (options.period, (self._stamp - self._start) * 1e-9))
-        on = [value >= threshold for threshold, value in passed if threshold > 0]
+        on = [value >= _ALMOST * threshold for threshold, value in passed if threshold > 0]
         return any(on) or not on
 
     @property

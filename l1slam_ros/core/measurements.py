@@ -8,7 +8,7 @@ from l1slam_ros.core.manifold import Array
 # [m/s] The speed of sound: no vehicle on the ground has been faster (Thrust SSC, 341 m/s). Stamps
 # nearer to each other than this [s] may be jitter, and say nothing about speed.
 FASTEST, SHORTEST_STEP = 340.0, 0.1
-# [s] After a longer gap in the stamps of the odometry, the next sample has to confirm the new one.
+# [s] The longest gap in the stamps of the odometry that is a pause without further evidence.
 LONGEST_PAUSE = 60.0
 
 @dataclass(frozen=True)

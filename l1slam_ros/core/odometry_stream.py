@@ -29,6 +29,9 @@ from l1slam_ros.core.notes import Notes
 _FAR, _RECENT = 5.0, 16
 # ... and at least so far [m]: nearer, it bends the map by less than a keyframe.
 _NEAR = 0.5
+# [s] After a longer gap a sample is held, which costs the robot nothing but a message's delay; it
+# is confirmed by one within `LONGEST_PAUSE`, so that odometry of any rate passes.
+_GAP = 2.0
 # [m/s] A robot that nobody saw may have gone so fast.
 _UNSEEN = 1.0
 # [m], [rad] The identity, after its way through a quaternion.
@@ -92,8 +95,7 @@ class OdometryStream:
             self.held = None
             held.anew = held.doubt == 'old_stamp'
             if held.doubt == 'jump':
-                held.unseen = max(_UNSEEN * (held.stamp - last.stamp) * 1e-9,
-                                  *self._recent)
+                held.unseen = max((_UNSEEN * (held.stamp - last.stamp) * 1e-9, *self._recent))
                 self._notes.warn('moved', f'{self._why(last, held)}; the robot is taken to be '
                                  'where it was')
             return self._used(held) + self._used(point)
@@ -109,6 +111,15 @@ class OdometryStream:
             self._notes.refuse(held.doubt, self._why(last, held))
         self.held = point if point.doubt else None
         return [] if point.doubt else self._used(point)
+
+    def finish(self) -> list[Point]:
+        """Return, as no more will come, what is held if it came after no more than a pause."""
+        last, held = self._last, self.held
+        if last is None or held is None or held.doubt != 'stamp_ahead' or (
+                (held.stamp - last.stamp) * 1e-9 > LONGEST_PAUSE):
+            return []
+        self.held = None
+        return self._used(held)
 
     def reason(self) -> str:
         """Return why a sample is held; empty: none is."""
@@ -138,11 +149,13 @@ class OdometryStream:
         if length > _NEAR and length > _FAR * max(self._recent, default=0.0) and (
                 self._is_identity(point)):
             return 'jump'
-        return 'stamp_ahead' if seconds > LONGEST_PAUSE else ''
+        return 'stamp_ahead' if seconds > _GAP else ''
 
     def _goes_on(self, last: Point, held: Point, point: Point) -> bool:
         """Tell whether a sample speaks for the one that is held."""
-        if self._doubt(held, point):
+        doubt = self._doubt(held, point)
+        slow = doubt == 'stamp_ahead' and (point.stamp - held.stamp) * 1e-9 <= LONGEST_PAUSE
+        if doubt and not slow:
             return False
         return held.doubt != 'jump' or (math.dist(held.position, point.position)
                                         <= math.dist(last.position, point.position))
