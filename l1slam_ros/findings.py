@@ -10,6 +10,7 @@ import numpy as np
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.inspection import (
     connected_parts,
+    cost_at,
     information_range,
     long_steps,
     noise_scales,
@@ -18,9 +19,7 @@ from l1slam_ros.core.inspection import (
     repeated_factors,
     step_lengths,
 )
-from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.manifold import Indices
-from l1slam_ros.core.optimality import l1_cost
 from l1slam_ros.io.files import NANOSECONDS, stamp_text
 from l1slam_ros.io.graph_file import GraphRecord
 from l1slam_ros.io.wording import counted
@@ -65,7 +64,7 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
     if record.stamps is not None:
         rows.append(('time', f'{(record.stamps[-1] - record.stamps[0]) / NANOSECONDS:,.1f} s'))
     if record.poses is not None:
-        cost = l1_cost(whitened_residual(graph, record.poses))
+        cost = cost_at(graph, record.poses)
         rows.append(('l1 cost', f'{cost:.6g} at the stored poses'))
     return rows
 

@@ -87,19 +87,20 @@ class Dense:
     def __init__(self, system, k):
         n, (i, j) = system.size, system.keyframe.T
         self.n, self.k, self.turned = n, k, i > j
-        self.panels = np.zeros((n * k) ** 2)
+        self.panels = np.full((n * k) ** 2, np.pi)  # to be written over
         row, col = np.maximum(i, j), np.minimum(i, j)
         self.address = np.column_stack((self.at(i, i), self.at(j, j), self.at(row, col)))
         self.address[i == n, 0] = self.address[j == n, 1] = -1
         self.address[(i == n) | (j == n), 2] = -1
         self.width = np.full((len(i), 3), n * k)
+        self.corner, self.stride = self.at(np.arange(n), np.arange(n)), np.full(n, n * k)
 
     def at(self, row, col):
         return (row * self.n * self.k + col) * self.k
 
     @property
     def places(self):
-        return self.address, self.width, self.turned, (0,) * self.k
+        return self.address, self.width, self.turned, self.corner, self.stride
 
     @property
     def lower(self):
@@ -112,24 +113,20 @@ def lower_blocks(matrix, k):
     return np.kron(np.tri(len(matrix) // k), np.ones((k, k))) * matrix
 
 
-def test_normal_matrices_are_summed_up(system, k, rng):
-    weights = rng.uniform(0.1, 3, len(system.b))
-    dense, A = Dense(system, k), system.A.toarray()
-    for total in (1, 2):  # added to what is there
-        cholesky.add_normal(dense.panels, system.blocks, weights.reshape(-1, k), *dense.places)
-        expected = total * A.T @ (weights[:, None] * A)
-        assert_allclose(dense.lower, lower_blocks(expected, k), atol=1e-11)
-        assert_allclose(dense.panels.reshape(expected.shape), dense.lower)
-
-
-def test_blocks_of_curvature_are_summed_up(system, k, rng):
-    m = len(system.keyframe) - 2  # of the first factors alone
-    values = rng.standard_normal((m, 2 * k, 2 * k))
-    values += values.transpose(0, 2, 1)
-    expected = np.zeros(((system.size + 1) * k,) * 2)
+@pytest.mark.parametrize('as_tuple', [True, False])
+def test_a_matrix_is_assembled(system, k, as_tuple, rng):
+    """J'WJ + D + 0.7 C, C of the first factors alone."""
+    weights, diagonal = rng.uniform(0.1, 3, len(system.b)), rng.uniform(0, 1, (system.size, k))
+    m = len(system.keyframe) - 2
+    curvature = rng.standard_normal((m, 2 * k, 2 * k))
+    curvature += curvature.transpose(0, 2, 1)
+    C = np.zeros(((system.size + 1) * k,) * 2)
     for f in range(m):
         rows = (system.keyframe[f][:, None] * k + np.arange(k)).ravel()
-        np.add.at(expected, np.ix_(rows, rows), 0.7 * values[f])
-    dense = Dense(system, k)
-    cholesky.add_blocks(dense.panels, values, 0.7, *dense.places)
-    assert_allclose(dense.lower, lower_blocks(expected[:-k, :-k], k), atol=1e-12)
+        np.add.at(C, np.ix_(rows, rows), curvature[f])
+    dense, A = Dense(system, k), system.A.toarray()
+    cholesky.assemble(dense.panels, *dense.places, system.blocks, weights.reshape(-1, k), diagonal,
+                      curvature, 0.7, (0,) * k if as_tuple else np.zeros(k))
+    expected = A.T @ (weights[:, None] * A) + np.diag(diagonal.ravel()) + 0.7 * C[:-k, :-k]
+    assert_allclose(dense.lower, lower_blocks(expected, k), atol=1e-11)
+    assert_allclose(dense.panels.reshape(expected.shape), dense.lower)

@@ -10,7 +10,9 @@ from l1slam_ros.core import se2
 from l1slam_ros.core.false_loops import insert_loops, random_false_loops
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.inspection import (
+    _system,
     connected_parts,
+    cost_at,
     information_range,
     long_steps,
     noise_scales,
@@ -19,6 +21,7 @@ from l1slam_ros.core.inspection import (
     repeated_factors,
     step_lengths,
 )
+from l1slam_ros.core.linearise import linearise, whitened_residual
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graph_file import read_graph_file
 
@@ -175,3 +178,13 @@ def test_a_large_graph_is_looked_at_in_seconds(rng):
     found = noise_scales(graph, rng)
     assert time.perf_counter() - began < 10
     assert found.loops == pytest.approx(1, rel=0.05)
+
+
+def test_what_nothing_is_compiled_for_is_what_the_compiled_loops_say(world):
+    graph, poses = world.graph, world.odometry
+    found, expected = _system(graph, poses), linearise(graph, poses)
+    np.testing.assert_allclose(found.blocks, expected.blocks, atol=1e-9)
+    np.testing.assert_allclose(found.b, expected.b, atol=1e-9)
+    graph.add_prior(np.array([7]), world.truth[7:8], np.eye(3)[None])
+    cost = np.abs(whitened_residual(graph, poses)).sum()
+    assert cost_at(graph, poses) == pytest.approx(cost, rel=1e-12)

@@ -105,8 +105,8 @@ class BlockCholesky:
         layout = self._layouts.get(k)
         if layout is None:
             layout = self._layouts[k] = _Layout(self.pattern, self._keyframe, k)
-        if curvature is None:
-            curvature, share = np.empty((0, 2 * k, 2 * k)), 0.0
+        if curvature is None or not share:
+            curvature = np.empty((0, 2 * k, 2 * k))
         added = np.full(system.size * k, diagonal, float).reshape(-1, k)
         cholesky.assemble(layout.panels, *layout.places, system.blocks, weights.reshape(-1, k),
                           added, curvature, share, layout.size)

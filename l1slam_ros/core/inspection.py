@@ -16,7 +16,7 @@ from l1slam_ros.core.initial import pair_key, tree_poses
 from l1slam_ros.core.linearise import LinearSystem, ends, keyframes_of, step_poses
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.noise import whiten
-from l1slam_ros.core.optimality import l2_cost
+from l1slam_ros.core.optimality import l1_cost, l2_cost
 
 # A step this many times as long as nine in ten of all steps is no step of the same robot.
 _LONG = 10.0
@@ -166,6 +166,15 @@ def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
             break
     odometry, loops = np.where(spare >= _FEWEST_SPARE, np.sqrt(variance), np.nan).tolist()
     return NoiseScales(odometry, loops, *ends)
+
+
+def cost_at(graph: FactorGraph, poses: Array) -> float:
+    """Return the L1 cost of a graph at poses (n, p), nothing compiled."""
+    manifold, factors, prior = graph.manifold, graph.between, graph.prior
+    B = manifold.between(*ends(graph, poses))
+    e = whiten(factors.sqrt_information, manifold.local(factors.measurement, B))
+    e_prior = whiten(prior.sqrt_information, manifold.local(prior.measurement, poses[prior.i]))
+    return l1_cost(e) + l1_cost(e_prior)
 
 
 def _l2_poses(graph: FactorGraph) -> Array:

@@ -33,30 +33,19 @@ def assemble(panels, address, width, turned, corner, stride, blocks, weights, di
     """
     Write the lower triangle of J'WJ + diag(diagonal) + share C to the panels.
 
-    corner, stride : (n,) where each keyframe's own block begins, and its panel's width;
-    diagonal : (n, k); curvature : C, see `add_blocks`; others as of `add_normal`
-    """
-    for at in range(len(panels)):
-        panels[at] = 0.0
-    add_normal(panels, blocks, weights, address, width, turned, size)
-    if share != 0:
-        add_blocks(panels, curvature, share, address, width, turned, size)
-    for v in range(len(diagonal)):
-        for a in range(len(size)):
-            panels[corner[v] + a * (stride[v] + 1)] += diagonal[v, a]
-
-
-@compiled
-def add_normal(panels, blocks, weights, address, width, turned, size):
-    """
-    Add J' W J of every factor to the panels of a lower triangle.
-
-    blocks : (m, 2, k, k) J_i and J_j; weights : (m, k)
+    blocks : (m, 2, k, k) J_i and J_j; weights : (m, k); diagonal : (n, k)
+    curvature : (m', 2 k, 2 k) of the first m' factors, C is their sum
     address, width : (m, 3) where the blocks (i, i), (j, j) and the one between i and j lie, and
     the width of their panels; address -1: there is none
     turned : (m,) bool, the block between them is that of row i and column j
+    corner, stride : (n,) where each keyframe's own block begins, and its panel's width
     """
     k = len(size)
+    for at in range(len(panels)):
+        panels[at] = 0.0
+    for v in range(len(diagonal)):
+        for a in range(k):
+            panels[corner[v] + a * (stride[v] + 1)] = diagonal[v, a]
     scaled = np.empty((2, k, k))
     for f in range(len(blocks)):
         for side in range(2):
@@ -73,23 +62,9 @@ def add_normal(panels, blocks, weights, address, width, turned, size):
                     total = 0.0
                     for a in range(k):
                         total += blocks[f, left, a, r] * scaled[right, a, c]
+                    if f < len(curvature):
+                        total += share * curvature[f, left * k + r, right * k + c]
                     panels[address[f, part] + r * width[f, part] + c] += total
-
-
-@compiled
-def add_blocks(panels, values, factor, address, width, turned, size):
-    """Add factor values, (m, 2 k, 2 k), the lower part of it, to the panels; see `add_normal`."""
-    k = len(size)
-    for f in range(len(values)):
-        for part in range(3):
-            if address[f, part] < 0:
-                continue
-            left = part if part < 2 else (0 if turned[f] else 1)
-            right = part if part < 2 else 1 - left
-            for r in range(k):
-                for c in range(k):
-                    panels[address[f, part] + r * width[f, part] + c] += (
-                        factor * values[f, left * k + r, right * k + c])
 
 
 @loop(f'({_PANELS}, UniTuple(i8, 3))', f'({_PANELS}, f8[::1])')

@@ -176,7 +176,7 @@ def block_addresses(keyframe, position, first, start, pattern, offset, k):
     Returns
     -------
     address, width, turned : of the three blocks of each factor, (m, 3), (m, 3) and (m,), see
-        `cholesky.add_normal`
+        `cholesky.assemble`
     corner, stride : where each keyframe's own block begins and its panel's width, (n,)
 
     """
