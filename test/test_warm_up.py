@@ -27,6 +27,7 @@ from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.least_squares import weighted_least_squares
 from l1slam_ros.core.linearise import linearise
+from l1slam_ros.core.names import NORMS, STARTS
 from l1slam_ros.core.warm_up import warm_up
 from l1slam_ros.io.graph_file import GraphRecord
 
@@ -91,7 +92,7 @@ def solved(graph, poses, **wish):
 
 solved(slipped(world), None, robust=True)
 look('a slip')
-for start, norm, robust in itertools.product(offline.STARTS, offline.NORMS, (False, True)):
+for start, norm, robust in itertools.product(STARTS, NORMS, (False, True)):
     for poses in (world.odometry, np.asfortranarray(world.odometry)):
         solved(world.graph, poses, start=start, norm=norm, robust=robust)
         look(f'{start}, {norm}, robust {robust}')
@@ -107,7 +108,7 @@ minimise_l2(world.graph, scattered, LeastSquaresOptions(), cholesky)
 look('damped steps')
 connected_parts(world.graph)
 world.graph.add_prior(np.array([7]), world.truth[7:8], np.eye(3)[None])
-for norm in offline.NORMS:
+for norm in NORMS:
     solved(world.graph, world.odometry, norm=norm)
 look('a prior')
 """
