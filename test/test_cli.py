@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from torn import torn_graph
 
 from l1slam_ros.cli import main
-from l1slam_ros.core import se2
+from l1slam_ros.core import cholesky, se2
 from l1slam_ros.core.initial import odometry_poses
 from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.optimality import l1_cost
@@ -314,6 +314,20 @@ def test_a_gap_in_the_odometry_leaves_nothing_to_judge_loops_by(capsys, tmp_path
     assert err == f'l1slam: {warning}\n' and json.loads(out)['warnings'] == [warning]
     assert main([*asked, '--quiet', '--no-robust']) == 0
     assert capsys.readouterr().err == ''
+
+
+def test_a_graph_too_dense_to_judge_is_solved_all_the_same(capsys, world, monkeypatch):
+    """With memory for few blocks: the odometry alone can be factored, all loops cannot."""
+    expected = solve_json(capsys, world, '--no-robust')['final_cost']
+    monkeypatch.setattr(cholesky, 'MOST_BLOCKS', 400)
+    report = solve_json(capsys, world)
+    assert report['solver'] == 'primal-dual'
+    assert report['final_cost'] == pytest.approx(expected, rel=1e-3)
+    (warning,) = report['warnings']
+    assert re.fullmatch('no loop was doubted: the factor of 149 keyframes and [0-9]+ factors '
+                        'would have more than 400 blocks: too many far places are joined', warning)
+    assert main(['solve', str(world), '--robust']) == 2
+    assert 'too many far places are joined' in capsys.readouterr().err
 
 
 def test_a_graph_without_loops_is_its_odometry(capsys, tmp_path):

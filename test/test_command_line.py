@@ -65,6 +65,7 @@ def test_what_runs_nothing_imports_nothing(tmp_path, arguments):
     (('convert', 'graph.g2o', 'out.graph'), {'numpy', 'scipy'}),
     (('convert', 'graph.g2o', 'out'), {'numpy', 'scipy', 'mcap', 'rosbags', 'yaml'}),
     (('plot', 'graph.g2o', '--output', 'map.png'), {'numpy', 'scipy', 'matplotlib'}),
+    (('info', 'graph.g2o'), {'numpy', 'scipy'}),
     (('solve', 'missing.g2o'), {'numpy', 'scipy'}),
     (('solve', 'graph.g2o'), {'numpy', 'scipy', 'numba'})], ids=lambda value: ' '.join(value))
 def test_a_command_imports_what_it_uses(graph, arguments, needed):

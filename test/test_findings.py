@@ -8,6 +8,8 @@ import pytest
 
 from l1slam_ros.core import se2
 from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.linearise import whitened_residual
+from l1slam_ros.core.optimality import l1_cost
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
 from l1slam_ros.findings import bag_numbers, complaints, numbers
 from l1slam_ros.io.graph_bag import write_graph_bag
@@ -124,6 +126,14 @@ def test_the_numbers_of_a_graph_with_everything(record_of, tmp_path):
     assert dict(numbers(record)) == {
         'poses': '5 in SE2, ids 10 to 14', 'odometry': '4, 4.0 m', 'loops': '1', 'priors': '1',
         'components': '1', 'time': '4.0 s'}
+
+
+def test_the_cost_is_that_which_is_minimised(record_of, rng):
+    vertices = [f'VERTEX_SE2 {k} {rng.normal()} {rng.normal()} {rng.normal()}'
+                for k in range(10, 15)]
+    record = record_of(*vertices, *LINES, LOOP, 'EDGE_PRIOR_SE2 12 1 2 .5 4 1 1 5 1 6')
+    expected = l1_cost(whitened_residual(record.graph, record.poses))
+    assert dict(numbers(record))['l1 cost'] == f'{expected:.6g} at the stored poses'
 
 
 def test_the_numbers_of_a_bag(rng, tmp_path):

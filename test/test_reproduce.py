@@ -179,7 +179,8 @@ def test_figures_4_and_6_are_of_the_files_that_are_there(tmp_path):
     text = (output / 'report.md').read_text()
     assert '10 in Intel (81 true loops' in text and '2 in Manhattan3500 (81 true loops' in text
     assert '20 false loops in all draws' in text and '4 false loops in all draws' in text
-    assert all(f'| {method} |' in text for method in ('seed alone', 'seed, then L1', '`--robust`'))
+    assert all(f'| {method} |' in text
+               for method in ('seed alone', 'seed, then L1', 'loops doubted, then L1'))
     assert 'it is of Intel' not in text
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from lies import careful_world, drive_roundabout, roundabout, seen, spoilt
 from problems import play
 
-from l1slam_ros import offline
+from l1slam_ros import formats, offline
 from l1slam_ros.compilation import fill_cache
 from l1slam_ros.core import kernels, se2
 from l1slam_ros.core.backend import Backend, BackendOptions, RobustOptions, optimise
@@ -36,6 +36,7 @@ from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.least_squares import weighted_least_squares
 from l1slam_ros.core.linearise import linearise
+from l1slam_ros.core.names import NORMS, STARTS
 from l1slam_ros.io.graph_file import GraphRecord
 
 MODULES = [importlib.import_module(f'{kernels.__name__}.{module.name}')
@@ -96,7 +97,7 @@ def solved(graph, poses, **wish):
 
 solved(slipped(world), None, robust=True)
 look('a slip')
-for start, norm, robust in itertools.product(offline.STARTS, offline.NORMS, (False, True)):
+for start, norm, robust in itertools.product(STARTS, NORMS, (False, True)):
     for poses in (world.odometry, np.asfortranarray(world.odometry)):
         solved(world.graph, poses, start=start, norm=norm, robust=robust)
         look(f'{start}, {norm}, robust {robust}')
@@ -112,7 +113,7 @@ minimise_l2(world.graph, scattered, LeastSquaresOptions(), cholesky)
 look('damped steps')
 connected_parts(world.graph)
 world.graph.add_prior(np.array([7]), world.truth[7:8], np.eye(3)[None])
-for norm in offline.NORMS:
+for norm in NORMS:
     solved(world.graph, world.odometry, norm=norm)
 look('a prior')
 used = [kernel for module in MODULES for kernel in vars(module).values()
@@ -125,10 +126,10 @@ LOOK = """
 import sys
 from pathlib import Path
 import numpy as np
-from l1slam_ros import offline
+from l1slam_ros import formats, offline
 from l1slam_ros.core.inspection import noise_scales
 
-record = offline.read_input(Path(sys.argv[1]))
+record = formats.read_input(Path(sys.argv[1]))
 if sys.argv[2] == 'info':
     noise_scales(record.graph, np.random.default_rng(0))
 else:
