@@ -3,14 +3,16 @@
 The incremental back end: samples and loops in, optimised poses out.
 
 `Backend` owns the growing graph, the poses and the dual. An update is three calls, so that a
-caller with threads need hold its lock for the first and the last only, which are short:
+caller with threads need hold its lock for two short moments only, `snapshot` and `adopt`:
 
-    problem = backend.problem()                         # snapshot, O(new loops)
+    problem = backend.snapshot().problem()
     improvement = improve(problem, options, budget)     # the work; touches nothing of the backend
     backend.adopt(improvement)                          # poses and dual for the next warm start
 """
 
+import copy
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +20,7 @@ import numpy as np
 from l1slam_ros.core.belief_state import Belief, judge
 from l1slam_ros.core.choice import AUTO, choose, minimise_by
 from l1slam_ros.core.cholesky import cholesky_of
+from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.growth import GraphGrowth, GrowthOptions
 from l1slam_ros.core.least_squares import reweighted_step
@@ -29,6 +32,10 @@ from l1slam_ros.core.optimiser import OptimiserOptions, Solution, backtrack, is_
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.robust_map import minimise_robustly
 from l1slam_ros.core.seed import seed_poses
+
+# A large map gets but one linearisation into an update, and never meets a test that takes two of
+# them. It is at rest when so many updates in a row lowered the cost by less than is looked for.
+_QUIET_UPDATES = 5
 
 
 @dataclass(frozen=True)
@@ -130,6 +137,15 @@ class Backend:
         self._belief = Belief.nothing()
         self._last_cost = 0.0
         self._status = Status.OUT_OF_TIME
+        self._changes = self._samples = self._quiet_updates = 0
+        self._map_to_odom: tuple[Array, Array] | None = None
+
+    @property
+    def version(self) -> tuple[int, int, int]:
+        """Other than an earlier one where there may be something new to do or to tell."""
+        growth = self.growth
+        # While loops wait, any sample may be the one that they wait for, or one too many.
+        return (self._changes, growth.graph.n_poses, self._samples if growth.n_waiting else 0)
 
     @property
     def poses(self) -> Array:
@@ -146,12 +162,15 @@ class Backend:
     @property
     def map_to_odom(self) -> Array:
         """The odometry frame seen from the map, (1, p): what the last optimised keyframe says."""
-        last = len(self._poses) - 1
+        last, manifold, offset = len(self._poses) - 1, self._manifold, self.growth.offset
         if last < 0:
-            return self._manifold.identity(1)
-        manifold, odometry = self._manifold, self.growth.odometry[last : last + 1]
-        to_kept = manifold.compose(self._poses[last:], manifold.inverse(odometry))
-        return manifold.compose(to_kept, self.growth.offset)
+            return manifold.identity(1)
+        # Asked for with every sample: worked out when an update or a new offset changes it.
+        if self._map_to_odom is None or self._map_to_odom[0] is not offset:
+            odometry = self.growth.odometry[last : last + 1]
+            to_kept = manifold.compose(self._poses[last:], manifold.inverse(odometry))
+            self._map_to_odom = offset, manifold.compose(to_kept, offset)
+        return self._map_to_odom[1]
 
     def set_options(self, options: BackendOptions) -> None:
         """
@@ -160,6 +179,7 @@ class Backend:
         Where loops are to be doubted that were not before, or the other way round, all are judged
         anew.
         """
+        self._changes += 1
         if options.robust != self._options.robust:
             self._belief, self._status = Belief.nothing(), Status.OUT_OF_TIME
         self._options = options
@@ -168,18 +188,28 @@ class Backend:
     def restore(self, graph: FactorGraph, poses: Array, stamps: Indices) -> None:
         """Begin with the map of an earlier run: see `GraphGrowth.restore`; call it first."""
         self.growth.restore(graph, stamps, poses)
-        self._poses = poses
+        self._poses, self._map_to_odom = poses, None
+        self._changes += 1
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """Add one sample; see `GraphGrowth.add_odometry`."""
+        self._samples += 1
         return self.growth.add_odometry(sample)
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Add one loop closure; see `GraphGrowth.add_loop`."""
+        self._changes += 1
         self.growth.add_loop(loop)
 
+    def snapshot(self) -> 'Backend':
+        """Return the back end as it is, the due loops in its graph, to be read at leisure."""
+        self.growth.add_due_loops()
+        clone = copy.copy(self)
+        clone.growth = self.growth.snapshot()
+        return clone
+
     def problem(self) -> Problem:
-        """Return a snapshot of the graph, the due loops in it, warm start included."""
+        """Return what an update begins with: graph, the due loops in it, and the warm start."""
         self.growth.add_due_loops()
         graph = self.growth.graph.copy()
         rows = len(graph.between) * self._manifold.TANGENT_SIZE
@@ -188,8 +218,9 @@ class Backend:
         robust = self._options.robust.enabled
         belief = self._belief.extended(graph, robust)
         grown = len(self._poses) < graph.n_poses or len(self._dual) < rows
-        settled = (not grown and belief.settled
-                   and self._status in (Status.CONVERGED, Status.STALLED))
+        at_rest = (self._status in (Status.CONVERGED, Status.STALLED)
+                   or self._quiet_updates >= _QUIET_UPDATES)
+        settled = not grown and belief.settled and at_rest
         return Problem(graph, self.poses, dual, belief, robust, self._last_cost, settled)
 
     def adopt(self, improvement: Improvement) -> None:
@@ -197,9 +228,24 @@ class Backend:
         Take over what `improve` made of a snapshot; keyframes since then follow along.
 
         What was made when loops were judged otherwise is left.
+
+        Raises
+        ------
+        GraphError : it is not finite; nothing is taken over.
+
         """
         if improvement.robust != self._options.robust.enabled:
             return
+        for name in ('poses', 'dual', 'cost'):
+            if not np.isfinite(getattr(improvement, name)).all():
+                raise GraphError(f'an update ended with a {name} that is not finite; expected '
+                                 'numbers, so the map stays as it is')
+        self._changes += 1
+        fell = improvement.cost_before - improvement.cost
+        quiet = (improvement.belief.settled and len(improvement.dual) == len(self._dual)
+                 and fell <= self._options.solver.outer_tolerance * improvement.cost)
+        self._quiet_updates = self._quiet_updates + 1 if quiet else 0
+        self._map_to_odom = None
         self._poses = improvement.poses
         self._dual = improvement.dual
         self._belief = improvement.belief
@@ -228,7 +274,12 @@ class Backend:
         return improvement
 
 
-def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Improvement:
+# Called on the way, often; raises where the work shall stop.
+Check = Callable[[], None]
+
+
+def improve(problem: Problem, options: OptimiserOptions, budget: float,
+            check: Check = lambda: None) -> Improvement:
     """
     Judge the loops that have come and lower the L1 cost of a snapshot, for about `budget` seconds.
 
@@ -241,9 +292,10 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Impro
     deadline = start + budget
     belief, starts = problem.belief, [problem.poses]
     if not belief.settled:
-        belief, judged = judge(problem.graph, problem.poses, belief, deadline)
+        belief, judged = judge(problem.graph, problem.poses, belief, deadline, check)
         # After a loop has closed, the L2 map of the judgement is nearer.
         starts.append(judged)
+    check()
     graph = problem.graph.subset(belief.accepted)
     size = graph.manifold.TANGENT_SIZE
     dual = problem.dual.reshape(-1, size)[belief.accepted].ravel()
@@ -253,17 +305,19 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Impro
     steps, far = 0, is_far(cost, problem.last_cost)
     cholesky = cholesky_of(graph) if far else None
     while cholesky and far and (not steps or time.monotonic() < deadline):
+        check()
         system = linearise(graph, poses)
         step, dual = reweighted_step(system, cholesky, system.b, smoothing(system.b))
         previous = cost
         poses, cost = backtrack(graph, poses, step, cost)
         steps += 1
         far = is_far(previous, cost)
-    solution = minimise(graph, poses, options, cholesky, dual, deadline)
+    solution = minimise(graph, poses, options, cholesky, dual, deadline, lambda *_: check())
     return _improvement(solution, problem, belief, before, steps, start)
 
 
-def optimise(problem: Problem, options: OptimiserOptions) -> Improvement:
+def optimise(problem: Problem, options: OptimiserOptions,
+             check: Check = lambda: None) -> Improvement:
     """
     Solve a snapshot to the end; where loops are doubted, after judging all of them anew.
 
@@ -272,19 +326,23 @@ def optimise(problem: Problem, options: OptimiserOptions) -> Improvement:
     start = time.monotonic()
     graph, belief = problem.graph, problem.belief
     if problem.robust:
-        found = minimise_robustly(graph, lambda part, poses: _solved(part, poses, options))
+        found = minimise_robustly(
+            graph, lambda part, poses: _solved(part, poses, options, check), check=check)
         solution, belief = found.solution, Belief(
             found.accepted, found.suspect, found.sigmas, found.variance)
     else:
-        starts = (problem.poses, seed_poses(graph, choose(AUTO, graph).cholesky))
-        solution = min((_solved(graph, poses, options) for poses in starts), key=lambda s: s.cost)
+        starts = (problem.poses, seed_poses(graph, choose(AUTO, graph).cholesky, check=check))
+        solution = min((_solved(graph, poses, options, check) for poses in starts),
+                       key=lambda s: s.cost)
     part = graph.subset(belief.accepted)
     before = l1_cost(whitened_residual(part, problem.poses))
     return _improvement(solution, problem, belief, before, 0, start)
 
 
-def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions) -> Solution:
-    return minimise_by(choose(AUTO, graph), graph, poses, options)[0]
+def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
+            check: Check) -> Solution:
+    check()
+    return minimise_by(choose(AUTO, graph), graph, poses, options, lambda *_: check())[0]
 
 
 def _improvement(solution: Solution, problem: Problem, belief: Belief, before: float, steps: int,

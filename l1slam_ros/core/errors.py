@@ -24,6 +24,10 @@ class InconsistentError(GraphError):
         self.loops, self.first, self.last = loops, first, last
 
 
+class Interrupted(Exception):  # noqa: N818
+    """Work was told to stop before its end; no input is to blame, and nothing of it is used."""
+
+
 class NoiseError(L1SlamError):
     """A covariance or information matrix that is none."""
 

@@ -67,7 +67,8 @@ Report = Callable[[int, int], None]
 
 
 def robust_solve(
-    graph: FactorGraph, report: Report = lambda round_, accepted: None
+    graph: FactorGraph, report: Report = lambda round_, accepted: None,
+    check: Callable[[], None] = lambda: None,
 ) -> RobustSolution:
     """
     Find out which loops to believe, from the graph alone.
@@ -75,6 +76,7 @@ def robust_solve(
     Parameters
     ----------
     report : called with the round and the loops accepted so far
+    check : called before long steps, raises where the work shall stop
 
     Raises
     ------
@@ -82,7 +84,7 @@ def robust_solve(
     InconsistentError : refused loops agree with each other, so the map is not to be trusted.
 
     """
-    first = growth = Growth(graph)
+    first = growth = Growth(graph, check)
     first.begin()
     number = 0
     for number, growth in enumerate(rounds(first, without_slip), 1):
@@ -158,7 +160,8 @@ def reconsidered(graph: FactorGraph, poses: Array, accepted: Mask) -> Mask:
     return np.where(is_loop, fits | factors.trusted, accepted)
 
 
-def minimise_accepted(graph: FactorGraph, poses: Array, accepted: Mask) -> Array:
+def minimise_accepted(graph: FactorGraph, poses: Array, accepted: Mask,
+                      check: Callable[[], None] = lambda: None) -> Array:
     """Return the L2 map (n, p) of the accepted factors, in the units that they state."""
     part = graph.subset(accepted)
-    return solve(part, poses, cholesky_of(part))
+    return solve(part, poses, cholesky_of(part), lambda *_: check())
