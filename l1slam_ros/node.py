@@ -27,13 +27,14 @@ from l1slam_ros.core.backend import Improvement
 from l1slam_ros.core.errors import GraphError, L1SlamError, MessageError
 from l1slam_ros.diagnosis import Diagnosis
 from l1slam_ros.failures import Failures
+from l1slam_ros.io import cdr
 from l1slam_ros.io.messages import loop_closure, odometry_sample
 from l1slam_ros.loop_status import LoopStatus
 from l1slam_ros.markers import graph_markers
 from l1slam_ros.node_options import NodeOptions
 from l1slam_ros.orders import Orders
 from l1slam_ros.params import NodeParameters
-from l1slam_ros.publishing import path_bytes, pose_stamped, transform_stamped
+from l1slam_ros.publishing import path_bytes, pose_bytes, transform_stamped
 from l1slam_ros.services import MapServices
 from l1slam_ros.shared_backend import SharedBackend
 from l1slam_ros.solver_thread import SolverThread
@@ -45,6 +46,8 @@ except ImportError:  # the ROS wheels on PyPI have none
     TFMessage = None
 
 _DEPTH = 1000
+# Messages of one topic at most before other callbacks have their turn.
+_AT_ONCE = 100
 _REPEAT_WARNING = 5.0  # [s]
 
 
@@ -132,14 +135,24 @@ class BackendNode(Node):
             self._subscribe(kind, topic, callback)
 
     def _subscribe(self, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
-        take = self.failures.guarded(topic, callback)
+        use = self.failures.guarded(topic, callback)
+        raw = kind is Odometry
 
         def received(message: Any, information: Any) -> None:
             traffic.note(information)
-            take(message)
+            use(message)
+            # What has queued up is taken at once: a round of the executor costs more than a
+            # message, and at the rate of some odometry, messages would be lost meanwhile.
+            with subscription.handle:
+                for _ in range(_AT_ONCE):
+                    taken = subscription.handle.take_message(kind, raw)
+                    if taken is None:
+                        break
+                    traffic.note(taken[1])
+                    use(taken[0])
 
         subscription = self.create_subscription(
-            kind, topic, received, QoSProfile(depth=_DEPTH),
+            kind, topic, received, QoSProfile(depth=_DEPTH), raw=raw,
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         traffic = self._topics[topic] = Traffic(subscription.get_publisher_count)
 
@@ -151,8 +164,9 @@ class BackendNode(Node):
             self.get_logger().warning('the clock jumped back: the map begins anew')
             self._orders.place('time jump', self._map_services.reset)
 
-    def _on_odometry(self, message: Odometry) -> None:
+    def _on_odometry(self, data: bytes) -> None:
         try:
+            message = cdr.odometry(data)
             self._check_base_frame(message.child_frame_id)
             sample = odometry_sample(message)
             self._map_to_odom = self._backend.add_odometry(sample)
@@ -162,8 +176,8 @@ class BackendNode(Node):
         manifold = self._manifold
         self._last_stamp, self._last_pose = sample.stamp, manifold.from_pose3(sample.pose3[None])
         pose = manifold.compose(self._map_to_odom, self._last_pose)
-        self._pose.publish(pose_stamped(self.options.map_frame, sample.stamp,
-                                        manifold.to_pose3(pose)[0]))
+        self._pose.publish(pose_bytes(self.options.map_frame, sample.stamp,
+                                      manifold.to_pose3(pose)[0]))
 
     def _check_base_frame(self, frame: str) -> None:
         self._base_frame = self._base_frame or frame

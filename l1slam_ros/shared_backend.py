@@ -16,17 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from l1slam_ros.core.backend import (
-    LOOP_STATES,
-    Backend,
-    BackendOptions,
-    Improvement,
-    LoopStates,
-    improve,
-    optimise,
-)
+from l1slam_ros.core.backend import Backend, BackendOptions, Improvement, improve, optimise
 from l1slam_ros.core.errors import FileError, Interrupted
 from l1slam_ros.core.graph import BetweenFactors
+from l1slam_ros.core.loop_states import LOOP_STATES, LoopStates
 from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.measurements import LoopClosure, OdometrySample
 from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, write_graph_file

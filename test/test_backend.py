@@ -19,23 +19,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from problems import PERIOD, loop, odometry, play, seconds
 
 from l1slam_ros.core import se2
-from l1slam_ros.core.backend import (
-    ACCEPTED,
-    EXPIRED,
-    LOOP_STATES,
-    REJECTED,
-    SUSPECT,
-    WAITING,
-    Backend,
-    BackendOptions,
-    RobustOptions,
-    improve,
-    optimise,
-)
+from l1slam_ros.core.backend import Backend, BackendOptions, RobustOptions, improve, optimise
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.growth import LoopOptions
 from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.linearise import whitened_residual
+from l1slam_ros.core.loop_states import ACCEPTED, EXPIRED, LOOP_STATES, REJECTED, SUSPECT, WAITING
 from l1slam_ros.core.optimality import Status, l1_cost
 from l1slam_ros.core.optimiser import OptimiserOptions, minimise
 from l1slam_ros.core.primal_dual import PrimalDualOptions

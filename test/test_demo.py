@@ -8,12 +8,13 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from geometry_msgs.msg import Point, Pose, PoseStamped
 from nav_msgs.msg import Path as PathMessage
 
 from l1slam_ros.cli import main
 from l1slam_ros.demo import BAG, Heard, read_recording, summarise
 from l1slam_ros.io.bag import read_messages
-from l1slam_ros.publishing import pose_stamped
+from l1slam_ros.publishing import header
 
 DEMO = Path(__file__).parents[1] / BAG
 
@@ -44,7 +45,7 @@ def test_the_summary_of_a_perfect_map_is_an_error_of_zero(tmp_path):
     assert (len(recording.stamps), len(recording.loops)) == (1000, 611)
     turned = recording.truth @ np.array([[0.0, -1.0], [1.0, 0.0]]) + (5.0, 6.0)
     path = PathMessage(poses=[
-        pose_stamped('map', int(stamp), np.array([x, y, 0, 0, 0, 0, 1.0]))
+        PoseStamped(header=header('map', int(stamp)), pose=Pose(position=Point(x=x, y=y)))
         for stamp, (x, y) in zip(recording.stamps, turned, strict=True)])
     false, true = (tuple(recording.stamps[recording.loops[np.argmax(recording.is_false == kind)]])
                    for kind in (True, False))

@@ -19,12 +19,12 @@ from torn import torn_graph
 from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core import se2
-from l1slam_ros.core.backend import ACCEPTED, REJECTED
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.errors import InconsistentError, OptionError
 from l1slam_ros.core.exact import minimise_interior_point
 from l1slam_ros.core.initial import odometry_poses
 from l1slam_ros.core.linearise import whitened_residual
+from l1slam_ros.core.loop_states import ACCEPTED, REJECTED
 from l1slam_ros.core.optimality import l1_cost
 from l1slam_ros.core.optimiser import OptimiserOptions
 from l1slam_ros.core.robust import robust_solve

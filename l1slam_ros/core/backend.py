@@ -25,6 +25,14 @@ from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.growth import GraphGrowth, GrowthOptions
 from l1slam_ros.core.least_squares import reweighted_step
 from l1slam_ros.core.linearise import linearise, whitened_residual
+from l1slam_ros.core.loop_states import (
+    ACCEPTED,
+    EXPIRED,
+    REJECTED,
+    SUSPECT,
+    WAITING,
+    LoopStates,
+)
 from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.optimality import Status, l1_cost, smoothing
@@ -95,26 +103,6 @@ class Improvement:
     inner_iterations: int
     gap: float
     seconds: float
-
-
-# What can become of a loop; `LoopStates.state` counts in this order.
-LOOP_STATES = ('waiting', 'suspect', 'accepted', 'rejected', 'expired')
-WAITING, SUSPECT, ACCEPTED, REJECTED, EXPIRED = range(len(LOOP_STATES))
-
-
-@dataclass(frozen=True)
-class LoopStates:
-    """
-    What has become of the loops.
-
-    rows : (k,) the between factors of the first k of them; stamps : (l, 2) [ns] reference and end;
-    state : (l,) of `LOOP_STATES`; sigmas : (l,), NaN where a loop was not looked at.
-    """
-
-    rows: Indices
-    stamps: Indices
-    state: Indices
-    sigmas: Array
 
 
 class Backend:
