@@ -20,11 +20,13 @@ class Failures:
     Parameters
     ----------
     logger : of the node
+    running : returns whether ROS is up: a signal can shut it down under any call, and what that
+        call then raises is no failure
 
     """
 
-    def __init__(self, logger: Any):
-        self._logger = logger
+    def __init__(self, logger: Any, running: Callable[[], bool]):
+        self._logger, self._running = logger, running
         self._lasting: dict[str, str] = {}
         self._known: set[tuple[object, ...]] = set()
 
@@ -35,6 +37,8 @@ class Failures:
 
     def note(self, what: str, error: Exception) -> None:
         """Remember a failure; its traceback is logged the first time that it comes from there."""
+        if not self._running():
+            return
         self._lasting[what] = reason(error)
         # Nothing may be left, memory for one: who reports a failure must not fail by it.
         with suppress(Exception):

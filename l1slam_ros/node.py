@@ -81,7 +81,7 @@ class BackendNode(Node):
         self._last_pose = self._map_to_odom = self._manifold.identity(1)
         self._told_map, self._told_version = 0, self._backend.version
         self._told_transform = self._map_to_odom
-        self.failures = Failures(self.get_logger())
+        self.failures = Failures(self.get_logger(), self.context.ok)
         self._solver = SolverThread(self._backend, self.failures, self.get_logger(),
                                     lambda: self.options.update.budget, self._tell)
         self._orders = Orders(self, self.failures, self._solver.hurry)
