@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What goes wrong in the node: told once in full, then remembered for as long as it lasts."""
 
+import math
+import time
 import traceback
 from collections.abc import Callable
 from contextlib import suppress
@@ -27,19 +29,24 @@ class Failures:
 
     def __init__(self, logger: Any, running: Callable[[], bool]):
         self._logger, self._running = logger, running
-        self._lasting: dict[str, str] = {}
+        self._lasting: dict[str, tuple[str, float]] = {}
         self._known: set[tuple[object, ...]] = set()
 
     @property
     def lasting(self) -> dict[str, str]:
         """What fails -> why."""
-        return self._lasting.copy()
+        now = time.monotonic()
+        return {what: why for what, (why, until) in self._lasting.copy().items() if now < until}
 
-    def note(self, what: str, error: Exception) -> None:
-        """Remember a failure; its traceback is logged the first time that it comes from there."""
+    def note(self, what: str, error: Exception, seconds: float = math.inf) -> None:
+        """
+        Remember a failure; its traceback is logged the first time that it comes from there.
+
+        seconds : for so long, unless it is over before
+        """
         if not self._running():
             return
-        self._lasting[what] = reason(error)
+        self._lasting[what] = reason(error), time.monotonic() + seconds
         # Nothing may be left, memory for one: who reports a failure must not fail by it.
         with suppress(Exception):
             self._tell(what, error)

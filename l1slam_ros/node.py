@@ -24,7 +24,7 @@ from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core import se2
 from l1slam_ros.core.backend import Improvement
-from l1slam_ros.core.errors import GraphError, L1SlamError, MessageError
+from l1slam_ros.core.errors import L1SlamError, MessageError
 from l1slam_ros.diagnosis import Diagnosis
 from l1slam_ros.failures import Failures
 from l1slam_ros.io import cdr
@@ -228,7 +228,7 @@ class BackendNode(Node):
     def _publish_map(self) -> None:
         state = self._backend.state()
         if not np.isfinite(state.poses).all() or not np.isfinite(state.map_to_odom).all():
-            raise GraphError('a pose of the map is not finite; expected numbers: not published')
+            raise ArithmeticError('a pose of the map is not finite: it is not published')
         self._diagnosis.note_jump(
             self._manifold, self._manifold.compose(self._told_transform, self._last_pose),
             self._manifold.compose(state.map_to_odom, self._last_pose))

@@ -12,6 +12,9 @@ from rclpy.task import Future
 from l1slam_ros.core.errors import Interrupted, L1SlamError
 from l1slam_ros.failures import Failures, reason
 
+# [s] A service that failed may not be called again: its failure is told for so long.
+_REMEMBERED = 60.0
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -75,7 +78,7 @@ class Orders:
             # The caller is told: the fault lies with the call, not with the node.
             return Answer(False, reason(error))
         except Exception as error:
-            self._failures.note(order.name, error)
+            self._failures.note(order.name, error, _REMEMBERED)
             return Answer(False, reason(error))
         self._failures.over(order.name)
         return answer

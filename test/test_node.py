@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The real node on real DDS, in this process: messages in, the optimised Path out."""
 
-import time
 
 import numpy as np
 import pytest
@@ -9,11 +8,9 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import Odometry, Path
-from rclpy.executors import SingleThreadedExecutor
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from node_bench import Bench, call, odometry
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool, Trigger
 from torn import torn_graph
 from visualization_msgs.msg import MarkerArray
@@ -33,74 +30,10 @@ from l1slam_ros.core.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bag import read_raw
 from l1slam_ros.io.graph_bag import write_graph_bag
 from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, write_graph_file
-from l1slam_ros.node import BackendNode
 from l1slam_ros.publishing import header
 
 EVERY_MESSAGE = {'keyframe.translation': 0.0, 'keyframe.rotation': 0.0,
                  'odometry.covariance_source': 'increment'}
-DEADLINE = 60.0
-TYPES = {'/odom': Odometry, '/loop_closures': PoseWithCovarianceStamped}
-
-
-class Bench:
-    """The node under test and a peer that talks to it, spun by one executor."""
-
-    def __init__(self, rclpy, parameters):
-        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
-        self.backend = BackendNode(parameter_overrides=overrides)
-        self.peer = rclpy.create_node('peer')
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.backend)
-        self.executor.add_node(self.peer)
-        self.publishers = {topic: self.peer.create_publisher(kind, topic, QoSProfile(depth=1000))
-                           for topic, kind in TYPES.items()}
-        self.received = {'path': [], 'pose': [], 'map_to_odom': []}
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.listen(Path, 'path', latched)
-        self.listen(PoseStamped, 'pose', 1000)
-        self.listen(TransformStamped, 'map_to_odom', 1000)
-        self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values()),
-                   'the node subscribes')
-
-    def listen(self, kind, topic, qos):
-        self.peer.create_subscription(kind, topic, self.received[topic].append, qos)
-
-    def until(self, condition, what):
-        deadline = time.monotonic() + DEADLINE
-        while not condition():
-            assert time.monotonic() < deadline, f'waited {DEADLINE} s in vain until {what}'
-            self.executor.spin_once(timeout_sec=0.05)
-
-    def send(self, topic, message):
-        self.publishers[topic].publish(message)
-        self.executor.spin_once(timeout_sec=0.0)
-
-    def path(self):
-        return self.received['path'][-1] if self.received['path'] else Path()
-
-    def close(self):
-        self.executor.shutdown()
-        self.backend.close()
-        self.peer.destroy_node()
-
-
-@pytest.fixture
-def bench(ros):
-    benches = []
-
-    def make(**parameters):
-        benches.append(Bench(ros, parameters))
-        return benches[-1]
-
-    yield make
-    for made in benches:
-        made.close()
-
-
-def odometry(stamp, x, frame='base_link'):
-    message = Odometry(header=header('odom', stamp), child_frame_id=frame)
-    message.pose.pose.position.x = x
-    return message
 
 
 def poses_of(path):
@@ -205,16 +138,6 @@ def test_nonsense_parameters_are_refused_at_start_and_on_set(ros, bench):
     assert not answer.successful
     assert b.backend.set_parameters([Parameter('update.budget', value=0.05)])[0].successful
     assert b.backend.options.update.budget == 0.05
-
-
-def call(b, name, request=None):
-    """Call a service of the node and return its answer."""
-    kind = SetBool if name == 'pause' else Trigger
-    client = b.peer.create_client(kind, f'/backend/{name}')
-    b.until(client.service_is_ready, f'{name} is offered')
-    future = client.call_async(request or kind.Request())
-    b.until(future.done, f'{name} answers')
-    return future.result()
 
 
 def test_a_saved_map_is_loaded_and_odometry_goes_on_from_its_end(bench, tmp_path):

@@ -20,7 +20,6 @@ import numpy as np
 from l1slam_ros.core.belief_state import Belief, judge
 from l1slam_ros.core.choice import AUTO, choose, minimise_by
 from l1slam_ros.core.cholesky import cholesky_of
-from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.growth import GraphGrowth, GrowthOptions
 from l1slam_ros.core.least_squares import reweighted_step
@@ -181,11 +180,13 @@ class Backend:
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """Add one sample; see `GraphGrowth.add_odometry`."""
+        _require_finite(sample.pose3)
         self._samples += 1
         return self.growth.add_odometry(sample)
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Add one loop closure; see `GraphGrowth.add_loop`."""
+        _require_finite(loop.pose3)
         self._changes += 1
         self.growth.add_loop(loop)
 
@@ -219,15 +220,14 @@ class Backend:
 
         Raises
         ------
-        GraphError : it is not finite; nothing is taken over.
+        ArithmeticError : it is not finite; nothing is taken over.
 
         """
         if improvement.robust != self._options.robust.enabled:
             return
         for name in ('poses', 'dual', 'cost'):
             if not np.isfinite(getattr(improvement, name)).all():
-                raise GraphError(f'an update ended with a {name} that is not finite; expected '
-                                 'numbers, so the map stays as it is')
+                raise ArithmeticError(f'the {name} of a new map is not finite; the map stays')
         self._changes += 1
         fell = improvement.cost_before - improvement.cost
         quiet = (improvement.belief.settled and len(improvement.dual) == len(self._dual)
@@ -325,6 +325,12 @@ def optimise(problem: Problem, options: OptimiserOptions,
     part = graph.subset(belief.accepted)
     before = l1_cost(whitened_residual(part, problem.poses))
     return _improvement(solution, problem, belief, before, 0, start)
+
+
+def _require_finite(pose3: Array) -> None:
+    # It would spoil all that comes after it.
+    if not np.isfinite(pose3).all():
+        raise ArithmeticError(f'pose {pose3} is not finite')
 
 
 def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
