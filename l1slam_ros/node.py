@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry, Path
-from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -97,8 +97,10 @@ class BackendNode(Node):
                           on_clock_change=False),
             post_callback=self.failures.guarded('time jump', self._on_time_jump))
         guarded = self.failures.guarded
-        self.create_timer(options.update.period, guarded('timer', self._on_timer))
-        self.create_timer(1.0, guarded('diagnostics', self._on_second))
+        # By a clock that goes on where simulated time stands still, or a bag has ended.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(options.update.period, guarded('timer', self._on_timer), clock=steady)
+        self.create_timer(1.0, guarded('diagnostics', self._on_second), clock=steady)
         self._solver.start()
 
     @property
