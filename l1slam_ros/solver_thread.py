@@ -28,7 +28,7 @@ class SolverThread:
     failures : where to tell what an update raised
     logger : of the node
     budget : returns how long one update may work [s]
-    tell : called after each wake, with what the update did, None: nothing; may publish
+    tell : called before and after each update, with what it did, None: nothing; may publish
 
     """
 
@@ -83,6 +83,8 @@ class SolverThread:
             if time.monotonic() < self._not_before:
                 continue
             try:
+                # First what services have made of the map: an update may take long.
+                self._tell(None)
                 self._tell(self._update())
             except Interrupted:
                 continue

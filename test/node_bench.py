@@ -3,6 +3,7 @@
 
 import time
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry, Path
@@ -11,6 +12,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
+from l1slam_ros.core import se2
 from l1slam_ros.node import BackendNode
 from l1slam_ros.publishing import header
 
@@ -72,6 +74,13 @@ def odometry(stamp, x, frame='base_link'):
     message = Odometry(header=header('odom', stamp), child_frame_id=frame)
     message.pose.pose.position.x = x
     return message
+
+
+def poses_of(path):
+    return se2.from_pose3(np.array([
+        (p.pose.position.x, p.pose.position.y, p.pose.position.z, p.pose.orientation.x,
+         p.pose.orientation.y, p.pose.orientation.z, p.pose.orientation.w)
+        for p in path.poses]).reshape(-1, 7))
 
 
 def call(b, name, request=None):

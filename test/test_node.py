@@ -9,13 +9,12 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_bench import Bench, call, odometry
+from node_bench import Bench, call, odometry, poses_of
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 from torn import torn_graph
 from visualization_msgs.msg import MarkerArray
 
-from l1slam_ros.core import se2
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.errors import InconsistentError, OptionError
 from l1slam_ros.core.exact import minimise_interior_point
@@ -34,13 +33,6 @@ from l1slam_ros.publishing import header
 
 EVERY_MESSAGE = {'keyframe.translation': 0.0, 'keyframe.rotation': 0.0,
                  'odometry.covariance_source': 'increment'}
-
-
-def poses_of(path):
-    return se2.from_pose3(np.array([
-        (p.pose.position.x, p.pose.position.y, p.pose.position.z, p.pose.orientation.x,
-         p.pose.orientation.y, p.pose.orientation.z, p.pose.orientation.w)
-        for p in path.poses]).reshape(-1, 7))
 
 
 def play(bench, bag):
