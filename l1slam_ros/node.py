@@ -111,8 +111,9 @@ class BackendNode(Node):
     def close(self, seconds: float = 60.0) -> bool:
         """End the threads and the node; return whether they ended within some seconds."""
         deadline = time.monotonic() + seconds
-        ended = self._solver.close(seconds)
-        ended &= self._orders.close(max(deadline - time.monotonic(), 0.0))
+        self._solver.close(0.0)  # what it works at for an order stops
+        ended = self._orders.close(seconds)
+        ended &= self._solver.close(max(deadline - time.monotonic(), 0.0))
         if ended:
             self.destroy_node()
         return ended

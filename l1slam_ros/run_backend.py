@@ -15,7 +15,7 @@ from contextlib import suppress
 from typing import Any
 
 # [s] A signal leaves that long for an orderly end; the threads of the node get a part of it.
-_PATIENCE, _THREADS = 1.5, 1.0
+_PATIENCE, _THREADS = 1.2, 0.9
 # [s] What raises each time it is called shall not keep a core busy.
 _BREATH = 0.05
 # [s] How long the interpreter lets the solver's own Python run before a callback may.

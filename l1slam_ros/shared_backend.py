@@ -22,6 +22,7 @@ from l1slam_ros.core.graph import BetweenFactors
 from l1slam_ros.core.loop_states import LOOP_STATES, LoopStates
 from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.snapshot import Snapshot
 from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, write_graph_file
 
 # Asked on the way, often: whether to stop.
@@ -97,7 +98,7 @@ class SharedBackend:
     def state(self) -> MapState:
         """Return the map as it is now."""
         now = self._snapshot()
-        return MapState(now.growth.stamps, now.poses, now.map_to_odom, now.growth.graph.between,
+        return MapState(now.stamps, now.poses, now.map_to_odom, now.graph.between,
                         now.loop_states())
 
     def loop_states(self) -> LoopStates:
@@ -111,15 +112,14 @@ class SharedBackend:
             refused = dict(self._backend.growth.refused)
         if self._counted[0] != version:
             now = self._snapshot()
-            sizes = {'keyframes': now.growth.graph.n_poses,
-                     'factors': len(now.growth.graph.between)}
+            sizes = {'keyframes': now.graph.n_poses, 'factors': len(now.graph.between)}
             loops = np.bincount(now.loop_states().state, minlength=len(LOOP_STATES))
             sizes |= {f'{name}_loops': int(count)
                       for name, count in zip(LOOP_STATES, loops, strict=True)}
             self._counted = version, sizes
         return self._counted[1], refused
 
-    def _snapshot(self) -> Backend:
+    def _snapshot(self) -> Snapshot:
         with self._lock:
             return self._backend.snapshot()
 
@@ -197,7 +197,7 @@ class SharedBackend:
     def save(self, path: Path) -> int:
         """Write graph, poses, stamps and trust as g2o and beside it; return how many keyframes."""
         now = self._snapshot()
-        graph, poses, stamps = now.growth.graph, now.poses, now.growth.stamps
+        graph, poses, stamps = now.graph, now.poses, now.stamps
         if not len(graph.between):
             raise FileError(path, 'there is no graph yet to be saved')
         write_graph_file(path, GraphRecord(graph, poses, np.arange(len(poses)), stamps))

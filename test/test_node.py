@@ -9,12 +9,15 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_bench import Bench, call, odometry, poses_of
+from node_bench import DEADLINE, TYPES, Bench, call, odometry, poses_of
 from rclpy.parameter import Parameter
+from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 from torn import torn_graph
 from visualization_msgs.msg import MarkerArray
 
+from l1slam_ros.core import se2
+from l1slam_ros.core.backend import Backend, BackendOptions
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.errors import InconsistentError, OptionError
 from l1slam_ros.core.exact import minimise_interior_point
@@ -23,12 +26,14 @@ from l1slam_ros.core.linearise import whitened_residual
 from l1slam_ros.core.loop_states import ACCEPTED, REJECTED
 from l1slam_ros.core.optimality import l1_cost
 from l1slam_ros.core.optimiser import OptimiserOptions
+from l1slam_ros.core.options import with_values
 from l1slam_ros.core.robust import robust_solve
 from l1slam_ros.core.seed import seed_poses
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bag import read_raw
 from l1slam_ros.io.graph_bag import write_graph_bag
 from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, write_graph_file
+from l1slam_ros.io.messages import loop_closure, odometry_sample
 from l1slam_ros.publishing import header
 
 EVERY_MESSAGE = {'keyframe.translation': 0.0, 'keyframe.rotation': 0.0,
@@ -77,6 +82,42 @@ def test_intel_ends_within_two_percent_of_the_optimum(bench, tmp_path, datasets)
     b = bench(**EVERY_MESSAGE)
     play(b, tmp_path / 'bag')
     assert_near_optimum(b, record, 961.77375, 0.02)
+
+
+def spoil(message, odometry_count):
+    """Let every twentieth odometry message know nothing, or all to the last atom."""
+    if odometry_count % 20 == 7:
+        variance = (1e12, 1e-20)[odometry_count // 20 % 2]
+        message.pose.covariance = (variance * np.eye(6)).ravel()
+
+
+def test_intel_survives_repeated_loops_and_absurd_covariances(bench, tmp_path, datasets):
+    """Each loop five times, odometry variances of 1e12 and 1e-20 in between."""
+    record = read_graph_file(datasets / 'intel.g2o')
+    write_graph_bag(tmp_path / 'bag', record)
+    clean = Backend(se2, with_values(BackendOptions(), EVERY_MESSAGE))
+    b = bench(**EVERY_MESSAGE)
+    sent = 0
+    for raw in read_raw(tmp_path / 'bag'):
+        message = deserialize_message(raw.data, TYPES[raw.topic])
+        if raw.topic == '/odom':
+            clean.add_odometry(odometry_sample(message))
+            spoil(message, sent)
+            sent += 1
+        else:
+            clean.add_loop(loop_closure(message, '', False))
+        for _ in range(1 if raw.topic == '/odom' else 5):
+            b.send(raw.topic, message)
+        if sent % 20 == 0:
+            b.until(lambda n=sent: len(b.received['pose']) >= n, 'poses come back')
+    while clean.update(DEADLINE) is not None:
+        pass
+    b.until(lambda: len(b.path().poses) == 943, 'all keyframes are in the Path')
+
+    def error():
+        return np.linalg.norm((poses_of(b.path()) - clean.poses)[:, :2], axis=1).max()
+
+    b.until(lambda: error() < 0.15, 'the map is that of the clean messages')
 
 
 def test_pose_and_transform_agree_with_the_path(bench, tmp_path, rng):

@@ -10,7 +10,6 @@ caller with threads need hold its lock for two short moments only, `snapshot` an
     backend.adopt(improvement)                          # poses and dual for the next warm start
 """
 
-import copy
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,14 +23,7 @@ from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.growth import GraphGrowth, GrowthOptions
 from l1slam_ros.core.least_squares import reweighted_step
 from l1slam_ros.core.linearise import linearise, whitened_residual
-from l1slam_ros.core.loop_states import (
-    ACCEPTED,
-    EXPIRED,
-    REJECTED,
-    SUSPECT,
-    WAITING,
-    LoopStates,
-)
+from l1slam_ros.core.loop_states import LoopStates
 from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.optimality import Status, l1_cost, smoothing
@@ -39,6 +31,7 @@ from l1slam_ros.core.optimiser import OptimiserOptions, Solution, backtrack, is_
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.robust_map import minimise_robustly
 from l1slam_ros.core.seed import seed_poses
+from l1slam_ros.core.snapshot import Problem, Snapshot
 
 # A large map gets but one linearisation into an update, and never meets a test that takes two of
 # them. It is at rest when so many updates in a row lowered the cost by less than is looked for.
@@ -60,24 +53,6 @@ class BackendOptions(GrowthOptions):
 
     solver: OptimiserOptions = OptimiserOptions()
     robust: RobustOptions = RobustOptions()
-
-
-@dataclass(frozen=True)
-class Problem:
-    """
-    A snapshot to improve: graph, poses (n, p), dual (rows,) and the cost the last update left.
-
-    belief : of all factors; robust : loops may be doubted; settled : nothing has come since an
-    update that converged.
-    """
-
-    graph: FactorGraph
-    poses: Array
-    dual: Array
-    belief: Belief
-    robust: bool
-    last_cost: float
-    settled: bool
 
 
 @dataclass(frozen=True)
@@ -137,14 +112,7 @@ class Backend:
     @property
     def poses(self) -> Array:
         """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
-        optimised, odometry = len(self._poses), self.growth.odometry
-        if not optimised or optimised == len(odometry):
-            return np.concatenate((self._poses, odometry[optimised:]))
-        new = odometry[optimised:]
-        start = np.broadcast_to(odometry[optimised - 1], new.shape)
-        last = np.broadcast_to(self._poses[-1], new.shape)
-        carried = self._manifold.compose(last, self._manifold.between(start, new))
-        return np.concatenate((self._poses, carried))
+        return self._now().poses
 
     @property
     def map_to_odom(self) -> Array:
@@ -190,27 +158,23 @@ class Backend:
         self._changes += 1
         self.growth.add_loop(loop)
 
-    def snapshot(self) -> 'Backend':
+    def snapshot(self) -> Snapshot:
         """Return the back end as it is, the due loops in its graph, to be read at leisure."""
         self.growth.add_due_loops()
-        clone = copy.copy(self)
-        clone.growth = self.growth.snapshot()
-        return clone
+        return self._now()
 
     def problem(self) -> Problem:
-        """Return what an update begins with: graph, the due loops in it, and the warm start."""
-        self.growth.add_due_loops()
-        graph = self.growth.graph.copy()
-        rows = len(graph.between) * self._manifold.TANGENT_SIZE
-        # Rows are only ever appended, so the dual of the old ones stays; new ones start at zero.
-        dual = np.concatenate((self._dual, np.zeros(rows - len(self._dual))))
-        robust = self._options.robust.enabled
-        belief = self._belief.extended(graph, robust)
-        grown = len(self._poses) < graph.n_poses or len(self._dual) < rows
+        """Return what an update begins with."""
+        return self.snapshot().problem()
+
+    def _now(self) -> Snapshot:
+        growth = self.growth
         at_rest = (self._status in (Status.CONVERGED, Status.STALLED)
                    or self._quiet_updates >= _QUIET_UPDATES)
-        settled = not grown and belief.settled and at_rest
-        return Problem(graph, self.poses, dual, belief, robust, self._last_cost, settled)
+        return Snapshot(
+            self.version, growth.graph.copy(), growth.stamps, growth.odometry, self.map_to_odom,
+            growth.loop_rows, growth.loop_stamps, self._poses, self._dual, self._belief,
+            self._options.robust.enabled, self._last_cost, at_rest)
 
     def adopt(self, improvement: Improvement) -> None:
         """
@@ -242,15 +206,7 @@ class Backend:
 
     def loop_states(self) -> LoopStates:
         """Return what has become of each loop, those of the graph first, in its order."""
-        in_graph, waiting, expired = self.growth.loop_stamps
-        belief = self._belief.extended(self.growth.graph, self._options.robust.enabled)
-        rows = self.growth.loop_rows
-        state = np.where(belief.accepted[rows], ACCEPTED,
-                         np.where(belief.suspect[rows], SUSPECT, REJECTED))
-        others = np.repeat([WAITING, EXPIRED], [len(waiting), len(expired)])
-        sigmas = np.concatenate((belief.sigmas[rows], np.full(len(others), np.nan)))
-        return LoopStates(rows, np.concatenate((in_graph, waiting, expired)),
-                          np.concatenate((state, others)), sigmas)
+        return self._now().loop_states()
 
     def update(self, budget: float) -> Improvement | None:
         """Improve the map for about `budget` seconds; None: there was nothing to do."""

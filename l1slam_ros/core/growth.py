@@ -6,7 +6,6 @@ A loop closure names two times. It waits until odometry has reached both, is the
 nearest keyframes by the raw odometry in between, and becomes a between factor.
 """
 
-import copy
 from collections import Counter
 from dataclasses import dataclass
 
@@ -83,14 +82,6 @@ class GraphGrowth:
         self._expired = GrowingArray((2,), np.int64)
         self._loop_stamps = GrowingArray((2,), np.int64)
         self._loop_rows = GrowingArray((), np.int64)
-
-    def snapshot(self) -> 'GraphGrowth':
-        """Return the growth as it is now, to be read while this one grows."""
-        clone = copy.copy(self)
-        for name, value in vars(self).items():
-            if isinstance(value, FactorGraph | GrowingArray | list):
-                setattr(clone, name, value.copy())
-        return clone
 
     @property
     def stamps(self) -> Indices:

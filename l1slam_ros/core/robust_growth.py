@@ -151,6 +151,7 @@ class Growth:
             cholesky = cholesky_of(part)
             self._check()
             self.poses = solve(part, self.poses, cholesky, lambda *_: self._check())
+            self._check()
             self.posterior = sample_posterior(part, self.poses, cholesky, self.rng)
             drop = self._misfits(rows)
             self.accepted[drop] = False
