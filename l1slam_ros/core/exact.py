@@ -42,7 +42,7 @@ def minimise_interior_point(
         return Solution(poses, start, Status.ITERATION_LIMIT, 0, 0, np.array([start]),
                         np.zeros(len(whitened_residual(graph, poses))))
     problem = GraphProblem(graph)
-    rough = minimise_l2(graph, poses, _ROUGH_L2, cholesky, lambda *_: report(0, start)).poses
+    rough = minimise_l2(graph, poses, _ROUGH_L2, cholesky).poses
     optimum = interior_point(problem, rough, cholesky, steps, _TOLERANCE, report)
     if optimum.costs[-1] > start:
         optimum = interior_point(problem, poses, cholesky, steps, _TOLERANCE, report)
