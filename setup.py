@@ -68,7 +68,7 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'backend = l1slam_ros.node:main',
+            'backend = l1slam_ros.run_backend:main',
             'replay = l1slam_ros.replay:main',
             'l1slam = l1slam_ros.cli:main',
         ],

@@ -9,7 +9,7 @@ import numpy as np
 from measuring import clock
 
 from l1slam_ros.core import se2
-from l1slam_ros.core.backend import ACCEPTED, Backend, BackendOptions
+from l1slam_ros.core.backend import Backend, BackendOptions
 from l1slam_ros.core.choice import AUTO, choose, minimise_by
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.graph import FactorGraph
@@ -17,6 +17,7 @@ from l1slam_ros.core.growth import GrowthOptions
 from l1slam_ros.core.initial import odometry_poses, pair_key
 from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
+from l1slam_ros.core.loop_states import ACCEPTED
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.noise import Mask
 from l1slam_ros.core.optimiser import OptimiserOptions, Solution

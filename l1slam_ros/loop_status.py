@@ -6,7 +6,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from l1slam_ros.core.backend import ACCEPTED, LOOP_STATES, WAITING, LoopStates
+from l1slam_ros.core.loop_states import ACCEPTED, LOOP_STATES, WAITING, LoopStates
 from l1slam_ros.core.manifold import Indices
 from l1slam_ros.io.files import stamp_text
 

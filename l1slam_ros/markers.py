@@ -5,8 +5,8 @@ from geometry_msgs.msg import Point, Vector3
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from l1slam_ros.core.backend import ACCEPTED, REJECTED, SUSPECT, LoopStates
 from l1slam_ros.core.graph import BetweenFactors
+from l1slam_ros.core.loop_states import ACCEPTED, REJECTED, SUSPECT, LoopStates
 from l1slam_ros.core.manifold import Array
 from l1slam_ros.publishing import header
 

@@ -2,23 +2,21 @@
 """
 `backend`: the node. Odometry and loop closures in, the optimised Path out; no arithmetic.
 
-Callbacks convert a message and append it to the back end. A timer wakes one worker thread, which
-improves the map and publishes it; see `shared_backend` for why neither waits for the other.
+Callbacks convert a message and append it to the back end; none of it is compiled code. A timer
+wakes the solver's thread, which improves the map and publishes it; another thread carries out what
+services ask for. See `shared_backend` for why none waits for the other.
 """
 
-import sys
-import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import rclpy
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry, Path
-from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -28,8 +26,9 @@ from l1slam_ros.core import se2
 from l1slam_ros.core.backend import Improvement
 from l1slam_ros.core.errors import L1SlamError, MessageError
 from l1slam_ros.core.measurements import OdometrySample
-from l1slam_ros.core.warm_up import warm_up
 from l1slam_ros.diagnosis import Diagnosis
+from l1slam_ros.failures import Failures
+from l1slam_ros.io import cdr
 from l1slam_ros.io.base_frame import BaseFrame
 from l1slam_ros.io.messages import loop_closure, odometry_sample
 from l1slam_ros.loop_status import LoopStatus
@@ -37,9 +36,11 @@ from l1slam_ros.markers import graph_markers
 from l1slam_ros.node_options import NodeOptions
 from l1slam_ros.orders import Orders
 from l1slam_ros.params import NodeParameters
-from l1slam_ros.publishing import path_bytes, pose_stamped, transform_stamped
+from l1slam_ros.publishing import path_bytes, pose_bytes, transform_stamped
 from l1slam_ros.services import MapServices
 from l1slam_ros.shared_backend import SharedBackend
+from l1slam_ros.solver_thread import SolverThread
+from l1slam_ros.traffic import Traffic
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -47,6 +48,8 @@ except ImportError:  # the ROS wheels on PyPI have none
     TFMessage = None
 
 _DEPTH = 1000
+# Messages of one topic at most before other callbacks have their turn.
+_AT_ONCE = 100
 _REPEAT_WARNING = 5.0  # [s]
 
 
@@ -58,6 +61,10 @@ class BackendNode(Node):
     ----------
     keywords : passed to `rclpy.node.Node`, e.g. parameter_overrides, context
 
+    Attributes
+    ----------
+    failures : what fails now
+
     Raises
     ------
     OptionError : a parameter given at start is refused.
@@ -67,49 +74,51 @@ class BackendNode(Node):
     def __init__(self, **keywords: Any):
         super().__init__('backend', **keywords)
         self._declared = NodeParameters(self, NodeOptions(), self._on_options)
-        self._make_ready()
         options = self.options
         self._manifold = se2
         self._backend = SharedBackend(self._manifold, options)
         self._base_frame = BaseFrame(options.base_frame)
         self._refused: Counter[str] = Counter()
         self._last_stamp = 0
-        self._map_to_odom = self._manifold.identity(1)
-        self._wake = threading.Event()
-        self._paused = self._closing = False
+        self._last_pose = self._map_to_odom = self._manifold.identity(1)
+        self._told_map, self._told_version = 0, self._backend.version
+        self._told_transform = self._map_to_odom
+        self.failures = Failures(self.get_logger(), self.context.ok)
+        self._solver = SolverThread(self._backend, self.failures, self.get_logger(),
+                                    lambda: self.options.update.budget, self._tell)
+        self._orders = Orders(self, self.failures, self._solver.hurry)
         self._make_publishers()
+        self._topics: dict[str, Traffic] = {}
         self._make_subscriptions()
-        self._orders = Orders(self, self._wake)
+        self._diagnosis = Diagnosis(self, self._topics, self._solver, self.failures)
         self._map_services = MapServices(
-            self, self._backend, self._orders, lambda: self.options.save_path, self._set_paused)
+            self, self._backend, self._orders, lambda: self.options.save_path,
+            self._solver.pause, self._solver.is_closing)
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
                           on_clock_change=False),
-            post_callback=self._on_time_jump)
-        self.create_timer(options.update.period, self._on_timer)
-        self.create_timer(1.0, self._on_second)
-        self._worker = threading.Thread(target=self._work, name='solver', daemon=True)
-        self._worker.start()
+            post_callback=self.failures.guarded('time jump', self._on_time_jump))
+        guarded = self.failures.guarded
+        # By a clock that goes on where simulated time stands still, or a bag has ended.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(options.update.period, guarded('timer', self._on_timer), clock=steady)
+        self.create_timer(1.0, guarded('diagnostics', self._on_second), clock=steady)
+        self._solver.start()
 
     @property
     def options(self) -> NodeOptions:
         """The options as they are now."""
         return self._declared.options
 
-    def close(self) -> None:
-        """End the worker and the node."""
-        self._closing = True
-        self._wake.set()
-        self._worker.join()
-        self.destroy_node()
-
-    def _make_ready(self) -> None:
-        """Compile the solver's loops before messages come: it would hold up their callbacks."""
-        self.get_logger().info('getting the solver ready; the first time on a machine it is '
-                               'compiled, which takes up to half a minute')
-        began = time.monotonic()
-        warm_up()
-        self.get_logger().info(f'solver ready after {time.monotonic() - began:.1f} s')
+    def close(self, seconds: float = 60.0) -> bool:
+        """End the threads and the node; return whether they ended within some seconds."""
+        deadline = time.monotonic() + seconds
+        self._solver.close(0.0)  # what it works at for an order stops
+        ended = self._orders.close(seconds)
+        ended &= self._solver.close(max(deadline - time.monotonic(), 0.0))
+        if ended:
+            self.destroy_node()
+        return ended
 
     def _make_publishers(self) -> None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -120,33 +129,49 @@ class BackendNode(Node):
         self._tf = None
         if TFMessage is not None and self.options.publish_tf:
             self._tf = self.create_publisher(TFMessage, '/tf', 100)
-        self._diagnosis = Diagnosis(self)
         self._loop_status = LoopStatus(self)
 
     def _make_subscriptions(self) -> None:
-        reliable = QoSProfile(depth=_DEPTH)
-        overridable = QoSOverridingOptions.with_default_policies()
         for kind, topic, callback in (
             (Odometry, 'odom', self._on_odometry),
             (PoseWithCovarianceStamped, 'loop_closures', self._on_loop),
             (PoseWithCovarianceStamped, 'trusted_loop_closures', self._on_trusted_loop),
         ):
-            self.create_subscription(kind, topic, callback, reliable,
-                                     qos_overriding_options=overridable)
+            self._subscribe(kind, topic, callback)
+
+    def _subscribe(self, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
+        use = self.failures.guarded(topic, callback)
+        raw = kind is Odometry
+
+        def received(message: Any, information: Any) -> None:
+            traffic.note(information)
+            use(message)
+            # What has queued up is taken at once: a round of the executor costs more than a
+            # message, and at the rate of some odometry, messages would be lost meanwhile.
+            with subscription.handle:
+                for _ in range(_AT_ONCE):
+                    taken = subscription.handle.take_message(kind, raw)
+                    if taken is None:
+                        break
+                    traffic.note(taken[1])
+                    use(taken[0])
+
+        subscription = self.create_subscription(
+            kind, topic, received, QoSProfile(depth=_DEPTH), raw=raw,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        traffic = self._topics[topic] = Traffic(subscription.get_publisher_count)
 
     def _on_options(self, options: NodeOptions) -> None:
         self._backend.set_options(options)
 
-    def _set_paused(self, paused: bool) -> None:
-        self._paused = paused
-
     def _on_time_jump(self, _: TimeJump) -> None:
         if self.options.on_time_jump == 'reset':
             self.get_logger().warning('the clock jumped back: the map begins anew')
-            self._orders.place(self._map_services.reset)
+            self._orders.place('time jump', self._map_services.reset)
 
-    def _on_odometry(self, message: Odometry) -> None:
+    def _on_odometry(self, data: bytes) -> None:
         try:
+            message = cdr.odometry(data)
             found = self._base_frame.take(message.child_frame_id, odometry_sample(message))
         except L1SlamError as error:
             self._refuse(error)
@@ -160,16 +185,17 @@ class BackendNode(Node):
 
     def _add_odometry(self, sample: OdometrySample) -> None:
         try:
-            if not self._backend.add_odometry(sample):
-                return
+            map_to_odom = self._backend.add_odometry(sample)
         except L1SlamError as error:
             self._refuse(error)
             return
-        self._last_stamp = sample.stamp
-        pose = self._manifold.compose(self._map_to_odom,
-                                      self._manifold.from_pose3(sample.pose3[None]))
-        self._pose.publish(pose_stamped(self.options.map_frame, sample.stamp,
-                                        self._manifold.to_pose3(pose)[0]))
+        if map_to_odom is None:
+            return
+        self._map_to_odom, manifold = map_to_odom, self._manifold
+        self._last_stamp, self._last_pose = sample.stamp, manifold.from_pose3(sample.pose3[None])
+        pose = manifold.compose(self._map_to_odom, self._last_pose)
+        self._pose.publish(pose_bytes(self.options.map_frame, sample.stamp,
+                                      manifold.to_pose3(pose)[0]))
 
     def _on_loop(self, message: PoseWithCovarianceStamped) -> None:
         self._add_loop(message, trusted=False)
@@ -190,7 +216,7 @@ class BackendNode(Node):
         self.get_logger().warning(f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
 
     def _on_timer(self) -> None:
-        self._wake.set()
+        self._solver.wake()
         if self._last_stamp:
             self._publish_transform()
 
@@ -200,30 +226,27 @@ class BackendNode(Node):
         counts, refused = self._backend.counts()
         self._diagnosis.publish(counts, self._refused + Counter(refused))
 
-    def _work(self) -> None:
-        while self._wake.wait() and not self._closing:
-            self._wake.clear()
-            try:
-                if self._orders.carry_out():
-                    self._publish_map()
-                if not self._paused:
-                    self._update()
-            except (L1SlamError, ArithmeticError, np.linalg.LinAlgError) as error:
-                # The last good map stays; the next update tries again.
-                self.get_logger().error(f'update failed: {error}',
-                                        throttle_duration_sec=_REPEAT_WARNING)
-
-    def _update(self) -> None:
-        improvement = self._backend.update(self.options.update.budget)
+    def _tell(self, improvement: Improvement | None) -> None:
+        """Publish what is new; the solver's thread calls it."""
         if improvement is not None:
-            self._publish_map()
             self._report(improvement)
-        else:  # nothing new in the map, but a loop can have come for later, or expired
+        maps, version = self._backend.maps, self._backend.version
+        if maps != self._told_map:
+            self._publish_map()
+            self._told_map = maps
+        elif version != self._told_version:
+            # Nothing new in the map, but a loop can have come for later, or expired.
             self._loop_status.publish(self._backend.loop_states())
+        self._told_version = version
 
     def _publish_map(self) -> None:
         state = self._backend.state()
-        self._map_to_odom = state.map_to_odom
+        if not np.isfinite(state.poses).all() or not np.isfinite(state.map_to_odom).all():
+            raise ArithmeticError('a pose of the map is not finite: it is not published')
+        self._diagnosis.note_jump(
+            self._manifold, self._manifold.compose(self._told_transform, self._last_pose),
+            self._manifold.compose(state.map_to_odom, self._last_pose))
+        self._map_to_odom = self._told_transform = state.map_to_odom
         frame, stamp = self.options.map_frame, self._last_stamp
         pose3 = self._manifold.to_pose3(state.poses)
         self._path.publish(path_bytes(frame, stamp, state.stamps, pose3))
@@ -248,29 +271,3 @@ class BackendNode(Node):
             f'{improvement.reweighted_steps} reweighted steps, {improvement.outer_iterations} '
             f'outer and {improvement.inner_iterations} inner iterations, '
             f'{improvement.seconds * 1e3:.0f} ms, {improvement.status.value}')
-
-
-def main() -> int:
-    """Run the node until SIGINT or SIGTERM; return the exit code."""
-    rclpy.init()
-    node = None
-    try:
-        node = BackendNode()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        node.get_logger().info('ready: waiting for odometry')
-        executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except L1SlamError as error:
-        print(f'backend: {error}', file=sys.stderr)
-        return 1
-    except Exception:
-        # A signal can shut ROS down under any call; what that call then raises is no failure.
-        if rclpy.ok():
-            raise
-    finally:
-        if node is not None:
-            node.close()
-        rclpy.try_shutdown()
-    return 0

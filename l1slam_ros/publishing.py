@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseStamped, TransformStamped
+from geometry_msgs.msg import TransformStamped
 from std_msgs.msg import Header
 
 from l1slam_ros.core.manifold import Array, Indices
@@ -52,11 +52,10 @@ def path_bytes(frame: str, stamp: int, stamps: Indices, pose3: Array) -> bytes:
     return _ENCAPSULATION + start + body[: -(record.itemsize - 56)]
 
 
-def pose_stamped(frame: str, stamp: int, pose3: Array) -> PoseStamped:
-    """Return one pose (7,) at one time [ns]."""
-    message = PoseStamped(header=header(frame, stamp))
-    _fill(message.pose, pose3)
-    return message
+def pose_bytes(frame: str, stamp: int, pose3: Array) -> bytes:
+    """Return a serialised geometry_msgs/PoseStamped: one pose (7,) at one time [ns]."""
+    start = _header(frame, stamp)
+    return b''.join((_ENCAPSULATION, start, b'\0' * (-len(start) % 8), pose3.tobytes()))
 
 
 def transform_stamped(parent: str, child: str, stamp: int, pose3: Array) -> TransformStamped:
@@ -72,12 +71,6 @@ def header(frame: str, stamp: int) -> Header:
     """Return a header with its stamp [ns]."""
     seconds, nanoseconds = divmod(int(stamp), _SECOND)
     return Header(frame_id=frame, stamp=Time(sec=seconds, nanosec=nanoseconds))
-
-
-def _fill(pose: Pose, pose3: Array) -> None:
-    pose.position.x, pose.position.y, pose.position.z = pose3[:3].tolist()
-    orientation = pose.orientation
-    orientation.x, orientation.y, orientation.z, orientation.w = pose3[3:].tolist()
 
 
 def _string(text: str) -> bytes:

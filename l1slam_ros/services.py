@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The services of the node; the worker carries out what they ask for."""
+"""The services of the node, and what the thread of the orders does for each."""
 
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -11,7 +11,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.core.errors import DoubtfulError, OptionError
 from l1slam_ros.orders import Orders
-from l1slam_ros.shared_backend import SharedBackend
+from l1slam_ros.shared_backend import SharedBackend, Stopped
 from l1slam_ros.verdict import doubt_sentence
 
 
@@ -25,26 +25,28 @@ class MapServices:
     backend : what they act on
     orders : where they place their work
     save_path : returns the file of `~/save` and `~/load` as it is set now
-    pause : called with whether updates shall pause
+    pause : called, at once, with whether updates shall pause
+    stopped : asked whether the node is ending
 
     """
 
     def __init__(self, node: Node, backend: SharedBackend, orders: Orders,
-                 save_path: Callable[[], str], pause: Callable[[bool], None]):
+                 save_path: Callable[[], str], pause: Callable[[bool], None], stopped: Stopped):
         self._backend, self._orders = backend, orders
-        self._save_path, self._pause = save_path, pause
+        self._save_path, self._pause, self._stopped = save_path, pause, stopped
         # A group of their own: a service that awaits its answer would block its whole group.
         group = ReentrantCallbackGroup()
         for name, work in (('optimize', self._optimise), ('reset', self.reset),
                            ('save', self._save), ('load', self._load)):
-            node.create_service(Trigger, f'~/{name}', self._trigger(work), callback_group=group)
+            node.create_service(Trigger, f'~/{name}', self._trigger(name, work),
+                                callback_group=group)
         node.create_service(SetBool, '~/pause', self._set_pause, callback_group=group)
 
     def _trigger(
-        self, work: Callable[[], str]
+        self, name: str, work: Callable[[], str]
     ) -> Callable[[Trigger.Request, Trigger.Response], Awaitable[Trigger.Response]]:
         async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            result = await self._orders.place(work)
+            result = await self._orders.place(f'~/{name}', work)
             response.success, response.message = result.success, result.message
             return response
 
@@ -57,7 +59,7 @@ class MapServices:
         return response
 
     def _optimise(self) -> str:
-        improvement = self._backend.optimise()
+        improvement = self._backend.optimise(self._stopped)
         if improvement is None:
             return 'there are no factors yet'
         if improvement.doubt:
@@ -67,7 +69,7 @@ class MapServices:
                 f'{improvement.status.value}, {improvement.seconds:.2f} s')
 
     def reset(self) -> str:
-        """Empty the map; the worker calls it."""
+        """Empty the map; the thread of the orders calls it."""
         self._backend.reset()
         return 'the map is empty'
 

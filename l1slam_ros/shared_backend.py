@@ -1,31 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The back end behind a lock: callbacks of one thread feed it, a worker of another improves it.
+The back end behind a lock: callbacks feed it, the solver improves it, services replace it.
 
-The lock is held to append and to take or hand back a snapshot, never while solving. Everything
-that replaces the map (`update`, `optimise`, `reset`, `load`) is called by the worker alone.
+Three threads meet here. The lock is held to append, to take a snapshot and to hand one back,
+never while solving, reading or writing a file. A second lock lets one thread at a time solve.
+
+What is being solved for a map that is replaced meanwhile, or that `optimise` is to solve in the
+place of an update, is told to stop, and never adopted.
 """
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from l1slam_ros.core.backend import (
-    LOOP_STATES,
-    Backend,
-    BackendOptions,
-    Improvement,
-    LoopStates,
-    improve,
-    optimise,
-)
-from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.backend import Backend, BackendOptions, Improvement, improve, optimise
+from l1slam_ros.core.errors import FileError, Interrupted
 from l1slam_ros.core.graph import BetweenFactors
+from l1slam_ros.core.loop_states import LOOP_STATES, LoopStates
 from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.snapshot import Snapshot
 from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, write_graph_file
+
+# Asked on the way, often: whether to stop.
+Stopped = Callable[[], bool]
 
 
 @dataclass(frozen=True)
@@ -46,12 +47,16 @@ class MapState:
 
 class SharedBackend:
     """
-    A `core.backend.Backend` for two threads.
+    A `core.backend.Backend` for several threads.
 
     Parameters
     ----------
     manifold : what the poses live on
     options : see `BackendOptions`
+
+    Attributes
+    ----------
+    maps : how many maps there were: one more with each that was adopted or took another's place
 
     """
 
@@ -59,7 +64,19 @@ class SharedBackend:
         self._manifold = manifold
         self._options = options
         self._backend = Backend(manifold, options)
+        self.maps = 0
         self._lock = threading.Lock()
+        self._solving = threading.Lock()
+        self._make_way = False
+        # The version at which an update found nothing to do.
+        self._at_rest: object = None
+        self._counted: tuple[object, dict[str, int]] = (None, {})
+
+    @property
+    def version(self) -> object:
+        """Other than an earlier one where there may be something new to tell."""
+        with self._lock:
+            return self._backend, self._backend.version
 
     def set_options(self, options: BackendOptions) -> None:
         """Work by other options from now on."""
@@ -67,16 +84,20 @@ class SharedBackend:
             self._options = options
             self._backend.set_options(options)
 
-    def add_odometry(self, sample: OdometrySample) -> bool:
-        """Add one sample; return whether it is used: `GraphGrowth.add_odometry` may hold it."""
+    def add_odometry(self, sample: OdometrySample) -> Array | None:
+        """
+        Add one sample; return map_to_odom (1, p) for it.
+
+        None: it is held, not used yet; see `GraphGrowth.add_odometry`.
+        """
         with self._lock:
             self._backend.add_odometry(sample)
-            return not self._backend.growth.held
+            return None if self._backend.growth.held else self._backend.map_to_odom
 
     def begin_anew(self) -> None:
         """Forget the only sample so far; see `GraphGrowth.begin_anew`."""
         with self._lock:
-            self._backend.growth.begin_anew()
+            self._backend.begin_anew()
 
     def news(self) -> list[str]:
         """Return what is new in the notes on messages; see `GraphGrowth.notes`."""
@@ -90,59 +111,107 @@ class SharedBackend:
 
     def state(self) -> MapState:
         """Return the map as it is now."""
-        with self._lock:
-            backend = self._backend
-            return MapState(backend.growth.stamps, backend.poses, backend.map_to_odom,
-                            backend.growth.graph.between, backend.loop_states())
+        now = self._snapshot()
+        return MapState(now.stamps, now.poses, now.map_to_odom, now.graph.between,
+                        now.loop_states())
 
     def loop_states(self) -> LoopStates:
         """Return what has become of the loops by now."""
-        with self._lock:
-            return self._backend.loop_states()
+        return self._snapshot().loop_states()
 
     def counts(self) -> tuple[dict[str, int], dict[str, int]]:
         """Return the sizes of the graph, and how many loops were refused for which cause."""
         with self._lock:
-            growth = self._backend.growth
-            sizes = {'keyframes': growth.graph.n_poses, 'factors': len(growth.graph.between)}
-            loops = np.bincount(self._backend.loop_states().state, minlength=len(LOOP_STATES))
+            version = self._backend, self._backend.version
+            refused = dict(self._backend.growth.refused)
+        if self._counted[0] != version:
+            now = self._snapshot()
+            sizes = {'keyframes': now.graph.n_poses, 'factors': len(now.graph.between)}
+            loops = np.bincount(now.loop_states().state, minlength=len(LOOP_STATES))
             sizes |= {f'{name}_loops': int(count)
                       for name, count in zip(LOOP_STATES, loops, strict=True)}
-            return sizes, dict(growth.refused)
+            self._counted = version, sizes
+        return self._counted[1], refused
 
-    def update(self, budget: float) -> Improvement | None:
-        """Improve the map for about `budget` seconds; None: there was nothing to do."""
+    def _snapshot(self) -> Snapshot:
         with self._lock:
-            problem = self._backend.problem()
-            solver = self._options.solver
-        if problem.settled or not problem.graph.n_poses:
-            return None
-        return self._adopt(improve(problem, solver, budget))
+            return self._backend.snapshot()
 
-    def optimise(self) -> Improvement | None:
-        """Solve to the end, from the map and from the seed; None: there are no factors yet."""
-        with self._lock:
-            problem = self._backend.problem()
-            solver = self._options.solver
-        if not len(problem.graph.between):
-            return None
-        return self._adopt(optimise(problem, solver))
+    def alone(self, work: Callable[[], None]) -> None:
+        """Do some work while nothing is being solved, nor begins to be."""
+        with self._solving:
+            work()
 
-    def _adopt(self, improvement: Improvement) -> Improvement:
+    def update(self, budget: float, stopped: Stopped) -> Improvement | None:
+        """
+        Improve the map for about `budget` seconds; None: there was nothing to do.
+
+        Raises
+        ------
+        Interrupted : told to stop, or to make way for `optimise`, or the map was replaced.
+
+        """
+        with self._solving:
+            with self._lock:
+                backend, solver = self._backend, self._options.solver
+                if self._at_rest == (backend, backend.version):
+                    return None
+                now = backend.snapshot()
+            problem = now.problem()
+            if problem.settled or not problem.graph.n_poses:
+                self._at_rest = backend, now.version
+                return None
+
+            def check() -> None:
+                if self._make_way or stopped() or backend is not self._backend:
+                    raise Interrupted
+
+            return self._adopt(improve(problem, solver, budget, check), backend, check)
+
+    def optimise(self, stopped: Stopped) -> Improvement | None:
+        """
+        Solve to the end, from the map and from the seed; None: there are no factors yet.
+
+        An update that is under way makes way.
+
+        Raises
+        ------
+        Interrupted : told to stop.
+
+        """
+        self._make_way = True
+        with self._solving:
+            self._make_way = False
+            with self._lock:
+                backend, solver = self._backend, self._options.solver
+                now = backend.snapshot()
+            problem = now.problem()
+            if not len(problem.graph.between):
+                return None
+
+            def check() -> None:
+                if stopped() or backend is not self._backend:
+                    raise Interrupted
+
+            return self._adopt(optimise(problem, solver, check), backend, check)
+
+    def _adopt(self, improvement: Improvement, backend: Backend,
+               check: Callable[[], None]) -> Improvement:
+        """Take an improvement over into the back end it was made for, unless told to stop."""
         with self._lock:
-            self._backend.adopt(improvement)
+            check()
+            backend.adopt(improvement)
+            self.maps += 1
         return improvement
 
     def reset(self) -> None:
         """Forget everything."""
-        with self._lock:
-            self._backend = Backend(self._manifold, self._options)
+        self._replace(Backend(self._manifold, self._options))
 
     def save(self, path: Path) -> int:
         """Write graph, poses, stamps and trust as g2o and beside it; return how many keyframes."""
-        with self._lock:
-            graph, poses = self._backend.growth.graph.copy(), self._backend.poses
-            stamps = self._backend.growth.stamps
+        now = self._snapshot()
+        graph, poses, stamps = now.graph, now.poses, now.stamps
         if not len(graph.between):
             raise FileError(path, 'there is no graph yet to be saved')
         write_graph_file(path, GraphRecord(graph, poses, np.arange(len(poses)), stamps))
@@ -158,6 +227,12 @@ class SharedBackend:
                             'expected a saved map')
         backend = Backend(self._manifold, self._options)
         backend.restore(record.graph, record.poses, record.stamps)
-        with self._lock:
-            self._backend = backend
+        self._replace(backend)
         return len(record.poses)
+
+    def _replace(self, backend: Backend) -> None:
+        with self._lock:
+            # Options may have changed since it was made.
+            backend.set_options(self._options)
+            self._backend = backend
+            self.maps += 1

@@ -34,3 +34,19 @@ def ros():
     rclpy.init()
     yield rclpy
     rclpy.try_shutdown()
+
+
+@pytest.fixture
+def bench(ros):
+    """Return what makes a node with a peer, of some parameters; all are closed after the test."""
+    from node_bench import Bench
+
+    benches = []
+
+    def make(**parameters):
+        benches.append(Bench(ros, parameters))
+        return benches[-1]
+
+    yield make
+    for made in benches:
+        made.close()

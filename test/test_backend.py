@@ -19,23 +19,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from problems import PERIOD, loop, odometry, play, seconds
 
 from l1slam_ros.core import se2
-from l1slam_ros.core.backend import (
-    ACCEPTED,
-    EXPIRED,
-    LOOP_STATES,
-    REJECTED,
-    SUSPECT,
-    WAITING,
-    Backend,
-    BackendOptions,
-    RobustOptions,
-    improve,
-    optimise,
-)
+from l1slam_ros.core.backend import Backend, BackendOptions, RobustOptions, improve, optimise
 from l1slam_ros.core.cholesky import cholesky_of
+from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.growth import LoopOptions
 from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.linearise import whitened_residual
+from l1slam_ros.core.loop_states import ACCEPTED, EXPIRED, LOOP_STATES, REJECTED, SUSPECT, WAITING
 from l1slam_ros.core.optimality import Status, l1_cost
 from l1slam_ros.core.optimiser import OptimiserOptions, minimise
 from l1slam_ros.core.primal_dual import PrimalDualOptions
@@ -563,6 +553,80 @@ def test_the_account_of_an_update_is_true(world):
 
 
 # Options and errors
+
+
+def test_what_was_judged_by_other_options_is_not_adopted(careful):
+    backend, world = Backend(se2, EVERY), spoilt(careful, 'random', 130)
+    play(backend, world, 0, 150)
+    doubting = improve(backend.problem(), EVERY.solver, PLENTY)
+    assert not doubting.belief.accepted.all()
+    backend.set_options(CREDULOUS)
+    before = backend.poses
+    backend.adopt(doubting)
+    assert_array_equal(backend.poses, before)
+    assert backend.problem().belief.accepted.all()
+
+
+@pytest.mark.parametrize('name', ['poses', 'dual', 'cost'])
+def test_what_is_not_finite_is_not_adopted(world, name):
+    backend = Backend(se2, EVERY)
+    play(backend, world, 0, 40)
+    settled(backend)
+    before = backend.poses
+    play(backend, world, 40, 60)
+    good = improve(backend.problem(), EVERY.solver, PLENTY)
+    value = np.copy(getattr(good, name))
+    value.flat[-1] = np.nan
+    with pytest.raises(ArithmeticError, match=f'the {name} of a new map is not finite'):
+        backend.adopt(replace(good, **{name: value}))
+    assert_array_equal(backend.poses[:40], before)
+    backend.adopt(good)
+    assert_array_equal(backend.poses, good.poses)
+
+
+@pytest.mark.parametrize('work', ['improve', 'optimise', 'optimise all'])
+def test_work_can_be_stopped_at_many_moments(careful, work):
+    world = spoilt(careful, 'random', 130)
+    backend = Backend(se2, CREDULOUS if work == 'optimise all' else EVERY)
+    play(backend, world)
+    problem = backend.problem()
+    kept = problem.poses.copy(), problem.belief.accepted.copy()
+    limit, count = 10**9, 0
+
+    def check():
+        nonlocal count
+        count += 1
+        if count > limit:
+            raise Interrupted
+
+    def run():
+        nonlocal count
+        count = 0
+        if work == 'improve':
+            improve(problem, EVERY.solver, PLENTY, check)
+        else:
+            optimise(problem, EVERY.solver, check)
+
+    run()
+    assert count > 20
+    for limit in np.linspace(0, count - 1, 8).astype(int):
+        with pytest.raises(Interrupted):
+            run()
+        assert count == limit + 1, 'it went on after it was stopped'
+    assert_array_equal(problem.poses, kept[0])
+    assert_array_equal(problem.belief.accepted, kept[1])
+
+
+def test_a_large_map_comes_to_rest_though_no_update_ends_by_its_tests(world):
+    """As where the budget is over after one linearisation, update after update."""
+    options = replace(EVERY, solver=OptimiserOptions(outer_iterations=1))
+    backend = Backend(se2, options)
+    play(backend, world)
+    updates = settled(backend)
+    assert backend.problem().settled and updates > 5
+    assert cost(world.graph, backend.poses) == pytest.approx(batch_of(world.graph).cost, rel=1e-3)
+    play(backend, careful_world(151, 320), 150, 151)
+    assert not backend.problem().settled
 
 
 def test_options_may_change_on_the_way(world):

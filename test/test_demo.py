@@ -12,6 +12,7 @@ import pytest
 rclpy = pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point, Pose, PoseStamped
 from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
@@ -28,7 +29,7 @@ from l1slam_ros.demo import (
     summarise,
 )
 from l1slam_ros.io.bag import read_messages
-from l1slam_ros.publishing import pose_stamped
+from l1slam_ros.publishing import header
 
 DEMO = Path(__file__).parents[1] / BAG
 DEADLINE = 60.0
@@ -60,7 +61,7 @@ def test_the_summary_of_a_perfect_map_is_an_error_of_zero(tmp_path):
     assert (len(recording.stamps), len(recording.loops)) == (1000, 611)
     turned = recording.truth @ np.array([[0.0, -1.0], [1.0, 0.0]]) + (5.0, 6.0)
     path = PathMessage(poses=[
-        pose_stamped('map', int(stamp), np.array([x, y, 0, 0, 0, 0, 1.0]))
+        PoseStamped(header=header('map', int(stamp)), pose=Pose(position=Point(x=x, y=y)))
         for stamp, (x, y) in zip(recording.stamps, turned, strict=True)])
     heard = Heard(path, [0.0, 0.25, 0.5], states_of(recording))
     for is_false in True, False:  # one of each is told apart wrongly

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The real node on real DDS, in this process: messages in, the optimised Path out."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -10,106 +9,37 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import Odometry, Path
-from rclpy.executors import SingleThreadedExecutor
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from node_bench import DEADLINE, TYPES, Bench, call, odometry, poses_of
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 from torn import torn_graph
 from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core import se2
-from l1slam_ros.core.backend import ACCEPTED, REJECTED
+from l1slam_ros.core.backend import Backend, BackendOptions
 from l1slam_ros.core.cholesky import cholesky_of
 from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.exact import minimise_interior_point
 from l1slam_ros.core.initial import odometry_poses
 from l1slam_ros.core.linearise import whitened_residual
+from l1slam_ros.core.loop_states import ACCEPTED, REJECTED
 from l1slam_ros.core.optimality import l1_cost
 from l1slam_ros.core.optimiser import OptimiserOptions
+from l1slam_ros.core.options import with_values
 from l1slam_ros.core.robust import robust_solve
 from l1slam_ros.core.seed import seed_poses
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bag import read_raw
 from l1slam_ros.io.graph_bag import write_graph_bag
 from l1slam_ros.io.graph_file import GraphRecord, read_graph_file, write_graph_file
-from l1slam_ros.node import BackendNode
+from l1slam_ros.io.messages import loop_closure, odometry_sample
 from l1slam_ros.publishing import header
 from l1slam_ros.verdict import doubt_sentence
 
 EVERY_MESSAGE = {'keyframe.translation': 0.0, 'keyframe.rotation': 0.0,
                  'odometry.covariance_source': 'increment'}
-DEADLINE = 60.0
-TYPES = {'/odom': Odometry, '/loop_closures': PoseWithCovarianceStamped}
-
-
-class Bench:
-    """The node under test and a peer that talks to it, spun by one executor."""
-
-    def __init__(self, rclpy, parameters):
-        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
-        self.backend = BackendNode(parameter_overrides=overrides)
-        self.peer = rclpy.create_node('peer')
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.backend)
-        self.executor.add_node(self.peer)
-        self.publishers = {topic: self.peer.create_publisher(kind, topic, QoSProfile(depth=1000))
-                           for topic, kind in TYPES.items()}
-        self.received = {'path': [], 'pose': [], 'map_to_odom': []}
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.listen(Path, 'path', latched)
-        self.listen(PoseStamped, 'pose', 1000)
-        self.listen(TransformStamped, 'map_to_odom', 1000)
-        self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values()),
-                   'the node subscribes')
-
-    def listen(self, kind, topic, qos):
-        self.peer.create_subscription(kind, topic, self.received[topic].append, qos)
-
-    def until(self, condition, what):
-        deadline = time.monotonic() + DEADLINE
-        while not condition():
-            assert time.monotonic() < deadline, f'waited {DEADLINE} s in vain until {what}'
-            self.executor.spin_once(timeout_sec=0.05)
-
-    def send(self, topic, message):
-        self.publishers[topic].publish(message)
-        self.executor.spin_once(timeout_sec=0.0)
-
-    def path(self):
-        return self.received['path'][-1] if self.received['path'] else Path()
-
-    def close(self):
-        self.executor.shutdown()
-        self.backend.close()
-        self.peer.destroy_node()
-
-
-@pytest.fixture
-def bench(ros):
-    benches = []
-
-    def make(**parameters):
-        benches.append(Bench(ros, parameters))
-        return benches[-1]
-
-    yield make
-    for made in benches:
-        made.close()
-
-
-def odometry(stamp, x, frame='base_link'):
-    message = Odometry(header=header('odom', stamp), child_frame_id=frame)
-    message.pose.pose.position.x = x
-    return message
-
-
-def poses_of(path):
-    return se2.from_pose3(np.array([
-        (p.pose.position.x, p.pose.position.y, p.pose.position.z, p.pose.orientation.x,
-         p.pose.orientation.y, p.pose.orientation.z, p.pose.orientation.w)
-        for p in path.poses]).reshape(-1, 7))
 
 
 def play(bench, bag):
@@ -161,6 +91,42 @@ def test_intel_ends_within_two_percent_of_the_optimum(bench, tmp_path, datasets)
     assert_near_optimum(b, once, 961.77375, 0.02)
 
 
+def spoil(message, odometry_count):
+    """Let every twentieth odometry message know nothing, or all to the last atom."""
+    if odometry_count % 20 == 7:
+        variance = (1e12, 1e-20)[odometry_count // 20 % 2]
+        message.pose.covariance = (variance * np.eye(6)).ravel()
+
+
+def test_intel_survives_repeated_loops_and_absurd_covariances(bench, tmp_path, datasets):
+    """Each loop five times, odometry variances of 1e12 and 1e-20 in between."""
+    record = read_graph_file(datasets / 'intel.g2o')
+    write_graph_bag(tmp_path / 'bag', record)
+    clean = Backend(se2, with_values(BackendOptions(), EVERY_MESSAGE))
+    b = bench(**EVERY_MESSAGE)
+    sent = 0
+    for raw in read_raw(tmp_path / 'bag'):
+        message = deserialize_message(raw.data, TYPES[raw.topic])
+        if raw.topic == '/odom':
+            clean.add_odometry(odometry_sample(message))
+            spoil(message, sent)
+            sent += 1
+        else:
+            clean.add_loop(loop_closure(message, '', False))
+        for _ in range(1 if raw.topic == '/odom' else 5):
+            b.send(raw.topic, message)
+        if sent % 20 == 0:
+            b.until(lambda n=sent: len(b.received['pose']) >= n, 'poses come back')
+    while clean.update(DEADLINE) is not None:
+        pass
+    b.until(lambda: len(b.path().poses) == 943, 'all keyframes are in the Path')
+
+    def error():
+        return np.linalg.norm((poses_of(b.path()) - clean.poses)[:, :2], axis=1).max()
+
+    b.until(lambda: error() < 0.15, 'the map is that of the clean messages')
+
+
 def test_pose_and_transform_agree_with_the_path(bench, tmp_path, rng):
     world = simulate_world(120, 200, WorldOptions(), rng)
     write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(120)))
@@ -183,7 +149,7 @@ def test_default_thresholds_make_a_keyframe_every_half_metre(bench):
     for k in range(101):
         b.send('/odom', odometry(10**9 + k * 10**8, 0.05 * k))
     b.until(lambda: len(b.path().poses) == 11, 'eleven keyframes came of five metres')
-    assert len(b.received['pose']) == 101
+    b.until(lambda: len(b.received['pose']) == 101, 'every message is answered')
 
 
 def test_bad_messages_are_counted_and_the_node_goes_on(bench):
@@ -212,16 +178,6 @@ def test_nonsense_parameters_are_refused_at_start_and_on_set(ros, bench):
     assert not answer.successful
     assert b.backend.set_parameters([Parameter('update.budget', value=0.05)])[0].successful
     assert b.backend.options.update.budget == 0.05
-
-
-def call(b, name, request=None):
-    """Call a service of the node and return its answer."""
-    kind = SetBool if name == 'pause' else Trigger
-    client = b.peer.create_client(kind, f'/backend/{name}')
-    b.until(client.service_is_ready, f'{name} is offered')
-    future = client.call_async(request or kind.Request())
-    b.until(future.done, f'{name} answers')
-    return future.result()
 
 
 def test_a_saved_map_is_loaded_and_odometry_goes_on_from_its_end(bench, tmp_path):

@@ -6,10 +6,11 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 from rclpy.serialization import deserialize_message
 
-from l1slam_ros.publishing import path_bytes, pose_stamped, transform_stamped
+from l1slam_ros.publishing import path_bytes, pose_bytes, transform_stamped
 
 
 def numbers(pose):
@@ -32,9 +33,17 @@ def test_ros_reads_the_path_that_was_meant(rng, frame, n):
     assert [numbers(p.pose) for p in path.poses] == pose3.tolist()
 
 
+@pytest.mark.parametrize('frame', ['', *('map_of_robot1'[:k] for k in range(1, 14))])
+def test_ros_reads_the_pose_that_was_meant(rng, frame):
+    pose3 = rng.normal(size=7)
+    pose = deserialize_message(pose_bytes(frame, 5_000_000_007, pose3), PoseStamped)
+    assert (pose.header.frame_id, numbers(pose.pose)) == (frame, pose3.tolist())
+    assert (pose.header.stamp.sec, pose.header.stamp.nanosec) == (5, 7)
+
+
 def test_a_pose_and_a_transform_hold_the_same_numbers():
     pose3 = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 0.4])
-    pose = pose_stamped('map', 2_000_000_003, pose3)
+    pose = deserialize_message(pose_bytes('map', 2_000_000_003, pose3), PoseStamped)
     transform = transform_stamped('map', 'odom', 2_000_000_003, pose3)
     assert numbers(pose.pose) == pose3.tolist()
     t, r = transform.transform.translation, transform.transform.rotation

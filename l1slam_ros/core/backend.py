@@ -3,14 +3,15 @@
 The incremental back end: samples and loops in, optimised poses out.
 
 `Backend` owns the growing graph, the poses and the dual. An update is three calls, so that a
-caller with threads need hold its lock for the first and the last only, which are short:
+caller with threads need hold its lock for two short moments only, `snapshot` and `adopt`:
 
-    problem = backend.problem()                         # snapshot, O(new loops)
+    problem = backend.snapshot().problem()
     improvement = improve(problem, options, budget)     # the work; touches nothing of the backend
     backend.adopt(improvement)                          # poses and dual for the next warm start
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.growth import GraphGrowth, GrowthOptions
 from l1slam_ros.core.least_squares import reweighted_step
 from l1slam_ros.core.linearise import linearise, whitened_residual
+from l1slam_ros.core.loop_states import LoopStates
 from l1slam_ros.core.manifold import Array, Indices, Manifold
 from l1slam_ros.core.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.optimality import Status, l1_cost, smoothing
@@ -30,6 +32,11 @@ from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.robust import Doubt
 from l1slam_ros.core.robust_map import minimise_robustly
 from l1slam_ros.core.seed import seed_poses
+from l1slam_ros.core.snapshot import Problem, Snapshot
+
+# A large map gets but one linearisation into an update, and never meets a test that takes two of
+# them. It is at rest when so many updates in a row lowered the cost by less than is looked for.
+_QUIET_UPDATES = 5
 
 
 @dataclass(frozen=True)
@@ -47,24 +54,6 @@ class BackendOptions(GrowthOptions):
 
     solver: OptimiserOptions = OptimiserOptions()
     robust: RobustOptions = RobustOptions()
-
-
-@dataclass(frozen=True)
-class Problem:
-    """
-    A snapshot to improve: graph, poses (n, p), dual (rows,) and the cost the last update left.
-
-    belief : of all factors; robust : loops may be doubted; settled : nothing has come since an
-    update that converged.
-    """
-
-    graph: FactorGraph
-    poses: Array
-    dual: Array
-    belief: Belief
-    robust: bool
-    last_cost: float
-    settled: bool
 
 
 @dataclass(frozen=True)
@@ -92,26 +81,6 @@ class Improvement:
     doubt: Doubt | None = None
 
 
-# What can become of a loop; `LoopStates.state` counts in this order.
-LOOP_STATES = ('waiting', 'suspect', 'accepted', 'rejected', 'expired')
-WAITING, SUSPECT, ACCEPTED, REJECTED, EXPIRED = range(len(LOOP_STATES))
-
-
-@dataclass(frozen=True)
-class LoopStates:
-    """
-    What has become of the loops.
-
-    rows : (k,) the between factors of the first k of them; stamps : (l, 2) [ns] reference and end;
-    state : (l,) of `LOOP_STATES`; sigmas : (l,), NaN where a loop was not looked at.
-    """
-
-    rows: Indices
-    stamps: Indices
-    state: Indices
-    sigmas: Array
-
-
 class Backend:
     """
     Keeps a map while it grows.
@@ -132,28 +101,33 @@ class Backend:
         self._belief = Belief.nothing()
         self._last_cost = 0.0
         self._status = Status.OUT_OF_TIME
+        self._changes = self._samples = self._quiet_updates = 0
+        self._map_to_odom: tuple[Array, Array] | None = None
+
+    @property
+    def version(self) -> tuple[int, int, int]:
+        """Other than an earlier one where there may be something new to do or to tell."""
+        growth = self.growth
+        # While loops wait, any sample may be the one that they wait for, or one too many.
+        return (self._changes, growth.graph.n_poses, self._samples if growth.n_waiting else 0)
 
     @property
     def poses(self) -> Array:
         """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
-        optimised, odometry = len(self._poses), self.growth.odometry
-        if not optimised or optimised == len(odometry):
-            return np.concatenate((self._poses, odometry[optimised:]))
-        new = odometry[optimised:]
-        start = np.broadcast_to(odometry[optimised - 1], new.shape)
-        last = np.broadcast_to(self._poses[-1], new.shape)
-        carried = self._manifold.compose(last, self._manifold.between(start, new))
-        return np.concatenate((self._poses, carried))
+        return self._now().poses
 
     @property
     def map_to_odom(self) -> Array:
         """The odometry frame seen from the map, (1, p): what the last optimised keyframe says."""
-        last = len(self._poses) - 1
+        last, manifold, offset = len(self._poses) - 1, self._manifold, self.growth.offset
         if last < 0:
-            return self._manifold.identity(1)
-        manifold, odometry = self._manifold, self.growth.odometry[last : last + 1]
-        to_kept = manifold.compose(self._poses[last:], manifold.inverse(odometry))
-        return manifold.compose(to_kept, self.growth.offset)
+            return manifold.identity(1)
+        # Asked for with every sample: worked out when an update or a new offset changes it.
+        if self._map_to_odom is None or self._map_to_odom[0] is not offset:
+            odometry = self.growth.odometry[last : last + 1]
+            to_kept = manifold.compose(self._poses[last:], manifold.inverse(odometry))
+            self._map_to_odom = offset, manifold.compose(to_kept, offset)
+        return self._map_to_odom[1]
 
     def set_options(self, options: BackendOptions) -> None:
         """
@@ -162,6 +136,7 @@ class Backend:
         Where loops are to be doubted that were not before, or the other way round, all are judged
         anew.
         """
+        self._changes += 1
         if options.robust != self._options.robust:
             self._belief, self._status = Belief.nothing(), Status.OUT_OF_TIME
         self._options = options
@@ -170,38 +145,61 @@ class Backend:
     def restore(self, graph: FactorGraph, poses: Array, stamps: Indices) -> None:
         """Begin with the map of an earlier run: see `GraphGrowth.restore`; call it first."""
         self.growth.restore(graph, stamps, poses)
-        self._poses = poses
+        self._poses, self._map_to_odom = poses, None
+        self._changes += 1
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """Add one sample; see `GraphGrowth.add_odometry`."""
+        _require_finite(sample.pose3)
+        self._samples += 1
         return self.growth.add_odometry(sample)
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Add one loop closure; see `GraphGrowth.add_loop`."""
+        _require_finite(loop.pose3)
+        self._changes += 1
         self.growth.add_loop(loop)
 
-    def problem(self) -> Problem:
-        """Return a snapshot of the graph, the due loops in it, warm start included."""
+    def snapshot(self) -> Snapshot:
+        """Return the back end as it is, the due loops in its graph, to be read at leisure."""
         self.growth.add_due_loops()
-        graph = self.growth.graph.copy()
-        rows = len(graph.between) * self._manifold.TANGENT_SIZE
-        # Rows are only ever appended, so the dual of the old ones stays; new ones start at zero.
-        dual = np.concatenate((self._dual, np.zeros(rows - len(self._dual))))
-        robust = self._options.robust.enabled
-        belief = self._belief.extended(graph, robust)
-        grown = len(self._poses) < graph.n_poses or len(self._dual) < rows
-        settled = (not grown and belief.settled
-                   and self._status in (Status.CONVERGED, Status.STALLED))
-        return Problem(graph, self.poses, dual, belief, robust, self._last_cost, settled)
+        return self._now()
+
+    def problem(self) -> Problem:
+        """Return what an update begins with."""
+        return self.snapshot().problem()
+
+    def _now(self) -> Snapshot:
+        growth = self.growth
+        at_rest = (self._status in (Status.CONVERGED, Status.STALLED)
+                   or self._quiet_updates >= _QUIET_UPDATES)
+        return Snapshot(
+            self.version, growth.graph.copy(), growth.stamps, growth.odometry, self.map_to_odom,
+            growth.loop_rows, growth.loop_stamps, self._poses, self._dual, self._belief,
+            self._options.robust.enabled, self._last_cost, at_rest)
 
     def adopt(self, improvement: Improvement) -> None:
         """
         Take over what `improve` made of a snapshot; keyframes since then follow along.
 
         What was made when loops were judged otherwise is left.
+
+        Raises
+        ------
+        ArithmeticError : it is not finite; nothing is taken over.
+
         """
         if improvement.robust != self._options.robust.enabled:
             return
+        for name in ('poses', 'dual', 'cost'):
+            if not np.isfinite(getattr(improvement, name)).all():
+                raise ArithmeticError(f'the {name} of a new map is not finite; the map stays')
+        self._changes += 1
+        fell = improvement.cost_before - improvement.cost
+        quiet = (improvement.belief.settled and len(improvement.dual) == len(self._dual)
+                 and fell <= self._options.solver.outer_tolerance * improvement.cost)
+        self._quiet_updates = self._quiet_updates + 1 if quiet else 0
+        self._map_to_odom = None
         self._poses = improvement.poses
         self._dual = improvement.dual
         self._belief = improvement.belief
@@ -210,15 +208,7 @@ class Backend:
 
     def loop_states(self) -> LoopStates:
         """Return what has become of each loop, those of the graph first, in its order."""
-        in_graph, waiting, expired = self.growth.loop_stamps
-        belief = self._belief.extended(self.growth.graph, self._options.robust.enabled)
-        rows = self.growth.loop_rows
-        state = np.where(belief.accepted[rows], ACCEPTED,
-                         np.where(belief.suspect[rows], SUSPECT, REJECTED))
-        others = np.repeat([WAITING, EXPIRED], [len(waiting), len(expired)])
-        sigmas = np.concatenate((belief.sigmas[rows], np.full(len(others), np.nan)))
-        return LoopStates(rows, np.concatenate((in_graph, waiting, expired)),
-                          np.concatenate((state, others)), sigmas)
+        return self._now().loop_states()
 
     def update(self, budget: float) -> Improvement | None:
         """Improve the map for about `budget` seconds; None: there was nothing to do."""
@@ -230,7 +220,12 @@ class Backend:
         return improvement
 
 
-def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Improvement:
+# Called on the way, often; raises where the work shall stop.
+Check = Callable[[], None]
+
+
+def improve(problem: Problem, options: OptimiserOptions, budget: float,
+            check: Check = lambda: None) -> Improvement:
     """
     Judge the loops that have come and lower the L1 cost of a snapshot, for about `budget` seconds.
 
@@ -243,9 +238,10 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Impro
     deadline = start + budget
     belief, starts = problem.belief, [problem.poses]
     if not belief.settled:
-        belief, judged = judge(problem.graph, problem.poses, belief, deadline)
+        belief, judged = judge(problem.graph, problem.poses, belief, deadline, check)
         # After a loop has closed, the L2 map of the judgement is nearer.
         starts.append(judged)
+    check()
     graph = problem.graph.subset(belief.accepted)
     size = graph.manifold.TANGENT_SIZE
     dual = problem.dual.reshape(-1, size)[belief.accepted].ravel()
@@ -255,17 +251,19 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float) -> Impro
     steps, far = 0, is_far(cost, problem.last_cost)
     cholesky = cholesky_of(graph) if far else None
     while cholesky and far and (not steps or time.monotonic() < deadline):
+        check()
         system = linearise(graph, poses)
         step, dual = reweighted_step(system, cholesky, system.b, smoothing(system.b))
         previous = cost
         poses, cost = backtrack(graph, poses, step, cost)
         steps += 1
         far = is_far(previous, cost)
-    solution = minimise(graph, poses, options, cholesky, dual, deadline)
+    solution = minimise(graph, poses, options, cholesky, dual, deadline, lambda *_: check())
     return _improvement(solution, problem, belief, before, steps, start)
 
 
-def optimise(problem: Problem, options: OptimiserOptions) -> Improvement:
+def optimise(problem: Problem, options: OptimiserOptions,
+             check: Check = lambda: None) -> Improvement:
     """
     Solve a snapshot to the end; where loops are doubted, after judging all of them anew.
 
@@ -274,19 +272,29 @@ def optimise(problem: Problem, options: OptimiserOptions) -> Improvement:
     start = time.monotonic()
     graph, belief, doubt = problem.graph, problem.belief, None
     if problem.robust:
-        found = minimise_robustly(graph, lambda part, poses: _solved(part, poses, options))
+        found = minimise_robustly(
+            graph, lambda part, poses: _solved(part, poses, options, check), check=check)
         solution, doubt, belief = found.solution, found.doubt, Belief(
             found.accepted, found.suspect, found.sigmas, found.variance)
     else:
-        starts = (problem.poses, seed_poses(graph, choose(AUTO, graph).cholesky))
-        solution = min((_solved(graph, poses, options) for poses in starts), key=lambda s: s.cost)
+        starts = (problem.poses, seed_poses(graph, choose(AUTO, graph).cholesky, check=check))
+        solution = min((_solved(graph, poses, options, check) for poses in starts),
+                       key=lambda s: s.cost)
     part = graph.subset(belief.accepted)
     before = l1_cost(whitened_residual(part, problem.poses))
     return replace(_improvement(solution, problem, belief, before, 0, start), doubt=doubt)
 
 
-def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions) -> Solution:
-    return minimise_by(choose(AUTO, graph), graph, poses, options)[0]
+def _require_finite(pose3: Array) -> None:
+    # It would spoil all that comes after it.
+    if not np.isfinite(pose3).all():
+        raise ArithmeticError(f'pose {pose3} is not finite')
+
+
+def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
+            check: Check) -> Solution:
+    check()
+    return minimise_by(choose(AUTO, graph), graph, poses, options, lambda *_: check())[0]
 
 
 def _improvement(solution: Solution, problem: Problem, belief: Belief, before: float, steps: int,

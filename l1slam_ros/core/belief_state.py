@@ -7,6 +7,7 @@ The rounds are those of the batch solve (`robust`), from the state that is there
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,7 +63,8 @@ class Belief:
 
 
 def judge(
-    graph: FactorGraph, poses: Array, belief: Belief, deadline: float
+    graph: FactorGraph, poses: Array, belief: Belief, deadline: float,
+    check: Callable[[], None] = lambda: None,
 ) -> tuple[Belief, Array]:
     """
     Return what is to be believed, after looking again at all loops that are not, and its L2 map.
@@ -73,9 +75,10 @@ def judge(
     ----------
     poses : (n, p) the map of what was believed
     deadline : `time.monotonic()` [s] after which no second round begins
+    check : called before long steps, raises where the work shall stop
 
     """
-    first, settled = Growth(graph), True
+    first, settled = Growth(graph, check), True
     first.resume(poses, belief.accepted, belief.variance)
     growth = first
     for growth in rounds(first, lambda _: None):

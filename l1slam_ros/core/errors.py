@@ -18,6 +18,10 @@ class DoubtfulError(L1SlamError):
     """A map that was made all the same, and is not to be relied on."""
 
 
+class Interrupted(Exception):  # noqa: N818
+    """Work was told to stop before its end; no input is to blame, and nothing of it is used."""
+
+
 class NoiseError(L1SlamError):
     """A covariance or information matrix that is none."""
 

@@ -86,7 +86,8 @@ Report = Callable[[int, int], None]
 
 
 def robust_solve(
-    graph: FactorGraph, report: Report = lambda round_, accepted: None
+    graph: FactorGraph, report: Report = lambda round_, accepted: None,
+    check: Callable[[], None] = lambda: None,
 ) -> RobustSolution:
     """
     Find out which loops to believe, from the graph alone.
@@ -94,13 +95,14 @@ def robust_solve(
     Parameters
     ----------
     report : called with the round and the loops accepted so far
+    check : called before long steps, raises where the work shall stop
 
     Raises
     ------
     GraphError : the odometry has a gap.
 
     """
-    first = growth = Growth(graph)
+    first = growth = Growth(graph, check)
     first.begin()
     number = 0
     for number, growth in enumerate(rounds(first, without_slip), 1):
@@ -187,7 +189,8 @@ def reconsidered(graph: FactorGraph, poses: Array, accepted: Mask) -> Mask:
     return np.where(is_loop, fits | factors.trusted, accepted)
 
 
-def minimise_accepted(graph: FactorGraph, poses: Array, accepted: Mask) -> Array:
+def minimise_accepted(graph: FactorGraph, poses: Array, accepted: Mask,
+                      check: Callable[[], None] = lambda: None) -> Array:
     """Return the L2 map (n, p) of the accepted factors, in the units that they state."""
     part = graph.subset(accepted)
-    return solve(part, poses, cholesky_of(part))
+    return solve(part, poses, cholesky_of(part), lambda *_: check())

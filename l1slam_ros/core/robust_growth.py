@@ -6,6 +6,7 @@ In: a graph and what is believed of it. Out: the same with more loops believed. 
 """
 
 import copy
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -26,6 +27,7 @@ from l1slam_ros.core.linearise import anchor, linearise, step_poses, whitened_re
 from l1slam_ros.core.manifold import Array, Indices
 from l1slam_ros.core.noise import Mask
 from l1slam_ros.core.optimality import l2_cost
+from l1slam_ros.core.optimiser import Report
 from l1slam_ros.core.prediction import (
     Innovations,
     Posterior,
@@ -67,10 +69,12 @@ class Growth:
 
     accepted, is_loop, trusted : (m,) bool of the between factors; low, high : (m,) the earlier and
     the later keyframe of each; poses : (n, p) the L2 map of the accepted; posterior : of these;
-    variance : (2,) of odometry and loops in units of what they state.
+    variance : (2,) of odometry and loops in units of what they state; check : called before long
+    steps, raises where the work shall stop.
     """
 
-    def __init__(self, graph: FactorGraph):
+    def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
+        self._check = check
         self.graph, self.factors, self.trusted = graph, graph.between, graph.between.trusted
         self.rng = np.random.default_rng(_SEED)
         self.low = np.minimum(self.factors.i, self.factors.j)
@@ -113,6 +117,7 @@ class Growth:
 
     def part(self, rows: Indices) -> FactorGraph:
         """Return the graph of some factors, with the noise as it was found."""
+        self._check()  # with this, each long step begins
         variance = np.maximum(self.variance, self._least_variance)
         return self.graph.subset(rows, variance[self.is_loop[rows].astype(np.int64)])
 
@@ -148,7 +153,9 @@ class Growth:
             rows = np.flatnonzero(self.accepted)
             part = self.part(rows)
             cholesky = cholesky_of(part)
-            self.poses = solve(part, self.poses, cholesky)
+            self._check()
+            self.poses = solve(part, self.poses, cholesky, lambda *_: self._check())
+            self._check()
             self.posterior = sample_posterior(part, self.poses, cholesky, self.rng)
             drop = self._misfits(rows)
             self.accepted[drop] = False
@@ -235,7 +242,8 @@ class Growth:
         return chosen
 
 
-def solve(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:
+def solve(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
+          report: Report = lambda iteration, cost: None) -> Array:
     """
     Return the L2 map of a graph to within its noise: chi2 one above the optimum or less.
 
@@ -249,7 +257,8 @@ def solve(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:
     if chi2 > _FITS * spare:
         linear = _two_linear_steps(graph, poses, cholesky)
         poses = linear if _chi2(graph, linear) < chi2 else poses
-    return minimise_l2(graph, poses, LeastSquaresOptions(_STEPS, 1 / spare), cholesky).poses
+    return minimise_l2(graph, poses, LeastSquaresOptions(_STEPS, 1 / spare), cholesky,
+                       report).poses
 
 
 def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:

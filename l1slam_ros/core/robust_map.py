@@ -50,17 +50,17 @@ class RobustMap:
 
 def minimise_robustly(
     graph: FactorGraph, minimise: Callable[[FactorGraph, Array], Solution],
-    report: Report = lambda round_, accepted: None,
+    report: Report = lambda round_, accepted: None, check: Callable[[], None] = lambda: None,
 ) -> RobustMap:
     """
     Return the map that `minimise` makes of the factors that may be believed.
 
-    minimise : from a graph and poses (n, p) to its solution; report : see `robust_solve`
+    minimise : from a graph and poses (n, p) to its solution; report, check : see `robust_solve`
     """
-    found = robust_solve(graph, report)
+    found = robust_solve(graph, report, check)
     accepted, poses = found.accepted, found.poses
     for _ in range(_MOST_ROUNDS):
-        poses, before = minimise_accepted(graph, poses, accepted), accepted
+        poses, before = minimise_accepted(graph, poses, accepted, check), accepted
         accepted = reconsidered(graph, poses, before)
         if (accepted == before).all():
             break

@@ -7,6 +7,8 @@ rotation rows involve the rotations alone (see `noise`), so they are solved firs
 rotations fixed, the remaining rows are linear in the translations.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from l1slam_ros.core.cholesky import BlockCholesky
@@ -37,7 +39,7 @@ _SAME = 1e-6
 
 def seed_poses(
     graph: FactorGraph, cholesky: BlockCholesky | None,
-    options: PrimalDualOptions = SEED_OPTIONS,
+    options: PrimalDualOptions = SEED_OPTIONS, check: Callable[[], None] = lambda: None,
 ) -> Array:
     """
     Return the poses of Algorithm 3, (n, p).
@@ -48,6 +50,7 @@ def seed_poses(
     Parameters
     ----------
     cholesky : of the graph; None: by the primal-dual method alone
+    check : called on the way, raises where the work shall stop
 
     """
     references = [tree_poses(graph, 0), tree_poses(graph, graph.n_poses // 2)]
@@ -57,10 +60,10 @@ def seed_poses(
     for k, reference in enumerate(references):
         # Two references that unwrap every factor alike lead to one and the same problem.
         if not any(_unwrap_alike(graph, reference, other) for other in references[:k]):
-            candidates.append(_solve_rotations(graph, reference, cholesky, options))
+            candidates.append(_solve_rotations(graph, reference, cholesky, options, check))
     poses = min(candidates, key=lambda poses: _rotation_cost(graph, poses))
     system = translation_system(graph, poses)
-    x = _minimise(system, cholesky, options)
+    x = _minimise(system, cholesky, options, check)
     return _moved(graph, poses, x, graph.manifold.TRANSLATION)
 
 
@@ -75,12 +78,12 @@ def translation_system(graph: FactorGraph, poses: Array) -> LinearSystem:
 
 
 def _solve_rotations(graph: FactorGraph, poses: Array, cholesky: BlockCholesky | None,
-                     options: PrimalDualOptions) -> Array:
+                     options: PrimalDualOptions, check: Callable[[], None]) -> Array:
     """Solve for the rotations, re-wrapped against the last solution while the cost falls."""
     cost = _rotation_cost(graph, poses)
     for _ in range(_MOST_ROUNDS):
         system = rotation_system(graph, poses)
-        x = _minimise(system, cholesky, options)
+        x = _minimise(system, cholesky, options, check)
         candidate = _moved(graph, poses, x, graph.manifold.ROTATION)
         candidate_cost = _rotation_cost(graph, candidate)
         if candidate_cost >= cost:
@@ -92,14 +95,15 @@ def _solve_rotations(graph: FactorGraph, poses: Array, cholesky: BlockCholesky |
 
 
 def _minimise(system: LinearSystem, cholesky: BlockCholesky | None,
-              options: PrimalDualOptions) -> Array:
+              options: PrimalDualOptions, check: Callable[[], None]) -> Array:
     """Return argmin |A x - b|_1 of one of the two convex problems."""
+    check()
     if cholesky is None:
         start = np.zeros(system.size * system.block_size), np.zeros(len(system.b))
         return minimise_l1_halpern(system, *start, options).x
     x = weighted_least_squares(system, cholesky, np.ones(len(system.b)))
     return interior_point(LinearProblem(system), x, cholesky, options.iterations,
-                          options.tolerance).poses
+                          options.tolerance, lambda *_: check()).poses
 
 
 def _unwrap_alike(graph: FactorGraph, poses: Array, others: Array) -> bool:

@@ -26,6 +26,8 @@ NANOSECONDS = 10**9
 LARGEST = 1e30
 # The longest piece of a damaged file that is quoted in an error.
 _QUOTED = 40
+# So many lines are formatted in one go.
+_AT_ONCE = 500
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,17 @@ def put_lines(path: Path, lines: Iterable[str]) -> None:
         file.flush()
         # Or a power cut just after the file is put in its place could leave it empty.
         os.fsync(file.fileno())
+
+
+def formatted(line: str, *columns: np.ndarray) -> list[str]:
+    """
+    Return `line % row` for each row of some tables (m, k) side by side, many lines to a string.
+
+    To format many at once takes a third less time than one by one; more would hold up others.
+    """
+    rows = np.concatenate([table.astype(object) for table in columns], axis=1)
+    parts = (rows[k : k + _AT_ONCE] for k in range(0, len(rows), _AT_ONCE))
+    return ['\n'.join([line] * len(part)) % tuple(part.ravel().tolist()) for part in parts]
 
 
 def write_lines(path: str | os.PathLike[str], lines: Iterable[str]) -> None:

@@ -28,6 +28,7 @@ from l1slam_ros.io.files import (
     LARGEST,
     TextLines,
     first_failure,
+    formatted,
     parse_rows,
     put_lines,
     quoted,
@@ -303,7 +304,7 @@ def _skipped(groups: dict[str, TextLines], ids: Indices) -> tuple[str, ...]:
 
 
 def _text(path: Path, record: GraphRecord) -> list[str]:
-    """Return the lines of the file."""
+    """Return the lines of the file, many to a string."""
     graph, ids = record.graph, record.ids
     none = np.empty((0, graph.manifold.TANGENT_SIZE, graph.manifold.TANGENT_SIZE))
     lines = []
@@ -336,6 +337,5 @@ def _lines(path: Path, graph: FactorGraph, kind: str, ids: Indices, pose: Array,
         k = int(np.argmin(readable))
         line = ' '.join((names[0], *map(str, ids[k]), 'would be', *(f'{v:g}' for v in values[k])))
         raise FileError(path, f'{line}; expected numbers to {LARGEST:g}; nothing written')
-    # repr: the fewest digits, 17 at most, that read back as the very same number.
-    return [f'{names[0]} {" ".join(map(repr, row_ids))} {" ".join(map(repr, row))}'
-            for row_ids, row in zip(ids.tolist(), values.tolist(), strict=True)]
+    # %r: the fewest digits, 17 at most, that read back as the very same number.
+    return formatted(f'{names[0]}{" %d" * ids.shape[1]}{" %r" * values.shape[1]}', ids, values)

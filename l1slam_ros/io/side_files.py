@@ -20,13 +20,14 @@ from l1slam_ros.core.graph import BetweenFactors
 from l1slam_ros.core.manifold import Indices
 from l1slam_ros.core.noise import Mask
 from l1slam_ros.io.files import (
+    NANOSECONDS,
+    formatted,
     parse_rows,
     put_lines,
     quoted,
     read_lines,
     replacing,
     stamp_from_text,
-    stamp_text,
 )
 
 
@@ -86,8 +87,7 @@ def _replaced(path: Path, lines: list[str]) -> Iterator[None]:
 
 
 def _stamp_lines(ids: Indices, stamps: Indices) -> list[str]:
-    return [f'{k} {stamp_text(stamp)}' for k, stamp
-            in zip(ids.tolist(), stamps.tolist(), strict=True)]
+    return formatted('%d %d.%09d', np.column_stack((ids, *np.divmod(stamps, NANOSECONDS))))
 
 
 def read_stamps(path: str | os.PathLike[str], ids: Indices) -> Indices | None:

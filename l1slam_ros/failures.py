@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What goes wrong in the node: told once in full, then remembered for as long as it lasts."""
+
+import math
+import time
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from l1slam_ros.core.errors import L1SlamError
+
+_REPEAT = 5.0  # [s] the log repeats a failure no more often
+
+
+class Failures:
+    """
+    The failures that last, by what fails: an update, a service, the callback of a topic.
+
+    Any thread may call it.
+
+    Parameters
+    ----------
+    logger : of the node
+    running : returns whether ROS is up: a signal can shut it down under any call, and what that
+        call then raises is no failure
+
+    """
+
+    def __init__(self, logger: Any, running: Callable[[], bool]):
+        self._logger, self._running = logger, running
+        self._lasting: dict[str, tuple[str, float]] = {}
+        self._known: set[tuple[object, ...]] = set()
+
+    @property
+    def lasting(self) -> dict[str, str]:
+        """What fails -> why."""
+        now = time.monotonic()
+        return {what: why for what, (why, until) in self._lasting.copy().items() if now < until}
+
+    def note(self, what: str, error: Exception, seconds: float = math.inf) -> None:
+        """
+        Remember a failure; its traceback is logged the first time that it comes from there.
+
+        seconds : for so long, unless it is over before
+        """
+        if not self._running():
+            return
+        self._lasting[what] = reason(error), time.monotonic() + seconds
+        # Nothing may be left, memory for one: who reports a failure must not fail by it.
+        with suppress(Exception):
+            self._tell(what, error)
+
+    def over(self, what: str) -> None:
+        """Forget a failure: it works again."""
+        if self._lasting:
+            self._lasting.pop(what, None)
+
+    def guarded(self, what: str, callback: Callable[..., None]) -> Callable[..., None]:
+        """Return a callback that notes whatever the given one raises."""
+
+        def guard(*arguments: Any) -> None:
+            try:
+                callback(*arguments)
+            except Exception as error:
+                self.note(what, error)
+            else:
+                self.over(what)
+
+        return guard
+
+    def _tell(self, what: str, error: Exception) -> None:
+        line = f'{what} failed: {reason(error)}'
+        frames = traceback.extract_tb(error.__traceback__)
+        kind = (what, type(error), *(frames[-1][:2] if frames else ()))
+        if not isinstance(error, L1SlamError) and kind not in self._known:
+            self._known.add(kind)
+            line += '\n' + ''.join(traceback.format_exception(error)).rstrip()
+            self._logger.error(line)
+        else:
+            self._logger.error(line, throttle_duration_sec=_REPEAT)
+
+
+def reason(error: Exception) -> str:
+    """Return what an error says, with its type where that is not ours, in one line."""
+    text = ' '.join(str(error).split())
+    if isinstance(error, L1SlamError | OSError):
+        return text or type(error).__name__
+    return f'{type(error).__name__}: {text}' if text else type(error).__name__

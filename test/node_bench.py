@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node under test in this process, and a peer that talks to it over real DDS."""
+
+import time
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import SetBool, Trigger
+
+from l1slam_ros.core import se2
+from l1slam_ros.node import BackendNode
+from l1slam_ros.publishing import header
+
+DEADLINE = 60.0
+TYPES = {'/odom': Odometry, '/loop_closures': PoseWithCovarianceStamped}
+
+
+class Bench:
+    """The node under test and a peer that talks to it, spun by one executor."""
+
+    def __init__(self, rclpy, parameters):
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        self.backend = BackendNode(parameter_overrides=overrides)
+        self.peer = rclpy.create_node('peer')
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.backend)
+        self.executor.add_node(self.peer)
+        self.publishers = {topic: self.peer.create_publisher(kind, topic, QoSProfile(depth=1000))
+                           for topic, kind in TYPES.items()}
+        self.received = {'path': [], 'pose': [], 'map_to_odom': [], '/diagnostics': []}
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.listen(Path, 'path', latched)
+        self.listen(PoseStamped, 'pose', 1000)
+        self.listen(TransformStamped, 'map_to_odom', 1000)
+        self.listen(DiagnosticArray, '/diagnostics', 100)
+        self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values()),
+                   'the node subscribes')
+
+    def listen(self, kind, topic, qos):
+        self.peer.create_subscription(kind, topic, self.received[topic].append, qos)
+
+    def until(self, condition, what):
+        deadline = time.monotonic() + DEADLINE
+        while not condition():
+            assert time.monotonic() < deadline, f'waited {DEADLINE} s in vain until {what}'
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def send(self, topic, message):
+        self.publishers[topic].publish(message)
+        self.executor.spin_once(timeout_sec=0.0)
+
+    def path(self):
+        return self.received['path'][-1] if self.received['path'] else Path()
+
+    def status(self):
+        """Return the last level, sentence and values that the node said of itself."""
+        if not self.received['/diagnostics']:
+            return None, '', {}
+        (status,) = self.received['/diagnostics'][-1].status
+        return status.level, status.message, {v.key: v.value for v in status.values}
+
+    def close(self):
+        self.executor.shutdown()
+        self.backend.close()
+        self.peer.destroy_node()
+
+
+def odometry(stamp, x, frame='base_link'):
+    message = Odometry(header=header('odom', stamp), child_frame_id=frame)
+    message.pose.pose.position.x = x
+    return message
+
+
+def poses_of(path):
+    return se2.from_pose3(np.array([
+        (p.pose.position.x, p.pose.position.y, p.pose.position.z, p.pose.orientation.x,
+         p.pose.orientation.y, p.pose.orientation.z, p.pose.orientation.w)
+        for p in path.poses]).reshape(-1, 7))
+
+
+def call(b, name, request=None):
+    """Call a service of the node and return its answer."""
+    kind = SetBool if name == 'pause' else Trigger
+    client = b.peer.create_client(kind, f'/backend/{name}')
+    b.until(client.service_is_ready, f'{name} is offered')
+    future = client.call_async(request or kind.Request())
+    b.until(future.done, f'{name} answers')
+    return future.result()
