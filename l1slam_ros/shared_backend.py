@@ -137,10 +137,10 @@ class SharedBackend:
         with self._lock:
             return self._backend.snapshot()
 
-    def alone(self, work: Callable[[], None]) -> None:
-        """Do some work while nothing is being solved, nor begins to be."""
+    def alone(self, work: Callable[[], bool]) -> bool:
+        """Do some work while nothing is being solved, nor begins to be; return what it returns."""
         with self._solving:
-            work()
+            return work()
 
     def update(self, budget: float, stopped: Stopped) -> Improvement | None:
         """

@@ -116,7 +116,8 @@ class SolverThread:
                 self._logger.info(f'compiling the solver, once on a machine: {self.compiling}')
 
         try:
-            self._backend.alone(lambda: fill_cache(report, self.is_closing))
+            if not self._backend.alone(lambda: fill_cache(report, self.is_closing)):
+                self._logger.debug('not all is compiled yet: the rest is when it is first called')
         except Exception as error:
             # Not the end: what is missing is compiled when it is first called.
             self._failures.note('compiling', error)

@@ -100,7 +100,7 @@ def listener(ros):
     recording = read_recording(DEMO)
     listener = Listener(node, recording)
     listener.path = PathMessage(poses=[
-        pose_stamped('map', int(stamp), np.array([0, 0, 0, 0, 0, 0, 1.0]))
+        PoseStamped(header=header('map', int(stamp)))
         for stamp in recording.stamps])
     yield listener
     node.destroy_node()

@@ -152,7 +152,23 @@ class Backend:
         """Add one sample; see `GraphGrowth.add_odometry`."""
         _require_finite(sample.pose3)
         self._samples += 1
-        return self.growth.add_odometry(sample)
+        graph = self.growth.graph
+        made = self.growth.add_odometry(sample)
+        if self.growth.graph is not graph:
+            self._forget_stray()
+        return made
+
+    def begin_anew(self) -> None:
+        """Forget the only sample so far; see `GraphGrowth.begin_anew`."""
+        self.growth.begin_anew()
+        self._forget_stray()
+
+    def _forget_stray(self) -> None:
+        """Forget the pose of a first sample that was none: an update may have looked at it."""
+        if self.growth.graph.n_poses < 2:
+            self._poses = self._poses[:0]
+        self._map_to_odom = None
+        self._changes += 1
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Add one loop closure; see `GraphGrowth.add_loop`."""
