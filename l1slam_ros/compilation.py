@@ -42,7 +42,7 @@ def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
 
     Parameters
     ----------
-    report : called with how many steps are done, and of how many, whenever one is
+    report : called with how many steps are done, of how many: at first, and whenever one is
     stopped : asked now and then; once it says yes, compiling ends and the call returns
     steps : what is needed, of `warm_up.STEPS`
 
@@ -57,6 +57,7 @@ def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
         return True
     if stopped() or not any(map(_is_writable, _folders())):
         return False
+    report(0, len(missing))
     for done, (step, files) in enumerate(_compiled(missing, stopped), 1):
         if files:
             known[step] = files

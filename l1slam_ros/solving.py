@@ -11,11 +11,13 @@ import numpy as np
 from l1slam_ros import formats, offline
 from l1slam_ros.commands import Ending, check_counts, named, read, warn, write_spoiled
 from l1slam_ros.compilation import fill_cache
+from l1slam_ros.core.choice import PRIMAL_DUAL
 from l1slam_ros.core.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.l2 import LeastSquaresOptions
 from l1slam_ros.core.manifold import Indices
 from l1slam_ros.core.optimality import SENTENCES
 from l1slam_ros.core.optimiser import OptimiserOptions
+from l1slam_ros.core.warm_up import DENSE, JUDGEMENT, SPARSE, STEPS
 from l1slam_ros.io.graph_file import GraphRecord
 from l1slam_ros.io.wording import counted
 from l1slam_ros.node_options import read_params_file
@@ -34,7 +36,7 @@ def solve(arguments: argparse.Namespace) -> Ending:
     if arguments.reference:
         truth = read_truth(arguments.reference, record, arguments.input)
         warn(truth.skipped, arguments.quiet)
-    _make_ready(arguments.quiet)
+    _make_ready(_steps(wish), arguments.quiet)
     outcome = _solved(arguments, record, wish)
     warnings = [*record.skipped, *(truth.skipped if truth else ())]
     if outcome.unjudged:
@@ -76,10 +78,17 @@ def _solved(
             lambda _, accepted: judging.advance(1, f'{counted(accepted, "loop")} believed'))
 
 
-def _make_ready(quiet: bool = False) -> None:
+def _steps(wish: offline.Wish) -> tuple[str, ...]:
+    """Return what to compile for a solve; a graph that fills in compiles more on its way."""
+    judgement = () if wish.robust is False else JUDGEMENT
+    dense = DENSE if wish.norm == 'l1' and wish.solver == PRIMAL_DUAL else ()
+    return (*SPARSE, *judgement, *dense)
+
+
+def _make_ready(steps: tuple[str, ...], quiet: bool = False) -> None:
     """Compile the solver's loops, which takes long only at the first use on a machine."""
     with Progress(None, 'part', quiet, 'compiling, once on this machine', delay=1.0) as progress:
-        fill_cache(lambda done, total: progress.reach(done, total), lambda: False)
+        fill_cache(progress.reach, lambda: False, steps)
 
 
 def _check_outputs(arguments: argparse.Namespace) -> None:
@@ -178,7 +187,7 @@ def corrupt(arguments: argparse.Namespace) -> Ending:
     former = known_false(arguments.input, record)
     believed = replace(record, graph=record.graph.subset(~former))
     options = LeastSquaresOptions()
-    _make_ready()
+    _make_ready(SPARSE)
     with named(arguments.input), Progress(options.iterations, 'step', label='solving') as progress:
         solution = offline.solve(
             believed, offline.Wish(norm='l2', robust=False, least_squares=options),
@@ -203,7 +212,7 @@ def reproduce(arguments: argparse.Namespace) -> Ending:
     from l1slam_ros.core.reproduction import Effort
     from l1slam_ros.paper import WORLDS
 
-    _make_ready()
+    _make_ready(STEPS)
     paper_experiments.reproduce(arguments.datasets, WORLDS[arguments.worlds], arguments.output,
                                 Effort())
     print(arguments.output / paper_experiments.REPORT)
