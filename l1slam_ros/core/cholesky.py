@@ -120,7 +120,7 @@ class BlockCholesky:
         layout = self._factored
         assert layout is not None, 'solve before factorise'
         x: Array = solve(layout.panels, *layout.shape, self.pattern.position,
-                         right.reshape(-1, len(layout.size)), layout.size)
+                         right.reshape(-1, len(layout.size)))
         return x.ravel()
 
     def solve_many(self, right: Array) -> Array:
