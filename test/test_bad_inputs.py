@@ -6,11 +6,12 @@ import pytest
 from problems import PERIOD, covariance6, loop, odometry
 
 from l1slam_ros.core import se2
-from l1slam_ros.core.backend import ACCEPTED, Backend, BackendOptions, RobustOptions, optimise
+from l1slam_ros.core.backend import Backend, BackendOptions, RobustOptions, optimise
 from l1slam_ros.core.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.graph import FactorGraph
 from l1slam_ros.core.initial import odometry_poses
 from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.loop_states import ACCEPTED
 from l1slam_ros.core.robust import robust_solve
 from l1slam_ros.core.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graph_file import read_graph_file
