@@ -86,6 +86,15 @@ class _Iterate:
         """What must stay positive: u, v, s, t."""
         return self.u, self.v, self.s, self.t
 
+    def advance(self, direction: '_Direction', primal: float) -> None:
+        """Go along a direction, u and v so far; the slacks stay positive."""
+        dual = direction.dual
+        self.u = self.u + primal * direction.u
+        self.v = self.v + primal * direction.v
+        self.y = self.y + dual * direction.y
+        self.s = np.maximum(self.s - dual * direction.y, _SMALLEST_SLACK)
+        self.t = np.maximum(self.t + dual * direction.y, _SMALLEST_SLACK)
+
     def is_solved(self, cost: float, tolerance: float) -> bool:
         split = l1_cost(self.residual - self.u + self.v)
         return split <= tolerance * cost and self.gap <= tolerance * cost
@@ -176,7 +185,7 @@ def interior_point(
         if at.is_solved(cost, tolerance) or fits_exactly(cost, len(at.y)):
             status = Status.CONVERGED if cost <= worst * costs[-1] else Status.STALLED
         if cost <= costs[-1]:
-            best = replace(at, s=at.s.copy(), t=at.t.copy(), y=at.y.copy())
+            best = replace(at)
         if iteration:
             costs.append(min(cost, costs[-1]))
             report(iteration, costs[-1])
@@ -240,8 +249,6 @@ def _start(problem: Problem, poses: Array) -> _Iterate:
 def _step(problem: Problem, at: _Iterate, cholesky: BlockCholesky,
           regularisation: _Regularisation) -> bool:
     """Move `at` by one predictor and corrector step; False: there was no direction."""
-    from l1slam_ros.core.kernels.interior_point import advance
-
     n, Q = len(at.y), at.weights
     if not regularisation.factorise(problem, at, Q, cholesky):
         return False
@@ -255,18 +262,18 @@ def _step(problem: Problem, at: _Iterate, cholesky: BlockCholesky,
     primal, at.poses, residual = _trusted(problem, at, corrector)
     regularisation.learn(primal)
     at.system = problem.linearise(at.poses, residual)
-    advance(*at.bounded, at.y, corrector.y, corrector.u, corrector.v, primal, corrector.dual,
-            _SMALLEST_SLACK)
+    at.advance(corrector, primal)
     return True
 
 
 def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, c1: Array,
                c2: Array) -> _Direction:
     """Solve for the step whose complementarity products become c1, c2 to first order."""
-    from l1slam_ros.core.kernels.interior_point import complete, right_side
+    from l1slam_ros.core.kernels.interior_point import complete
 
-    g, z = right_side(at.residual, *at.bounded, at.y, Q, c1, c2)
-    x = cholesky.solve(-at.system.transposed_times(z))
+    # e - (u - v) - (c1/s - u) + (c2/t - v)
+    g = at.residual - c1 / at.s + c2 / at.t
+    x = cholesky.solve(-at.system.transposed_times(at.y + Q * g))
     moved = at.system.times(x)
     y, u, v, primal, dual, gap = complete(*at.bounded, Q, c1, c2, g, moved, _FRACTION)
     return _Direction(x, moved, y, u, v, primal, dual, gap)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The row-wise work of one interior-point step, in single passes; names as in `interior_point`.
+The row-wise work of one interior-point step in a single pass; names as in `interior_point`.
 
 All arrays are (rows,). q = 1 / (u/s + v/t); c1, c2 are what the products u s and v t are to
 become.
@@ -9,16 +9,6 @@ become.
 import numpy as np
 
 from l1slam_ros.core.kernels.compiled import loop
-
-
-@loop('(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])')
-def right_side(e, u, v, s, t, y, q, c1, c2):
-    """Return g = e - (u - v) - (c1/s - u) + (c2/t - v), and y + q g."""
-    g, z = np.empty_like(e), np.empty_like(e)
-    for k in range(len(e)):
-        g[k] = e[k] - c1[k] / s[k] + c2[k] / t[k]
-        z[k] = y[k] + q[k] * g[k]
-    return g, z
 
 
 @loop('(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8)')
@@ -49,14 +39,3 @@ def complete(u, v, s, t, q, c1, c2, g, moved, fraction):
         total += ((u[k] + primal * du[k]) * (s[k] - dual * dy[k])
                   + (v[k] + primal * dv[k]) * (t[k] + dual * dy[k]))
     return dy, du, dv, primal, dual, total
-
-
-@loop('(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8, f8, f8)')
-def advance(u, v, s, t, y, dy, du, dv, primal, dual, smallest):
-    """Take the step in place; the slacks stay at `smallest` or above."""
-    for k in range(len(u)):
-        u[k] += primal * du[k]
-        v[k] += primal * dv[k]
-        y[k] += dual * dy[k]
-        s[k] = max(s[k] - dual * dy[k], smallest)
-        t[k] = max(t[k] + dual * dy[k], smallest)
