@@ -119,7 +119,7 @@ def test_a_cache_that_is_no_more_what_it_was_is_filled_again(installed, tmp_path
     assert fill(installed, tmp_path / 'home') == DONE
     for index in (kernels / '__pycache__').glob('se2.residual-*.nbi'):
         index.unlink()
-    assert fill(installed, tmp_path / 'home') == 'True [(1, 1)] False'
+    assert fill(installed, tmp_path / 'home') == 'True [(0, 1), (1, 1)] False'
     assert fill(installed, tmp_path / 'home', NO_PROCESS) == NOTHING_TO_DO
 
 
@@ -132,7 +132,7 @@ def test_where_nothing_can_be_kept_no_process_is_started(installed, tmp_path):
 
 def test_a_process_that_breaks_does_not_hold_up_the_others(installed, tmp_path):
     (installed / 'l1slam_ros' / 'core' / 'kernels' / 'se2.py').write_text('raise SystemExit\n')
-    assert fill(installed, tmp_path / 'home') == 'False [(1, 2)] False'
+    assert fill(installed, tmp_path / 'home') == 'False [(0, 2), (1, 2)] False'
 
 
 def test_it_ends_its_processes_when_it_is_stopped(tmp_path, monkeypatch):
