@@ -88,7 +88,7 @@ print(answer, reports, 'numba' in sys.modules)
 """
 # Nobody can start a process with this.
 NO_PROCESS = "sys.executable = '/nowhere/python'"
-DONE, NOTHING_TO_DO = 'True [(1, 2), (2, 2)] False', 'True [] False'
+DONE, NOTHING_TO_DO = 'True [(0, 2), (1, 2), (2, 2)] False', 'True [] False'
 
 
 def fill(installed, home, before=''):
