@@ -68,9 +68,9 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'backend = l1slam_ros.run_backend:main',
-            'replay = l1slam_ros.replay:main',
-            'l1slam = l1slam_ros.cli:main',
+            'backend = l1slam_ros.ros.run_backend:main',
+            'replay = l1slam_ros.ros.replay:main',
+            'l1slam = l1slam_ros.cli.main:main',
         ],
     },
 )

@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse import csr_array
 
-from l1slam_ros.core.choice import AUTO, choose
-from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.initial import odometry_poses
-from l1slam_ros.core.linearise import LinearSystem, anchor, linearise
-from l1slam_ros.core.manifold import Array
-from l1slam_ros.core.seed import seed_poses
-from l1slam_ros.core.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.graph_file import read_graph_file
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, linearise
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.solvers.solve import AUTO, choose
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.graphs.graph_file import read_graph_file
 
 GRAPHS = ('intel', 'manhattan3500', 'city10000')
 # Poses and edges of the world that has many loops per pose.

@@ -20,8 +20,8 @@ from cases import Case
 from graph_solvers import MOST_ITERATIONS, SAME_TOLERANCE, GraphSolver
 from measuring import Answer, clock, timed
 
-from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.factor_graph import FactorGraph
 
 # [sigma] Huber's k, and how many steps at each, at most.
 _CONVERGED = (1.0, 0.1, 0.01, 0.001), MOST_ITERATIONS

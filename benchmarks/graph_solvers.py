@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from cases import Case
 from measuring import Answer
 
-from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array
 
 # A whole solve ends when the cost fell by less than this part of itself: gtsam's own default.
 SAME_TOLERANCE = 1e-5

@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from l1slam_ros.core import se2
-from l1slam_ros.core.backend import Backend, BackendOptions, optimise
-from l1slam_ros.core.growth import GrowthOptions
-from l1slam_ros.core.initial import odometry_poses
-from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.measurements import LoopClosure, OdometrySample
-from l1slam_ros.io.graph_file import GraphRecord, read_graph_file
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.online.backend import Backend, BackendOptions, optimise
+from l1slam_ros.core.online.graph_builder import GrowthOptions
+from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file
 from l1slam_ros.io.trajectory import invented_stamps
 
 CHECKPOINTS = 10

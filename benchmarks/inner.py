@@ -17,7 +17,7 @@ from linear_solvers import LinearSolver, Setting, normal_factor
 from measuring import Row, interleaved, report_progress, row
 from ours import INNER, PLAIN
 
-from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array
 
 MARKS = (1e-3, 1e-4)
 REFERENCE = PLAIN

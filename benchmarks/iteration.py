@@ -15,7 +15,7 @@ from cases import Case, InnerProblem, inner_problems
 from measuring import Measured, Row, clock, report_progress, row
 from ours import ITERATIONS, Iteration
 
-from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array
 
 REFERENCE = ITERATIONS[0].name
 _ITERATIONS = 400

@@ -25,7 +25,7 @@ from cases import InnerProblem
 from linear_solvers import TOLERANCES, ByTolerance, Setting
 from measuring import Answer, timed
 
-from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array
 
 _WORKER = Path(__file__).with_name('pdlp_process.py')
 

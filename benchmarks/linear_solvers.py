@@ -19,7 +19,7 @@ from measuring import Answer, timed
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import SuperLU, splu
 
-from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array
 
 Setting = Hashable
 # 1e-2 to 1e-8, two to a decade.

@@ -18,7 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
-from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array
 
 _PACKAGES = ('numpy', 'scipy', 'numba', 'gtsam', 'g2opy', 'clarabel', 'highspy', 'ortools')
 

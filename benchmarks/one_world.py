@@ -16,13 +16,13 @@ import numpy as np
 from cases import WORLD_SEED
 from measuring import clock
 
-from l1slam_ros.core.choice import AUTO, choose, minimise_by
-from l1slam_ros.core.linearise import whitened_residual
-from l1slam_ros.core.optimality import l1_cost
-from l1slam_ros.core.optimiser import OptimiserOptions
-from l1slam_ros.core.seed import seed_poses
-from l1slam_ros.core.simulate import World, WorldOptions, simulate_world
-from l1slam_ros.core.warm_up import warm_up
+from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
+from l1slam_ros.core.solvers.optimality import l1_cost
+from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
+from l1slam_ros.core.solvers.warm_up import warm_up
+from l1slam_ros.core.worlds.simulate import World, WorldOptions, simulate_world
 
 
 def solve(world: World) -> dict[str, float]:

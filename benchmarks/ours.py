@@ -23,25 +23,25 @@ from linear_solvers import (
 )
 from measuring import Answer, timed
 
-from l1slam_ros.core.choice import AUTO, INTERIOR_POINT, PRIMAL_DUAL, choose, minimise_by
-from l1slam_ros.core.cholesky import cholesky_of
-from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.halpern import minimise_l1_halpern
-from l1slam_ros.core.interior_point import interior_point
-from l1slam_ros.core.l1_problem import LinearProblem
-from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.least_squares import weighted_least_squares
-from l1slam_ros.core.manifold import Array
-from l1slam_ros.core.optimality import smoothing
-from l1slam_ros.core.optimiser import OptimiserOptions
-from l1slam_ros.core.primal_dual import (
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.l1_problem import LinearProblem
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
+from l1slam_ros.core.solvers.interior_point import interior_point
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
+from l1slam_ros.core.solvers.optimality import smoothing
+from l1slam_ros.core.solvers.primal_dual import (
     PrimalDualOptions,
     PrimalDualSolution,
     diagonal_step_sizes,
     primal_dual,
     primal_weight,
 )
-from l1slam_ros.core.seed import seed_poses
+from l1slam_ros.core.solvers.restarted_pdhg import minimise_l1_halpern
+from l1slam_ros.core.solvers.reweighting import weighted_least_squares
+from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.solvers.solve import AUTO, INTERIOR_POINT, PRIMAL_DUAL, choose, minimise_by
 
 # What the ratios of the inner problems are to.
 PLAIN = 'Algorithm 2, plain'

@@ -22,7 +22,7 @@ from measuring import clock
 from ortools.pdlp import solvers_pb2
 from ortools.pdlp.python import pdlp
 
-from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array
 
 
 def model(A: sp.csr_array, b: Array, form: str) -> Any:

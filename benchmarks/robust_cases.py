@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from robust_kinds import CLEAN, DEGREES, HEADING, KINDS, METRES, NOISIER, OWN_SHARE, TENTH
 
-from l1slam_ros.core.cholesky import cholesky_of
-from l1slam_ros.core.false_loops import FALSE_LOOPS, insert_loops
-from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.initial import pair_key
-from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.manifold import Array, Manifold
-from l1slam_ros.core.noise import Mask
-from l1slam_ros.core.seed import seed_poses
-from l1slam_ros.io.graph_file import read_graph_file
+from l1slam_ros.core.geometry.manifold import Array, Manifold
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.spanning_tree import pair_key
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
+from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
+from l1slam_ros.io.graphs.graph_file import read_graph_file
 
 _KEPT_TRUE = 0.1
 _SLIP_TRANSLATION, _SLIP_ROTATION = 5.0, math.pi / 2

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The kinds of lies that the false-loop suite knows, by name; imports nothing."""
 
-# Of `l1slam_ros.core.false_loops.FALSE_LOOPS`.
+# Of `l1slam_ros.core.worlds.false_loops.FALSE_LOOPS`.
 LIES = ('random', 'identity', 'grouped')
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
 CLEAN = 'clean'

@@ -11,15 +11,15 @@ import numpy as np
 from robust_cases import FalseCase
 from robust_kinds import NOISIER
 
-from l1slam_ros.core.belief import DOUBT
-from l1slam_ros.core.cholesky import cholesky_of
-from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.prediction import (
+from l1slam_ros.core.robust.batch import robust_solve
+from l1slam_ros.core.robust.gating import DOUBT
+from l1slam_ros.core.robust.innovation import (
     claimed_volume,
     log_likelihood_ratio,
     sample_posterior,
 )
-from l1slam_ros.core.robust import robust_solve
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 
 
 def undecidable(case: FalseCase) -> float:

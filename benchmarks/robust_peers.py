@@ -17,8 +17,8 @@ from graph_solvers import MOST_ITERATIONS, SAME_TOLERANCE
 from measuring import clock
 from robust_solvers import Driven, Found, OnlineSolver, RobustSolver
 
-from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.factor_graph import FactorGraph
 
 # The parameter of each kernel [sigma, for DCS sigma^2]. Also tried, one run each on Intel (30%
 # random) and Manhattan (10%): Geman-McClure 3, better on Intel, worse on Manhattan; Huber 1.345,

@@ -20,15 +20,15 @@ from robust_kinds import CLEAN, NOISIER
 from robust_oracle import undecidable
 from robust_solvers import Driven, Found, OnlineSolver, RobustSolver
 
-from l1slam_ros.core.choice import AUTO, choose
-from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.initial import odometry_poses
-from l1slam_ros.core.linearise import whitened_residual
-from l1slam_ros.core.manifold import Array
-from l1slam_ros.core.metrics import absolute_trajectory_error
-from l1slam_ros.core.noise import Mask
-from l1slam_ros.core.prediction import chi2_quantile
-from l1slam_ros.core.seed import seed_poses
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.robust.innovation import chi2_quantile
+from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.solvers.solve import AUTO, choose
 
 # Where a solver is started: its poses (n, p) of a case.
 STARTS: dict[str, Callable[[FalseCase], Array]] = {

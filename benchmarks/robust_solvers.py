@@ -8,22 +8,22 @@ import incremental
 import numpy as np
 from measuring import clock
 
-from l1slam_ros.core import se2
-from l1slam_ros.core.backend import Backend, BackendOptions
-from l1slam_ros.core.choice import AUTO, choose, minimise_by
-from l1slam_ros.core.cholesky import cholesky_of
-from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.growth import GrowthOptions
-from l1slam_ros.core.initial import odometry_poses, pair_key
-from l1slam_ros.core.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.loop_states import ACCEPTED
-from l1slam_ros.core.manifold import Array, Indices
-from l1slam_ros.core.noise import Mask
-from l1slam_ros.core.optimiser import OptimiserOptions, Solution
-from l1slam_ros.core.robust import INCONSISTENT
-from l1slam_ros.core.robust_map import minimise_robustly
-from l1slam_ros.io.graph_file import GraphRecord
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.spanning_tree import odometry_poses, pair_key
+from l1slam_ros.core.online.backend import Backend, BackendOptions
+from l1slam_ros.core.online.graph_builder import GrowthOptions
+from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.loop_states import ACCEPTED
+from l1slam_ros.core.robust.batch import INCONSISTENT
+from l1slam_ros.core.robust.robust_map import minimise_robustly
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Solution
+from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
+from l1slam_ros.io.graphs.graph_file import GraphRecord
 
 # Online: an update after so many keyframes, for so long [s].
 _EVERY, _BUDGET = 10, 0.1

@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from l1slam_ros.compilation import fill_cache
-from l1slam_ros.core.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.graph_file import GraphRecord, write_graph_file
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.compilation import fill_cache
+from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
 
 _YARDSTICKS = ('numpy', 'scipy.sparse', 'numba')
-_COMMAND = 'import sys; from l1slam_ros.cli import main; sys.exit(main())'
+_COMMAND = 'import sys; from l1slam_ros.cli.main import main; sys.exit(main())'
 
 
 def main() -> None:

@@ -27,8 +27,8 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 
-from l1slam_ros.demo import executable
-from l1slam_ros.publishing import header
+from l1slam_ros.ros.demo import executable
+from l1slam_ros.ros.publishing import header
 
 MESSAGES, RATE = 25_000, 1_000.0
 _SPEED = 5.0  # [m/s] ten keyframes a second

@@ -16,9 +16,9 @@ from graph_solvers import GraphSolver
 from measuring import Measured, Row, interleaved, report_progress, row
 from ours import DEFAULT, FROM_NOTHING, WHOLE
 
-from l1slam_ros.core.linearise import whitened_residual
-from l1slam_ros.core.manifold import Array
-from l1slam_ros.core.optimality import l1_cost, l2_cost
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
 
 REFERENCE = GAUSS_NEWTON.name
 # Where the poses come from the graph alone, and finding them is counted.

@@ -15,9 +15,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from l1slam_ros.core.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.graph_bag import write_graph_bag
-from l1slam_ros.io.graph_file import GraphRecord
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.bags.from_graph import write_graph_bag
+from l1slam_ros.io.graphs.graph_file import GraphRecord
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 NOTE = '{keyframes: every, covariance: increment}'

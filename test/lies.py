@@ -4,11 +4,11 @@
 import numpy as np
 from problems import PERIOD, covariance6, loop, odometry
 
-from l1slam_ros.core import se2
-from l1slam_ros.core.false_loops import FALSE_LOOPS
-from l1slam_ros.core.initial import pair_key
-from l1slam_ros.core.metrics import absolute_trajectory_error
-from l1slam_ros.core.simulate import WorldOptions, simulate_world, with_false_loops
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.core.graph.spanning_tree import pair_key
+from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
 
 # Odometry good enough for a drive of some hundred metres to come back near where it was.
 CAREFUL = WorldOptions(odometry_sigma_rotation=0.005)

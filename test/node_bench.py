@@ -12,9 +12,9 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
-from l1slam_ros.core import se2
-from l1slam_ros.node import BackendNode
-from l1slam_ros.publishing import header
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.ros.node import BackendNode
+from l1slam_ros.ros.publishing import header
 
 DEADLINE = 60.0
 TYPES = {'/odom': Odometry, '/loop_closures': PoseWithCovarianceStamped}

@@ -7,10 +7,10 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
-from l1slam_ros.core import se2
-from l1slam_ros.core.graph import FactorGraph
-from l1slam_ros.core.growth import GraphGrowth
-from l1slam_ros.core.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.online.graph_builder import GraphGrowth
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from l1slam_ros.core.cholesky import BlockCholesky, find_pattern
-from l1slam_ros.core.linearise import LinearSystem
+from l1slam_ros.core.graph.linear_system import LinearSystem
+from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, find_pattern
 
 PLENTY = 10**6  # blocks that a factor of these small systems never needs
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l1slam_ros.core.false_loops import FALSE_LOOPS
-from l1slam_ros.core.simulate import WorldOptions, simulate_world
+from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 FOLDER = Path(__file__).parents[1] / 'benchmarks'
 sys.path.append(str(FOLDER))

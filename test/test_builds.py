@@ -35,7 +35,7 @@ COLCON = ('colcon-bash', 'colcon-output', 'colcon-ros', 'setuptools<80', '--no-b
 SMOKE = """
 import contextlib, importlib.util, io, json, sys
 import numpy
-from l1slam_ros.cli import main
+from l1slam_ros.cli.main import main
 
 def run(*arguments):
     printed = io.StringIO()

@@ -7,17 +7,17 @@ from functools import cache, cached_property
 import numpy as np
 import pytest
 
-from l1slam_ros.core import se2
-from l1slam_ros.core.choice import AUTO, INTERIOR_POINT, choose, minimise_by
-from l1slam_ros.core.graph import component_labels
-from l1slam_ros.core.initial import odometry_poses
-from l1slam_ros.core.l2 import LeastSquaresOptions, minimise_huber, minimise_l2
-from l1slam_ros.core.linearise import whitened_residual
-from l1slam_ros.core.metrics import absolute_trajectory_error
-from l1slam_ros.core.optimality import Status, l1_cost
-from l1slam_ros.core.optimiser import OptimiserOptions, minimise
-from l1slam_ros.core.seed import seed_poses
-from l1slam_ros.io.graph_file import read_graph_file
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.core.graph.factor_graph import component_labels
+from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_huber, minimise_l2
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, minimise
+from l1slam_ros.core.solvers.optimality import Status, l1_cost
+from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.solvers.solve import AUTO, INTERIOR_POINT, choose, minimise_by
+from l1slam_ros.io.graphs.graph_file import read_graph_file
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from environments import environment
 
-from l1slam_ros.cli import main
+from l1slam_ros.cli.main import main
 
 # Before Python 3.11 there are only wheels of gtsam that were built for NumPy 1.
 GTSAM = ('gtsam>=4.2,<4.4', 'numpy<2; python_version < "3.11"')

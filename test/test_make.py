@@ -22,7 +22,7 @@ case "$*" in
 esac
 """
 VENV = '-m venv .venv'
-DEMO = ['-m pip install --quiet --editable .[ros]', '-m l1slam_ros.demo']
+DEMO = ['-m pip install --quiet --editable .[ros]', '-m l1slam_ros.ros.demo']
 TEST = ['-m pip install --quiet l1slam_ros[test]', 'setup.py --quiet install_data', '-m pytest']
 
 

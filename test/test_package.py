@@ -37,7 +37,7 @@ sys.meta_path.insert(0, Wall())
 def wheel(tmp_path_factory):
     """Build the wheel of a copy, so that nothing is left in the checkout, and open it."""
     source, built = tmp_path_factory.mktemp('source') / 'copy', tmp_path_factory.mktemp('built')
-    ignored = shutil.ignore_patterns('.*', '*.egg-info', 'build', 'bags', 'demo', '__pycache__')
+    ignored = shutil.ignore_patterns('.*', '*.egg-info', 'build', 'demo', '__pycache__')
     shutil.copytree(ROOT, source, ignore=ignored, symlinks=True)
     # From this version on setuptools builds wheels by itself: nothing has to be fetched.
     able = Version(importlib.metadata.version('setuptools')) >= Version('70.1')
@@ -160,9 +160,9 @@ def run_python(code):
 def test_the_core_and_the_command_need_no_ros():
     ran = run_python(WITHOUT_ROS + """
 import importlib, pkgutil
-import l1slam_ros.cli, l1slam_ros.core, l1slam_ros.io
+import l1slam_ros.cli.main, l1slam_ros.core, l1slam_ros.io
 for package in l1slam_ros.core, l1slam_ros.io:
-    for module in pkgutil.iter_modules(package.__path__, package.__name__ + '.'):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):
         importlib.import_module(module.name)
 try:
     import rclpy
@@ -175,7 +175,7 @@ except ImportError:
 def test_the_command_starts_without_what_it_may_not_need():
     ran = run_python("""
 import sys
-import l1slam_ros.cli
+import l1slam_ros.cli.main
 print(sorted({'matplotlib', 'rosbags', 'mcap', 'numba', 'rclpy'} & sys.modules.keys()))
 """)
     assert (ran.stdout, ran.stderr) == ('[]\n', '')

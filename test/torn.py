@@ -4,8 +4,8 @@
 import numpy as np
 from lies import careful_world, spoilt
 
-from l1slam_ros.core import se2
-from l1slam_ros.core.graph import FactorGraph
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
 
 
 def torn_graph():

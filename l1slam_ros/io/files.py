@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.core.manifold import Array, Indices
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.io.wording import counted
 
 NANOSECONDS = 10**9

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.core.manifold import Array, Indices
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.io.files import replacing, require_folder
 from l1slam_ros.io.wording import counted
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l1slam_ros.core import se2
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.core.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.io.files import (
     NANOSECONDS,
     TextLines,
@@ -23,9 +23,9 @@ from l1slam_ros.io.files import (
     stamp_text,
     write_lines,
 )
-from l1slam_ros.io.graph_file import read_vertices
-from l1slam_ros.io.messages import QUATERNION_NORM_ERROR
-from l1slam_ros.io.side_files import read_stamps
+from l1slam_ros.io.graphs.graph_file import read_vertices
+from l1slam_ros.io.graphs.side_files import read_stamps
+from l1slam_ros.io.messages.conversion import QUATERNION_NORM_ERROR
 from l1slam_ros.io.wording import counted
 
 _TUM_COLUMNS = 8

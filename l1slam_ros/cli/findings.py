@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `l1slam info` says: the numbers of a graph or bag, and a sentence on what looks wrong."""
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from l1slam_ros.core.errors import L1SlamError
+from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.robust.inspection import (
+    connected_parts,
+    cost_at,
+    information_range,
+    long_steps,
+    noise_scales,
+    odometry_gaps,
+    parallel_factors,
+    repeated_factors,
+    step_lengths,
+)
+from l1slam_ros.io.files import NANOSECONDS, stamp_text
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.wording import counted
+
+# Errors that many times as large, or as small, as their information says are worth a sentence.
+_OFF_SCALE = 3.0
+# So is information that differs that much from edge to edge.
+_WIDE_RANGE = 1e6
+# So many examples are named in one sentence.
+_NAMED = 3
+
+
+def bag_numbers(path: Path) -> list[tuple[str, str]]:
+    """Return what is worth knowing of a bag, whatever its topics."""
+    from l1slam_ros.io.bags.reader import bag_summary
+
+    summary = bag_summary(path)
+    note = ', '.join(f'{key} {value}' for key, value in sorted(summary.note.items()))
+    return [
+        ('duration', f'{summary.duration / NANOSECONDS:,.1f} s from {stamp_text(summary.start)}'),
+        ('note', note or 'none of l1slam: keyframes and covariances by the options of the node'),
+        *(('topic', f'{topic.name}: {topic.count:,} of {topic.msgtype}')
+          for topic in summary.topics),
+    ]
+
+
+def numbers(record: GraphRecord) -> list[tuple[str, str]]:
+    """Return what is worth knowing of a graph: names and values, without a judgement."""
+    graph, ids = record.graph, record.ids
+    factors = graph.between
+    is_loop = ~factors.is_odometry
+    parallel = int(is_loop[parallel_factors(graph)].sum())
+    beside = f', {parallel:,} of them beside another edge' if parallel else ''
+    rows = [
+        ('poses', f'{graph.n_poses:,} in {graph.manifold.NAME}, ids {ids[0]} to {ids[-1]}'),
+        ('odometry', f'{len(factors) - int(is_loop.sum()):,}, {step_lengths(graph).sum():,.1f} m'),
+        ('loops', f'{int(is_loop.sum()):,}{beside}'),
+        ('components', f'{len(connected_parts(graph)):,}'),
+    ]
+    if len(graph.prior):
+        rows.insert(3, ('priors', f'{len(graph.prior):,}'))
+    if record.stamps is not None:
+        rows.append(('time', f'{(record.stamps[-1] - record.stamps[0]) / NANOSECONDS:,.1f} s'))
+    if record.poses is not None:
+        cost = cost_at(graph, record.poses)
+        rows.append(('l1 cost', f'{cost:.6g} at the stored poses'))
+    return rows
+
+
+def complaints(record: GraphRecord) -> list[str]:
+    """Return one sentence on each thing that looks wrong with a graph."""
+    checks: tuple[Callable[[GraphRecord], Iterator[str]], ...] = (
+        _on_ids, _on_parts, _on_gaps, _on_repetitions, _on_steps, _on_information, _on_noise)
+    return [sentence for check in checks for sentence in check(record)]
+
+
+def _on_ids(record: GraphRecord) -> Iterator[str]:
+    # A difference of two ids may be beyond 64 bits.
+    jumps = np.flatnonzero(record.ids[1:] != record.ids[:-1] + 1)
+    if len(jumps):
+        pairs = [f'{record.ids[k]} to {record.ids[k + 1]}' for k in jumps[:_NAMED]]
+        yield f'vertex ids are not consecutive: {_listed("jump", pairs, len(jumps))}'
+
+
+def _on_parts(record: GraphRecord) -> Iterator[str]:
+    parts = connected_parts(record.graph)
+    if len(parts) == 1:
+        return
+    lonely = [part[0] for part in parts if len(part) == 1]
+    joined = [part for part in parts if len(part) > 1]
+    if lonely:
+        names = [str(record.ids[k]) for k in lonely[:_NAMED]]
+        yield (f'no edge leads to {_listed("vertex", names, len(lonely), "vertices")}, so the '
+               'graph cannot be solved')
+    if len(joined) > 1:
+        joined.sort(key=len, reverse=True)
+        names = [f'{len(part):,} vertices between ids {record.ids[part[0]]} and '
+                 f'{record.ids[part[-1]]}' for part in joined[:_NAMED]]
+        yield ('the graph is not connected and cannot be solved: '
+               f'{_listed("part", names, len(joined))}')
+
+
+def _on_gaps(record: GraphRecord) -> Iterator[str]:
+    gaps = odometry_gaps(record.graph)
+    if len(gaps):
+        pairs = [f'{record.ids[k]} and {record.ids[k + 1]}' for k in gaps[:_NAMED]]
+        yield (f'the odometry has {_listed("gap", pairs, len(gaps))}, consecutive vertices '
+               'without an edge')
+
+
+def _on_repetitions(record: GraphRecord) -> Iterator[str]:
+    repeated = repeated_factors(record.graph)
+    if len(repeated):
+        yield (f'{_listed("edge", _edges(record, repeated), len(repeated))}: given before with '
+               'the same measurement, so counted twice')
+
+
+def _on_steps(record: GraphRecord) -> Iterator[str]:
+    long = long_steps(record.graph)
+    if len(long.factors):
+        longest = np.argsort(-long.lengths)[:_NAMED]
+        steps = [f'{length:.4g} m from {edge}' for length, edge in zip(
+            long.lengths[longest], _edges(record, long.factors[longest]), strict=True)]
+        yield (f'odometry that jumps: {_listed("step", steps, len(long.factors))}; nine in ten '
+               f'are no longer than {long.ordinary:.4g} m')
+
+
+def _on_information(record: GraphRecord) -> Iterator[str]:
+    manifold = record.graph.manifold
+    for name, part in (('position', manifold.TRANSLATION), ('rotation', manifold.ROTATION)):
+        found = information_range(record.graph, part)
+        if found.most > _WIDE_RANGE * found.least:
+            least, most = _edges(record, np.array([found.least_factor, found.most_factor]))
+            yield (f'the information on {name} differs by {found.most / found.least:.1g} between '
+                   f'edges: {found.least:.3g} from {least}, {found.most:.3g} from {most}')
+
+
+def _on_noise(record: GraphRecord) -> Iterator[str]:
+    # Any seed does: the draws stand for thousands of measurements.
+    try:
+        scales = noise_scales(record.graph, np.random.default_rng(0))
+    except L1SlamError as error:
+        yield f'the noise cannot be judged: {error}'
+        return
+    # Of too few factors nothing can be said.
+    both = {'odometry': scales.odometry, 'loops': scales.loops}
+    found = {name: scale for name, scale in both.items() if not math.isnan(scale)}
+    if all(1 / _OFF_SCALE <= scale <= _OFF_SCALE for scale in found.values()):
+        return
+    most = max(found.values())
+    reason = 'too large, or some loops are false' if most > _OFF_SCALE else 'too small'
+    times = ' and '.join(f'{scale:.2g} ({name})' for name, scale in found.items())
+    yield (f'errors at the L2 map of vertices {record.ids[scales.first]} to '
+           f'{record.ids[scales.last]} are {times} times what the information says; expected '
+           f'about 1: the information is {reason}')
+
+
+def _edges(record: GraphRecord, factors: Indices) -> list[str]:
+    """Return the vertex ids of the first few factors, in words."""
+    between = record.graph.between
+    return [f'{record.ids[between.i[k]]} to {record.ids[between.j[k]]}' for k in factors[:_NAMED]]
+
+
+def _listed(name: str, examples: list[str], count: int, plural: str = '') -> str:
+    """Return e.g. `2 gaps (3 and 4, 8 and 9)`; of many, the first few and dots."""
+    dots = ', ...' if count > len(examples) else ''
+    return f'{counted(count, name, plural)} ({", ".join(examples)}{dots})'

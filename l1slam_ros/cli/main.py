@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`l1slam`: the core from the command line, without ROS. Parsing, and the exit code."""
+# PYTHON_ARGCOMPLETE_OK
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from l1slam_ros.core.errors import L1SlamError
+from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS, NORMS, SOLVERS, STARTS
+from l1slam_ros.io.bags.topics import DEFAULT_TOPICS
+from l1slam_ros.paper import printed as paper
+
+BAD_INPUT, READ_IN_PART, DOUBTFUL, INTERRUPTED, BROKEN_PIPE = 2, 3, 4, 130, 141
+# By command: the module that runs it, imported only then.
+_MODULES = {
+    'solve': 'solving', 'corrupt': 'solving', 'reproduce': 'solving',
+    'convert': 'commands', 'simulate': 'commands', 'info': 'commands', 'plot': 'commands',
+}
+
+_INPUT = '.g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1'
+_OUTPUT = '.g2o, .graph, .tum, or a name without a suffix for a bag directory'
+_GRAPH_OUTPUT = '.g2o, .graph, or a name without a suffix for a bag directory'
+_KIND = ('random: far poses said to be near each other; identity: at the very same place; '
+         'grouped: 10 to 20 in a row that agree (default: %(default)s)')
+_FIRST_STEPS = """\
+a first look:
+  l1slam simulate world.g2o --poses 1000 --edges 2000
+  l1slam solve world.g2o --reference world.g2o.truth.txt --plot map.png
+"""
+_MORE = """\
+`l1slam COMMAND --help` explains one command.
+
+exit codes:
+  0  done
+  2  bad input or arguments, said in one line; nothing written
+  3  done, but the input is damaged and only a part of it was used
+  4  solve: the best map is written, but it is doubtful (also where the code would be 3)
+
+completion of commands and options by the TAB key, in bash and zsh, where argcomplete is
+installed (pip install argcomplete, or the package python3-argcomplete):
+  eval "$(register-python-argcomplete l1slam)"
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; return the exit code, see `l1slam --help`."""
+    try:
+        try:
+            return _answer(arguments)
+        finally:
+            # Here, where it can be answered: at the end of Python a failure is but noise.
+            if sys.stdout is not None:
+                sys.stdout.flush()
+    except BrokenPipeError:
+        _forget_output()
+        return BROKEN_PIPE
+    except OSError as error:
+        _forget_output()
+        _say(_in_words(error))
+        return BAD_INPUT
+
+
+def _answer(arguments: Sequence[str] | None) -> int:
+    parser = _parser()
+    if '_ARGCOMPLETE' in os.environ:
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
+    options = parser.parse_args(arguments)
+    if options.command is None:
+        parser.print_help(sys.stderr)
+        return BAD_INPUT
+    try:
+        ending = _run(options)
+    except BrokenPipeError:
+        raise
+    except L1SlamError as error:
+        _say(str(error))
+        return BAD_INPUT
+    except OSError as error:
+        _say(_in_words(error))
+        return BAD_INPUT
+    except MemoryError:
+        _say('not enough memory for a graph of this size')
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    for sentence in filter(None, ending):
+        _say(sentence)
+    if ending.doubt:
+        return DOUBTFUL
+    return READ_IN_PART if ending.damage else 0
+
+
+def _run(options: argparse.Namespace) -> Any:
+    module = import_module(f'l1slam_ros.cli.{_MODULES[options.command]}')
+    import numpy as np
+
+    # Numbers beyond all measure end in an error that says so, not in NumPy's warnings.
+    with np.errstate(all='ignore'):
+        return getattr(module, options.command)(options)
+
+
+def _in_words(error: OSError) -> str:
+    what = error.strerror or str(error)
+    return what if error.filename is None else f'{error.filename}: {what}'
+
+
+def _say(sentence: str) -> None:
+    with suppress(BrokenPipeError):
+        print(f'l1slam: {sentence}', file=sys.stderr)
+
+
+def _forget_output() -> None:
+    """Let Python not fail again on what nobody can read when it ends."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+class _Version(argparse.Action):
+    """Prints the version; what knows it takes time to import."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **_: Any):
+        super().__init__(option_strings, dest, nargs=0, help='print the version and end')
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        from importlib.metadata import version
+
+        print(f'{parser.prog} {version("l1slam_ros")}')
+        parser.exit()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='l1slam', description='Pose-graph SLAM by the L1 norm, from files; needs no ROS.',
+        epilog=f'{_FIRST_STEPS}\n{_MORE}', formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--version', action=_Version)
+    commands_of = parser.add_subparsers(metavar='COMMAND', dest='command')
+
+    def add(name: str, text: str, example: str) -> argparse.ArgumentParser:
+        return commands_of.add_parser(
+            name, help=text, description=f'{text[0].upper()}{text[1:]}.',
+            epilog=f'example:\n  l1slam {name} {example}',
+            formatter_class=argparse.RawDescriptionHelpFormatter)
+
+    _add_solve(add('solve', 'optimise a graph or a bag',
+                   'graph.g2o --output solved.g2o --plot map.png'))
+    _add_convert(add('convert', 'turn a graph file into a bag, or back', 'graph.g2o bag'))
+    _add_simulate(add('simulate', 'make a world of streets, its truth known',
+                      'world.g2o --poses 1000 --edges 2000 --seed 1'))
+    _add_corrupt(add('corrupt', 'add false loops to a graph',
+                     'graph.g2o spoiled.g2o --false-loops 20 --kind grouped'))
+    _add_info(add('info', 'say what is in a graph or a bag, and what looks wrong', 'graph.g2o'))
+    _add_plot(add('plot', 'draw maps beside each other, known false loops black',
+                  'graph.g2o solved.g2o --output maps.png'))
+    _add_reproduce(add('reproduce',
+                       "run the paper's experiments and report them beside what it printed",
+                       '--datasets datasets --worlds 10k --output reproduction'))
+    return parser
+
+
+def _add_input(parser: argparse.ArgumentParser) -> None:
+    """Add the input, and how a bag of other origin is read."""
+    parser.add_argument('input', type=Path, metavar='INPUT', help=_INPUT)
+    _add_bag_options(parser)
+
+
+def _add_bag_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group('how to read a bag').add_argument
+    add('--odom-topic', default=DEFAULT_TOPICS.odometry, metavar='TOPIC',
+        help='nav_msgs/Odometry (default: %(default)s)')
+    add('--loop-topic', default=DEFAULT_TOPICS.loops, metavar='TOPIC',
+        help='geometry_msgs/PoseWithCovarianceStamped (default: %(default)s)')
+    add('--trusted-topic', default=DEFAULT_TOPICS.trusted, metavar='TOPIC',
+        help='the same, loops somebody vouches for (default: %(default)s)')
+    add('--params-file', type=Path, metavar='YAML',
+        help="the node's parameter file: what makes keyframes, their noise, and the solver; "
+        'without it, what a bag of l1slam notes of itself, or the defaults of the node')
+
+
+def _add_solve(parser: argparse.ArgumentParser) -> None:
+    _add_input(parser)
+    add = parser.add_argument
+    add('--start', choices=STARTS, default=STARTS[0],
+        help='where from: first poses from the graph alone, the stored poses, or the odometry; '
+        'where loops are doubted, always from the graph alone (default: %(default)s)')
+    add('--norm', choices=NORMS, default=NORMS[0],
+        help='what is minimised (default: %(default)s)')
+    add('--solver', choices=SOLVERS, default=SOLVERS[0],
+        help='for l1; auto: interior-point on sparse graphs (default: %(default)s)')
+    add('--robust', action=argparse.BooleanOptionalAction,
+        help='refuse loops that cannot be believed, and say which, or believe all; by default '
+        'they are doubted wherever they can be judged')
+    add('--outer', type=int, metavar='N', help='most linearisations')
+    add('--inner', type=int, metavar='N', help='most primal-dual iterations of each')
+    add('--output', type=Path, metavar='OUT', help=_OUTPUT)
+    add('--reference', metavar='TRUTH',
+        help='print the position error to it: TUM, g2o, `id x y theta` text, CSV of `stamp, x, y, '
+        "theta`, or a bag's topic, BAG:/TOPIC; interpolated at the stamps of the poses")
+    add('--plot', type=Path, metavar='PNG', help='draw the map and its cost; .svg and .pdf too')
+    add('--json', action='store_true', help='one object on standard output')
+    add('--quiet', action='store_true', help='no progress, no summary, no warning')
+
+
+def _add_convert(parser: argparse.ArgumentParser) -> None:
+    _add_input(parser)
+    parser.add_argument('output', type=Path, metavar='OUTPUT', help=_OUTPUT)
+
+
+def _add_simulate(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add('output', type=Path, metavar='OUTPUT',
+        help=f'{_GRAPH_OUTPUT}; beside it OUTPUT.truth.txt and OUTPUT.false.txt')
+    add('--poses', type=int, required=True, metavar='N')
+    add('--edges', type=int, required=True, metavar='M', help='true ones, odometry included')
+    add('--false-loops', type=int, default=0, metavar='K',
+        help='on top of the edges (default: %(default)s)')
+    _add_randomness(parser)
+
+
+def _add_corrupt(parser: argparse.ArgumentParser) -> None:
+    _add_input(parser)
+    add = parser.add_argument
+    add('output', type=Path, metavar='OUTPUT',
+        help=f'{_GRAPH_OUTPUT}; beside it OUTPUT.false.txt, the vertex ids of the false loops')
+    add('--false-loops', type=int, required=True, metavar='K', help='how many')
+    _add_randomness(parser)
+
+
+def _add_randomness(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--kind', choices=KINDS_OF_FALSE_LOOPS,
+                        default=KINDS_OF_FALSE_LOOPS[0], help=_KIND)
+    parser.add_argument('--seed', type=int, default=0, metavar='S',
+                        help='another one, another draw (default: %(default)s)')
+
+
+def _add_info(parser: argparse.ArgumentParser) -> None:
+    _add_input(parser)
+
+
+def _add_plot(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('input', type=Path, nargs='+', metavar='INPUT',
+                        help=f'{_INPUT}; INPUT.truth.txt and INPUT.false.txt are drawn, if there')
+    parser.add_argument('--output', type=Path, required=True, metavar='PNG',
+                        help='.png, .svg or .pdf')
+    _add_bag_options(parser)
+
+
+def _add_reproduce(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add('--datasets', type=Path, metavar='DIR',
+        help=f"the folder with the paper's own graphs: {', '.join(paper.FILES)}; "
+        'without it, the simulated worlds alone')
+    add('--worlds', choices=list(paper.WORLDS), default='all',
+        help="which of the paper's large worlds to simulate: 10,000 poses with 64,000 edges, and "
+        '50,000 with 700,000, which takes minutes (default: %(default)s)')
+    add('--output', type=Path, default=Path('reproduction'), metavar='DIR',
+        help='the folder for report.md and its pictures (default: %(default)s)')

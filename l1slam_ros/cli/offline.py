@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The core without ROS: a graph -> its solution, and what is believed of the graph."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
+from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.robust.batch import Report as OnRound
+from l1slam_ros.core.robust.inspection import odometry_gaps
+from l1slam_ros.core.robust.robust_map import RobustMap, minimise_robustly
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import (
+    LeastSquaresOptions,
+    huber_cost,
+    minimise_huber,
+    minimise_l2,
+)
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
+from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
+from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.solvers.solve import AUTO, Choice, choose, minimise_by
+from l1slam_ros.io.formats import require_connected, stored_poses
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+
+
+@dataclass(frozen=True)
+class Wish:
+    """
+    How a graph is to be solved; see `core.names`.
+
+    solver : for L1; robust : refuse loops that cannot be believed; None: where the graph is one
+    whose loops can be judged.
+    """
+
+    start: str = 'seed'
+    norm: str = 'l1'
+    solver: str = AUTO
+    robust: bool | None = None
+    options: OptimiserOptions = OptimiserOptions()
+    least_squares: LeastSquaresOptions = LeastSquaresOptions()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """
+    What `solve` did; costs are of the norm that was asked for, seed_cost None without one.
+
+    solver : what found the solution, by its name; reason : a clause that says why it; judgement :
+    of a robust solve, whose costs count the accepted factors; unjudged : why there is none though
+    nobody said so, else empty; parts : of the graph, joined by nothing that is believed.
+    """
+
+    solution: Solution
+    solver: str
+    reason: str
+    initial_cost: float
+    seed_cost: float | None
+    seconds: float
+    judgement: RobustMap | None
+    unjudged: str
+    parts: int
+
+
+def solve(
+    record: GraphRecord, wish: Wish, report: Report,
+    on_round: OnRound = lambda round_, accepted: None,
+) -> Outcome:
+    """
+    Solve a graph; seconds: solving alone.
+
+    report : called with each iteration and its cost; on_round : see `robust_solve`
+
+    Raises
+    ------
+    GraphError : the graph is not connected, has no such start, or numbers beyond all measure; or
+        its loops cannot be judged and `wish.robust` is True.
+
+    """
+    _require_start(record, wish)
+    graph, seed = record.graph, None
+    initial = odometry_poses(graph) if wish.start == 'odometry' else stored_poses(record)
+    minimiser = _Minimiser(wish, report)
+    began = time.perf_counter()
+    judgement, unjudged = _judgement(record, wish, minimiser, on_round)
+    if judgement:
+        solution, seed = judgement.solution, judgement.seed
+        graph = graph.subset(judgement.accepted)
+    else:
+        choice = minimiser.choose(graph)
+        seed = seed_poses(graph, choice.cholesky) if wish.start == 'seed' else None
+        solution = minimiser.minimise_by(choice, graph, initial if seed is None else seed)
+    seconds = time.perf_counter() - began
+    cost = cost_function(graph, wish)
+    seed_cost = None if seed is None else cost(seed)
+    if not np.isfinite([cost(initial), seed_cost or 0.0, solution.cost]).all():
+        raise GraphError('the cost leaves double precision: measurements and information of the '
+                         'graph are too large, or too different from each other')
+    return Outcome(solution, minimiser.solver, minimiser.reason, cost(initial), seed_cost, seconds,
+                   judgement, unjudged, int(component_labels(graph).max()) + 1)
+
+
+def _judgement(
+    record: GraphRecord, wish: Wish, minimiser: '_Minimiser', on_round: OnRound
+) -> tuple[RobustMap | None, str]:
+    """Return the robust map; where nobody insists on one and there is none, None and why."""
+    if wish.robust is False:
+        return None, ''
+    try:
+        _require_chain(record, 'so no chain of odometry to judge loops by')
+        return minimise_robustly(record.graph, minimiser.minimise, on_round), ''
+    except GraphError as error:
+        if wish.robust:
+            raise
+        return None, str(error)
+
+
+class _Minimiser:
+    """Minimises the norm that was wished for; solver, reason : what did it last, and why."""
+
+    def __init__(self, wish: Wish, report: Report):
+        self._wish, self._report = wish, report
+        self.solver = self.reason = ''
+
+    def choose(self, graph: FactorGraph) -> Choice:
+        """Return what the graph is solved by."""
+        if self._wish.norm == 'l1':
+            return choose(self._wish.solver, graph)
+        return Choice(cholesky_of(graph), 'gauss-newton', f'the norm is {self._wish.norm}')
+
+    def minimise(self, graph: FactorGraph, poses: Array) -> Solution:
+        """Return the solution from poses (n, p)."""
+        return self.minimise_by(self.choose(graph), graph, poses)
+
+    def minimise_by(self, choice: Choice, graph: FactorGraph, poses: Array) -> Solution:
+        """Return the solution by what was chosen."""
+        wish, self.solver, self.reason = self._wish, choice.solver, choice.reason
+        if wish.norm == 'l1':
+            solution, self.solver = minimise_by(choice, graph, poses, wish.options, self._report)
+            if self.solver != choice.solver:
+                self.reason = f'it went on where {choice.solver} came no further'
+            return solution
+        assert choice.cholesky is not None
+        minimise_norm = minimise_l2 if wish.norm == 'l2' else minimise_huber
+        return minimise_norm(graph, poses, wish.least_squares, choice.cholesky, self._report)
+
+
+def cost_function(graph: FactorGraph, wish: Wish) -> Callable[[Array], float]:
+    """Return what is to be minimised, as a function of the poses."""
+    size, delta = graph.manifold.TANGENT_SIZE, wish.least_squares.huber_delta
+    of_residual: dict[str, Callable[[Array], float]] = {
+        'l1': l1_cost,
+        'l2': l2_cost,
+        'huber': lambda r: huber_cost(r, size, delta),
+    }
+    return lambda poses: of_residual[wish.norm](whitened_residual(graph, poses))
+
+
+def _require_start(record: GraphRecord, wish: Wish) -> None:
+    """Refuse, before any work is done, a graph that is not connected or has no such start."""
+    require_connected(record)
+    if wish.start == 'file' and record.poses is None:
+        raise GraphError('the input stores no poses to start from; expected --start seed or '
+                         'odometry')
+    if wish.start == 'odometry':
+        _require_chain(record, 'so no chain of odometry to start from; expected --start seed')
+
+
+def _require_chain(record: GraphRecord, consequence: str) -> None:
+    """Refuse a graph whose odometry has a gap."""
+    gaps = odometry_gaps(record.graph)
+    if len(gaps):
+        raise GraphError(f'no edge between the consecutive vertices {record.ids[gaps[0]]} and '
+                         f'{record.ids[gaps[0] + 1]}, {consequence}')

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What keyframes should be: truth from a file or a topic, at their ids or times."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, align, poses_at
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.io.files import NANOSECONDS
+from l1slam_ros.io.formats import is_bag, stamps_of
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.trajectory import Reference, read_reference
+
+# [ns] As far as that a pose may lie before the first or after the last true one: files round.
+_SAME_STAMP = 1_000_000
+# A gap in the truth is bridged up to so many of its usual steps, and up to so long [ns] anyway.
+_USUAL_STEPS, _SHORT = 3, NANOSECONDS
+
+
+@dataclass(frozen=True)
+class Truth:
+    """
+    Where some keyframes should be.
+
+    rows : (k,) these keyframes; poses : (k, p) theirs; path : (l, p) the true poses from the first
+    of them to the last, a row of NaN in each gap; skipped : sentences on what was not used.
+    """
+
+    rows: Indices
+    poses: Array
+    path: Array
+    skipped: tuple[str, ...] = ()
+
+
+def read_truth(source: str, record: GraphRecord, input_path: Path) -> Truth:
+    """
+    Return the truth about a graph.
+
+    Parameters
+    ----------
+    source : a TUM or CSV file, a graph file, `id x y theta` text; or `BAG:/TOPIC`, where `bag`
+        stands for the input itself unless there is something of this name
+    record, input_path : the graph, and where it is from
+
+    Raises
+    ------
+    FileError : it cannot be read, or shares fewer than two poses with the graph.
+
+    """
+    reference = _read(source, record, input_path)
+    keys = stamps_of(record) if reference.stamped else record.ids
+    if reference.stamped:
+        rows, poses, gaps = _at_stamps(record, reference, keys)
+    else:
+        _, rows, theirs = np.intersect1d(keys, reference.keys, return_indices=True)
+        poses, gaps = reference.poses[theirs], np.zeros(0, np.int64)
+    if len(rows) < 2:
+        stampless = reference.stamped and record.stamps is None
+        hint = '; the graph has no stamps, so its poses are 0.1 s apart from 1000 s on'
+        raise FileError(source, f'shares {len(rows)} poses with the graph, expected 2 or more'
+                        f'{hint if stampless else ""}')
+    scored = keys[rows]
+    first, last = np.searchsorted(reference.keys, [scored.min(), scored.max()])
+    inside = gaps[(gaps > first) & (gaps <= last)] - first
+    path = np.insert(reference.poses[first:last + 1], inside, np.nan, axis=0)
+    return Truth(rows, poses, path, reference.skipped)
+
+
+def _read(source: str, record: GraphRecord, input_path: Path) -> Reference:
+    bag, colon, topic = source.rpartition(':/')
+    if colon and not Path(source).exists():
+        from l1slam_ros.io.bags.truth_topic import read_truth_topic
+
+        path = Path(bag)
+        if bag == 'bag' and not path.exists() and is_bag(input_path):
+            path = input_path
+        if not path.exists():
+            raise FileError(path, 'no such file or directory')
+        return read_truth_topic(path, f'/{topic}', record.graph.manifold)
+    return read_reference(source, record.graph.manifold, by_stamps=record.stamps is not None)
+
+
+def _at_stamps(
+    record: GraphRecord, reference: Reference, stamps: Indices
+) -> tuple[Indices, Array, Indices]:
+    """Return the keyframes that have truth, it, and before which true poses there is a gap."""
+    if len(reference.keys) < 2:
+        return np.zeros(0, np.int64), reference.poses[:0], np.zeros(0, np.int64)
+    steps = np.diff(reference.keys)
+    longest = max(_USUAL_STEPS * int(np.median(steps)), _SHORT)
+    rows, poses = poses_at(record.graph.manifold, reference.keys, reference.poses, stamps,
+                           longest, _SAME_STAMP)
+    return rows, poses, np.flatnonzero(steps > longest) + 1
+
+
+def position_error(record: GraphRecord, poses: Array, truth: Truth) -> float:
+    """Return the RMSE of the positions [m] of poses (n, p) after rigid alignment."""
+    positions = record.graph.manifold.positions
+    return absolute_trajectory_error(positions(poses)[truth.rows], positions(truth.poses))
+
+
+def true_path(record: GraphRecord, poses: Array, truth: Truth) -> Array:
+    """Return the positions (l, k) of the true path, moved onto poses (n, p) as for the error."""
+    positions = record.graph.manifold.positions
+    R, t = align(positions(truth.poses), positions(poses)[truth.rows])
+    path: Array = positions(truth.path) @ R.T + t
+    return path

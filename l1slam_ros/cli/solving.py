@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands of `l1slam` that solve: solve, corrupt and reproduce."""
+
+import argparse
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from l1slam_ros.cli import offline
+from l1slam_ros.cli.commands import Ending, check_counts, named, read, warn, write_spoiled
+from l1slam_ros.cli.reference import Truth, position_error, read_truth, true_path
+from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
+from l1slam_ros.core.solvers.optimality import SENTENCES
+from l1slam_ros.core.solvers.solve import PRIMAL_DUAL
+from l1slam_ros.core.solvers.warm_up import DENSE, JUDGEMENT, SPARSE, STEPS
+from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
+from l1slam_ros.io import formats
+from l1slam_ros.io.compilation import fill_cache
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.node_options import read_params_file
+from l1slam_ros.io.progress import Progress
+from l1slam_ros.io.sentences import DOUBTFUL, doubt_sentence, verdict
+from l1slam_ros.io.wording import counted
+
+
+def solve(arguments: argparse.Namespace) -> Ending:
+    """Optimise a graph; print, write and draw what came out."""
+    _check_outputs(arguments)
+    wish = _wish(arguments)
+    record = read(arguments, arguments.input)
+    warn(record.skipped, arguments.quiet)
+    truth = None
+    if arguments.reference:
+        truth = read_truth(arguments.reference, record, arguments.input)
+        warn(truth.skipped, arguments.quiet)
+    _make_ready(_steps(wish), arguments.quiet)
+    outcome = _solved(arguments, record, wish)
+    warnings = [*record.skipped, *(truth.skipped if truth else ())]
+    if outcome.unjudged:
+        warnings.append(f'no loop was doubted: {outcome.unjudged}')
+        warn((warnings[-1],), arguments.quiet)
+    judgement = outcome.judgement
+    ending = Ending(record.damage, doubt_sentence(judgement.doubt, record.ids, record.stamps)
+                    if judgement and judgement.doubt else '')
+    report = _report(record, arguments.norm, outcome)
+    report['warnings'] = [*warnings, *filter(None, ending)]
+    if truth:
+        report['ate'] = position_error(record, outcome.solution.poses, truth)
+        report['ate_poses'] = len(truth.rows)
+    if arguments.plot:
+        _plot(arguments, record, outcome, truth)
+    if arguments.output:
+        formats.write_output(arguments.output, replace(record, poses=outcome.solution.poses))
+    if arguments.json:
+        # What is not finite has no place in JSON.
+        print(json.dumps({name: None if isinstance(value, float) and not math.isfinite(value)
+                          else value for name, value in report.items()}))
+    elif not arguments.quiet:
+        _print_report(report, arguments.norm, outcome)
+        if judgement:
+            print('\n'.join(verdict(record, judgement)))
+    return ending
+
+
+def _solved(
+    arguments: argparse.Namespace, record: GraphRecord, wish: offline.Wish
+) -> offline.Outcome:
+    steps = (wish.options.outer_iterations if wish.norm == 'l1'
+             else wish.least_squares.iterations)
+    quiet = arguments.quiet
+    with (named(arguments.input), Progress(None, 'round', quiet, 'judging loops') as judging,
+          Progress(steps, 'step', quiet, 'solving') as solving):
+        return offline.solve(
+            record, wish, solving.report,
+            lambda _, accepted: judging.advance(1, f'{counted(accepted, "loop")} believed'))
+
+
+def _steps(wish: offline.Wish) -> tuple[str, ...]:
+    """Return what to compile for a solve; a graph that fills in compiles more on its way."""
+    judgement = () if wish.robust is False else JUDGEMENT
+    dense = DENSE if wish.norm == 'l1' and wish.solver == PRIMAL_DUAL else ()
+    return (*SPARSE, *judgement, *dense)
+
+
+def _make_ready(steps: tuple[str, ...], quiet: bool = False) -> None:
+    """Compile the solver's loops, which takes long only at the first use on a machine."""
+    with Progress(None, 'part', quiet, 'compiling, once on this machine', delay=1.0) as progress:
+        fill_cache(progress.reach, lambda: False, steps)
+
+
+def _check_outputs(arguments: argparse.Namespace) -> None:
+    """Refuse names of outputs before the work is done, not after."""
+    if arguments.output:
+        formats.check_output(arguments.output)
+    if arguments.plot:
+        from l1slam_ros.io.plot import check_picture
+
+        check_picture(arguments.plot)
+
+
+def _wish(arguments: argparse.Namespace) -> offline.Wish:
+    solver, least_squares, robust = OptimiserOptions(), LeastSquaresOptions(), arguments.robust
+    if arguments.params_file:
+        options = read_params_file(arguments.params_file)
+        solver = options.solver
+        if robust is None and not options.robust.enabled:
+            robust = False
+    if arguments.outer is not None:
+        solver = replace(solver, outer_iterations=arguments.outer)
+        least_squares = replace(least_squares, iterations=arguments.outer)
+    if arguments.inner is not None:
+        solver = replace(solver, inner=replace(solver.inner, iterations=arguments.inner))
+    return offline.Wish(arguments.start, arguments.norm, arguments.solver, robust, solver,
+                        least_squares)
+
+
+def _report(record: GraphRecord, norm: str, outcome: offline.Outcome) -> dict[str, object]:
+    solution, factors, judgement = outcome.solution, record.graph.between, outcome.judgement
+    suspect = judgement.suspect if judgement else np.zeros(len(factors), bool)
+    refused = ~judgement.accepted & ~suspect if judgement else suspect
+    slips = judgement.slips if judgement else np.zeros(0, np.int64)
+    doubtful = judgement is not None and judgement.doubt is not None
+    return {
+        'poses': record.graph.n_poses,
+        'factors': len(factors) + len(record.graph.prior),
+        'loops': int((~factors.is_odometry).sum()),
+        'initial_cost': outcome.initial_cost,
+        'seed_cost': outcome.seed_cost,
+        'final_cost': solution.cost,
+        'status': DOUBTFUL if doubtful else solution.status.value,
+        'seconds': outcome.seconds,
+        'solver': outcome.solver,
+        'outer_iterations': solution.outer_iterations,
+        'inner_iterations': solution.inner_iterations,
+        'rejected': record.ids[factors.pairs[refused]].tolist(),
+        'suspect': record.ids[factors.pairs[suspect]].tolist(),
+        'slips': record.ids[factors.pairs[slips]].tolist(),
+        'parts': outcome.parts,
+    }
+
+
+def _print_report(report: dict[str, object], norm: str, outcome: offline.Outcome) -> None:
+    solution = outcome.solution
+    seed = f'seed {outcome.seed_cost:.6g}, ' if outcome.seed_cost is not None else ''
+    numbers = [counted(int(str(report[name])), name[:-1]) for name in ('factors', 'loops')]
+    print(f'{counted(len(solution.poses), "pose")}, {", ".join(numbers)}')
+    print(f'{norm} cost: initial {outcome.initial_cost:.6g}, {seed}final {solution.cost:.6g}')
+    inner = f', {counted(solution.inner_iterations, "inner one")}' if (
+        solution.inner_iterations) else ''
+    print(f'{solution.status.value.replace("_", " ")} ({SENTENCES[solution.status]}): '
+          f'{counted(solution.outer_iterations, "iteration")}{inner}, {outcome.seconds:.2f} s')
+    print(f'solver: {outcome.solver}, because {outcome.reason}')
+    if 'ate' in report:
+        print(f'position error {report["ate"]:.4f} m over {report["ate_poses"]:,} of '
+              f'{counted(len(solution.poses), "pose")} (RMSE after rigid alignment)')
+
+
+def _plot(arguments: argparse.Namespace, record: GraphRecord, outcome: offline.Outcome,
+          truth: Truth | None) -> None:
+    from l1slam_ros.cli.drawing import cost_curve, drawing
+    from l1slam_ros.io.plot import plot_solution
+
+    poses = outcome.solution.poses
+    path = true_path(record, poses, truth) if truth else None
+    note = f'{arguments.norm} cost {outcome.solution.cost:.6g}'
+    plot_solution(arguments.plot, drawing(
+        arguments.input, record, poses, path, 'optimised', note, outcome.judgement),
+        cost_curve(arguments.norm, outcome))
+
+
+def corrupt(arguments: argparse.Namespace) -> Ending:
+    """
+    Add false loops to a graph.
+
+    What is far apart is judged on the L2 map, solved from the graph alone: a stored start may be
+    raw odometry, whose drift makes places look far apart that are the same, and a 'false' loop
+    between them would be true. False loops that are known already are left out of that map.
+    """
+    from l1slam_ros.cli.drawing import known_false
+
+    check_counts(arguments)
+    record = read(arguments, arguments.input)
+    warn(record.skipped)
+    former = known_false(arguments.input, record)
+    believed = replace(record, graph=record.graph.subset(~former))
+    options = LeastSquaresOptions()
+    _make_ready(SPARSE)
+    with named(arguments.input), Progress(options.iterations, 'step', label='solving') as progress:
+        solution = offline.solve(
+            believed, offline.Wish(norm='l2', robust=False, least_squares=options),
+            progress.report).solution
+    loops = FALSE_LOOPS[arguments.kind](record.graph, solution.poses, arguments.false_loops,
+                                        np.random.default_rng(arguments.seed))
+    factors = record.graph.between
+    pairs: Indices = np.concatenate((factors.pairs[former],
+                                     np.stack((loops.i, loops.j), axis=1)))
+    spoiled = formats.with_poses(replace(record, graph=insert_loops(record.graph, loops)))
+    # A bag has no vertex ids: read back, it counts its keyframes from 0.
+    ids = record.ids[pairs] if arguments.output.suffix else pairs
+    with named(arguments.input):
+        write_spoiled(arguments.output, ids,
+                      lambda: formats.write_output(arguments.output, spoiled))
+    return Ending(record.damage)
+
+
+def reproduce(arguments: argparse.Namespace) -> Ending:
+    """Run the paper's experiments; write the report and say where it is."""
+    from l1slam_ros.paper import reproduce as paper_experiments
+    from l1slam_ros.paper.experiments import Effort
+    from l1slam_ros.paper.printed import WORLDS
+
+    _make_ready(STEPS)
+    paper_experiments.reproduce(arguments.datasets, WORLDS[arguments.worlds], arguments.output,
+                                Effort())
+    print(arguments.output / paper_experiments.REPORT)
+    return Ending()

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+How far an estimated trajectory is from the truth, once both are of the same times and frame.
+
+In: poses, or positions [m]. Out: the truth at the times of the estimate; the error.
+"""
+
+import numpy as np
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+
+
+def poses_at(
+    manifold: Manifold, times: Indices, poses: Array, at: Indices, longest: int, tolerance: int
+) -> tuple[Indices, Array]:
+    """
+    Return which of some times have poses between those known, and these: (k,) and (k, p).
+
+    Linear in position and along the shorter arc in heading; nothing is extrapolated.
+
+    Parameters
+    ----------
+    times, poses : (n,) ascending and (n, p), n >= 2, what is known
+    at : (m,) the times that are asked about
+    longest : between known times further apart nothing is interpolated
+    tolerance : so near to a known time the pose is known
+
+    """
+    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    since, until = at - times[after - 1], times[after] - at
+    gap = since + until
+    inside = (since >= 0) & (until >= 0) & (gap <= longest)
+    rows = np.flatnonzero(inside | (np.minimum(np.abs(since), np.abs(until)) <= tolerance))
+    part = np.clip(since[rows] / gap[rows], 0.0, 1.0)
+    later = after[rows]
+    return rows, manifold.interpolate(poses[later - 1], poses[later], part)
+
+
+def align(estimate: Array, truth: Array) -> tuple[Array, Array]:
+    """
+    Return the rigid motion R, t that minimises sum |R estimate + t - truth|^2.
+
+    Parameters
+    ----------
+    estimate, truth : (n, k) positions [m] of the same times, k = 2 or 3
+
+    Returns
+    -------
+    R : (k, k) rotation, never a reflection; t : (k,) [m].
+
+    Raises
+    ------
+    GraphError : no position at all, or not as many of one as of the other.
+
+    Source
+    ------
+    Umeyama, "Least-squares estimation of transformation parameters between two point patterns"
+    (1991), equations 40, 41 and 43, with scale 1.
+
+    """
+    if estimate.shape != truth.shape or not len(estimate):
+        raise GraphError(f'{len(estimate)} positions of {estimate.shape[1]} coordinates to align '
+                         f'with {len(truth)} of {truth.shape[1]}, expected as many, 1 or more')
+    mean_estimate, mean_truth = estimate.mean(axis=0), truth.mean(axis=0)
+    U, _, Vt = np.linalg.svd((truth - mean_truth).T @ (estimate - mean_estimate))
+    sign = np.ones(len(U))
+    sign[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    R = (U * sign) @ Vt
+    return R, mean_truth - R @ mean_estimate
+
+
+def aligned_positions(estimate: Array, truth: Array) -> Array:
+    """Return the estimated positions (n, k) [m] in the frame of the truth; see `align`."""
+    R, t = align(estimate, truth)
+    aligned: Array = estimate @ R.T + t
+    return aligned
+
+
+def absolute_trajectory_error(estimate: Array, truth: Array) -> float:
+    """Return the RMSE of the positions (n, k) [m] after alignment; see `align`."""
+    distance = np.linalg.norm(aligned_positions(estimate, truth) - truth, axis=1)
+    return float(np.sqrt(np.mean(distance**2)))

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The pose factor graph: which keyframes exist and what was measured, never where they are.
+
+Factors are stored as arrays per kind and are only ever appended, so the row of a factor in the
+linear system never moves, a warm start is a pad with zeros, and what an earlier call returned
+stays valid while the graph grows. Poses live outside, in (n, p) arrays.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.noise import Mask, square_root_information
+from l1slam_ros.core.graph.growable_array import GrowingArray
+
+
+@dataclass(frozen=True)
+class BetweenFactors:
+    """
+    Measurements of the pose of keyframe j seen from keyframe i.
+
+    i, j : (m,) keyframe indices; measurement : (m, p) relative poses;
+    sqrt_information : (m, d, d) upper triangular roots, see `noise`; trusted : (m,) bool, a person
+    or a marker vouches for it.
+    """
+
+    i: Indices
+    j: Indices
+    measurement: Array
+    sqrt_information: Array
+    trusted: Mask
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+    @property
+    def pairs(self) -> Indices:
+        """The keyframes i and j of each, (m, 2)."""
+        return np.stack((self.i, self.j), axis=1)
+
+    @cached_property
+    def is_odometry(self) -> np.ndarray:
+        """(m,) bool: the first factor between each two consecutive keyframes, either way round."""
+        consecutive = np.flatnonzero(np.abs(self.i - self.j) == 1)
+        _, first = np.unique(np.minimum(self.i, self.j)[consecutive], return_index=True)
+        mask = np.zeros(len(self), bool)
+        mask[consecutive[first]] = True
+        return mask
+
+
+@dataclass(frozen=True)
+class PriorFactors:
+    """
+    Measurements of the pose of keyframe i in the map frame.
+
+    i : (m,) keyframe indices; measurement : (m, p) poses; sqrt_information : (m, d, d).
+    """
+
+    i: Indices
+    measurement: Array
+    sqrt_information: Array
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+
+class FactorGraph:
+    """
+    An append-only pose graph on one manifold.
+
+    Parameters
+    ----------
+    manifold : the module the poses live on, e.g. `se2`
+
+    """
+
+    def __init__(self, manifold: Manifold):
+        self.manifold = manifold
+        self.n_poses = 0
+        p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
+        self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
+                         GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_)]
+        self._prior = [GrowingArray((), np.int64), GrowingArray((p,)), GrowingArray((d, d))]
+
+    def copy(self) -> 'FactorGraph':
+        """Return a graph that shares all factors so far; either may grow without the other."""
+        clone = FactorGraph(self.manifold)
+        clone.n_poses = self.n_poses
+        clone._between = [column.copy() for column in self._between]
+        clone._prior = [column.copy() for column in self._prior]
+        return clone
+
+    def subset(self, chosen: Indices | Mask, variance: Array | None = None) -> 'FactorGraph':
+        """
+        Return a graph of all keyframes, all priors and some of the between factors.
+
+        Parameters
+        ----------
+        chosen : rows (k,), or (m,) bool
+        variance : (k,) by which to multiply the covariance of each, none: as they are
+
+        """
+        part = FactorGraph(self.manifold)
+        part.n_poses = self.n_poses
+        part._prior = [column.copy() for column in self._prior]
+        i, j, measurement, root, trusted = (column.view()[chosen] for column in self._between)
+        if variance is not None:
+            root = root / np.sqrt(variance)[:, None, None]
+        self._append(part._between, (i, j, measurement, root, trusted))
+        return part
+
+    @property
+    def between(self) -> BetweenFactors:
+        """All between factors so far: a snapshot that later appends do not change."""
+        return BetweenFactors(*(column.view() for column in self._between))
+
+    @property
+    def prior(self) -> PriorFactors:
+        """All prior factors so far: a snapshot that later appends do not change."""
+        return PriorFactors(*(column.view() for column in self._prior))
+
+    def add_poses(self, count: int = 1) -> None:
+        """Let `count` more keyframes exist; the next index is `n_poses` before the call."""
+        self.n_poses += count
+
+    def add_between(
+        self, i: Indices, j: Indices, measurement: Array, information: Array,
+        trusted: Mask | bool = False,
+    ) -> None:
+        """
+        Append between factors: i, j (m,), measurement (m, p), information (m, d, d), trusted (m,).
+
+        Raises
+        ------
+        GraphError : an index without a keyframe, a self loop, a measurement that is not finite.
+        NoiseError : an information matrix that is not positive definite.
+
+        Nothing is appended when anything is wrong.
+
+        """
+        i, j = np.atleast_1d(i), np.atleast_1d(j)
+        self._check_shapes(measurement, information, i, j)
+        if (i == j).any():
+            raise GraphError(f'keyframe {i[np.argmax(i == j)]} has a factor to itself')
+        self._check(np.concatenate((i, j)), measurement)
+        self.append_between(i, j, measurement, square_root_information(information), trusted)
+
+    def append_between(
+        self, i: Indices, j: Indices, measurement: Array, sqrt_information: Array,
+        trusted: Mask | bool = False,
+    ) -> None:
+        """Append between factors that are known to be sound, with the roots (m, d, d) at hand."""
+        self._append(self._between, (i, j, measurement, sqrt_information,
+                                     np.broadcast_to(trusted, len(i))))
+
+    def add_prior(self, i: Indices, measurement: Array, information: Array) -> None:
+        """Append prior factors: i (m,), measurement (m, p), information (m, d, d); as above."""
+        i = np.atleast_1d(i)
+        self._check_shapes(measurement, information, i)
+        self._check(i, measurement)
+        self._append(self._prior, (i, measurement, square_root_information(information)))
+
+    def _check_shapes(self, measurement: Array, information: Array, *indices: Indices) -> None:
+        m, p, d = len(indices[0]), self.manifold.POSE_SIZE, self.manifold.TANGENT_SIZE
+        found = [np.shape(a) for a in (*indices, measurement, information)]
+        expected = [(m,)] * len(indices) + [(m, p), (m, d, d)]
+        if found != expected:
+            raise GraphError(f'indices, measurements and information have the shapes {found}, '
+                             f'expected {expected}')
+
+    def _check(self, indices: Indices, measurement: Array) -> None:
+        unknown = (indices < 0) | (indices >= self.n_poses)
+        if unknown.any():
+            raise GraphError(f'a factor names keyframe {indices[np.argmax(unknown)]}, '
+                             f'the graph has 0 to {self.n_poses - 1}')
+        if not np.isfinite(measurement).all():
+            row = int(np.argmin(np.isfinite(measurement).all(axis=1)))
+            raise GraphError(f'measurement {row} is not finite: {measurement[row]}')
+
+    @staticmethod
+    def _append(columns: list['GrowingArray'], values: tuple[np.ndarray, ...]) -> None:
+        for column, value in zip(columns, values, strict=True):
+            column.extend(value)
+
+
+def component_labels(graph: FactorGraph) -> Indices:
+    """
+    Return a component number for each keyframe, (n,), in the order of their first keyframes.
+
+    Every keyframe points to a lower one of its component, or to itself; factors pull what both
+    ends point to down to the lower one, and pointers are doubled, until nothing moves.
+    """
+    i, j = graph.between.i, graph.between.j
+    lowest = np.arange(graph.n_poses)
+    while True:
+        a, b = lowest[i], lowest[j]
+        apart = a != b
+        if not apart.any():
+            return np.unique(lowest, return_inverse=True)[1]
+        i, j, a, b = i[apart], j[apart], a[apart], b[apart]
+        np.minimum.at(lowest, np.maximum(a, b), np.minimum(a, b))
+        while (lowest[lowest] != lowest).any():
+            lowest = lowest[lowest]
+
+
+def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:
+    """Return of all between factors the earlier and later keyframe (m,), and that from this."""
+    i, j, Z = graph.between.i, graph.between.j, graph.between.measurement
+    forward = np.where((i > j)[:, None], graph.manifold.inverse(Z), Z)
+    return np.minimum(i, j), np.maximum(i, j), forward

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the interior point minimises: the L1 norm of a residual over poses that move by steps.
+
+In: a graph, or a linear system in the place of one. Out: its residual, linearisation, curvature.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import (
+    LinearSystem,
+    ends,
+    linearise,
+    step_poses,
+    whitened_residual,
+)
+
+
+class Problem(Protocol):
+    """What is minimised: the L1 norm of a residual, over poses that move by steps."""
+
+    def residual(self, poses: Array) -> Array:
+        """Return the whitened residual, (rows,)."""
+
+    def linearise(self, poses: Array, residual: Array) -> LinearSystem:
+        """Return the linear system whose b is minus the residual."""
+
+    def step(self, poses: Array, x: Array) -> Array:
+        """Return the poses moved by x (columns,)."""
+
+    def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> Array | None:
+        """Return the Hessian of dual'e for each of the first factors, (m', 2 k, 2 k)."""
+
+
+@dataclass(frozen=True)
+class GraphProblem:
+    """The poses of a graph."""
+
+    graph: FactorGraph
+
+    def residual(self, poses: Array) -> Array:
+        """See `Problem`."""
+        return whitened_residual(self.graph, poses)
+
+    def linearise(self, poses: Array, residual: Array) -> LinearSystem:
+        """See `Problem`."""
+        return linearise(self.graph, poses, residual)
+
+    def step(self, poses: Array, x: Array) -> Array:
+        """See `Problem`."""
+        return step_poses(self.graph, poses, x)
+
+    def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> Array:
+        """See `Problem`."""
+        gradient = system.gradients(dual)[: len(self.graph.between)]
+        return self.graph.manifold.residual_curvature(*ends(self.graph, poses), gradient)
+
+
+@dataclass(frozen=True)
+class LinearProblem:
+    """A step x (columns,) in the place of poses: |A x - b|."""
+
+    system: LinearSystem
+
+    def residual(self, poses: Array) -> Array:
+        """See `Problem`."""
+        return self.system.times(poses) - self.system.b
+
+    def linearise(self, poses: Array, residual: Array) -> LinearSystem:
+        """See `Problem`."""
+        return replace(self.system, b=-residual)
+
+    def step(self, poses: Array, x: Array) -> Array:
+        """See `Problem`."""
+        return poses + x
+
+    def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> None:
+        """See `Problem`."""

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+From graph and poses to one sparse linear system: minimise |A x - b| over the step x.
+
+In: a graph and its poses. Out: A and b, whitened, b the negative residual, the gauge removed.
+Rows keep the order of the factors, all priors after the between factors; columns keep the order of
+the free keyframes.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+
+@dataclass(frozen=True)
+class LinearSystem:
+    """
+    |A x - b|, with A kept as the two square blocks of each factor.
+
+    keyframe : (m, 2) which free keyframe's step each block multiplies, `size` for none: that of a
+        keyframe held fixed, the second one of a prior;
+    blocks : (m, 2, k, k) whitened Jacobians; b : (rows,) minus the whitened residual, rows = m k;
+    size : free keyframes; columns = size k.
+    """
+
+    keyframe: Indices
+    blocks: Array
+    b: Array
+    size: int
+
+    @property
+    def block_size(self) -> int:
+        """Rows of a factor and columns of a keyframe, k."""
+        return int(self.blocks.shape[-1])
+
+    @cached_property
+    def A(self) -> 'csr_array':
+        """(rows, columns) CSR without the zeros of the blocks."""
+        from scipy.sparse import csr_array
+
+        m, _, k, _ = self.blocks.shape
+        values = self.blocks.transpose(0, 2, 1, 3).reshape(m * k, 2 * k)
+        column = (self.keyframe[:, :, None] * k + np.arange(k)).reshape(m, 1, 2 * k)
+        column = np.broadcast_to(column, (m, k, 2 * k)).reshape(m * k, 2 * k)
+        keep = (values != 0) & (column < self.size * k)
+        indptr = np.concatenate(([0], np.cumsum(keep.sum(axis=1))))
+        return csr_array((values[keep], column[keep].astype(np.int32), indptr.astype(np.int32)),
+                         shape=(m * k, self.size * k))
+
+    def times(self, x: Array) -> Array:
+        """Return A x, (rows,)."""
+        from l1slam_ros.core.kernels.blocks import multiply
+
+        k = self.block_size
+        padded = np.zeros((self.size + 1, k))
+        padded[:-1] = x.reshape(-1, k)
+        product = np.empty((len(self.blocks), k))
+        multiply(self.keyframe, self.blocks, padded, product)
+        return product.ravel()
+
+    def transposed_times(self, y: Array) -> Array:
+        """Return A'y, (columns,)."""
+        from l1slam_ros.core.kernels.blocks import multiply_transposed
+
+        k = self.block_size
+        product = np.zeros((self.size + 1, k))
+        multiply_transposed(self.keyframe, self.blocks, y.reshape(-1, k), product)
+        return product[:-1].ravel()
+
+    def gradients(self, y: Array) -> Array:
+        """Return J_i'y and J_j'y of each factor, (m, 2, k): the summands of A'y."""
+        from l1slam_ros.core.kernels.blocks import gradients
+
+        k = self.block_size
+        product: Array = gradients(self.blocks, y.reshape(-1, k), (0,) * k)
+        return product
+
+    def part(self, entries: slice) -> 'LinearSystem':
+        """Return the system of only these rows of each factor and columns of each keyframe."""
+        blocks = np.ascontiguousarray(self.blocks[:, :, entries, entries])
+        b = self.b.reshape(len(blocks), self.block_size)[:, entries].ravel()
+        return LinearSystem(self.keyframe, blocks, b, self.size)
+
+
+def anchor(graph: FactorGraph) -> int:
+    """Return how many leading keyframes are held fixed: one, unless a prior fixes the gauge."""
+    return 0 if len(graph.prior) else min(1, graph.n_poses)
+
+
+def ends(graph: FactorGraph, poses: Array) -> tuple[Array, Array]:
+    """Return the poses of keyframes i and j of each between factor, (m, p) each."""
+    factors = graph.between
+    return poses.take(factors.i, axis=0), poses.take(factors.j, axis=0)
+
+
+def whitened_residual(graph: FactorGraph, poses: Array) -> Array:
+    """Return the whitened residual of every row, (rows,), in the order of `LinearSystem`."""
+    from l1slam_ros.core.kernels.blocks import whiten
+
+    manifold, factors, prior = graph.manifold, graph.between, graph.prior
+    sizes = (0,) * manifold.TANGENT_SIZE
+    e = manifold.residual(factors.measurement, *ends(graph, poses))
+    whitened: Array = whiten(factors.sqrt_information, e, sizes).ravel()
+    if not len(prior):
+        return whitened
+    e_prior = manifold.local(prior.measurement, poses[prior.i])
+    return np.concatenate((whitened, whiten(prior.sqrt_information, e_prior, sizes).ravel()))
+
+
+def linearise(
+    graph: FactorGraph, poses: Array, residual: Array | None = None
+) -> LinearSystem:
+    """
+    Return the system at `poses` (n, p); Jacobians with respect to right steps.
+
+    residual : of these poses, where it is known already
+    """
+    from l1slam_ros.core.kernels.blocks import whiten_blocks
+
+    manifold, factors, prior, m = graph.manifold, graph.between, graph.prior, len(graph.between)
+    d, size = manifold.TANGENT_SIZE, graph.n_poses - anchor(graph)
+    blocks = np.zeros((m + len(prior), 2, d, d))
+    pair = manifold.residual_jacobians(factors.measurement, *ends(graph, poses))
+    for side, J in enumerate(pair):
+        whiten_blocks(factors.sqrt_information, J, side, blocks[:m], (0,) * d)
+    if len(prior):
+        J_prior = manifold.local_jacobian(prior.measurement, poses[prior.i])
+        whiten_blocks(prior.sqrt_information, J_prior, 0, blocks[m:], (0,) * d)
+    if residual is None:
+        residual = whitened_residual(graph, poses)
+    return LinearSystem(keyframes_of(graph), blocks, -residual, size)
+
+
+def keyframes_of(graph: FactorGraph) -> Indices:
+    """Return the free keyframes that each factor moves, (m, 2); see `LinearSystem`."""
+    factors, prior, fixed = graph.between, graph.prior, anchor(graph)
+    keyframe = np.full((len(factors) + len(prior), 2), graph.n_poses, np.int64)
+    keyframe[: len(factors), 0], keyframe[: len(factors), 1] = factors.i, factors.j
+    keyframe[len(factors):, 0] = prior.i
+    return np.where(keyframe < fixed, graph.n_poses, keyframe) - fixed
+
+
+def step_poses(graph: FactorGraph, poses: Array, x: Array) -> Array:
+    """Return the poses retracted by x (columns,); the anchor stays."""
+    fixed = anchor(graph)
+    step = np.asarray(x).reshape(-1, graph.manifold.TANGENT_SIZE)
+    return np.concatenate((poses[:fixed], graph.manifold.retract(poses[fixed:], step)))

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What comes in from outside: odometry samples and loop closures, still in three dimensions."""
+
+from dataclasses import dataclass
+
+from l1slam_ros.core.geometry.manifold import Array
+
+# [m/s] The speed of sound: no vehicle on the ground has been faster (Thrust SSC, 341 m/s). Stamps
+# nearer to each other than this [s] may be jitter, and say nothing about speed.
+FASTEST, SHORTEST_STEP = 340.0, 0.1
+# [s] The longest gap in the stamps of the odometry that is a pause without further evidence.
+LONGEST_PAUSE = 60.0
+
+@dataclass(frozen=True)
+class OdometrySample:
+    """
+    The pose of the robot in the odometry frame at one time.
+
+    stamp : [ns]; pose3 : (7,) x y z qx qy qz qw [m]; covariance, twist_covariance : (6, 6),
+    rows x y z rx ry rz, as they came in the message: `growth` decides what they mean.
+    """
+
+    stamp: int
+    pose3: Array
+    covariance: Array
+    twist_covariance: Array
+
+
+@dataclass(frozen=True)
+class LoopClosure:
+    """
+    The pose of the robot at `stamp`, seen from the robot at the earlier `reference_stamp`.
+
+    stamps : [ns]; pose3 : (7,) x y z qx qy qz qw [m]; covariance : (6, 6), rows x y z rx ry rz,
+    in the axes of the measured pose; trusted : a person or a marker vouches for it.
+    """
+
+    reference_stamp: int
+    stamp: int
+    pose3: Array
+    covariance: Array
+    trusted: bool = False

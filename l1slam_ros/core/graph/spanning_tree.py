@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+First poses from the graph alone: compose the measurements along a spanning tree.
+
+In: a factor graph. Out: (n, p) poses, keyframe 0 at the identity.
+"""
+
+import numpy as np
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+
+
+def odometry_poses(graph: FactorGraph) -> Array:
+    """
+    Return the chain of the odometry factors, (n, p).
+
+    Raises
+    ------
+    GraphError : two consecutive keyframes without a factor between them.
+
+    """
+    parent = np.maximum(np.arange(graph.n_poses) - 1, 0)
+    odometry = np.flatnonzero(graph.between.is_odometry)
+    return _compose_along(graph, parent, odometry)
+
+
+def tree_poses(graph: FactorGraph, root: int) -> Array:
+    """
+    Return the poses along the breadth-first tree from `root`, (n, p).
+
+    The tree has the shortest chains, so the least drift, of all spanning trees from there.
+
+    Raises
+    ------
+    GraphError : a keyframe without a path to the root.
+
+    """
+    poses = _compose_along(graph, _breadth_first(graph, root), np.arange(len(graph.between)))
+    manifold = graph.manifold
+    return manifold.between(np.broadcast_to(poses[0], poses.shape), poses)
+
+
+def _breadth_first(graph: FactorGraph, root: int) -> Indices:
+    """Return the parent of each keyframe, (n,), the root its own; -1: it has no path to it."""
+    i, j, n = graph.between.i, graph.between.j, graph.n_poses
+    near, far = np.concatenate((i, j)), np.concatenate((j, i))
+    order = np.lexsort((far, np.arange(len(near)) >= len(i), near))
+    start = np.searchsorted(near[order], np.arange(n + 1)).tolist()
+    neighbours = far[order].tolist()
+    # One by one: a graph is often nearly a chain, with as many levels as keyframes.
+    parent, reached = [-1] * n, [root]
+    parent[root] = root
+    for k in reached:
+        for other in neighbours[start[k]:start[k + 1]]:
+            if parent[other] < 0:
+                parent[other] = k
+                reached.append(other)
+    return np.array(parent)
+
+
+def compose_tree(manifold: Manifold, parent: Indices, relative: Array) -> Array:
+    """
+    Return each pose as the product of the relative poses from its root down, (n, p).
+
+    parent : (n,), a root is its own parent; relative : (n, p), seen from the parent; the roots'
+    rows are their poses. Pointer doubling: as many compositions of whole arrays as the tree's
+    depth has binary digits.
+    """
+    poses: Array = relative.copy()
+    root = parent == np.arange(len(parent))
+    while not root.all():
+        poses = np.where(root[:, None], poses, manifold.compose(poses[parent], poses))
+        root, parent = root | root[parent], parent[parent]
+    return poses
+
+
+def _compose_along(graph: FactorGraph, parent: Indices, candidates: Indices) -> Array:
+    """Compose along the tree `parent`, each step the first of the candidate factors it has."""
+    factors, manifold, n = graph.between, graph.manifold, graph.n_poses
+    child = np.flatnonzero(parent != np.arange(n))
+    if (parent[child] < 0).any():
+        lost = child[np.argmax(parent[child] < 0)]
+        raise GraphError(f'keyframe {lost} has no path to the rest of the graph')
+    i, j = factors.i[candidates], factors.j[candidates]
+    pairs, first = np.unique(pair_key(i, j, n), return_index=True)
+    wanted = pair_key(parent[child], child, n)
+    place = np.minimum(np.searchsorted(pairs, wanted), max(len(pairs) - 1, 0))
+    missing = pairs[place] != wanted if len(pairs) else np.ones(len(wanted), bool)
+    if missing.any():
+        k = child[np.argmax(missing)]
+        raise GraphError(f'no factor between keyframes {parent[k]} and {k}')
+    chosen = candidates[first[place]]
+    measurement = factors.measurement[chosen]
+    downwards = (factors.i[chosen] == parent[child])[:, None]
+    relative = manifold.identity(n)
+    relative[child] = np.where(downwards, measurement, manifold.inverse(measurement))
+    return compose_tree(manifold, parent, relative)
+
+
+def pair_key(i: Indices, j: Indices, n: int) -> Indices:
+    """Return one number for each pair of keyframes of n, whichever way round, (m,)."""
+    key: Indices = np.minimum(i, j) * n + np.maximum(i, j)
+    return key

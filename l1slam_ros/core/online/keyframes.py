@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+When motion makes a keyframe, and how uncertain that motion is.
+
+In: the relative pose of each odometry message to the one before. Out: whether a keyframe is due,
+and the motion since the last keyframe with its covariance.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Manifold
+from l1slam_ros.core.geometry.noise import (
+    MOST_OF_ODOMETRY,
+    MOST_VARIANCE,
+    at_most,
+    bounds,
+    or_model,
+    usable,
+)
+from l1slam_ros.core.graph.measurements import OdometrySample
+from l1slam_ros.core.options import Options, option
+
+# Ten steps of 5 cm are half a metre, though the difference of coordinates be a rounding less.
+_ALMOST = 1 - 1e-9
+
+
+@dataclass(frozen=True)
+class KeyframeOptions(Options):
+    """Which motion makes a keyframe: any one threshold; 0 switches one off; all 0: any message."""
+
+    translation: float = option(0.5, 'distance from the last keyframe; 0: off', 'm', 0, 1e6)
+    rotation: float = option(0.2, 'turn since the last keyframe; 0: off', 'rad', 0, 1e6)
+    period: float = option(0.0, 'time since the last keyframe; 0: off', 's', 0, 1e9)
+
+
+@dataclass(frozen=True)
+class OdometryOptions(Options):
+    """Where the covariance of the odometry comes from."""
+
+    covariance_source: str = option(
+        'model', 'model: the sigmas below; increment: pose.covariance is that of the motion since '
+        'the previous message; twist: twist.covariance times the time squared', '',
+        choices=('model', 'increment', 'twist'))
+    sigma_translation: float = option(0.05, 'model: per metre travelled', 'm/m', 0, 1e6)
+    sigma_rotation: float = option(0.05, 'model: per radian turned', 'rad/rad', 0, 1e6)
+    floor_translation: float = option(
+        0.02, 'model: of any motion, added in quadrature', 'm', 1e-9, 1e6)
+    floor_rotation: float = option(
+        0.02, 'model: of any motion, added in quadrature', 'rad', 1e-9, 1e6)
+
+
+def diagonal_covariance(manifold: Manifold, translation: float, rotation: float) -> Array:
+    """Return diag(translation^2, ..., rotation^2, ...), (d, d), from two sigmas [m], [rad]."""
+    sigma = np.zeros(manifold.TANGENT_SIZE)
+    sigma[manifold.TRANSLATION] = translation
+    sigma[manifold.ROTATION] = rotation
+    return np.diag(sigma**2)
+
+
+def reduced_covariance(manifold: Manifold, covariance: Array) -> Array:
+    """Return the rows of messages' (..., 6, 6) covariances that the manifold has, (..., d, d)."""
+    rows = np.array(manifold.COVARIANCE_ROWS)
+    part: Array = covariance[..., rows[:, None], rows]
+    return part
+
+
+class Motion:
+    """
+    The motion since the last keyframe, grown message by message.
+
+    Parameters
+    ----------
+    manifold : what the poses live on
+    stamp, pose : of the keyframe [ns], (1, p) in the odometry frame
+
+    Attributes
+    ----------
+    bounded : of all variances that `covariance` could not take as stated, found and used
+
+    """
+
+    def __init__(self, manifold: Manifold, stamp: int, pose: Array):
+        d = manifold.TANGENT_SIZE
+        self._manifold = manifold
+        self._start = self._stamp = stamp
+        # The keyframe and the last sample.
+        self._ends = np.concatenate((pose, pose))
+        self._metres = self._radians = 0.0
+        self._distance = self._turn = 0.0
+        self.bounded: list[tuple[float, float]] = []
+        self._poses: list[Array] = []
+        self._stated: list[Array] | None = []
+        self._unseen = np.zeros((d, d))
+
+    def add(self, sample: OdometrySample, pose: Array, options: OdometryOptions) -> None:
+        """Continue to `pose` (1, p) in the odometry frame, that of a sample."""
+        manifold = self._manifold
+        length, angle = manifold.motion(manifold.local(self._ends, pose))
+        (self._distance, metres), (self._turn, radians) = length.tolist(), angle.tolist()
+        self._metres += metres
+        self._radians += radians
+        if options.covariance_source == 'model':
+            self._stated = None  # one message without a covariance: the model speaks for all
+        elif self._stated is not None:
+            self._poses.append(pose)
+            self._stated.append(
+                sample.covariance if options.covariance_source == 'increment'
+                else sample.twist_covariance * ((sample.stamp - self._stamp) * 1e-9) ** 2)
+        self._ends[1], self._stamp = pose[0], sample.stamp
+
+    def add_unseen(self, sample: OdometrySample, metres: float, radians: float) -> None:
+        """Continue to a sample at the same place, to which the robot may have gone some way."""
+        self._unseen = self._unseen + diagonal_covariance(self._manifold, metres, radians)
+        self._stamp = sample.stamp
+
+    def is_keyframe(self, options: KeyframeOptions) -> bool:
+        """Tell whether the motion passes any threshold that is on."""
+        passed = ((options.translation, self._distance), (options.rotation, self._turn),
+                  (options.period, (self._stamp - self._start) * 1e-9))
+        on = [value >= _ALMOST * threshold for threshold, value in passed if threshold > 0]
+        return any(on) or not on
+
+    @property
+    def pose(self) -> Array:
+        """The relative pose, (1, p)."""
+        return self._manifold.between(self._ends[:1], self._ends[1:])
+
+    def covariance(self, options: OdometryOptions, verbatim: bool = False) -> Array:
+        """
+        Return the covariance of the motion in the axes of its end, (d, d).
+
+        verbatim : as stated, though it be more, or less, than any odometry can know
+        """
+        model = diagonal_covariance(
+            self._manifold,
+            float(np.hypot(options.sigma_translation * self._metres, options.floor_translation)),
+            float(np.hypot(options.sigma_rotation * self._radians, options.floor_rotation)))
+        stated = self._sum(model, verbatim) if self._stated else None
+        return (model if stated is None else stated) + self._unseen
+
+    def _sum(self, model: Array, verbatim: bool) -> Array | None:
+        """Return the sum of what the messages state; None where one states no covariance."""
+        manifold = self._manifold
+        stated = reduced_covariance(manifold, np.array(self._stated))
+        if not usable(stated).all():
+            return None
+        total = stated
+        if len(total) > 1:
+            # The errors on the way, seen from the end.
+            Ad = manifold.adjoint(manifold.between(self._ends[1:], np.concatenate(self._poses)))
+            total = (Ad @ total @ Ad.transpose(0, 2, 1)).sum(axis=0, keepdims=True)
+        if verbatim:
+            exactly: Array = total[0]
+            return exactly
+        known, out = or_model(total, model, MOST_VARIANCE)
+        used, large = at_most(known, MOST_OF_ODOMETRY)
+        self.bounded = bounds(total, used, out | large)
+        # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
+        return used[0] if len(stated) == 1 or usable(used)[0] else None

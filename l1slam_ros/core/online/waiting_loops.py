@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loop closures that wait for odometry to reach their times, or for their time to be over."""
+
+import heapq
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.measurements import LoopClosure
+
+
+@dataclass(frozen=True)
+class WaitingLoop:
+    """
+    A loop, when it came on the clock of the odometry [ns], and what it says on the manifold.
+
+    measurement : (1, p); covariance : (1, d, d), sound; key : what equal loops have in common.
+    """
+
+    loop: LoopClosure
+    arrival: int
+    measurement: Array
+    covariance: Array
+    key: bytes
+
+
+class WaitingLoops:
+    """Loops by the times they wait for; each costs O(log n) once, however long it waits."""
+
+    def __init__(self) -> None:
+        self._loops: dict[int, WaitingLoop] = {}
+        self._by_stamp: list[tuple[int, int]] = []
+        self._by_arrival: deque[int] = deque()
+        self._count = 0
+        self._stamps: Indices | None = None
+
+    def __len__(self) -> int:
+        return len(self._loops)
+
+    def add(self, waiting: WaitingLoop) -> None:
+        """Add a loop, which comes not before those that are there."""
+        self._loops[self._count] = waiting
+        heapq.heappush(self._by_stamp, (waiting.loop.stamp, self._count))
+        self._by_arrival.append(self._count)
+        self._count += 1
+        self._stamps = None
+
+    def due(self, now: int) -> list[WaitingLoop]:
+        """Take out the loops whose times odometry has reached by `now`, in the order they came."""
+        due = []
+        while self._by_stamp and self._by_stamp[0][0] <= now:
+            _, number = heapq.heappop(self._by_stamp)
+            if number in self._loops:  # else it has expired
+                due.append(number)
+        return [self._take(number) for number in sorted(due)]
+
+    def expired(self, since: int) -> list[WaitingLoop]:
+        """Take out the loops that came before `since`, in the order they came."""
+        expired = []
+        while self._by_arrival:
+            number = self._by_arrival[0]
+            if number in self._loops:  # else it was due
+                if self._loops[number].arrival >= since:
+                    break
+                expired.append(self._take(number))
+            self._by_arrival.popleft()
+        return expired
+
+    def forget_arrivals(self) -> None:
+        """Let all have come before any odometry: the clock they came by was none."""
+        self._loops = {number: replace(one, arrival=0) for number, one in self._loops.items()}
+
+    def stamps(self) -> Indices:
+        """Return reference and end [ns] of each, (k, 2)."""
+        if self._stamps is None:
+            self._stamps = np.array(
+                [(one.loop.reference_stamp, one.loop.stamp) for one in self._loops.values()],
+                np.int64).reshape(-1, 2)
+        return self._stamps
+
+    def _take(self, number: int) -> WaitingLoop:
+        self._stamps = None
+        return self._loops.pop(number)

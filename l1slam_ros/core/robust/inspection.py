@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What may be wrong with a graph, before anybody solves it.
+
+In: a graph. Out: which keyframes and factors are suspicious, and by how much; sentences are made
+of them elsewhere. All but `noise_scales` look at each factor once.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import whiten
+from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
+from l1slam_ros.core.graph.linear_system import LinearSystem, ends, keyframes_of, step_poses
+from l1slam_ros.core.graph.spanning_tree import pair_key, tree_poses
+from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
+
+# A step this many times as long as nine in ten of all steps is no step of the same robot.
+_LONG = 10.0
+# Noise is judged in a part of the graph: a dense graph of 50,000 poses takes minutes to solve.
+_PART = 2000
+# Fewer spare measurements than this tell nothing of their noise.
+_FEWEST_SPARE = 20
+_ROUNDS = 8
+# The poses need not be exact for their residuals to have the right size: steps of Gauss-Newton at
+# most, each halved so often, and the part of chi2 that no longer matters; nor the ratios.
+_STEPS, _HALVINGS, _TOLERANCE = 20, 5, 1e-3
+_SAME_RATIO = 0.01
+
+
+def repeated_factors(graph: FactorGraph) -> Indices:
+    """Return the factors with the pair and the measurement of an earlier one, (k,)."""
+    factors = graph.between
+    rows = np.flatnonzero(_has_parallel(graph))
+    table = np.column_stack((factors.i[rows], factors.j[rows], factors.measurement[rows]))
+    _, first = np.unique(table, axis=0, return_index=True)
+    repeated: Indices = np.delete(rows, first)
+    return repeated
+
+
+def parallel_factors(graph: FactorGraph) -> Indices:
+    """Return the factors that share their pair of keyframes, either way round, (k,)."""
+    return np.flatnonzero(_has_parallel(graph))
+
+
+def _has_parallel(graph: FactorGraph) -> np.ndarray:
+    factors = graph.between
+    _, inverse, counts = np.unique(pair_key(factors.i, factors.j, graph.n_poses),
+                                   return_inverse=True, return_counts=True)
+    shared: np.ndarray = counts[inverse] > 1
+    return shared
+
+
+def connected_parts(graph: FactorGraph) -> list[Indices]:
+    """Return the keyframes of each part of the graph, ascending; the first part has keyframe 0."""
+    labels = component_labels(graph)
+    ends = np.cumsum(np.bincount(labels))[:-1]
+    return np.split(np.argsort(labels, kind='stable'), ends)
+
+
+def odometry_gaps(graph: FactorGraph) -> Indices:
+    """Return the keyframes k without a factor between k and k + 1, (g,)."""
+    factors = graph.between
+    first = np.minimum(factors.i, factors.j)[factors.is_odometry]
+    gaps: Indices = np.setdiff1d(np.arange(graph.n_poses - 1), first)
+    return gaps
+
+
+@dataclass(frozen=True)
+class LongSteps:
+    """
+    Odometry that jumps.
+
+    factors : (k,) of steps much longer than others; lengths : (k,) theirs [m]; ordinary : nine
+    in ten steps are shorter [m].
+    """
+
+    factors: Indices
+    lengths: Array
+    ordinary: float
+
+
+def long_steps(graph: FactorGraph) -> LongSteps:
+    """Return the steps of odometry that are much longer than others."""
+    rows = np.flatnonzero(graph.between.is_odometry)
+    length = step_lengths(graph)
+    ordinary = float(np.quantile(length, 0.9)) if len(length) else 0.0
+    # A robot that mostly stands still has no ordinary step.
+    long = length > _LONG * ordinary if ordinary else np.zeros(len(rows), bool)
+    return LongSteps(rows[long], length[long], ordinary)
+
+
+def step_lengths(graph: FactorGraph) -> Array:
+    """Return how long each step of odometry is [m], in the order of the factors."""
+    manifold, factors = graph.manifold, graph.between
+    steps = factors.measurement[factors.is_odometry]
+    length: Array = manifold.motion(manifold.local(manifold.identity(len(steps)), steps))[0]
+    return length
+
+
+@dataclass(frozen=True)
+class InformationRange:
+    """The factors with the least and with the most information, and how much it is."""
+
+    least_factor: int
+    least: float
+    most_factor: int
+    most: float
+
+
+def information_range(graph: FactorGraph, part: slice) -> InformationRange:
+    """Return the range of the diagonal entries of the information in `part` of the tangent."""
+    diagonal = (graph.between.sqrt_information**2).sum(axis=1)[:, part]
+    least, most = diagonal.min(axis=1), diagonal.max(axis=1)
+    low, high = int(np.argmin(least)), int(np.argmax(most))
+    return InformationRange(low, float(least[low]), high, float(most[high]))
+
+
+@dataclass(frozen=True)
+class NoiseScales:
+    """
+    How many times as large as their information says the errors of factors are.
+
+    odometry, loops : ratios of standard deviations, NaN where too few factors are left to tell;
+    first, last : the keyframes between which this was found.
+    """
+
+    odometry: float
+    loops: float
+    first: int
+    last: int
+
+
+def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
+    """
+    Compare residuals at the L2 optimum with the information that came with them.
+
+    For each of the two groups (odometry, loops) the squared residual is divided by what noise of
+    the stated size, drawn at random and solved for alike, leaves behind: so it counts how far
+    each group is fitted away. Weights follow the ratios found, a few times over.
+
+    Raises
+    ------
+    GraphError : what was looked at cannot be solved.
+
+    """
+    part, keyframes, is_loop = _densest_part(graph)
+    ends = int(keyframes[0]), int(keyframes[-1])
+    if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < _FEWEST_SPARE:
+        return NoiseScales(np.nan, np.nan, *ends)
+    system = _system(part, _l2_poses(part))
+    group = np.repeat(is_loop.astype(np.int64), graph.manifold.TANGENT_SIZE)
+    noise = rng.standard_normal(len(group))
+    variance, spare = np.ones(2), np.zeros(2)
+    for _ in range(_ROUNDS):
+        both = np.stack((system.b, np.sqrt(variance)[group] * noise), axis=1)
+        left = both - system.A @ _least_squares(system, both, 1 / variance[group])
+        found, drawn = (np.bincount(group, column**2, minlength=2) for column in left.T)
+        spare = drawn / variance
+        ratio = np.divide(found, drawn, out=np.ones(2), where=spare >= _FEWEST_SPARE)
+        variance = np.clip(variance * ratio, 1e-12, 1e12)
+        if (np.abs(ratio - 1) < _SAME_RATIO).all():
+            break
+    odometry, loops = np.where(spare >= _FEWEST_SPARE, np.sqrt(variance), np.nan).tolist()
+    return NoiseScales(odometry, loops, *ends)
+
+
+def cost_at(graph: FactorGraph, poses: Array) -> float:
+    """Return the L1 cost of a graph at poses (n, p), nothing compiled."""
+    manifold, factors, prior = graph.manifold, graph.between, graph.prior
+    B = manifold.between(*ends(graph, poses))
+    e = whiten(factors.sqrt_information, manifold.local(factors.measurement, B))
+    e_prior = whiten(prior.sqrt_information, manifold.local(prior.measurement, poses[prior.i]))
+    return l1_cost(e) + l1_cost(e_prior)
+
+
+def _l2_poses(graph: FactorGraph) -> Array:
+    """Return the L2 map of a graph without priors, (n, p): rotations, positions, then both."""
+    manifold, poses = graph.manifold, tree_poses(graph, 0)
+    for part in (manifold.ROTATION, manifold.TRANSLATION):
+        system = _system(graph, poses).part(part)
+        step = np.zeros((system.size, manifold.TANGENT_SIZE))
+        step[:, part] = _least_squares(system, system.b).reshape(system.size, -1)
+        poses = step_poses(graph, poses, step)
+    system = _system(graph, poses)
+    for _ in range(_STEPS):
+        step, chi2 = _least_squares(system, system.b), l2_cost(system.b)
+        for halvings in range(_HALVINGS + 1):
+            candidate = step_poses(graph, poses, step / 2**halvings)
+            moved = _system(graph, candidate)
+            if l2_cost(moved.b) < chi2:
+                poses, system = candidate, moved
+                break
+        if chi2 - l2_cost(system.b) <= _TOLERANCE * chi2:
+            break
+    return poses
+
+
+def _system(graph: FactorGraph, poses: Array) -> LinearSystem:
+    """
+    Return `linearise` of a graph without priors by the verbs of its manifold, nothing compiled.
+
+    A look at a graph is over before compiled loops are there. With B = Xi^-1 Xj the residual is
+    that of B seen from Z; a step s of i moves B on the right by -Ad(B^-1) s.
+    """
+    manifold, factors = graph.manifold, graph.between
+    B = manifold.between(*ends(graph, poses))
+    J_j = manifold.local_jacobian(factors.measurement, B)
+    J_i = -J_j @ manifold.adjoint(manifold.inverse(B))
+    roots = factors.sqrt_information
+    b = -whiten(roots, manifold.local(factors.measurement, B))
+    blocks = np.stack((whiten(roots, J_i), whiten(roots, J_j)), axis=1)
+    return LinearSystem(keyframes_of(graph), blocks, b.ravel(), graph.n_poses - 1)
+
+
+def _least_squares(system: LinearSystem, b: Array, weights: Array | float = 1.0) -> Array:
+    """
+    Return argmin_x sum_i w_i (A x - b)_i^2, (columns,) or (columns, k) for as many b.
+
+    Raises
+    ------
+    GraphError : the matrix is singular.
+
+    """
+    from scipy.sparse import csc_array
+    from scipy.sparse.linalg import splu
+
+    root = np.sqrt(np.broadcast_to(weights, len(system.b)))
+    A = system.A.copy()
+    A.data = A.data * np.repeat(root, np.diff(A.indptr))
+    b = b * (root if b.ndim == 1 else root[:, None])
+    try:
+        factor = splu(csc_array(A.T @ A), permc_spec='MMD_AT_PLUS_A', diag_pivot_thresh=0.0,
+                      options={'SymmetricMode': True})
+    except RuntimeError as error:
+        raise GraphError('the normal matrix is singular') from error
+    x: Array = factor.solve(A.T @ b)
+    return x
+
+
+def _densest_part(graph: FactorGraph) -> tuple[FactorGraph, Indices, np.ndarray]:
+    """
+    Return a connected part of some consecutive keyframes, with as many factors as may be.
+
+    Its graph without priors, its keyframes in the whole graph (k,), and which of its between
+    factors are loops (m,).
+    """
+    factors, n = graph.between, graph.n_poses
+    first, last = np.minimum(factors.i, factors.j), np.maximum(factors.i, factors.j)
+    starts = np.arange(0, max(n - _PART, 0) + 1, _PART // 2)
+    counts = [np.count_nonzero((first >= start) & (last < start + _PART)) for start in starts]
+    start = starts[np.argmax(counts)]
+    keyframes = np.arange(start, min(start + _PART, n))
+    window, _ = _restricted(graph, keyframes)
+    keyframes = keyframes[max(connected_parts(window), key=len)]
+    part, rows = _restricted(graph, keyframes)
+    return part, keyframes, ~factors.is_odometry[rows]
+
+
+def _restricted(graph: FactorGraph, keyframes: Indices) -> tuple[FactorGraph, Indices]:
+    """Return the graph of these keyframes alone, ascending, and which factors it has."""
+    factors = graph.between
+    index = np.full(graph.n_poses, -1)
+    index[keyframes] = np.arange(len(keyframes))
+    i, j = index[factors.i], index[factors.j]
+    rows = np.flatnonzero((i >= 0) & (j >= 0))
+    roots = factors.sqrt_information[rows]
+    part = FactorGraph(graph.manifold)
+    part.add_poses(len(keyframes))
+    part.add_between(i[rows], j[rows], factors.measurement[rows],
+                     roots.transpose(0, 2, 1) @ roots)
+    return part, rows

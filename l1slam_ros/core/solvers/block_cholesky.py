@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+One sparse factorisation for all: Cholesky of J'WJ in blocks of a keyframe's size.
+
+In: which keyframes each factor joins. Out: solutions of normal equations. The order of elimination
+and the pattern of the factor are those of keyframes, found once (`Pattern`) and used for blocks of
+every size: of the rotations alone, of the translations, of whole poses.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from l1slam_ros.core.errors import FillError
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, keyframes_of
+
+Places = NDArray[np.int32]
+
+# Blocks of SE(2) that one gigabyte holds.
+MOST_BLOCKS = 15_000_000
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """
+    The order in which keyframes are eliminated, and where the factor's blocks lie.
+
+    position : (n,) of each keyframe in that order; first : first position of each panel, and n;
+    start, rows : the rows of panel s are rows[start[s]:start[s + 1]], positions; work :
+    multiplications of blocks that one factorisation takes.
+    """
+
+    position: Indices
+    first: Indices
+    start: Indices
+    rows: Indices
+    work: float
+
+
+def find_pattern(keyframe: Indices, size: int, most_blocks: int) -> Pattern:
+    """
+    Return a pattern of little fill; keyframe, size : as in `LinearSystem`.
+
+    Raises
+    ------
+    FillError : the factor would have more than `most_blocks`.
+
+    """
+    from l1slam_ros.core.kernels.ordering import minimum_degree
+    from l1slam_ros.core.kernels.symbolic import lay_out
+
+    order, column, rows = minimum_degree(*neighbours(keyframe, size), most_blocks)
+    if len(order) < size:
+        raise FillError(f'the factor of {size} keyframes and {len(keyframe)} factors would have '
+                        f'more than {most_blocks} blocks: too many far places are joined')
+    return Pattern(*lay_out(order, column, rows))
+
+
+def neighbours(keyframe: Indices, size: int) -> tuple[Places, Places]:
+    """
+    Return the neighbours of each free keyframe k, adjacent[start[k]:start[k + 1]], int32.
+
+    Each once, ascending, both ways round; keyframe, size : as in `LinearSystem`
+    """
+    i, j = keyframe[(keyframe < size).all(axis=1)].T
+    row, adjacent = np.divmod(np.unique(np.concatenate((i * size + j, j * size + i))),
+                              max(size, 1))
+    start = np.searchsorted(row, np.arange(size + 1)).astype(np.int32)
+    return start, adjacent.astype(np.int32)
+
+
+class BlockCholesky:
+    """
+    Factors the normal matrices of all systems that join the same keyframes.
+
+    Parameters
+    ----------
+    pattern : of `keyframe`, or of more
+    keyframe : (m, 2) as in `LinearSystem`
+
+    """
+
+    def __init__(self, pattern: Pattern, keyframe: Indices):
+        self.pattern = pattern
+        self._keyframe = keyframe
+        self._layouts: dict[int, _Layout] = {}
+        self._factored: _Layout | None = None
+
+    def factorise(
+        self, system: LinearSystem, weights: Array, diagonal: Array | float = 0.0,
+        curvature: Array | None = None, share: float = 0.0,
+    ) -> bool:
+        """
+        Factor J'WJ + diag(diagonal) + share C; False: it is not positive definite.
+
+        weights : (rows,); diagonal : (columns,) or one number; curvature : (m', 2 k, 2 k) of the
+        first m' factors, C their sum
+        """
+        from l1slam_ros.core.kernels import cholesky
+
+        k = system.block_size
+        layout = self._layouts.get(k)
+        if layout is None:
+            layout = self._layouts[k] = _Layout(self.pattern, self._keyframe, k)
+        if curvature is None or not share:
+            curvature = np.empty((0, 2 * k, 2 * k))
+        added = np.full(system.size * k, diagonal, float).reshape(-1, k)
+        cholesky.assemble(layout.panels, *layout.places, system.blocks, weights.reshape(-1, k),
+                          added, curvature, share, layout.size)
+        self._factored = layout
+        return bool(cholesky.factorise(layout.panels, *layout.shape, layout.size) == system.size)
+
+    def solve(self, right: Array) -> Array:
+        """Return the solution for a right hand side (columns,) by the last factorisation."""
+        from l1slam_ros.core.kernels.substitution import solve
+
+        layout = self._factored
+        assert layout is not None, 'solve before factorise'
+        x: Array = solve(layout.panels, *layout.shape, self.pattern.position,
+                         right.reshape(-1, len(layout.size)))
+        return x.ravel()
+
+    def solve_many(self, right: Array) -> Array:
+        """Return the solutions for q right hand sides (free keyframes, k, q), of that shape."""
+        from l1slam_ros.core.kernels.prediction import solve_many
+
+        layout = self._factored
+        assert layout is not None, 'solve before factorise'
+        x: Array = solve_many(layout.panels, *layout.shape, self.pattern.position, right)
+        return x
+
+
+class _Layout:
+    """
+    Where in memory the blocks of one size lie.
+
+    panels : all entries; shape : what describes the panels to the kernels; places : where in them
+    the blocks of factors and keyframes are, see `kernels.symbolic.block_addresses`; size : see
+    `kernels.cholesky`.
+    """
+
+    def __init__(self, pattern: Pattern, keyframe: Indices, block_size: int):
+        from l1slam_ros.core.kernels.symbolic import block_addresses
+
+        # Blocks of whole poses are worth loops of their own.
+        self.size = (0,) * 3 if block_size == 3 else np.zeros(block_size)
+        areas = np.diff(pattern.first) * np.diff(pattern.start) * block_size**2
+        offset = np.concatenate(([0], np.cumsum(areas))).astype(np.int64)
+        self.panels = np.empty(offset[-1])
+        self.shape = (pattern.first, pattern.start, pattern.rows, offset)
+        self.places = block_addresses(keyframe, pattern.position, *self.shape, block_size)
+
+
+def cholesky_of(graph: FactorGraph) -> BlockCholesky:
+    """
+    Return what factors the systems of a graph.
+
+    Raises
+    ------
+    FillError : the factor would have more than `MOST_BLOCKS`.
+
+    """
+    keyframe = keyframes_of(graph)
+    pattern = find_pattern(keyframe, graph.n_poses - anchor(graph), MOST_BLOCKS)
+    return BlockCholesky(pattern, keyframe)

@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The L1 map to the last digits: one nonlinear primal-dual interior-point run (Mehrotra's steps).
+
+In: a graph and poses near the map. Out: poses at a local optimum. Where Algorithm 4 solves many
+linear problems one after the other, this relinearises at every step of a single solve. With
+e(x) = u - v, u, v >= 0 and the slacks s = 1 - y, t = 1 + y of the dual's box:
+
+    minimise sum(u + v)    so that    u s = mu, v t = mu, J'y = 0,    mu -> 0.
+
+A step solves (J'QJ + kappa C + D I) dx = -J'(y + Q g), Q = 1 / (u/s + v/t), where C = sum y d2e is
+the curvature of the residuals: without it the run fails where a map bends easily (Manhattan).
+
+It costs one sparse factorisation a step, some twenty in all: cheap on sparse graphs, hopeless on
+dense ones. It is local: started far off it can return its start, which it says by its status.
+
+The same run solves a linear problem (the two of Algorithm 3): one whose linearisation is exact.
+
+Source: Mehrotra (1992) for the predictor and corrector; the rest is ours, defended by
+`test_interior_point.py`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.l1_problem import Problem
+from l1slam_ros.core.graph.linear_system import LinearSystem
+from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
+from l1slam_ros.core.solvers.optimality import Status, fits_exactly, l1_cost, smoothing
+
+# How far to go towards the nearest bound.
+_FRACTION = 0.9995
+# Converged must also mean that no step of the last linear problem would lower the cost by more
+# than this part: with many false loops it can come to rest where one would.
+_PROVEN = 1e-2
+# Slacks are kept above this and never recomputed as 1 -+ y, which would cancel.
+_SMALLEST_SLACK = 1e-15
+# A step is shortened while the residual departs from its linearisation by more than this part of
+# the gap, but not below the last number.
+_DEPARTURE, _SHORTEST = 0.5, 1e-4
+# Of the curvature: how much of it is wanted, and how fast that is taken up again once refused.
+_CURVATURE, _RECOVERY = 0.7, 1.3
+# Of the damping: added where a pivot is not positive; and where a step was short.
+_DAMPING_PIVOT, _DAMPING_STEP = 0.1, 3.0
+_DAMPING_FACTOR = 10.0
+# Of the dual at the end: most projections to make it feasible (each costs a solution, none a
+# factorisation), and the part of the cost that is a gap small enough.
+_PROJECTIONS, _CLOSE = 10, 1e-4
+# A row at its bound still gives way a little, or there might be no feasible dual nearby.
+_LEAST_WEIGHT = 1e-9
+
+Report = Callable[[int, float], None]
+
+
+@dataclass
+class _Iterate:
+    """Poses and their linearisation; the splitting u, v of the residual, slacks s, t, dual y."""
+
+    poses: Array
+    system: LinearSystem
+    u: Array
+    v: Array
+    s: Array
+    t: Array
+    y: Array
+
+    @property
+    def residual(self) -> Array:
+        return -self.system.b
+
+    @property
+    def gap(self) -> float:
+        """The complementarity u's + v't."""
+        return float((self.u * self.s + self.v * self.t).sum())
+
+    @property
+    def weights(self) -> Array:
+        """Q = 1 / (u/s + v/t)."""
+        return 1 / (self.u / self.s + self.v / self.t)
+
+    @property
+    def bounded(self) -> tuple[Array, Array, Array, Array]:
+        """What must stay positive: u, v, s, t."""
+        return self.u, self.v, self.s, self.t
+
+    def advance(self, direction: '_Direction', primal: float) -> None:
+        """Go along a direction, u and v so far; the slacks stay positive."""
+        dual = direction.dual
+        self.u = self.u + primal * direction.u
+        self.v = self.v + primal * direction.v
+        self.y = self.y + dual * direction.y
+        self.s = np.maximum(self.s - dual * direction.y, _SMALLEST_SLACK)
+        self.t = np.maximum(self.t + dual * direction.y, _SMALLEST_SLACK)
+
+    def is_solved(self, cost: float, tolerance: float) -> bool:
+        split = l1_cost(self.residual - self.u + self.v)
+        return split <= tolerance * cost and self.gap <= tolerance * cost
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """
+    What a run ended with: the best poses met, never worse than the start.
+
+    costs : (steps + 1,) the lowest so far; ends : the best iterate, and the last one's dual where
+    that is another, for `prove`.
+    """
+
+    poses: Array
+    costs: list[float]
+    status: Status
+    ends: list[_Iterate]
+
+
+@dataclass(frozen=True)
+class _Direction:
+    """
+    A step of the poses, of the linearised residual, of y, u, v.
+
+    primal, dual : how far it can go; gap : u's + v't there
+    """
+
+    x: Array
+    residual: Array
+    y: Array
+    u: Array
+    v: Array
+    primal: float
+    dual: float
+    gap: float
+
+
+class _Regularisation:
+    """How much curvature kappa and damping D the next factorisation gets."""
+
+    def __init__(self) -> None:
+        self._kappa, self._damping = _CURVATURE, 0.0
+
+    def factorise(self, problem: Problem, at: _Iterate, weights: Array,
+                  cholesky: BlockCholesky) -> bool:
+        """Factor J'QJ + kappa C + D I; take less curvature while that is not definite."""
+        C = problem.curvature(at.poses, at.system, at.y)
+        kappa, damping = self._kappa, self._damping
+        for share in (0.5, 0.5, 0.0, None):
+            definite = cholesky.factorise(at.system, weights, damping, C, kappa)
+            if definite or share is None:
+                break
+            kappa, damping = share * kappa, max(damping, _DAMPING_PIVOT)
+        clean = kappa == self._kappa
+        recovered = min(_CURVATURE, _RECOVERY * max(kappa, _CURVATURE / 10))
+        self._kappa = recovered if clean else kappa
+        return definite
+
+    def learn(self, length: float) -> None:
+        """Damp more after a short step, less after a long one."""
+        if length < 0.1:
+            self._damping = max(_DAMPING_FACTOR * self._damping, _DAMPING_STEP)
+        elif length > 0.3:
+            self._damping /= _DAMPING_FACTOR
+
+
+def interior_point(
+    problem: Problem, poses: Array, cholesky: BlockCholesky, iterations: int, tolerance: float,
+    report: Report = lambda iteration, cost: None,
+) -> Optimum:
+    """
+    Minimise the L1 norm of a problem's residual from poses.
+
+    Parameters
+    ----------
+    cholesky : for the problem's factors
+    iterations : most steps
+    tolerance : converged when both the complementarity gap u's + v't and |e - u + v|_1 are below
+        this part of the cost
+
+    """
+    at = _start(problem, poses)
+    costs, best, regularisation = [l1_cost(at.residual)], at, _Regularisation()
+    status, worst = Status.ITERATION_LIMIT, 1 + tolerance
+    for iteration in range(iterations + 1):
+        cost = l1_cost(at.residual)
+        if at.is_solved(cost, tolerance) or fits_exactly(cost, len(at.y)):
+            status = Status.CONVERGED if cost <= worst * costs[-1] else Status.STALLED
+        if cost <= costs[-1]:
+            best = replace(at)
+        if iteration:
+            costs.append(min(cost, costs[-1]))
+            report(iteration, costs[-1])
+        if status is not Status.ITERATION_LIMIT or iteration == iterations:
+            break
+        if not _step(problem, at, cholesky, regularisation):
+            status = Status.STALLED
+            break
+    ends = [best] if best.system is at.system else [best, replace(at, system=best.system)]
+    return Optimum(best.poses, costs, status, ends)
+
+
+def prove(optimum: Optimum, cholesky: BlockCholesky) -> tuple[Array, float, Status]:
+    """
+    Return a dual y (rows,) with A'y = 0, |y| <= 1, what it proves, and the status in its light.
+
+    No step of the linear problem at the poses can lower their cost by more than the second number,
+    |b|_1 + b'y. A run that came to rest where one might lower it by a percent has not converged.
+    """
+    cost = optimum.costs[-1]
+    y, gap = min((_feasible_dual(end, cost, cholesky) for end in optimum.ends),
+                 key=lambda proof: proof[1])
+    unproven = gap > _PROVEN * cost and not fits_exactly(cost, len(y))
+    stalls = unproven and optimum.status is Status.CONVERGED
+    return y, gap, Status.STALLED if stalls else optimum.status
+
+
+def _feasible_dual(at: _Iterate, cost: float, cholesky: BlockCholesky) -> tuple[Array, float]:
+    """
+    Return a dual near y with A'y = 0, |y| <= 1, and by how much the cost exceeds its value.
+
+    By turns projected on the one, along the slack each row has left, and clipped to the other; at
+    the end shrunk by what is missing.
+    """
+    slack = np.maximum(np.minimum(at.s, at.t), _LEAST_WEIGHT)
+    if not cholesky.factorise(at.system, slack):
+        return np.zeros_like(at.y), cost
+    y = at.y
+    for _ in range(_PROJECTIONS):
+        x = cholesky.solve(at.system.transposed_times(np.clip(y, -1, 1)))
+        y = np.clip(y, -1, 1) - slack * at.system.times(x)
+        feasible = y / max(1.0, float(np.abs(y).max(initial=0.0)))
+        gap = max(cost - float((feasible * at.residual).sum()), 0.0)
+        if gap <= _CLOSE * cost:
+            break
+    return feasible, gap
+
+
+def _start(problem: Problem, poses: Array) -> _Iterate:
+    """Return the point of the central path of mu = mean |e| for the residual as it is."""
+    e = problem.residual(poses)
+    system = problem.linearise(poses, e)
+    mu = smoothing(e)
+    root = np.hypot(mu, e)
+    large = (mu + root + np.abs(e)) / 2
+    small = mu * (mu + root) / (2 * large)  # (mu + root - |e|) / 2 would cancel
+    u, v = np.where(e >= 0, large, small), np.where(e >= 0, small, large)
+    return _Iterate(poses, system, u, v, mu / u, mu / v, e / (mu + root))
+
+
+def _step(problem: Problem, at: _Iterate, cholesky: BlockCholesky,
+          regularisation: _Regularisation) -> bool:
+    """Move `at` by one predictor and corrector step; False: there was no direction."""
+    n, Q = len(at.y), at.weights
+    if not regularisation.factorise(problem, at, Q, cholesky):
+        return False
+    predictor = _direction(at, cholesky, Q, np.zeros(n), np.zeros(n))
+    gap = at.gap
+    mu = gap / (2 * n) * (predictor.gap / gap) ** 3
+    corrector = _direction(at, cholesky, Q, mu + predictor.u * predictor.y,
+                           mu - predictor.v * predictor.y)
+    if not np.isfinite(corrector.x).all():
+        return False
+    primal, at.poses, residual = _trusted(problem, at, corrector)
+    regularisation.learn(primal)
+    at.system = problem.linearise(at.poses, residual)
+    at.advance(corrector, primal)
+    return True
+
+
+def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, c1: Array,
+               c2: Array) -> _Direction:
+    """Solve for the step whose complementarity products become c1, c2 to first order."""
+    from l1slam_ros.core.kernels.interior_point import complete
+
+    # e - (u - v) - (c1/s - u) + (c2/t - v)
+    g = at.residual - c1 / at.s + c2 / at.t
+    x = cholesky.solve(-at.system.transposed_times(at.y + Q * g))
+    moved = at.system.times(x)
+    y, u, v, primal, dual, gap = complete(*at.bounded, Q, c1, c2, g, moved, _FRACTION)
+    return _Direction(x, moved, y, u, v, primal, dual, gap)
+
+
+def _trusted(problem: Problem, at: _Iterate, direction: _Direction) -> tuple[float, Array, Array]:
+    """Halve the primal step while the residual departs too far from its linearisation."""
+    length, allowed = direction.primal, _DEPARTURE * at.gap
+    while True:
+        poses = problem.step(at.poses, length * direction.x)
+        linear = at.residual + length * direction.residual
+        residual = problem.residual(poses)
+        departure = l1_cost(residual - linear)
+        if departure <= allowed or length < _SHORTEST:
+            return length, poses, residual
+        length /= 2

@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What can still be had of a bag that the bag library gives up on.
+
+The files of a bag are walked in the order in which they were written, up to the first damage.
+What lies behind is not used: odometry that ends early gives a smaller map, odometry with a piece
+missing in its middle a wrong one.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from l1slam_ros.io.bags.damaged.walk import BrokenRecordError, RawMessage, zstd_decoder
+from l1slam_ros.io.bags.damaged.walk_mcap import walk_mcap
+from l1slam_ros.io.bags.damaged.walk_rosbag1 import walk_rosbag1
+from l1slam_ros.io.bags.damaged.walk_sqlite import walk_sqlite
+
+METADATA = 'metadata.yaml'
+# How rosbag2 names the files of a bag; `.zstd` where it compresses them as a whole.
+_STORAGE_NAME = re.compile(r'(?P<bag>.+?)(_[0-9]+)?(\.mcap|\.db3)(\.zstd)?')
+# The first bytes of a message that rosbag2 has compressed by itself; of CDR they never are.
+_ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+_WALKS = {'.mcap': walk_mcap, '.db3': walk_sqlite, '.bag': walk_rosbag1}
+_PIECE = 4096  # [bytes] of a compressed file that are decompressed at a time
+_COMPLAINT = 200  # the longest piece of a library's complaint that is passed on
+
+
+@dataclass(frozen=True)
+class Damage:
+    """
+    What keeps a bag from being read to its end.
+
+    path : the file or directory; where : words that follow 'damaged'; used : which messages are
+    """
+
+    path: Path
+    where: str
+    used: str = 'before that'
+
+    def sentence(self, count: int) -> str:
+        """Say it all, when `count` messages were used."""
+        return f'{self.path} is damaged{self.where}; {count:,} messages {self.used} were used'
+
+
+class _DamageError(Exception):
+    """The walk ends here."""
+
+    def __init__(self, damage: Damage):
+        super().__init__(damage)
+        self.damage = damage
+
+
+class Salvage:
+    """
+    A damaged bag, looked through once when this is made.
+
+    Parameters
+    ----------
+    bag : a rosbag2 directory, .mcap, .db3 or .bag
+
+    Attributes
+    ----------
+    counts : (topic, type) -> how many messages were found
+    times : when they were recorded, in the order in which they were written [ns]
+    damage : what ended the search; None: it came to the end
+
+    """
+
+    def __init__(self, bag: Path):
+        self._bag = bag
+        self._definitions: dict[str, str] = {}
+        self.counts: Counter[tuple[str, str]] = Counter()
+        self.times: list[int] = []
+        self.damage: Damage | None = None
+        try:
+            for message in self._walk():
+                self.counts[message.topic, message.msgtype] += 1
+                self.times.append(message.time)
+        except _DamageError as error:
+            self.damage = error.damage
+
+    def messages(
+        self, topics: Collection[str] | None, start: int | None, stop: int | None
+    ) -> Iterator[RawMessage]:
+        """
+        Yield the messages in order of time, those of one time in the order of the files.
+
+        The bag is walked once more, so that only messages ahead of their time are in memory.
+
+        topics : only these; None: all; start, stop : only from start [ns] on and before stop [ns]
+        """
+        order = sorted(range(len(self.times)), key=self.times.__getitem__)
+        rank = [0] * len(order)
+        for position, k in enumerate(order):
+            rank[k] = position
+        waiting: dict[int, RawMessage] = {}
+        position = 0
+        # `rank` first: it ends before the walk comes to the damage.
+        for k, message in zip(rank, self._walk(), strict=False):
+            waiting[k] = message
+            while position in waiting:
+                due = waiting.pop(position)
+                position += 1
+                if ((topics is None or due.topic in topics)
+                        and (start is None or due.time >= start)
+                        and (stop is None or due.time < stop)):
+                    yield due
+
+    def types(self) -> Any:
+        """Return the types to decode by: of Jazzy; what it has not, as the bag defines it."""
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        types = get_typestore(Stores.ROS2_JAZZY)
+        for name, text in self._definitions.items():
+            with suppress(Exception):  # a damaged definition makes the library raise anything
+                types.register({other: fields for other, fields
+                                in get_types_from_msg(text, name).items()
+                                if other not in types.fielddefs})
+        return types
+
+    def _walk(self) -> Iterator[RawMessage]:
+        """Yield the messages of all files in the order in which they were written."""
+        files, damage = _files(self._bag)
+        for file in files:
+            if not file.exists():
+                raise _DamageError(Damage(file, ': the file is missing'))
+            try:
+                yield from self._messages_of(file)
+            except _DamageError:
+                raise
+            except Exception as error:  # damaged files make the libraries raise anything
+                raise _DamageError(Damage(file, f': {complaint(error)}')) from error
+        if damage is not None:
+            raise _DamageError(damage)
+
+    def _messages_of(self, file: Path) -> Iterator[RawMessage]:
+        with _decompressed(file) as readable:
+            walk = _WALKS[readable.suffix]
+            try:
+                yield from map(_unpacked, walk(readable, self._definitions))
+            except BrokenRecordError as error:
+                size = readable.stat().st_size
+                where = (f': it breaks off after {size:,} bytes' if error.position == size
+                         else f' after {error.position:,} of {size:,} bytes')
+                raise _DamageError(Damage(file, where)) from error
+
+
+def complaint(error: Exception) -> str:
+    """Return what a library complains of, on one line."""
+    return ' '.join(str(error).split())[:_COMPLAINT] or type(error).__name__
+
+
+def directory_metadata(bag: Path) -> dict[str, Any]:
+    """Return what the metadata.yaml of a bag says, nothing where it cannot be read."""
+    import yaml
+
+    with suppress(Exception):  # it may be missing, no text, no YAML or other YAML
+        document = yaml.safe_load((bag / METADATA).read_text(encoding='utf-8'))
+        return dict(document['rosbag2_bagfile_information'])
+    return {}
+
+
+def storage_files(directory: Path) -> list[Path]:
+    """Return the files of a bag that are there, in the order of their numbers."""
+    def by_number(path: Path) -> list[tuple[str, int]]:
+        return [(text, int(number or 0)) for text, number
+                in re.findall(r'(\D*)([0-9]*)', path.name)]
+
+    return sorted((path for path in directory.iterdir() if _STORAGE_NAME.fullmatch(path.name)),
+                  key=by_number)
+
+
+def bag_names(directory: Path) -> set[str]:
+    """Return the names of the bags that a directory has files of, without their numbers."""
+    matches = map(_STORAGE_NAME.fullmatch, (path.name for path in directory.iterdir()))
+    return {match['bag'] for match in matches if match}
+
+
+def _files(bag: Path) -> tuple[list[Path], Damage | None]:
+    """Return the files of a bag in the order of writing, and what is wrong with their list."""
+    if not bag.is_dir():
+        return [bag], None
+    names = directory_metadata(bag).get('relative_file_paths')
+    if isinstance(names, list) and names and all(isinstance(name, str) for name in names):
+        # Older versions name the directory too.
+        return [bag / Path(name).name for name in names], None
+    wrong = 'cannot be read' if (bag / METADATA).exists() else 'is missing'
+    return storage_files(bag), Damage(bag, f': its {METADATA} {wrong}', 'of its files')
+
+
+@contextmanager
+def _decompressed(file: Path) -> Iterator[Path]:
+    """Yield the name of a file that can be read: itself, or what is in it, as far as it goes."""
+    if file.suffix != '.zstd':
+        yield file
+        return
+    with TemporaryDirectory() as folder:
+        readable, decoder = Path(folder, file.stem), zstd_decoder()
+        with file.open('rb') as source, readable.open('wb') as target, suppress(Exception):
+            while piece := source.read(_PIECE):
+                target.write(decoder.decompress(piece))
+        yield readable
+
+
+def _unpacked(message: RawMessage) -> RawMessage:
+    """Return a message, decompressed where it was compressed by itself."""
+    if not message.data.startswith(_ZSTD_MAGIC):
+        return message
+    return message._replace(data=zstd_decoder().decompress(message.data))

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+An MCAP file record by record from its start, as far as it can be read; no index is needed.
+
+A file is a row of records: opcode, length, content. A chunk's content is such a row again,
+usually compressed. Of a chunk that the end of the file cuts, or that is damaged inside, what
+comes before is decompressed and used.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+from l1slam_ros.io.bags.damaged.walk import (
+    BrokenRecordError,
+    RawMessage,
+    broken_at,
+    decoded,
+    lz4_decoder,
+    zstd_decoder,
+)
+
+MAGIC = b'\x89MCAP0\r\n'
+_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA, _DATA_END = 3, 4, 5, 6, 12, 15
+# Opcodes between are kept for later versions of the format; zeros are what a power cut leaves.
+_LAST_OPCODE, _FIRST_FOREIGN_OPCODE = 15, 128
+_HEAD = struct.Struct('<BQ')
+_MESSAGE_HEAD = struct.Struct('<HIQQ')
+_FOOTER = struct.Struct('<BQQQI')
+_CHECKSUM = 4  # [bytes] at the end of the footer
+
+
+def walk_mcap(path: Path, definitions: dict[str, str]) -> Iterator[RawMessage]:
+    """
+    Yield the messages of a file in the order in which they were written.
+
+    Parameters
+    ----------
+    path : an MCAP file
+    definitions : message type -> its `ros2msg` definition; those of the file are put in
+
+    Raises
+    ------
+    BrokenRecordError : after the last message before the first damage.
+
+    """
+    size, channels = path.stat().st_size, _Channels(definitions)
+    with path.open('rb') as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise BrokenRecordError(0)
+        for start, opcode, length in _records(file, size):
+            if opcode == _DATA_END:
+                break
+            if opcode not in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK):
+                continue
+            content = file.read(length)
+            # The last record of a whole file is none of these: this one is cut.
+            position = size if file.tell() == size else start
+            yield from broken_at(position, channels.chunk(content) if opcode == _CHUNK
+                                 else channels.record(opcode, content))
+        file.seek(-min(size, len(MAGIC)), 2)
+        if file.read() != MAGIC:
+            raise BrokenRecordError(size)
+
+
+def mcap_metadata(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield the name and the entries of each metadata record of a file, up to its first damage."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Metadata
+
+    with path.open('rb') as file:
+        file.seek(len(MAGIC))
+        for _, opcode, length in _records(file, path.stat().st_size):
+            if opcode == _METADATA:
+                record = Metadata.read(ReadDataStream(BytesIO(file.read(length))))
+                yield record.name, record.metadata
+
+
+def is_indexed(path: Path) -> bool:
+    """Tell whether a file has an index that is unharmed and leads to all its messages."""
+    from mcap.reader import make_reader
+
+    with path.open('rb') as file:
+        summary = make_reader(file).get_summary()
+        if summary is None or summary.statistics is None:
+            return False
+        end = file.seek(-_FOOTER.size - len(MAGIC), 2)
+        footer = file.read(_FOOTER.size)
+        _, _, start, _, checksum = _FOOTER.unpack(footer)
+        file.seek(start)
+        index = file.read(end - start)
+    if checksum and zlib.crc32(index + footer[:-_CHECKSUM]) != checksum:
+        return False
+    chunks = summary.chunk_indexes
+    return (all(chunk.message_index_offsets for chunk in chunks)
+            and bool(chunks or not summary.statistics.message_count))
+
+
+def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
+    """Yield start, opcode and length of each record, the stream at its content."""
+    start = stream.tell()
+    while start < size:
+        stream.seek(start)
+        head = stream.read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            raise BrokenRecordError(size)
+        opcode, length = _HEAD.unpack(head)
+        if not (0 < opcode <= _LAST_OPCODE or opcode >= _FIRST_FOREIGN_OPCODE):
+            raise BrokenRecordError(start)
+        there = size - start - _HEAD.size
+        if length <= there or opcode == _CHUNK:
+            yield start, opcode, min(length, there)
+        if length > there:
+            raise BrokenRecordError(size)
+        start += _HEAD.size + length
+
+
+class _Channels:
+    """Turns records into messages, by the channels announced before them."""
+
+    def __init__(self, definitions: dict[str, str]):
+        self._definitions = definitions
+        self._schemas: dict[int, str] = {0: ''}
+        # None: a channel whose messages are not of ROS 2.
+        self._topics: dict[int, tuple[str, str] | None] = {}
+
+    def record(self, opcode: int, content: bytes) -> Iterator[RawMessage]:
+        """Yield the message that a record is; of any other, learn what it says."""
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Channel, Schema
+
+        if opcode == _MESSAGE:
+            channel_id, _, time, _ = _MESSAGE_HEAD.unpack_from(content)
+            topic = self._topics[channel_id]
+            if topic is not None:
+                yield RawMessage(*topic, time, content[_MESSAGE_HEAD.size:])
+        elif opcode == _SCHEMA:
+            schema = Schema.read(ReadDataStream(BytesIO(content)))
+            self._schemas[schema.id] = schema.name
+            if schema.encoding == 'ros2msg':
+                self._definitions[schema.name] = schema.data.decode()
+        elif opcode == _CHANNEL:
+            channel = Channel.read(ReadDataStream(BytesIO(content)))
+            self._topics[channel.id] = (
+                (channel.topic, self._schemas[channel.schema_id])
+                if channel.message_encoding == 'cdr' else None)
+
+    def chunk(self, content: bytes) -> Iterator[RawMessage]:
+        """Yield the messages of a chunk, in part where it is damaged."""
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Chunk
+
+        chunk = Chunk.read(ReadDataStream(BytesIO(content)))
+        rows = _uncompressed(chunk.data, chunk.compression)
+        whole = len(rows) == chunk.uncompressed_size
+        messages = self._rows(rows)
+        if whole and chunk.uncompressed_crc and zlib.crc32(rows) != chunk.uncompressed_crc:
+            whole = False
+            # A decoder copies a wrong byte to wherever the right one occurs again.
+            messages = iter(() if chunk.compression else _before_a_break(messages))
+        yield from messages
+        if not whole:
+            raise BrokenRecordError(len(rows))
+
+    def _rows(self, rows: bytes) -> Iterator[RawMessage]:
+        stream = BytesIO(rows)
+        for _, opcode, length in _records(stream, len(rows)):
+            yield from self.record(opcode, stream.read(length))
+
+
+def _before_a_break(messages: Iterator[RawMessage]) -> list[RawMessage]:
+    """
+    Return the messages of records that are known to be wrong somewhere.
+
+    Those before the place where they stop being records; none where all of them are.
+    """
+    found = []
+    try:
+        for message in messages:
+            found.append(message)
+    except Exception:
+        return found
+    return []
+
+
+def _uncompressed(data: bytes, compression: str) -> bytes:
+    """Return the content of a chunk, as far as it goes."""
+    decoders = {'zstd': zstd_decoder, 'lz4': lz4_decoder}
+    return decoded(decoders[compression], data) if compression else data

@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A graph as the messages of a bag, such that it can be had back exactly.
+
+    /odom            one nav_msgs/Odometry per keyframe: the odometry factors, chained
+    /loop_closures   one geometry_msgs/PoseWithCovarianceStamped per other factor;
+                     /trusted_loop_closures for those that are never doubted
+    /ground_truth    geometry_msgs/PoseStamped, where the truth is known
+
+Covariances are those of the factors, in the axes of the measured pose: of an odometry message
+that of the motion since the message before.
+"""
+
+import os
+from typing import Any
+
+import numpy as np
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import LEAST_VARIANCE, MOST_OF_ODOMETRY, MOST_VARIANCE
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.measurements import FASTEST, LONGEST_PAUSE, SHORTEST_STEP
+from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUSTED_LOOP_TOPIC, TRUTH_TOPIC
+from l1slam_ros.io.bags.writer import BagWriter, new_bag
+from l1slam_ros.io.files import NANOSECONDS
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.messages.conversion import reference_frame_id
+from l1slam_ros.io.trajectory import invented_stamps
+
+# What `bag.read_note` returns for a graph.
+GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
+# And besides, where a reader of messages would take some for faults: see `_note`.
+VERBATIM_NOTE = {'messages': 'verbatim'}
+
+_TRUTH_FRAME = 'map'
+# builtin_interfaces/Time holds its seconds in 32 bits.
+_LAST_STAMP = 2**31 * NANOSECONDS - 1
+
+
+def write_graph_bag(
+    path: str | os.PathLike[str],
+    record: GraphRecord,
+    truth: Array | None = None,
+    odom_frame: str = 'odom',
+    base_frame: str = 'base_link',
+) -> None:
+    """
+    Write a graph as the messages a robot would have sent.
+
+    Parameters
+    ----------
+    path : the bag's directory; a bag already there is replaced once the new one is complete
+    record : its stamps, or invented ones; its stored poses and vertex ids have no place in a bag
+    truth : (n, p) poses in the map frame, or None
+    odom_frame, base_frame : the frames of the messages
+
+    Raises
+    ------
+    GraphError : the graph has a part that messages cannot express exactly.
+    FileError : the bag cannot be written, or something that is no bag is in its place.
+
+    """
+    graph, stamps = record.graph, _stamps(record)
+    steps, loops = _steps(record), _loops(record)
+    if truth is not None and len(truth) != len(stamps):
+        raise GraphError(f'{len(truth)} true poses; expected {len(stamps)}, one for each vertex')
+    with new_bag(path, _note(record, stamps, steps)) as writer:
+        factors = _FactorWriter(writer, graph, odom_frame, base_frame)
+        chain = graph.manifold.to_pose3(_chain(graph, steps)).tolist()
+        true = None if truth is None else _PoseWriter(writer, graph, truth)
+        for k, stamp in enumerate(stamps):
+            factors.write_odometry(stamp, chain[k], steps[k - 1] if k else None)
+            if true is not None:
+                true.write(stamp, k)
+            for loop in loops[k]:
+                factors.write_loop(stamp, stamps[graph.between.i[loop]], loop)
+
+
+class _FactorWriter:
+    """Writes /odom and /loop_closures, filling one message of each anew for every factor."""
+
+    def __init__(self, writer: BagWriter, graph: FactorGraph, odom_frame: str, base_frame: str):
+        manifold, roots = graph.manifold, np.linalg.inv(graph.between.sqrt_information)
+        self._writer, self._base_frame = writer, base_frame
+        self._measured = manifold.to_pose3(graph.between.measurement).tolist()
+        self._covariances = roots @ roots.transpose(0, 2, 1)
+        rows = np.array(manifold.COVARIANCE_ROWS)
+        self._entries = (6 * rows[:, None] + rows).ravel()
+        self._topics = [TRUSTED_LOOP_TOPIC if trusted else LOOP_TOPIC
+                        for trusted in (graph.between.trusted & ~graph.between.is_odometry)]
+        self._odometry = _blank_odometry(writer.types, odom_frame, base_frame)
+        self._loop = _blank_loop(writer.types)
+        writer.add_topic(ODOMETRY_TOPIC, self._odometry.__msgtype__)
+        for topic in sorted({LOOP_TOPIC, *self._topics}):
+            writer.add_topic(topic, self._loop.__msgtype__)
+
+    def write_odometry(self, stamp: int, pose3: list[float], step: int | None) -> None:
+        """Write a pose of the odometry; step : the factor that leads there, None at the start."""
+        _fill(self._odometry.header, self._odometry.pose.pose, stamp, pose3)
+        self._odometry.pose.covariance = self._covariance(step)
+        self._writer.write(ODOMETRY_TOPIC, stamp, self._odometry)
+
+    def write_loop(self, stamp: int, reference_stamp: int, loop: int) -> None:
+        """Write the factor `loop`, between the keyframes of two stamps [ns]."""
+        _fill(self._loop.header, self._loop.pose.pose, stamp, self._measured[loop])
+        self._loop.header.frame_id = reference_frame_id(self._base_frame, reference_stamp)
+        self._loop.pose.covariance = self._covariance(loop)
+        self._writer.write(self._topics[loop], stamp, self._loop)
+
+    def _covariance(self, factor: int | None) -> Array:
+        """Return the 36 entries of a message; zero without a factor."""
+        entries = np.zeros(36)
+        if factor is not None:
+            entries[self._entries] = self._covariances[factor].ravel()
+        return entries
+
+
+class _PoseWriter:
+    """Writes /ground_truth."""
+
+    def __init__(self, writer: BagWriter, graph: FactorGraph, truth: Array):
+        types = writer.types
+        self._writer = writer
+        self._pose3 = graph.manifold.to_pose3(truth).tolist()
+        self._message = types['geometry_msgs/msg/PoseStamped'](
+            _header(types, _TRUTH_FRAME), _blank_pose(types))
+        writer.add_topic(TRUTH_TOPIC, self._message.__msgtype__)
+
+    def write(self, stamp: int, k: int) -> None:
+        """Write the true pose of keyframe k."""
+        _fill(self._message.header, self._message.pose, stamp, self._pose3[k])
+        self._writer.write(TRUTH_TOPIC, stamp, self._message)
+
+
+def _blank_odometry(types: dict[str, Any], odom_frame: str, base_frame: str) -> Any:
+    twist = types['geometry_msgs/msg/Twist'](
+        *(types['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0) for _ in range(2)))
+    return types['nav_msgs/msg/Odometry'](
+        _header(types, odom_frame), base_frame,
+        types['geometry_msgs/msg/PoseWithCovariance'](_blank_pose(types), np.zeros(36)),
+        types['geometry_msgs/msg/TwistWithCovariance'](twist, np.zeros(36)))
+
+
+def _blank_loop(types: dict[str, Any]) -> Any:
+    return types['geometry_msgs/msg/PoseWithCovarianceStamped'](
+        _header(types, ''),
+        types['geometry_msgs/msg/PoseWithCovariance'](_blank_pose(types), np.zeros(36)))
+
+
+def _blank_pose(types: dict[str, Any]) -> Any:
+    return types['geometry_msgs/msg/Pose'](
+        types['geometry_msgs/msg/Point'](0.0, 0.0, 0.0),
+        types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0))
+
+
+def _header(types: dict[str, Any], frame: str) -> Any:
+    return types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](0, 0), frame)
+
+
+def _fill(header: Any, pose: Any, stamp: int, pose3: list[float]) -> None:
+    """Set the stamp [ns] and the pose x y z qx qy qz qw of a message."""
+    position, orientation = pose.position, pose.orientation
+    header.stamp.sec, header.stamp.nanosec = divmod(stamp, NANOSECONDS)
+    position.x, position.y, position.z = pose3[:3]
+    orientation.x, orientation.y, orientation.z, orientation.w = pose3[3:]
+
+
+def _note(record: GraphRecord, stamps: list[int], steps: Indices) -> dict[str, str]:
+    """
+    Return what is noted of a graph in its bag.
+
+    A graph may have loops that are equal in all, steps longer than a robot's, years between its
+    keyframes, and variances of no measurement: each message is meant then, and the note says so.
+    """
+    factors = record.graph.between
+    loops = np.flatnonzero(~factors.is_odometry)
+    equal = np.concatenate((factors.pairs[loops], factors.measurement[loops]), axis=1)
+    seconds = np.diff(stamps) * 1e-9
+    manifold = record.graph.manifold
+    metres, _ = manifold.motion(
+        manifold.local(manifold.identity(len(steps)), factors.measurement[steps]))
+    roots = np.linalg.inv(factors.sqrt_information)
+    variances = (roots**2).sum(axis=2)
+    meant = (len(np.unique(equal, axis=0)) < len(equal) or (seconds > LONGEST_PAUSE).any()
+             or (metres > FASTEST * np.maximum(seconds, SHORTEST_STEP)).any()
+             or variances.min(initial=1.0) < LEAST_VARIANCE
+             or variances[steps].max(initial=1.0) > MOST_OF_ODOMETRY
+             or variances.max(initial=1.0) > MOST_VARIANCE)
+    return GRAPH_NOTE | VERBATIM_NOTE if meant else GRAPH_NOTE
+
+
+def _steps(record: GraphRecord) -> Indices:
+    """Return which factor leads from each keyframe to the next, (n - 1,)."""
+    factors, ids = record.graph.between, record.ids
+    rows = np.flatnonzero(factors.is_odometry)
+    first = np.minimum(factors.i, factors.j)[rows]
+    missing = np.setdiff1d(np.arange(len(ids) - 1), first)
+    if len(missing):
+        k = missing[0]
+        raise GraphError(f'no edge between the consecutive vertices {ids[k]} and {ids[k + 1]}; '
+                         'a bag needs the odometry of every vertex')
+    _refuse_backward(record, rows)
+    return rows[np.argsort(first)]
+
+
+def _loops(record: GraphRecord) -> list[list[int]]:
+    """Return the loops that end at each keyframe, in the order of the graph."""
+    if len(record.graph.prior):
+        k = record.ids[record.graph.prior.i[0]]
+        raise GraphError(f'a prior on vertex {k}; a bag carries between factors only')
+    rows = np.flatnonzero(~record.graph.between.is_odometry)
+    _refuse_backward(record, rows)
+    loops: list[list[int]] = [[] for _ in record.ids]
+    for row, j in zip(rows.tolist(), record.graph.between.j[rows].tolist(), strict=True):
+        loops[j].append(row)
+    return loops
+
+
+def _refuse_backward(record: GraphRecord, rows: Indices) -> None:
+    """Refuse factors from a later keyframe to an earlier one: inverting them is not exact."""
+    i, j = record.graph.between.i[rows], record.graph.between.j[rows]
+    if (i > j).any():
+        k = int(np.argmax(i > j))
+        raise GraphError(f'an edge from vertex {record.ids[i[k]]} back to {record.ids[j[k]]}; '
+                         'in a bag a pose is seen from an earlier one')
+
+
+def _stamps(record: GraphRecord) -> list[int]:
+    """Return the stamps [ns], each after the one before."""
+    stamps = invented_stamps(len(record.ids)) if record.stamps is None else record.stamps
+    if not len(stamps):
+        raise GraphError('a graph without vertices; expected one at least')
+    bad = np.flatnonzero(np.diff(stamps, prepend=0) <= 0)
+    if len(bad) or stamps[-1] > _LAST_STAMP:
+        k = bad[0] if len(bad) else -1
+        raise GraphError(f'vertex {record.ids[k]} has the stamp {stamps[k]} ns; expected one '
+                         'after 0, after that of the vertex before, and before the year 2038')
+    as_list: list[int] = stamps.tolist()
+    return as_list
+
+
+def _chain(graph: FactorGraph, steps: Indices) -> Array:
+    """
+    Return the poses (n, p) that the odometry alone gives, from the identity.
+
+    One after the other: so each is exact to rounding *relative to the one before*.
+    """
+    poses = graph.manifold.identity(graph.n_poses)
+    for k, step in enumerate(graph.between.measurement[steps]):
+        poses[k + 1] = graph.manifold.compose(poses[k], step)
+    return poses

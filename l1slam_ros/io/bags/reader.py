@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Bags in: rosbag2 directories, bare `.mcap` and `.db3` files, `.bag` files of ROS 1.
+
+The bag library reads them while it can; where it gives up, `salvage` goes on. The bag libraries
+are imported by `bag`, `bag_writer`, `salvage` and the walks alone, and only where needed.
+"""
+
+import math
+import os
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.io.bags.damaged.salvage import (
+    METADATA,
+    Salvage,
+    bag_names,
+    complaint,
+    directory_metadata,
+    storage_files,
+)
+from l1slam_ros.io.bags.damaged.sqlite_pages import is_cut
+from l1slam_ros.io.bags.damaged.walk import RawMessage, ros1_types
+from l1slam_ros.io.bags.damaged.walk_mcap import is_indexed, mcap_metadata
+from l1slam_ros.io.bags.damaged.walk_sqlite import has_journal, sqlite_metadata
+from l1slam_ros.io.bags.writer import NOTE_KEY
+
+BAG_SUFFIXES = ('.mcap', '.db3', '.bag')
+_TO_ITS_END = 'expected a bag that can be read to its end'
+# Told of damage, in one sentence.
+OnDamage = Callable[[str], None]
+
+
+class BagMessage(NamedTuple):
+    """A message of a bag; time : when it was recorded [ns]."""
+
+    topic: str
+    msgtype: str
+    time: int
+    message: Any
+
+
+@dataclass(frozen=True)
+class TopicSummary:
+    """A topic, its type and how many messages it has."""
+
+    name: str
+    msgtype: str
+    count: int
+
+
+@dataclass(frozen=True)
+class BagSummary:
+    """
+    What a bag holds, as far as it can be read.
+
+    start : time of the first message [ns]; duration : until the last one [ns]; note : `read_note`.
+    """
+
+    topics: tuple[TopicSummary, ...]
+    start: int
+    duration: int
+    note: dict[str, str]
+
+
+def read_messages(
+    path: str | os.PathLike[str],
+    topics: Collection[str] | None = None,
+    on_damage: OnDamage | None = None,
+) -> Iterator[BagMessage]:
+    """
+    Yield the messages of a bag in order of time.
+
+    Parameters
+    ----------
+    path : a rosbag2 directory, .mcap, .db3 or .bag
+    topics : only these, as far as the bag has them; None: all
+    on_damage : told, in the end, why only a part could be read; None: damage is an error
+
+    Raises
+    ------
+    FileError : nothing in it can be read, or it is damaged and nobody wants to be told.
+
+    """
+    count = undecodable = 0
+    for raw, types in _messages(path, topics, None, None, on_damage):
+        try:
+            message = types.deserialize_cdr(raw.data, raw.msgtype)
+        except Exception as error:  # bytes that are no message make the library raise anything
+            undecodable += 1
+            if on_damage is None:
+                raise FileError(path, f'a message on {raw.topic} cannot be decoded '
+                                f'({complaint(error)}); {_TO_ITS_END}') from error
+            continue
+        count += 1
+        yield BagMessage(raw.topic, raw.msgtype, raw.time, message)
+    if undecodable and on_damage is not None:
+        on_damage(f'{path} is damaged: {undecodable:,} messages cannot be decoded; '
+                  f'{count:,} others were used')
+
+
+def read_raw(
+    path: str | os.PathLike[str],
+    topics: Collection[str] | None = None,
+    on_damage: OnDamage | None = None,
+    *,
+    start: int | None = None,
+    stop: int | None = None,
+) -> Iterator[RawMessage]:
+    """
+    Yield the messages of a bag in order of time, as serialised; arguments as `read_messages`.
+
+    start, stop : only messages from start [ns] on and before stop [ns].
+    """
+    for message, _ in _messages(path, topics, start, stop, on_damage):
+        yield message
+
+
+def bag_summary(path: str | os.PathLike[str]) -> BagSummary:
+    """
+    Return what a bag holds, topics in alphabetical order.
+
+    Raises
+    ------
+    FileError : nothing in it can be read.
+
+    """
+    bag = _bag_path(path)
+    try:
+        with _reader(bag) as reader:
+            counts = [(name, topic.msgtype or 'several types', topic.msgcount)
+                      for name, topic in reader.topics.items()]
+            # Without messages the library's times are its largest and smallest numbers; its end
+            # lies one nanosecond behind the last message.
+            times = [reader.start_time, reader.end_time - 1] if reader.message_count else [0]
+    except Exception as error:  # damaged bags make the library raise anything
+        salvage = _salvage(bag, error)
+        counts = [(*names, count) for names, count in salvage.counts.items()]
+        times = salvage.times
+    topics = tuple(TopicSummary(*entry) for entry in sorted(counts))
+    return BagSummary(topics, min(times), max(times) - min(times), read_note(path))
+
+
+def read_note(path: str | os.PathLike[str]) -> dict[str, str]:
+    """
+    Return what this package noted in a bag, {} where it noted nothing or nothing can be read.
+
+    `keyframes: every`: each odometry message is a keyframe; `covariance: increment`: its
+    covariance is that of the motion since the message before.
+
+    Raises
+    ------
+    FileError : there is no such bag.
+
+    """
+    bag = _bag_path(path)
+    for file in [bag] if bag.is_file() else [bag, *storage_files(bag)]:
+        try:
+            note = _note_in(file)
+        except Exception:  # damaged files make the libraries raise anything
+            continue
+        if note:
+            return {str(key): str(value) for key, value in note.items()}
+    return {}
+
+
+def _note_in(file: Path) -> dict[str, str]:
+    """Return the note in a file, or in the metadata.yaml of a directory."""
+    import yaml
+
+    metadata: dict[str, Any] = {}
+    if file.is_dir():
+        metadata = directory_metadata(file)
+    elif file.suffix == '.db3':
+        metadata = yaml.safe_load(sqlite_metadata(file)) or {}
+    elif file.suffix == '.mcap':
+        for name, entries in mcap_metadata(file):
+            if name == NOTE_KEY:
+                return entries
+            if name == 'rosbag2':
+                metadata = yaml.safe_load(entries['serialized_metadata'])
+    note: dict[str, str] = yaml.safe_load((metadata.get('custom_data') or {}).get(NOTE_KEY, '{}'))
+    return note
+
+
+def _bag_path(path: str | os.PathLike[str]) -> Path:
+    bag = Path(path)
+    if not bag.exists():
+        raise FileError(path, 'no such file or directory; expected a bag')
+    if bag.is_file() and bag.suffix not in BAG_SUFFIXES:
+        raise FileError(path, f'no bag by its name; expected {", ".join(BAG_SUFFIXES)} '
+                        'or a rosbag2 directory')
+    if bag.is_dir() and not (bag / METADATA).is_file() and len(bag_names(bag)) != 1:
+        raise FileError(path, f'a directory without {METADATA} and with the files of '
+                        f'{len(bag_names(bag))} bags; expected a rosbag2 directory')
+    return bag
+
+
+class _Place:
+    """How far the messages of a bag have been read: `count` of them."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._time = -math.inf
+        # At that very time: the library may have another order than the file.
+        self._read: Counter[tuple[str, bytes]] = Counter()
+
+    def advance(self, message: RawMessage) -> None:
+        """Count a message."""
+        if message.time != self._time:
+            self._read.clear()
+        self._time = message.time
+        self._read[message.topic, message.data] += 1
+        self.count += 1
+
+    def rest(self, messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
+        """Yield those of all messages, in order of time, that have not been read yet."""
+        time, read = self._time, self._read.copy()
+        for message in messages:
+            key = (message.topic, message.data)
+            if message.time == time and read[key]:
+                read[key] -= 1
+            elif message.time >= time:
+                yield message
+
+
+def _messages(
+    path: str | os.PathLike[str], topics: Collection[str] | None, start: int | None,
+    stop: int | None, on_damage: OnDamage | None
+) -> Iterator[tuple[RawMessage, Any]]:
+    """Yield the messages of a bag, each with the types to decode it by."""
+    bag, place = _bag_path(path), _Place()
+    try:
+        for message, types in _by_library(bag, topics, start, stop):
+            place.advance(message)
+            yield message, types
+        return
+    except Exception as error:  # damaged bags make the library raise anything
+        salvage = _salvage(bag, error)
+    damage = salvage.damage
+    if damage is not None and on_damage is None:
+        raise FileError(damage.path, f'damaged{damage.where}; {_TO_ITS_END}')
+    types = salvage.types()
+    for message in place.rest(salvage.messages(topics, start, stop)):
+        place.advance(message)
+        yield message, types
+    if damage is not None and on_damage is not None:
+        on_damage(damage.sentence(place.count))
+
+
+def _by_library(
+    bag: Path, topics: Collection[str] | None, start: int | None, stop: int | None
+) -> Iterator[tuple[RawMessage, Any]]:
+    with _reader(bag) as reader:
+        types = reader.typestore if reader.is2 else ros1_types(reader.typestore.fielddefs)
+        connections = [c for c in reader.connections if topics is None or c.topic in topics]
+        # No connection would mean all of them to the library.
+        for c, time, data in reader.messages(connections, start, stop) if connections else ():
+            cdr = bytes(data if reader.is2 else types.ros1_to_cdr(data, c.msgtype))
+            yield RawMessage(c.topic, c.msgtype, time, cdr), types
+
+
+@contextmanager
+def _reader(bag: Path) -> Iterator[Any]:
+    """Yield the library's reader of a bag that it can be trusted with."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    for file in storage_files(bag) if bag.is_dir() else [bag]:
+        if file.suffix == '.mcap' and not is_indexed(file):
+            raise LookupError(f'{file.name} has no sound index')
+        if file.suffix == '.db3' and (has_journal(file) or is_cut(file)):
+            raise LookupError(f'{file.name} is not all there')
+    # The definitions in the bag come first; sqlite bags of older distributions have none.
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    with AnyReader([bag], default_typestore=typestore) as reader:
+        yield reader
+
+
+def _salvage(bag: Path, error: Exception) -> Salvage:
+    """Return what can be had of a bag that the library gave up on."""
+    salvage = Salvage(bag)
+    if salvage.counts:
+        return salvage
+    reason = complaint(error)
+    if salvage.damage is not None and salvage.damage.where.startswith(': '):
+        reason = salvage.damage.where[2:]
+    raise FileError(bag, f'damaged, or no bag ({reason}); {_TO_ITS_END}') from error

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag -> a graph, grown by the code that the node grows with: live and offline see one graph."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from l1slam_ros.core.errors import FileError, MessageError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.online.graph_builder import GraphGrowth, GrowthOptions
+from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.io.bags.from_graph import GRAPH_NOTE, VERBATIM_NOTE
+from l1slam_ros.io.bags.reader import BagMessage, bag_summary, read_messages, read_note
+from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.messages.base_frame import BaseFrame, Sorted
+from l1slam_ros.io.messages.conversion import loop_closure, odometry_sample
+
+_ODOMETRY = 'nav_msgs/msg/Odometry'
+
+
+def graph_from_bag(path: Path, options: GrowthOptions | None, topics: Topics) -> GraphRecord:
+    """
+    Grow a graph from the messages of a bag, damaged or not.
+
+    Parameters
+    ----------
+    path : a rosbag2 directory, .mcap, .db3 or .bag
+    options : what makes keyframes of messages; None: what the bag's note says, or the node's
+        defaults
+    topics : where to look
+
+    Raises
+    ------
+    FileError : the bag cannot be read, there is no graph in it, or not the topics asked for.
+
+    """
+    note = read_note(path)
+    growing = _Growing(options or _noted_options(note), topics,
+                       note.get('messages') == VERBATIM_NOTE['messages'])
+    damage: list[str] = []
+    for message in read_messages(path, topics.types(), damage.append):
+        growing.take(message)
+    record = growing.record('; '.join(damage))
+    if record.graph.n_poses < 2:
+        raise FileError(path, '; '.join([
+            f'{record.graph.n_poses} keyframes from {topics.odometry}; expected 2 or more',
+            *_alternatives(path, topics.odometry, _ODOMETRY), *record.skipped, *damage]))
+    for topic in sorted(topics.types().keys() - DEFAULT_TOPICS.types().keys() - growing.seen):
+        raise FileError(path, '; '.join([
+            f'no messages on {topic}; expected {topics.types()[topic]}',
+            *_alternatives(path, topic, topics.types()[topic]), *damage]))
+    return record
+
+
+class _Growing:
+    """A graph that grows message by message."""
+
+    def __init__(self, options: GrowthOptions, topics: Topics, verbatim: bool):
+        self._growth = GraphGrowth(se2, options, verbatim)
+        self._topics, self._types = topics, topics.types()
+        self._base_frame = BaseFrame('')
+        self.seen: set[str] = set()
+
+    def take(self, message: BagMessage) -> None:
+        """Use a message, or note why not."""
+        topic, expected = message.topic, self._types[message.topic]
+        self.seen.add(topic)
+        notes = self._growth.notes
+        try:
+            if message.msgtype != expected:
+                raise MessageError('type', f'{message.msgtype} on {topic}; expected {expected}')
+            if topic == self._topics.odometry:
+                self._add_odometry(self._base_frame.take(
+                    message.message.child_frame_id, odometry_sample(message.message)))
+            else:
+                self._growth.add_loop(loop_closure(
+                    message.message, self._base_frame.name, topic == self._topics.trusted))
+        except MessageError as error:
+            notes.refuse(error.cause, str(error))
+        except (AttributeError, TypeError, ValueError):
+            # The bag defines the type otherwise: it is damaged there, or of another ROS.
+            notes.refuse('fields', f'a message on {topic}; expected the fields of {expected}')
+
+    def _add_odometry(self, found: Sorted) -> None:
+        if found.anew:
+            self._growth.begin_anew()
+        for error in found.others:
+            self._growth.notes.refuse(error.cause, str(error))
+        for sample in found.ours:
+            try:
+                self._growth.add_odometry(sample)
+            except MessageError as error:
+                self._growth.notes.refuse(error.cause, str(error))
+
+    def record(self, damage: str) -> GraphRecord:
+        """Return the graph that has grown; damage : of the bag."""
+        growth = self._growth
+        self._add_odometry(Sorted(others=self._base_frame.rest()))
+        growth.finish()
+        growth.add_due_loops()
+        skipped = growth.notes.sentences()
+        if growth.held:
+            skipped.append(f'the last message is not used: {growth.held}')
+        if growth.n_waiting == 1:
+            skipped.append('1 loop names a time after the last odometry')
+        elif growth.n_waiting:
+            skipped.append(f'{growth.n_waiting} loops name times after the last odometry')
+        return GraphRecord(growth.graph, None, np.arange(growth.graph.n_poses), growth.stamps,
+                           tuple(skipped), damage)
+
+
+def _noted_options(note: dict[str, str]) -> GrowthOptions:
+    options = GrowthOptions()
+    if note.get('keyframes') == GRAPH_NOTE['keyframes']:
+        options = replace(options, keyframe=KeyframeOptions(0.0, 0.0, 0.0))
+    if note.get('covariance') == GRAPH_NOTE['covariance']:
+        options = replace(options, odometry=OdometryOptions(GRAPH_NOTE['covariance']))
+    return options
+
+
+def _alternatives(path: Path, topic: str, msgtype: str) -> list[str]:
+    """Say on which other topics a bag has messages of a type; nothing where on none."""
+    others = [t.name for t in bag_summary(path).topics if t.msgtype == msgtype and t.name != topic]
+    return [f'{msgtype} is on {", ".join(others)}'] if others else []

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Bags out: rosbag2 directories (mcap) that `ros2 bag play`, rosbags, Foxglove and mcap tools read.
+
+The mcap library writes the file, in small chunks with checksums: of a file that is cut or gets a
+wrong bit later on, little is lost, and the loss is seen. What rosbag2 wants besides is made here:
+metadata.yaml of its version 9, and a copy of it in the file.
+"""
+
+import os
+import shutil
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import StringIO
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.io.bags.damaged.salvage import METADATA
+from l1slam_ros.io.files import sync_folder
+
+NOTE_KEY = 'l1slam'
+# What recorders leave in a bag's directory besides metadata.yaml.
+_BAG_SUFFIXES = ('.mcap', '.db3', '.db3-shm', '.db3-wal', '.zstd')
+_CHUNK = 16 * 1024  # [bytes] before compression: about 20 odometry messages
+_LIBRARY = 'l1slam_ros'
+_DISTRIBUTION = 'jazzy'
+# As rosbag2 writes them: no deadline is 2^63 - 1 ns, and so is the start of an empty bag.
+_FOREVER = {'sec': 9223372036, 'nsec': 854775807}
+_NEVER = 2**63 - 1
+_QOS = {
+    'history': 'keep_last', 'depth': 1000, 'reliability': 'reliable', 'durability': 'volatile',
+    'deadline': _FOREVER, 'lifespan': _FOREVER, 'liveliness': 'automatic',
+    'liveliness_lease_duration': _FOREVER, 'avoid_ros_namespace_conventions': False,
+}
+
+
+class BagWriter:
+    """Writes messages into a new bag; `types` holds the classes of all ROS 2 messages by name."""
+
+    def __init__(self, writer: Any, typestore: Any):
+        self._writer, self._typestore = writer, typestore
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._msgtypes: dict[str, str] = {}
+        self._counts: Counter[str] = Counter()
+        self._times = (_NEVER, 0)
+        self.types: dict[str, Any] = typestore.types
+
+    def add_topic(self, topic: str, msgtype: str) -> None:
+        """Announce a topic: reliable, volatile, the last 1000 messages kept."""
+        if msgtype not in self._schemas:
+            definition, _ = self._typestore.generate_msgdef(msgtype, ros_version=2)
+            self._schemas[msgtype] = self._writer.register_schema(
+                msgtype, 'ros2msg', definition.encode())
+        self._msgtypes[topic] = msgtype
+        self._channels[topic] = self._writer.register_channel(
+            topic, 'cdr', self._schemas[msgtype], {
+                'offered_qos_profiles': _yaml([_QOS]),
+                'topic_type_hash': self._typestore.hash_rihs01(msgtype)})
+
+    def write(self, topic: str, time: int, message: Any) -> None:
+        """Write a message at a time [ns]."""
+        data = self._typestore.serialize_cdr(message, self._msgtypes[topic])
+        self._writer.add_message(self._channels[topic], time, bytes(data), time)
+        self._counts[topic] += 1
+        self._times = (min(self._times[0], time), max(self._times[1], time))
+
+    def metadata(self, file: str, note: dict[str, str]) -> dict[str, Any]:
+        """Return what metadata.yaml is to say of the file, and of a note in it."""
+        start, stop = self._times
+        extent = {
+            'duration': {'nanoseconds': max(stop - start, 0)},
+            'starting_time': {'nanoseconds_since_epoch': start},
+            'message_count': self._counts.total(),
+        }
+        return {
+            'version': 9,
+            'storage_identifier': 'mcap',
+            'relative_file_paths': [file],
+            **extent,
+            'topics_with_message_count': [self._topic_metadata(name) for name in self._channels],
+            'compression_format': '',
+            'compression_mode': '',
+            'files': [{'path': file, **extent}],
+            'custom_data': {NOTE_KEY: _yaml(note, in_one_line=True)} if note else None,
+            'ros_distro': _DISTRIBUTION,
+        }
+
+    def _topic_metadata(self, topic: str) -> dict[str, Any]:
+        return {'message_count': self._counts[topic], 'topic_metadata': {
+            'name': topic,
+            'type': self._msgtypes[topic],
+            'serialization_format': 'cdr',
+            'offered_qos_profiles': [_QOS],
+            'type_description_hash': self._typestore.hash_rihs01(self._msgtypes[topic]),
+        }}
+
+
+@contextmanager
+def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagWriter]:
+    """
+    Yield the writer of a bag (a rosbag2 directory, mcap), in its place when the block succeeds.
+
+    Parameters
+    ----------
+    path : a bag already there is replaced once the new one is complete
+    note : what `read_note` will return
+
+    Raises
+    ------
+    FileError : the bag cannot be written, or something that is no bag is in its place.
+
+    """
+    from mcap.writer import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    target = Path(os.path.abspath(path))
+    with _replacing_directory(target) as made:
+        made.mkdir()
+        file = made / f'{target.name}.mcap'
+        with file.open('xb') as stream:
+            writer = Writer(stream, chunk_size=_CHUNK)
+            writer.start('ros2', _LIBRARY)
+            # First of all: what is read of a file that is cut must not lose its meaning.
+            if note:
+                writer.add_metadata(NOTE_KEY, note)
+            bag = BagWriter(writer, get_typestore(Stores.ROS2_JAZZY))
+            yield bag
+            metadata = bag.metadata(file.name, note)
+            writer.add_metadata('rosbag2', {'serialized_metadata': _yaml(metadata)})
+            writer.finish()
+        document = {'rosbag2_bagfile_information': metadata}
+        (made / METADATA).write_text(_yaml(document) + '\n', 'utf-8')
+
+
+def _yaml(document: Any, in_one_line: bool = False) -> str:
+    """Return a document as YAML, whatever occurs in it twice written out twice."""
+    import yaml
+
+    text = StringIO()
+    dumper = yaml.SafeDumper(text, sort_keys=False, width=2**16,
+                             default_flow_style=in_one_line)
+    dumper.ignore_aliases = lambda _: True
+    dumper.open()
+    dumper.represent(document)
+    dumper.close()
+    return text.getvalue().strip()
+
+
+def _refuse_other_than_bag(target: Path) -> None:
+    """Refuse to replace what is there, unless it is a bag and nothing else."""
+    if not os.path.lexists(target):
+        return
+    if not (target / METADATA).is_file():
+        raise FileError(target, 'exists and is no bag, so it is not overwritten; expected a bag '
+                        'or nothing there')
+    for child in sorted(target.iterdir()):
+        if child.name != METADATA and not child.name.endswith(_BAG_SUFFIXES):
+            raise FileError(target, f'holds {child.name}, which is no part of a bag, so it is not '
+                            'overwritten; expected a bag or nothing there')
+
+
+@contextmanager
+def _replacing_directory(target: Path) -> Iterator[Path]:
+    """Yield the name of a directory to make, which takes the place of `target` in the end."""
+    scratch = None
+    try:
+        _refuse_other_than_bag(target)
+        scratch = Path(mkdtemp(prefix=f'.{target.name}.', suffix='.tmp', dir=target.parent))
+        # The bag is made under its own name: that of the file inside repeats it.
+        made = scratch / target.name
+        yield made
+        for file in made.iterdir():
+            with file.open('rb') as written:
+                os.fsync(written.fileno())
+        sync_folder(made)
+        _swap(made, target, scratch / f'{target.name}.former')
+        sync_folder(target.parent)
+    except OSError as error:
+        raise FileError(target, f'cannot be written: {error.strerror or error}') from error
+    finally:
+        if scratch is not None:
+            shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _swap(made: Path, target: Path, former: Path) -> None:
+    """Put `made` in the place of `target`, and what was there, if anything, into `former`."""
+    replaces = os.path.lexists(target)
+    if replaces:
+        os.rename(target, former)
+    try:
+        os.rename(made, target)
+    except OSError:
+        if replaces:
+            os.rename(former, target)
+        raise

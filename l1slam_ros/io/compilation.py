@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Filling the cache of compiled loops before they are needed, by processes of their own.
+
+In: nothing. Out: numba's cache, and beside it a note of what it holds, by which the next call
+knows without numba that nothing is to be done. The note counts only for the very sources, Python,
+numba and processor that it was made with, and while the files it names are there.
+"""
+
+import hashlib
+import importlib.util
+import json
+import os
+import platform
+import queue
+import selectors
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from l1slam_ros.core.solvers.warm_up import STEPS, make_ready
+
+_KERNELS = Path(__file__).parents[1] / 'core' / 'kernels'
+# [s] How often the caller is asked whether to stop.
+_LOOK = 0.1
+# Other processes go first, though not by far: whoever waits for the loops waits for these.
+_NICE = 5
+# What a processor is known by, of all that the kernel of Linux says of it.
+_PROCESSOR = ('model name', 'flags', 'Features', 'CPU implementer', 'CPU part')
+
+
+def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
+               steps: Sequence[str] = STEPS) -> bool:
+    """
+    Compile what is not in the cache yet; returns at once where nothing is missing.
+
+    What is not compiled here, for whatever reason, is when it is first called.
+
+    Parameters
+    ----------
+    report : called with how many steps are done, of how many: at first, and whenever one is
+    stopped : asked now and then; once it says yes, compiling ends and the call returns
+    steps : what is needed, of `warm_up.STEPS`
+
+    Returns
+    -------
+    whether all of it is in the cache now
+
+    """
+    known = _noted()
+    missing = [step for step in steps if step not in known]
+    if not missing:
+        return True
+    if stopped() or not any(map(_is_writable, _folders())):
+        return False
+    report(0, len(missing))
+    for done, (step, files) in enumerate(_compiled(missing, stopped), 1):
+        if files:
+            known[step] = files
+            _note(known)
+        report(done, len(missing))
+    return set(steps) <= known.keys()
+
+
+def _compiled(steps: list[str], stopped: Callable[[], bool]) -> Iterator[tuple[str, list[str]]]:
+    """Yield each step and the files that keep it, as processes are done with them."""
+    waiting, busy = list(steps), {}
+    workers = [_start() for _ in range(min(_cores(), len(steps)))]
+    with selectors.DefaultSelector() as selector:
+        try:
+            for worker in workers:
+                assert worker.stdout is not None
+                selector.register(worker.stdout, selectors.EVENT_READ, worker)
+                busy[worker.pid] = _give(worker, waiting)
+            while busy and not stopped():
+                for key, _ in selector.select(_LOOK):
+                    worker = key.data
+                    step, answer = busy.pop(worker.pid), worker.stdout.readline()
+                    # A process that broke says nothing; the others go on.
+                    if not answer:
+                        selector.unregister(worker.stdout)
+                        continue
+                    yield step, json.loads(answer)
+                    if waiting:
+                        busy[worker.pid] = _give(worker, waiting)
+                    else:
+                        selector.unregister(worker.stdout)
+        finally:
+            for worker in workers:
+                worker.kill()
+                worker.communicate()
+
+
+def _start() -> 'subprocess.Popen[str]':
+    """Start a process that finds its modules where this one does."""
+    code = (f'import sys; sys.path[:] = {sys.path!r}; '
+            'from l1slam_ros.io.compilation import work; work()')
+    return subprocess.Popen([sys.executable, '-c', code], stdin=subprocess.PIPE,
+                            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+
+
+def _give(worker: 'subprocess.Popen[str]', waiting: list[str]) -> str:
+    """Give a process the next step to do; return which it is."""
+    step = waiting.pop(0)
+    assert worker.stdin is not None
+    try:
+        worker.stdin.write(f'{step}\n')
+        worker.stdin.flush()
+    except BrokenPipeError:
+        pass  # it is gone, which reading from it will tell
+    return step
+
+
+def work() -> None:
+    """Make ready the steps named on standard input; end with it, as when the parent dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a person's Ctrl-C is for the parent
+    os.nice(_NICE)
+    steps: queue.Queue[str] = queue.Queue()
+
+    def read() -> None:
+        for line in sys.stdin:
+            steps.put(line.strip())
+        os._exit(0)
+
+    threading.Thread(target=read, daemon=True).start()
+    while True:
+        step = steps.get()
+        folder = make_ready(step)
+        files = sorted(map(str, Path(folder).glob(f'{step}.*.nbi'))) if folder else []
+        print(json.dumps(files), flush=True)
+
+
+def _cores() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
+        os.cpu_count() or 1)
+
+
+def _folders() -> list[Path]:
+    """Return where the note may be: where numba would keep what it compiles, the first first."""
+    user = os.environ.get('XDG_CACHE_HOME') or os.path.join(os.path.expanduser('~'), '.cache')
+    own = os.environ.get('NUMBA_CACHE_DIR')
+    return [*([Path(own)] if own else []), _KERNELS / '__pycache__', Path(user) / 'numba']
+
+
+def _is_writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def _name() -> str:
+    """Return the name of the note: one for each place of the package, and Python, in a folder."""
+    place = hashlib.sha256(os.fsencode(_KERNELS)).hexdigest()[:12]
+    return f'l1slam-{sys.implementation.cache_tag}-{place}.json'
+
+
+def _noted() -> dict[str, list[str]]:
+    """Return the steps that are in the cache, and the files that keep each."""
+    for folder in _folders():
+        try:
+            note = json.loads((folder / _name()).read_text())
+        except (OSError, ValueError):
+            continue
+        if note['key'] == _key():
+            return {step: files for step, files in note['steps'].items()
+                    if all(map(os.path.exists, files))}
+    return {}
+
+
+def _note(steps: dict[str, list[str]]) -> None:
+    """Write down what is in the cache; a reader finds all of the note or none."""
+    folder = next(filter(_is_writable, _folders()))
+    with tempfile.NamedTemporaryFile('w', dir=folder, delete=False) as file:
+        json.dump({'key': _key(), 'steps': steps}, file)
+    os.replace(file.name, folder / _name())
+
+
+def _key() -> str:
+    """Return what changes with all that a compiled loop depends on."""
+    numba = importlib.util.find_spec('numba')
+    sources = [Path(numba.origin)] if numba and numba.origin else []
+    stats = [(path.name, path.stat()) for path in (*sources, *sorted(_KERNELS.glob('*.py')))]
+    settings = sorted(pair for pair in os.environ.items() if pair[0].startswith('NUMBA_'))
+    facts = (sys.version, platform.machine(), _processor(), settings,
+             [(name, stat.st_mtime_ns, stat.st_size) for name, stat in stats])
+    return hashlib.sha256(repr(facts).encode()).hexdigest()
+
+
+def _processor() -> list[str]:
+    try:
+        first = Path('/proc/cpuinfo').read_text().split('\n\n')[0]
+    except OSError:
+        return [platform.processor()]
+    return [line for line in first.splitlines() if line.startswith(_PROCESSOR)]

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Any input file -> graph, and a graph -> any output file; nothing is solved here."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from l1slam_ros.core.errors import FileError, GraphError
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.factor_graph import component_labels
+from l1slam_ros.core.graph.spanning_tree import odometry_poses, tree_poses
+from l1slam_ros.core.robust.inspection import odometry_gaps
+from l1slam_ros.io.bags.reader import BAG_SUFFIXES
+from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
+from l1slam_ros.io.files import require_folder
+from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
+from l1slam_ros.io.trajectory import invented_stamps, write_tum
+
+if TYPE_CHECKING:
+    from l1slam_ros.core.online.graph_builder import GrowthOptions
+
+GRAPH_SUFFIXES = ('.g2o', '.graph')
+
+
+def read_input(
+    path: Path, options: 'GrowthOptions | None' = None, topics: Topics = DEFAULT_TOPICS
+) -> GraphRecord:
+    """
+    Read a graph file or grow a graph from a bag.
+
+    Parameters
+    ----------
+    path : .g2o, .graph, .mcap, .db3, .bag (ROS 1) or a rosbag2 directory
+    options : what makes keyframes of a bag's messages; None: what the bag's note says, or the
+        node's defaults
+    topics : where in a bag to look
+
+    Raises
+    ------
+    FileError : it cannot be read, or there is no graph in it.
+
+    """
+    if not path.exists():
+        raise FileError(path, 'no such file or directory')
+    if is_bag(path):
+        from l1slam_ros.io.bags.to_graph import graph_from_bag
+
+        return graph_from_bag(path, options, topics)
+    if path.suffix in GRAPH_SUFFIXES:
+        return read_graph_file(path)
+    raise FileError(path, f'unknown kind of file; expected {", ".join(GRAPH_SUFFIXES)}, '
+                    f'{", ".join(BAG_SUFFIXES)} or a rosbag2 directory')
+
+
+def is_bag(path: Path) -> bool:
+    """Tell whether an input is taken for a bag."""
+    return path.is_dir() or path.suffix in BAG_SUFFIXES
+
+
+def stored_poses(record: GraphRecord) -> Array:
+    """
+    Return the stored start, (n, p); where none is stored, the odometry chain.
+
+    Where that has gaps, the poses along a breadth-first tree from the first keyframe.
+
+    Raises
+    ------
+    GraphError : none is stored, and the graph is not connected.
+
+    """
+    if record.poses is not None:
+        return record.poses
+    require_connected(record)
+    if len(odometry_gaps(record.graph)):
+        return tree_poses(record.graph, 0)
+    return odometry_poses(record.graph)
+
+
+def with_poses(record: GraphRecord) -> GraphRecord:
+    """Return the record with `stored_poses`; as it is where there are none to be had."""
+    try:
+        return replace(record, poses=stored_poses(record))
+    except GraphError:
+        return record
+
+
+def require_connected(record: GraphRecord) -> None:
+    """
+    Refuse a graph of several parts.
+
+    Raises
+    ------
+    GraphError : naming a vertex of the loose part.
+
+    """
+    labels = component_labels(record.graph)
+    loose = np.flatnonzero(labels != labels[0])
+    if len(loose):
+        others = f' and {len(loose) - 1:,} more have' if len(loose) > 1 else ' has'
+        raise GraphError(f'the graph is not connected: vertex {record.ids[loose[0]]}{others} no '
+                         f'path to vertex {record.ids[0]}; `l1slam info` lists the parts')
+
+
+def stamps_of(record: GraphRecord) -> Indices:
+    """Return the stamps of the keyframes, (n,) [ns], invented where the input has none."""
+    return record.stamps if record.stamps is not None else invented_stamps(record.graph.n_poses)
+
+
+def check_output(path: Path) -> None:
+    """Refuse, before any work is done, an output whose suffix names no format."""
+    if path.suffix not in (*GRAPH_SUFFIXES, '.tum', ''):
+        raise FileError(path, f'unknown suffix; expected {", ".join(GRAPH_SUFFIXES)}, .tum, or '
+                        'none for a bag directory')
+    require_folder(path)
+    if path.suffix and path.is_dir():
+        raise FileError(path, 'cannot be written: it is a directory')
+
+
+def check_graph_output(path: Path) -> None:
+    """Refuse, as `check_output`, an output that does not hold a graph."""
+    check_output(path)
+    if path.suffix == '.tum':
+        raise FileError(path, 'a trajectory has no edges; expected '
+                        f'{", ".join(GRAPH_SUFFIXES)}, or no suffix for a bag directory')
+
+
+def write_output(path: Path, record: GraphRecord) -> None:
+    """
+    Write a graph with its poses, in the format that the suffix names; none: a bag.
+
+    Raises
+    ------
+    FileError : an unknown suffix, or the file cannot be written.
+    GraphError : the format has no place for a part of the graph.
+
+    """
+    check_output(path)
+    if path.suffix in GRAPH_SUFFIXES:
+        write_graph_file(path, record)
+    elif path.suffix == '.tum':
+        write_tum(path, stamps_of(record), stored_poses(record), record.graph.manifold)
+    else:
+        from l1slam_ros.io.bags.from_graph import write_graph_bag
+
+        write_graph_bag(path, record)

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What lies beside a graph because no graph format has a place for it.
+
+    <path>.stamps.txt    `id seconds`, one line for each vertex; or `seconds` alone, in their order
+    <path>.trusted.txt   `i j`, the vertex ids of each loop that is never doubted
+    <path>.truth.txt     `id x y theta`, true poses; see `trajectory`
+    <path>.false.txt     `i j`, the vertex ids of each edge known to be a false loop
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import BetweenFactors
+from l1slam_ros.io.files import (
+    NANOSECONDS,
+    formatted,
+    parse_rows,
+    put_lines,
+    quoted,
+    read_lines,
+    replacing,
+    stamp_from_text,
+)
+
+
+def stamps_path(path: str | os.PathLike[str]) -> Path:
+    """Return the name of the file with the stamps of a graph."""
+    return _beside(path, 'stamps')
+
+
+def trusted_path(path: str | os.PathLike[str]) -> Path:
+    """Return the name of the file with the trusted loops of a graph."""
+    return _beside(path, 'trusted')
+
+
+def truth_path(path: str | os.PathLike[str]) -> Path:
+    """Return the name of the file with the true poses of a graph or a bag."""
+    return _beside(path, 'truth')
+
+
+def false_loops_path(path: str | os.PathLike[str]) -> Path:
+    """Return the name of the file with the false loops of a graph or a bag."""
+    return _beside(path, 'false')
+
+
+def write_beside(path: str | os.PathLike[str], ids: Indices, stamps: Indices | None,
+                 factors: BetweenFactors) -> None:
+    """
+    Write the files beside a graph: ids, stamps [ns] (n,), and its factors, for trusted loops.
+
+    Without stamps, or without a trusted loop, there will be no such file. Odometry is no loop, and
+    trusted anyway.
+
+    Raises
+    ------
+    FileError : one of them cannot be written or removed.
+
+    """
+    stamp_lines = [] if stamps is None else _stamp_lines(ids, stamps)
+    trusted = ids[factors.pairs][factors.trusted & ~factors.is_odometry]
+    with (_replaced(stamps_path(path), stamp_lines),
+          _replaced(trusted_path(path), pair_lines(trusted))):
+        pass  # both are on the disk before either takes its place
+
+
+@contextmanager
+def _replaced(path: Path, lines: list[str]) -> Iterator[None]:
+    """Let a file of these lines take its place when the block succeeds; no lines, no file."""
+    if lines:
+        with replacing(path) as temporary:
+            put_lines(temporary, lines)
+            yield
+        return
+    yield
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise FileError(path, f'cannot be removed: {error.strerror or error}') from error
+
+
+def _stamp_lines(ids: Indices, stamps: Indices) -> list[str]:
+    return formatted('%d %d.%09d', np.column_stack((ids, *np.divmod(stamps, NANOSECONDS))))
+
+
+def read_stamps(path: str | os.PathLike[str], ids: Indices) -> Indices | None:
+    """
+    Return the stamps [ns] of the vertices `ids` (n,) of a graph; None without a file of them.
+
+    Raises
+    ------
+    FileError : the file is damaged, or is not about these vertices.
+
+    """
+    side = stamps_path(path)
+    if not side.exists():
+        return None
+    lines = read_lines(side)
+    in_order = bool(lines.texts) and len(lines.texts[0].split()) == 1
+    stamp_of = {}
+    for k, (number, text) in enumerate(zip(lines.numbers, lines.texts, strict=True)):
+        try:
+            name, stamp = (ids[k % len(ids)], text) if in_order else text.split()
+            stamp_of[int(name)] = stamp_from_text(stamp.strip())
+        except ValueError as error:
+            raise FileError(side, f'{quoted(text)}; expected '
+                            f'{"seconds" if in_order else "a vertex id and seconds"}',
+                            number) from error
+    if len(lines.texts) != len(ids) or stamp_of.keys() != set(ids.tolist()):
+        raise FileError(side, f'{len(lines.texts)} stamps that are not those of the {len(ids)} '
+                        'vertices; expected one for each, or no such file')
+    return np.array([stamp_of[k] for k in ids.tolist()], np.int64)
+
+
+def read_trusted(path: str | os.PathLike[str], ids: Indices, factors: BetweenFactors) -> Mask:
+    """
+    Return which factors of a graph are trusted loops, (m,) bool; none without a file of them.
+
+    All loops between two vertices that the file names are, either way round; ids : (n,) of the
+    keyframes.
+
+    Raises
+    ------
+    FileError : naming the line, when the file is damaged or names vertices without an edge.
+
+    """
+    side = trusted_path(path)
+    if not side.exists():
+        return np.zeros(len(factors), bool)
+    lines = read_lines(side)
+    named = parse_rows(side, 'trusted loop', lines, ids=2, values=0)[0]
+    # Ids may be any 64 bits, so pairs of them are numbered anew.
+    both = np.sort(np.concatenate((ids[factors.pairs], named)), axis=1)
+    number = np.unique(both, axis=0, return_inverse=True)[1].ravel()  # NumPy 2.0: (m, 1)
+    edges, trusted = number[:len(factors)], number[len(factors):]
+    unknown = ~np.isin(trusted, edges)
+    if unknown.any():
+        k = int(np.argmax(unknown))
+        raise FileError(side, f'no edge between {named[k, 0]} and {named[k, 1]} in {path}; '
+                        'expected its trusted loops, or no such file', lines.numbers[k])
+    return np.asarray(np.isin(edges, trusted) & ~factors.is_odometry)
+
+
+def pair_lines(pairs: Indices) -> list[str]:
+    """Return the lines of a file of loops, false or trusted: pairs (k, 2) of vertex ids."""
+    return [f'{i} {j}' for i, j in pairs.tolist()]
+
+
+def read_false_loops(path: Path) -> Indices:
+    """
+    Return the vertex ids i, j of each false loop, (k, 2); none where there is no such file.
+
+    Raises
+    ------
+    FileError : naming the line, when the file is damaged.
+
+    """
+    if not path.exists():
+        return np.zeros((0, 2), np.int64)
+    return parse_rows(path, 'false loop', read_lines(path), ids=2, values=0)[0]
+
+
+def _beside(path: str | os.PathLike[str], what: str) -> Path:
+    return Path(f'{os.fspath(path)}.{what}.txt')

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+ROS messages -> records, by their attributes: rclpy's and rosbags' messages alike, without ROS.
+
+A message that cannot be used raises `MessageError` with one of these causes:
+
+    stamp        zero (never set), negative, or no time
+    not_finite   NaN or infinity in the pose
+    range        so far away that it can only be garbage
+    quaternion   its norm is far from 1
+    frame        a loop whose frame is not `<base_frame>@<sec>.<nanosec, 9 digits>`
+    order        a loop whose reference is not earlier than its stamp
+
+Covariances pass as they come: `growth` decides what they are worth.
+"""
+
+import math
+import re
+from typing import Any
+
+import numpy as np
+
+from l1slam_ros.core.errors import MessageError
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.io.files import NANOSECONDS, quoted, stamp_text
+
+_REFERENCE_FRAME = re.compile(r'(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
+# builtin_interfaces/Time holds its seconds in 32 bits.
+_MAX_SECONDS = 2**31 - 1
+# Two printed digits stay below; an unset or broken quaternion does not.
+QUATERNION_NORM_ERROR = 0.1
+# [m] No robot's coordinates: beyond, differences of positions lose the millimetre, then overflow.
+_FARTHEST = 1e9
+
+
+def odometry_sample(message: Any) -> OdometrySample:
+    """
+    Return what a nav_msgs/Odometry says.
+
+    Raises
+    ------
+    MessageError : it cannot be used.
+
+    """
+    return OdometrySample(
+        stamp_of(message.header),
+        _pose3(message.pose.pose),
+        _covariance(message.pose.covariance),
+        _covariance(message.twist.covariance))
+
+
+def loop_closure(message: Any, base_frame: str, trusted: bool) -> LoopClosure:
+    """
+    Return what a geometry_msgs/PoseWithCovarianceStamped says about two times.
+
+    Parameters
+    ----------
+    message : its `header.frame_id` names the earlier time, see `reference_frame_id`
+    base_frame : the frame that must be named there; empty: any
+    trusted : whether a person or a marker vouches for it
+
+    Raises
+    ------
+    MessageError : it cannot be used.
+
+    """
+    stamp = stamp_of(message.header)
+    reference_stamp = _reference_stamp(message.header.frame_id, base_frame)
+    if reference_stamp >= stamp:
+        raise MessageError('order', f'reference {stamp_text(reference_stamp)} of a loop; '
+                           f'expected one earlier than its stamp {stamp_text(stamp)}')
+    return LoopClosure(reference_stamp, stamp, _pose3(message.pose.pose),
+                       _covariance(message.pose.covariance), trusted)
+
+
+def stamped_pose(message: Any) -> tuple[int, Array]:
+    """
+    Return the stamp [ns] and x y z qx qy qz qw (7,) of a message with a pose or a transform.
+
+    Of geometry_msgs a PoseStamped, PoseWithCovarianceStamped or TransformStamped, or an Odometry.
+
+    Raises
+    ------
+    MessageError : it cannot be used.
+
+    """
+    if hasattr(message, 'transform'):
+        pose3 = _checked(message.transform.translation, message.transform.rotation)
+    else:
+        pose3 = _pose3(getattr(message.pose, 'pose', message.pose))
+    return stamp_of(message.header), pose3
+
+
+def reference_frame_id(base_frame: str, stamp: int) -> str:
+    """Return the name of the robot's frame at a time [ns]: `<base_frame>@<sec>.<9 digits>`."""
+    return f'{base_frame}@{stamp_text(stamp)}'
+
+
+def stamp_of(header: Any) -> int:
+    """
+    Return the stamp of a std_msgs/Header [ns].
+
+    Raises
+    ------
+    MessageError : it is zero, negative or no time.
+
+    """
+    seconds, nanoseconds = int(header.stamp.sec), int(header.stamp.nanosec)
+    stamp = seconds * NANOSECONDS + nanoseconds
+    if seconds < 0 or not 0 <= nanoseconds < NANOSECONDS or stamp == 0:
+        raise MessageError('stamp', f'stamp {seconds} s {nanoseconds} ns; '
+                           'expected a time after 0 with less than 1000000000 ns')
+    return stamp
+
+
+def _reference_stamp(frame_id: str, base_frame: str) -> int:
+    """Return the stamp [ns] that a reference frame names."""
+    match = _REFERENCE_FRAME.fullmatch(frame_id)
+    expected = f'{base_frame or "<base_frame>"}@<sec>.<nanosec, 9 digits>'
+    if match is None or int(match['seconds']) > _MAX_SECONDS:
+        raise MessageError('frame', f'frame {quoted(frame_id)} of a loop; expected {expected}')
+    if base_frame and match['base'] != base_frame:
+        raise MessageError('frame', f'frame {quoted(frame_id)} of a loop is of '
+                           f'{quoted(match["base"])}; expected {expected}')
+    return int(match['seconds']) * NANOSECONDS + int(match['nanoseconds'])
+
+
+def _pose3(pose: Any) -> Array:
+    """Return x y z qx qy qz qw (7,) of a geometry_msgs/Pose, the quaternion normalised."""
+    return _checked(pose.position, pose.orientation)
+
+
+def _checked(t: Any, q: Any) -> Array:
+    """Return translation and rotation as one (7,), the quaternion normalised."""
+    position, quaternion = (t.x, t.y, t.z), (q.x, q.y, q.z, q.w)
+    if not all(map(math.isfinite, position + quaternion)):
+        raise MessageError('not_finite', f'pose {position} {quaternion}; expected finite numbers')
+    if max(map(abs, position)) > _FARTHEST:
+        raise MessageError('range', f'position {position}; expected it within {_FARTHEST:g} m')
+    norm = math.hypot(*quaternion)
+    if abs(norm - 1.0) > QUATERNION_NORM_ERROR:
+        raise MessageError('quaternion', f'quaternion {quaternion} of norm {norm:g}; expected 1')
+    return np.array((*position, *(component / norm for component in quaternion)))
+
+
+def _covariance(entries: Any) -> Array:
+    """Return 36 row-major entries as (6, 6), a copy: a message may be reused."""
+    return np.array(entries, float).reshape(6, 6)

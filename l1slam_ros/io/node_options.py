@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the node can be told, and the YAML file that tells it; without ROS, for `l1slam` too."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from l1slam_ros.core.errors import FileError, OptionError
+from l1slam_ros.core.online.backend import BackendOptions
+from l1slam_ros.core.options import Options, Scalar, option, with_values
+
+
+@dataclass(frozen=True)
+class UpdateOptions(Options):
+    """When the node works."""
+
+    period: float = option(
+        0.2, 'how often the timer wakes the solver', 's', 1e-3, 3600, fixed=True)
+    budget: float = option(0.1, 'how long one update may work', 's', 1e-3, 3600)
+
+
+@dataclass(frozen=True)
+class NodeOptions(BackendOptions):
+    """Everything the node can be told: the back end's options and its own."""
+
+    map_frame: str = option('map', 'frame of the optimised poses', fixed=True)
+    odom_frame: str = option('odom', 'frame of the odometry', fixed=True)
+    base_frame: str = option(
+        '', "the robot's frame; empty: the first child_frame_id seen", fixed=True)
+    publish_tf: bool = option(
+        True, 'publish map -> odom on /tf, where tf2_msgs is installed', fixed=True)
+    save_path: str = option('', 'the .g2o file of ~/save and ~/load')
+    on_time_jump: str = option(
+        'ignore', 'what to do when the ROS clock jumps back: go on, or begin a new map', '',
+        choices=('reset', 'ignore'))
+    update: UpdateOptions = UpdateOptions()
+
+
+def read_params_file(path: Path) -> NodeOptions:
+    """
+    Return the options that a ROS parameter file sets, for any node name.
+
+    Raises
+    ------
+    FileError : it cannot be read, is no parameter file, or sets something that is refused.
+
+    """
+    import yaml
+
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise FileError(path, 'expected a YAML file: ' + ' '.join(str(error).split())) from error
+    values: dict[str, Scalar] = {}
+    for node in content.values() if isinstance(content, Mapping) else ():
+        if isinstance(node, Mapping) and isinstance(node.get('ros__parameters'), Mapping):
+            values.update(_flat(node['ros__parameters']))
+    if not values:
+        raise FileError(path, 'sets no parameters; expected `/**: {ros__parameters: {...}}`')
+    try:
+        return with_values(NodeOptions(), values)
+    except OptionError as error:
+        raise FileError(path, str(error)) from error
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f'{prefix}{name}.')
+        else:
+            yield prefix + str(name), value

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a robust solve refused, and what it found of the noise, in sentences for people."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.robust.batch import INCONSISTENT, Doubt
+from l1slam_ros.core.robust.robust_map import RobustMap
+from l1slam_ros.io.files import stamp_text
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.wording import counted
+
+# The status of a map that is not to be relied on.
+DOUBTFUL = 'doubtful'
+
+# So many edges are named one by one; `--json` lists all.
+_NAMED = 20
+# A gross slip of the odometry: said apart, because nothing that was driven after it can be trusted
+# without the loops across it.
+_SLIP = 'odometry {pair} lies: {sigmas:.1f} sigmas off what the loops say; left out'
+# Sigmas so many times the stated ones are worth a word; less is what people are wrong by.
+_NOISY = 2.0
+# Of odometry and of loops, as `RobustMap.variance` has them.
+_NOISE = (
+    'the odometry is about {times:.1f} times as noisy as it says: loops far apart in time are '
+    'judged by little',
+    'the loops are about {times:.1f} times as noisy as they say: a false one that is little off '
+    'passes for noise',
+)
+
+
+def verdict(record: GraphRecord, judgement: RobustMap) -> Iterator[str]:
+    """Yield what was refused and why, the worst first; then what is noisier than it says."""
+    factors, accepted = record.graph.between, judgement.accepted
+    is_loop = ~factors.is_odometry
+    pairs = record.ids[factors.pairs]
+    for row in judgement.slips.tolist():
+        yield _SLIP.format(pair=_named(pairs[row]), sigmas=judgement.sigmas[row])
+    refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect)
+    suspect = np.flatnonzero(is_loop & judgement.suspect)
+    if is_loop.any():
+        yield f'{len(refused):,} of {counted(int(np.count_nonzero(is_loop)), "loop")} refused'
+    worst = refused[np.argsort(-judgement.sigmas[refused], kind='stable')]
+    for row in worst[:_NAMED].tolist():
+        yield f'  {_named(pairs[row])}: {judgement.sigmas[row]:.1f} sigmas off the accepted ones'
+    if len(refused) > _NAMED:
+        yield f'  and {len(refused) - _NAMED:,} more; `--json` lists all'
+    if len(suspect):
+        yield (f'suspect and left out, because nothing vouches for them: {len(suspect):,} that '
+               'fit where they stand, but could as well do so by chance')
+    for sentence, times in zip(_NOISE, np.sqrt(judgement.variance).tolist(), strict=True):
+        if times >= _NOISY:
+            yield sentence.format(times=times)
+
+
+def doubt_sentence(doubt: Doubt, ids: Indices, stamps: Indices | None) -> str:
+    """Return why and where a map is not to be relied on; ids, stamps : (n,) of the keyframes."""
+    where = f'between {ids[doubt.first]} and {ids[doubt.last]}'
+    if stamps is not None:
+        where += f' ({stamp_text(stamps[doubt.first])} s to {stamp_text(stamps[doubt.last])} s)'
+    if doubt.kind == INCONSISTENT:
+        return (f'{DOUBTFUL}: {doubt.loops:,} refused loops agree with each other, but not with '
+                f'the odometry {where}, and to leave out one step of it does not reconcile them; '
+                'the map may be bent there')
+    return (f'{DOUBTFUL}: {doubt.loops:,} loops, most of all, are refused or suspect, {where}; '
+            'either they are false, or the odometry is worse than it says')
+
+
+def _named(pair: np.ndarray) -> str:
+    return f'{pair[0]} - {pair[1]}'

@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`l1slam reproduce`: runs the paper's experiments and writes the report, its pictures beside."""
+
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from tempfile import mkdtemp
+
+import numpy as np
+
+from l1slam_ros.core.errors import FileError, GraphError, OptionError
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
+from l1slam_ros.core.solvers.optimality import l1_cost
+from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io import formats
+from l1slam_ros.io.files import put_lines, require_folder
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.plot import MapDrawing
+from l1slam_ros.io.progress import Progress
+from l1slam_ros.paper import figures, report
+from l1slam_ros.paper import printed as paper
+from l1slam_ros.paper.experiments import (
+    Costs,
+    Effort,
+    measure_convergence,
+    measure_costs,
+    measure_seconds,
+)
+from l1slam_ros.paper.printed import PaperGraph
+from l1slam_ros.paper.report import WORLD_SEED, GraphResult, Results
+from l1slam_ros.paper.trials import (
+    NOISES,
+    LoopTrials,
+    StartTrials,
+    try_false_loops,
+    try_noisy_starts,
+)
+
+REPORT = 'report.md'
+
+
+def reproduce(
+    datasets: Path | None, worlds: Sequence[PaperGraph], output: Path, effort: Effort
+) -> None:
+    """
+    Run the experiments and write the report into the folder `output`, whole or not at all.
+
+    Parameters
+    ----------
+    datasets : the folder with the paper's own graphs; None: without them
+    worlds : which of the paper's simulated worlds to make anew, in their sizes
+    output : its other files stay as they are
+    effort : how long the experiments run
+
+    Raises
+    ------
+    FileError : no graph of the paper in the folder, one that cannot be used, or no place to write.
+    OptionError : nothing to run.
+
+    """
+    if not datasets and not worlds:
+        raise OptionError('nothing to run: no datasets and no worlds; expected --datasets DIR, '
+                          'or --worlds other than none')
+    _check_folder(output)
+    records = read_datasets(datasets) if datasets else {}
+    results = run(records, worlds, effort)
+    with _filling(output) as folder:
+        lines = report.head(results)
+        for title, section in SECTIONS.items():
+            lines += ['', f'## {title}', '', *section(results, folder)]
+        put_lines(folder / REPORT, lines)
+
+
+def read_datasets(datasets: Path) -> dict[str, GraphRecord]:
+    """
+    Return name in the paper -> graph, for those of the paper's graphs that are in the folder.
+
+    Raises
+    ------
+    FileError : none is there, or one cannot be used.
+
+    """
+    files = {graph.name: datasets / graph.file for graph in paper.GRAPHS
+             if graph.file and (datasets / graph.file).is_file()}
+    if not files:
+        raise FileError(datasets, "none of the paper's graphs is there; expected "
+                        + ', '.join(paper.FILES))
+    return {name: _read(path) for name, path in files.items()}
+
+
+def _read(path: Path) -> GraphRecord:
+    record = formats.read_input(path)
+    with _named(path):
+        formats.require_connected(record)
+    return record
+
+
+@contextmanager
+def _named(file: Path | str) -> Iterator[None]:
+    """Let what is wrong with a graph name the file it came from."""
+    try:
+        yield
+    except GraphError as error:
+        raise FileError(file, str(error)) from error
+
+
+def run(
+    records: dict[str, GraphRecord], worlds: Sequence[PaperGraph], effort: Effort
+) -> Results:
+    """Measure every graph, in the order of the paper; records as of `read_datasets`."""
+    simulated = {world.name: world for world in worlds}
+    graphs, convergence, missing = [], {}, []
+    for graph in paper.GRAPHS:
+        if graph.name in records or graph.name in simulated:
+            print(f'l1slam: {graph.name}', file=sys.stderr)
+        if graph.name in records:
+            graphs.append(_run_record(graph, records[graph.name], effort))
+        elif graph.name in simulated:
+            result, curves = _run_world(simulated[graph.name], effort)
+            graphs.append(result)
+            convergence.update(curves)
+        else:
+            missing.append(graph)
+    return Results(graphs, missing, convergence, _run_starts(records, effort),
+                   _run_false_loops(records, effort))
+
+
+def _run_starts(records: dict[str, GraphRecord], effort: Effort) -> StartTrials | None:
+    record = records.get(paper.NOISY.name)
+    if record is None:
+        return None
+    print(f'l1slam: {paper.NOISY.name} from noisy starts', file=sys.stderr)
+    as_in_paper = replace(effort, outer=paper.NOISY_OUTER, inner=paper.NOISY_INNER)
+    with Progress(len(NOISES) * effort.draws, 'start') as progress:
+        return try_noisy_starts(record.graph, formats.stored_poses(record), effort, as_in_paper,
+                                np.random.default_rng(WORLD_SEED), progress.advance)
+
+
+def _run_false_loops(
+    records: dict[str, GraphRecord], effort: Effort
+) -> dict[str, LoopTrials]:
+    trials = {}
+    for graph, count in paper.FALSE_LOOPS.items():
+        record = records.get(graph.name)
+        if record is None:
+            continue
+        print(f'l1slam: {graph.name} with false loops', file=sys.stderr)
+        with _named(graph.file), Progress(1 + effort.draws, 'draw') as progress:
+            trials[graph.name] = try_false_loops(
+                record.graph, formats.stored_poses(record), count, effort,
+                np.random.default_rng(WORLD_SEED), progress.advance)
+    return trials
+
+
+def _run_record(graph: PaperGraph, record: GraphRecord, effort: Effort) -> GraphResult:
+    seed = seed_poses(record.graph, cholesky_of(record.graph))
+    return _measured(graph, record.graph, formats.stored_poses(record), seed, effort)
+
+
+def _run_world(
+    graph: PaperGraph, effort: Effort
+) -> tuple[GraphResult, dict[str, dict[str, Array]]]:
+    """Return what a world of the graph's size gives, with the curves if they are shown of it."""
+    world = simulate_world(graph.poses, graph.edges, WorldOptions(),
+                           np.random.default_rng(WORLD_SEED))
+    seed = seed_poses(world.graph, cholesky_of(world.graph))
+    truth_cost = l1_cost(whitened_residual(world.graph, world.truth))
+    result = _measured(graph, world.graph, world.odometry, seed, effort, truth_cost)
+    if graph.name != paper.MANHATTAN_10K.name:
+        return result, {}
+    curves = measure_convergence(world.graph, world.odometry, seed, effort.iterations)
+    return result, {**curves, 'global': _global_curves(result.costs)}
+
+
+def _measured(
+    paper_graph: PaperGraph, graph: FactorGraph, start: Array, seed: Array, effort: Effort,
+    truth_cost: float | None = None,
+) -> GraphResult:
+    steps = (OptimiserOptions().outer_iterations + effort.outer
+             + LeastSquaresOptions().iterations)
+    with Progress(steps, 'step') as progress:
+        costs = measure_costs(graph, start, seed, effort, progress.report)
+    seconds = measure_seconds(graph, seed, effort)
+    return GraphResult(paper_graph, graph.n_poses, len(graph.between), costs, seconds,
+                       _map(paper_graph, graph, costs), truth_cost)
+
+
+def _map(paper_graph: PaperGraph, graph: FactorGraph, costs: Costs) -> MapDrawing:
+    factors, solution = graph.between, costs.solution
+    loops = factors.pairs[~factors.is_odometry]
+    return MapDrawing(paper_graph.name, graph.manifold.positions(solution.poses), loops=loops,
+                      note=f'L1 cost {solution.cost:.6g}')
+
+
+def _global_curves(costs: Costs) -> dict[str, Array]:
+    histories = {'as printed': costs.printed, f'ours, {costs.solver}': costs.solution.history}
+    return {method: np.stack((np.arange(len(history)), history), axis=1)
+            for method, history in histories.items()}
+
+
+def _table_1(results: Results, folder: Path) -> list[str]:
+    return report.table_1(results)
+
+
+def _table_2(results: Results, folder: Path) -> list[str]:
+    return report.table_2(results)
+
+
+# Title -> what draws the section's pictures into a folder and returns its lines.
+SECTIONS: dict[str, Callable[[Results, Path], list[str]]] = {
+    'Table I: the cost': _table_1,
+    'Table II: the time per iteration': _table_2,
+    'Figure 2: cost against iterations': figures.figure_2,
+    'Figure 3: the maps': figures.figure_3,
+    'Figure 4: a start that is mostly noise': figures.figure_4,
+    'Figure 6: loops that lie': figures.figure_6,
+}
+
+
+def _check_folder(output: Path) -> None:
+    """Refuse, before any work is done, a place where no folder can be."""
+    require_folder(output)
+    if os.path.lexists(output) and not output.is_dir():
+        raise FileError(output, 'is no folder; expected one, or nothing there')
+
+
+@contextmanager
+def _filling(output: Path) -> Iterator[Path]:
+    """Yield a new folder, whose files go into the folder `output` when the block succeeds."""
+    target, scratch = Path(os.path.abspath(output)), None
+    try:
+        scratch = Path(mkdtemp(prefix=f'.{target.name}.', suffix='.tmp', dir=target.parent))
+        # One of our own inside it: what `mkdtemp` makes is for its owner only.
+        made = scratch / target.name
+        made.mkdir()
+        yield made
+        if target.is_dir():
+            # The report last: it names the others.
+            for file in sorted(made.iterdir(), key=lambda file: file.name == REPORT):
+                os.replace(file, target / file.name)
+        else:
+            os.rename(made, target)
+    except OSError as error:
+        raise FileError(output, f'cannot be written: {error.strerror or error}') from error
+    finally:
+        if scratch is not None:
+            shutil.rmtree(scratch, ignore_errors=True)

@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+`make demo`: plays the demo bag into the real node, draws its map, and compares with the truth.
+
+`backend` and `replay` run as processes of their own, with the parameters as shipped; this one
+only listens, as any other ROS program would. It counts no seconds, so it works on a busy machine
+and while the solver is compiled: it waits for the whole recording to be in the map and for the
+node to say that nothing changes any more.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import sysconfig
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Path as PathMessage
+from rcl_interfaces.msg import Log
+from rclpy.executors import ExternalShutdownException
+from rclpy.logging import LoggingSeverity
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from l1slam_ros.core.errors import L1SlamError
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, aligned_positions
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.io.bags.reader import read_messages
+from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
+from l1slam_ros.io.files import stamp_from_text
+from l1slam_ros.io.graphs.side_files import false_loops_path, read_false_loops
+from l1slam_ros.io.messages.conversion import stamp_of
+from l1slam_ros.io.plot import MapDrawing, plot_maps
+
+Process = subprocess.Popen[bytes]
+
+BAG = Path('bags/demo')
+BACKEND = 'backend'  # the executable, and the node
+PICTURE = Path('demo/map.png')
+RATE = 10.0
+# The map is final when the node has said so often [diagnostics, one a second] the same of it.
+CALM = 3
+OF_THE_MAP = ('keyframes', 'factors', 'updates', 'l1_cost')
+# Given up only when nothing has moved for so long [s]; the node can be compiling its solver.
+PATIENCE = 300.0
+END = 60.0  # [s] longest that a process may take to end when it is told to
+_INTERRUPTED = 130
+_TELL = 10.0  # [s] how often it is said how far things are
+
+
+class DemoError(Exception):
+    """The demo cannot go on, or did not show what it is to show; the message says why."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """
+    What the bag holds.
+
+    stamps : (n,) [ns]; odometry, truth : (n, 2) positions [m]; loops : (m, 2) rows of these;
+    is_false : (m,) bool, the loops that the file beside the bag calls false.
+    """
+
+    stamps: Indices
+    odometry: Array
+    truth: Array
+    loops: Indices
+    is_false: np.ndarray
+
+    @property
+    def loop_stamps(self) -> list[tuple[int, int]]:
+        """The stamps of both ends of each loop [ns]."""
+        return [(int(i), int(j)) for i, j in self.stamps[self.loops]]
+
+
+def read_recording(path: Path) -> Recording:
+    """Read the demo bag; loops as rows of `stamps`."""
+    stamps: list[int] = []
+    poses: dict[str, list[tuple[float, float]]] = {ODOMETRY_TOPIC: [], TRUTH_TOPIC: []}
+    loops: list[tuple[int, int]] = []
+    for topic, _, _, message in read_messages(path):
+        if topic == LOOP_TOPIC:
+            seconds, _, nanoseconds = message.header.frame_id.split('@')[1].partition('.')
+            loops.append((int(seconds + nanoseconds), stamp_of(message.header)))
+            continue
+        if topic == ODOMETRY_TOPIC:
+            stamps.append(stamp_of(message.header))
+            message = message.pose
+        poses[topic].append((message.pose.position.x, message.pose.position.y))
+    pairs = np.searchsorted(stamps, loops)
+    false = read_false_loops(false_loops_path(path))
+    is_false = (pairs[:, None] == false).all(axis=2).any(axis=1)
+    return Recording(np.array(stamps), np.array(poses[ODOMETRY_TOPIC]),
+                     np.array(poses[TRUTH_TOPIC]), pairs, is_false)
+
+
+@dataclass
+class Heard:
+    """
+    What the back end published.
+
+    path : the last one; times : [s] when each came; states : loop (reference, end) [ns] -> what
+    has become of it; sentence : of its diagnostics; calm : how many diagnostics in a row said the
+    same of the map, with no other news in between.
+    """
+
+    path: PathMessage | None = None
+    times: list[float] = field(default_factory=list)
+    states: dict[tuple[int, int], str] = field(default_factory=dict)
+    sentence: str = 'nothing yet'
+    calm: int = 0
+
+    @property
+    def stamps(self) -> list[int]:
+        """The stamps of the map's keyframes [ns]."""
+        return [] if self.path is None else [stamp_of(pose.header) for pose in self.path.poses]
+
+    def count_judged(self, loops: list[tuple[int, int]]) -> int:
+        """Return how many of some loops are in the map or refused."""
+        return sum(self.states.get(loop, 'waiting') != 'waiting' for loop in loops)
+
+    def refused(self, loops: list[tuple[int, int]]) -> np.ndarray:
+        """Return which of some loops are not in the map, bool."""
+        return np.array([self.states.get(loop) != 'accepted' for loop in loops], bool)
+
+
+class Listener:
+    """Keeps what the back end publishes, and knows how much of a recording is in its map."""
+
+    def __init__(self, node: Node, recording: Recording):
+        self.node, self.recording, self.heard = node, recording, Heard()
+        self.moved = time.monotonic()
+        self._said: dict[str, str] = {}
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        node.create_subscription(PathMessage, 'path', self._hear, latched)
+        every = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        node.create_subscription(DiagnosticArray, 'loop_status', self._hear_of_loops, every)
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._hear_of_the_map, 10)
+        node.create_subscription(Log, '/rosout', self._hear_it_log, every)
+
+    def _hear(self, message: PathMessage) -> None:
+        self.heard.path = message
+        self.heard.times.append(time.monotonic())
+        self._move()
+
+    def _hear_of_loops(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            ends = stamp_from_text(values['reference_stamp']), stamp_from_text(values['stamp'])
+            self.heard.states[ends] = values['state']
+        self._move()
+
+    def _hear_of_the_map(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            said = {key: values[key] for key in OF_THE_MAP if key in values}
+            if not said:
+                continue
+            if status.message != self.heard.sentence:
+                self.heard.sentence, self.moved = status.message, time.monotonic()
+            if said != self._said:
+                self._said = said
+                self._move()
+            self.heard.calm += 1
+
+    def _hear_it_log(self, message: Log) -> None:
+        # How far it is with compiling is news, but not of the map; that it failed again is none.
+        if message.name == BACKEND and message.level == LoggingSeverity.INFO:
+            self.moved = time.monotonic()
+
+    def _move(self) -> None:
+        self.heard.calm, self.moved = 0, time.monotonic()
+
+    def is_final(self) -> bool:
+        """Return whether all of the recording is in the map, and the map at rest."""
+        heard, loops = self.heard, self.recording.loop_stamps
+        return (heard.calm >= CALM and heard.stamps[-1:] == [self.recording.stamps[-1]]
+                and heard.count_judged(loops) == len(loops))
+
+    def how_far(self) -> str:
+        """Return how much of the recording is in the map, and what the node says."""
+        heard, loops = self.heard, self.recording.loop_stamps
+        return (f'{len(heard.stamps)} of {len(self.recording.stamps)} keyframes mapped, '
+                f'{heard.count_judged(loops)} of {len(loops)} loops judged; the node says: '
+                f'{heard.sentence}')
+
+    def wait(self, backend: Process, ready: Callable[[], bool]) -> None:
+        """
+        Listen until it is ready, saying now and then how far things are.
+
+        Raises
+        ------
+        DemoError : the node has ended, or nothing has moved for `PATIENCE` seconds.
+
+        """
+        self.moved = time.monotonic()
+        tell = self.moved + _TELL
+        while not ready():
+            rclpy.spin_once(self.node, timeout_sec=0.1)
+            now = time.monotonic()
+            if backend.poll() is not None:
+                raise DemoError(f'{BACKEND} ended with exit code {backend.returncode}; '
+                                f'{self.how_far()}')
+            if now > self.moved + PATIENCE:
+                raise DemoError(f'nothing has moved for {PATIENCE:.0f} s; {self.how_far()}')
+            if now > tell:
+                tell = now + _TELL
+                print(f'demo: {self.how_far()}', flush=True)
+
+
+@contextmanager
+def running(name: str, *arguments: str) -> Iterator[Process]:
+    """Run an executable as a process; in the end stop it as a user would, by SIGINT."""
+    process = Process([executable(name), *arguments])
+    try:
+        yield process
+        process.send_signal(signal.SIGINT)
+        code = process.wait(END)
+    except subprocess.TimeoutExpired as error:
+        raise DemoError(f'{name} was told to end, and did not within {END:.0f} s') from error
+    finally:
+        process.kill()
+        process.wait()
+    if code:
+        raise DemoError(f'{name} ended with exit code {code}')
+
+
+def executable(name: str) -> str:
+    """Return where this package's executable is: where `ros2 run` looks, or beside Python."""
+    for prefix in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep):
+        path = Path(prefix) / 'lib' / 'l1slam_ros' / name
+        if prefix and path.exists():
+            return str(path)
+    return str(Path(sysconfig.get_path('scripts')) / name)
+
+
+def record_map(bag: Path, recording: Recording) -> Heard:
+    """Play the bag into `backend`; return what it published."""
+    rclpy.init()
+    try:
+        listener = Listener(rclpy.create_node('demo'), recording)
+        with running(BACKEND) as backend:
+            print(f'demo: playing {bag}, {RATE:g} times as fast as recorded', flush=True)
+            with running('replay', str(bag), '--rate', str(RATE)) as replay:
+                listener.wait(backend, lambda: replay.poll() is not None)
+            print('demo: waiting until nothing changes in the map any more', flush=True)
+            listener.wait(backend, listener.is_final)
+        return listener.heard
+    finally:
+        rclpy.try_shutdown()
+
+
+def summarise(recording: Recording, heard: Heard, picture: Path) -> str:
+    """Draw the map and return what to print about it."""
+    assert heard.path is not None
+    stamps = np.array(heard.stamps)
+    positions = np.array([(p.pose.position.x, p.pose.position.y) for p in heard.path.poses])
+    rows = np.searchsorted(recording.stamps, stamps)
+    truth, odometry = recording.truth[rows], recording.odometry[rows]
+    errors = (absolute_trajectory_error(odometry, truth),
+              absolute_trajectory_error(positions, truth))
+    note = f'position error {errors[0]:.2f} m by odometry, {errors[1]:.2f} m optimised'
+    refused, false = heard.refused(recording.loop_stamps), recording.is_false
+    loops = np.searchsorted(stamps, recording.stamps[recording.loops])
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    plot_maps(picture, [MapDrawing('l1slam_ros demo', positions, odometry,
+                                   aligned_positions(truth, positions), loops[~refused & ~false],
+                                   rejected=loops[refused], false=loops[~refused & false],
+                                   note=note)])
+    rate = (len(heard.times) - 1) / max(heard.times[-1] - heard.times[0], 1e-9)
+    return '\n'.join((
+        f'position error  {errors[0]:.3f} m by odometry, {errors[1]:.3f} m in the map (RMSE)',
+        f'graph           {len(stamps)} keyframes, {len(loops)} loops, {false.sum()} of them '
+        'false',
+        f'refused         {(refused & false).sum()} false loops, {(refused & ~false).sum()} true '
+        'ones',
+        f'node            {rate:.1f} updates per second',
+        f'picture         {picture}'))
+
+
+def require_the_truth(recording: Recording, heard: Heard) -> None:
+    """
+    Check that the node refused the false loops and no other.
+
+    Raises
+    ------
+    DemoError : it did not.
+
+    """
+    refused, false = heard.refused(recording.loop_stamps), recording.is_false
+    if (refused != false).any():
+        raise DemoError(f'expected the {false.sum()} false loops to be refused and no true one')
+
+
+def main() -> int:
+    """Run the demo from the checkout's top folder; return the exit code."""
+    # A domain of its own: the demo neither hears nor disturbs what else runs here.
+    os.environ.setdefault('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    # What an earlier run drew must not pass for what this one does.
+    PICTURE.unlink(missing_ok=True)
+    try:
+        recording = read_recording(BAG)
+        heard = record_map(BAG, recording)
+        print(summarise(recording, heard, PICTURE))
+        require_the_truth(recording, heard)
+    except (DemoError, L1SlamError) as error:
+        print(f'demo: {error}', file=sys.stderr)
+        return 1
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return _INTERRUPTED
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the node says of itself on /diagnostics, once a second."""
+
+from collections import Counter, deque
+from collections.abc import Mapping
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from l1slam_ros.core.geometry.manifold import Array, Manifold
+from l1slam_ros.core.online.backend import Improvement
+from l1slam_ros.ros.threads.failures import Failures
+from l1slam_ros.ros.threads.solver_thread import SolverThread
+from l1slam_ros.ros.traffic import Traffic
+
+# Seconds, which are as many publications.
+_MINUTE = 60
+# [s] Loops may wait for so long to be judged.
+_BEHIND = 10.0
+# Of so many judged loops most may be refused without a warning: a few say little.
+_FEW = 5
+
+
+class Diagnosis:
+    """
+    Publishes the state of the back end.
+
+    Parameters
+    ----------
+    node : whose name and clock it speaks with
+    topics : name -> how its messages come
+    solver : which may be compiling, or behind
+    failures : what fails now
+
+    """
+
+    def __init__(self, node: Node, topics: Mapping[str, Traffic], solver: SolverThread,
+                 failures: Failures):
+        self._node, self._topics, self._solver, self._failures = node, topics, solver, failures
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._last: Improvement | None = None
+        self._updates = 0
+        self._jump: dict[str, str] = {}
+        self._refused: deque[Counter[str]] = deque([Counter()], maxlen=_MINUTE)
+
+    def note(self, improvement: Improvement) -> None:
+        """Remember the latest update; the solver's thread calls it."""
+        self._last = improvement
+        self._updates += 1
+
+    def note_jump(self, manifold: Manifold, before: Array, after: Array) -> None:
+        """Remember how far a new map moved the robot: its pose (1, p) before [m] and after."""
+        metres, radians = manifold.motion(manifold.local(before, after))
+        self._jump = {'jump.translation': f'{metres[0]:.4f}', 'jump.rotation': f'{radians[0]:.5f}'}
+
+    def publish(self, counts: Mapping[str, int], refused: Counter[str]) -> None:
+        """
+        Publish one status.
+
+        counts : sizes of the graph; refused : cause -> how many messages, since the start.
+        """
+        lately = refused - self._refused[0]
+        self._refused.append(Counter(refused))
+        values: dict[str, object] = {
+            f'{topic}.{name}': value for topic, traffic in self._topics.items()
+            for name, value in traffic.values().items()}
+        values |= counts
+        values['updates'] = self._updates
+        if self._last is not None:
+            values |= {'l1_cost': f'{self._last.cost:.6g}', 'gap': f'{self._last.gap:.3g}',
+                       'update_seconds': f'{self._last.seconds:.4f}',
+                       'update_status': self._last.status.value}
+        values |= self._jump
+        for cause, count in sorted((+refused).items()):
+            values |= {f'refused.{cause}': count,
+                       f'refused.{cause}.last_minute': lately[cause]}
+        level, sentence = self._judgement(counts, lately)
+        name = self._node.get_fully_qualified_name()
+        status = DiagnosticStatus(
+            level=level, name=f'{name}: map', message=sentence, hardware_id=name,
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+
+    def _judgement(self, counts: Mapping[str, int], lately: Counter[str]) -> tuple[bytes, str]:
+        """Return the level and all that is wrong now, in one sentence."""
+        failures = self._failures.lasting
+        if failures:
+            return DiagnosticStatus.ERROR, '; '.join(
+                f'{what} failed: {why}' for what, why in failures.items())
+        wrong = []
+        if lately:
+            wrong.append('refused in the last minute: ' + ', '.join(
+                f'{count} {cause}' for cause, count in sorted(lately.items())))
+        rejected = counts['rejected_loops']
+        judged = rejected + counts['accepted_loops'] + counts['suspect_loops']
+        if judged >= _FEW and rejected > judged / 2:
+            wrong.append(f'{rejected} of {judged} loops are rejected')
+        if self._solver.compiling:
+            wrong.append(f'compiling the solver: {self._solver.compiling}')
+        elif self._solver.behind > _BEHIND:
+            wrong.append(f'loops have not been judged for {self._solver.behind:.0f} s')
+        return (DiagnosticStatus.WARN, '; '.join(wrong)) if wrong else (DiagnosticStatus.OK, 'ok')

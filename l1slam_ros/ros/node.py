@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+`backend`: the node. Odometry and loop closures in, the optimised Path out; no arithmetic.
+
+Callbacks convert a message and append it to the back end; none of it is compiled code. A timer
+wakes the solver's thread, which improves the map and publishes it; another thread carries out what
+services ask for. See `shared_backend` for why none waits for the other.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from visualization_msgs.msg import MarkerArray
+
+from l1slam_ros.core.errors import L1SlamError, MessageError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.measurements import OdometrySample
+from l1slam_ros.core.online.backend import Improvement
+from l1slam_ros.core.online.shared_backend import SharedBackend
+from l1slam_ros.io.messages import cdr
+from l1slam_ros.io.messages.base_frame import BaseFrame
+from l1slam_ros.io.messages.conversion import loop_closure, odometry_sample
+from l1slam_ros.io.node_options import NodeOptions
+from l1slam_ros.ros.diagnostics import Diagnosis
+from l1slam_ros.ros.loop_status import LoopStatus
+from l1slam_ros.ros.markers import graph_markers
+from l1slam_ros.ros.parameters import NodeParameters
+from l1slam_ros.ros.publishing import path_bytes, pose_bytes, transform_stamped
+from l1slam_ros.ros.services import MapServices
+from l1slam_ros.ros.threads.failures import Failures
+from l1slam_ros.ros.threads.orders import Orders
+from l1slam_ros.ros.threads.solver_thread import SolverThread
+from l1slam_ros.ros.traffic import Traffic
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # the ROS wheels on PyPI have none
+    TFMessage = None
+
+_DEPTH = 1000
+# Messages of one topic at most before other callbacks have their turn.
+_AT_ONCE = 100
+_REPEAT_WARNING = 5.0  # [s]
+
+
+class BackendNode(Node):
+    """
+    The ROS face of `shared_backend.SharedBackend`.
+
+    Parameters
+    ----------
+    keywords : passed to `rclpy.node.Node`, e.g. parameter_overrides, context
+
+    Attributes
+    ----------
+    failures : what fails now
+
+    Raises
+    ------
+    OptionError : a parameter given at start is refused.
+
+    """
+
+    def __init__(self, **keywords: Any):
+        super().__init__('backend', **keywords)
+        self._declared = NodeParameters(self, NodeOptions(), self._on_options)
+        options = self.options
+        self._manifold = se2
+        self._backend = SharedBackend(self._manifold, options)
+        self._base_frame = BaseFrame(options.base_frame)
+        self._refused: Counter[str] = Counter()
+        self._last_stamp = 0
+        self._last_pose = self._map_to_odom = self._manifold.identity(1)
+        self._told_map, self._told_version = 0, self._backend.version
+        self._told_transform = self._map_to_odom
+        self.failures = Failures(self.get_logger(), self.context.ok)
+        self._solver = SolverThread(self._backend, self.failures, self.get_logger(),
+                                    lambda: self.options.update.budget, self._tell)
+        self._orders = Orders(self, self.failures, self._solver.hurry)
+        self._make_publishers()
+        self._topics: dict[str, Traffic] = {}
+        self._make_subscriptions()
+        self._diagnosis = Diagnosis(self, self._topics, self._solver, self.failures)
+        self._map_services = MapServices(
+            self, self._backend, self._orders, lambda: self.options.save_path,
+            self._solver.pause, self._solver.is_closing)
+        self._jumps = self.get_clock().create_jump_callback(
+            JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
+                          on_clock_change=False),
+            post_callback=self.failures.guarded('time jump', self._on_time_jump))
+        guarded = self.failures.guarded
+        # By a clock that goes on where simulated time stands still, or a bag has ended.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(options.update.period, guarded('timer', self._on_timer), clock=steady)
+        self.create_timer(1.0, guarded('diagnostics', self._on_second), clock=steady)
+        self._solver.start()
+
+    @property
+    def options(self) -> NodeOptions:
+        """The options as they are now."""
+        return self._declared.options
+
+    def close(self, seconds: float = 60.0) -> bool:
+        """End the threads and the node; return whether they ended within some seconds."""
+        deadline = time.monotonic() + seconds
+        self._solver.close(0.0)  # what it works at for an order stops
+        ended = self._orders.close(seconds)
+        ended &= self._solver.close(max(deadline - time.monotonic(), 0.0))
+        if ended:
+            self.destroy_node()
+        return ended
+
+    def _make_publishers(self) -> None:
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._path = self.create_publisher(Path, 'path', latched)
+        self._pose = self.create_publisher(PoseStamped, 'pose', 10)
+        self._transform = self.create_publisher(TransformStamped, 'map_to_odom', 10)
+        self._graph = self.create_publisher(MarkerArray, 'graph', latched)
+        self._tf = None
+        if TFMessage is not None and self.options.publish_tf:
+            self._tf = self.create_publisher(TFMessage, '/tf', 100)
+        self._loop_status = LoopStatus(self)
+
+    def _make_subscriptions(self) -> None:
+        for kind, topic, callback in (
+            (Odometry, 'odom', self._on_odometry),
+            (PoseWithCovarianceStamped, 'loop_closures', self._on_loop),
+            (PoseWithCovarianceStamped, 'trusted_loop_closures', self._on_trusted_loop),
+        ):
+            self._subscribe(kind, topic, callback)
+
+    def _subscribe(self, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
+        use = self.failures.guarded(topic, callback)
+        raw = kind is Odometry
+
+        def received(message: Any, information: Any) -> None:
+            traffic.note(information)
+            use(message)
+            # What has queued up is taken at once: a round of the executor costs more than a
+            # message, and at the rate of some odometry, messages would be lost meanwhile.
+            with subscription.handle:
+                for _ in range(_AT_ONCE):
+                    taken = subscription.handle.take_message(kind, raw)
+                    if taken is None:
+                        break
+                    traffic.note(taken[1])
+                    use(taken[0])
+
+        subscription = self.create_subscription(
+            kind, topic, received, QoSProfile(depth=_DEPTH), raw=raw,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        traffic = self._topics[topic] = Traffic(subscription.get_publisher_count)
+
+    def _on_options(self, options: NodeOptions) -> None:
+        self._backend.set_options(options)
+
+    def _on_time_jump(self, _: TimeJump) -> None:
+        if self.options.on_time_jump == 'reset':
+            self.get_logger().warning('the clock jumped back: the map begins anew')
+            self._orders.place('time jump', self._map_services.reset)
+
+    def _on_odometry(self, data: bytes) -> None:
+        try:
+            message = cdr.odometry(data)
+            found = self._base_frame.take(message.child_frame_id, odometry_sample(message))
+        except L1SlamError as error:
+            self._refuse(error)
+            return
+        if found.anew:
+            self._backend.begin_anew()
+        for other in found.others:
+            self._refuse(other)
+        for sample in found.ours:
+            self._add_odometry(sample)
+
+    def _add_odometry(self, sample: OdometrySample) -> None:
+        try:
+            map_to_odom = self._backend.add_odometry(sample)
+        except L1SlamError as error:
+            self._refuse(error)
+            return
+        if map_to_odom is None:
+            return
+        self._map_to_odom, manifold = map_to_odom, self._manifold
+        self._last_stamp, self._last_pose = sample.stamp, manifold.from_pose3(sample.pose3[None])
+        pose = manifold.compose(self._map_to_odom, self._last_pose)
+        self._pose.publish(pose_bytes(self.options.map_frame, sample.stamp,
+                                      manifold.to_pose3(pose)[0]))
+
+    def _on_loop(self, message: PoseWithCovarianceStamped) -> None:
+        self._add_loop(message, trusted=False)
+
+    def _on_trusted_loop(self, message: PoseWithCovarianceStamped) -> None:
+        self._add_loop(message, trusted=True)
+
+    def _add_loop(self, message: PoseWithCovarianceStamped, trusted: bool) -> None:
+        try:
+            loop = loop_closure(message, self._base_frame.name, trusted)
+        except L1SlamError as error:
+            self._refuse(error)
+            return
+        self._backend.add_loop(loop)
+
+    def _refuse(self, error: L1SlamError) -> None:
+        self._refused[error.cause if isinstance(error, MessageError) else 'unusable'] += 1
+        self.get_logger().warning(f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
+
+    def _on_timer(self) -> None:
+        self._solver.wake()
+        if self._last_stamp:
+            self._publish_transform()
+
+    def _on_second(self) -> None:
+        for sentence in self._backend.news():
+            self.get_logger().warning(sentence)
+        counts, refused = self._backend.counts()
+        self._diagnosis.publish(counts, self._refused + Counter(refused))
+
+    def _tell(self, improvement: Improvement | None) -> None:
+        """Publish what is new; the solver's thread calls it."""
+        if improvement is not None:
+            self._report(improvement)
+        maps, version = self._backend.maps, self._backend.version
+        if maps != self._told_map:
+            self._publish_map()
+            self._told_map = maps
+        elif version != self._told_version:
+            # Nothing new in the map, but a loop can have come for later, or expired.
+            self._loop_status.publish(self._backend.loop_states())
+        self._told_version = version
+
+    def _publish_map(self) -> None:
+        state = self._backend.state()
+        if not np.isfinite(state.poses).all() or not np.isfinite(state.map_to_odom).all():
+            raise ArithmeticError('a pose of the map is not finite: it is not published')
+        self._diagnosis.note_jump(
+            self._manifold, self._manifold.compose(self._told_transform, self._last_pose),
+            self._manifold.compose(state.map_to_odom, self._last_pose))
+        self._map_to_odom = self._told_transform = state.map_to_odom
+        frame, stamp = self.options.map_frame, self._last_stamp
+        pose3 = self._manifold.to_pose3(state.poses)
+        self._path.publish(path_bytes(frame, stamp, state.stamps, pose3))
+        self._publish_transform()
+        self._loop_status.publish(state.loops)
+        # Markers are slow to make: not unless somebody looks.
+        if self._graph.get_subscription_count():
+            self._graph.publish(graph_markers(frame, stamp, pose3, state.factors, state.loops))
+
+    def _publish_transform(self) -> None:
+        options = self.options
+        transform = transform_stamped(options.map_frame, options.odom_frame, self._last_stamp,
+                                      self._manifold.to_pose3(self._map_to_odom)[0])
+        self._transform.publish(transform)
+        if self._tf is not None:
+            self._tf.publish(TFMessage(transforms=[transform]))
+
+    def _report(self, improvement: Improvement) -> None:
+        self._diagnosis.note(improvement)
+        self.get_logger().debug(
+            f'update: cost {improvement.cost_before:.6g} -> {improvement.cost:.6g}, '
+            f'{improvement.reweighted_steps} reweighted steps, {improvement.outer_iterations} '
+            f'outer and {improvement.inner_iterations} inner iterations, '
+            f'{improvement.seconds * 1e3:.0f} ms, {improvement.status.value}')

@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+`replay`: plays a bag onto topics, paced by the times its messages were recorded.
+
+Messages are published as the bytes they are in the bag; nothing is decoded.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from importlib import import_module
+from pathlib import Path
+
+import rclpy
+from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+
+from l1slam_ros.core.errors import FileError, L1SlamError, OptionError
+from l1slam_ros.io.bags.damaged.walk import RawMessage
+from l1slam_ros.io.bags.reader import BagSummary, bag_summary, read_raw
+from l1slam_ros.io.progress import Progress
+from l1slam_ros.ros.publishing import header
+
+_BAD_INPUT = 2
+_DAMAGED = 3
+_DEPTH = 1000
+_SECOND = 1_000_000_000
+# A publisher sends nothing to whom it has not met. A node is met one subscription at a time, so
+# once there is any, no other has come for this long [s] before messages go out.
+_REST = 1.0
+_SOON, _AGAIN = 2.0, 30.0  # [s] when it is said that nobody subscribes, and how often from then on
+_CLOCK_PERIOD = 0.01  # [s] of the bag's time
+_PAUSE = 0.05  # [s] longest sleep at a time, so that an interrupt is seen
+
+
+class Player:
+    """
+    Publishes the messages of one bag.
+
+    Parameters
+    ----------
+    node : to publish with
+    summary : of the bag
+    topics : only these; None: all whose type is installed here
+    remap : topic in the bag -> topic to publish on
+    clock : publish /clock too
+
+    Raises
+    ------
+    OptionError : a topic that the bag does not have, or whose type is not installed.
+
+    """
+
+    def __init__(self, node: Node, summary: BagSummary, topics: Sequence[str] | None,
+                 remap: dict[str, str], clock: bool):
+        self._node = node
+        names = {topic.name for topic in summary.topics}
+        for name in [*(topics or ()), *remap]:
+            if name not in names:
+                raise OptionError(f'the bag has no topic {name}; it has '
+                                  f'{", ".join(sorted(names))}')
+        self.publishers: dict[str, Publisher] = {}
+        for topic in summary.topics:
+            if topics is not None and topic.name not in topics:
+                continue
+            kind = _message_class(topic.msgtype)
+            if kind is None and topics is not None:
+                raise OptionError(f'{topic.name}: the type {topic.msgtype} is not installed')
+            if kind is None:
+                node.get_logger().warning(f'{topic.name} is left out: the type {topic.msgtype} '
+                                          'is not installed')
+                continue
+            self.publishers[topic.name] = node.create_publisher(
+                kind, remap.get(topic.name, topic.name), QoSProfile(depth=_DEPTH))
+        self._clock = node.create_publisher(Clock, '/clock', 10) if clock else None
+
+    def wait_for_subscribers(self, longest: float | None) -> None:
+        """
+        Wait until anybody subscribes, then until nobody else does.
+
+        longest : [s] then play to nobody; None: as long as it takes; 0: do not wait at all
+
+        """
+        if longest == 0:
+            return
+        began = time.monotonic()
+        say = began + _SOON
+        while not self._subscribed():
+            now = time.monotonic()
+            if longest is not None and now > began + longest:
+                self._node.get_logger().warning(
+                    f'nobody subscribed for {longest:g} s; playing all the same')
+                return
+            if now > say:
+                say = now + _AGAIN
+                names = ', '.join(publisher.topic_name for publisher in self.publishers.values())
+                self._node.get_logger().info(f'waiting for a subscriber of {names}')
+            _sleep_until(now + _PAUSE)
+        self._wait_for_others()
+
+    def _subscribed(self) -> int:
+        """Return how many of the topics have a subscriber."""
+        return sum(publisher.get_subscription_count() > 0
+                   for publisher in self.publishers.values())
+
+    def _wait_for_others(self) -> None:
+        known, quiet = self._subscribed(), time.monotonic() + _REST
+        while time.monotonic() < quiet and known < len(self.publishers):
+            _sleep_until(time.monotonic() + _PAUSE)
+            if self._subscribed() > known:
+                known, quiet = self._subscribed(), time.monotonic() + _REST
+
+    def play(self, messages: Iterable[RawMessage], rate: float, progress: Progress) -> None:
+        """Publish the messages, `rate` times as fast as they were recorded."""
+        first, began, shown, next_clock = None, time.monotonic(), 0.0, 0.0
+        for message in messages:
+            first = message.time if first is None else first
+            recorded = (message.time - first) / _SECOND
+            while self._clock is not None and next_clock <= recorded:
+                _sleep_until(began + next_clock / rate)
+                self._publish_clock(first + round(next_clock * _SECOND))
+                next_clock += _CLOCK_PERIOD
+            _sleep_until(began + recorded / rate)
+            self.publishers[message.topic].publish(message.data)
+            progress.advance(recorded - shown)
+            shown = recorded
+        self._wait_until_received()
+
+    def _wait_until_received(self) -> None:
+        """Wait until every subscriber has the last messages, or is gone."""
+        moment = Duration(seconds=_PAUSE)
+        while not all(p.wait_for_all_acked(moment) for p in self.publishers.values()):
+            _sleep_until(time.monotonic())  # an interrupt is seen between the waits
+
+    def _publish_clock(self, stamp: int) -> None:
+        assert self._clock is not None
+        self._clock.publish(Clock(clock=header('', stamp).stamp))
+
+
+def _sleep_until(moment: float) -> None:
+    """Sleep until a `time.monotonic()` [s]; raise when ROS is shut down meanwhile."""
+    while (rest := moment - time.monotonic()) > 0:
+        time.sleep(min(rest, _PAUSE))
+        if not rclpy.ok():
+            raise ExternalShutdownException()
+    if not rclpy.ok():
+        raise ExternalShutdownException()
+
+
+def _message_class(msgtype: str) -> type | None:
+    """Return the class of `package/msg/Name`, None where it is not installed."""
+    package, _, name = msgtype.replace('/', '.').rpartition('.')
+    try:
+        kind: type = getattr(import_module(package), name)
+    except (ImportError, AttributeError, ValueError):
+        return None
+    return kind
+
+
+class _Damage:
+    """Says each damage once, however often the bag is played."""
+
+    def __init__(self) -> None:
+        self.sentences: set[str] = set()
+
+    def tell(self, sentence: str) -> None:
+        """Say a sentence on damage."""
+        if sentence not in self.sentences:
+            print(f'replay: {sentence}', file=sys.stderr)
+        self.sentences.add(sentence)
+
+
+def _rounds(arguments: argparse.Namespace, summary: BagSummary, topics: list[str],
+            damage: _Damage) -> Iterator[Iterator[RawMessage]]:
+    """Yield the messages to play: once, or again and again with --loop."""
+    start = summary.start + round(arguments.start * _SECOND)
+    stop = None
+    if arguments.duration is not None:
+        stop = start + round(arguments.duration * _SECOND)
+    while True:
+        yield read_raw(arguments.bag, topics, damage.tell, start=start, stop=stop)
+        if not arguments.loop:
+            return
+
+
+def _play(arguments: argparse.Namespace, damage: _Damage) -> None:
+    summary = bag_summary(arguments.bag)
+    node = rclpy.create_node('replay')
+    try:
+        player = Player(node, summary, arguments.topics, arguments.remap, arguments.clock)
+        if not player.publishers:
+            raise FileError(arguments.bag, 'no topic of this bag can be played')
+        player.wait_for_subscribers(arguments.wait)
+        seconds = max(summary.duration / _SECOND - arguments.start, 0)
+        for messages in _rounds(arguments, summary, list(player.publishers), damage):
+            with Progress(min(seconds, arguments.duration or seconds), 's') as progress:
+                player.play(messages, arguments.rate, progress)
+    finally:
+        node.destroy_node()
+
+
+def _remapping(text: str) -> tuple[str, str]:
+    old, separator, new = text.partition(':=')
+    if not (old and separator and new):
+        raise argparse.ArgumentTypeError(f'{text!r}, expected old:=new')
+    return old, new
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float('inf'):
+        raise argparse.ArgumentTypeError(f'{text}, expected above 0')
+    return value
+
+
+def _not_negative(text: str) -> float:
+    value = float(text)
+    if not 0 <= value < float('inf'):
+        raise argparse.ArgumentTypeError(f'{text}, expected 0 or more')
+    return value
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog='replay', description='Play a bag onto topics.')
+    add = parser.add_argument
+    add('bag', type=Path, help='.mcap, .db3, .bag (ROS 1) or a rosbag2 directory')
+    add('--wait', type=_not_negative, metavar='SECONDS',
+        help='play after so long even if nobody subscribes; 0: at once (default: until somebody '
+             'does)')
+    add('--rate', type=_positive, default=1.0, help='times as fast as recorded')
+    add('--start', type=_not_negative, default=0.0, help='skip so much of the bag [s]')
+    add('--duration', type=_positive, help='play only so much of the bag [s]')
+    add('--loop', action='store_true', help='again and again')
+    add('--remap', type=_remapping, nargs='+', default=[], metavar='OLD:=NEW')
+    add('--topics', nargs='+', help='play only these')
+    add('--clock', action='store_true', help='publish /clock')
+    return parser
+
+
+def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Split at `--ros-args`. rclpy's own splitting also takes the old:=new of --remap for its."""
+    at = arguments.index('--ros-args') if '--ros-args' in arguments else len(arguments)
+    return arguments[:at], arguments[at:]
+
+
+def main() -> int:
+    """Play; return the exit code: 0, 2 for bad input, 3 where only a part could be read."""
+    own, ros = _split(sys.argv[1:])
+    arguments = _parser().parse_args(own)
+    arguments.remap = dict(arguments.remap)
+    damage = _Damage()
+    rclpy.init(args=ros)
+    try:
+        _play(arguments, damage)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (L1SlamError, OSError) as error:
+        print(f'replay: {error}', file=sys.stderr)
+        return _BAD_INPUT
+    finally:
+        rclpy.try_shutdown()
+    return _DAMAGED if damage.sentences else 0

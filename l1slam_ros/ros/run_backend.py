@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The process of `backend`: SIGINT and SIGTERM end it within two seconds, whatever it is doing.
+
+Imported and run before anything heavy, so that this holds while the rest is being imported, too.
+"""
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+# [s] A signal leaves that long for an orderly end; the threads of the node get a part of it.
+_PATIENCE, _THREADS = 1.2, 0.9
+# [s] What raises each time it is called shall not keep a core busy.
+_BREATH = 0.05
+# [s] How long the interpreter lets the solver's own Python run before a callback may.
+_TURN = 5e-4
+
+
+class Ending:
+    """
+    Waits for a signal in a thread of its own: no other thread need be where it can take one.
+
+    Attributes
+    ----------
+    begun : whether there was a signal
+
+    """
+
+    def __init__(self) -> None:
+        self.begun = False
+        self._wake: Callable[[], None] | None = None
+        self._read, write = os.pipe()
+        os.set_blocking(write, False)
+        signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: None)
+        threading.Thread(target=self._wait, name='signals', daemon=True).start()
+
+    def orderly(self, wake: Callable[[], None]) -> None:
+        """From now on a signal calls `wake`, which is to make the main thread end all."""
+        self._wake = wake
+        if self.begun:
+            wake()
+
+    def _wait(self) -> None:
+        os.read(self._read, 1)
+        self.begun = True
+        if self._wake is None:
+            leave(0)
+        else:
+            self._wake()
+            time.sleep(_PATIENCE)
+            leave(0)
+
+
+def leave(code: int) -> None:
+    """End the process now, whatever its threads are doing."""
+    for stream in (sys.stdout, sys.stderr):
+        # Nobody may be listening any more.
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
+
+
+def main() -> int:
+    """Run the node until SIGINT or SIGTERM; return the exit code."""
+    ending = Ending()
+    sys.setswitchinterval(_TURN)
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
+
+    from l1slam_ros.core.errors import L1SlamError
+    from l1slam_ros.ros.node import BackendNode
+
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node, code = None, 0
+    ending.orderly(rclpy.try_shutdown)
+    try:
+        node = BackendNode()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        node.get_logger().info('ready: waiting for odometry')
+        _spin(executor, node)
+    except L1SlamError as error:
+        print(f'backend: {error}', file=sys.stderr)
+        code = 1
+    except Exception:
+        # A signal can shut ROS down under any call; what that call then raises is no failure.
+        if rclpy.ok():
+            raise
+    if node is not None and not node.close(_THREADS):
+        leave(code)
+    rclpy.try_shutdown()
+    return code
+
+
+def _spin(executor: Any, node: Any) -> None:
+    """Serve callbacks until ROS is shut down, whatever ROS itself raises meanwhile."""
+    import rclpy
+    from rclpy.executors import ExternalShutdownException
+
+    while rclpy.ok():
+        try:
+            executor.spin_once()
+        except ExternalShutdownException:
+            return
+        except Exception as error:
+            if rclpy.ok():
+                node.failures.note('callback', error)
+                time.sleep(_BREATH)
+        else:
+            node.failures.over('callback')

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Work that services ask for, done one after the other by a thread of its own."""
+
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from rclpy.node import Node
+from rclpy.task import Future
+
+from l1slam_ros.core.errors import Interrupted, L1SlamError
+from l1slam_ros.ros.threads.failures import Failures, reason
+
+# [s] A service that failed may not be called again: its failure is told for so long.
+_REMEMBERED = 60.0
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a service replies."""
+
+    success: bool
+    message: str
+
+
+@dataclass(frozen=True)
+class _Order:
+    name: str
+    work: Callable[[], str]
+    future: Future
+
+
+class Orders:
+    """
+    A queue of orders from service callbacks, carried out in the order they came.
+
+    A callback awaits `place`, so the executor goes on with other callbacks meanwhile. Whatever an
+    order raises, it is answered, and the next one follows.
+
+    Parameters
+    ----------
+    node : whose executor runs the callbacks
+    failures : where to tell what nobody foresaw
+    done : called after each order
+
+    """
+
+    def __init__(self, node: Node, failures: Failures, done: Callable[[], None]):
+        self._node, self._failures, self._done = node, failures, done
+        self._queue: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._work, name='services', daemon=True)
+        self._thread.start()
+
+    def place(self, name: str, work: Callable[[], str]) -> Future:
+        """Queue some work, which returns a sentence; the future's result is an `Answer`."""
+        future = Future(executor=self._node.executor)
+        self._queue.put(_Order(name, work, future))
+        return future
+
+    def close(self, seconds: float) -> bool:
+        """End the thread after what is queued; return whether it ended within some seconds."""
+        self._queue.put(None)
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+    def _work(self) -> None:
+        while (order := self._queue.get()) is not None:
+            order.future.set_result(self._carry_out(order))
+
+    def _carry_out(self, order: _Order) -> Answer:
+        try:
+            answer = Answer(True, order.work())
+            self._done()
+        except Interrupted:
+            return Answer(False, 'the node is ending')
+        except (L1SlamError, OSError) as error:
+            # The caller is told: the fault lies with the call, not with the node.
+            return Answer(False, reason(error))
+        except Exception as error:
+            self._failures.note(order.name, error, _REMEMBERED)
+            return Answer(False, reason(error))
+        self._failures.over(order.name)
+        return answer

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The thread that improves the map, update by update, and survives whatever an update raises."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from l1slam_ros.core.errors import Interrupted
+from l1slam_ros.core.online.backend import Improvement
+from l1slam_ros.core.online.shared_backend import SharedBackend
+from l1slam_ros.io.compilation import fill_cache
+from l1slam_ros.ros.threads.failures import Failures
+
+# [s] After a failed update the next one waits; twice as long after each more, up to this.
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 10.0
+# [s] What takes less is not worth a line.
+_WORTH_TELLING = 1.0
+
+
+class SolverThread:
+    """
+    Updates the map of a back end whenever it is woken.
+
+    Parameters
+    ----------
+    backend : whose map
+    failures : where to tell what an update raised
+    logger : of the node
+    budget : returns how long one update may work [s]
+    tell : called before and after each update, with what it did, None: nothing; may publish
+
+    """
+
+    def __init__(self, backend: SharedBackend, failures: Failures, logger: Any,
+                 budget: Callable[[], float], tell: Callable[[Improvement | None], None]):
+        self._backend, self._failures, self._logger = backend, failures, logger
+        self._budget, self._tell = budget, tell
+        self._woken = threading.Event()
+        self._paused = self._closing = False
+        self._pause, self._not_before = _FIRST_PAUSE, 0.0
+        self._behind_since = 0.0
+        self.compiling = ''
+        self._thread = threading.Thread(target=self._work, name='solver', daemon=True)
+
+    def start(self) -> None:
+        """Begin; before the first update, what is not in the cache is compiled."""
+        self._thread.start()
+
+    def wake(self) -> None:
+        """Let an update begin, unless one is at work, or failed just now."""
+        self._woken.set()
+
+    def hurry(self) -> None:
+        """Let an update begin even if the last one failed just now."""
+        self._not_before = 0.0
+        self._woken.set()
+
+    def pause(self, paused: bool) -> None:
+        """Let no more updates begin, and one that is at work stop; or go on."""
+        self._paused = paused
+
+    def close(self, seconds: float) -> bool:
+        """Tell the thread to end; return whether it did within some seconds."""
+        self._closing = True
+        self._woken.set()
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+    def is_closing(self) -> bool:
+        """Return whether the node is ending."""
+        return self._closing
+
+    @property
+    def behind(self) -> float:
+        """For how long loops have been waiting to be judged [s]."""
+        return time.monotonic() - self._behind_since if self._behind_since else 0.0
+
+    def _work(self) -> None:
+        self._compile()
+        while self._woken.wait() and not self._closing:
+            self._woken.clear()
+            if time.monotonic() < self._not_before:
+                continue
+            try:
+                # First what services have made of the map: an update may take long.
+                self._tell(None)
+                self._tell(self._update())
+            except Interrupted:
+                continue
+            except Exception as error:
+                # The last good map stays. What fails always shall not keep a core busy.
+                self._failures.note('update', error)
+                self._not_before = time.monotonic() + self._pause
+                self._pause = min(2 * self._pause, _LONGEST_PAUSE)
+            else:
+                self._failures.over('update')
+                self._pause = _FIRST_PAUSE
+
+    def _update(self) -> Improvement | None:
+        if self._paused:
+            return None
+        self._behind_since = self._behind_since or time.monotonic()
+        improvement = self._backend.update(
+            self._budget(), lambda: self._paused or self._closing)
+        if improvement is None or improvement.belief.settled:
+            self._behind_since = 0.0
+        return improvement
+
+    def _compile(self) -> None:
+        began = time.monotonic()
+
+        def report(done: int, total: int) -> None:
+            self.compiling = f'{done} of {total}'
+            if time.monotonic() - began > _WORTH_TELLING:
+                self._logger.info(f'compiling the solver, once on a machine: {self.compiling}')
+
+        try:
+            if not self._backend.alone(lambda: fill_cache(report, self.is_closing)):
+                self._logger.debug('not all is compiled yet: the rest is when it is first called')
+        except Exception as error:
+            # Not the end: what is missing is compiled when it is first called.
+            self._failures.note('compiling', error)
+        self.compiling = ''
+        spent = time.monotonic() - began
+        if spent > _WORTH_TELLING and not self._closing:
+            self._logger.info(f'solver ready after {spent:.0f} s')

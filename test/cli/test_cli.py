@@ -1,0 +1,812 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`l1slam`: what it prints, writes and answers to bad input."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from torn import torn_graph
+
+from l1slam_ros.cli.main import main
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.solvers import block_cholesky as cholesky
+from l1slam_ros.core.solvers.optimality import l1_cost
+from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
+
+VERTICES = ['VERTEX_SE2 0 0 0 0', 'VERTEX_SE2 1 1 0 0', 'VERTEX_SE2 2 2 0 0']
+EDGES = ['EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1',
+         'EDGE_SE2 0 2 2.1 0 0 1 0 0 1 0 1']
+
+
+# The costs of the odometry as it stands, every loop counted.
+ODOMETRY = ('--no-robust', '--start', 'odometry', '--outer', 0)
+
+
+def graph_file(folder, lines):
+    path = folder / 'graph.g2o'
+    path.write_text('\n'.join(lines) + '\n')
+    return path
+
+
+@pytest.fixture
+def world(tmp_path):
+    path = tmp_path / 'world.g2o'
+    assert main(['simulate', str(path), '--poses', '150', '--edges', '250', '--seed', '7']) == 0
+    return path
+
+
+def run(capsys, *arguments):
+    """Run a command that must succeed; return its standard output and error."""
+    code = main([str(a) for a in arguments])
+    out, err = capsys.readouterr()
+    assert code == 0, err
+    return out, err
+
+
+def solve_json(capsys, *arguments):
+    return json.loads(run(capsys, 'solve', *arguments, '--json')[0])
+
+
+def test_solve_reports_what_it_wrote(capsys, world, tmp_path):
+    output, picture = tmp_path / 'out.g2o', tmp_path / 'map.png'
+    report = solve_json(capsys, world, '--output', output, '--plot', picture,
+                        '--reference', f'{world}.truth.txt')
+    record = read_graph_file(output)
+    recomputed = l1_cost(whitened_residual(record.graph, record.poses))
+    assert recomputed == pytest.approx(report['final_cost'], rel=1e-12)
+    assert report['final_cost'] < report['seed_cost'] < report['initial_cost']
+    assert (report['poses'], report['factors'], report['loops']) == (150, 250, 101)
+    assert report['rejected'] == [] and report['solver'] == 'interior-point'
+    assert report['status'] in ('converged', 'iteration_limit', 'stalled')
+    assert 0 < report['ate'] < 0.3
+    assert picture.read_bytes().startswith(b'\x89PNG')
+
+
+@pytest.mark.parametrize('solver', ['primal-dual', 'interior-point'])
+def test_a_chosen_solver_is_the_one_that_solves(capsys, world, solver):
+    report = solve_json(capsys, world, '--solver', solver)
+    best = solve_json(capsys, world)
+    assert report['solver'] == solver
+    assert report['final_cost'] == pytest.approx(best['final_cost'], rel=1e-3)
+    assert (report['inner_iterations'] > 0) == (solver == 'primal-dual')
+
+
+REPORTED = [
+    'poses', 'factors', 'loops', 'initial_cost', 'seed_cost', 'final_cost', 'status', 'seconds',
+    'solver', 'outer_iterations', 'inner_iterations', 'rejected', 'suspect', 'slips', 'parts',
+    'warnings']
+
+
+@pytest.mark.parametrize('more', [(), ('--no-robust',), ('--robust', '--norm', 'l2')])
+def test_the_names_of_a_report_stay(capsys, world, more):
+    assert list(solve_json(capsys, world, *more)) == REPORTED
+    truth = ('--reference', f'{world}.truth.txt')
+    assert list(solve_json(capsys, world, *more, *truth)) == [
+        *REPORTED, 'ate', 'ate_poses']
+
+
+# Robust
+
+
+@pytest.fixture(params=['random', 'identity', 'grouped'])
+def lies(tmp_path, request):
+    """A world with 100 false loops, its edges in no order, and its ids 10, 13, 16, ..."""
+    path = tmp_path / 'lies.g2o'
+    assert main(['simulate', str(path), '--poses', '300', '--edges', '600', '--seed', '4',
+                 '--false-loops', '100', '--kind', request.param]) == 0
+    lines = [line.split() for line in path.read_text().splitlines()]
+    for fields in lines:
+        for k in (1,) if fields[0] == 'VERTEX_SE2' else (1, 2):
+            fields[k] = str(10 + 3 * int(fields[k]))
+    np.random.default_rng(0).shuffle(lines)
+    path.write_text('\n'.join(' '.join(fields) for fields in lines) + '\n')
+    false = Path(f'{path}.false.txt')
+    pairs = 10 + 3 * np.loadtxt(false, dtype=int)
+    false.write_text('\n'.join(f'{i} {j}' for i, j in pairs))
+    return path
+
+
+def edges_of(path):
+    """Return the pairs of ids of the edges of a g2o file, in its order."""
+    rows = [line.split() for line in path.read_text().splitlines() if line.startswith('EDGE')]
+    return [[int(row[1]), int(row[2])] for row in rows]
+
+
+def test_what_is_rejected_are_the_false_loops_in_the_order_of_the_file(capsys, lies):
+    false = np.loadtxt(f'{lies}.false.txt', dtype=int).tolist()
+    report = solve_json(capsys, lies)
+    assert report['rejected'] == [pair for pair in edges_of(lies) if pair in false]
+    assert len(report['rejected']) == 100
+    assert (report['factors'], report['loops']) == (700, 401)
+
+
+def clean_copy(path):
+    """Write the graph without its false loops; return its path."""
+    false = np.loadtxt(f'{path}.false.txt', dtype=int).tolist()
+    clean = path.with_name('clean.g2o')
+    clean.write_text('\n'.join(
+        line for line in path.read_text().splitlines()
+        if not (line.startswith('EDGE') and [int(n) for n in line.split()[1:3]] in false)))
+    return clean
+
+
+@pytest.mark.parametrize('norm', ['l1', 'l2', 'huber'])
+@pytest.mark.parametrize('lies', ['grouped'], indirect=True)
+def test_costs_count_what_is_accepted(capsys, lies, norm):
+    """They are those of a file without the false loops."""
+    robust = solve_json(capsys, lies, '--norm', norm)
+    honest = solve_json(capsys, clean_copy(lies), '--norm', norm, '--no-robust')
+    for name in ('initial_cost', 'final_cost'):
+        assert robust[name] == pytest.approx(honest[name], rel=1e-3)
+    credulous = solve_json(capsys, lies, '--norm', norm, '--no-robust')
+    assert credulous['rejected'] == credulous['suspect'] == credulous['slips'] == []
+    assert credulous['final_cost'] > 2 * robust['final_cost']
+    assert robust['final_cost'] <= robust['seed_cost'] < robust['initial_cost']
+
+
+@pytest.mark.parametrize('lies', ['grouped'], indirect=True)
+def test_every_start_is_the_same_to_a_robust_solve(capsys, lies, tmp_path):
+    """Its own seed reads no start, so not even a start of garbage can spoil it."""
+    spoiled, rng = tmp_path / 'garbage.g2o', np.random.default_rng(1)
+    spoiled.write_text('\n'.join(
+        ' '.join([*line.split()[:2], *map(str, 1e3 * rng.standard_normal(3))])
+        if line.startswith('VERTEX') else line for line in lies.read_text().splitlines()))
+    reports, poses = [], []
+    for path, start in ((lies, 'seed'), (lies, 'odometry'), (lies, 'file'), (spoiled, 'file')):
+        output = tmp_path / f'{len(reports)}.tum'
+        reports.append(solve_json(capsys, path, '--start', start, '--output', output))
+        poses.append(np.loadtxt(output))
+    for name in ('seed_cost', 'final_cost', 'rejected', 'status', 'outer_iterations'):
+        assert [report[name] for report in reports[1:]] == [reports[0][name]] * 3
+    for other in poses[1:]:
+        np.testing.assert_array_equal(other, poses[0])
+    assert reports[3]['initial_cost'] > 100 * reports[2]['initial_cost']
+
+
+@pytest.mark.parametrize('lies', ['random'], indirect=True)
+def test_the_output_has_the_robust_map_and_every_edge(capsys, lies, tmp_path):
+    output = tmp_path / 'out.g2o'
+    report = solve_json(capsys, lies, '--output', output)
+    assert edges_of(output) == edges_of(lies)
+    kept = [pair not in report['rejected'] for pair in edges_of(output)]
+    record = read_graph_file(output)
+    residual = whitened_residual(record.graph, record.poses).reshape(-1, 3)
+    assert l1_cost(residual[kept]) == pytest.approx(report['final_cost'], rel=1e-9)
+
+
+@pytest.mark.parametrize('lies', ['random'], indirect=True)
+def test_people_are_told_which_loops_were_refused_and_why(capsys, lies):
+    said = run(capsys, 'solve', lies)[0].splitlines()
+    at = said.index('100 of 401 loops refused')
+    named = [re.fullmatch(r'  (\d+) - (\d+): (\d+\.\d) sigmas off the accepted ones', line)
+             for line in said[at + 1 : at + 21]]
+    false = np.loadtxt(f'{lies}.false.txt', dtype=int).tolist()
+    assert all([int(match[1]), int(match[2])] in false for match in named)
+    sigmas = [float(match[3]) for match in named]
+    assert sigmas == sorted(sigmas, reverse=True) and sigmas[-1] > 4
+    assert said[at + 21 :] == ['  and 80 more; `--json` lists all']
+    assert run(capsys, 'solve', lies, '--quiet') == ('', '')
+    assert 'refused' not in run(capsys, 'solve', lies, '--no-robust')[0]
+
+
+def test_of_an_honest_graph_nothing_is_refused(capsys, world):
+    robust, plain = solve_json(capsys, world), solve_json(capsys, world, '--no-robust')
+    assert robust['rejected'] == plain['rejected'] == []
+    assert robust['final_cost'] == pytest.approx(plain['final_cost'], rel=1e-5)
+    assert '\n0 of 101 loops refused\n' in run(capsys, 'solve', world)[0]
+
+
+@pytest.mark.parametrize('lies', ['random'], indirect=True)
+def test_odometry_that_lies_is_refused_and_named(capsys, lies):
+    lines = lies.read_text().splitlines()
+    step = next(k for k, line in enumerate(lines) if line.startswith('EDGE_SE2 610 613 '))
+    fields = lines[step].split()
+    fields[3] = str(float(fields[3]) + 6)
+    lies.write_text('\n'.join([*lines[:step], ' '.join(fields), *lines[step + 1:]]))
+    report = solve_json(capsys, lies)
+    rejected, (slip,) = report['rejected'], report['slips']
+    assert [[i, j] for i, j in rejected if j - i == 3] == [slip]
+    assert abs(slip[0] - 610) <= 9  # between loops nobody can tell which of the steps it was
+    assert len(rejected) == 101 and report['parts'] == 1
+    said = run(capsys, 'solve', lies)[0]
+    assert re.search(rf'\nodometry {slip[0]} - {slip[1]} lies: \d+\.\d sigmas off what the loops '
+                     'say; left out\n100 of 401 loops refused\n', said)
+
+
+@pytest.mark.parametrize('lies', ['random'], indirect=True)
+def test_the_picture_shows_what_was_refused(capsys, lies, tmp_path):
+    run(capsys, 'solve', lies, '--quiet', '--plot', tmp_path / 'map.svg')
+    said = words(tmp_path / 'map.svg')
+    assert 'refused loops' in said and 'false loops' not in said
+    assert any('300 poses, 401 loops (100 refused)' in word for word in said)
+
+
+# Doubtful
+
+
+DOUBT = re.compile(r'doubtful: (\d+) refused loops agree with each other, but not with the '
+                   r'odometry between (\d+) and (\d+)( \([0-9.]+ s to [0-9.]+ s\))?, and to leave '
+                   'out one step of it does not reconcile them; the map may be bent there')
+
+
+@pytest.fixture
+def torn(tmp_path):
+    """Return a graph that no map is made of, ids from 100 on; and the ids before its two slips."""
+    path, (graph, slips) = tmp_path / 'torn.g2o', torn_graph()
+    write_graph_file(path, GraphRecord(graph, odometry_poses(graph), 100 + np.arange(400)))
+    return path, slips + 100
+
+
+@pytest.mark.parametrize('norm', ['l1', 'l2'])
+def test_a_map_that_loops_agree_is_wrong_is_given_as_doubtful(capsys, torn, tmp_path, norm):
+    path, slips = torn
+    output, picture = tmp_path / 'out.g2o', tmp_path / 'map.png'
+    assert main(['solve', str(path), '--norm', norm, '--json', '--output', str(output),
+                 '--plot', str(picture)]) == 4
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    said = DOUBT.fullmatch(err.removeprefix('l1slam: ').rstrip('\n'))
+    loops, first, last = map(int, said.groups()[:3])
+    assert slips[0] - 20 < first < last < slips[1] + 20 and 10 < loops < len(report['rejected'])
+    assert report['status'] == 'doubtful' and report['warnings'] == [said[0]]
+    record = read_graph_file(output)
+    kept = [pair not in report['rejected'] + report['suspect'] for pair in edges_of(output)]
+    residual = whitened_residual(record.graph, record.poses).reshape(-1, 3)[kept]
+    cost = l1_cost(residual) if norm == 'l1' else (residual**2).sum()
+    assert cost == pytest.approx(report['final_cost'], rel=1e-9)
+    assert picture.exists()
+
+
+def test_a_doubt_is_said_even_quietly_and_with_the_times_of_a_bag(capsys, torn, tmp_path):
+    run(capsys, 'convert', torn[0], tmp_path / 'bag')
+    assert main(['solve', str(tmp_path / 'bag'), '--quiet']) == 4
+    out, err = capsys.readouterr()
+    said = DOUBT.fullmatch(err.removeprefix('l1slam: ').rstrip('\n'))
+    first, last = int(said[2]), int(said[3])
+    assert out == '' and said[4] == (
+        f' ({1000 + first / 10:.9f} s to {1000 + last / 10:.9f} s)')
+
+
+def test_a_damaged_bag_with_a_doubtful_map_says_both(capsys, torn, tmp_path):
+    run(capsys, 'convert', torn[0], tmp_path / 'bag')
+    whole = (tmp_path / 'bag' / 'bag.mcap').read_bytes()
+    (tmp_path / 'cut.mcap').write_bytes(whole[:-20])
+    assert main(['solve', str(tmp_path / 'cut.mcap'), '--quiet']) == 4
+    damage, doubt = capsys.readouterr().err.splitlines()
+    assert 'is damaged' in damage and DOUBT.fullmatch(doubt.removeprefix('l1slam: '))
+
+
+def test_most_loops_refused_is_a_doubt(capsys, world, tmp_path):
+    """Three false loops to two true ones: the map is right, but who could know."""
+    bad = tmp_path / 'bad.g2o'
+    run(capsys, 'corrupt', world, bad, '--false-loops', 150)
+    assert main(['solve', str(bad), '--json']) == 4
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    left_out = len(report['rejected'] + report['suspect'])
+    assert report['status'] == 'doubtful' and left_out >= 150
+    assert err.startswith(f'l1slam: doubtful: {left_out} loops, most of all, are refused or ')
+    assert len(err.splitlines()) == 1
+
+
+GAP = 'no edge between the consecutive vertices 1 and 2, so no chain of odometry'
+
+
+@pytest.mark.parametrize('start', ['seed', 'file'])
+def test_a_gap_in_the_odometry_leaves_nothing_to_judge_loops_by(capsys, tmp_path, start):
+    path = graph_file(tmp_path, [*VERTICES, EDGES[0], EDGES[2]])
+    output = str(tmp_path / 'out.g2o')
+    asked = ['solve', str(path), '--start', start, '--json', '--output', output]
+    assert main([*asked, '--robust']) == 2
+    assert capsys.readouterr() == ('', f'l1slam: {path}: {GAP} to judge loops by\n')
+    assert sorted(tmp_path.iterdir()) == [path]
+    assert main(asked) == 0
+    out, err = capsys.readouterr()
+    warning = f'no loop was doubted: {GAP} to judge loops by'
+    assert err == f'l1slam: {warning}\n' and json.loads(out)['warnings'] == [warning]
+    assert main([*asked, '--quiet', '--no-robust']) == 0
+    assert capsys.readouterr().err == ''
+
+
+def test_a_graph_too_dense_to_judge_is_solved_all_the_same(capsys, world, monkeypatch):
+    """With memory for few blocks: the odometry alone can be factored, all loops cannot."""
+    expected = solve_json(capsys, world, '--no-robust')['final_cost']
+    monkeypatch.setattr(cholesky, 'MOST_BLOCKS', 400)
+    report = solve_json(capsys, world)
+    assert report['solver'] == 'primal-dual'
+    assert report['final_cost'] == pytest.approx(expected, rel=1e-3)
+    (warning,) = report['warnings']
+    assert re.fullmatch('no loop was doubted: the factor of 149 keyframes and [0-9]+ factors '
+                        'would have more than 400 blocks: too many far places are joined', warning)
+    assert main(['solve', str(world), '--robust']) == 2
+    assert 'too many far places are joined' in capsys.readouterr().err
+
+
+def test_a_graph_without_loops_is_its_odometry(capsys, tmp_path):
+    report = solve_json(capsys, graph_file(tmp_path, EDGES[:2]))
+    assert report['status'] == 'converged' and report['final_cost'] < 1e-6
+    assert report['warnings'] == report['rejected'] == report['suspect'] == []
+    assert 'refused' not in run(capsys, 'solve', tmp_path / 'graph.g2o')[0]
+
+
+def test_a_parameter_file_may_say_that_all_loops_are_believed(capsys, tmp_path, lies):
+    params = tmp_path / 'params.yaml'
+    params.write_text('/**: {ros__parameters: {robust: {enabled: false}}}')
+    asked = (lies, '--norm', 'l2', '--params-file', params)
+    assert solve_json(capsys, *asked)['rejected'] == []
+    assert len(solve_json(capsys, *asked, '--robust')['rejected']) == 100
+
+
+def test_ate_of_the_odometry_is_that_of_zero_steps(capsys, world):
+    truth = f'{world}.truth.txt'
+    odometry = solve_json(capsys, world, '--no-robust', '--start', 'odometry', '--outer', 0,
+                          '--reference', truth)
+    assert odometry['outer_iterations'] == 0
+    assert odometry['final_cost'] == odometry['initial_cost']
+    assert odometry['ate'] > 3 * solve_json(capsys, world, '--reference', truth)['ate']
+
+
+@pytest.mark.parametrize('start', ['seed', 'file', 'odometry'])
+@pytest.mark.parametrize('norm', ['l1', 'l2', 'huber'])
+def test_every_start_leads_every_norm_to_one_cost(capsys, world, start, norm):
+    report = solve_json(capsys, world, '--no-robust', '--start', start, '--norm', norm)
+    best = solve_json(capsys, world, '--norm', norm)
+    assert report['final_cost'] == pytest.approx(best['final_cost'], rel=1e-3)
+    assert (report['seed_cost'] is None) == (start != 'seed')
+
+
+def test_without_json_there_is_a_summary_and_with_quiet_nothing(capsys, world):
+    out, err = run(capsys, 'solve', world)
+    assert '150 poses, 250 factors, 101 loops' in out and 'final' in out and err == ''
+    assert run(capsys, 'solve', world, '--quiet') == ('', '')
+
+
+def test_graph_to_bag_to_graph_is_one_graph(capsys, world, tmp_path):
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    run(capsys, 'convert', tmp_path / 'bag', tmp_path / 'back.g2o')
+    costs = [solve_json(capsys, path, *ODOMETRY)['initial_cost']
+             for path in (world, tmp_path / 'bag', tmp_path / 'back.g2o')]
+    assert np.ptp(costs) <= 1e-9 * costs[0]
+
+
+def copied_bag(bag, copy, renamed=None, note=True):
+    """Copy a bag into an sqlite one by rosbags' own reader and writer."""
+    writer = Writer(copy, version=9, storage_plugin=StoragePlugin.SQLITE3)
+    metadata = yaml.safe_load((bag / 'metadata.yaml').read_text())
+    for key, text in metadata['rosbag2_bagfile_information']['custom_data'].items():
+        if note:
+            writer.set_custom_data(key, text)
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    with AnyReader([bag]) as reader, writer:
+        connections = {c.id: writer.add_connection(
+            (renamed or {}).get(c.topic, c.topic), c.msgtype, typestore=typestore)
+            for c in reader.connections}
+        for connection, time, data in reader.messages():
+            writer.write(connections[connection.id], time, data)
+    return copy
+
+
+@pytest.fixture
+def doors(capsys, world, tmp_path):
+    """One graph in every form that a user may have it in."""
+    run(capsys, 'convert', world, tmp_path / 'a.graph')
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    sqlite = copied_bag(tmp_path / 'bag', tmp_path / 'sqlite')
+    return [world, tmp_path / 'a.graph', tmp_path / 'bag', tmp_path / 'bag' / 'bag.mcap', sqlite,
+            sqlite / 'sqlite.db3']
+
+
+def test_every_door_leads_to_the_same_costs(capsys, doors):
+    for norm in 'l1', 'l2', 'huber':
+        costs = [solve_json(capsys, door, *ODOMETRY, '--norm', norm)['initial_cost']
+                 for door in doors]
+        np.testing.assert_allclose(costs, costs[0], rtol=1e-9)
+        assert costs[0] > 100
+
+
+@pytest.mark.parametrize('norm', ['l1', 'l2'])
+def test_every_door_leads_to_the_same_poses(capsys, doors, tmp_path, norm):
+    outputs = []
+    for k, door in enumerate(doors):
+        run(capsys, 'solve', door, '--no-robust', '--start', 'odometry', '--norm', norm,
+            '--quiet', '--output', tmp_path / f'{k}.tum')
+        outputs.append(np.loadtxt(tmp_path / f'{k}.tum'))
+    moved = np.linalg.norm(outputs[0][:, 1:3] - np.loadtxt(f'{doors[0]}.truth.txt')[:, 1:3])
+    assert moved > 0.1
+    for output in outputs[1:]:
+        np.testing.assert_allclose(output, outputs[0], atol=1e-6)
+
+
+def test_a_bag_without_our_note_goes_by_the_parameters(capsys, world, tmp_path):
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    plain = copied_bag(tmp_path / 'bag', tmp_path / 'plain', note=False)
+    params = tmp_path / 'params.yaml'
+    params.write_text('/**: {ros__parameters: {odometry: {covariance_source: increment}, '
+                      'keyframe: {translation: 0.0, rotation: 0.0, period: 0.0}}}')
+    expected = solve_json(capsys, world, '--norm', 'l2')['final_cost']
+    by_defaults = solve_json(capsys, plain, '--norm', 'l2')['final_cost']
+    told = solve_json(capsys, plain, '--norm', 'l2', '--params-file', params)['final_cost']
+    assert told == pytest.approx(expected, rel=1e-6)
+    assert by_defaults != pytest.approx(expected, rel=0.01)
+    # So do the other commands that read bags.
+    run(capsys, 'convert', plain, tmp_path / 'told.g2o', '--params-file', params)
+    assert solve_json(capsys, tmp_path / 'told.g2o', '--norm', 'l2')[
+        'final_cost'] == pytest.approx(expected, rel=1e-6)
+
+
+def test_other_topics(capsys, world, tmp_path):
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    other = copied_bag(tmp_path / 'bag', tmp_path / 'other', {
+        '/odom': '/wheels/odom', '/loop_closures': '/places'})
+    code = main(['info', str(other)])
+    out, err = capsys.readouterr()
+    assert code == 2 and '/wheels/odom: 150 of nav_msgs/msg/Odometry' in out
+    assert err.startswith('l1slam: ') and err.count('\n') == 1 and '/wheels/odom' in err
+    topics = ('--odom-topic', '/wheels/odom', '--loop-topic', '/places')
+    assert solve_json(capsys, other, *topics)['loops'] == 101
+    vouched = ('--odom-topic', '/wheels/odom', '--trusted-topic', '/places')
+    assert solve_json(capsys, other, *vouched)['loops'] == 101
+    run(capsys, 'plot', other, *topics, '--output', tmp_path / 'map.png')
+
+
+def test_a_cut_bag_is_read_in_part_and_exits_with_3(capsys, world, tmp_path):
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    whole = (tmp_path / 'bag' / 'bag.mcap').read_bytes()
+    cut = tmp_path / 'cut.mcap'
+    cut.write_bytes(whole[:len(whole) // 2])
+    for arguments in (['solve', cut, '--quiet', '--output', tmp_path / 'out.g2o'], ['info', cut],
+                      ['convert', cut, tmp_path / 'out.graph'],
+                      ['corrupt', cut, tmp_path / 'bad.g2o', '--false-loops', 1],
+                      ['plot', cut, world, '--output', tmp_path / 'map.png']):
+        assert main([str(a) for a in arguments]) == 3
+        out, err = capsys.readouterr()
+        assert err.startswith(f'l1slam: {cut}') and err.count('\n') == 1 and 'damaged' in err
+        assert 'nothing looks wrong' not in out
+    assert read_graph_file(tmp_path / 'out.g2o').graph.n_poses > 20
+    cut.write_bytes(whole[:100])
+    assert main(['solve', str(cut), '--json']) == 2
+    out, err = capsys.readouterr()
+    assert out == '' and err.startswith(f'l1slam: {cut}') and err.count('\n') == 1
+
+
+def test_intel_as_a_bag_is_the_same_graph(capsys, datasets, tmp_path):
+    run(capsys, 'convert', datasets / 'intel.g2o', tmp_path / 'bag')
+    costs = [solve_json(capsys, path, *ODOMETRY)['initial_cost']
+             for path in (datasets / 'intel.g2o', tmp_path / 'bag')]
+    assert costs[0] == pytest.approx(16108.59, abs=0.005)
+    assert costs[1] == pytest.approx(costs[0], abs=1e-6)
+
+
+def test_a_trajectory_goes_out_as_tum_and_in_as_reference(capsys, world, tmp_path):
+    output = tmp_path / 'out.tum'
+    report = solve_json(capsys, world, '--output', output, '--reference', f'{world}.truth.txt')
+    assert len(output.read_text().splitlines()) == 150
+    assert report['ate'] > 0
+    assert solve_json(capsys, world, '--reference', output)['ate'] == pytest.approx(0, abs=1e-8)
+
+
+def test_stamps_rounded_to_microseconds_still_match(capsys, world, tmp_path):
+    output = tmp_path / 'out.tum'
+    run(capsys, 'solve', world, '--output', output, '--quiet')
+    lines = [line.split() for line in output.read_text().splitlines()]
+    output.write_text('\n'.join(' '.join([f'{float(stamp) + 2e-7:.6f}', *rest])
+                                for stamp, *rest in lines))
+    assert solve_json(capsys, world, '--reference', output)['ate'] == pytest.approx(0, abs=1e-5)
+
+
+def test_simulate_writes_truth_and_false_loops(capsys, tmp_path):
+    output = tmp_path / 'bag'
+    run(capsys, 'simulate', output, '--poses', 200, '--edges', 300, '--false-loops', 5)
+    pairs = np.loadtxt(f'{output}.false.txt', dtype=int)
+    assert pairs.shape == (5, 2) and (pairs[:, 1] > pairs[:, 0] + 1).all()
+    assert len(np.loadtxt(f'{output}.truth.txt')) == 200
+    assert 'loops       106' in run(capsys, 'info', output)[0]
+
+
+def test_info_counts_components(capsys, tmp_path):
+    lines = [*VERTICES, 'VERTEX_SE2 7 0 0 0', 'VERTEX_SE2 8 0 0 0', *EDGES,
+             'EDGE_SE2 7 8 1 0 0 1 0 0 1 0 1']
+    out, _ = run(capsys, 'info', graph_file(tmp_path, lines))
+    assert 'poses       5' in out and 'components  2' in out and 'odometry    3' in out
+
+
+def test_info_of_a_good_graph_and_of_its_bag(capsys, world, tmp_path):
+    out, err = run(capsys, 'info', world)
+    assert out.endswith('\nnothing looks wrong\n') and err == ''
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    out, _ = run(capsys, 'info', tmp_path / 'bag')
+    for row in ('duration    14.9 s from 1000.000000000',
+                'note        covariance increment, keyframes every',
+                'topic       /loop_closures: 101 of geometry_msgs/msg/PoseWithCovarianceStamped',
+                'topic       /odom: 150 of nav_msgs/msg/Odometry', 'poses       150 in SE2',
+                'time        14.9 s', 'nothing looks wrong'):
+        assert f'\n{row}' in f'\n{out}', out
+
+
+def test_info_says_what_was_skipped(capsys, tmp_path):
+    out, err = run(capsys, 'info', graph_file(tmp_path, [*VERTICES, *EDGES, 'VERTEX_XY 9 1 2']))
+    assert "- 1 'VERTEX_XY' line is not used" in out and err == ''
+
+
+def words(path):
+    """The texts of an SVG: matplotlib draws them as outlines and notes them in comments."""
+    return re.findall(r'<!-- (.*?) -->', path.read_text())
+
+
+def test_plot_draws_several_maps(capsys, world, tmp_path):
+    run(capsys, 'plot', world, world, '--output', tmp_path / 'maps.svg')
+    assert words(tmp_path / 'maps.svg').count('world.g2o') == 2
+    assert words(tmp_path / 'maps.svg').count('odometry') == 2
+    assert words(tmp_path / 'maps.svg').count('truth') == 2
+
+
+def test_plot_shows_false_loops_where_they_are_known(capsys, world, tmp_path):
+    run(capsys, 'corrupt', world, tmp_path / 'bad.g2o', '--false-loops', 12)
+    run(capsys, 'plot', world, tmp_path / 'bad.g2o', '--output', tmp_path / 'maps.svg')
+    said = words(tmp_path / 'maps.svg')
+    assert said.count('false loops') == 1
+    assert '150 poses, 101 loops' in said and '150 poses, 113 loops (12 false)' in said
+
+
+@pytest.mark.parametrize('line, words', [
+    ('3 5', 'no edge between 3 and 5'), ('3 999', 'no edge between 3 and 999'),
+    ('3', '1 field; expected 2 whole numbers'), ('3 x', "'x' is not a whole number"),
+])
+def test_a_file_of_other_false_loops_is_refused(capsys, tmp_path, line, words):
+    path = graph_file(tmp_path, [*VERTICES, *EDGES])
+    (tmp_path / 'graph.g2o.false.txt').write_text(f'0 2\n{line}\n')
+    assert main(['plot', str(path), '--output', str(tmp_path / 'map.png')]) == 2
+    _, err = capsys.readouterr()
+    assert err.startswith(f'l1slam: {path}.false.txt') and words in err and err.count('\n') == 1
+
+
+def test_solve_draws_the_costs_beside_the_map(capsys, world, tmp_path):
+    picture = tmp_path / 'map.svg'
+    report = solve_json(capsys, world, '--plot', picture, '--reference', f'{world}.truth.txt')
+    said = words(picture)
+    for word in ('world.g2o', 'optimised', 'truth', 'odometry', 'l1 cost', 'iteration',
+                 f'initial {report["initial_cost"]:.6g}, seed {report["seed_cost"]:.6g}, '
+                 f'final {report["final_cost"]:.6g}'):
+        assert word in said
+
+
+@pytest.fixture
+def odd(world, tmp_path):
+    """The world with stamps and with ids 10, 13, 16, ..."""
+    path = tmp_path / 'odd.g2o'
+    lines = [line.split() for line in world.read_text().splitlines()]
+    for fields in lines:
+        for k in (1,) if fields[0] == 'VERTEX_SE2' else (1, 2):
+            fields[k] = str(10 + 3 * int(fields[k]))
+    path.write_text('\n'.join(' '.join(fields) for fields in lines) + '\n')
+    Path(f'{path}.stamps.txt').write_text(
+        ''.join(f'{10 + 3 * k} {5 + k}.25\n' for k in range(150)))
+    return path
+
+
+def corrupted(capsys, path, output, *options):
+    """Corrupt; return the record, which of its factors are false, and the pairs of the file."""
+    run(capsys, 'corrupt', path, output, *options)
+    pairs = np.loadtxt(f'{output}.false.txt', dtype=int, ndmin=2)
+    record = read_graph_file(output)
+    factors = record.graph.between
+    ids = np.stack((record.ids[factors.i], record.ids[factors.j]), axis=1)
+    false = (ids[:, None] == pairs).all(axis=2).any(axis=1)
+    assert false.sum() == len(pairs)
+    return record, false, pairs
+
+
+@pytest.mark.parametrize('kind', ['random', 'identity', 'grouped'])
+def test_corrupt_adds_far_pairs_and_keeps_the_rest(capsys, odd, world, tmp_path, kind):
+    before = read_graph_file(odd)
+    after, false, pairs = corrupted(capsys, odd, tmp_path / 'bad.g2o', '--false-loops', 40,
+                                    '--kind', kind, '--seed', 3)
+    assert len(pairs) == 40 and set(pairs.ravel() % 3) == {1}
+    np.testing.assert_array_equal(after.poses, before.poses)
+    np.testing.assert_array_equal(after.ids, before.ids)
+    np.testing.assert_array_equal(after.stamps, before.stamps)
+    np.testing.assert_array_equal(after.graph.between.measurement[~false],
+                                  before.graph.between.measurement)
+    truth = np.loadtxt(f'{world}.truth.txt')[:, 1:3]
+    i, j = ((pairs - 10) // 3).T
+    distance = np.linalg.norm(truth[i] - truth[j], axis=1)
+    # A tenth of the diagonal of the map; the map that judged it is some centimetres off.
+    assert distance.min() > 0.1 * np.linalg.norm(np.ptp(truth, axis=0)) - 0.3
+    assert (j - i).min() >= 15
+    claimed = np.linalg.norm(after.graph.between.measurement[false][:, :2], axis=1)
+    assert claimed.max() < {'random': 2, 'identity': 1e-9, 'grouped': 40}[kind]
+    assert solve_json(capsys, tmp_path / 'bad.g2o')['loops'] == 141
+
+
+def test_grouped_false_loops_run_along_and_agree(capsys, odd, tmp_path):
+    record, false, pairs = corrupted(capsys, odd, tmp_path / 'bad.g2o', '--false-loops', 45,
+                                     '--kind', 'grouped')
+    factors = record.graph.between
+    z = {(i, j): m for i, j, m in zip(factors.i[false], factors.j[false],
+                                      factors.measurement[false], strict=True)}
+    steps = factors.measurement[factors.is_odometry]
+    runs = [(i, j) for i, j in z if (i - 1, j - 1) not in z]
+    lengths = []
+    for i, j in runs:
+        k = 0
+        while (i + k + 1, j + k + 1) in z:
+            around = se2.compose(steps[i + k], z[i + k + 1, j + k + 1])
+            np.testing.assert_allclose(se2.compose(z[i + k, j + k], steps[j + k]), around,
+                                       atol=1e-9)
+            k += 1
+        lengths.append(k + 1)
+    assert sum(lengths) == 45 and len(lengths) <= 5
+    assert sum(10 <= length <= 20 for length in lengths) >= len(lengths) - 2
+
+
+def test_another_seed_draws_other_loops_and_the_same_one_the_same(capsys, world, tmp_path):
+    drawn = [corrupted(capsys, world, tmp_path / f'{k}.g2o', '--false-loops', 10, '--seed', seed)
+             [2].tolist() for k, seed in enumerate((1, 1, 2))]
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
+def test_false_loops_are_told_by_the_solved_map_not_by_a_drifted_start(capsys, world, tmp_path):
+    """The stored start is wound up like a spring: by it, the same place is far from itself."""
+    path = tmp_path / 'drift.g2o'
+    record = read_graph_file(world)
+    steps = record.graph.between.measurement[record.graph.between.is_odometry]
+    poses = [np.zeros(3)]
+    for step in steps + [0, 0, 0.2]:
+        poses.append(se2.compose(poses[-1], step))
+    lines = [f'VERTEX_SE2 {k} {x} {y} {theta}' for k, (x, y, theta) in enumerate(poses)]
+    edges = [line for line in world.read_text().splitlines() if line.startswith('EDGE')]
+    path.write_text('\n'.join(lines + edges))
+    _, _, pairs = corrupted(capsys, path, tmp_path / 'bad.g2o', '--false-loops', 200)
+    truth = np.loadtxt(f'{world}.truth.txt')[:, 1:3]
+    distance = np.linalg.norm(truth[pairs[:, 0]] - truth[pairs[:, 1]], axis=1)
+    assert distance.min() > 0.1 * np.linalg.norm(np.ptp(truth, axis=0)) - 0.3
+
+
+def test_corrupting_twice_names_the_false_loops_of_both(capsys, world, tmp_path):
+    _, _, first = corrupted(capsys, world, tmp_path / 'a.g2o', '--false-loops', 10)
+    _, _, both = corrupted(capsys, tmp_path / 'a.g2o', tmp_path / 'b.g2o', '--false-loops', 20,
+                           '--kind', 'grouped')
+    assert len(both) == 30 and both[:10].tolist() == first.tolist()
+
+
+def test_corrupting_to_a_bag_counts_as_the_bag_does(capsys, odd, tmp_path):
+    run(capsys, 'corrupt', odd, tmp_path / 'bad', '--false-loops', 7)
+    pairs = np.loadtxt(tmp_path / 'bad.false.txt', dtype=int)
+    assert pairs.shape == (7, 2) and pairs.max() < 150
+    run(capsys, 'plot', tmp_path / 'bad', '--output', tmp_path / 'map.svg')
+    assert '150 poses, 108 loops (7 false)' in words(tmp_path / 'map.svg')
+
+
+def test_a_graph_that_cannot_be_written_leaves_no_file_of_false_loops(capsys, world, tmp_path):
+    # The priors of a graph have no place in TORO.
+    path = tmp_path / 'prior.g2o'
+    path.write_text(world.read_text() + 'EDGE_PRIOR_SE2 0 0 0 0 1 0 0 1 0 1\n')
+    there = sorted(tmp_path.iterdir())
+    assert main(['corrupt', str(path), str(tmp_path / 'bad.graph'), '--false-loops', '3']) == 2
+    assert sorted(tmp_path.iterdir()) == there
+    assert capsys.readouterr().err.count('\n') == 1
+
+
+def test_a_parameter_file_speaks_to_both_growth_and_solver(capsys, world, tmp_path):
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    params = tmp_path / 'params.yaml'
+    params.write_text('/**: {ros__parameters: {keyframe: {translation: 5.0, rotation: 0.0}, '
+                      'solver: {outer_iterations: 2}}}')
+    report = solve_json(capsys, tmp_path / 'bag', '--params-file', params)
+    assert report['poses'] < 60 and report['outer_iterations'] == 2
+
+
+@pytest.mark.parametrize('lines, line, words', [
+    ([*VERTICES, 'EDGE_SE2 0 1 nan 0 0 1 0 0 1 0 1'], 4, 'nan'),
+    ([*VERTICES, *EDGES[:2], 'EDGE_SE2 0 2 2 0 0 1 2 0 1 0 1'], 6, 'positive definite'),
+    ([*VERTICES, *EDGES, 'EDGE_SE2 0 9 1 0 0 1 0 0 1 0 1'], 7, '9'),
+    ([*VERTICES, 'VERTEX_SE2 1 0 0 0', *EDGES], 4, '1'),
+    (VERTICES, None, 'edge'),
+    ([*VERTICES, 'EDGE_SE2 0 1 1 0 0 1 0 0 1 0'], 4, 'expected'),
+    (['once upon a time'], 1, 'once'),
+    (['VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1'], 1, '3D'),
+    ([*VERTICES, 'VERTEX_SE2 9 0 0 0', *EDGES], None, 'not connected'),
+])
+def test_bad_input_is_one_line_exit_code_2_and_no_output(capsys, tmp_path, lines, line, words):
+    path, output = graph_file(tmp_path, lines), tmp_path / 'out.g2o'
+    assert main(['solve', str(path), '--output', str(output)]) == 2
+    out, err = capsys.readouterr()
+    assert out == '' and err.count('\n') == 1 and err.startswith(f'l1slam: {path}:')
+    assert words.lower() in err.lower()
+    if line is not None:
+        assert f'{path}:{line}:' in err
+    assert sorted(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize('arguments, words', [
+    (['solve', 'missing.g2o'], 'no such file'),
+    (['solve', 'graph.txt'], 'unknown kind'),
+    (['solve', 'graph.g2o', '--start', 'file'], 'no poses'),
+    (['solve', 'graph.g2o', '--inner', '0'], 'iterations'),
+    (['solve', 'graph.g2o', '--output', 'out.doc'], 'suffix'),
+    (['solve', 'graph.g2o', '--output', 'missing/out.g2o'], 'missing is no folder'),
+    (['solve', 'graph.g2o', '--output', 'taken.g2o', '--plot', 'a.png'], 'it is a directory'),
+    (['solve', 'graph.g2o', '--plot', 'missing/out.png'], 'missing is no folder'),
+    (['solve', 'gap.g2o', '--start', 'odometry'], 'consecutive vertices 1 and 2'),
+    (['convert', 'graph.g2o', 'out.doc'], 'suffix'),
+    (['corrupt', 'graph.g2o', 'out.tum', '--false-loops', '1'], 'trajectory'),
+    (['corrupt', 'graph.g2o', 'out.g2o', '--false-loops', '-1'], '--false-loops is -1'),
+    (['corrupt', 'graph.g2o', 'out.g2o', '--false-loops', '1000000000'], '3 pairs among 3'),
+    (['corrupt', 'missing.g2o', 'out.g2o', '--false-loops', '1'], 'no such file'),
+    (['plot', 'graph.g2o', '--output', 'map.doc'], '.png'),
+    (['plot', 'graph.g2o', 'missing.g2o', '--output', 'map.png'], 'missing.g2o'),
+    (['info', 'missing.g2o'], 'no such file'),
+    (['simulate', 'out.tum', '--poses', '10', '--edges', '12'], 'trajectory'),
+    (['solve', 'graph.g2o', '--plot', 'out.doc'], '.png'),
+    (['solve', 'graph.g2o', '--reference', 'missing.txt'], 'missing.txt'),
+    (['solve', 'graph.g2o', '--params-file', 'graph.txt'], 'parameters'),
+    (['simulate', 'out.g2o', '--poses', '10', '--edges', '5'], '9 to 45'),
+    (['simulate', 'out.g2o', '--poses', '10', '--edges', '20', '--seed', '-1'], 'seed'),
+])
+def test_bad_arguments_are_one_line_and_exit_code_2(
+        capsys, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'graph.g2o').write_text('\n'.join(EDGES))
+    (tmp_path / 'graph.txt').write_text('{}')
+    (tmp_path / 'taken.g2o').mkdir()
+    (tmp_path / 'gap.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 0 5 1 '))
+    assert main([*arguments]) == 2
+    _, err = capsys.readouterr()
+    assert err.count('\n') == 1 and words in err, err
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        'gap.g2o', 'graph.g2o', 'graph.txt', 'taken.g2o']
+
+
+def test_a_graph_with_gaps_and_without_poses_is_solved_from_its_tree(capsys, tmp_path):
+    path = graph_file(tmp_path, [EDGES[0], 'EDGE_SE2 1 5 1.1 0 0 1 0 0 1 0 1',
+                                 'EDGE_SE2 1 7 2.2 0 0 1 0 0 1 0 1',
+                                 'EDGE_SE2 0 7 3 0 0 1 0 0 1 0 1'])
+    report = solve_json(capsys, path)
+    assert report['final_cost'] < report['initial_cost']
+    run(capsys, 'convert', path, tmp_path / 'out.g2o')
+    assert read_graph_file(tmp_path / 'out.g2o').poses.shape == (4, 3)
+
+
+def test_a_graph_in_parts_without_poses_is_converted_all_the_same(capsys, tmp_path):
+    path = graph_file(tmp_path, [*EDGES, EDGES[0].replace(' 0 1 ', ' 7 9 ', 1)])
+    run(capsys, 'convert', path, tmp_path / 'out.graph')
+    record = read_graph_file(tmp_path / 'out.graph')
+    assert record.poses is None and record.ids.tolist() == [0, 1, 2, 7, 9]
+
+
+COMMANDS = ['simulate', 'convert', 'solve', 'corrupt', 'info', 'plot']
+
+
+def help_of(capsys, *arguments):
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, '--help'])
+    assert ended.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_the_examples_of_the_help_work(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run(capsys, 'simulate', 'graph.g2o', '--poses', 100, '--edges', 180)
+    for command in COMMANDS:
+        example = re.search(r'example:\n  l1slam (.*)', help_of(capsys, command))[1]
+        assert example.startswith(f'{command} ')
+        run(capsys, *shlex.split(example))
+    for example in re.findall(r'\n  l1slam (.*)', help_of(capsys)):
+        run(capsys, *shlex.split(example))
+    written = {p.name for p in tmp_path.iterdir()}
+    assert {'world.g2o', 'bag', 'solved.g2o', 'map.png', 'spoiled.g2o', 'maps.png'} <= written
+
+
+def test_without_a_command_there_is_help(capsys):
+    assert main([]) == 2
+    out, err = capsys.readouterr()
+    assert out == '' and all(f'    {command} ' in err for command in COMMANDS)

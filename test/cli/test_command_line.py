@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`l1slam` as a process: what it imports; readers that have gone; TAB key, terminal and log."""
+
+import fcntl
+import json
+import os
+import pty
+import re
+import select
+import struct
+import subprocess
+import sys
+import termios
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from l1slam_ros.cli.main import main
+from l1slam_ros.io.progress import Progress
+from l1slam_ros.io.wording import counted
+
+ROOT = Path(__file__).parents[2]
+DEADLINE = 60.0
+RUN = 'import sys; from l1slam_ros.cli.main import main; sys.argv[0] = "l1slam"; sys.exit(main())'
+# Prints, last on standard error, which modules were imported.
+TELL = 'import atexit, sys; atexit.register(lambda: print(*sys.modules, file=sys.stderr)); ' + RUN
+LINES = [f'EDGE_SE2 {k} {k + 1} 1 0 {1.57 * (k % 5 == 0)} 100 0 0 100 0 900' for k in range(20)]
+
+
+@pytest.fixture
+def graph(tmp_path):
+    path = tmp_path / 'graph.g2o'
+    path.write_text('\n'.join(LINES) + '\n')
+    return path
+
+
+# As it is with people: what is printed is written when there is much of it, or at the end.
+BUFFERED = {name: value for name, value in os.environ.items() if name != 'PYTHONUNBUFFERED'}
+
+
+def l1slam(*arguments, code=RUN, **options):
+    return subprocess.run([sys.executable, '-c', code, *map(str, arguments)], timeout=DEADLINE,
+                          text=True, **{'capture_output': True, 'env': BUFFERED, **options})
+
+
+def imported(*arguments, cwd):
+    told = l1slam(*arguments, code=TELL, cwd=cwd).stderr.splitlines()[-1].split()
+    assert 'l1slam_ros.cli.main' in told
+    return {name.split('.')[0] for name in told}
+
+
+HEAVY = {'numpy', 'scipy', 'numba', 'matplotlib', 'tqdm', 'yaml', 'mcap', 'rosbags', 'argcomplete'}
+
+
+@pytest.mark.parametrize('arguments', [
+    (), ('--help',), ('--version',), ('solve', '--help'), ('solve', 'graph.g2o', '--norm', 'l3'),
+    ('nonsense',), ('simulate', 'a.g2o', '--poses', 'many')], ids=' '.join)
+def test_what_runs_nothing_imports_nothing(tmp_path, arguments):
+    assert not imported(*arguments, cwd=tmp_path) & HEAVY
+
+
+@pytest.mark.parametrize('arguments, used', [
+    (('convert', 'graph.g2o', 'out.graph'), {'numpy', 'scipy'}),
+    (('convert', 'graph.g2o', 'out'), {'numpy', 'scipy', 'mcap', 'rosbags', 'yaml'}),
+    (('plot', 'graph.g2o', '--output', 'map.png'), {'numpy', 'scipy', 'matplotlib'}),
+    (('info', 'graph.g2o'), {'numpy', 'scipy'}),
+    (('solve', 'missing.g2o'), {'numpy', 'scipy'}),
+    (('solve', 'graph.g2o'), {'numpy', 'scipy', 'numba'})], ids=lambda value: ' '.join(value))
+def test_a_command_imports_what_it_uses(graph, arguments, used):
+    """Others may be behind these: numba and matplotlib look for YAML."""
+    found = imported(*arguments, cwd=graph.parent) & HEAVY
+    assert 'numpy' in found <= used | {'yaml'}
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(['--version'])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f'l1slam {version("l1slam_ros")}\n'
+
+
+@pytest.mark.parametrize('arguments', [
+    ('info', 'graph.g2o'), ('--help',), ('solve', 'graph.g2o'), ('solve', 'graph.g2o', '--json'),
+    ('--version',)], ids=' '.join)
+def test_a_reader_that_has_gone_is_no_error(graph, arguments):
+    """Nobody reads from the start on, so it fails whenever it writes: at once or at the end."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = l1slam(*arguments, cwd=graph.parent, stdout=writing, stderr=subprocess.PIPE,
+                      capture_output=False)
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (141, '')
+
+
+@pytest.mark.skipif(not Path('/dev/full').exists(), reason='no device that is always full')
+@pytest.mark.parametrize('arguments', [('info', 'graph.g2o'), ('--help',)], ids=' '.join)
+def test_a_full_disk_is_one_line(graph, arguments):
+    with open('/dev/full', 'w') as full:
+        done = l1slam(*arguments, cwd=graph.parent, stdout=full, stderr=subprocess.PIPE,
+                      capture_output=False)
+    assert (done.returncode, done.stderr) == (2, 'l1slam: No space left on device\n')
+
+
+@pytest.mark.parametrize('typed, offered', [
+    ('l1slam so', ['solve ']), ('l1slam solve a.g2o --norm ', ['l1', 'l2', 'huber']),
+    ('l1slam solve a.g2o --no-r', ['--no-robust ']),
+    ('l1slam corrupt a.g2o b.g2o --kind g', ['grouped '])])
+def test_the_tab_key_completes(tmp_path, typed, offered):
+    pytest.importorskip('argcomplete')
+    answer = tmp_path / 'answer'
+    asked = {'_ARGCOMPLETE': '1', '_ARGCOMPLETE_STDOUT_FILENAME': str(answer),
+             '_ARGCOMPLETE_IFS': '\n', 'COMP_TYPE': '9', 'COMP_LINE': typed,
+             'COMP_POINT': str(len(typed))}
+    l1slam(env=os.environ | asked)
+    assert answer.read_text().split('\n') == offered
+
+
+def test_the_help_says_how_to_switch_completion_on_and_what_exit_codes_mean():
+    said = l1slam('--help').stdout
+    assert 'register-python-argcomplete l1slam' in said
+    assert re.findall(r'^  (\d)  ', said, re.MULTILINE) == ['0', '2', '3', '4']
+
+
+def on_a_terminal(code):
+    """Run code with standard error on a terminal; return what it showed there."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack('HHHH', 24, 80, 0, 0))
+    process = subprocess.Popen([sys.executable, '-c', code], stderr=theirs, cwd=ROOT)
+    os.close(theirs)
+    shown, deadline = b'', time.monotonic() + DEADLINE
+    try:
+        while time.monotonic() < deadline:
+            if select.select([ours], [], [], 1.0)[0]:
+                try:
+                    news = os.read(ours, 4096)
+                except OSError:  # its other end is closed
+                    break
+                if not news:
+                    break
+                shown += news
+    finally:
+        os.close(ours)
+        process.kill()
+        process.wait()
+    return shown.decode()
+
+
+BAR = """
+from l1slam_ros.io.progress import Progress
+with Progress(3, 'part', {quiet}, 'compiling', delay={delay}) as progress:
+    for done in 1, 2, 3:
+        progress.reach(done, 3)
+"""
+
+
+@pytest.mark.parametrize('quiet, delay, bar', [(False, 0, True), (False, 60, False),
+                                               (True, 0, False)])
+def test_on_a_terminal_there_is_a_bar_of_what_takes_long(quiet, delay, bar):
+    shown = on_a_terminal(BAR.format(quiet=quiet, delay=delay))
+    assert ('compiling' in shown and '/3' in shown) if bar else shown == ''
+
+
+def test_in_a_log_there_is_a_line_now_and_then_of_what_takes_long(capsys, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr('l1slam_ros.io.progress.time.monotonic', lambda: now[0])
+    with Progress(200, 'step', label='solving') as progress, Progress(9, 'x', True, 'a') as quiet:
+        for k in range(200):
+            now[0] += 0.125
+            progress.report(k, 1234.5678)
+            quiet.advance()
+        for _ in range(60):
+            now[0] += 0.125
+            progress.advance()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == 'l1slam: solving: step 24 of 200, cost 1234.57'
+    assert len(lines) == 6 and lines[-1] == 'l1slam: solving: step 224'
+    with Progress(2, 'step', label='soon done') as progress:
+        progress.advance(2)
+    assert capsys.readouterr().err == ''
+
+
+@pytest.mark.parametrize('count, plural, said', [
+    (0, '', '0 loops'), (1, '', '1 loop'), (1837, '', '1,837 loops'), (1, 'looses', '1 loop'),
+    (2, 'looses', '2 looses')])
+def test_numbers_in_sentences(count, plural, said):
+    assert counted(count, 'loop', plural) == said
+
+
+def test_what_is_said_of_one_of_each_is_in_the_singular(tmp_path):
+    path = tmp_path / 'one.g2o'
+    path.write_text('\n'.join([*LINES[:2], 'EDGE_SE2 0 2 0 1 1.57 100 0 0 100 0 900']))
+    said = l1slam('solve', path).stdout
+    assert '3 poses, 3 factors, 1 loop\n' in said and ' of 1 loop refused' in said
+    for word in ('block products', 'did not converge', 'nan', '1 loops', '1 iterations'):
+        assert word not in said
+    assert json.loads(l1slam('solve', path, '--json').stdout)['loops'] == 1

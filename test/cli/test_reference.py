@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Truth at the times of keyframes: between true poses, never beyond them, and not across gaps."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from l1slam_ros.cli.main import main
+from l1slam_ros.cli.reference import position_error, read_truth, true_path
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.alignment import poses_at
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.trajectory import write_tum
+
+SECOND = 10**9
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+_ = TYPES.types
+Time, Header = _['builtin_interfaces/msg/Time'], _['std_msgs/msg/Header']
+Point, Quaternion = _['geometry_msgs/msg/Point'], _['geometry_msgs/msg/Quaternion']
+Vector3, Pose = _['geometry_msgs/msg/Vector3'], _['geometry_msgs/msg/Pose']
+
+
+def test_between_true_poses_the_position_is_on_the_line_and_the_heading_on_the_shorter_arc():
+    poses = np.array([[1.0, 0.0, 3.0], [3.0, 4.0, -3.0]])
+    rows, found = poses_at(se2, np.array([0, 10]), poses, np.array([0, 5, 10]), 10, 0)
+    assert rows.tolist() == [0, 1, 2]
+    np.testing.assert_allclose(found[1, :2], [2, 2], atol=1e-12)
+    assert abs(found[1, 2]) == pytest.approx(np.pi, abs=1e-12)
+    np.testing.assert_allclose(found[[0, 2]], poses, atol=1e-12)
+
+
+def test_nothing_is_extrapolated_nor_bridged():
+    times, poses = np.array([10, 20, 30, 90, 100]), np.arange(15.0).reshape(5, 3) / 10
+    at = np.array([8, 9, 10, 25, 30, 31, 32, 60, 88, 89, 90, 95, 100, 101, 102])
+    rows, found = poses_at(se2, times, poses, at, 20, 1)
+    assert at[rows].tolist() == [9, 10, 25, 30, 31, 89, 90, 95, 100, 101]
+    # What lies beyond the end by rounding alone is at the end.
+    np.testing.assert_allclose(found[[0, -1]], poses[[0, -1]], atol=1e-12)
+
+
+def drive(stamps):
+    """Return a record of a drive along a circle, and its poses (n, 3) at stamps [ns]."""
+    poses = true_at(stamps)
+    graph, k = FactorGraph(se2), np.arange(len(stamps) - 1)
+    graph.add_poses(len(stamps))
+    graph.add_between(k, k + 1, se2.between(poses[:-1], poses[1:]),
+                      np.tile(np.eye(3), (len(k), 1, 1)))
+    return GraphRecord(graph, poses, 7 + 2 * np.arange(len(stamps)), stamps), poses
+
+
+def true_at(stamps):
+    angle = 0.05 * (np.asarray(stamps) - 100 * SECOND) / SECOND
+    return np.stack((20 * np.sin(angle), -20 * np.cos(angle), se2.wrap(angle)), axis=1)
+
+
+# Keyframes that fall in between the true poses, which begin later, end earlier and have a hole.
+KEYFRAMES = 100 * SECOND + np.arange(0, 60 * SECOND, 730_000_000)
+TRUE = 110 * SECOND + np.arange(0, 40 * SECOND, 250_000_000)
+TRUE = TRUE[(TRUE < 120 * SECOND) | (TRUE > 125 * SECOND)]
+BEFORE, AFTER = TRUE[TRUE < 120 * SECOND], TRUE[TRUE > 125 * SECOND]
+SCORED = (((BEFORE[0] <= KEYFRAMES) & (BEFORE[-1] >= KEYFRAMES))
+          | ((AFTER[0] <= KEYFRAMES) & (AFTER[-1] >= KEYFRAMES)))
+
+
+def test_truth_is_interpolated_at_the_stamps_of_the_poses(tmp_path):
+    record, poses = drive(KEYFRAMES)
+    write_tum(tmp_path / 'truth.tum', TRUE, true_at(TRUE), se2)
+    truth = read_truth(str(tmp_path / 'truth.tum'), record, Path('graph.g2o'))
+    assert truth.rows.tolist() == np.flatnonzero(SCORED).tolist() and 30 < len(truth.rows) < 60
+    # A chord of a quarter of a metre; the nearest true pose is up to an eighth of one off.
+    assert position_error(record, poses, truth) < 5e-4
+    moved = se2.compose(np.tile([3.0, 4.0, 1.0], (len(poses), 1)), poses)
+    assert position_error(record, moved, truth) < 5e-4
+    path = true_path(record, moved, truth)
+    gap = np.isnan(path[:, 0])
+    assert gap.sum() == 1 and len(path) > 2 * len(truth.rows)
+    centre = se2.compose(np.array([[3.0, 4.0, 1.0]]), np.zeros((1, 3)))[0, :2]
+    np.testing.assert_allclose(np.linalg.norm(path[~gap] - centre, axis=1), 20, atol=1e-3)
+
+
+def test_a_truth_that_is_slow_throughout_has_no_gaps(tmp_path):
+    record, poses = drive(KEYFRAMES)
+    slow = 100 * SECOND + np.arange(0, 60 * SECOND, 5 * SECOND)
+    write_tum(tmp_path / 'truth.tum', slow, true_at(slow), se2)
+    truth = read_truth(str(tmp_path / 'truth.tum'), record, Path('graph.g2o'))
+    assert len(truth.rows) == np.count_nonzero(slow[-1] >= KEYFRAMES)
+
+
+def write_bag(path, topics):
+    """Write messages, topic -> list of (msgtype, message), recorded at 1 s."""
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, messages in topics.items():
+            kind = messages[0][0]
+            connection = writer.add_connection(topic, kind, typestore=TYPES)
+            for _, message in messages:
+                writer.write(connection, SECOND, TYPES.serialize_cdr(message, kind))
+    return path
+
+
+def message_of(kind, stamp, pose):
+    sec, nanosec = divmod(int(stamp), SECOND)
+    header = Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id='map')
+    x, y, z, *q = se2.to_pose3(pose[None])[0].tolist()
+    name = f'geometry_msgs/msg/{kind}'
+    if kind == 'TransformStamped':
+        transform = TYPES.types['geometry_msgs/msg/Transform'](
+            translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(*q))
+        return name, TYPES.types[name](header=header, child_frame_id='b', transform=transform)
+    pose = Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(*q))
+    if kind == 'PoseStamped':
+        return name, TYPES.types[name](header=header, pose=pose)
+    uncertain = TYPES.types['geometry_msgs/msg/PoseWithCovariance'](
+        pose=pose, covariance=np.zeros(36))
+    if kind == 'PoseWithCovarianceStamped':
+        return name, TYPES.types[name](header=header, pose=uncertain)
+    name, still = 'nav_msgs/msg/Odometry', Vector3(x=0.0, y=0.0, z=0.0)
+    twist = TYPES.types['geometry_msgs/msg/TwistWithCovariance'](
+        twist=TYPES.types['geometry_msgs/msg/Twist'](linear=still, angular=still),
+        covariance=np.zeros(36))
+    return name, TYPES.types[name](header=header, child_frame_id='b', pose=uncertain, twist=twist)
+
+
+@pytest.mark.parametrize('kind', [
+    'PoseStamped', 'PoseWithCovarianceStamped', 'TransformStamped', 'Odometry'])
+def test_a_topic_is_a_truth(tmp_path, kind):
+    record, poses = drive(KEYFRAMES)
+    messages = [message_of(kind, stamp, pose)
+                for stamp, pose in zip(TRUE, true_at(TRUE), strict=True)]
+    lost = message_of(kind, TRUE[3], np.array([np.nan, 0.0, 0.0]))
+    late = messages[::-1] + messages[:5] + [lost]
+    write_bag(tmp_path / 'mocap', {'/robot/truth': late})
+    truth = read_truth(f'{tmp_path}/mocap:/robot/truth', record, Path('graph.g2o'))
+    assert truth.rows.tolist() == np.flatnonzero(SCORED).tolist()
+    assert position_error(record, poses, truth) < 5e-4
+    assert truth.skipped == (
+        f'1 message on /robot/truth of {tmp_path}/mocap refused: not_finite',)
+
+
+@pytest.mark.parametrize('source, said', [
+    ('bag:/nothing', 'no poses on /nothing; expected true poses; there are poses on /pose'),
+    ('bag:/time', '/time is of builtin_interfaces/msg/Time; expected one of geometry_'),
+    ('missing:/pose', 'missing: no such file or directory'),
+    ('bag:/pose', 'shares 0 poses with the graph, expected 2 or more$'),
+])
+def test_a_topic_that_is_none_is_one_line(tmp_path, monkeypatch, source, said):
+    monkeypatch.chdir(tmp_path)
+    record, _ = drive(KEYFRAMES)
+    write_bag(tmp_path / 'bag', {
+        '/pose': [message_of('PoseStamped', SECOND, np.zeros(3))],
+        '/time': [('builtin_interfaces/msg/Time', Time(sec=1, nanosec=0))]})
+    with pytest.raises(FileError, match=said):
+        read_truth(source, record, Path('graph.g2o'))
+
+
+def test_a_graph_without_stamps_is_said_to_have_none(tmp_path):
+    record, _ = drive(KEYFRAMES)
+    record = GraphRecord(record.graph, record.poses, record.ids)
+    (tmp_path / 'truth.csv').write_text('5, 0, 0, 0\n6, 1, 0, 0\n')
+    with pytest.raises(FileError, match='shares 0 poses with the graph, expected 2 or more; '
+                       'the graph has no stamps, so its poses are 0.1 s apart from 1000 s on'):
+        read_truth(str(tmp_path / 'truth.csv'), record, Path('graph.g2o'))
+
+
+def test_the_command_says_over_how_many_poses(capsys, tmp_path, monkeypatch):
+    """`bag` stands for the input, where nothing is called so."""
+    monkeypatch.chdir(tmp_path)
+    assert main(['simulate', 'world', '--poses', '120', '--edges', '200']) == 0
+    ate = []
+    for truth in ('world.truth.txt', 'world:/ground_truth', 'bag:/ground_truth'):
+        assert main(['solve', 'world', '--json', '--reference', truth]) == 0
+        report = json.loads(capsys.readouterr().out)
+        assert report['ate_poses'] == 120 and report['warnings'] == []
+        ate.append(report['ate'])
+    assert ate == pytest.approx([ate[0]] * 3, rel=1e-9) and 0 < ate[0] < 0.3
+    lines = Path('world.truth.txt').read_text().splitlines()
+    Path('half.txt').write_text('\n'.join(lines[::2]))
+    assert main(['solve', 'world', '--reference', 'half.txt']) == 0
+    assert ' m over 60 of 120 poses (RMSE after rigid alignment)' in capsys.readouterr().out
+
+
+def test_bicocca_by_its_stamps(capsys, datasets, tmp_path):
+    """4.36 m by odometry alone, as its truth has it at 5 Hz with gaps."""
+    real, graph = datasets / 'real', tmp_path / 'bicocca.g2o'
+    graph.write_bytes((real / 'bicocca25b_0.150.g2o').read_bytes())
+    Path(f'{graph}.stamps.txt').write_bytes((real / 'bicocca25b.stamps.txt').read_bytes())
+    assert main(['solve', str(graph), '--no-robust', '--start', 'odometry', '--outer', '0',
+                 '--json', '--reference', str(real / 'bicocca25b.truth.csv')]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report['ate'] == pytest.approx(4.36, abs=0.02)
+    assert 7000 < report['ate_poses'] < report['poses'] == 8358

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Alignment and trajectory error, against hand-made cases, a search, and known graphs."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, align, aligned_positions
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.io.graphs.graph_file import read_graph_file
+
+
+def rotation(k, rng):
+    if k == 3:
+        return Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+    angle = rng.uniform(-np.pi, np.pi)
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+@pytest.mark.parametrize('k', [2, 3])
+def test_a_rigid_motion_is_found(k, rng):
+    for _ in range(20):
+        estimate, R, t = rng.normal(size=(30, k)), rotation(k, rng), 100 * rng.normal(size=k)
+        truth = estimate @ R.T + t
+        found_R, found_t = align(estimate, truth)
+        np.testing.assert_allclose(found_R, R, atol=1e-12)
+        np.testing.assert_allclose(found_t, t, atol=1e-10)
+        np.testing.assert_allclose(aligned_positions(estimate, truth), truth, atol=1e-10)
+        assert absolute_trajectory_error(estimate, truth) < 1e-10
+
+
+@pytest.mark.parametrize('k', [2, 3])
+def test_a_mirror_image_is_not_matched_by_a_reflection(k, rng):
+    estimate = rng.normal(size=(40, k))
+    truth = estimate * np.array([1.0] * (k - 1) + [-1.0])
+    R, _ = align(estimate, truth)
+    np.testing.assert_allclose(R.T @ R, np.eye(k), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1)
+    assert absolute_trajectory_error(estimate, truth) > 0.5
+
+
+def test_a_case_by_hand():
+    """2 m become 4 m: turned by 90 degrees about the middle, each end is 1 m off."""
+    estimate = np.array([[0.0, 0.0], [2.0, 0.0]])
+    truth = np.array([[7.0, 1.0], [7.0, 5.0]])
+    R, t = align(estimate, truth)
+    np.testing.assert_allclose(R, [[0, -1], [1, 0]], atol=1e-15)
+    np.testing.assert_allclose(t, [7, 2], atol=1e-15)
+    assert absolute_trajectory_error(estimate, truth) == pytest.approx(1)
+
+
+def test_the_mean_is_that_of_squares():
+    """Three points stay, one of four pairs moves out by 1 and back by 1: no motion helps."""
+    truth = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]) * 10
+    estimate = truth + [[1, 0], [-1, 0], [0, 0], [0, 0]]
+    assert absolute_trajectory_error(estimate, truth) == pytest.approx(np.sqrt(2 / 4))
+
+
+@pytest.mark.parametrize('k', [2, 3])
+def test_no_motion_does_better(k, rng):
+    estimate = rng.normal(size=(15, k))
+    truth = estimate @ rotation(k, rng).T + rng.normal(size=k) + 0.3 * rng.normal(size=(15, k))
+
+    def error(parameters):
+        vector = parameters[:-k] if k == 3 else [0, 0, parameters[0]]
+        R = Rotation.from_rotvec(vector).as_matrix()[:k, :k]
+        return ((estimate @ R.T + parameters[-k:] - truth) ** 2).sum()
+
+    starts = rng.normal(size=(6, 3 if k == 2 else 6))
+    best = min(minimize(error, start, tol=1e-12).fun for start in starts)
+    assert absolute_trajectory_error(estimate, truth) == pytest.approx(np.sqrt(best / 15))
+
+
+@pytest.mark.parametrize('k', [2, 3])
+def test_poor_geometry_still_gives_a_rotation(k):
+    line = np.outer(np.arange(5.0), np.eye(k)[0])
+    for estimate, truth in (line, line[:, ::-1]), (line * 0, line), (line[:1], line[1:2]):
+        R, t = align(estimate, truth)
+        np.testing.assert_allclose(R.T @ R, np.eye(k), atol=1e-12)
+        assert np.linalg.det(R) == pytest.approx(1) and np.isfinite(t).all()
+    assert absolute_trajectory_error(line, line[:, ::-1]) < 1e-12
+
+
+@pytest.mark.parametrize('shape, other', [((0, 2), (0, 2)), ((3, 2), (4, 2)), ((3, 2), (3, 3))])
+def test_what_does_not_correspond_is_refused(shape, other):
+    with pytest.raises(GraphError, match=f'^{shape[0]} positions of {shape[1]} coordinates'):
+        align(np.zeros(shape), np.zeros(other))
+
+
+@pytest.mark.parametrize('name, error', [('manhattan3500', 15.5), ('city10000', 25.6)])
+def test_the_odometry_of_known_graphs(name, error, datasets):
+    graph = read_graph_file(datasets / f'{name}.g2o').graph
+    truth = np.loadtxt(datasets / f'{name}.truth.txt')[:, 1:3]
+    estimate = se2.positions(odometry_poses(graph))
+    assert absolute_trajectory_error(estimate, truth) == pytest.approx(error, abs=0.06)

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Covariance, information and its root: values, and what is refused and how it is said."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from problems import random_information
+
+from l1slam_ros.core.errors import L1SlamError, NoiseError
+from l1slam_ros.core.geometry.noise import (
+    LEAST_VARIANCE,
+    MOST_VARIANCE,
+    at_most,
+    information_from_covariance,
+    or_model,
+    root_of_inverse,
+    square_root_information,
+    usable,
+    whiten,
+)
+
+ASYMMETRIC = np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+INDEFINITE = np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def test_the_root_is_upper_triangular_and_gives_back_the_information(rng):
+    information = random_information(50, rng)
+    root = square_root_information(information)
+    assert_allclose(root, np.triu(root))
+    assert_allclose(root.transpose(0, 2, 1) @ root, information, atol=1e-12)
+    assert (np.diagonal(root, axis1=1, axis2=2) > 0).all()
+
+
+def test_a_root_by_hand():
+    information = np.array([[[4.0, 2.0, 0.0], [2.0, 10.0, 3.0], [0.0, 3.0, 2.0]]])
+    assert_allclose(square_root_information(information),
+                    [[[2.0, 1.0, 0.0], [0.0, 3.0, 1.0], [0.0, 0.0, 1.0]]])
+
+
+def test_the_last_rows_of_whitening_see_the_rotation_alone(rng):
+    """Algorithm 3 stands on this."""
+    root = square_root_information(random_information(10, rng))
+    assert (root[:, 2, :2] == 0).all()
+
+
+def test_whitening_of_vectors_and_of_matrices(rng):
+    root = square_root_information(random_information(7, rng))
+    vectors, matrices = rng.standard_normal((7, 3)), rng.standard_normal((7, 3, 6))
+    for k in range(7):
+        assert_allclose(whiten(root, vectors)[k], root[k] @ vectors[k])
+        assert_allclose(whiten(root, matrices)[k], root[k] @ matrices[k])
+    squared = np.einsum('ki,kij,kj->k', vectors, root.transpose(0, 2, 1) @ root, vectors)
+    assert_allclose((whiten(root, vectors) ** 2).sum(axis=1), squared)
+
+
+def test_covariances_are_inverted(rng):
+    covariance = random_information(50, rng)
+    assert_allclose(information_from_covariance(covariance), np.linalg.inv(covariance),
+                    rtol=1e-8, atol=1e-12)
+
+
+def test_no_matrix_at_all_is_none_wrong():
+    assert square_root_information(np.zeros((0, 3, 3))).shape == (0, 3, 3)
+    assert information_from_covariance(np.zeros((0, 6, 6))).shape == (0, 6, 6)
+
+
+@pytest.mark.parametrize('size', [1, 2, 6])
+def test_any_size_will_do(size):
+    assert_allclose(square_root_information(9 * np.eye(size)[None]), 3 * np.eye(size)[None])
+
+
+@pytest.mark.parametrize('bad, said', [
+    (np.diag([1.0, np.nan, 1.0]), 'matrix 2 is not finite: [1 0 0; 0 nan 0; 0 0 1]'),
+    (np.diag([1.0, np.inf, 1.0]), 'matrix 2 is not finite: [1 0 0; 0 inf 0; 0 0 1]'),
+    (ASYMMETRIC, 'matrix 2 is not symmetric: [1 0.5 0; 0 1 0; 0 0 1]'),
+    (INDEFINITE, 'matrix 2 is not positive definite: [1 2 0; 2 1 0; 0 0 1]'),
+    (np.zeros((3, 3)), 'matrix 2 is not positive definite: [0 0 0; 0 0 0; 0 0 0]'),
+    (-np.eye(3), 'matrix 2 is not positive definite: [-1 -0 -0; -0 -1 -0; -0 -0 -1]'),
+])
+@pytest.mark.parametrize('function', [square_root_information, information_from_covariance])
+def test_the_first_bad_matrix_is_named(function, bad, said):
+    stack = np.array([np.eye(3), np.eye(3), bad, bad])
+    with pytest.raises(NoiseError) as caught:
+        function(stack)
+    assert str(caught.value) == said
+    assert isinstance(caught.value, L1SlamError)
+
+
+def test_the_print_of_a_file_may_be_a_little_asymmetric():
+    printed = np.array([[[50.0, 1.00001], [1.00002, 20.0]]])
+    assert np.isfinite(square_root_information(printed)).all()
+
+
+@pytest.mark.parametrize('covariance', [
+    np.eye(3), 9999 * np.eye(3), 0.1 * np.eye(3), 1e-9 * np.eye(3), np.diag([1e-6, 1e-6, 9999.0]),
+    1e-300 * np.eye(3), 1e300 * np.eye(3), np.diag([0.1, 1e-300, 1e300]),
+], ids=['1', '9999', '.1', '1e-9', 'heading unknown', '1e-300', '1e300', 'from 1e-300 to 1e300'])
+def test_usable_covariances(covariance):
+    assert usable(covariance[None])[0]
+
+
+@pytest.mark.parametrize('covariance', [
+    np.zeros((3, 3)), -np.eye(3), np.full((3, 3), -1.0), np.full((3, 3), np.nan),
+    np.diag([1.0, np.inf, 1.0]), np.full((3, 3), 1e308), np.full((3, 3), 9999.0),
+    np.diag([0.1, 0.1, 0.0]), np.diag([1.0, 1.0, -1.0]), ASYMMETRIC, INDEFINITE,
+], ids=['0', 'diagonal -1', '-1', 'nan', 'inf', '1e308', '9999', 'no heading', 'flag',
+        'asymmetric', 'indefinite'])
+def test_unusable_covariances(covariance):
+    assert not usable(covariance[None])[0]
+
+
+def test_a_root_of_the_inverse_whitens_as_that_of_the_information(rng):
+    covariance = random_information(50, rng)
+    root = root_of_inverse(covariance)
+    assert_allclose(root, np.triu(root))
+    assert_allclose(root, square_root_information(np.linalg.inv(covariance)), rtol=1e-7,
+                    atol=1e-9)
+
+
+MODEL = np.diag([0.4, 0.5, 0.6])
+
+
+@pytest.mark.parametrize('stated, most, model', [
+    (1e300, MOST_VARIANCE, 1e300), (1e-300, 1e-300, 0.5), (1e-9, 1e-9, 0.5),
+    (1.1 * MOST_VARIANCE, MOST_VARIANCE, 1.1 * MOST_VARIANCE), (MOST_VARIANCE,) * 3,
+    (LEAST_VARIANCE,) * 3])
+def test_variances_are_bounded_and_the_others_stay(stated, most, model):
+    """One component, correlated with the others by a half."""
+    sigma = np.array([2.0, np.sqrt(stated), 3.0])
+    covariance = np.outer(sigma, sigma) * (0.5 + 0.5 * np.eye(3))
+    cut, large = at_most(covariance[None], MOST_VARIANCE)
+    expected = np.array([2.0, np.sqrt(most), 3.0])
+    assert_allclose(cut[0], np.outer(expected, expected) * (0.5 + 0.5 * np.eye(3)), rtol=1e-12)
+    assert large.tolist() == [[False, stated != most, False]]
+    modelled, out = or_model(covariance[None], MODEL)
+    correlation = 0.5 if stated == model else 0.0
+    expected = np.array([2.0, np.sqrt(model), 3.0])
+    shape = np.eye(3) + (1 - np.eye(3)) * [[0, correlation, 0.5], [correlation, 0, correlation],
+                                           [0.5, correlation, 0]]
+    assert_allclose(modelled[0], np.outer(expected, expected) * shape, rtol=1e-12)
+    assert out.tolist() == [[False, stated != model, False]]

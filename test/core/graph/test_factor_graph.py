@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The factor graph: append-only, snapshots that stay valid, and what it refuses."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import random_information, random_poses
+
+from l1slam_ros.core.errors import GraphError, L1SlamError, NoiseError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import (
+    BetweenFactors,
+    FactorGraph,
+    PriorFactors,
+    component_labels,
+)
+
+
+def between(i, j):
+    """Return factors between the given keyframes that measure nothing in particular."""
+    m = len(i)
+    return BetweenFactors(np.array(i), np.array(j), np.zeros((m, 3)), np.zeros((m, 3, 3)),
+                          np.zeros(m, bool))
+
+
+def graph_with(n, pairs):
+    graph = FactorGraph(se2)
+    graph.add_poses(n)
+    for i, j in pairs:
+        graph.add_between(i, j, np.array([[i, j, 0.0]]), np.eye(3)[None])
+    return graph
+
+
+def pairs_of(graph):
+    return np.stack((graph.between.i, graph.between.j), axis=1).tolist()
+
+
+def test_a_new_graph_is_empty():
+    graph = FactorGraph(se2)
+    assert graph.n_poses == len(graph.between) == len(graph.prior) == 0
+    assert graph.between.is_odometry.shape == (0,)
+
+
+def test_factors_are_kept_in_the_order_they_came(rng):
+    graph = FactorGraph(se2)
+    graph.add_poses(2)
+    graph.add_poses()
+    measurement, information = random_poses(4, rng), random_information(4, rng)
+    graph.add_between(np.array([0, 2, 1]), np.array([1, 0, 2]), measurement[:3], information[:3])
+    graph.add_between(np.array([2]), np.array([1]), measurement[3:], information[3:])
+    factors = graph.between
+    assert pairs_of(graph) == [[0, 1], [2, 0], [1, 2], [2, 1]]
+    assert_array_equal(factors.measurement, measurement)
+    root = factors.sqrt_information
+    assert_allclose(root.transpose(0, 2, 1) @ root, information)
+
+
+def test_trust_is_of_each_factor_and_none_where_nobody_speaks():
+    graph = graph_with(4, [(0, 1)])
+    z, information = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
+    graph.add_between(np.array([0, 1, 0]), np.array([2, 2, 3]), z, information,
+                      np.array([True, False, True]))
+    graph.add_between(np.array([1, 2, 2]), np.array([3, 3, 0]), z, information, True)
+    assert graph.between.trusted.dtype == bool
+    assert graph.between.trusted.tolist() == [False, True, False, True, True, True, True]
+
+
+def test_trust_grows_apart_in_copies_and_stays_in_snapshots():
+    original = graph_with(3, [(0, 1)])
+    copy, before = original.copy(), original.between
+    copy.add_between(0, 2, np.zeros((1, 3)), np.eye(3)[None], True)
+    original.add_between(0, 2, np.zeros((1, 3)), np.eye(3)[None])
+    assert copy.between.trusted.tolist() == [False, True]
+    assert original.between.trusted.tolist() == [False, False]
+    assert before.trusted.tolist() == [False]
+
+
+def test_trust_of_too_few_factors_is_refused():
+    graph = graph_with(3, [])
+    with pytest.raises(ValueError):
+        graph.add_between(np.array([0, 1, 0]), np.array([1, 2, 2]), np.zeros((3, 3)),
+                          np.tile(np.eye(3), (3, 1, 1)), np.array([True, False]))
+    assert {len(column) for column in vars(graph.between).values()} == {0}
+
+
+def test_priors_are_kept_apart(rng):
+    graph = graph_with(3, [(0, 1)])
+    measurement, information = random_poses(2, rng), random_information(2, rng)
+    graph.add_prior(np.array([2, 0]), measurement, information)
+    assert isinstance(graph.prior, PriorFactors)
+    assert_array_equal(graph.prior.i, [2, 0])
+    assert_array_equal(graph.prior.measurement, measurement)
+    root = graph.prior.sqrt_information
+    assert_allclose(root.transpose(0, 2, 1) @ root, information)
+    assert len(graph.prior) == 2 and len(graph.between) == 1
+
+
+def test_parallel_factors_are_never_merged():
+    graph = graph_with(2, [(0, 1), (0, 1), (1, 0)])
+    assert pairs_of(graph) == [[0, 1], [0, 1], [1, 0]]
+
+
+def test_a_snapshot_stays_as_it_was_while_the_graph_grows():
+    graph = graph_with(100, [])
+    snapshots = []
+    for k in range(99):
+        snapshots.append(graph.between)
+        graph.add_between(k, k + 1, np.full((1, 3), k), np.eye(3)[None])
+        graph.add_prior(k, np.full((1, 3), k), np.eye(3)[None])
+    for k, factors in enumerate(snapshots):
+        assert len(factors) == k
+        assert_array_equal(factors.i, np.arange(k))
+        assert_array_equal(factors.measurement[:, 0], np.arange(k))
+
+
+@pytest.mark.parametrize('size', [1, 15, 16, 17, 40])
+def test_a_copy_and_its_original_grow_apart(size):
+    original = graph_with(size + 2, [(k, k + 1) for k in range(size)])
+    copy = original.copy()
+    copy.add_poses(5)
+    copy.add_between(size + 5, 0, np.ones((1, 3)), np.eye(3)[None])
+    original.add_between(0, size + 1, np.zeros((1, 3)), 4 * np.eye(3)[None])
+    original.add_prior(0, np.zeros((1, 3)), np.eye(3)[None])
+    assert (original.n_poses, copy.n_poses) == (size + 2, size + 7)
+    assert pairs_of(original)[-1] == [0, size + 1] and pairs_of(copy)[-1] == [size + 5, 0]
+    assert pairs_of(original)[:-1] == pairs_of(copy)[:-1]
+    assert_array_equal(original.between.sqrt_information[-1], 2 * np.eye(3))
+    assert_array_equal(copy.between.sqrt_information[-1], np.eye(3))
+    assert (len(original.prior), len(copy.prior)) == (1, 0)
+
+
+def test_a_copy_of_an_empty_graph_grows_too():
+    copy = FactorGraph(se2).copy()
+    copy.add_poses(2)
+    copy.add_between(0, 1, np.zeros((1, 3)), np.eye(3)[None])
+    assert pairs_of(copy) == [[0, 1]]
+
+
+@pytest.mark.parametrize('i, j, odometry', [
+    ([0, 1, 2], [1, 2, 3], [True, True, True]),
+    ([0, 0, 1], [1, 1, 2], [True, False, True]),  # the second of two parallel ones is a loop
+    ([1, 0, 1], [0, 1, 2], [True, False, True]),  # either way round
+    ([3, 0, 2, 1, 0], [2, 3, 1, 0, 2], [True, False, True, True, False]),
+    ([5, 0, 0], [2, 3, 2], [False, False, False]),
+    ([7, 0, 7, 6, 1], [8, 1, 6, 7, 0], [True, True, True, False, False]),
+])
+def test_odometry_is_the_first_factor_between_consecutive_keyframes(i, j, odometry):
+    assert between(i, j).is_odometry.tolist() == odometry
+
+
+def test_odometry_is_found_wherever_it_stands_in_the_file(rng):
+    i = np.concatenate((np.arange(50), rng.integers(0, 40, 30)))
+    j = np.concatenate((np.arange(1, 51), rng.integers(42, 51, 30)))
+    order = rng.permutation(80)
+    turned = rng.random(80) < 0.5
+    first, second = np.where(turned, j, i)[order], np.where(turned, i, j)[order]
+    assert_array_equal(between(first, second).is_odometry, (j - i == 1)[order])
+
+
+GOOD = np.eye(3)
+BAD_FACTORS = [
+    ([0, 3], [1, 0], 0.0, GOOD, GraphError, 'a factor names keyframe 3, the graph has 0 to 2'),
+    ([0, 0], [1, -1], 0.0, GOOD, GraphError, 'a factor names keyframe -1, the graph has 0 to 2'),
+    ([0, 2], [1, 2], 0.0, GOOD, GraphError, 'keyframe 2 has a factor to itself'),
+    ([0, 1], [1, 2], np.nan, GOOD, GraphError, 'measurement 1 is not finite: [ 0. nan  0.]'),
+    ([0, 1], [1, 2], np.inf, GOOD, GraphError, 'measurement 1 is not finite: [ 0. inf  0.]'),
+    ([0, 1], [1, 2], 0.0, -GOOD, NoiseError, 'matrix 1 is not positive definite: '
+     '[-1 -0 -0; -0 -1 -0; -0 -0 -1]'),
+]
+
+
+@pytest.mark.parametrize('i, j, value, information, error, said', BAD_FACTORS)
+def test_a_bad_factor_is_named_and_nothing_is_appended(i, j, value, information, error, said):
+    graph = graph_with(3, [(0, 1)])
+    measurement = np.zeros((2, 3))
+    measurement[1, 1] = value
+    with pytest.raises(error) as caught:
+        graph.add_between(np.array(i), np.array(j), measurement, np.array([GOOD, information]))
+    assert str(caught.value) == said
+    assert isinstance(caught.value, L1SlamError)
+    graph.add_between(1, 2, np.full((1, 3), 0.5), GOOD[None])
+    assert pairs_of(graph) == [[0, 1], [1, 2]]
+    assert_array_equal(graph.between.measurement[1], [0.5] * 3)
+    assert len(graph.between.sqrt_information) == 2
+
+
+@pytest.mark.parametrize('i, value, information, error', [
+    (3, 0.0, GOOD, GraphError), (-1, 0.0, GOOD, GraphError), (0, np.nan, GOOD, GraphError),
+    (0, 0.0, 0 * GOOD, NoiseError)])
+def test_a_bad_prior_is_refused_and_nothing_is_appended(i, value, information, error):
+    graph = graph_with(3, [])
+    with pytest.raises(error):
+        graph.add_prior(np.array([1, i]), np.array([[0.0] * 3, [value] * 3]),
+                        np.array([GOOD, information]))
+    assert len(graph.prior) == len(graph.prior.measurement) == 0
+
+
+@pytest.mark.parametrize('shape', [(1, 3), (3, 3), (2, 4)])
+def test_arrays_that_do_not_fit_together_are_refused(shape):
+    graph = graph_with(3, [])
+    with pytest.raises((GraphError, ValueError)):
+        graph.add_between(np.array([0, 1]), np.array([1, 2]), np.zeros(shape),
+                          np.array([GOOD, GOOD]))
+    columns = vars(graph.between).values()
+    assert {len(column) for column in columns} == {0}
+
+
+def test_component_labels_tell_the_parts_of_a_graph_apart():
+    labels = component_labels(graph_with(7, [(0, 2), (5, 3), (2, 1)]))
+    assert labels[0] == labels[1] == labels[2]
+    assert labels[3] == labels[5]
+    assert len({labels[0], labels[3], labels[4], labels[6]}) == 4
+
+
+def test_a_connected_graph_has_one_label():
+    assert_array_equal(component_labels(graph_with(4, [(3, 0), (1, 3), (2, 1)])), 0)

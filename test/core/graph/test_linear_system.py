@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Graph and poses to A and b: A x - b is the whitened residual after a small step x."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import chain_and_loops, graph_of, random_information, random_poses
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import anchor, linearise, step_poses, whitened_residual
+
+N, LOOPS = 12, 9
+M = N - 1 + LOOPS
+
+
+@pytest.fixture(params=[0, 1, 3], ids=lambda priors: f'{priors} priors')
+def case(request, rng):
+    """A graph with full information matrices and poses that do not fit it; edges both ways."""
+    truth = random_poses(N, rng)
+    pairs = [pair[::-1] if k % 3 == 0 else pair
+             for k, pair in enumerate(chain_and_loops(N, LOOPS, rng))]
+    graph = graph_of(truth, pairs, 0.4 * rng.uniform(-1, 1, (M, 3)), random_information(M, rng))
+    if request.param:
+        i = rng.choice(N, request.param, replace=False)
+        graph.add_prior(i, se2.retract(truth[i], 0.2 * rng.standard_normal((len(i), 3))),
+                        random_information(len(i), rng))
+    return graph, truth
+
+
+def test_b_is_minus_the_whitened_residual(case):
+    graph, poses = case
+    assert_array_equal(linearise(graph, poses).b, -whitened_residual(graph, poses))
+
+
+def test_rows_are_the_factors_in_order_then_the_priors(case):
+    graph, poses = case
+    expected = []
+    for factors, start in (graph.between, poses[graph.between.i]), (graph.prior, None):
+        for k in range(len(factors)):
+            z = factors.measurement[k : k + 1]
+            if start is None:
+                e = se2.local(z, poses[factors.i[k]][None])[0]
+            else:
+                e = se2.residual(z, start[k : k + 1], poses[factors.j[k]][None])[0]
+            expected.append(factors.sqrt_information[k] @ e)
+    assert_allclose(whitened_residual(graph, poses), np.concatenate(expected))
+
+
+def test_a_equals_differences_through_step_poses(case):
+    graph, poses = case
+    A = linearise(graph, poses).A.toarray()
+    h = 1e-6
+    for column, unit in enumerate(np.eye(A.shape[1])):
+        change = [whitened_residual(graph, step_poses(graph, poses, s * h * unit))
+                  for s in (1, -1)]
+        assert_allclose(A[:, column], (change[0] - change[1]) / (2 * h), atol=1e-7)
+
+
+def test_the_linear_model_errs_by_the_square_of_the_step(case, rng):
+    graph, poses = case
+    system = linearise(graph, poses)
+    direction = rng.standard_normal(system.A.shape[1])
+    errors = [np.abs(whitened_residual(graph, step_poses(graph, poses, h * direction))
+                     - (system.A @ (h * direction) - system.b)).sum() for h in (1e-3, 1e-4)]
+    assert errors[0] > 1e-7
+    assert errors[0] / errors[1] == pytest.approx(100, rel=0.1)
+
+
+def test_the_gauge_is_fixed_by_keyframe_0_or_by_priors(case, rng):
+    graph, poses = case
+    fixed = 0 if len(graph.prior) else 1
+    A = linearise(graph, poses).A
+    assert anchor(graph) == fixed
+    assert A.shape == (3 * (M + len(graph.prior)), 3 * (N - fixed))
+    assert np.linalg.matrix_rank(A.toarray()) == A.shape[1]
+    moved = step_poses(graph, poses, rng.standard_normal(A.shape[1]))
+    assert np.array_equal(moved[0], poses[0]) == bool(fixed)
+    assert (moved[fixed:] != poses[fixed:]).any(axis=1).all()
+
+
+def test_each_row_touches_the_keyframes_of_its_factor_alone(case):
+    graph, poses = case
+    A = linearise(graph, poses).A
+    factors, fixed = graph.between, anchor(graph)
+    for row in range(3 * M):
+        k = row // 3
+        touched = set(A.indices[A.indptr[row] : A.indptr[row + 1]] // 3 + fixed)
+        assert touched <= {factors.i[k], factors.j[k]}
+        assert touched | set(range(fixed)) >= {factors.i[k], factors.j[k]} - {0}
+    assert (A.data != 0).all()
+
+
+def test_the_free_motion_of_the_whole_is_no_column(rng):
+    """Without an anchor A would not see a motion of all keyframes at once."""
+    truth = random_poses(N, rng)
+    graph = graph_of(truth, chain_and_loops(N, LOOPS, rng))
+    moved = se2.compose(np.broadcast_to([5.0, -2.0, 1.0], truth.shape), truth)
+    assert_allclose(whitened_residual(graph, moved), whitened_residual(graph, truth), atol=1e-10)
+
+
+@pytest.mark.parametrize('step', [[], np.zeros(0)])
+def test_one_keyframe_without_factors_is_an_empty_system(step):
+    graph = FactorGraph(se2)
+    graph.add_poses(1)
+    system = linearise(graph, se2.identity(1))
+    assert system.A.shape == (0, 0) and system.b.shape == (0,)
+    assert_array_equal(step_poses(graph, se2.identity(1), step), se2.identity(1))
+
+
+def test_keyframes_without_factors_are_empty_columns():
+    graph = FactorGraph(se2)
+    graph.add_poses(3)
+    system = linearise(graph, se2.identity(3))
+    assert system.A.shape == (0, 6) and system.A.nnz == 0
+
+
+def test_an_empty_graph_is_an_empty_system():
+    assert linearise(FactorGraph(se2), se2.identity(0)).A.shape == (0, 0)
+
+
+def test_poses_and_graph_are_left_as_they_were(case):
+    graph, poses = case
+    before, measurement = poses.copy(), graph.between.measurement.copy()
+    poses.flags.writeable = False
+    system = linearise(graph, poses)
+    step_poses(graph, poses, np.ones(system.A.shape[1]))
+    assert_array_equal(poses, before)
+    assert_array_equal(graph.between.measurement, measurement)

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses along a spanning tree: exact on noise-free graphs, whatever the order of the factors."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import chain_and_loops, drive, graph_of
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.spanning_tree import compose_tree, odometry_poses, tree_poses
+
+
+def assert_same(a, b):
+    assert_allclose(se2.local(a, b), 0, atol=1e-9)
+
+
+def shuffled(pairs, rng):
+    """Return the pairs in another order, half of them the other way round."""
+    return [tuple(pair)[:: rng.choice([-1, 1])] for pair in rng.permutation(pairs).tolist()]
+
+
+@pytest.mark.parametrize('n', [2, 3, 17, 128, 1000])
+def test_odometry_of_a_noise_free_graph_is_the_truth(n, rng):
+    truth = drive(n, rng)
+    loops = [(a, b) for a, b in rng.integers(n, size=(n, 2)) if abs(a - b) > 1]
+    pairs = [(k, k + 1) for k in range(n - 1)] + loops
+    assert_same(odometry_poses(graph_of(truth, shuffled(pairs, rng))), truth)
+
+
+def test_odometry_is_the_chain_composed_one_by_one(rng):
+    n = 300
+    noise = 0.3 * rng.standard_normal((n - 1, 3))
+    graph = graph_of(drive(n, rng), [(k, k + 1) for k in range(n - 1)], noise)
+    pose = np.zeros((1, 3))
+    poses = odometry_poses(graph)
+    for k, z in enumerate(graph.between.measurement, 1):
+        pose = se2.compose(pose, z[None])
+        assert_same(poses[k : k + 1], pose)
+
+
+def test_odometry_takes_the_first_of_parallel_factors():
+    graph = FactorGraph(se2)
+    graph.add_poses(2)
+    for x in 1.0, 2.0:
+        graph.add_between(1, 0, np.array([[-x, 0, 0]]), np.eye(3)[None])
+    graph.add_between(0, 1, np.array([[3.0, 0, 0]]), np.eye(3)[None])
+    assert_allclose(odometry_poses(graph), [[0, 0, 0], [1, 0, 0]])
+
+
+@pytest.mark.parametrize('pairs, said', [
+    ([(0, 1), (1, 3), (2, 3)], 'no factor between keyframes 1 and 2'),
+    ([(0, 3), (1, 3), (0, 2)], 'no factor between keyframes 0 and 1'),
+    ([(0, 1), (1, 2)], 'no factor between keyframes 2 and 3'),
+])
+def test_a_gap_in_the_odometry_is_named(pairs, said, rng):
+    with pytest.raises(GraphError) as caught:
+        odometry_poses(graph_of(drive(4, rng), pairs))
+    assert str(caught.value) == said
+
+
+@pytest.mark.parametrize('root', [0, 7, 39])
+def test_a_tree_from_any_root_puts_keyframe_0_at_the_identity(root, rng):
+    truth = drive(40, rng)
+    graph = graph_of(truth, shuffled(chain_and_loops(40, 40, rng), rng))
+    poses = tree_poses(graph, root)
+    assert_array_equal(poses[0], 0)
+    assert_same(poses, truth)
+
+
+def test_a_tree_needs_no_odometry(rng):
+    truth = drive(20, rng)
+    assert_same(tree_poses(graph_of(truth, [(5, k) for k in range(20) if k != 5]), 0), truth)
+
+
+def test_a_tree_takes_the_shortest_way(rng):
+    """A chain that slips, and loops to keyframe 0 that do not: the tree uses the loops."""
+    n = 50
+    truth = drive(n, rng)
+    chain = [(k, k + 1) for k in range(n - 1)]
+    star = [(k, 0) for k in range(1, n)]
+    noise = np.zeros((len(chain) + len(star), 3))
+    noise[1 : len(chain)] = 0.5
+    graph = graph_of(truth, chain + star, noise)
+    assert_same(tree_poses(graph, 0), truth)
+    assert np.abs(se2.local(odometry_poses(graph), truth)).max() > 0.4
+
+
+def test_a_keyframe_without_a_path_is_named(rng):
+    with pytest.raises(GraphError) as caught:
+        tree_poses(graph_of(drive(5, rng), [(0, 1), (1, 4), (2, 3)]), 0)
+    assert str(caught.value) == 'keyframe 2 has no path to the rest of the graph'
+
+
+def test_a_tree_of_any_shape_is_composed(rng):
+    """Against one composition after the other, for random trees and forests."""
+    for n in (1, 2, 10, 100):
+        order = rng.permutation(n)
+        parent = np.arange(n)
+        for k in range(1, n):
+            parent[order[k]] = order[rng.integers(k)] if rng.random() < 0.95 else order[k]
+        relative = rng.standard_normal((n, 3))
+        poses = compose_tree(se2, parent, relative)
+        for k in range(n):
+            expected = relative[k : k + 1]
+            if parent[k] != k:
+                expected = se2.compose(poses[parent[k]][None], expected)
+            assert_same(poses[k : k + 1], expected)
+
+
+@pytest.mark.parametrize('poses_of', [odometry_poses, lambda graph: tree_poses(graph, 0)])
+def test_one_keyframe_is_at_the_identity(poses_of):
+    graph = FactorGraph(se2)
+    graph.add_poses(1)
+    assert_array_equal(poses_of(graph), np.zeros((1, 3)))

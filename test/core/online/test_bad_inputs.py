@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What drivers and simulators really send, through the whole back end: the map goes on."""
+
+import numpy as np
+import pytest
+from problems import PERIOD, covariance6, loop, odometry
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions, optimise
+from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.loop_states import ACCEPTED
+from l1slam_ros.core.robust.batch import robust_solve
+from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.graphs.graph_file import read_graph_file
+
+EVERY = KeyframeOptions(0.0, 0.0, 0.0)
+
+
+def backend_after(graph, options, every=50, copies=1, spoil=lambda k, covariance: covariance):
+    """Return the back end that heard a graph pose by pose and was updated, then settled."""
+    backend, factors = Backend(se2, options), graph.between
+    roots = np.linalg.inv(factors.sqrt_information)
+    covariances = roots @ roots.transpose(0, 2, 1)
+    odometry_rows = np.flatnonzero(factors.is_odometry)
+    step = dict(zip(factors.j[odometry_rows].tolist(), odometry_rows.tolist(), strict=True))
+    for k, pose in enumerate(odometry_poses(graph)):
+        covariance = covariances[step[k]] if k else np.zeros((3, 3))
+        backend.add_odometry(odometry(k * PERIOD, pose, covariance6(spoil(k, covariance))))
+        for row in np.flatnonzero((factors.j == k) & ~factors.is_odometry).tolist():
+            for _ in range(copies):
+                backend.add_loop(loop(factors.i[row] * PERIOD, k * PERIOD,
+                                      factors.measurement[row], covariance6(covariances[row])))
+        if k % every == 0:
+            backend.update(0.1)
+    backend.adopt(optimise(backend.problem(), options.solver))
+    return backend
+
+
+@pytest.mark.parametrize('robust', [True, False])
+def test_intel_with_absurd_variances_and_every_loop_five_times(datasets, robust):
+    graph = read_graph_file(datasets / 'intel.g2o').graph
+    options = BackendOptions(EVERY, OdometryOptions('increment'), robust=RobustOptions(robust))
+    rng = np.random.default_rng(0)
+    absurd = dict(zip(rng.permutation(np.arange(1, 943))[:80].tolist(),
+                      40 * [1e12 * np.eye(3), 1e-20 * np.eye(3)], strict=True))
+    clean = backend_after(graph, options)
+    spoiled = backend_after(graph, options, 30, 5, lambda k, sound: absurd.get(k, sound))
+    assert len(spoiled.poses) == 943
+    off = np.hypot(*(spoiled.poses - clean.poses)[:, :2].T)
+    assert off.max() < 0.15
+    assert (spoiled.loop_states().state == ACCEPTED).sum() == 893
+    # 895 loops, two of which stand in the file twice.
+    assert spoiled.growth.refused['repeated'] == 5 * 895 - 893
+    assert spoiled.growth.notes.warned['odometry_variance'] == 80 * 3
+
+
+VARIANCES = [1e-300, 1e-30, 1e-20, 1e-12, 1e-8, 1e-4, 1.0, 1e4, 1e12, 1e30, 1e300]
+
+
+@pytest.mark.parametrize('component', [[0], [2], [0, 1, 2]])
+@pytest.mark.parametrize('source', ['increment', 'twist', 'loop'])
+@pytest.mark.parametrize('period', [0.0, 0.4])
+def test_no_variance_makes_an_update_fail(source, component, period, rng):
+    """Any at all, a message in ten; keyframes of one message and of several."""
+    world = simulate_world(300, 420, WorldOptions(), rng)
+    factors, chain = world.graph.between, odometry_poses(world.graph)
+    options = BackendOptions(KeyframeOptions(0.0, 0.0, period),
+                             OdometryOptions('model' if source == 'loop' else source))
+    backend = Backend(se2, options)
+    sound = np.diag([0.02, 0.02, 0.002])
+
+    def stated(k, mine):
+        covariance = sound.copy()
+        if mine and k % 10 == 5:
+            covariance[component, component] = VARIANCES[k // 10 % len(VARIANCES)]
+        return covariance6(covariance)
+
+    loops = np.flatnonzero(~factors.is_odometry)
+    with np.errstate(all='raise', under='ignore'):
+        for k, pose in enumerate(chain):
+            backend.add_odometry(odometry(k * PERIOD, pose, stated(k, source == 'increment'),
+                                          stated(k, source == 'twist') / PERIOD**2))
+            for n in np.flatnonzero(factors.j[loops] == k).tolist():
+                backend.add_loop(loop(factors.i[loops[n]] * PERIOD, k * PERIOD,
+                                      factors.measurement[loops[n]],
+                                      stated(n, source == 'loop')))
+        backend.growth.add_due_loops()
+    for _ in range(3):
+        backend.update(0.1)
+    backend.adopt(optimise(backend.problem(), options.solver))
+    assert np.isfinite(backend.poses).all() and len(backend.poses) == backend.growth.graph.n_poses
+    off = np.hypot(*(se2.between(backend.poses[:1], backend.poses))[:, :2].T)
+    assert off.max() < 2 * np.hypot(*chain[:, :2].T).max() + 10
+    assert backend.growth.notes.warned
+
+
+def exact_world(n, edges, rng, false_loops):
+    """Return a graph whose odometry has noise and whose loops have none, and its truth."""
+    world = simulate_world(n, edges, WorldOptions(), rng)
+    factors, graph = world.graph.between, FactorGraph(se2)
+    exact = se2.between(world.truth[factors.i], world.truth[factors.j])
+    graph.add_poses(n)
+    graph.append_between(factors.i, factors.j,
+                         np.where(factors.is_odometry[:, None], factors.measurement, exact),
+                         factors.sqrt_information)
+    if false_loops:
+        graph = insert_loops(graph, FALSE_LOOPS['random'](graph, world.truth, false_loops, rng))
+    return graph, world.truth
+
+
+@pytest.mark.parametrize('lies', [0, 2001])
+def test_loops_without_noise_are_believed(lies, rng):
+    """A simulator's: the noise that is learnt of them does not run to nothing."""
+    graph, truth = exact_world(1000, 3000, rng, lies)
+    solution = robust_solve(graph)
+    factors = graph.between
+    exact = np.abs(se2.residual(factors.measurement, truth[factors.i], truth[factors.j])
+                   ).max(axis=1) < 1e-9
+    loops = ~factors.is_odometry
+    assert (loops & exact).sum() == 2001
+    assert (solution.accepted == exact)[loops].mean() > 0.99
+    assert not (solution.accepted & ~exact)[loops].any()
+    assert solution.variance.min() >= 1e-3
+
+
+@pytest.mark.parametrize('lies', [1001])
+def test_loops_without_noise_while_the_map_grows(lies, rng):
+    graph, truth = exact_world(600, 1600, rng, lies)
+    backend = backend_after(graph, BackendOptions(EVERY, OdometryOptions('increment')), 5)
+    off = np.hypot(*(se2.between(backend.poses[:1], backend.poses)
+                     - se2.between(truth[:1], truth))[:, :2].T)
+    assert off.max() < 0.5
+    states = backend.loop_states()
+    assert (states.state == ACCEPTED).sum() == 1001
+    # False ones came in the order of their ends: told by what they measure.
+    rows = states.rows[states.state[:len(states.rows)] == ACCEPTED]
+    used = backend.growth.graph.between
+    exact = se2.between(truth[used.i[rows]], truth[used.j[rows]])
+    assert np.abs(se2.local(exact, used.measurement[rows])).max() < 1e-6

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lies are refused, truth is kept, and what cannot be told is left open."""
+
+import numpy as np
+import pytest
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.spanning_tree import pair_key
+from l1slam_ros.core.robust.batch import (
+    INCONSISTENT,
+    MOSTLY_REFUSED,
+    Doubt,
+    minimise_accepted,
+    mostly_refused,
+    reconsidered,
+    robust_solve,
+)
+from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
+
+# Odometry good enough for a drive of 400 m to come back near where it was.
+OPTIONS = WorldOptions(odometry_sigma_rotation=0.005)
+
+
+def error(poses, others):
+    return absolute_trajectory_error(se2.positions(poses), se2.positions(others))
+
+
+@pytest.fixture(scope='module')
+def world():
+    return simulate_world(400, 800, OPTIONS, np.random.default_rng(0))
+
+
+def spoilt(world, kind, count, seed=1):
+    """Return the graph with false loops, and which of its factors are true."""
+    loops = FALSE_LOOPS[kind](world.graph, world.truth, count, np.random.default_rng(seed))
+    graph = with_false_loops(world, loops).graph
+    n, factors = graph.n_poses, graph.between
+    return graph, ~np.isin(pair_key(factors.i, factors.j, n), pair_key(loops.i, loops.j, n))
+
+
+def with_measurements(graph, change, variance=1.0):
+    """Return the graph with changed measurements and its information divided by `variance`."""
+    factors = graph.between
+    roots = factors.sqrt_information
+    changed = FactorGraph(graph.manifold)
+    changed.add_poses(graph.n_poses)
+    changed.add_between(factors.i, factors.j, change(factors.measurement.copy()),
+                        roots.transpose(0, 2, 1) @ roots / variance)
+    return changed
+
+
+@pytest.mark.parametrize('kind', FALSE_LOOPS)
+@pytest.mark.parametrize('count', [20, 401, 1600])
+def test_false_loops_are_refused_and_true_ones_kept(world, kind, count):
+    graph, true = spoilt(world, kind, count)
+    solution = robust_solve(graph)
+    assert not (solution.accepted & ~true).any()
+    assert np.count_nonzero(true & ~solution.accepted) <= 4
+    assert error(solution.poses, world.truth) < 0.2
+    assert not len(solution.slips)
+
+
+def test_a_clean_graph_keeps_all_its_loops(world):
+    solution = robust_solve(world.graph)
+    keep = reconsidered(world.graph, solution.poses, solution.accepted)
+    assert np.count_nonzero(~keep) <= 2  # one true loop in a thousand is beyond the gate
+    best = minimise_accepted(world.graph, solution.poses, np.ones(len(keep), bool))
+    assert error(minimise_accepted(world.graph, solution.poses, keep), best) < 0.02
+
+
+def test_a_graph_of_odometry_alone_is_its_chain(world):
+    loops = ~world.graph.between.is_odometry
+    solution = robust_solve(world.graph.subset(~loops))
+    assert error(solution.poses, world.odometry) < 1e-6
+    assert solution.accepted.all() and not solution.suspect.any()
+
+
+@pytest.mark.parametrize('offset', [(5.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2)])
+def test_a_slip_of_the_odometry_is_found_and_named(world, offset):
+    graph, true = spoilt(world, 'random', 170)
+    factors = graph.between
+    slip = int(np.flatnonzero(factors.is_odometry)[200])
+
+    def change(measurement):
+        measurement[slip] = se2.retract(measurement[slip][None], np.array([offset]))[0]
+        return measurement
+
+    solution = robust_solve(with_measurements(graph, change))
+    assert len(solution.slips) == 1
+    # Between loops nobody can tell which of the steps it was.
+    assert abs(factors.i[solution.slips[0]] - factors.i[slip]) <= 3
+    assert not (solution.accepted & ~true).any()
+    assert error(solution.poses, world.truth) < 0.3
+
+
+def test_a_map_that_loops_agree_is_wrong_is_doubtful(world):
+    # Two slips, and no single step explains what the loops across both agree upon.
+    graph, _ = spoilt(world, 'random', 170)
+    rng = np.random.default_rng(5)
+    slipped = rng.choice(np.flatnonzero(graph.between.is_odometry), 2, replace=False)
+    off = rng.normal(size=(2, 3)) * [4, 4, 1.5]
+
+    def change(measurement):
+        measurement[slipped] = se2.retract(measurement[slipped], off)
+        return measurement
+
+    steps = graph.between.i[np.sort(slipped)]
+    doubt = robust_solve(with_measurements(graph, change)).doubt
+    assert doubt.kind == INCONSISTENT and doubt.loops > 10
+    assert steps[0] - 20 < doubt.first < doubt.last < steps[1] + 20
+
+
+@pytest.mark.parametrize('refused, doubtful', [(0, False), (2, False), (3, True), (5, True)])
+def test_most_loops_refused_is_a_doubt(refused, doubtful):
+    graph, n = FactorGraph(se2), 10
+    graph.add_poses(n)
+    i = np.concatenate((np.arange(n - 1), np.arange(5)))
+    j = np.concatenate((np.arange(1, n), np.arange(5) + 4))
+    graph.add_between(i, j, np.zeros((len(i), 3)), np.tile(np.eye(3), (len(i), 1, 1)))
+    accepted = np.arange(len(i)) < len(i) - refused
+    expected = Doubt(MOSTLY_REFUSED, refused, 5 - refused, 8) if doubtful else None
+    assert mostly_refused(graph, accepted) == expected
+    # Of less than a handful most may be refused.
+    assert mostly_refused(graph.subset(np.arange(n + 3)), accepted[:n + 3]) is None
+
+
+def test_a_trusted_loop_is_never_refused(world):
+    graph, true = spoilt(world, 'random', 10)
+    lie = int(np.flatnonzero(~true)[4])
+    assert not robust_solve(graph).accepted[lie]
+    trusting, factors = FactorGraph(graph.manifold), graph.between
+    trusting.add_poses(graph.n_poses)
+    information = factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information
+    trusting.add_between(factors.i, factors.j, factors.measurement, information,
+                         trusted=np.arange(len(true)) == lie)
+    solution = robust_solve(trusting)
+    assert solution.accepted[lie]
+    assert reconsidered(trusting, solution.poses, solution.accepted)[lie]
+
+
+def test_the_same_graph_gives_the_same_answer(world):
+    graph, _ = spoilt(world, 'grouped', 401)
+    one, other = robust_solve(graph), robust_solve(graph)
+    np.testing.assert_array_equal(one.poses, other.poses)
+    np.testing.assert_array_equal(one.accepted, other.accepted)
+    np.testing.assert_array_equal(one.sigmas, other.sigmas)
+
+
+@pytest.mark.parametrize('variance', [0.01, 100.0])
+def test_information_may_be_off_by_a_constant(world, variance):
+    graph, true = spoilt(world, 'random', 401)
+    solution = robust_solve(with_measurements(graph, lambda z: z, variance))
+    assert not (solution.accepted & ~true).any()
+    assert np.count_nonzero(true & ~solution.accepted) <= 4
+    np.testing.assert_allclose(solution.variance, 1 / variance, rtol=0.3)
+
+
+def test_odometry_may_be_noisier_than_it_says(world):
+    odometry = np.flatnonzero(world.graph.between.is_odometry)
+    noise = np.random.default_rng(3).standard_normal((len(odometry), 3)) * [0.15, 0.15, 0.015]
+
+    def change(measurement):
+        measurement[odometry] = se2.retract(measurement[odometry], noise)
+        return measurement
+
+    graph = with_measurements(world.graph, change)
+    solution = robust_solve(graph)
+    assert np.count_nonzero(~solution.accepted) <= 4
+    assert solution.variance[0] > 2 * solution.variance[1]
+
+
+def test_a_lone_far_loop_is_left_open():
+    # A drive straight on: nothing but the drift says whether a loop to its start may be true.
+    n = 400
+    graph = FactorGraph(se2)
+    graph.add_poses(n)
+    i = np.arange(n - 1)
+    step = np.tile([1.0, 0.0, np.pi / 200], (n - 1, 1))
+    graph.add_between(i, i + 1, step, np.tile(np.diag([4.0, 4.0, 100.0]), (n - 1, 1, 1)))
+    graph.add_between(np.array([0]), np.array([n - 1]), np.array([[1.0, 20.0, 0.5]]),
+                      np.diag([100.0, 100.0, 1000.0])[None])
+    solution = robust_solve(graph)
+    assert solution.suspect[-1] and not solution.accepted[-1]
+    assert 0 < solution.sigmas[-1] < 4
+
+
+def test_sigmas_say_how_far_off_a_loop_is(world):
+    graph, true = spoilt(world, 'random', 50)
+    solution = robust_solve(graph)
+    assert solution.sigmas[~true].min() > 4
+    assert np.median(solution.sigmas[true]) < 3
+    assert not (solution.suspect & solution.accepted).any()
+
+
+def test_a_prior_does_not_stand_in_its_way():
+    world = simulate_world(100, 180, WorldOptions(), np.random.default_rng(5))
+    graph = world.graph
+    without = robust_solve(graph)
+    graph.add_prior(np.array([3]), world.truth[3:4], np.eye(3)[None] * 1e4)
+    found = robust_solve(graph)
+    assert len(found.accepted) == len(graph.between)
+    assert found.accepted.sum() == without.accepted.sum()

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a map says of a factor: against dense algebra, and against drawn numbers."""
+
+import numpy as np
+import pytest
+from lies import careful_world
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.linear_system import linearise
+from l1slam_ros.core.robust.innovation import (
+    SAMPLES,
+    chi2_quantile,
+    claimed_volume,
+    exact_squares,
+    innovations,
+    log_likelihood_ratio,
+    sample_posterior,
+    sampled_quantile,
+)
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
+
+
+def loops_of(graph):
+    """Return the rows of the loops."""
+    return np.flatnonzero(~graph.between.is_odometry)
+
+
+@pytest.fixture(scope='module')
+def solved():
+    """Return a graph without its last loops, these loops, the L2 map and the posterior."""
+    graph = careful_world(120, 220).graph
+    left_out = np.isin(np.arange(len(graph.between)), loops_of(graph)[-20:])
+    part = graph.subset(~left_out)
+    cholesky = cholesky_of(part)
+    poses = minimise_l2(part, careful_world(120, 220).truth, LeastSquaresOptions(), cholesky).poses
+    posterior = sample_posterior(part, poses, cholesky, np.random.default_rng(0))
+    return part, graph.subset(left_out), poses, posterior
+
+
+def dense_squares(part, others, poses):
+    """Return r'C^-1 r of each of some factors, C = I + J H^-1 J'."""
+    A, system = linearise(part, poses).A.toarray(), linearise(others, poses)
+    J = system.A.toarray().reshape(len(others.between), 3, -1)
+    covariance = np.eye(3) + J @ np.linalg.inv(A.T @ A) @ J.transpose(0, 2, 1)
+    r = system.b.reshape(-1, 3)
+    return np.einsum('mi,mij,mj->m', r, np.linalg.inv(covariance), r)
+
+
+def test_exact_squares_are_those_of_dense_algebra(solved):
+    part, others, poses, posterior = solved
+    np.testing.assert_allclose(exact_squares(others, poses, posterior),
+                               dense_squares(part, others, poses), rtol=1e-8)
+
+
+def test_sampled_squares_are_about_the_exact_ones(solved):
+    part, others, poses, posterior = solved
+    sampled = innovations(others, poses, posterior, 0.0).square
+    ratio = sampled / dense_squares(part, others, poses)
+    assert 0.8 < np.median(ratio) < 1.4  # C^-1 of so few samples is 1 / (1 - 4/24) too large
+    assert ratio.min() > 0.4 and ratio.max() < 4
+
+
+def test_a_factor_left_out_is_as_far_off_as_if_it_had_never_been_there(solved):
+    part, others, poses, posterior = solved
+    whole = careful_world(120, 220).graph
+    cholesky = cholesky_of(whole)
+    best = minimise_l2(whole, poses, LeastSquaresOptions(), cholesky).poses
+    inside = sample_posterior(whole, best, cholesky, np.random.default_rng(1)).left_out()
+    row = loops_of(whole)[-1]
+    without = whole.subset(np.arange(len(whole.between)) != row)
+    cholesky = cholesky_of(without)
+    best = minimise_l2(without, poses, LeastSquaresOptions(), cholesky).poses
+    posterior = sample_posterior(without, best, cholesky, np.random.default_rng(1))
+    alone = exact_squares(whole.subset(np.array([row])), best, posterior)[0]
+    assert inside[row] == pytest.approx(alone, rel=0.8)
+
+
+@pytest.mark.parametrize('size', [3, 6])
+def test_true_factors_stay_below_the_quantile_of_samples(size):
+    rng = np.random.default_rng(0)
+    drawn = rng.standard_normal((20000, SAMPLES, size))
+    covariance = drawn.transpose(0, 2, 1) @ drawn / SAMPLES
+    r = rng.standard_normal((20000, size))
+    square = np.einsum('mi,mij,mj->m', r, np.linalg.inv(covariance), r)
+    beyond = (square > sampled_quantile(0.99, size)).mean()
+    assert 0.008 < beyond < 0.012
+    assert sampled_quantile(0.99, size) > chi2_quantile(0.99, size)
+
+
+def test_the_density_of_a_true_residual_has_volume_one():
+    x = np.linspace(-60, 60, 241)
+    square = (x[:, None, None] ** 2 + x[:, None] ** 2 + x**2).ravel()
+    none = np.zeros_like(square)
+    density = np.exp(log_likelihood_ratio(square, none, none, 3))
+    assert density.sum() * (x[1] - x[0]) ** 3 == pytest.approx(1, rel=1e-3)
+
+
+def test_a_corridor_does_not_narrow_what_false_factors_claim():
+    rng = np.random.default_rng(0)
+    straight = np.zeros((500, 3))
+    straight[:, 0] = np.arange(500)
+    area = np.column_stack((rng.uniform(0, 500, (500, 2)) / np.sqrt(2), np.zeros(500)))
+    along, about = (claimed_volume(se2, poses, np.random.default_rng(1))
+                    for poses in (straight, area))
+    assert along == pytest.approx(about, abs=0.3)

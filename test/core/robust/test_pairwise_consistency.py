@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loops that were refused because the odometry slipped agree; false ones do not."""
+
+import numpy as np
+import pytest
+from lies import careful_world, is_false, spoilt
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
+from l1slam_ros.core.robust.gating import DOUBT
+from l1slam_ros.core.robust.pairwise_consistency import accord, spanned, weakest_steps
+from l1slam_ros.core.robust.rounds import Growth
+
+STEP = 200
+
+
+@pytest.fixture(scope='module')
+def bad():
+    return spoilt(careful_world(400, 800), 'random', 100)
+
+
+def slipped(graph, step):
+    """Return the graph, the robot turned by 90 degrees more at a step."""
+    factors, new = graph.between, FactorGraph(graph.manifold)
+    row = int(np.flatnonzero(factors.is_odometry & (factors.i == step))[0])
+    measurement = factors.measurement.copy()
+    measurement[row] = se2.retract(measurement[row][None], np.array([[0, 0, np.pi / 2]]))[0]
+    new.add_poses(graph.n_poses)
+    new.add_between(factors.i, factors.j, measurement,
+                    factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information)
+    return new
+
+
+def grown(graph):
+    """Return the state in which nothing more can be believed."""
+    growth = Growth(graph)
+    growth.begin()
+    while len(news := growth.believable(growth.undecided())):
+        growth.accepted[news] = True
+        growth.settle()
+    return growth
+
+
+def test_loops_across_a_slip_agree(bad):
+    growth = grown(slipped(bad.graph, STEP))
+    camp, chance = accord(growth)
+    assert len(growth.heads(camp)) >= 3 and chance < DOUBT
+    assert not is_false(bad, growth.factors)[camp].any()
+    assert ((growth.low[camp] <= STEP) & (growth.high[camp] > STEP)).all()
+    steps = weakest_steps(growth, camp)
+    assert steps[0] <= STEP <= steps[-1] and len(steps) < 20
+
+
+@pytest.mark.parametrize('kind', ['random', 'identity', 'grouped'])
+def test_false_loops_agree_by_chance_at_most(kind):
+    growth = grown(spoilt(careful_world(400, 800), kind, 400).graph)
+    camp, chance = accord(growth)
+    assert not len(camp) or chance > DOUBT
+    assert not len(weakest_steps(growth, camp[:0]))
+
+
+def test_where_nothing_is_refused_nobody_agrees():
+    growth = grown(careful_world(60, 100).graph)
+    growth.accepted[:] = True
+    assert accord(growth)[0].shape == (0,)
+
+
+def test_spanned_counts_the_factors_across_each_step():
+    rng = np.random.default_rng(0)
+    ends = np.sort(rng.integers(0, 12, (30, 2)), axis=1)
+    expected = [np.count_nonzero((ends[:, 0] <= k) & (ends[:, 1] > k)) for k in range(11)]
+    np.testing.assert_array_equal(spanned(ends[:, 0], ends[:, 1], 12), expected)
+
+
+def test_ends_are_in_the_order_of_time(bad):
+    low, high, Z = ends_in_time(bad.graph)
+    factors = bad.graph.between
+    assert (low < high).all()
+    turned = factors.i > factors.j
+    np.testing.assert_array_equal(Z[~turned], factors.measurement[~turned])
+    np.testing.assert_allclose(se2.inverse(Z[turned]), factors.measurement[turned], atol=1e-12)

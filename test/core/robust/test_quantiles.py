@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Quantiles against those of SciPy."""
+
+import pytest
+from scipy.special import betaincinv, gammainc, gammaincinv
+
+from l1slam_ros.core.robust.quantiles import beta_quantile, gamma_probability, gamma_quantile
+
+PROBABILITIES = [1e-6, 0.01, 0.5, 0.95, 0.999, 1 - 1e-6, 1 - 1e-9]
+
+
+@pytest.mark.parametrize('probability', PROBABILITIES)
+@pytest.mark.parametrize('a', [0.5, 1.0, 1.5, 3.0, 6.0, 40.0])
+def test_of_the_gamma_distribution(a, probability):
+    # Near 1 the last digit of the probability itself moves the quantile.
+    within = max(1e-12, 1e-15 / (1 - probability))
+    assert gamma_quantile(a, probability) == pytest.approx(gammaincinv(a, probability), rel=within)
+
+
+@pytest.mark.parametrize('probability', PROBABILITIES)
+@pytest.mark.parametrize('a, b', [(0.5, 12.0), (1.5, 11.0), (3.0, 9.5), (6.0, 6.5)])
+def test_of_the_beta_distribution(a, b, probability):
+    within = max(1e-12, 1e-15 / (1 - probability))
+    assert beta_quantile(a, b, probability) == pytest.approx(betaincinv(a, b, probability),
+                                                            rel=within)
+
+
+@pytest.mark.parametrize('a', [1.0, 2.5, 30.0])
+@pytest.mark.parametrize('x', [1e-3, 0.2, 1.0, 50.0])
+def test_the_distribution_function_itself(a, x):
+    assert gamma_probability(a, x) == pytest.approx(gammainc(a, x), rel=1e-12)

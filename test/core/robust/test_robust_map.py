@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robust map: the solver's own, of what is believed, and a true account of it."""
+
+import numpy as np
+import pytest
+from lies import careful_world, is_false, position_error, roundabout, spoilt
+from numpy.testing import assert_allclose, assert_array_equal
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.robust.batch import robust_solve
+from l1slam_ros.core.robust.robust_map import minimise_robustly
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
+from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
+from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
+
+
+def in_l1(graph, poses):
+    return minimise_by(choose(AUTO, graph), graph, poses, OptimiserOptions())[0]
+
+
+def in_l2(graph, poses):
+    return minimise_l2(graph, poses, LeastSquaresOptions(), cholesky_of(graph))
+
+
+@pytest.fixture(scope='module')
+def world():
+    return careful_world(200, 400)
+
+
+@pytest.fixture(scope='module')
+def bad(world):
+    return spoilt(world, 'grouped', 90)
+
+
+@pytest.fixture(scope='module')
+def found(bad):
+    return minimise_robustly(bad.graph, in_l1)
+
+
+def rebuilt(graph, measurement):
+    """Return the graph with other measurements, (m, 3)."""
+    factors, other = graph.between, FactorGraph(graph.manifold)
+    other.add_poses(graph.n_poses)
+    roots = factors.sqrt_information
+    other.add_between(factors.i, factors.j, measurement, roots.transpose(0, 2, 1) @ roots)
+    return other
+
+
+def test_the_accepted_graph_has_the_accepted_factors_as_they_were(bad):
+    accepted = ~is_false(bad, bad.graph.between)
+    part, factors = bad.graph.subset(accepted), bad.graph.between
+    assert part.n_poses == bad.graph.n_poses and len(part.between) == accepted.sum()
+    for name in ('i', 'j', 'measurement', 'sqrt_information', 'trusted', 'is_odometry'):
+        assert_array_equal(getattr(part.between, name), getattr(factors, name)[accepted])
+
+
+def test_false_loops_are_refused_and_the_map_is_that_of_the_clean_graph(world, bad, found):
+    false = is_false(bad, bad.graph.between)
+    assert not found.accepted[false].any()
+    assert np.count_nonzero(~found.accepted[~false]) <= 2
+    clean = in_l1(world.graph, world.odometry)
+    assert position_error(found.solution.poses, clean.poses) < 0.05
+    assert position_error(in_l1(bad.graph, bad.odometry).poses, clean.poses) > 1
+
+
+def test_its_cost_counts_the_accepted_factors_only(bad, found):
+    residual = whitened_residual(bad.graph, found.solution.poses).reshape(-1, 3)
+    assert found.solution.cost == pytest.approx(np.abs(residual[found.accepted]).sum(), rel=1e-12)
+    assert l1_cost(residual) > 2 * found.solution.cost
+
+
+@pytest.mark.parametrize('minimise, cost', [(in_l1, l1_cost), (in_l2, l2_cost)])
+def test_the_map_is_an_optimum_of_the_norm_asked_for(bad, minimise, cost):
+    found = minimise_robustly(bad.graph, minimise)
+    part = bad.graph.subset(found.accepted)
+    best = cost(whitened_residual(part, found.solution.poses))
+    again = minimise(part, found.solution.poses)
+    assert best == pytest.approx(found.solution.cost) == pytest.approx(again.cost, rel=1e-4)
+    assert best <= cost(whitened_residual(part, found.seed)) * (1 + 1e-12)
+
+
+def test_the_choice_does_not_hang_on_the_norm(bad, found):
+    assert_array_equal(minimise_robustly(bad.graph, in_l2).accepted, found.accepted)
+
+
+def test_the_solver_is_asked_once_and_from_the_seed(bad):
+    asked = []
+
+    def minimise(graph, poses):
+        asked.append((len(graph.between), poses))
+        return in_l2(graph, poses)
+
+    found = minimise_robustly(bad.graph, minimise)
+    (count, poses), = asked
+    assert count == found.accepted.sum()
+    assert_array_equal(poses, found.seed)
+
+
+def test_the_seed_is_the_l2_map_of_what_is_accepted(bad, found):
+    part = bad.graph.subset(found.accepted)
+    best = in_l2(part, found.seed)
+    assert l2_cost(whitened_residual(part, found.seed)) <= best.cost + 1
+
+
+def test_a_factor_is_accepted_suspect_or_refused(bad, found):
+    assert not (found.accepted & found.suspect).any()
+    assert not found.suspect[bad.graph.between.is_odometry].any()
+    assert found.sigmas.shape == found.accepted.shape and (found.sigmas >= 0).all()
+    refused = ~found.accepted & ~found.suspect
+    assert found.sigmas[refused].min() > 4
+    assert not len(found.slips)
+
+
+def test_a_clean_graph_is_its_ordinary_map(world):
+    found = minimise_robustly(world.graph, in_l1)
+    assert found.accepted.all() and not found.suspect.any()
+    assert found.solution.cost == pytest.approx(
+        in_l1(world.graph, world.odometry).cost, rel=1e-5)
+
+
+def test_a_graph_of_odometry_alone_is_its_chain():
+    world = careful_world(30, 29)
+    found = minimise_robustly(world.graph, in_l1)
+    assert found.accepted.all() and found.solution.cost < 1e-6
+    assert_allclose(se2.local(found.solution.poses, world.odometry), 0, atol=1e-6)
+
+
+def test_a_trusted_loop_is_kept_however_absurd(world):
+    """Two steps that are said to be 30 m: nothing else would let it pass."""
+    information = np.diag([400.0, 400.0, 1e4])[None]
+    for trusted in (False, True):
+        graph = world.graph.copy()
+        graph.add_between(np.array([50]), np.array([52]), np.array([[30.0, 0.0, 0.0]]),
+                          information, trusted)
+        found = minimise_robustly(graph, in_l1)
+        assert found.accepted[-1] == trusted and not found.suspect[-1]
+
+
+def test_what_fits_exactly_is_accepted_though_nothing_vouches_for_it():
+    """It bends nothing: the map is the same with it."""
+    truth, graph = roundabout(220), FactorGraph(se2)
+    graph.add_poses(220)
+    graph.add_between(np.arange(219), np.arange(1, 220), se2.between(truth[:-1], truth[1:]),
+                      np.tile(np.diag([1.0, 1.0, 1e2]), (219, 1, 1)))
+    graph.add_between(np.array([3]), np.array([203]), se2.between(truth[3:4], truth[203:204]),
+                      np.diag([100.0, 100.0, 1e3])[None])
+    assert robust_solve(graph).suspect[-1]
+    found = minimise_robustly(graph, in_l1)
+    assert found.accepted.all() and not found.suspect.any()
+
+
+def test_an_odometry_that_slipped_is_named_and_left_out(world):
+    factors = world.graph.between
+    slip = int(np.flatnonzero(factors.is_odometry)[100])
+    measurement = factors.measurement.copy()
+    measurement[slip] += [4.0, 0.0, 0.0]
+    found = minimise_robustly(rebuilt(world.graph, measurement), in_l1)
+    (named,) = found.slips
+    # Between loops nobody can tell which of the steps it was.
+    assert abs(factors.i[named] - factors.i[slip]) <= 3
+    assert not found.accepted[named] and found.sigmas[named] > 10
+    assert position_error(found.solution.poses, world.truth) < 0.3
+
+
+def test_progress_is_reported(bad):
+    said = []
+    found = minimise_robustly(bad.graph, in_l2, lambda *news: said.append(news))
+    rounds, loops = zip(*said, strict=True)
+    assert rounds == tuple(range(1, len(said) + 1))
+    assert abs(loops[-1] - (found.accepted & ~bad.graph.between.is_odometry).sum()) <= 2

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The gates of a robust solve, by how often they are wrong."""
+
+import numpy as np
+import pytest
+from lies import careful_world
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.robust.rounds import Growth
+
+
+def test_one_true_loop_in_a_thousand_is_beyond_the_gate():
+    """Of 59,760 true loops to worlds with few others: the map's own uncertainty decides."""
+    refused = asked = 0
+    for seed in range(60):
+        growth = Growth(careful_world(200, 1200, seed).graph)
+        loops = np.flatnonzero(growth.is_loop)
+        growth.accepted[np.random.default_rng(seed).choice(loops, 5, replace=False)] = True
+        growth.settle()
+        rows = growth.undecided()
+        refused += np.count_nonzero(growth.innovations(rows).square >= growth.gate())
+        asked += len(rows)
+    # Loops of one world share its errors, so a binomial bound (3 sigma: 23 in 60) is doubled.
+    assert asked > 50_000
+    assert asked / 2000 < refused < asked / 500
+
+
+ROUND = 4000  # keyframes of a round so wide that one loop back to its start could be chance
+
+
+def two_loops(apart):
+    """Return a noise-free round and two loops behind it that say it ends `apart` m apart [x]."""
+    n = ROUND + 100
+    angle, radius = 2 * np.pi * np.arange(n) / ROUND, ROUND / (2 * np.pi)
+    truth = np.column_stack((radius * np.sin(angle), radius * (1 - np.cos(angle)), angle))
+    graph, i = FactorGraph(se2), np.arange(n - 1)
+    graph.add_poses(n)
+    information = np.diag(np.array([0.085, 0.085, 0.0085]) ** -2)
+    graph.add_between(i, i + 1, se2.between(truth[:-1], truth[1:]),
+                      np.tile(information, (n - 1, 1, 1)))
+    start = np.array([10, 31])
+    seen = se2.between(truth[start], truth[start + ROUND])
+    seen = se2.retract(seen, np.array([[0.0, 0.0, 0.0], [apart, 0.0, 0.0]]))
+    graph.add_between(start, start + ROUND, seen, np.tile(np.diag([1e4, 1e4, 1e6]), (2, 1, 1)))
+    return graph
+
+
+@pytest.mark.parametrize(('apart', 'believed'), [(2.5, 2), (3.6, 0)])
+def test_two_loops_vouch_for_each_other_only_within_the_gate_of_both(apart, believed):
+    """
+    Each fits alone, and both together are likelier true than chance in either case.
+
+    But 3.6 m are more, over the 42 steps between them, than one true pair in a thousand shows.
+    """
+    growth = Growth(two_loops(apart))
+    growth.settle()
+    rows = growth.undecided()
+    assert (growth.innovations(rows).square < 1).all()
+    assert len(growth.believable(rows)) == believed

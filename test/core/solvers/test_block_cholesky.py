@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The block Cholesky factorisation against dense NumPy, on graphs of every shape."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import noisy_graph
+from systems import (
+    PLENTY,
+    SHAPES,
+    chain,
+    cholesky_of_system,
+    grid,
+    parallel,
+    random_loops,
+    random_system,
+    star,
+)
+
+from l1slam_ros.core.errors import FillError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import keyframes_of, linearise
+from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, cholesky_of, find_pattern
+
+N = 26
+
+
+def normal(system, weights, diagonal=0.0):
+    A = system.A.toarray()
+    return A.T @ (weights[:, None] * A) + np.diag(np.broadcast_to(diagonal, A.shape[1]))
+
+
+def check_solution(cholesky, matrix, rng):
+    """Two right hand sides, to 1e-10 of what the matrix allows."""
+    for _ in range(2):
+        right = rng.standard_normal(len(matrix))
+        expected = np.linalg.solve(matrix, right)
+        assert_allclose(cholesky.solve(right), expected, rtol=1e-10,
+                        atol=1e-10 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize('k', [1, 2, 3, 6])
+@pytest.mark.parametrize('shape', SHAPES, ids=lambda shape: shape.__name__)
+def test_it_solves_as_numpy_does(shape, k, rng):
+    # Twice each pair: random blocks alone are nearly singular now and then.
+    system = random_system(3 * shape(N), N, k, rng)
+    weights = rng.uniform(0.1, 3, len(system.b))
+    cholesky = cholesky_of_system(system)
+    assert cholesky.factorise(system, weights, 0.1)
+    check_solution(cholesky, normal(system, weights, 0.1), rng)
+
+
+@pytest.mark.parametrize('n', [1, 2, 3])
+def test_the_smallest_graphs(n, rng):
+    system = random_system(2 * chain(n), n, 3, rng)
+    cholesky = cholesky_of_system(system)
+    assert cholesky.factorise(system, np.ones(len(system.b)))
+    check_solution(cholesky, normal(system, np.ones(len(system.b))), rng)
+
+
+def test_a_graph_without_free_keyframes():
+    graph = FactorGraph(se2)
+    graph.add_poses(1)
+    cholesky = cholesky_of(graph)
+    assert cholesky.factorise(linearise(graph, np.zeros((1, 3))), np.zeros(0))
+    assert cholesky.solve(np.zeros(0)).shape == (0,)
+
+
+@pytest.mark.parametrize('prior', [False, True])
+def test_the_systems_of_graphs_are_solved(prior, rng):
+    """The anchor held fixed, or priors in its place: one, and two of one keyframe."""
+    graph, truth = noisy_graph(40, 40, rng)
+    if prior:
+        rows = np.array([5, 17, 17])
+        graph.add_prior(rows, truth[rows], np.broadcast_to(np.eye(3), (3, 3, 3)))
+    system, cholesky = linearise(graph, truth), cholesky_of(graph)
+    assert system.size == (40 if prior else 39)
+    weights = rng.uniform(0.1, 3, len(system.b))
+    assert cholesky.factorise(system, weights)
+    check_solution(cholesky, normal(system, weights), rng)
+
+
+def test_dense_panels_of_many_columns(rng):
+    """All keyframes joined with all: one panel, wider than any tile."""
+    pairs = [(i, j) for i in range(23) for j in range(i)] + [(0, 23)]
+    for k in (2, 3):
+        system = random_system(pairs, 23, k, rng)
+        cholesky = cholesky_of_system(system)
+        assert cholesky.factorise(system, np.ones(len(system.b)))
+        check_solution(cholesky, normal(system, np.ones(len(system.b))), rng)
+        assert cholesky.pattern.first.tolist() == [0, 23]
+
+
+def test_a_large_grid_leaves_a_small_residual(rng):
+    system = random_system(2 * grid(900), 900, 3, rng)
+    weights = rng.uniform(0.1, 3, len(system.b))
+    cholesky = cholesky_of_system(system)
+    assert cholesky.factorise(system, weights, 0.1)
+    right = rng.standard_normal(2700)
+    x = cholesky.solve(right)
+    left = system.transposed_times(weights * system.times(x)) + 0.1 * x
+    assert_allclose(left, right, atol=1e-10)
+
+
+def test_one_serves_blocks_of_every_size(rng):
+    """Rotations, translations, poses: the last factorisation is the one that solves."""
+    whole = random_system(3 * random_loops(N), N, 3, rng)
+    cholesky = cholesky_of_system(whole)
+    rotations, translations = whole.part(slice(2, 3)), whole.part(slice(0, 2))
+    for system in (rotations, translations, whole, rotations, whole):
+        weights = rng.uniform(0.1, 3, len(system.b))
+        assert cholesky.factorise(system, weights, 0.1)
+        check_solution(cholesky, normal(system, weights, 0.1), rng)
+
+
+def test_a_factorisation_leaves_nothing_behind(rng):
+    """Also not one that failed."""
+    system = random_system(3 * grid(N), N, 3, rng)
+    ones, cholesky = np.ones(len(system.b)), cholesky_of_system(system)
+    assert cholesky.factorise(system, 5 * ones)
+    assert not cholesky.factorise(system, ones, -1e3)
+    assert cholesky.factorise(system, ones)
+    check_solution(cholesky, normal(system, ones), rng)
+
+
+def test_a_pattern_of_more_factors_serves_fewer(rng):
+    pairs = random_loops(N)
+    pattern = find_pattern(np.array(3 * pairs), N, PLENTY)
+    system = random_system(3 * chain(N), N, 2, rng)
+    cholesky = BlockCholesky(pattern, system.keyframe)
+    assert cholesky.factorise(system, np.ones(len(system.b)))
+    check_solution(cholesky, normal(system, np.ones(len(system.b))), rng)
+
+
+# What may be added to the matrix
+
+
+def test_a_diagonal_is_added(rng):
+    system = random_system(3 * grid(N), N, 3, rng)
+    weights, diagonal = rng.uniform(0.1, 3, len(system.b)), rng.uniform(0, 2, 3 * N)
+    cholesky = cholesky_of_system(system)
+    for added in (diagonal, 0.5, 0.0):
+        assert cholesky.factorise(system, weights, added)
+        check_solution(cholesky, normal(system, weights, added), rng)
+
+
+@pytest.mark.parametrize('share', [0.0, 0.3, 1.0])
+@pytest.mark.parametrize('shape', SHAPES, ids=lambda shape: shape.__name__)
+def test_a_share_of_the_curvature_is_added(shape, share, rng):
+    """Of the first factors alone; the last ones are priors, which have none."""
+    k, system = 3, random_system(3 * shape(N), N, 3, rng)
+    m = len(system.keyframe) - 3
+    curvature = 0.1 * rng.standard_normal((m, 2 * k, 2 * k))
+    curvature += curvature.transpose(0, 2, 1)
+    C = np.zeros(((N + 1) * k,) * 2)
+    for f, pair in enumerate(system.keyframe[:m]):
+        rows = (pair[:, None] * k + np.arange(k)).ravel()
+        C[np.ix_(rows, rows)] += curvature[f]
+    matrix = normal(system, np.ones(len(system.b)), 3.0) + share * C[:-k, :-k]
+    cholesky = cholesky_of_system(system)
+    assert np.linalg.eigvalsh(matrix)[0] > 0
+    assert cholesky.factorise(system, np.ones(len(system.b)), 3.0, curvature, share)
+    check_solution(cholesky, matrix, rng)
+
+
+# Matrices that have no factor
+
+
+@pytest.mark.parametrize('k', [1, 2, 3, 6])
+@pytest.mark.parametrize('shape', SHAPES, ids=lambda shape: shape.__name__)
+def test_it_tells_which_matrices_are_positive_definite(shape, k, rng):
+    """Just above and just below the smallest eigenvalue."""
+    system = random_system(3 * shape(N), N, k, rng)
+    ones, cholesky = np.ones(len(system.b)), cholesky_of_system(system)
+    smallest = np.linalg.eigvalsh(normal(system, ones))[0]
+    assert cholesky.factorise(system, ones, -smallest + 1e-6) is True
+    assert cholesky.factorise(system, ones, -smallest - 1e-6) is False
+
+
+@pytest.mark.parametrize('pairs', [
+    chain(N)[1:], [pair for pair in chain(N) if pair != (9, 10)], [(k, N) for k in range(N - 1)]],
+    ids=['no anchor', 'two parts', 'a loose keyframe'])
+def test_a_part_that_is_not_tied_down_is_singular(pairs, rng):
+    """Relative measurements alone, as exact as a graph's Jacobians are."""
+    system = random_system(pairs, N, 3, rng)
+    system.blocks[:, 0], system.blocks[:, 1] = -np.eye(3), np.eye(3)
+    cholesky = cholesky_of_system(system)
+    assert not cholesky.factorise(system, rng.uniform(0.5, 2, len(system.b)))
+
+
+def test_rounding_seldom_passes_for_a_pivot(rng):
+    """Without an anchor the last pivot is rounding, as often positive as negative."""
+    pairs = [pair for pair in grid(N) if max(pair) < N]
+    system = random_system(pairs, N, 3, rng)
+    system.blocks[:, 0], system.blocks[:, 1] = -np.eye(3), np.eye(3)
+    cholesky = cholesky_of_system(system)
+    taken = [cholesky.factorise(system, rng.uniform(0.1, 10, len(system.b))) for _ in range(300)]
+    assert sum(taken) < 10
+
+
+@pytest.mark.parametrize('stiff', [1e6, 1e9, 1e12])
+def test_small_pivots_are_not_taken_for_rounding(stiff):
+    """A stiff chain held by a soft anchor: x of its end is the force over the anchor's weight."""
+    system = random_system(chain(N), N, 1, np.random.default_rng(0))
+    system.blocks[:, 0], system.blocks[:, 1] = -1.0, 1.0
+    system.blocks[0, 0] = 0.0
+    weights = np.append(1.0, np.full(N - 1, stiff))
+    cholesky = cholesky_of_system(system)
+    assert cholesky.factorise(system, weights)
+    x = cholesky.solve(np.append(np.zeros(N - 1), 1.0))
+    assert_allclose(x, 1 + np.arange(N) / stiff, rtol=1e-14 * stiff)
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_refused(value, rng):
+    system = random_system(3 * chain(N), N, 3, rng)
+    weights, cholesky = np.ones(len(system.b)), cholesky_of_system(system)
+    weights[40] = value
+    with np.errstate(invalid='ignore'):
+        assert not cholesky.factorise(system, weights)
+
+
+def test_units_do_not_matter(rng):
+    """Steps in nanometres and in gigaradians: a scaled diagonal is no singularity."""
+    system = random_system(3 * grid(N), N, 3, rng)
+    scale = np.array([1e-8, 1.0, 1e8])
+    blocks = system.blocks * scale
+    scaled = type(system)(system.keyframe, blocks, system.b, N)
+    cholesky, ones = cholesky_of_system(system), np.ones(len(system.b))
+    right = rng.standard_normal(3 * N)
+    assert cholesky.factorise(system, ones)
+    expected = cholesky.solve(right) / np.tile(scale, N)
+    assert cholesky.factorise(scaled, ones)
+    assert_allclose(cholesky.solve(right * np.tile(scale, N)), expected, rtol=1e-9)
+
+
+# The pattern
+
+
+def filled(pairs, n, position):
+    """Return the lower triangle (n, n) bool of the factor in an order, by dense elimination."""
+    matrix = np.eye(n, dtype=bool)
+    for i, j in pairs:
+        if max(i, j) < n:
+            matrix[position[i], position[j]] = matrix[position[j], position[i]] = True
+    for k in range(n):
+        below = k + 1 + np.flatnonzero(matrix[k + 1:, k])
+        matrix[np.ix_(below, below)] = True
+    return np.tril(matrix)
+
+
+@pytest.fixture(params=SHAPES, ids=lambda shape: shape.__name__)
+def pairs(request):
+    return request.param(N)
+
+
+def test_the_pattern_is_a_permutation_in_panels(pairs):
+    pattern = find_pattern(np.array(pairs), N, PLENTY)
+    assert_array_equal(np.sort(pattern.position), np.arange(N))
+    assert (pattern.first[0], pattern.first[-1]) == (0, N)
+    assert pattern.start[-1] == len(pattern.rows)
+
+
+def test_the_panels_cover_the_fill_of_dense_elimination(pairs):
+    pattern = find_pattern(np.array(pairs), N, PLENTY)
+    expected = filled(pairs, N, pattern.position)
+    stored = np.zeros((N, N), bool)
+    for s, first in enumerate(pattern.first[:-1]):
+        rows = pattern.rows[pattern.start[s]:pattern.start[s + 1]]
+        stored[np.ix_(rows, range(first, pattern.first[s + 1]))] = True
+    stored = np.tril(stored)
+    assert not (expected & ~stored).any()
+    # Panels hold some zeros for the sake of being large: no more than is said.
+    assert stored.sum() <= expected.sum() / (1 - 0.2)
+
+
+def test_the_work_is_that_of_dense_elimination(pairs):
+    """Half of the square of each column: its products with itself below the diagonal."""
+    pattern = find_pattern(np.array(pairs), N, PLENTY)
+    columns = filled(pairs, N, pattern.position).sum(axis=0)
+    assert pattern.work == (columns.astype(float) ** 2).sum() / 2
+
+
+def test_a_chain_and_a_star_do_not_fill_in():
+    for shape in (chain, star, parallel):
+        pattern = find_pattern(np.array(shape(N)), N, PLENTY)
+        assert filled(shape(N), N, pattern.position).sum() == N + N - 1
+
+
+def test_too_much_fill_is_refused():
+    keyframe = np.array([(i, j) for i in range(20) for j in range(i)])
+    below = 20 * 19 // 2
+    assert find_pattern(keyframe, 20, below).first.tolist() == [0, 20]
+    with pytest.raises(FillError, match=f'20 keyframes and {below} factors .* more than '
+                       f'{below - 1} blocks'):
+        find_pattern(keyframe, 20, below - 1)
+
+
+def test_the_pattern_of_a_graph_is_that_of_its_free_keyframes(rng):
+    graph, _ = noisy_graph(40, 40, rng)
+    ours = cholesky_of(graph).pattern
+    expected = find_pattern(keyframes_of(graph), 39, PLENTY)
+    assert len(ours.position) == 39
+    assert_array_equal(ours.position, expected.position)
+    assert ours.work == expected.work

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exact L1 map: optimal by HiGHS and by its dual, never worse than its start."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import linprog_l1
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.exact import minimise_interior_point
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, minimise
+from l1slam_ros.core.solvers.optimality import Status, l1_cost
+from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.worlds.false_loops import random_false_loops
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
+
+DEFAULTS = OptimiserOptions()
+
+
+def cost_of(graph, poses):
+    return l1_cost(whitened_residual(graph, poses))
+
+
+def solve(graph, poses, options=DEFAULTS):
+    return minimise_interior_point(graph, poses, options, cholesky_of(graph))
+
+
+@pytest.fixture
+def world(rng):
+    return simulate_world(200, 330, WorldOptions(), rng)
+
+
+def test_it_agrees_with_algorithm_4_and_is_optimal_by_its_dual(world):
+    graph, cholesky = world.graph, cholesky_of(world.graph)
+    seed = seed_poses(graph, cholesky)
+    solution = minimise_interior_point(graph, seed, DEFAULTS, cholesky)
+    first_order = minimise(graph, seed, OptimiserOptions(outer_iterations=60), cholesky)
+    assert solution.cost <= (1 + 1e-5) * first_order.cost
+    system = linearise(graph, solution.poses)
+    assert np.abs(solution.dual).max() <= 1
+    # The dual is feasible for the linear problem at the end, and its value is nearly the cost.
+    assert np.abs(system.A.T @ solution.dual).max() < 1e-9 * np.abs(system.A).sum(axis=0).max()
+    assert solution.dual @ -system.b == pytest.approx(solution.cost, rel=1e-3)
+    assert 0 <= solution.gap == pytest.approx(solution.cost - solution.dual @ -system.b)
+
+
+def test_no_small_step_is_better_by_highs(world):
+    solution = solve(world.graph, world.truth)
+    system = linearise(world.graph, solution.poses)
+    best, _ = linprog_l1(system.A, system.b, box=0.02)
+    assert solution.cost == cost_of(world.graph, solution.poses)
+    assert best >= (1 - 3e-5) * solution.cost
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_clean_worlds_converge_to_one_cost_from_all_starts(seed):
+    world = simulate_world(150, 250, WorldOptions(), np.random.default_rng(seed))
+    graph, cholesky = world.graph, cholesky_of(world.graph)
+    starts = seed_poses(graph, cholesky), world.truth, odometry_poses(graph)
+    solutions = [minimise_interior_point(graph, poses, DEFAULTS, cholesky) for poses in starts]
+    assert {solution.status for solution in solutions} == {Status.CONVERGED}
+    assert_allclose([solution.cost for solution in solutions], solutions[0].cost, rtol=3e-5)
+
+
+def test_from_its_own_map_it_converges_to_that_map(world):
+    first = solve(world.graph, world.truth)
+    again = solve(world.graph, first.poses)
+    assert again.status is Status.CONVERGED
+    assert (1 - 3e-5) * first.cost <= again.cost <= first.cost
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_it_never_ends_worse_than_it_began(seed):
+    rng = np.random.default_rng(seed)
+    world = simulate_world(150, 220, WorldOptions(), rng)
+    loops = random_false_loops(world.graph, world.truth, 30, rng)
+    graph = with_false_loops(world, loops).graph
+    start = cost_of(graph, world.truth)
+    for outer in (0, 1, 2, 60):
+        solution = solve(graph, world.truth, OptimiserOptions(outer_iterations=outer))
+        assert solution.cost == cost_of(graph, solution.poses) <= start
+        assert solution.history[0] == start and solution.history[-1] == solution.cost
+        assert (np.diff(solution.history) <= 0).all()
+
+
+@pytest.mark.parametrize('outer', [0, 1, 3])
+def test_the_iteration_limit_is_kept_and_named(outer, world):
+    start = odometry_poses(world.graph)
+    solution = solve(world.graph, start, OptimiserOptions(outer_iterations=outer))
+    assert solution.status is Status.ITERATION_LIMIT
+    assert solution.outer_iterations == outer == len(solution.history) - 1
+    assert solution.inner_iterations == 0
+    assert solution.dual.shape == (3 * len(world.graph.between),)
+
+
+def test_no_steps_leave_the_start_as_it_is(world):
+    start = odometry_poses(world.graph)
+    solution = solve(world.graph, start, OptimiserOptions(outer_iterations=0))
+    assert_array_equal(solution.poses, start)
+    assert solution.cost == solution.history[0] == cost_of(world.graph, start)
+
+
+def test_a_chain_without_loops_is_solved_as_it_is(rng):
+    graph = simulate_world(20, 19, WorldOptions(), rng).graph
+    solution = solve(graph, odometry_poses(graph))
+    assert solution.status is Status.CONVERGED
+    assert solution.cost == pytest.approx(0, abs=1e-9)
+
+
+def test_one_keyframe_is_solved():
+    graph = FactorGraph(se2)
+    graph.add_poses(1)
+    solution = solve(graph, se2.identity(1))
+    assert (solution.status, solution.cost) == (Status.CONVERGED, 0.0)
+    assert_array_equal(solution.poses, se2.identity(1))
+
+
+def test_a_prior_fixes_the_gauge_instead_of_the_anchor(rng):
+    world = simulate_world(60, 90, WorldOptions(), rng)
+    moved = se2.compose(np.broadcast_to([3.0, 4.0, 0.5], world.truth.shape), world.truth)
+    graph = world.graph.copy()
+    graph.add_prior(np.array([7]), moved[7:8], 1e4 * np.eye(3)[None])
+    solution = solve(graph, moved)
+    assert solution.status is Status.CONVERGED
+    assert_allclose(solution.poses[7], moved[7], atol=1e-6)
+    unfixed = solve(world.graph, world.truth)
+    assert solution.cost == pytest.approx(unfixed.cost, rel=1e-5)
+
+
+def test_progress_is_reported(world):
+    reports = []
+    start = odometry_poses(world.graph)
+    solution = minimise_interior_point(world.graph, start, DEFAULTS, cholesky_of(world.graph),
+                                       lambda k, cost: reports.append((k, cost)))
+    steps = [k for k, _ in reports]
+    assert steps == list(range(1, solution.outer_iterations))  # the L2 map is one, unreported
+    assert reports[-1][1] == solution.cost

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gauss-Newton and Huber against SciPy, closed forms and each other."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import drive, graph_of, noisy_graph
+from scipy.optimize import approx_fprime, least_squares
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import step_poses, whitened_residual
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import (
+    LeastSquaresOptions,
+    huber_cost,
+    minimise_huber,
+    minimise_l2,
+)
+from l1slam_ros.core.solvers.optimality import Status, l2_cost
+
+DEFAULTS = LeastSquaresOptions()
+BOTH = pytest.mark.parametrize('minimise', [minimise_l2, minimise_huber])
+
+
+@pytest.fixture
+def world(rng):
+    return noisy_graph(25, 20, rng)
+
+
+def solve(minimise, graph, start, options=DEFAULTS):
+    return minimise(graph, start, options, cholesky_of(graph))
+
+
+def chi2(graph, poses):
+    return l2_cost(whitened_residual(graph, poses))
+
+
+def parallel(distances, information):
+    graph = FactorGraph(se2)
+    graph.add_poses(2)
+    m = len(distances)
+    graph.add_between(np.zeros(m, int), np.ones(m, int),
+                      np.array([(x, 0.0, 0.0) for x in distances]),
+                      np.array([value * np.eye(3) for value in information]))
+    return graph
+
+
+def test_parallel_factors_meet_at_their_weighted_mean():
+    graph = parallel([0.0, 1.0, 5.0], [1.0, 2.0, 1.0])
+    solution = solve(minimise_l2, graph, np.zeros((2, 3)))
+    assert_allclose(solution.poses[1], [7 / 4, 0, 0], atol=1e-9)
+    assert solution.cost == pytest.approx(1.75**2 + 2 * 0.75**2 + 3.25**2)
+
+
+def test_l2_agrees_with_scipy(world):
+    graph, truth = world
+    solution = solve(minimise_l2, graph, odometry_poses(graph))
+
+    def residual(x):
+        return whitened_residual(graph, step_poses(graph, truth, x))
+
+    expected = least_squares(residual, np.zeros(3 * (len(truth) - 1)), xtol=1e-12, ftol=1e-12,
+                             gtol=1e-12)
+    assert solution.status is Status.CONVERGED
+    assert solution.cost == pytest.approx(2 * expected.cost, rel=1e-8)
+    assert_allclose(se2.local(solution.poses, step_poses(graph, truth, expected.x)), 0, atol=1e-4)
+
+
+def test_the_cost_has_no_half(world):
+    graph, _ = world
+    solution = solve(minimise_l2, graph, odometry_poses(graph))
+    assert solution.cost == chi2(graph, solution.poses) == solution.history[-1]
+    assert solution.history[0] == chi2(graph, odometry_poses(graph))
+
+
+def test_huber_cost_by_hand():
+    """Lengths 5 (beyond 2: 2 2 5 - 2^2 = 16), 1 (1^2) and 2 (2^2, either way)."""
+    residual = np.array([3.0, 4.0, 0.0, 0.6, 0.0, -0.8, 0.0, 2.0, 0.0])
+    assert huber_cost(residual, 3, 2.0) == pytest.approx(16 + 1 + 4)
+    assert huber_cost(residual, 3, 1e9) == pytest.approx(l2_cost(residual))
+    assert huber_cost(np.zeros(0), 3, 1.0) == 0.0
+
+
+def test_huber_cost_is_smooth_where_it_turns_linear():
+    delta, h = 1.345, 1e-6
+    costs = [huber_cost(np.array([s, 0.0, 0.0]), 3, delta) for s in (delta - h, delta, delta + h)]
+    assert (costs[2] - costs[1]) / h == pytest.approx((costs[1] - costs[0]) / h, rel=1e-4)
+    assert costs[1] == delta**2
+
+
+@pytest.mark.parametrize('delta', [0.1, 0.5, 1.345])
+def test_huber_ends_where_its_gradient_is_zero(delta, world):
+    graph, _ = world
+    options = LeastSquaresOptions(huber_delta=delta, iterations=1000, tolerance=1e-12)
+    solution = solve(minimise_huber, graph, odometry_poses(graph), options)
+
+    def cost(x):
+        return huber_cost(whitened_residual(graph, step_poses(graph, solution.poses, x)), 3, delta)
+
+    n = 3 * (graph.n_poses - 1)
+    gradient = approx_fprime(np.zeros(n), cost, 1e-7)
+    assert solution.cost == pytest.approx(cost(np.zeros(n)))
+    assert np.abs(gradient).max() < 0.2
+    assert np.abs(approx_fprime(np.full(n, 0.01), cost, 1e-7)).max() > 10
+
+
+def test_huber_with_a_huge_delta_is_l2(world):
+    graph, _ = world
+    start = odometry_poses(graph)
+    l2 = solve(minimise_l2, graph, start)
+    huber = solve(minimise_huber, graph, start, LeastSquaresOptions(huber_delta=1e9))
+    assert_allclose(huber.history, l2.history, rtol=1e-9)
+    assert_allclose(huber.poses, l2.poses, atol=1e-9)
+
+
+def test_huber_with_a_tiny_delta_is_a_median():
+    """rho(s) = 2 delta s, almost: three places weigh the same, however far."""
+    graph = parallel([0.0, 1.0, 100.0], [1.0, 1.0, 1.0])
+    options = LeastSquaresOptions(huber_delta=1e-3, iterations=10_000, tolerance=1e-12)
+    solution = solve(minimise_huber, graph, np.zeros((2, 3)), options)
+    assert solution.poses[1, 0] == pytest.approx(1.0, abs=0.01)
+
+
+def test_huber_gives_an_outlier_less_weight_than_l2():
+    graph = parallel([0.0, 0.1, -0.1, 50.0], [1.0] * 4)
+    l2, huber = (solve(minimise, graph, np.zeros((2, 3))).poses[1, 0]
+                 for minimise in (minimise_l2, minimise_huber))
+    assert l2 == pytest.approx(12.5)
+    # The outlier pulls with 2 delta, three good ones with 2 x each.
+    assert huber == pytest.approx(1.345 / 3, abs=1e-3)
+
+
+@pytest.fixture
+def exact(rng):
+    """A graph that its poses fit to rounding, and a start nearby."""
+    truth = drive(20, rng)
+    graph = graph_of(truth, [(k, k + 1) for k in range(19)] + [(0, 10), (5, 19)])
+    return graph, truth, step_poses(graph, truth, 0.05 * rng.standard_normal(57))
+
+
+@BOTH
+def test_a_graph_without_noise_is_solved_exactly(minimise, exact):
+    graph, truth, start = exact
+    solution = solve(minimise, graph, start)
+    assert solution.cost < 1e-20
+    assert_allclose(se2.local(solution.poses, truth), 0, atol=1e-10)
+
+
+@BOTH
+def test_a_graph_without_noise_is_soon_done(minimise, exact):
+    graph, _, start = exact
+    solution = solve(minimise, graph, start)
+    assert solution.status in (Status.CONVERGED, Status.STALLED)
+
+
+@BOTH
+def test_an_exact_start_is_the_end(minimise):
+    poses = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    solution = solve(minimise, parallel([1.0], [1.0]), poses)
+    assert (solution.cost, solution.status) == (0.0, Status.CONVERGED)
+    assert_array_equal(solution.poses, poses)
+
+
+@BOTH
+@pytest.mark.parametrize('seed', [0, 1, 3, 4])
+def test_where_a_plain_step_fails_damping_finds_the_way(minimise, seed):
+    """From poses anywhere Gauss-Newton leaps too far: steps are refused, then shortened."""
+    rng = np.random.default_rng(seed)
+    graph, truth = noisy_graph(25, 20, rng)
+    start = np.concatenate((truth[:1], 3 * rng.standard_normal((24, 3))))
+    solution = solve(minimise, graph, start, LeastSquaresOptions(iterations=1000))
+    change = np.diff(solution.history)
+    assert (change == 0).any() and (change <= 0).all()
+    assert solution.cost < 0.1 * solution.history[0]
+    assert solution.status in (Status.CONVERGED, Status.STALLED)
+
+
+@BOTH
+@pytest.mark.parametrize('iterations', [0, 1, 2])
+def test_the_iteration_limit_is_kept_and_named(minimise, iterations, world):
+    graph, _ = world
+    start = odometry_poses(graph)
+    solution = solve(minimise, graph, start, LeastSquaresOptions(iterations=iterations))
+    assert solution.status is Status.ITERATION_LIMIT
+    assert solution.outer_iterations == iterations == len(solution.history) - 1
+    assert iterations or solution.poses is start
+
+
+@BOTH
+def test_there_is_no_dual_and_no_gap(minimise, world):
+    graph, truth = world
+    solution = solve(minimise, graph, truth)
+    assert solution.dual.shape == (0,) and np.isinf(solution.gap)
+    assert solution.inner_iterations == 0
+
+
+@BOTH
+def test_progress_is_reported(minimise, world):
+    graph, _ = world
+    reports = []
+    solution = minimise(graph, odometry_poses(graph), DEFAULTS, cholesky_of(graph),
+                        lambda k, cost: reports.append((k, cost)))
+    assert reports == list(enumerate(solution.history))[1:]
+
+
+@BOTH
+def test_a_loose_keyframe_is_refused(minimise):
+    graph = FactorGraph(se2)
+    graph.add_poses(3)
+    graph.add_between(0, 1, np.ones((1, 3)), np.eye(3)[None])
+    with pytest.raises(GraphError, match='not tied to the anchor'):
+        solve(minimise, graph, np.zeros((3, 3)))
+
+
+def test_priors_take_the_place_of_the_anchor(world):
+    graph, truth = world
+    alone = solve(minimise_l2, graph, truth)
+    there = se2.compose(np.broadcast_to([10.0, 20.0, 0.5], truth.shape), truth)
+    graph.add_prior(np.array([3]), there[3:4], np.eye(3)[None])
+    solution = solve(minimise_l2, graph, truth)
+    assert solution.cost == pytest.approx(alone.cost, rel=1e-9)
+    assert_allclose(se2.local(solution.poses[3:4], there[3:4]), 0, atol=1e-6)

@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The interior-point method: linear problems against HiGHS, graphs near their map, its account."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import HAND_SOLVED, chain_and_loops, drive, graph_of, linprog_l1, noisy_graph
+from systems import SHAPES, cholesky_of_system, random_system, system_of
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.l1_problem import GraphProblem, LinearProblem
+from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
+from l1slam_ros.core.kernels import interior_point as kernels
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.interior_point import _Direction, _Iterate, interior_point, prove
+from l1slam_ros.core.solvers.optimality import Status, l1_cost
+
+TOLERANCE = 1e-8
+
+
+@dataclass
+class Proved:
+    """What a run ended with, and the proof of it."""
+
+    poses: np.ndarray
+    costs: list
+    y: np.ndarray
+    gap: float
+    status: Status
+
+
+def proved(problem, poses, cholesky, *limits):
+    optimum = interior_point(problem, poses, cholesky, *limits)
+    return Proved(optimum.poses, optimum.costs, *prove(optimum, cholesky))
+
+
+def solve_linear(system, x, iterations=60, tolerance=TOLERANCE):
+    return proved(LinearProblem(system), x, cholesky_of_system(system), iterations, tolerance)
+
+
+def solve_graph(graph, poses, iterations=100, tolerance=TOLERANCE):
+    return proved(GraphProblem(graph), poses, cholesky_of(graph), iterations, tolerance)
+
+
+def cost_of(graph, poses):
+    return l1_cost(whitened_residual(graph, poses))
+
+
+@pytest.fixture
+def world(rng):
+    return noisy_graph(60, 50, rng)
+
+
+# Linear problems
+
+
+@pytest.mark.parametrize('k', [1, 2, 3])
+@pytest.mark.parametrize('shape', SHAPES, ids=lambda shape: shape.__name__)
+@pytest.mark.parametrize('scale', [0.0, 1.5])
+def test_linear_problems_are_solved_as_by_highs(shape, k, scale, rng):
+    # Twice each pair, or a chain has as many rows as columns and fits exactly.
+    system = random_system(2 * shape(12), 12, k, rng, scale)
+    optimum = solve_linear(system, np.zeros(12 * k))
+    best, _ = linprog_l1(system.A, system.b)
+    assert optimum.status is Status.CONVERGED
+    assert l1_cost(system.A @ optimum.poses - system.b) == pytest.approx(best, rel=1e-7)
+
+
+@pytest.mark.parametrize('make', HAND_SOLVED[:-1], ids=lambda make: make.__name__)
+def test_hand_solved_problems(make):
+    problem = make()
+    optimum = solve_linear(system_of(problem.A, problem.b), np.zeros(problem.A.shape[1]))
+    assert_allclose(optimum.poses, problem.x, atol=1e-6)
+    assert optimum.costs[-1] == pytest.approx(problem.optimum, rel=1e-7)
+    assert problem.b @ -optimum.y == pytest.approx(problem.optimum, rel=1e-6)
+
+
+@pytest.mark.parametrize('iterations', [0, 1, 3, 60])
+def test_the_dual_is_feasible_and_the_gap_bounds_the_error(iterations, rng):
+    for shape in SHAPES:
+        system = random_system(2 * shape(12), 12, 2, rng)
+        optimum = solve_linear(system, np.zeros(24), iterations)
+        assert np.abs(optimum.y).max() <= 1
+        assert_allclose(system.A.T @ optimum.y, 0, atol=1e-9 * np.abs(system.blocks).max())
+        best, _ = linprog_l1(system.A, system.b)
+        assert optimum.costs[-1] - optimum.gap <= best * (1 + 1e-9)
+        assert optimum.gap <= (1e-6 if iterations == 60 else 1) * optimum.costs[-1]
+
+
+def test_a_start_far_away_is_no_trouble_to_a_linear_problem(rng):
+    system = random_system(2 * SHAPES[0](12), 12, 3, rng)
+    optimum = solve_linear(system, 1e6 * rng.standard_normal(36))
+    assert optimum.costs[-1] == pytest.approx(linprog_l1(system.A, system.b)[0], rel=1e-6)
+
+
+# Graphs
+
+
+def test_no_small_step_is_better_by_highs(world):
+    graph, truth = world
+    optimum = solve_graph(graph, truth)
+    assert optimum.status is Status.CONVERGED
+    system = linearise(graph, optimum.poses)
+    best, _ = linprog_l1(system.A, system.b, box=0.02)
+    assert optimum.costs[-1] == cost_of(graph, optimum.poses)
+    assert best >= (1 - 1e-5) * optimum.costs[-1]
+    assert optimum.costs[-1] - optimum.gap <= linprog_l1(system.A, system.b)[0] * (1 + 1e-9)
+
+
+def test_converged_means_that_little_is_left(world):
+    """A hundred times as loose, a hundred times as far from the best, but for luck."""
+    graph, truth = world
+    best = solve_graph(graph, truth, tolerance=1e-10).costs[-1]
+    for tolerance in (1e-2, 1e-4, 1e-6):
+        optimum = solve_graph(graph, truth, tolerance=tolerance)
+        assert optimum.status is Status.CONVERGED
+        assert 0 <= optimum.costs[-1] / best - 1 <= tolerance + 1e-10
+
+
+def test_the_lowest_cost_met_is_what_is_returned(world):
+    graph, truth = world
+    for iterations in (1, 2, 5, 100):
+        optimum = solve_graph(graph, truth, iterations)
+        assert optimum.costs[0] == cost_of(graph, truth)
+        assert (np.diff(optimum.costs) <= 0).all()
+        assert optimum.costs[-1] == cost_of(graph, optimum.poses)
+
+
+@pytest.mark.parametrize('iterations', [0, 1, 3])
+def test_the_iteration_limit_is_kept_and_named(iterations, world):
+    graph, truth = world
+    optimum = solve_graph(graph, truth, iterations)
+    assert optimum.status is Status.ITERATION_LIMIT
+    assert len(optimum.costs) == iterations + 1
+    assert optimum.y.shape == (3 * len(graph.between),)
+    assert iterations or optimum.poses is truth
+
+
+@pytest.mark.parametrize('iterations', [0, 60])
+def test_an_exact_start_is_the_end(iterations, rng):
+    truth = drive(20, rng)
+    graph = graph_of(truth, chain_and_loops(20, 10, rng))
+    optimum = solve_graph(graph, truth, iterations)
+    assert optimum.status is Status.CONVERGED and len(optimum.costs) == 1
+    assert_array_equal(optimum.poses, truth)
+    assert optimum.gap <= optimum.costs[0]
+
+
+def test_one_keyframe_is_solved():
+    graph = FactorGraph(se2)
+    graph.add_poses(1)
+    optimum = solve_graph(graph, se2.identity(1))
+    assert (optimum.status, optimum.costs, optimum.gap) == (Status.CONVERGED, [0.0], 0.0)
+
+
+def test_a_loose_keyframe_stays_and_nothing_is_claimed(rng):
+    """The damping holds it, the rest is solved; there is no dual to prove it by."""
+    truth = drive(4, rng)
+    noise = 0.1 * rng.standard_normal((3, 3))
+    pairs = [(0, 1), (1, 2), (0, 2)]
+    optimum = solve_graph(graph_of(truth, pairs, noise), truth)
+    tied = solve_graph(graph_of(truth[:3], pairs, noise), truth[:3])
+    assert_array_equal(optimum.poses[3], truth[3])
+    assert optimum.costs[-1] == pytest.approx(tied.costs[-1], rel=1e-6)
+    assert_array_equal(optimum.y, 0)
+    assert optimum.gap == optimum.costs[-1]
+
+
+def test_where_there_is_no_direction_it_stalls_at_its_start(world):
+    """A pose that is not finite: nothing can be factored."""
+    graph, truth = world
+    truth[7, 0] = np.nan
+    optimum = solve_graph(graph, truth)
+    assert optimum.status is Status.STALLED and optimum.poses is truth
+    assert len(optimum.costs) == 1
+
+
+def test_progress_is_reported(world):
+    graph, truth = world
+    reports = []
+    optimum = interior_point(GraphProblem(graph), truth, cholesky_of(graph), 8, TOLERANCE,
+                             lambda k, cost: reports.append((k, cost)))
+    assert reports == list(enumerate(optimum.costs))[1:]
+
+
+def test_the_start_is_left_as_it_was(world):
+    graph, truth = world
+    before = truth.copy()
+    truth.flags.writeable = False
+    solve_graph(graph, truth, 5)
+    assert_array_equal(truth, before)
+
+
+# The compiled row-wise work
+
+
+@pytest.fixture
+def rows(rng):
+    """Return e, (u, v, s, t), y, q, c1, c2 of a point inside its bounds."""
+    e, c1, c2 = rng.standard_normal((3, 50))
+    u, v = rng.uniform(0.1, 2, (2, 50))
+    y = rng.uniform(-0.9, 0.9, 50)
+    s, t = 1 - y, 1 + y
+    return e, (u, v, s, t), y, 1 / (u / s + v / t), c1, c2
+
+
+def test_the_step_solves_the_newton_equations(rows, rng):
+    """u s = c1 and v t = c2 to first order, e + J dx = u - v, and bounds met as said."""
+    e, (u, v, s, t), y, q, c1, c2 = rows
+    moved = rng.standard_normal(50)
+    g = e - (u - v) - (c1 / s - u) + (c2 / t - v)
+    dy, du, dv, primal, dual, _ = kernels.complete(u, v, s, t, q, c1, c2, g, moved, 1.0)
+    assert_allclose(u * s + s * du - u * dy, c1)
+    assert_allclose(v * t + t * dv + v * dy, c2)
+    assert_allclose((u + du) - (v + dv), e + moved, atol=1e-12)
+    # At these lengths the first bound is met, and none is passed.
+    assert primal < 1 and dual < 1
+    assert min((u + primal * du).min(), (v + primal * dv).min()) == pytest.approx(0, abs=1e-12)
+    assert min((s - dual * dy).min(), (t + dual * dy).min()) == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize('scale', [1.0, 1e-3])
+def test_a_step_goes_a_part_of_the_way_and_says_its_gap(rows, rng, scale):
+    """Small steps meet no bound: they are taken whole."""
+    _, (u, v, s, t), y, q, *_ = rows
+    g, moved = scale * rng.standard_normal((2, 50))
+    c1, c2 = u * s, v * t  # so that a step is as small as g and moved
+    found = kernels.complete(u, v, s, t, q, c1, c2, g, moved, 0.9)
+    dy, du, dv, primal, dual, gap = found
+    all_the_way = kernels.complete(u, v, s, t, q, c1, c2, g, moved, 1.0)
+    expected = (1.0, 1.0) if scale < 1 else (0.9 * all_the_way[3], 0.9 * all_the_way[4])
+    assert (primal, dual) == pytest.approx(expected)
+    after = u + primal * du, v + primal * dv, s - dual * dy, t + dual * dy
+    assert gap == pytest.approx(after[0] @ after[2] + after[1] @ after[3])
+
+
+def test_a_step_is_taken_and_slacks_stay_positive(rows):
+    _, (u, v, s, t), y, *_ = rows
+    dy, du, dv = np.where(y > 0, 9.0, -9.0), u.copy(), v.copy()
+    at = _Iterate(np.zeros(0), None, u, v, s, t, y)
+    best = replace(at)
+    at.advance(_Direction(np.zeros(0), np.zeros(50), dy, du, dv, 1.0, 0.2, 0.0), 0.3)
+    assert_allclose((at.u, at.v, at.y), (1.3 * u, 1.3 * v, y + 0.2 * dy))
+    assert (s - 0.2 * dy < 0).any() and (t + 0.2 * dy < 0).any()
+    assert (np.minimum(at.s, at.t) > 0).all()
+    # The best iterate is kept by reference: a step must not write into it.
+    assert best.u is u and best.y is y and best.s is s

@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Algorithm 4: it descends, ends at a point that HiGHS cannot improve, and says how it ended."""
+
+import time
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import chain_and_loops, drive, graph_of, linprog_l1, noisy_graph
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import linearise, step_poses, whitened_residual
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, backtrack, is_far, minimise
+from l1slam_ros.core.solvers.optimality import Status, duality_gap, l1_cost
+from l1slam_ros.core.solvers.primal_dual import PrimalDualOptions
+from l1slam_ros.core.solvers.seed import seed_poses
+
+DEFAULTS = OptimiserOptions()
+
+
+def cost(graph, poses):
+    return l1_cost(whitened_residual(graph, poses))
+
+
+def seed_of(graph):
+    return seed_poses(graph, cholesky_of(graph))
+
+
+def solve(graph, start, options, **more):
+    return minimise(graph, start, options, cholesky_of(graph), **more)
+
+
+def parallel(*distances):
+    """Return two keyframes and a factor of unit noise for each distance between them."""
+    graph = FactorGraph(se2)
+    graph.add_poses(2)
+    m = len(distances)
+    measurement = np.array([(x, 0.0, 0.0) for x in distances])
+    graph.add_between(np.zeros(m, int), np.ones(m, int), measurement,
+                      np.broadcast_to(np.eye(3), (m, 3, 3)))
+    return graph
+
+
+@pytest.fixture
+def world(rng):
+    return noisy_graph(60, 50, rng)
+
+
+@pytest.mark.parametrize('start_of', [seed_of, odometry_poses, None],
+                         ids=['seed', 'odometry', 'truth'])
+def test_no_small_step_is_better_by_highs(start_of, world):
+    graph, truth = world
+    start = truth if start_of is None else start_of(graph)
+    solution = solve(graph, start, DEFAULTS)
+    system = linearise(graph, solution.poses)
+    best, _ = linprog_l1(system.A, system.b, box=0.02)
+    assert solution.cost == cost(graph, solution.poses) == l1_cost(system.b)
+    assert best >= (1 - 1e-3) * solution.cost
+    assert solution.cost < cost(graph, truth)
+
+
+def test_all_starts_lead_to_one_cost(world):
+    graph, truth = world
+    costs = [solve(graph, start, DEFAULTS).cost
+             for start in (seed_of(graph), odometry_poses(graph), truth)]
+    assert_allclose(costs, costs[0], rtol=1e-4)
+
+
+def test_without_a_factorisation_it_ends_there_too(world):
+    """Of a graph that fills in; the linear problems then begin where the last one ended."""
+    graph, truth = world
+    best = solve(graph, truth, DEFAULTS).cost
+    for start in seed_poses(graph, None), odometry_poses(graph), truth:
+        assert minimise(graph, start, DEFAULTS).cost == pytest.approx(best, rel=2e-3)
+
+
+@pytest.mark.parametrize('inner', [1, 50, 400])
+def test_the_cost_never_rises(inner, world):
+    graph, _ = world
+    options = OptimiserOptions(inner=PrimalDualOptions(iterations=inner))
+    solution = solve(graph, odometry_poses(graph), options)
+    assert solution.history[0] == cost(graph, odometry_poses(graph))
+    assert (np.diff(solution.history) <= 0).all()
+    assert solution.history[-1] == solution.cost
+    assert len(solution.history) == solution.outer_iterations + 1
+
+
+def test_keyframe_0_stays_where_it_was(world):
+    graph, truth = world
+    moved = se2.compose(np.broadcast_to([3.0, -1.0, 2.0], truth.shape), truth)
+    solution = solve(graph, moved, DEFAULTS)
+    assert_array_equal(solution.poses[0], moved[0])
+    assert solution.cost == pytest.approx(solve(graph, truth, DEFAULTS).cost, rel=1e-4)
+
+
+def test_parallel_factors_meet_at_their_median():
+    solution = solve(parallel(0.0, 1.0, 5.0), np.zeros((2, 3)), DEFAULTS)
+    assert_allclose(solution.poses, [[0, 0, 0], [1, 0, 0]], atol=1e-3)
+    assert solution.cost == pytest.approx(5.0, abs=1e-3)
+
+
+# How it ends
+
+
+def test_it_converges(world):
+    graph, truth = world
+    options = OptimiserOptions(outer_iterations=1000)
+    solution = solve(graph, truth, options)
+    assert solution.status is Status.CONVERGED
+    assert solution.outer_iterations < 1000
+    small = -np.diff(solution.history) <= options.outer_tolerance * solution.history[1:]
+    assert small[-2:].all() and not (small[:-2] & small[1:-1]).any()
+
+
+@pytest.mark.parametrize('outer', [0, 1, 3])
+def test_the_iteration_limit_is_kept_and_named(outer, world):
+    graph, _ = world
+    options = OptimiserOptions(outer_iterations=outer)
+    solution = solve(graph, odometry_poses(graph), options)
+    assert solution.status is Status.ITERATION_LIMIT
+    assert solution.outer_iterations == outer
+    assert 0 <= solution.inner_iterations <= outer * options.inner.iterations
+    assert solution.dual.shape == (3 * len(graph.between),)
+    assert np.isinf(solution.gap) == (outer == 0)
+
+
+def test_where_nothing_is_better_it_has_converged():
+    """At the median to the last bit no step lowers the cost, and the dual proves it."""
+    poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    solution = solve(parallel(0.0, 1.0, 5.0), poses, DEFAULTS)
+    assert solution.status is Status.CONVERGED
+    assert solution.cost == 5.0
+    assert_array_equal(solution.poses, poses)
+
+
+def test_a_deadline_that_has_passed_leaves_one_linearisation(world):
+    graph, _ = world
+    start = odometry_poses(graph)
+    solution = solve(graph, start, DEFAULTS, deadline=time.monotonic())
+    assert solution.status is Status.OUT_OF_TIME
+    assert solution.outer_iterations == 1
+    assert solution.cost < cost(graph, start)
+
+
+def test_a_cost_of_zero_is_the_end(rng):
+    graph = parallel(1.0)
+    solution = solve(graph, odometry_poses(graph), DEFAULTS)
+    assert (solution.status, solution.cost, solution.gap) == (Status.CONVERGED, 0.0, 0.0)
+    assert solution.outer_iterations == solution.inner_iterations == 0
+    assert_array_equal(solution.dual, np.zeros(3))
+
+
+def test_one_keyframe_is_solved():
+    graph = FactorGraph(se2)
+    graph.add_poses(1)
+    solution = solve(graph, se2.identity(1), DEFAULTS)
+    assert (solution.status, solution.cost) == (Status.CONVERGED, 0.0)
+    assert_array_equal(solution.poses, se2.identity(1))
+
+
+def test_a_graph_that_fits_to_rounding_is_solved(rng):
+    truth = drive(30, rng)
+    graph = graph_of(truth, chain_and_loops(30, 20, rng))
+    solution = solve(graph, se2.retract(truth, 1e-9 * rng.standard_normal((30, 3))), DEFAULTS)
+    assert_allclose(se2.between(solution.poses[:1], solution.poses), se2.between(truth[:1], truth),
+                    atol=1e-8)
+
+
+def test_chains_without_loops_are_solved_from_anywhere():
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        truth = drive(2, rng)
+        solution = solve(graph_of(truth, [(0, 1)]), se2.identity(2), DEFAULTS)
+        assert_allclose(solution.poses, truth, atol=1e-9)
+
+
+def test_progress_is_reported(world):
+    graph, truth = world
+    reports = []
+    solution = solve(graph, truth, OptimiserOptions(outer_iterations=4),
+                        report=lambda k, value: reports.append((k, value)))
+    assert reports == list(enumerate(solution.history))[1:]
+
+
+def test_poses_and_dual_are_left_as_they_were(world):
+    graph, poses = world
+    dual = np.zeros(3 * len(graph.between))
+    before = poses.copy()
+    poses.flags.writeable = dual.flags.writeable = False
+    solve(graph, poses, OptimiserOptions(outer_iterations=2), dual=dual)
+    assert_array_equal(poses, before)
+    assert_array_equal(dual, 0)
+
+
+# The dual
+
+
+def test_the_dual_proves_how_good_the_last_step_was(world):
+    graph, truth = world
+    solution = solve(graph, truth, OptimiserOptions(outer_iterations=1000))
+    system = linearise(graph, solution.poses)
+    assert np.abs(solution.dual).max() <= 1
+    within = duality_gap(system.A, system.b, np.zeros(system.A.shape[1]), solution.dual,
+                         np.full(system.A.shape[1], 0.01))
+    assert 0 <= within < 0.01 * solution.cost
+    assert 0 <= solution.gap < 1e-3 * solution.cost
+
+
+def test_with_the_dual_returned_it_converges_at_once(world):
+    graph, truth = world
+    first = solve(graph, truth, OptimiserOptions(outer_iterations=1000))
+    again = solve(graph, first.poses, DEFAULTS, dual=first.dual)
+    assert again.status in (Status.CONVERGED, Status.STALLED)
+    assert again.outer_iterations <= 4
+    assert first.cost - again.cost <= 2e-5 * first.cost
+
+
+def test_a_dual_kept_from_step_to_step_leads_further(world):
+    """Ten linearisations of 100 iterations: the reason why the paper's own costs are higher."""
+    graph, truth = world
+    best = solve(graph, truth, OptimiserOptions(outer_iterations=1000)).cost
+    options = OptimiserOptions(outer_iterations=1, inner=PrimalDualOptions(iterations=100))
+    zeros = np.zeros(3 * len(graph.between))
+    excess = []
+    for kept in True, False:
+        poses, dual = truth, zeros
+        for _ in range(10):
+            solution = solve(graph, poses, options, dual=dual)
+            poses, dual = solution.poses, solution.dual if kept else zeros
+        excess.append(solution.cost / best - 1)
+    assert excess[0] < excess[1] / 2
+
+
+# Backtracking
+
+
+def test_a_step_that_lowers_the_cost_is_taken_whole(world):
+    graph, truth = world
+    start = solve(graph, truth, OptimiserOptions(outer_iterations=1)).poses
+    system = linearise(graph, start)
+    _, step = linprog_l1(system.A, system.b, box=0.01)
+    poses, value = backtrack(graph, start, step, cost(graph, start))
+    assert_array_equal(poses, step_poses(graph, start, step))
+    assert value == cost(graph, poses) < cost(graph, start)
+
+
+@pytest.mark.parametrize('length, taken', [
+    (1.0, 1.0), (1.5, 1.5), (2.0, 1.0), (3.0, 1.5), (30.0, 1.875), (63.0, 63 / 32)])
+def test_a_step_too_long_is_halved(length, taken):
+    """The best is at 1; at 2 the cost is that of the start, which is no gain."""
+    graph, start = parallel(1.0), np.zeros((2, 3))
+    poses, value = backtrack(graph, start, np.array([length, 0.0, 0.0]), 1.0)
+    assert_array_equal(poses, [[0, 0, 0], [taken, 0, 0]])
+    assert value == abs(taken - 1)
+
+
+@pytest.mark.parametrize('step', [[-1.0, 0, 0], [64.0, 0, 0], [0.0, 0, 0], [np.nan, 0, 0]])
+def test_a_direction_that_is_no_good_is_given_up(step):
+    graph, start = parallel(1.0), np.zeros((2, 3))
+    poses, value = backtrack(graph, start, np.array(step), 1.0)
+    assert poses is start and value == 1.0
+
+
+def test_far_is_more_than_a_hundredth():
+    assert is_far(102.0, 100.0) and not is_far(100.9, 100.0)
+    assert is_far(1.0, 0.0) and not is_far(0.0, 0.0)
+
+
+# Priors
+
+
+def test_priors_meet_at_their_median():
+    """All look north, so that x and y of the map are the axes of their residuals."""
+    graph = FactorGraph(se2)
+    graph.add_poses(1)
+    places = np.array([(0.0, 2.0, np.pi / 2), (1.0, 4.0, np.pi / 2), (5.0, 3.0, np.pi / 2)])
+    graph.add_prior(np.zeros(3, int), places, np.broadcast_to(np.eye(3), (3, 3, 3)))
+    solution = solve(graph, se2.identity(1), DEFAULTS)
+    assert_allclose(solution.poses, [[1.0, 3.0, np.pi / 2]], atol=1e-3)
+    assert solution.cost == pytest.approx(5.0 + 2.0, abs=1e-2)
+
+
+def test_priors_put_the_map_in_its_place(world, rng):
+    graph, truth = world
+    alone = solve(graph, truth, DEFAULTS)
+    there = se2.compose(np.broadcast_to([10.0, 20.0, 0.5], truth.shape), truth)
+    graph.add_prior(np.array([0]), there[:1], np.eye(3)[None])
+    solution = solve(graph, there, DEFAULTS)
+    assert solution.cost == pytest.approx(alone.cost, rel=1e-4)
+    assert_allclose(solution.poses[0], there[0], atol=1e-3)
+    assert len(solution.dual) == 3 * (len(graph.between) + 1)
+
+
+@pytest.mark.parametrize('outer', [0, 30])
+def test_the_dual_has_rows_for_priors_even_if_nothing_was_solved(outer):
+    graph = parallel(1.0)
+    graph.add_prior(np.array([0]), np.zeros((1, 3)), np.eye(3)[None])
+    solution = solve(graph, odometry_poses(graph), OptimiserOptions(outer_iterations=outer))
+    assert len(solution.dual) == 6

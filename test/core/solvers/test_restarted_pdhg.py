@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fast primal-dual method: kernel against NumPy, answers against HiGHS, starts, deadlines."""
+
+import time
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import linprog_l1, noisy_graph
+
+from l1slam_ros.core.graph.linear_system import LinearSystem, linearise
+from l1slam_ros.core.graph.tiles import Tiles
+from l1slam_ros.core.kernels import halpern as kernels
+from l1slam_ros.core.solvers.optimality import Status, l1_cost
+from l1slam_ros.core.solvers.primal_dual import CHECK_EVERY, PrimalDualOptions, minimise_l1
+from l1slam_ros.core.solvers.restarted_pdhg import halpern_step, minimise_l1_halpern, scaled_system
+
+BLOCK_SIZES = [1, 2, 3, 6]
+
+
+def chain_with_loops(k, rng, size=12, loops=20, priors=2):
+    """Return a system with a keyframe held fixed, loops, and priors; blocks differ in scale."""
+    i = np.concatenate((np.arange(-1, size - 1), rng.integers(0, size, loops)))
+    j = np.concatenate((np.arange(size), (i[size:] + rng.integers(1, size, loops)) % size))
+    i[0] = size
+    keyframe = np.stack((i, j), axis=1)
+    keyframe = np.concatenate((keyframe, np.stack((rng.integers(0, size, priors),
+                                                   np.full(priors, size)), axis=1)))
+    m = len(keyframe)
+    blocks = rng.standard_normal((m, 2, k, k)) * 10 ** rng.uniform(-1, 1, (m, 1, 1, 1))
+    blocks[len(i):, 1] = 0
+    return LinearSystem(keyframe, blocks, rng.standard_normal(m * k), size)
+
+
+def zeros(system):
+    return np.zeros(system.size * system.block_size), np.zeros(len(system.b))
+
+
+def laid_out(system, y, y0, dtype):
+    """Return tiles (flat), keyframes and their order, written out anew."""
+    k = system.block_size
+    tiles = Tiles(system.keyframe, system.size, kernels.LANES)
+    rows = np.concatenate((system.blocks.reshape(-1, 2 * k * k),
+                           *(v.reshape(-1, k) for v in (system.b, y, y0))), axis=1)
+    packed = tiles.pack(rows).astype(dtype)
+    return tiles, packed, packed.reshape(len(packed), -1)
+
+
+# Scaling
+
+
+@pytest.mark.parametrize('k', BLOCK_SIZES)
+def test_the_scaled_operator_is_within_1_and_close_to_it(k, rng):
+    scaled, _ = scaled_system(chain_with_loops(k, rng))
+    assert 0.5 < np.linalg.norm(scaled.A.toarray(), 2) <= 1 + 1e-12
+
+
+@pytest.mark.parametrize('k', BLOCK_SIZES)
+def test_scaling_changes_the_unknowns_alone(k, rng):
+    system = chain_with_loops(k, rng)
+    scaled, inverse = scaled_system(system)
+    z = rng.standard_normal((system.size, k))
+    x = np.einsum('nij,nj->ni', inverse, z).ravel()
+    assert_allclose(scaled.A @ z.ravel(), system.A @ x, atol=1e-9)
+
+
+def test_a_keyframe_without_factors_is_no_trouble(rng):
+    system = chain_with_loops(3, rng)
+    lonely = LinearSystem(np.where(system.keyframe == 12, 13, system.keyframe), system.blocks,
+                          system.b, 13)
+    solution = minimise_l1_halpern(lonely, *zeros(lonely), PrimalDualOptions(iterations=400))
+    assert_array_equal(solution.x[-3:], 0)
+    assert np.isfinite(solution.x).all()
+
+
+# The kernel
+
+
+@pytest.mark.parametrize('dtype, within', [(np.float32, 2e-4), (np.float64, 1e-6)])
+@pytest.mark.parametrize('k', BLOCK_SIZES)
+def test_the_kernel_takes_the_steps_of_the_page(k, dtype, within, rng):
+    """Iteration for iteration; tiles are packed in single precision, so A itself is rounded."""
+    system, _ = scaled_system(chain_with_loops(k, rng))
+    y0 = rng.uniform(-1, 1, len(system.b))
+    y, weight, K = y0.copy(), 0.7, (0,) * k
+    layout, packed, flat = laid_out(system, y, y0, dtype)
+    x, z, g = np.zeros((3, system.size + 1, k), dtype)
+    kernels.adjoint(flat, layout.keyframes, g, K)
+    expected = np.zeros(system.size * k)
+    for iteration in range(30):
+        kernels.iterate(flat, layout.keyframes, x, z, g, weight, iteration, 1, K)
+        expected, y = halpern_step(system.A, system.b, expected, y, y0, weight, iteration)
+        found_y = layout.unpack(packed[:, 2 * k * k + k: 2 * k * k + 2 * k]).ravel()
+        assert_allclose(x[:-1].ravel(), expected, atol=within * max(1, np.abs(expected).max()))
+        assert_allclose(found_y, y, atol=within)
+        assert_allclose(g[:-1].ravel(), system.A.T @ y, atol=10 * within)
+        assert_array_equal(x[-1], 0)
+
+
+@pytest.mark.parametrize('k', BLOCK_SIZES)
+def test_many_iterations_at_once_are_as_many_single_ones(k, rng):
+    system, _ = scaled_system(chain_with_loops(k, rng))
+    _, y = zeros(system)
+    ends = []
+    for counts in ([17], [1] * 17, [5, 12]):
+        layout, _, flat = laid_out(system, y, y, np.float32)
+        x, z, g = np.zeros((3, system.size + 1, k), np.float32)
+        done = 0
+        for count in counts:
+            kernels.iterate(flat, layout.keyframes, x, z, g, 0.3, done, count, (0,) * k)
+            done += count
+        ends.append(x)
+    assert_array_equal(ends[0], ends[1])
+    assert_array_equal(ends[0], ends[2])
+
+
+@pytest.mark.parametrize('k', BLOCK_SIZES)
+def test_a_look_finds_the_next_point_and_its_residual(k, rng):
+    system, _ = scaled_system(chain_with_loops(k, rng))
+    A, b, weight, K = system.A, system.b, 0.4, (0,) * k
+    y = rng.uniform(-1, 1, len(b))
+    layout, _, flat = laid_out(system, y, y, np.float32)
+    x, g, x_bar, g_bar = np.zeros((4, system.size + 1, k), np.float32)
+    x[:-1] = rng.standard_normal((system.size, k))
+    kernels.adjoint(flat, layout.keyframes, g, K)
+    y_bar = np.zeros((len(flat), k * kernels.LANES), np.float32)
+    residual, cost, dual = kernels.look(flat, layout.keyframes, x, g, weight, x_bar, g_bar,
+                                        y_bar, K)
+    d = A.T @ y / weight
+    at = x[:-1].ravel().astype(float)
+    new = np.clip(y + weight * (A @ (at - 2 * d) - b), -1, 1)
+    dy = new - y
+    assert_allclose(x_bar[:-1].ravel(), at - d, atol=1e-4)
+    assert_allclose(layout.unpack(y_bar.reshape(-1, k, kernels.LANES)).ravel(), new, atol=1e-4)
+    assert_allclose(g_bar[:-1].ravel(), A.T @ new, atol=1e-3)
+    assert residual == pytest.approx(weight * d @ d + dy @ dy / weight + 2 * dy @ (A @ d),
+                                     rel=1e-3)
+    assert cost == pytest.approx(l1_cost(A @ (at - d) - b), rel=1e-4)
+    assert dual == pytest.approx(-b @ new, rel=1e-3, abs=1e-3)
+
+
+# The solver
+
+
+@pytest.mark.parametrize('k', BLOCK_SIZES)
+def test_it_agrees_with_highs(k, rng):
+    for _ in range(3):
+        system = chain_with_loops(k, rng)
+        options = PrimalDualOptions(iterations=200_000, tolerance=1e-4)
+        solution = minimise_l1_halpern(system, *zeros(system), options)
+        best, _ = linprog_l1(system.A, system.b)
+        assert solution.status is Status.CONVERGED
+        assert (1 - 1e-9) * best <= solution.objective <= (1 + 1e-4) * best
+        assert solution.objective == pytest.approx(l1_cost(system.A @ solution.x - system.b))
+        assert np.abs(solution.y).max() <= 1
+
+
+def test_it_agrees_with_highs_on_a_pose_graph_in_far_fewer_iterations_than_algorithm_2(rng):
+    graph, truth = noisy_graph(200, 300, rng)
+    system = linearise(graph, truth)
+    best, _ = linprog_l1(system.A, system.b)
+    fast = minimise_l1_halpern(system, *zeros(system), PrimalDualOptions(
+        iterations=100_000, tolerance=1e-4))
+    plain = minimise_l1(system.A, system.b, *zeros(system), PrimalDualOptions(
+        iterations=2 * fast.iterations, tolerance=0.0))
+    assert fast.objective == pytest.approx(best, rel=1e-4)
+    assert plain.objective - best > 2 * (fast.objective - best)
+
+
+@pytest.mark.parametrize('offset', [0.0, 1e4])
+def test_single_precision_is_refined(offset, rng):
+    """A start far away: in single precision alone A x would lose what b holds."""
+    system = chain_with_loops(3, rng)
+    x, y = zeros(system)
+    moved = LinearSystem(system.keyframe, system.blocks,
+                         system.b + system.A @ np.full(len(x), offset), system.size)
+    solution = minimise_l1_halpern(moved, x + offset, y, PrimalDualOptions(
+        iterations=100_000, tolerance=1e-5))
+    best, _ = linprog_l1(system.A, system.b)
+    assert solution.status is Status.CONVERGED
+    assert solution.objective == pytest.approx(best, rel=2e-5)
+
+
+@pytest.mark.parametrize('k', [1, 3])
+def test_the_gap_bounds_the_error_within_its_box(k, rng):
+    """Early and late, against HiGHS inside the box that the docstring names."""
+    system = chain_with_loops(k, rng)
+    scaled, inverse = scaled_system(system)
+    for iterations in (40, 400, 4000):
+        solution = minimise_l1_halpern(system, *zeros(system), PrimalDualOptions(
+            iterations=iterations, tolerance=0.0))
+        z = np.linalg.solve(inverse, solution.x.reshape(-1, k, 1)).ravel()
+        best, _ = linprog_l1(scaled.A, scaled.b, np.abs(z) + 1 / solution.weight)
+        assert solution.objective - solution.gap <= best * (1 + 1e-5)
+
+
+def test_a_warm_start_needs_fewer_iterations(rng):
+    graph, truth = noisy_graph(200, 300, rng)
+    system = linearise(graph, truth)
+    options = PrimalDualOptions(iterations=100_000, tolerance=1e-3)
+    cold = minimise_l1_halpern(system, *zeros(system), options)
+    moved = LinearSystem(system.keyframe, system.blocks,
+                         system.b + 1e-4 * rng.standard_normal(len(system.b)), system.size)
+    again = minimise_l1_halpern(moved, *zeros(system), options)
+    warm = minimise_l1_halpern(moved, cold.x, cold.y, options, cold.weight)
+    assert warm.status is again.status is Status.CONVERGED
+    assert warm.iterations < again.iterations / 2
+
+
+@pytest.mark.parametrize('iterations', [1, 39, 40, 41, 100])
+def test_the_iteration_limit_is_kept_and_named(iterations, rng):
+    system = chain_with_loops(3, rng)
+    solution = minimise_l1_halpern(system, *zeros(system), PrimalDualOptions(
+        iterations=iterations, tolerance=0.0))
+    assert solution.status is Status.ITERATION_LIMIT
+    assert solution.iterations == iterations == solution.history[-1, 0]
+    assert solution.history[0, 1] == l1_cost(system.b)
+    assert solution.history[-1, 1] == solution.objective
+
+
+def test_a_deadline_that_has_passed_ends_it_at_the_next_look(rng):
+    system = chain_with_loops(3, rng)
+    options = PrimalDualOptions(iterations=10**6, tolerance=0.0)
+    solution = minimise_l1_halpern(system, *zeros(system), options, deadline=time.monotonic())
+    assert solution.status is Status.OUT_OF_TIME
+    assert solution.iterations == CHECK_EVERY
+
+
+def test_a_deadline_to_come_is_kept(rng):
+    system = chain_with_loops(3, rng)
+    options = PrimalDualOptions(iterations=10**7, tolerance=0.0)
+    minimise_l1_halpern(system, *zeros(system), PrimalDualOptions(iterations=1))
+    start = time.monotonic()
+    solution = minimise_l1_halpern(system, *zeros(system), options, deadline=start + 0.05)
+    assert solution.status is Status.OUT_OF_TIME
+    assert 0.05 <= time.monotonic() - start < 1
+
+
+def test_inputs_are_never_written_to(rng):
+    system = chain_with_loops(2, rng)
+    x, y = rng.standard_normal(24), rng.uniform(-1, 1, len(system.b))
+    arrays = (system.keyframe, system.blocks, system.b, x, y)
+    before = [array.copy() for array in arrays]
+    for array in arrays:
+        array.flags.writeable = False
+    minimise_l1_halpern(system, x, y, PrimalDualOptions(iterations=200, tolerance=0.0))
+    for array, expected in zip(arrays, before, strict=True):
+        assert_array_equal(array, expected)
+
+
+def test_a_system_without_factors_or_without_keyframes():
+    empty = LinearSystem(np.zeros((0, 2), np.int64), np.zeros((0, 2, 3, 3)), np.zeros(0), 4)
+    solution = minimise_l1_halpern(empty, np.ones(12), np.zeros(0), PrimalDualOptions())
+    assert solution.status is Status.CONVERGED and solution.objective == 0
+    assert_array_equal(solution.x, 1)
+    fixed = LinearSystem(np.zeros((1, 2), np.int64), np.zeros((1, 2, 3, 3)), np.ones(3), 0)
+    solution = minimise_l1_halpern(fixed, np.zeros(0), np.zeros(3), PrimalDualOptions())
+    assert solution.objective == 3 and solution.gap == 0
+
+
+def test_an_exact_fit_stays_finite(rng):
+    system = chain_with_loops(3, rng)
+    x = rng.standard_normal(36)
+    exact = LinearSystem(system.keyframe, system.blocks, system.A @ x, system.size)
+    solution = minimise_l1_halpern(exact, x, np.zeros(len(exact.b)), PrimalDualOptions())
+    assert_allclose(solution.x, x, atol=1e-5)
+    cold = minimise_l1_halpern(exact, *zeros(exact), PrimalDualOptions(
+        iterations=20_000, tolerance=1e-6))
+    assert cold.objective < 1e-6 * l1_cost(exact.b)
+
+
+@pytest.mark.parametrize('factor', [1000.0, 1e-6])
+def test_the_unit_of_length_does_not_matter(factor, rng):
+    """Columns in another unit: the same path but for rounding."""
+    system = chain_with_loops(3, rng)
+    other = LinearSystem(system.keyframe, factor * system.blocks, system.b, system.size)
+    options = PrimalDualOptions(iterations=400, tolerance=0.0)
+    one, two = (minimise_l1_halpern(s, *zeros(s), options) for s in (system, other))
+    assert two.objective == pytest.approx(one.objective, rel=1e-3)
+    assert_allclose(factor * two.x, one.x, rtol=0.05, atol=0.05 * np.abs(one.x).max())

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Weighted least squares against dense NumPy, and the start it gives to L1 against HiGHS."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from problems import HAND_SOLVED, consistent, linprog_l1, median, noisy_graph
+from scipy.sparse import csr_array
+from systems import cholesky_of_system, grid, random_loops, random_system, system_of
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.graph.linear_system import linearise
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.optimality import duality_gap, l1_cost
+from l1slam_ros.core.solvers.reweighting import (
+    reweighted_start,
+    reweighted_step,
+    weighted_least_squares,
+)
+
+KINDS = {
+    'dense': lambda rng: random_system([(0, 2), (1, 0)] * 3 + [(2, 1)], 2, 3, rng),
+    'sparse': lambda rng: random_system(grid(10) + random_loops(10), 10, 2, rng),
+    'scaled rows': lambda rng: random_system(grid(10) + random_loops(10), 10, 2, rng, scale=1.5),
+}
+
+
+@pytest.mark.parametrize('weighted', [False, True])
+@pytest.mark.parametrize('damping', [0.0, 0.3])
+@pytest.mark.parametrize('kind', KINDS)
+def test_it_is_the_least_squares_solution(kind, weighted, damping, rng):
+    system = KINDS[kind](rng)
+    weights = rng.uniform(0.1, 5, len(system.b)) if weighted else np.ones_like(system.b)
+    x = weighted_least_squares(system, cholesky_of_system(system), weights, damping)
+    root = np.sqrt(weights)
+    dense = root[:, None] * system.A.toarray()
+    marquardt = np.diag(np.sqrt(damping * (dense**2).sum(axis=0)))
+    expected = np.linalg.lstsq(np.concatenate((dense, marquardt)),
+                               np.concatenate((root * system.b, np.zeros(dense.shape[1]))),
+                               rcond=None)[0]
+    assert_allclose(x, expected, rtol=1e-7, atol=1e-9)
+
+
+def test_a_step_by_hand():
+    """
+    Minimise |x| + |x - 1| + |x - 5| from the mean, x = 2.
+
+    Residuals (2, 1, -3), weights (1/2, 1, 1/3): the weighted mean is 16/11 and the dual
+    (8/11, 5/11, -13/11), of which the last is clipped.
+    """
+    system = system_of(median().A, median().b)
+    cholesky = cholesky_of_system(system)
+    assert_allclose(weighted_least_squares(system, cholesky, np.ones(3)), [2.0])
+    x, y = reweighted_step(system, cholesky, system.times(np.array([2.0])) - system.b, mu=0.0)
+    assert_allclose(x, [16 / 11])
+    assert_allclose(y, [8 / 11, 5 / 11, -1.0])
+
+
+def test_a_part_that_is_not_tied_to_the_anchor_is_named():
+    A = csr_array(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, -1.0]]))
+    system = system_of(A, np.ones(3))
+    with pytest.raises(GraphError, match='not tied to the anchor'):
+        weighted_least_squares(system, cholesky_of_system(system), np.ones(3))
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_the_start_is_within_two_percent_of_the_optimum(kind, rng):
+    for _ in range(10):
+        system = KINDS[kind](rng)
+        x, y = reweighted_start(system, cholesky_of_system(system))
+        best, _ = linprog_l1(system.A, system.b)
+        assert l1_cost(system.A @ x - system.b) <= 1.02 * best
+        assert np.abs(y).max() <= 1
+        assert duality_gap(system.A, system.b, x, y, np.abs(x)) <= 0.05 * best
+
+
+def test_the_start_is_near_the_optimum_of_a_pose_graph(rng):
+    graph, truth = noisy_graph(30, 30, rng)
+    system = linearise(graph, truth)
+    x, y = reweighted_start(system, cholesky_of(graph))
+    best, _ = linprog_l1(system.A, system.b)
+    assert l1_cost(system.A @ x - system.b) <= 1.01 * best
+    assert duality_gap(system.A, system.b, x, y, np.abs(x)) <= 0.05 * best
+
+
+@pytest.mark.parametrize('make', HAND_SOLVED[:-1], ids=lambda make: make.__name__)
+def test_the_start_of_hand_solved_problems(make):
+    problem = make()
+    system = system_of(problem.A, problem.b)
+    x, y = reweighted_start(system, cholesky_of_system(system))
+    assert l1_cost(problem.A @ x - problem.b) <= 1.05 * problem.optimum
+    assert np.abs(y).max() <= 1
+
+
+def test_the_start_of_a_problem_that_fits_exactly():
+    problem = consistent()
+    system = system_of(problem.A, problem.b)
+    x, y = reweighted_start(system, cholesky_of_system(system))
+    assert_allclose(x, problem.x, atol=1e-9)
+    assert np.abs(y).max() <= 1

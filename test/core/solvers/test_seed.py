@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Algorithm 3: exact where there is no noise, and each of its two steps against HiGHS."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import chain_and_loops, drive, graph_of, linprog_l1, noisy_graph, random_information
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.optimality import l1_cost
+from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
+
+
+def seed_of(graph):
+    return seed_poses(graph, cholesky_of(graph))
+
+
+def cost(graph, poses):
+    return l1_cost(whitened_residual(graph, poses))
+
+
+def part(graph, poses, tangent):
+    """Return the A and b of one part of the tangent space, rows and columns alike."""
+    system = linearise(graph, poses)
+    kept = [np.arange(size).reshape(-1, 3)[:, tangent].ravel() for size in system.A.shape]
+    return system.A[kept[0]][:, kept[1]], system.b[kept[0]]
+
+
+def spinning(n, turn):
+    """Return the truth of a robot that turns by `turn` at every keyframe."""
+    poses = np.zeros((n, 3))
+    for k in range(1, n):
+        poses[k] = se2.compose(poses[k - 1 : k], np.array([[1.0, 0.2, turn]]))[0]
+    return poses
+
+
+def test_it_is_exact_on_noise_free_graphs(rng):
+    """One rounding in the measurements, so that no row fits to the last bit."""
+    for n in (5, 20, 60):
+        truth = drive(n, rng)
+        pairs = chain_and_loops(n, n, rng)
+        noise = 1e-12 * rng.standard_normal((len(pairs), 3))
+        poses = seed_of(graph_of(truth, pairs, noise, random_information(len(pairs), rng)))
+        assert_allclose(se2.local(poses, truth), 0, atol=1e-8)
+
+
+def test_it_is_exact_on_graphs_without_any_noise(rng):
+    for _ in range(100):
+        truth = drive(12, rng)
+        poses = seed_of(graph_of(truth, chain_and_loops(12, 2, rng)))
+        assert_allclose(se2.local(poses, truth), 0, atol=1e-9)
+
+
+@pytest.mark.parametrize('turn', [1.5, -2.0, 3.1])
+def test_headings_that_wrap_many_times(turn, rng):
+    n = 120
+    truth = spinning(n, turn)
+    assert n * abs(turn) > 25 * 2 * np.pi
+    pairs = chain_and_loops(n, n, rng)
+    noise = [1e-3, 1e-3, 0.02] * rng.standard_normal((len(pairs), 3))
+    graph = graph_of(truth, pairs, noise)
+    poses = seed_of(graph)
+    assert np.abs(se2.local(poses, truth)[:, 2]).max() < 0.1
+    assert cost(graph, poses) < 1.1 * cost(graph, truth)
+
+
+def test_keyframe_0_is_at_the_identity(rng):
+    graph, _ = noisy_graph(30, 20, rng)
+    assert_array_equal(seed_of(graph)[0], 0)
+
+
+def test_the_rotations_are_the_best_there_are(rng):
+    """No better ones near them, by HiGHS, and none at the truth either."""
+    graph, truth = noisy_graph(40, 40, rng)
+    poses = seed_of(graph)
+    A, b = part(graph, poses, se2.ROTATION)
+    assert l1_cost(b) == pytest.approx(linprog_l1(A, b)[0], rel=1e-4)
+    assert l1_cost(b) <= l1_cost(part(graph, truth, se2.ROTATION)[1])
+
+
+def test_the_translations_are_the_best_for_these_rotations(rng):
+    graph, _ = noisy_graph(40, 40, rng)
+    A, b = part(graph, seed_of(graph), se2.TRANSLATION)
+    assert l1_cost(b) == pytest.approx(linprog_l1(A, b)[0], rel=5e-4)
+
+
+def test_it_is_far_better_than_the_odometry(rng):
+    graph, _ = noisy_graph(150, 100, rng)
+    assert cost(graph, seed_of(graph)) < 0.2 * cost(graph, odometry_poses(graph))
+
+
+def test_a_few_gross_loops_do_not_bend_the_headings(rng):
+    """What L1 is for: three loops of 150 are off by a radian, the headings are not."""
+    truth = drive(60, rng)
+    pairs = chain_and_loops(60, 150, rng)
+    noise = [0.05, 0.05, 0.01] * rng.standard_normal((len(pairs), 3))
+    noise[[70, 100, 130], 2] += 1.0
+    poses = seed_of(graph_of(truth, pairs, noise))
+    assert np.abs(se2.local(poses, truth)[:, 2]).max() < 0.05
+
+
+def test_it_needs_no_odometry(rng):
+    """Keyframes seen from one hub alone, and from each other."""
+    truth = drive(20, rng)
+    pairs = [(7, k) for k in range(20) if k != 7] + [(k, k + 5) for k in range(10, 15)]
+    noise = 0.01 * rng.standard_normal((len(pairs), 3))
+    poses = seed_of(graph_of(truth, pairs, noise))
+    assert np.abs(se2.local(poses, truth)[:, 2]).max() < 0.1
+
+
+def test_it_reads_no_stored_pose(tmp_path, rng):
+    """Two files of one graph with different vertices have one seed."""
+    graph, truth = noisy_graph(30, 20, rng)
+    seeds = []
+    for name, poses in ('good.g2o', truth), ('bad.g2o', 100 * rng.standard_normal(truth.shape)):
+        write_graph_file(tmp_path / name, GraphRecord(graph, poses, np.arange(30)))
+        record = read_graph_file(tmp_path / name)
+        assert_allclose(se2.local(record.poses, poses), 0, atol=1e-9)
+        seeds.append(seed_of(record.graph))
+    assert_array_equal(*seeds)
+
+
+def test_the_order_of_the_factors_does_not_matter_much(rng):
+    graph, _ = noisy_graph(40, 30, rng)
+    factors, order = graph.between, rng.permutation(len(graph.between))
+    shuffled = FactorGraph(se2)
+    shuffled.add_poses(40)
+    root = factors.sqrt_information[order]
+    shuffled.add_between(factors.i[order], factors.j[order], factors.measurement[order],
+                         root.transpose(0, 2, 1) @ root)
+    assert cost(shuffled, seed_of(shuffled)) == pytest.approx(cost(graph, seed_of(graph)),
+                                                                 rel=1e-2)
+
+
+def test_a_graph_in_two_parts_is_refused(rng):
+    with pytest.raises(GraphError, match='keyframe 3 has no path'):
+        seed_of(graph_of(drive(5, rng), [(0, 1), (1, 2), (3, 4)]))

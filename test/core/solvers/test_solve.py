@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which solver a graph gets: by what a factorisation costs, by name, and where one fails."""
+
+import numpy as np
+import pytest
+from problems import chain_and_loops, drive, graph_of
+
+from l1slam_ros.core.errors import FillError, L1SlamError
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.names import SOLVERS
+from l1slam_ros.core.solvers import block_cholesky as cholesky
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
+from l1slam_ros.core.solvers.optimality import Status
+from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.solvers.solve import AUTO, INTERIOR_POINT, PRIMAL_DUAL, choose, minimise_by
+from l1slam_ros.core.worlds.false_loops import random_false_loops
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
+
+DEFAULTS = OptimiserOptions()
+
+
+@pytest.fixture
+def world(rng):
+    return simulate_world(60, 90, WorldOptions(), rng)
+
+
+@pytest.fixture
+def dense(rng):
+    """A graph whose far places are joined at random: half of it ends in one dense block."""
+    truth = drive(600, rng)
+    pairs = chain_and_loops(600, 4000, rng)
+    return graph_of(truth, pairs, 0.01 * rng.standard_normal((len(pairs), 3)))
+
+
+def test_sparse_graphs_get_the_interior_point_and_dense_ones_algorithm_4(world, dense):
+    for graph, expected, expected_reason in ((world.graph, INTERIOR_POINT, 'sparse'),
+                                             (dense, PRIMAL_DUAL, 'dense')):
+        choice = choose(AUTO, graph)
+        assert (choice.solver, choice.falls_back) == (expected, True)
+        assert choice.cholesky is not None
+        assert choice.reason == f'the graph is {expected_reason}'
+        _, solver = minimise_by(choice, graph, seed_poses(graph, choice.cholesky), DEFAULTS)
+        assert solver == expected
+
+
+def test_the_papers_graphs_get_the_interior_point(datasets):
+    from l1slam_ros.io.graphs.graph_file import read_graph_file
+
+    for name in ('intel', 'manhattan3500', 'city10000'):
+        assert choose(AUTO, read_graph_file(datasets / f'{name}.g2o').graph).solver == (
+            INTERIOR_POINT)
+
+
+@pytest.mark.parametrize('solver', SOLVERS[1:])
+def test_a_solver_that_was_asked_for_is_the_one(solver, world, dense):
+    for graph in world.graph, dense:
+        choice = choose(solver, graph)
+        assert (choice.solver, choice.reason, choice.falls_back) == (solver, 'asked for', False)
+        assert choice.cholesky is not None
+
+
+def test_both_solvers_end_at_one_cost(world):
+    start = odometry_poses(world.graph)
+    solved = [minimise_by(choose(solver, world.graph), world.graph, start, DEFAULTS)
+              for solver in SOLVERS]
+    assert [name for _, name in solved] == [INTERIOR_POINT, PRIMAL_DUAL, INTERIOR_POINT]
+    costs = [solution.cost for solution, _ in solved]
+    assert costs == pytest.approx([costs[0]] * 3, rel=1e-3)
+    assert [solution.inner_iterations > 0 for solution, _ in solved] == [False, True, False]
+
+
+def test_a_graph_that_fills_in_gets_algorithm_4(world, monkeypatch):
+    """With memory for a few blocks only: nothing is factored, and it is solved all the same."""
+    graph = world.graph
+    expected = minimise_by(choose(AUTO, graph), graph, world.truth, DEFAULTS)[0].cost
+    monkeypatch.setattr(cholesky, 'MOST_BLOCKS', 30)
+    for solver in AUTO, PRIMAL_DUAL:
+        choice = choose(solver, graph)
+        assert (choice.cholesky, choice.solver) == (None, PRIMAL_DUAL)
+        assert choice.reason == 'the graph is too dense to be factorised'
+        solution, name = minimise_by(choice, graph, seed_poses(graph, None), DEFAULTS)
+        assert name == PRIMAL_DUAL
+        assert solution.cost == pytest.approx(expected, rel=1e-3)
+
+
+def test_the_interior_point_of_a_graph_that_fills_in_is_refused(world, monkeypatch):
+    monkeypatch.setattr(cholesky, 'MOST_BLOCKS', 30)
+    with pytest.raises(FillError, match='60|59 keyframes') as refusal:
+        choose(INTERIOR_POINT, world.graph)
+    assert isinstance(refusal.value, L1SlamError) and '\n' not in str(refusal.value)
+
+
+@pytest.mark.parametrize('solver, expected', [(AUTO, PRIMAL_DUAL), (INTERIOR_POINT,) * 2])
+def test_algorithm_4_goes_on_where_the_interior_point_failed_unless_it_was_asked_for(
+        solver, expected, rng):
+    """From raw odometry, a third of the loops false, three steps are not enough."""
+    world = simulate_world(150, 220, WorldOptions(), rng)
+    loops = random_false_loops(world.graph, world.truth, 30, rng)
+    graph = with_false_loops(world, loops).graph
+    start = odometry_poses(graph)
+    options = OptimiserOptions(outer_iterations=3)
+    asked, _ = minimise_by(choose(INTERIOR_POINT, graph), graph, start, options)
+    assert asked.status is not Status.CONVERGED
+    solution, name = minimise_by(choose(solver, graph), graph, start, options)
+    assert name == expected
+    assert (solution.cost < asked.cost) == (expected == PRIMAL_DUAL)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_auto_is_never_worse_than_the_interior_point_alone(seed):
+    rng = np.random.default_rng(seed)
+    world = simulate_world(150, 220, WorldOptions(), rng)
+    graph = with_false_loops(world, random_false_loops(world.graph, world.truth, 30, rng)).graph
+    alone, chosen = (minimise_by(choose(solver, graph), graph, world.truth, DEFAULTS)[0].cost
+                     for solver in (INTERIOR_POINT, AUTO))
+    assert chosen <= alone
+
+
+def test_progress_is_reported_by_every_solver(world):
+    for solver in SOLVERS:
+        reports = []
+        choice = choose(solver, world.graph)
+        solution, _ = minimise_by(choice, world.graph, world.truth, DEFAULTS,
+                                  lambda k, cost, reports=reports: reports.append((k, cost)))
+        assert reports[-1][1] == solution.cost
+        assert 0 < len(reports) <= solution.outer_iterations

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Once the cache is full nothing is compiled any more: a robot would stand still meanwhile."""
+
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l1slam_ros.core import kernels
+from l1slam_ros.core.solvers.warm_up import DENSE, JUDGEMENT, SPARSE, STEPS, warm_up
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.compilation import fill_cache
+from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
+
+# Prints what a process compiles.
+WORK = """
+import importlib
+import itertools
+import pkgutil
+from dataclasses import replace
+
+import numpy as np
+from lies import careful_world, drive_roundabout, roundabout, seen, spoilt
+from problems import play
+
+from l1slam_ros.io import formats
+from l1slam_ros.cli import offline
+from l1slam_ros.io.compilation import fill_cache
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core import kernels
+from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions, optimise
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.robust.inspection import connected_parts
+from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
+from l1slam_ros.core.solvers.reweighting import weighted_least_squares
+from l1slam_ros.core.graph.linear_system import linearise
+from l1slam_ros.core.names import NORMS, STARTS
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+
+MODULES = [importlib.import_module(f'{kernels.__name__}.{module.name}')
+           for module in pkgutil.iter_modules(kernels.__path__)]
+
+
+def compiled_here():
+    return {(kernel.py_func.__module__, kernel.py_func.__name__, str(signature))
+            for module in MODULES for kernel in vars(module).values()
+            if hasattr(kernel, 'signatures') for signature in kernel.stats.cache_misses}
+
+
+def look(what):
+    for module, name, signature in sorted(compiled_here()):
+        print(f'{what}: {module}.{name}{signature}')
+
+
+assert fill_cache(lambda done, total: None, lambda: False)
+assert not compiled_here()
+
+every = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
+world = spoilt(careful_world(150, 300), 'grouped', 60)
+for enabled in (True, False):
+    options = replace(every, robust=RobustOptions(enabled))
+    backend = Backend(se2, options)
+    for k in range(0, 150, 15):
+        play(backend, world, k, k + 15)
+        backend.update(0.001 if k % 2 else 60.0)
+    backend.loop_states()
+    look(f'updates, robust {enabled}')
+    backend.adopt(optimise(backend.problem(), options.solver))
+    look(f'optimise, robust {enabled}')
+    after = Backend(se2, options)
+    after.restore(backend.growth.graph, backend.poses, backend.growth.stamps)
+    after.update(60.0)
+    look(f'restored, robust {enabled}')
+
+truth = roundabout(220)
+backend = Backend(se2, every)
+drive_roundabout(backend, truth)
+for i, j in ((3, 203), (30, 140)):
+    backend.add_loop(seen(truth, i, j))
+    backend.update(60.0)
+look('pairs of loops')
+
+def slipped(world):
+    factors, graph = world.graph.between, type(world.graph)(se2)
+    graph.add_poses(world.graph.n_poses)
+    measurement = factors.measurement.copy()
+    measurement[np.flatnonzero(factors.is_odometry)[80]] += [5.0, 0.0, 0.0]
+    roots = factors.sqrt_information
+    graph.add_between(factors.i, factors.j, measurement, roots.transpose(0, 2, 1) @ roots)
+    return graph
+
+def solved(graph, poses, **wish):
+    record = GraphRecord(graph, poses, np.arange(graph.n_poses))
+    offline.solve(record, offline.Wish(**wish), lambda iteration, cost: None)
+
+solved(slipped(world), None, robust=True)
+look('a slip')
+for start, norm, robust in itertools.product(STARTS, NORMS, (False, True)):
+    for poses in (world.odometry, np.asfortranarray(world.odometry)):
+        solved(world.graph, poses, start=start, norm=norm, robust=robust)
+        look(f'{start}, {norm}, robust {robust}')
+for solver in ('primal-dual', 'interior-point'):
+    solved(world.graph, world.odometry, solver=solver)
+    look(solver)
+
+cholesky = cholesky_of(world.graph)
+system = linearise(world.graph, world.odometry)
+weighted_least_squares(system, cholesky, np.ones_like(system.b), 0.1)
+scattered = 20 * np.random.default_rng(0).standard_normal((150, 3))
+minimise_l2(world.graph, scattered, LeastSquaresOptions(), cholesky)
+look('damped steps')
+connected_parts(world.graph)
+world.graph.add_prior(np.array([7]), world.truth[7:8], np.eye(3)[None])
+for norm in NORMS:
+    solved(world.graph, world.odometry, norm=norm)
+look('a prior')
+used = [kernel for module in MODULES for kernel in vars(module).values()
+        if hasattr(kernel, 'takes') and kernel.stats.cache_hits]
+assert len(used) > 25, 'are the kernels not where this test looks for them?'
+"""
+
+# What somebody does with a file first; prints what it imports, and how many loops it reads.
+LOOK = """
+import sys
+from pathlib import Path
+import numpy as np
+from l1slam_ros.io import formats
+from l1slam_ros.cli import offline
+from l1slam_ros.core.robust.inspection import noise_scales
+
+record = formats.read_input(Path(sys.argv[1]))
+if sys.argv[2] == 'info':
+    noise_scales(record.graph, np.random.default_rng(0))
+else:
+    wish = offline.Wish(robust=sys.argv[2] == 'robust')
+    offline.solve(record, wish, lambda iteration, cost: None)
+kernels = [kernel for name in list(sys.modules) if name.startswith('l1slam_ros.core.kernels.')
+           for kernel in vars(sys.modules[name]).values() if hasattr(kernel, 'takes')]
+print(sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels))
+print(*sys.modules)
+"""
+
+
+def test_nothing_is_compiled_once_the_cache_is_full():
+    done = subprocess.run([sys.executable, '-c', WORK], capture_output=True, text=True,
+                          timeout=240, cwd=Path(__file__).parents[2])
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ''
+
+
+@pytest.fixture(scope='module')
+def world(tmp_path_factory):
+    """A graph file; the cache is full."""
+    fill_cache(lambda done, total: None, lambda: False)
+    path = tmp_path_factory.mktemp('world') / 'world.g2o'
+    made = simulate_world(150, 300, WorldOptions(), np.random.default_rng(0))
+    write_graph_file(path, GraphRecord(made.graph, made.odometry, np.arange(150)))
+    return path
+
+
+@pytest.mark.parametrize('what, most_loops, missing', [
+    ('info', 0, {'numba', 'llvmlite', 'scipy.special', 'scipy.sparse.csgraph._shortest_path'}),
+    ('plain', 20, {'l1slam_ros.core.kernels.prediction', 'l1slam_ros.core.kernels.halpern',
+                   'scipy.sparse', 'scipy.special', 'scipy.linalg'}),
+    ('robust', 27, {'l1slam_ros.core.kernels.halpern', 'scipy.sparse', 'scipy.special',
+                    'scipy.linalg'}),
+])
+def test_only_what_is_needed_is_read(world, what, most_loops, missing):
+    done = subprocess.run([sys.executable, '-c', LOOK, str(world), what], capture_output=True,
+                          text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    loops, modules = done.stdout.splitlines()
+    assert int(loops) <= most_loops
+    assert not missing & set(modules.split())
+
+
+def test_each_step_is_reported_once_it_is_done():
+    said = []
+    warm_up(said.append)
+    assert tuple(said) == STEPS
+
+
+def test_every_module_of_loops_is_a_step():
+    modules = {module.name for module in pkgutil.iter_modules(kernels.__path__)}
+    assert sorted(STEPS) == sorted(modules - {'compiled'})
+    assert set(STEPS) == {*SPARSE, *JUDGEMENT, *DENSE}

@@ -1,0 +1,451 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Damaged bags: all before the damage is used, it is said, nothing else is lost or made up."""
+
+import re
+import shutil
+import time
+from collections import Counter
+from contextlib import suppress
+from io import BytesIO
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+
+from bags import (
+    KINDS,
+    NOTE,
+    TYPES,
+    mcap_file,
+    recording_of,
+    ros1_file,
+    rosbag2_directory,
+    split_directory,
+    write_mcap,
+    write_world,
+)
+from l1slam_ros.cli.main import main
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.io.bags.damaged.salvage import Salvage
+from l1slam_ros.io.bags.from_graph import GRAPH_NOTE
+from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note, read_raw
+from l1slam_ros.io.formats import read_input
+from l1slam_ros.io.graphs.graph_file import read_graph_file
+
+LONGEST = 2.0  # [s] a command may take on a damaged bag
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    """Return a bag of this package: 200 odometry messages, 101 loops."""
+    path = tmp_path_factory.mktemp('world') / 'bag'
+    write_world(path, 200, 300)
+    return path
+
+
+@pytest.fixture(scope='module')
+def recording(bag):
+    return recording_of(bag)
+
+
+def read(path, topics=None):
+    """Return what can be read as a recording, and what is said of damage."""
+    said = []
+    messages = [tuple(m) for m in read_raw(path, topics, said.append)]
+    messages = [(topic, msgtype, moment, data) for topic, msgtype, moment, data in messages]
+    assert len(said) <= 1 and not any('\n' in sentence for sentence in said)
+    return messages, ''.join(said)
+
+
+def assert_told(said, path, used):
+    assert re.fullmatch(rf'{re.escape(str(path))} is damaged(:| after) .*[^;]; '
+                        rf'{used:,} messages before that were used', said), said
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_what_is_whole_is_walked_to_its_end(tmp_path, recording, kind):
+    salvage = Salvage(KINDS[kind](tmp_path, recording))
+    found = list(salvage.messages(None, None, None))
+    assert salvage.damage is None
+    assert [m[:3] for m in found] == [m[:3] for m in recording]
+    if not kind.startswith('ROS 1'):
+        assert [m.data for m in found] == [m[3] for m in recording]
+
+
+# What the file holds up to a byte, by independent means: kind -> the file's bytes, and where it
+# ends after each message of the recording, in the order of writing.
+def unchunked(folder, recording):
+    stream, ends = BytesIO(), []
+    write_mcap(stream, recording, ends, use_chunking=False)
+    return 'a.mcap', stream.getvalue(), ends
+
+
+def uncompressed(folder, recording):
+    whole = mcap_file(folder / 'a.mcap', recording, compression=CompressionType.NONE,
+                      chunk_size=100_000).read_bytes()
+    ends, at = [], 0
+    for *_, data in recording:
+        at = whole.index(data, at) + len(data)
+        ends.append(at)
+    return 'a.mcap', whole, ends
+
+
+def database(folder, recording):
+    """SQLite reads whole pages."""
+    bag = rosbag2_directory(folder / 'a', recording, StoragePlugin.SQLITE3)
+    whole = (bag / 'a.db3').read_bytes()
+    return 'a.db3', whole, [(whole.index(data) // 4096 + 1) * 4096 for *_, data in recording]
+
+
+def ros1(folder, recording):
+    whole = ros1_file(folder / 'a.bag', recording).read_bytes()
+    ends, at = [], 0
+    for _, msgtype, _, data in recording:
+        message = bytes(TYPES.cdr_to_ros1(data, msgtype))
+        at = whole.index(message, at) + len(message)
+        ends.append(at)
+    return 'a.bag', whole, ends
+
+
+@pytest.mark.parametrize('kind', [unchunked, uncompressed, database, ros1])
+def test_every_message_before_a_cut_is_used_and_no_other(tmp_path, recording, kind, rng):
+    name, whole, ends = kind(tmp_path, recording)
+    assert len(ends) == len(recording) and sorted(ends) == ends
+    path = tmp_path / f'cut_{name}'
+    for cut in rng.integers(0, len(whole), 30):
+        path.write_bytes(whole[:cut])
+        expected = int(np.searchsorted(ends, cut, 'right'))
+        try:
+            found, said = read(path)
+        except FileError as error:
+            assert expected == 0 and '\n' not in str(error)
+            continue
+        assert len(found) == expected
+        assert [m[:3] for m in found] == [m[:3] for m in recording[:expected]]
+        assert_told(said, path, expected)
+
+
+def chunk_ends(whole):
+    """Return where the chunk of each message of an MCAP file ends, in the order of writing."""
+    ends = []
+    for chunk in make_reader(BytesIO(whole)).get_summary().chunk_indexes:
+        after = chunk.chunk_start_offset + chunk.chunk_length
+        indexes = whole[after:after + chunk.message_index_length]
+        with suppress(EndOfFile):
+            for record in StreamReader(BytesIO(indexes), skip_magic=True).records:
+                ends += [after] * len(record.records)
+    return ends
+
+
+def test_200_cuts_of_a_bag(tmp_path, rng, capsys):
+    write_world(tmp_path / 'bag', 120, 180)
+    recording = recording_of(tmp_path / 'bag')
+    name, whole = 'a.mcap', (tmp_path / 'bag' / 'bag.mcap').read_bytes()
+    ends = chunk_ends(whole)
+    assert len(ends) == len(recording) and len(set(ends)) > 7
+    path, output = tmp_path / name, tmp_path / 'out.g2o'
+    odometry = np.cumsum([topic == '/odom' for topic, *_ in recording])
+    codes = []
+    for cut in rng.integers(0, len(whole), 200):
+        path.write_bytes(whole[:cut])
+        output.unlink(missing_ok=True)
+        expected = int(np.searchsorted(ends, cut, 'right'))
+        began = time.perf_counter()
+        codes.append(main(['convert', str(path), str(output)]))
+        assert time.perf_counter() - began < LONGEST
+        err = capsys.readouterr().err
+        keyframes = int(odometry[expected - 1]) if expected else 0
+        if codes[-1] == 2:
+            assert keyframes < 2 and not output.exists() and err.count('\n') == 1
+            continue
+        assert codes[-1] == 3
+        assert 'is damaged: it breaks off after' in err and 'Traceback' not in err
+        record = read_graph_file(output)
+        # A decoder gives more of a chunk that is cut than nothing.
+        assert keyframes <= record.graph.n_poses <= keyframes + 30
+        assert len(record.graph.between) >= expected - 1
+    assert codes.count(3) > 150
+
+
+def test_a_cut_bag_is_solved_plotted_and_described_with_exit_code_3(tmp_path, bag, capsys):
+    whole = (bag / 'bag.mcap').read_bytes()
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(whole[:len(whole) // 2])
+    picture = str(tmp_path / 'map.png')
+    for arguments in (['solve', str(path), '--outer', '2'], ['info', str(path)],
+                      ['plot', str(path), '--output', picture],
+                      ['plot', str(bag), str(path), '--output', picture]):
+        assert main(arguments) == 3
+        err = capsys.readouterr().err
+        assert len(re.findall('is damaged: it breaks off after [0-9,]+ bytes; [0-9,]+ messages '
+                              'before that were used', err)) == 1
+    assert (tmp_path / 'map.png').exists()
+
+
+def test_what_the_messages_mean_survives_a_cut(tmp_path, bag):
+    path = tmp_path / 'a.mcap'
+    path.write_bytes((bag / 'bag.mcap').read_bytes()[:5000])
+    assert read_note(path) == GRAPH_NOTE
+    assert len(read_input(path).graph.between) >= 30
+
+
+def test_damage_is_an_error_to_who_wants_no_part(tmp_path, bag):
+    path = tmp_path / 'a.mcap'
+    path.write_bytes((bag / 'bag.mcap').read_bytes()[:5000])
+    for call in (read_messages, read_raw):
+        with pytest.raises(FileError, match='a.mcap: damaged: it breaks off after 5,000 bytes; '
+                                            'expected a bag that can be read to its end'):
+            list(call(path))
+
+
+@pytest.mark.parametrize('compression', ['NONE', 'ZSTD', 'LZ4'])
+def test_of_a_chunk_cut_in_two_the_first_part_is_used(tmp_path, recording, compression):
+    # One chunk for all: a decoder works block by block.
+    path = mcap_file(tmp_path / 'a.mcap', recording, compression=CompressionType[compression],
+                     chunk_size=2**30)
+    whole = path.read_bytes()
+    chunk, = make_reader(BytesIO(whole)).get_summary().chunk_indexes
+    path.write_bytes(whole[:chunk.chunk_start_offset + int(0.9 * chunk.chunk_length)])
+    found, said = read(path)
+    assert found == recording[:len(found)]
+    assert len(recording) // 3 < len(found) < len(recording)
+    assert_told(said, path, len(found))
+
+
+def test_from_the_middle_of_a_bag_on_nothing_comes_twice(tmp_path, recording):
+    """The library reads up to a bad chunk; what was read then is not read again."""
+    recording = coarse(recording)
+    path = mcap_file(tmp_path / 'a.mcap', recording, chunk_size=20_000)
+    whole = bytearray(path.read_bytes())
+    chunks = make_reader(BytesIO(whole)).get_summary().chunk_indexes
+    bad = chunks[len(chunks) // 2]
+    whole[bad.chunk_start_offset + bad.chunk_length // 2] ^= 1
+    path.write_bytes(whole)
+    found, said = read(path)
+    assert found == recording[:len(found)]
+    assert len(recording) // 3 < len(found) < len(recording)
+    assert_told(said, path, len(found))
+    only, _ = read(path, ['/loop_closures'])
+    assert only == [m for m in found if m[0] == '/loop_closures']
+
+
+def test_wherever_a_bit_of_our_bag_is_wrong_no_message_is(tmp_path, bag, recording, rng):
+    whole = (bag / 'bag.mcap').read_bytes()
+    path = tmp_path / 'a.mcap'
+    told = 0
+    for at in rng.integers(0, len(whole), 60):
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        with suppress(FileError):
+            found, said = read(path)
+            assert found == recording[:len(found)]
+            assert said or len(found) == len(recording)
+            told += bool(said)
+    assert told > 15
+
+
+def test_zeros_at_the_end_are_damage(tmp_path, recording):
+    for options in ({'use_chunking': False}, {'compression': CompressionType.NONE}):
+        path = mcap_file(tmp_path / 'a.mcap', recording, **options)
+        whole = path.read_bytes()
+        path.write_bytes(whole[:len(whole) // 2] + bytes(len(whole) // 2))
+        found, said = read(path)
+        # The last one may have zeros in it: nothing in such a file tells.
+        assert found[:-1] == recording[:len(found) - 1]
+        assert abs(len(found) - len(recording) // 2) < 20
+        assert re.search(r' is damaged after [0-9,]+ of [0-9,]+ bytes; ', said)
+
+
+def test_a_directory_without_its_metadata(tmp_path, bag, recording):
+    folder = shutil.copytree(bag, tmp_path / 'a')
+    for content in (None, '', 'x', '[', 'rosbag2_bagfile_information:\n  version: 9\n', '\x00'):
+        (folder / 'metadata.yaml').unlink(missing_ok=True)
+        if content is not None:
+            (folder / 'metadata.yaml').write_text(content)
+        wrong = 'is missing' if content is None else 'cannot be read'
+        found, said = read(folder)
+        assert found == recording
+        assert said == (f'{folder} is damaged: its metadata.yaml {wrong}; '
+                        '301 messages of its files were used')
+        assert read_note(folder) == GRAPH_NOTE
+        assert [t.count for t in bag_summary(folder).topics] == [101, 200]
+
+
+@pytest.mark.parametrize('mode', [CompressionMode.NONE, CompressionMode.FILE])
+@pytest.mark.parametrize('plugin', StoragePlugin)
+def test_a_split_bag_is_used_up_to_the_damage(tmp_path, recording, plugin, mode):
+    folder = split_directory(tmp_path / 'a', recording, plugin, mode, parts=12)
+    files = sorted(folder.glob('a_*'), key=lambda file: int(re.findall('[0-9]+', file.name)[0]))
+    size = -(-len(recording) // 12)
+    files[11].write_bytes(files[11].read_bytes()[:-4000])
+    found, said = read(folder)
+    assert found == recording[:len(found)] and len(found) >= 11 * size
+    assert said.startswith(f'{files[11]} is damaged: ')
+    (folder / 'metadata.yaml').unlink()
+    assert read(folder) == (found, said)
+    files[10].unlink()
+    assert read(folder)[0] == recording[:10 * size] + found[11 * size:]
+
+
+def test_a_missing_file_of_a_split_bag(tmp_path, recording):
+    folder = split_directory(tmp_path / 'a', recording, StoragePlugin.MCAP)
+    size = -(-len(recording) // 3)
+    (folder / 'a_1.mcap').unlink()
+    found, said = read(folder)
+    assert found == recording[:size]
+    assert said == (f'{folder / "a_1.mcap"} is damaged: the file is missing; '
+                    f'{size} messages before that were used')
+
+
+def coarse(recording):
+    """Return a recording with times so coarse that messages of one time are on many pages."""
+    return [(topic, msgtype, moment // 10**10 * 10**10, data)
+            for topic, msgtype, moment, data in recording]
+
+
+def test_a_database_with_a_damaged_page(tmp_path, recording):
+    """The library reads up to it; what was read then is not read again."""
+    recording = coarse(recording)
+    path = rosbag2_directory(tmp_path / 'a', recording, StoragePlugin.SQLITE3) / 'a.db3'
+    whole = bytearray(path.read_bytes())
+    at = whole.index(recording[250][3]) // 4096 * 4096
+    whole[at:at + 200] = b'\xff' * 200
+    path.write_bytes(whole)
+    found, said = read(path)
+    assert found == recording[:len(found)] and 240 < len(found) <= 250
+    assert said == (f'{path} is damaged: database disk image is malformed; '
+                    f'{len(found)} messages before that were used')
+
+
+def test_a_database_that_lacks_its_last_bytes_only(tmp_path, recording):
+    path = rosbag2_directory(tmp_path / 'a', recording, StoragePlugin.SQLITE3) / 'a.db3'
+    path.write_bytes(path.read_bytes()[:-10])
+    found, said = read(path)
+    assert found == recording[:len(found)] and len(found) > len(recording) - 20
+    assert_told(said, path, len(found))
+
+
+def test_a_message_that_cannot_be_decoded_is_left_out(tmp_path, recording):
+    broken = list(recording)
+    for k in (20, 30):
+        broken[k] = (*broken[k][:3], broken[k][3][:40])
+    path = mcap_file(tmp_path / 'a.mcap', broken)
+    said = []
+    times = [m.time for m in read_messages(path, None, said.append)]
+    assert times == [m[2] for k, m in enumerate(recording) if k not in (20, 30)]
+    assert said == [f'{path} is damaged: 2 messages cannot be decoded; 299 others were used']
+    with pytest.raises(FileError, match='a message on /.* cannot be decoded'):
+        list(read_messages(path))
+    assert read_input(path).damage == said[0]
+
+
+@pytest.mark.parametrize('compression', [None, *Rosbag1Writer.CompressionFormat])
+def test_a_ros1_bag_whose_recorder_was_killed_has_no_index(tmp_path, recording, compression):
+    path = ros1_file(tmp_path / 'a.bag', recording, compression)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:len(whole) // 2])
+    found, said = read(path)
+    assert [m[:3] for m in found] == [m[:3] for m in recording[:len(found)]]
+    assert abs(len(found) - len(recording) // 2) < 100
+    assert_told(said, path, len(found))
+
+
+def test_a_ros1_bag_with_a_damaged_chunk(tmp_path, recording):
+    """Of one time, the library reads one topic after the other, whatever the order in the file."""
+    recording = coarse(recording)
+    path = ros1_file(tmp_path / 'a.bag', recording, Rosbag1Writer.CompressionFormat.BZ2)
+    whole = bytearray(path.read_bytes())
+    starts = [found.start() for found in re.finditer(b'BZh91AY', whole)]
+    whole[starts[len(starts) // 2] + 50] ^= 1
+    path.write_bytes(whole)
+    found, said = read(path)
+    assert Counter(m[:3] for m in found) == Counter(m[:3] for m in recording[:len(found)])
+    assert len(recording) // 3 < len(found) < len(recording) * 2 // 3
+    assert_told(said, path, len(found))
+
+
+def test_a_ros1_bag_that_ends_before_its_index(tmp_path, recording):
+    path = ros1_file(tmp_path / 'a.bag', recording)
+    whole = path.read_bytes()
+    at = whole.index(b'index_pos=') + len(b'index_pos=')
+    path.write_bytes(whole[:int.from_bytes(whole[at:at + 8], 'little')])
+    found, said = read(path)
+    assert len(found) == len(recording)
+    assert_told(said, path, len(found))
+
+
+# What happens to files: bytes are changed, lost or inserted, and the end is lost or zero.
+PIECES = st.tuples(st.sampled_from(['flip', 'write', 'insert', 'delete', 'cut', 'zero']),
+                   st.floats(0, 1), st.binary(min_size=1, max_size=40))
+
+
+def damaged(whole, pieces):
+    for what, where, content in pieces:
+        at = int(where * (len(whole) - 1)) if whole else 0
+        rest = {
+            'flip': bytes(a ^ b for a, b in zip(whole[at:], content, strict=False)),
+            'write': content,
+            'insert': content,
+            'delete': b'',
+            'cut': None,
+            'zero': bytes(len(whole) - at),
+        }[what]
+        if rest is None:
+            whole = whole[:at]
+            continue
+        skipped = {'insert': 0, 'delete': len(content) ** 2}.get(what, len(rest))
+        whole = whole[:at] + rest + whole[at + skipped:]
+    return whole
+
+
+@pytest.fixture(scope='module')
+def small(tmp_path_factory):
+    """Return a folder with one small recording as several kinds."""
+    folder = tmp_path_factory.mktemp('small')
+    write_world(folder / 'bag', 40, 60)
+    messages = recording_of(folder / 'bag')
+    shutil.copy(folder / 'bag' / 'bag.mcap', folder / 'ours.mcap')
+    mcap_file(folder / 'lz4.mcap', messages, compression=CompressionType.LZ4, chunk_size=5_000)
+    mcap_file(folder / 'unchunked.mcap', messages, use_chunking=False)
+    shutil.copy(rosbag2_directory(folder / 'db3', messages, StoragePlugin.SQLITE3, note=NOTE)
+                / 'db3.db3', folder / 'rosbag2.db3')
+    ros1_file(folder / 'ros1.bag', messages, Rosbag1Writer.CompressionFormat.BZ2, chunk=5_000)
+    return folder
+
+
+@pytest.mark.parametrize('name', ['ours.mcap', 'lz4.mcap', 'unchunked.mcap', 'rosbag2.db3',
+                                  'ros1.bag', 'bag/metadata.yaml'])
+@settings(max_examples=40, derandomize=True, deadline=None, database=None,
+          suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(pieces=st.lists(PIECES, min_size=1, max_size=3))
+def test_no_bytes_make_a_traceback_or_half_a_file(tmp_path, small, capfd, name, pieces):
+    folder = tmp_path / 'input'
+    if folder.exists():
+        shutil.rmtree(tmp_path / 'input')
+    folder.mkdir()
+    path = folder / name.rpartition('/')[2]
+    if name.endswith('.yaml'):
+        shutil.copy(small / 'bag' / 'bag.mcap', folder)
+    path.write_bytes(damaged((small / name).read_bytes(), pieces))
+    output = tmp_path / 'out.g2o'
+    for former in tmp_path.glob('out.*'):
+        former.unlink()
+    capfd.readouterr()
+    source = folder if name.endswith('.yaml') else path
+    code = main(['convert', str(source), str(output)])
+    err = capfd.readouterr().err
+    assert code in (0, 2, 3) and 'Traceback' not in err
+    assert all(line.startswith('l1slam: ') for line in err.splitlines())
+    assert sorted(p.name for p in tmp_path.iterdir() if p != folder) == (
+        [] if code == 2 else ['out.g2o', 'out.g2o.stamps.txt'])
+    if code != 2:
+        assert read_graph_file(output).graph.n_poses >= 2
+        assert (code == 3) == ('is damaged' in err)

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A graph as a bag: every number comes back, read by two independent libraries."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.io.bags.from_graph import GRAPH_NOTE, VERBATIM_NOTE, write_graph_bag
+from l1slam_ros.io.bags.reader import read_note
+from l1slam_ros.io.bags.to_graph import DEFAULT_TOPICS, graph_from_bag
+from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file
+from l1slam_ros.io.messages.conversion import loop_closure, odometry_sample
+
+ROWS = np.array(se2.COVARIANCE_ROWS)
+
+
+def record_of(pairs, rng, n=None, stamps=None):
+    """Return a graph with random measurements between the pairs of keyframes; vertex ids 10 k."""
+    i, j = np.array(pairs).T
+    n = n or int(max(i.max(), j.max())) + 1
+    graph = FactorGraph(se2)
+    graph.add_poses(n)
+    A = rng.normal(size=(len(i), 3, 3))
+    graph.add_between(i, j, rng.normal(size=(len(i), 3)),
+                      A @ A.transpose(0, 2, 1) + 0.1 * np.eye(3))
+    return GraphRecord(graph, None, 10 * np.arange(n), stamps)
+
+
+def read_with_rosbags(path):
+    with AnyReader([path]) as reader:
+        return [(c.topic, time, reader.deserialize(data, c.msgtype))
+                for c, time, data in reader.messages()]
+
+
+def read_with_mcap(path):
+    typestore = get_typestore(Stores.ROS2_JAZZY)
+    with path.open('rb') as file:
+        return [(channel.topic, message.log_time,
+                 typestore.deserialize_cdr(message.data, schema.name))
+                for schema, channel, message in make_reader(file).iter_messages()]
+
+
+def stamp_of(header):
+    return header.stamp.sec * 10**9 + header.stamp.nanosec
+
+
+def covariances_of(factors, rows):
+    roots = factors.sqrt_information[rows]
+    return np.linalg.inv(roots.transpose(0, 2, 1) @ roots)
+
+
+def assert_says(messages, record, stamps, tolerance):
+    """Check odometry and loops against the factors: differences of poses, inverse information."""
+    factors, index = record.graph.between, {int(s): k for k, s in enumerate(stamps)}
+    odometry = [odometry_sample(m) for topic, _, m in messages if topic == '/odom']
+    assert [s.stamp for s in odometry] == list(index)
+    poses = se2.from_pose3(np.array([s.pose3 for s in odometry]))
+    steps = np.flatnonzero(factors.is_odometry)
+    steps = steps[np.argsort(factors.i[steps])]
+    error = se2.residual(factors.measurement[steps], poses[:-1], poses[1:])
+    assert np.abs(error).max() < tolerance
+    assert not odometry[0].covariance.any()
+    assert_covariances([s.covariance for s in odometry[1:]], covariances_of(factors, steps))
+
+    loops = [loop_closure(m, 'base_link', False) for t, _, m in messages if t == '/loop_closures']
+    rows = np.flatnonzero(~factors.is_odometry)
+    rows = rows[np.argsort(factors.j[rows], kind='stable')]
+    assert [index[m.reference_stamp] for m in loops] == factors.i[rows].tolist()
+    assert [index[m.stamp] for m in loops] == factors.j[rows].tolist()
+    measured = se2.from_pose3(np.array([m.pose3 for m in loops]))
+    assert np.abs(se2.between(factors.measurement[rows], measured)).max() < 1e-14
+    assert_covariances([m.covariance for m in loops], covariances_of(factors, rows))
+
+
+def assert_covariances(found, expected):
+    found = np.array(found)
+    np.testing.assert_allclose(found[:, ROWS[:, None], ROWS], expected, rtol=1e-9, atol=1e-14)
+    found[:, ROWS[:, None], ROWS] = 0
+    assert not found.any()
+
+
+@pytest.mark.parametrize('read', [read_with_rosbags, read_with_mcap])
+def test_a_graph_comes_back(tmp_path, rng, read):
+    pairs = [(0, 3), (2, 3), (0, 1), (1, 2), (0, 1), (3, 4), (1, 4), (0, 3), (0, 4)]
+    record = record_of(pairs, rng)
+    path = tmp_path / 'bag'
+    write_graph_bag(path, record)
+    messages = read(path if read is read_with_rosbags else path / 'bag.mcap')
+    assert_says(messages, record, 10**12 + 10**8 * np.arange(5), 1e-15)
+    assert [(topic, (time - 10**12) // 10**8) for topic, time, _ in messages] == [
+        ('/odom', 0), ('/odom', 1), ('/loop_closures', 1), ('/odom', 2), ('/odom', 3),
+        ('/loop_closures', 3), ('/loop_closures', 3), ('/odom', 4), ('/loop_closures', 4),
+        ('/loop_closures', 4)]
+    assert all(time == stamp_of(m.header) for _, time, m in messages)
+    frames = [(m.header.frame_id, m.child_frame_id) for t, _, m in messages if t == '/odom']
+    assert set(frames) == {('odom', 'base_link')}
+
+
+def test_loops_that_are_trusted_have_their_own_topic(tmp_path, rng):
+    record = record_of([(0, 1), (1, 2), (0, 2), (2, 3), (1, 3)], rng)
+    factors, trusting = record.graph.between, FactorGraph(se2)
+    trusting.add_poses(4)
+    trusting.add_between(factors.i, factors.j, factors.measurement,
+                         factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information,
+                         np.array([True, False, False, False, True]))
+    write_graph_bag(tmp_path / 'bag', replace(record, graph=trusting))
+    topics = [topic for topic, _, _ in read_with_rosbags(tmp_path / 'bag')]
+    assert topics == ['/odom', '/odom', '/odom', '/loop_closures', '/odom',
+                      '/trusted_loop_closures']
+    read = graph_from_bag(tmp_path / 'bag', None, DEFAULT_TOPICS).graph.between
+    pairs = zip(read.i.tolist(), read.j.tolist(), strict=True)
+    loops = dict(zip(pairs, read.trusted.tolist(), strict=True))
+    assert loops[0, 2] is False and loops[1, 3] is True
+
+
+@pytest.mark.parametrize('name', ['intel', 'city10000'])
+def test_the_papers_graphs_come_back_to_rounding(datasets, tmp_path, name):
+    record = read_graph_file(datasets / f'{name}.g2o')
+    path = tmp_path / name
+    write_graph_bag(path, record)
+    messages = read_with_rosbags(path)
+    # Coordinates of hundreds of metres keep 1e-13 of a step.
+    assert_says(messages, record, 10**12 + 10**8 * np.arange(record.graph.n_poses), 3e-13)
+    # Two loops of Intel stand in the file twice, number for number: they are meant.
+    assert read_note(path) == GRAPH_NOTE | (VERBATIM_NOTE if name == 'intel' else {})
+    assert len(graph_from_bag(path, None, DEFAULT_TOPICS).graph.between) == len(
+        record.graph.between)
+
+
+def test_the_stamps_of_the_graph_are_kept(tmp_path, rng):
+    stamps = np.array([1, 10**9 - 1, 1305031102175300121])
+    record = record_of([(0, 1), (1, 2), (0, 2)], rng, stamps=stamps)
+    write_graph_bag(tmp_path / 'bag', record)
+    messages = read_with_mcap(tmp_path / 'bag' / 'bag.mcap')
+    assert_says(messages, record, stamps, 1e-15)
+    assert messages[-1][2].header.frame_id == 'base_link@0.000000001'
+
+
+def test_truth_and_frames(tmp_path, rng):
+    record = record_of([(0, 1), (1, 2), (0, 2)], rng)
+    truth = rng.uniform(-3, 3, (3, 3))
+    write_graph_bag(tmp_path / 'bag', record, truth, odom_frame='o', base_frame='robot/base')
+    messages = read_with_rosbags(tmp_path / 'bag')
+    poses = [m for topic, _, m in messages if topic == '/ground_truth']
+    assert [stamp_of(m.header) for m in poses] == (10**12 + 10**8 * np.arange(3)).tolist()
+    assert {m.header.frame_id for m in poses} == {'map'}
+    found = [(p.x, p.y, 2 * np.arctan2(q.z, q.w)) for p, q in
+             ((m.pose.position, m.pose.orientation) for m in poses)]
+    np.testing.assert_allclose(found, truth, rtol=0, atol=1e-15)
+    loop = next(m for topic, _, m in messages if topic == '/loop_closures')
+    assert loop.header.frame_id == 'robot/base@1000.000000000'
+    odometry = messages[0][2]
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ('o', 'robot/base')
+
+
+def test_metadata_as_rosbag2_writes_it(tmp_path, rng):
+    path = tmp_path / 'bag'
+    write_graph_bag(path, record_of([(0, 1), (1, 2), (0, 2)], rng), np.zeros((3, 3)))
+    data = yaml.safe_load((path / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+    assert data['version'] == 9
+    assert data['storage_identifier'] == 'mcap'
+    assert data['relative_file_paths'] == ['bag.mcap']
+    assert data['custom_data'] == {'l1slam': '{keyframes: every, covariance: increment}'}
+    assert data['message_count'] == 7
+    assert data['duration']['nanoseconds'] == 2 * 10**8
+    counts = {}
+    for topic in data['topics_with_message_count']:
+        metadata, (qos,) = topic['topic_metadata'], topic['topic_metadata']['offered_qos_profiles']
+        counts[metadata['name']] = topic['message_count']
+        assert metadata['type_description_hash'].startswith('RIHS01_')
+        assert set(qos) == {
+            'history', 'depth', 'reliability', 'durability', 'deadline', 'lifespan', 'liveliness',
+            'liveliness_lease_duration', 'avoid_ros_namespace_conventions'}
+        assert (qos['history'], qos['depth']) == ('keep_last', 1000)
+        assert (qos['reliability'], qos['durability']) == ('reliable', 'volatile')
+    assert counts == {'/odom': 3, '/loop_closures': 1, '/ground_truth': 3}
+
+
+def test_the_file_alone_carries_the_note_and_is_compressed(tmp_path, rng):
+    write_graph_bag(tmp_path / 'bag', record_of([(0, 1), (1, 2), (0, 2)], rng))
+    alone = tmp_path / 'alone.mcap'
+    (tmp_path / 'bag' / 'bag.mcap').rename(alone)
+    assert read_note(alone) == GRAPH_NOTE
+    with alone.open('rb') as file:
+        summary = make_reader(file).get_summary()
+    assert {chunk.compression for chunk in summary.chunk_indexes} == {'zstd'}
+    assert {schema.encoding for schema in summary.schemas.values()} == {'ros2msg'}
+
+
+def test_the_same_graph_gives_the_same_bytes(tmp_path, rng):
+    record = record_of([(0, 1), (1, 2), (0, 2)], rng)
+    for folder in ('first', 'second'):
+        (tmp_path / folder).mkdir()
+        write_graph_bag(tmp_path / folder / 'bag', record)
+    names = sorted(p.relative_to(tmp_path / 'first')
+                   for p in (tmp_path / 'first').rglob('*') if p.is_file())
+    assert names == [Path('bag/bag.mcap'), Path('bag/metadata.yaml')]
+    for name in names:
+        first, second = (tmp_path / folder / name for folder in ('first', 'second'))
+        assert first.read_bytes() == second.read_bytes()
+
+
+@pytest.mark.parametrize(('pairs', 'n', 'message'), [
+    ([(0, 1), (2, 3), (1, 3)], None, 'no edge between the consecutive vertices 10 and 20'),
+    ([(0, 1)], 3, 'no edge between the consecutive vertices 10 and 20'),
+    ([(0, 1), (2, 1)], None, 'an edge from vertex 20 back to 10'),
+    ([(0, 1), (2, 1), (1, 2)], None, 'an edge from vertex 20 back to 10'),
+    ([(0, 1), (1, 2), (2, 0)], None, 'an edge from vertex 20 back to 0'),
+])
+def test_what_messages_cannot_express_exactly(tmp_path, rng, pairs, n, message):
+    with pytest.raises(GraphError, match=message):
+        write_graph_bag(tmp_path / 'bag', record_of(pairs, rng, n))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_prior_has_no_place_in_a_bag(tmp_path, rng):
+    record = record_of([(0, 1), (1, 2)], rng)
+    record.graph.add_prior(np.array([1]), np.zeros((1, 3)), np.eye(3)[None])
+    with pytest.raises(GraphError, match='a prior on vertex 10; a bag carries'):
+        write_graph_bag(tmp_path / 'bag', record)
+
+
+@pytest.mark.parametrize(('stamps', 'vertex'), [
+    ([5, 5, 6], 10), ([5, 7, 6], 20), ([0, 1, 2], 0), ([1, 2, 2**31 * 10**9], 20)])
+def test_stamps_that_no_messages_can_have(tmp_path, rng, stamps, vertex):
+    record = replace(record_of([(0, 1), (1, 2)], rng), stamps=np.array(stamps))
+    with pytest.raises(GraphError, match=f'vertex {vertex} has the stamp'):
+        write_graph_bag(tmp_path / 'bag', record)
+
+
+def test_truth_of_another_graph(tmp_path, rng):
+    with pytest.raises(GraphError, match='2 true poses; expected 3, one for each vertex'):
+        write_graph_bag(tmp_path / 'bag', record_of([(0, 1), (1, 2)], rng), np.zeros((2, 3)))
+
+
+def test_a_single_keyframe(tmp_path):
+    graph = FactorGraph(se2)
+    graph.add_poses(1)
+    write_graph_bag(tmp_path / 'bag', GraphRecord(graph, None, np.array([0])))
+    assert [topic for topic, _, _ in read_with_rosbags(tmp_path / 'bag')] == ['/odom']
+    with pytest.raises(GraphError, match='without vertices'):
+        write_graph_bag(tmp_path / 'none', GraphRecord(FactorGraph(se2), None, np.array([], int)))

@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags as robots and tools write them: every kind, other topics, odd orders, no note of ours."""
+
+import json
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from bags import KINDS, TYPES, mcap_file, recording_of, rosbag2_directory, write_world
+from l1slam_ros.cli.main import main
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.online.graph_builder import GrowthOptions
+from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_raw
+from l1slam_ros.io.bags.to_graph import Topics
+from l1slam_ros.io.formats import read_input
+
+EVERY = GrowthOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
+ODOMETRY = 'nav_msgs/msg/Odometry'
+SECOND = 10**9
+
+
+@pytest.fixture(scope='module')
+def world(tmp_path_factory):
+    """Return a bag of this package, its messages and the graph in it."""
+    bag = tmp_path_factory.mktemp('world') / 'bag'
+    write_world(bag, 120, 180)
+    return bag, recording_of(bag), read_input(bag)
+
+
+def assert_same_graph(record, expected):
+    for name in ('i', 'j', 'measurement', 'sqrt_information'):
+        np.testing.assert_array_equal(getattr(record.graph.between, name),
+                                      getattr(expected.graph.between, name))
+    np.testing.assert_array_equal(record.stamps, expected.stamps)
+    assert (record.skipped, record.damage) == ((), '')
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_every_kind_is_the_same_recording(tmp_path, world, kind):
+    _, recording, expected = world
+    path = KINDS[kind](tmp_path, recording)
+    raw = list(read_raw(path))
+    assert [(m.topic, m.msgtype, m.time) for m in raw] == [m[:3] for m in recording]
+    assert [TYPES.deserialize_cdr(m.data, m.msgtype).header.frame_id for m in raw] == [
+        TYPES.deserialize_cdr(data, msgtype).header.frame_id for _, msgtype, _, data in recording]
+    assert_same_graph(read_input(path, EVERY), expected)
+
+
+@pytest.mark.parametrize('kind', ['db3', 'directory of db3', 'directory of mcap, file compressed',
+                                  'split mcap', 'db3 with a journal'])
+def test_the_note_is_found_in_every_kind_that_can_have_one(tmp_path, world, kind):
+    assert_same_graph(read_input(KINDS[kind](tmp_path, world[1])), world[2])
+
+
+@pytest.mark.parametrize('kind', ['directory of mcap', 'db3', 'split db3', 'ROS 1'])
+def test_a_summary_of_every_kind(tmp_path, world, kind):
+    recording = world[1]
+    summary = bag_summary(KINDS[kind](tmp_path, recording))
+    assert [(t.name, t.msgtype) for t in summary.topics] == [
+        ('/loop_closures', 'geometry_msgs/msg/PoseWithCovarianceStamped'),
+        ('/odom', 'nav_msgs/msg/Odometry')]
+    assert summary.start == recording[0][2]
+
+
+def test_one_graph_has_one_cost_whatever_it_comes_in(tmp_path, world, capsys):
+    bag, recording, _ = world
+    for name in ('a.g2o', 'a.graph'):
+        assert main(['convert', str(bag), str(tmp_path / name)]) == 0
+    db3 = rosbag2_directory(tmp_path / 'db3', recording, StoragePlugin.SQLITE3)
+    costs, poses = [], []
+    for path in (bag, bag / 'bag.mcap', db3, db3 / 'db3.db3', tmp_path / 'a.g2o',
+                 tmp_path / 'a.graph'):
+        capsys.readouterr()
+        out = tmp_path / 'out.tum'
+        arguments = ['solve', str(path), '--start', 'odometry', '--json', '--output', str(out)]
+        assert main(arguments) == 0
+        costs.append(json.loads(capsys.readouterr().out)['initial_cost'])
+        poses.append(np.loadtxt(out))
+    assert np.ptp(costs) <= 1e-9 * costs[0]
+    assert np.ptp(poses, axis=0).max() < 1e-6
+
+
+def test_a_robot_without_our_note_goes_by_the_defaults_of_the_node(tmp_path, world):
+    # 16 messages a metre and 20 a second, straight on; no word on their errors.
+    template = TYPES.deserialize_cdr(world[1][0][3], ODOMETRY)
+    assert not template.pose.covariance.any()
+    recording = []
+    for k in range(161):
+        template.header.stamp.nanosec, time = k % 20 * SECOND // 20, k * SECOND // 20
+        template.header.stamp.sec = 1 + k // 20
+        template.pose.pose.position.x = k / 16
+        recording.append(('/odom', ODOMETRY, time, bytes(TYPES.serialize_cdr(template, ODOMETRY))))
+    path = rosbag2_directory(tmp_path / 'a', recording, StoragePlugin.MCAP, note=None)
+    record = read_input(path)
+    default = GrowthOptions()
+    assert np.diff(record.stamps).tolist() == [8 * SECOND // 20] * 20
+    steps = record.graph.between.measurement
+    np.testing.assert_allclose(steps, [[default.keyframe.translation, 0, 0]] * 20, atol=1e-12)
+    sigma = np.hypot(default.odometry.sigma_translation * 0.5, default.odometry.floor_translation)
+    np.testing.assert_allclose(record.graph.between.sqrt_information[:, 0, 0], 1 / sigma)
+
+
+def renamed(recording, names):
+    return [(names.get(topic, topic), *rest) for topic, *rest in recording]
+
+
+def test_other_topics(tmp_path, world):
+    recording = renamed(world[1], {'/odom': '/wheels', '/loop_closures': '/scan_matcher/loops'})
+    path = mcap_file(tmp_path / 'a.mcap', recording)
+    topics = Topics('/wheels', '/scan_matcher/loops')
+    assert_same_graph(read_input(path, EVERY, topics), world[2])
+    trusted = read_input(path, EVERY, Topics('/wheels', trusted='/scan_matcher/loops'))
+    assert_same_graph(trusted, world[2])
+
+
+def test_without_the_default_topic_all_odometry_is_named(tmp_path, world):
+    odometry = [m for m in world[1] if m[0] == '/odom']
+    both = renamed(odometry, {'/odom': '/wheels'}) + renamed(odometry, {'/odom': '/visual'})
+    path = mcap_file(tmp_path / 'a.mcap', both)
+    with pytest.raises(FileError) as caught:
+        read_input(path)
+    assert str(caught.value) == (
+        f'{path}: 0 keyframes from /odom; expected 2 or more; '
+        'nav_msgs/msg/Odometry is on /visual, /wheels')
+
+
+def test_a_topic_asked_for_that_is_not_there_is_an_error(tmp_path, world):
+    with pytest.raises(FileError) as caught:
+        read_input(world[0], None, Topics(loops='/loops'))
+    assert str(caught.value).endswith(
+        'no messages on /loops; expected geometry_msgs/msg/PoseWithCovarianceStamped; '
+        'geometry_msgs/msg/PoseWithCovarianceStamped is on /loop_closures')
+
+
+def test_a_topic_of_another_type_is_told(tmp_path, world):
+    swapped = renamed(world[1], {'/odom': '/loop_closures', '/loop_closures': '/odom'})
+    with pytest.raises(FileError, match=(
+            '0 keyframes from /odom.* on /loop_closures; 181 messages refused: '
+            'nav_msgs/msg/Odometry on /loop_closures; expected '
+            'geometry_msgs/msg/PoseWithCovarianceStamped$')):
+        read_input(mcap_file(tmp_path / 'a.mcap', swapped))
+
+
+def test_a_type_defined_otherwise_is_told(tmp_path):
+    other = get_typestore(Stores.EMPTY)
+    other.register(get_types_from_msg('float64 x', ODOMETRY))
+    writer = Writer(tmp_path / 'a', version=9, storage_plugin=StoragePlugin.MCAP)
+    with writer:
+        topic = writer.add_connection('/odom', ODOMETRY, typestore=other)
+        for k in range(5):
+            message = other.types[ODOMETRY](x=float(k))
+            writer.write(topic, k, other.serialize_cdr(message, ODOMETRY))
+    with pytest.raises(FileError, match='0 keyframes from /odom; expected 2 or more; '
+                                        '5 messages refused: a message on /odom; expected the '
+                                        'fields of nav_msgs/msg/Odometry$'):
+        read_input(tmp_path / 'a')
+
+
+def test_loops_may_be_recorded_before_the_odometry_they_name(tmp_path, world):
+    loops = [m for m in world[1] if m[0] == '/loop_closures']
+    start = world[1][0][2]
+    early = [(*m[:2], start - len(loops) + k, m[3]) for k, m in enumerate(loops)]
+    odometry = [m for m in world[1] if m[0] == '/odom']
+    record = read_input(mcap_file(tmp_path / 'a.mcap', early + odometry), EVERY)
+    assert record.skipped == ()
+    assert len(record.graph.between) == len(world[2].graph.between)
+
+
+def test_duplicates_and_a_clock_set_back_are_counted_and_told(tmp_path, world):
+    recording = world[1]
+    odometry = [m for m in recording if m[0] == '/odom']
+    # The robot's driver starts anew: the messages of before come once more, later.
+    again = [(*m[:2], m[2] + 1000 * SECOND, m[3]) for m in odometry[:30]]
+    twice = sorted(recording + odometry[:10], key=lambda m: m[2])
+    path = mcap_file(tmp_path / 'a.mcap', twice + again)
+    record = read_input(path, EVERY)
+    first, second = (m[2] for m in odometry[:2])
+    assert record.skipped == (f'40 messages refused: odometry stamp {first} ns is not after the '
+                              f'last one, {first} ns',)
+    assert second > first
+    assert len(record.graph.between) == len(world[2].graph.between)
+
+
+def test_what_cannot_be_used_is_counted_by_its_cause(tmp_path, world):
+    recording = list(world[1])
+
+    def broken(k, change):
+        topic, msgtype, time, data = recording[k]
+        message = TYPES.deserialize_cdr(data, msgtype)
+        change(message)
+        recording[k] = (topic, msgtype, time, bytes(TYPES.serialize_cdr(message, msgtype)))
+
+    odometry = [k for k, m in enumerate(recording) if m[0] == '/odom']
+    loops = [k for k, m in enumerate(recording) if m[0] == '/loop_closures']
+    broken(odometry[50], lambda m: setattr(m.pose.pose.position, 'x', np.nan))
+    broken(odometry[60], lambda m: setattr(m.header.stamp, 'sec', 0))
+    broken(loops[3], lambda m: setattr(m.header, 'frame_id', 'map'))
+    broken(loops[4], lambda m: setattr(m.header.stamp, 'sec', 2_000_000))
+    record = read_input(mcap_file(tmp_path / 'a.mcap', recording), EVERY)
+    for said, start in zip(sorted(record.skipped), [
+            '1 loop names a time after the last odometry',
+            "1 message refused: frame 'map' of a loop; expected base_link@",
+            '1 message refused: pose (nan, ', '1 message refused: stamp 0 s 0 ns; expected'],
+            strict=True):
+        assert said.startswith(start)
+    assert all('expected' in sentence for sentence in record.skipped if 'refused' in sentence)
+    assert record.graph.n_poses == 118
+
+
+def test_messages_come_in_order_of_time_even_from_a_file_without_order(tmp_path, world, rng):
+    shuffled = [world[1][k] for k in rng.permutation(len(world[1]))]
+    for options in ({'use_chunking': False}, {'chunk_size': 5_000}):
+        path = mcap_file(tmp_path / 'a.mcap', shuffled, **options)
+        times = [m.time for m in read_messages(path)]
+        assert times == [m[2] for m in world[1]]
+
+
+def changed(message, change):
+    topic, msgtype, time, data = message
+    decoded = TYPES.deserialize_cdr(data, msgtype)
+    change(decoded)
+    return topic, msgtype, time, bytes(TYPES.serialize_cdr(decoded, msgtype))
+
+
+def test_loops_of_another_frame_are_told_with_what_was_expected(tmp_path, world):
+    recording = [changed(m, lambda m: setattr(m.header, 'frame_id', 'odom'))
+                 if m[0] == '/loop_closures' else m for m in world[1]]
+    record = read_input(mcap_file(tmp_path / 'a.mcap', recording), EVERY)
+    count = sum(m[0] == '/loop_closures' for m in recording)
+    assert record.skipped == (f"{count} messages refused: frame 'odom' of a loop; expected "
+                              'base_link@<sec>.<nanosec, 9 digits>',)
+
+
+def test_a_stray_base_frame_in_the_beginning_is_dropped(tmp_path, world):
+    recording = list(world[1])
+    first = next(m for m in recording if m[0] == '/odom')
+    wrong = changed(first, lambda m: setattr(m, 'child_frame_id', 'gripper'))
+    record = read_input(mcap_file(tmp_path / 'a.mcap', [
+        (*wrong[:2], first[2] - 1, wrong[3]), *recording]), EVERY)
+    assert record.skipped == ("1 message refused: odometry of 'gripper'; expected that of "
+                              "'base_link'",)
+    np.testing.assert_array_equal(record.graph.between.measurement,
+                                  world[2].graph.between.measurement)
+
+
+def test_a_bag_played_twice_is_the_bag(tmp_path, world):
+    """Into one recording: all once more, later, with the stamps it had."""
+    recording = world[1]
+    again = [(*m[:2], m[2] + 1000 * SECOND, m[3]) for m in recording]
+    record = read_input(mcap_file(tmp_path / 'a.mcap', recording + again), EVERY)
+    assert len(record.graph.between) == len(world[2].graph.between)
+    loops = sum(m[0] == '/loop_closures' for m in recording)
+    assert [sentence.split(':')[0] for sentence in record.skipped] == [
+        f'{len(recording) - loops} messages refused', f'{loops} messages refused']
+    assert 'was sent before' in record.skipped[1]
+
+
+def test_faults_of_the_odometry_are_told(tmp_path, world):
+    """A jump, a stamp ahead, a restart, a variance of 1e12, and a last message on its own."""
+    def moved(x, sec, k, index=-1, variance=0.0):
+        def change(m):
+            m.pose.pose.position.x += x
+            m.header.stamp.sec += sec
+            m.pose.covariance = np.where(np.arange(36) == index, variance, m.pose.covariance)
+        recording[k] = changed(recording[k], change)
+
+    recording = [m for m in world[1] if m[0] == '/odom']
+    moved(3e8, 0, 30)
+    moved(0.0, 5000, 40)
+    moved(0.0, 0, 50, 7, 1e12)
+    moved(0.0, 5000, len(recording) - 1)
+    record = read_input(mcap_file(tmp_path / 'a.mcap', recording), EVERY)
+    assert record.graph.n_poses == len(recording) - 3
+    jump, ahead, variance, last = record.skipped
+    assert jump.startswith('1 message refused: odometry 3e+08 m from one message to the next')
+    assert ahead.startswith('1 message refused: odometry stamp ')
+    assert variance.startswith('variance 1e+12 of odometry at ')
+    assert last.startswith('the last message is not used: odometry stamp ')

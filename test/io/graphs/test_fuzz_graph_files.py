@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whatever stands in a graph file: an answer in one line, never a traceback or half a file."""
+
+import contextlib
+import io
+import tempfile
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from l1slam_ros.cli.main import main
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
+
+VALID = {
+    '.g2o': """\
+VERTEX_SE2 0 0 0 0
+VERTEX_SE2 1 1 0 0.1
+VERTEX_SE2 2 2 0.1 0.2
+VERTEX_SE2 4 1 1 3
+FIX 0
+EDGE_SE2 0 1 1 0 0.1 100 0 0 100 0 400
+EDGE_SE2 1 2 1 0 0.1 100 1 2 100 3 400
+EDGE_SE2 2 4 0.5 0.5 2.5 100 0 0 100 0 400
+EDGE_SE2 0 4 1 1 3 10 0 0 10 0 40
+EDGE_PRIOR_SE2 0 0 0 0 1 0 0 1 0 1
+""",
+    '.graph': """\
+VERTEX2 0 0 0 0
+VERTEX2 1 1 0 0.1
+VERTEX2 2 2 0.1 0.2
+EDGE2 0 1 1 0 0.1 100 0 100 400 0 0
+EDGE2 1 2 1 0 0.1 100 1 100 400 2 3
+EDGE2 0 2 2 0.1 0.2 10 0 10 40 0 0
+""",
+}
+# What breaks readers: numbers at the ends of their ranges, words, signs, other tags.
+TOKENS = st.sampled_from([
+    '', '0', '-0', '1', '-1', '3', '2.5', '1e308', '-1e308', '1e-308', '5e-324', '1e154', '1e40',
+    '1e-40', 'nan', 'inf', '-inf', '9223372036854775807', '9223372036854775808', '1e3', '0x10',
+    '1_0', '++1', '1,5', 'x', '#', '\x00', '\u0663', '\u2028', '\x1b[31m', 'VERTEX_SE2',
+    'EDGE_SE2', 'EDGE2', 'VERTEX2', 'FIX', 'PARAMS_\x07', 'VERTEX_XY', 'EDGE_SE3:QUAT',
+])
+NUMBERS = st.sampled_from([
+    '0', '1', '-1', '2', '3', '0.1', '100', '3.14159265358979', '-3.2', '1e-9', '1e9', '1e-40',
+    '1e40', '1e-154', '1e154', '-1e154', '1e-300', '1e300', '1e308', '-1e308', '5e-324',
+])
+COMMANDS = st.sampled_from([
+    ('info', ()), ('convert', ('out.g2o',)), ('convert', ('out.graph',)), ('convert', ('out',)),
+    ('convert', ('out.tum',)), ('solve', ('--output', 'out.g2o', '--outer', '2')),
+    ('solve', ('--norm', 'l2', '--start', 'odometry', '--output', 'out.tum')),
+    ('solve', ('--norm', 'huber', '--start', 'file', '--output', 'out.g2o', '--json')),
+    ('corrupt', ('out.g2o', '--false-loops', '1')), ('plot', ('--output', 'out.png')),
+])
+BOUNDED = settings(derandomize=True, deadline=None, database=None,
+                   suppress_health_check=[HealthCheck.too_slow])
+
+
+@st.composite
+def mutations(draw):
+    """A valid file after a few changes: suffix and bytes."""
+    suffix = draw(st.sampled_from(sorted(VALID)))
+    lines = [line.split(' ') for line in VALID[suffix].splitlines()]
+    changes = draw(st.sampled_from([
+        ['number'], ['number', 'double', 'swap'],
+        ['number', 'replace', 'insert', 'cut', 'double', 'drop', 'swap']]))
+    for _ in range(draw(st.integers(1, 4))):
+        line = draw(st.integers(0, len(lines) - 1))
+        field = draw(st.integers(0, len(lines[line]) - 1)) if lines[line] else 0
+        change = draw(st.sampled_from(changes))
+        if change == 'replace' and lines[line]:
+            lines[line][field] = draw(TOKENS)
+        elif change == 'number' and len(lines[line]) > 3:
+            lines[line][-1 - field % 7] = draw(NUMBERS)
+        elif change == 'insert':
+            lines[line].insert(field, draw(TOKENS))
+        elif change == 'cut':
+            del lines[line][field:]
+        elif change == 'double':
+            lines.append(list(lines[line]))
+        elif change == 'drop' and len(lines) > 1:
+            del lines[line]
+        elif change == 'swap':
+            lines.insert(0, lines.pop(line))
+    content = '\n'.join(' '.join(line) for line in lines).encode() + b'\n'
+    if changes[-1] == 'swap':
+        content = content[:draw(st.integers(0, len(content)) | st.just(len(content)))]
+    return suffix, content
+
+
+def answer(suffix, content, command, more):
+    """Run one command on a file of these bytes; look at what it says and what it leaves."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        path = folder / f'in{suffix}'
+        path.write_bytes(content)
+        arguments = [str(folder / word) if word.startswith('out') else word for word in more]
+        out, err = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), \
+                warnings.catch_warnings():
+            # A warning would be a second line, of no use to who reads it.
+            warnings.simplefilter('error')
+            code = main([command, str(path), *arguments])
+        left = {p.name for p in folder.iterdir()} - {path.name}
+        assert path.read_bytes() == content
+        for line in err.getvalue().splitlines():
+            assert line.startswith('l1slam: ') and line.isprintable()
+            assert len(line) < 500 + 2 * len(name)
+        if code == 2:
+            assert left == set() and out.getvalue() == '' and err.getvalue()
+        else:
+            assert code == (4 if 'doubtful: ' in err.getvalue() else 0)
+            assert all(part.startswith('out') for part in left)
+            for part in left & {'out.g2o', 'out.graph'}:
+                read_graph_file(folder / part)
+        return code
+
+
+@settings(BOUNDED, max_examples=150)
+@given(suffix=st.sampled_from(sorted(VALID)), content=st.binary(max_size=300), command=COMMANDS)
+def test_arbitrary_bytes(suffix, content, command):
+    assert answer(suffix, content, *command) == 2
+
+
+@settings(BOUNDED, max_examples=400)
+@given(file=mutations(), command=COMMANDS)
+def test_mutated_files(file, command):
+    answer(*file, *command)
+
+
+@st.composite
+def records(draw):
+    """A random graph: any ids, edges either way, any numbers, with poses and stamps or not."""
+    ids = sorted(draw(st.sets(st.integers(-2**63, 2**63 - 1) | st.integers(0, 20),
+                              min_size=2, max_size=6)))
+    n, m = len(ids), draw(st.integers(1, 8))
+    number = st.floats(-1e30, 1e30) | st.floats(-10, 10) | st.sampled_from([0.0, -0.0, 1 / 3])
+    pairs = np.array(draw(st.lists(st.tuples(st.integers(0, n - 1), st.integers(1, n - 1)),
+                                   min_size=m, max_size=m)))
+    # Every vertex has an edge, or a file without poses would not know it.
+    pairs = np.concatenate((pairs, np.stack((np.arange(n), np.ones(n, int)), axis=1)))
+    m = len(pairs)
+
+    def numbers(*shape):
+        count = int(np.prod(shape))
+        return np.array(draw(st.lists(number, min_size=count, max_size=count))).reshape(shape)
+
+    root = np.tril(np.clip(numbers(m, 3, 3), -1, 1))
+    root[:, range(3), range(3)] = np.array(
+        draw(st.lists(st.floats(0.5, 2), min_size=3 * m, max_size=3 * m))).reshape(m, 3)
+    scale = np.array(draw(st.lists(st.integers(-20, 20), min_size=m, max_size=m)))
+    graph = FactorGraph(se2)
+    graph.add_poses(n)
+    graph.add_between(pairs[:, 0], pairs.sum(axis=1) % n, numbers(m, 3),
+                      (root @ root.transpose(0, 2, 1)) * 10.0 ** scale[:, None, None])
+    stamps = draw(st.none() | st.lists(st.integers(0, 2**62), min_size=n, max_size=n))
+    return GraphRecord(graph, draw(st.none() | st.just(numbers(n, 3))), np.array(ids),
+                       None if stamps is None else np.array(stamps))
+
+
+def assert_same(a, b):
+    """Numbers to the last bit, signs of zeros too; the information to rounding."""
+    for x, y in ((a.ids, b.ids), (a.poses, b.poses), (a.stamps, b.stamps),
+                 (a.graph.between.i, b.graph.between.i), (a.graph.between.j, b.graph.between.j),
+                 (a.graph.between.measurement, b.graph.between.measurement)):
+        assert (x is None) == (y is None)
+        assert x is None or x.tobytes() == y.tobytes()
+    roots = a.graph.between.sqrt_information
+    scale = np.abs(roots).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(b.graph.between.sqrt_information / scale, roots / scale,
+                               rtol=0, atol=1e-13)
+
+
+@settings(BOUNDED, max_examples=100)
+@given(record=records())
+def test_what_is_written_is_read(record):
+    with tempfile.TemporaryDirectory() as name:
+        g2o, toro, again = (Path(name) / file for file in ('a.g2o', 'b.graph', 'c.g2o'))
+        write_graph_file(g2o, record)
+        read = read_graph_file(g2o)
+        assert_same(record, read)
+        write_graph_file(toro, read)
+        assert_same(record, read_graph_file(toro))
+        write_graph_file(again, read_graph_file(toro))
+        assert_same(record, read_graph_file(again))
+        assert len(list(Path(name).iterdir())) == (3 if record.stamps is None else 6)
+
+
+@settings(BOUNDED, max_examples=40)
+@given(record=records(), command=COMMANDS)
+def test_commands_on_random_graphs(record, command):
+    with tempfile.TemporaryDirectory() as name:
+        write_graph_file(Path(name) / 'a.g2o', record)
+        content = (Path(name) / 'a.g2o').read_bytes()
+    answer('.g2o', content, *command)
+
+
+@pytest.mark.parametrize('suffix', sorted(VALID))
+def test_the_file_before_its_mutation_works(suffix):
+    for command in ('info',), ('solve', '--norm', 'l2'), ('convert', 'out.g2o'):
+        assert answer(suffix, VALID[suffix].encode(), command[0], command[1:]) == 0

@@ -1,0 +1,491 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Graph files: g2o and TORO in, the same numbers out, every malformed line named."""
+
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.noise import square_root_information
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.io.graphs.graph_file import (
+    GraphRecord,
+    read_graph_file,
+    read_vertices,
+    write_graph_file,
+)
+from l1slam_ros.io.graphs.side_files import stamps_path, trusted_path
+
+SQUARE = """\
+# a comment
+VERTEX_SE2 7 1.5 0 1.5
+VERTEX_SE2 3 0 0 0
+
+EDGE_SE2 3 7 1 0.25 1.5 4 0.5 0.25 5 0.125 6
+VERTEX_SE2 9 1 1 3
+EDGE_SE2 7 9 1 0 1.5 4 0 0 4 0 9
+EDGE_SE2 9 3 -0.5 1 -3 1 0 0 1 0 1
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def file(content, name='a.g2o'):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+    return file
+
+
+def message_of(path):
+    with pytest.raises(FileError) as caught:
+        read_graph_file(path)
+    assert '\n' not in str(caught.value)
+    return str(caught.value).removeprefix(str(path))
+
+
+def information_of(factors):
+    roots = factors.sqrt_information
+    return roots.transpose(0, 2, 1) @ roots
+
+
+def test_a_small_graph(write):
+    record = read_graph_file(write(SQUARE))
+    assert record.ids.tolist() == [3, 7, 9]
+    assert record.poses.tolist() == [[0, 0, 0], [1.5, 0, 1.5], [1, 1, 3]]
+    factors = record.graph.between
+    assert factors.i.tolist() == [0, 1, 2]
+    assert factors.j.tolist() == [1, 2, 0]
+    assert factors.measurement[0].tolist() == [1, 0.25, 1.5]
+    np.testing.assert_allclose(
+        information_of(factors)[0], [[4, 0.5, 0.25], [0.5, 5, 0.125], [0.25, 0.125, 6]],
+        rtol=1e-15)
+    assert record.stamps is None
+    assert record.skipped == ()
+
+
+def test_toro_orders_the_information_otherwise(write):
+    g2o = 'EDGE_SE2 0 1 1 2 0.5 10 1 2 20 3 30\n'
+    toro = 'EDGE2 0 1 1 2 0.5 10 1 20 30 2 3\n'
+    first, second = (read_graph_file(write(text)).graph.between for text in (g2o, toro))
+    assert (first.sqrt_information == second.sqrt_information).all()
+    assert (first.measurement == second.measurement).all()
+
+
+def test_edges_alone_name_the_vertices(write):
+    record = read_graph_file(write('EDGE_SE2 5 -2 1 0 0 1 0 0 1 0 1\n'))
+    assert record.ids.tolist() == [-2, 5]
+    assert record.poses is None
+    assert record.graph.between.i.tolist() == [1]
+
+
+def test_ids_beyond_the_floats(write):
+    # Names such as x0, x1 of other tools: a letter in the top byte.
+    a = ord('x') << 56
+    record = read_graph_file(write(f'EDGE_SE2 {a} {a + 1} 1 0 0 1 0 0 1 0 1\n'))
+    assert record.ids.tolist() == [a, a + 1]
+
+
+def test_priors(write):
+    record = read_graph_file(write(SQUARE + 'EDGE_PRIOR_SE2 7 1 2 0.5 10 1 2 20 3 30\n'))
+    prior = record.graph.prior
+    assert prior.i.tolist() == [1]
+    assert prior.measurement.tolist() == [[1, 2, 0.5]]
+    np.testing.assert_allclose(
+        information_of(prior)[0], [[10, 1, 2], [1, 20, 3], [2, 3, 30]], rtol=1e-15)
+
+
+def test_edges_of_both_formats_keep_the_order_of_the_file(write):
+    record = read_graph_file(write(
+        'EDGE2 0 1 1 0 0 1 0 1 1 0 0\nEDGE_SE2 0 1 2 0 0 1 0 0 1 0 1\n'
+        'EDGE2 0 1 3 0 0 1 0 1 1 0 0\n'))
+    assert record.graph.between.measurement[:, 0].tolist() == [1, 2, 3]
+
+
+def test_a_disconnected_graph_is_read(write):
+    record = read_graph_file(write(
+        'EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 5 6 1 0 0 1 0 0 1 0 1\n'))
+    assert record.graph.n_poses == 4
+
+
+def test_what_is_not_used_is_said(write):
+    record = read_graph_file(write(
+        SQUARE + 'FIX 9\nFIX 3\nPARAMS_SE2OFFSET 0 0 0 0\nVERTEX_XY 20 1 2\nVERTEX_XY 21 1 2\n'
+        'EDGE_SE2_XY 3 20 1 1 1 0 1\n'))
+    assert record.skipped == (
+        "FIX '9 3' is not used: the first vertex, 3, is the one held fixed",
+        "1 'PARAMS_SE2OFFSET' line is not used: "
+        'sensor data and calibration are no part of a pose graph',
+        "2 'VERTEX_XY' lines are not used: landmarks are no part of a pose graph",
+        "1 'EDGE_SE2_XY' line is not used: landmarks are no part of a pose graph")
+
+
+@pytest.mark.parametrize('tag', [
+    'VERTEX_XY', 'EDGE_SE2_XY', 'EDGE_BEARING_SE2_XY', 'EDGE_PRIOR_SE2_XY', 'VERTEX_LINE2D',
+    'EDGE_SE2_SEGMENT2D', 'ROBOTLASER1', 'RAWLASER1', 'VERTEX_TAG', 'PARAMS_CAMERAPARAMETERS',
+])
+def test_known_tags_may_say_anything(write, tag):
+    record = read_graph_file(write(SQUARE + f'{tag}\n{tag} 3 x nan 1 2 3 4 5 6 7 8 9\n'))
+    sentence, = record.skipped
+    assert sentence.startswith(f'2 {tag!r} lines are not used: ')
+    assert record.graph.n_poses == 3 and len(record.graph.between) == 3
+
+
+def test_a_fixed_first_vertex_is_no_news(write):
+    assert read_graph_file(write(SQUARE + 'FIX 3\n')).skipped == ()
+
+
+# The square again, as TORO has it.
+TORO_SQUARE = """\
+# a comment
+VERTEX2 7 1.5 0 1.5
+VERTEX2 3 0 0 0
+
+EDGE2 3 7 1 0.25 1.5 4 0.5 5 6 0.25 0.125
+VERTEX2 9 1 1 3
+EDGE2 7 9 1 0 1.5 4 0 4 9 0 0
+EDGE2 9 3 -0.5 1 -3 1 0 1 1 0 0
+"""
+
+
+def test_the_same_square_in_toro(write):
+    a, b = read_graph_file(write(SQUARE)), read_graph_file(write(TORO_SQUARE, 'a.graph'))
+    assert_same(a, b)
+
+
+# As g2o has them; in TORO the tags are others, and so is the order of the information.
+MALFORMED = [
+    ('EDGE 3 7 1 0 0 1 0 0 1 0', 'EDGE: 10 fields; expected 2 whole and 9 finite numbers'),
+    ('EDGE 3 7 1 0 0 1 0 0 1 0 1 1', 'EDGE: 12 fields; expected 2 whole'),
+    ('EDGE', 'EDGE: 0 fields; expected 2 whole'),
+    ('EDGE 3 7 # 1 0 0 1 0 0 1 0 1', 'EDGE: 2 fields; expected 2 whole'),
+    ('VERTEX 5 0 0', 'VERTEX: 3 fields; expected 1 whole and 3 finite numbers'),
+    ('VERTEX', 'VERTEX: 0 fields; expected 1 whole and 3 finite numbers'),
+    ('VERTEX 5 0 nan 0', "VERTEX: 'nan' is not a finite number; expected"),
+    ('VERTEX 5 0 O 0', "VERTEX: 'O' is not a finite number; expected"),
+    ('VERTEX 5 0 1,5 0', "VERTEX: '1,5' is not a finite number; expected"),
+    ('VERTEX 5 0 1e31 0', "VERTEX: '1e31' is beyond 1e+30; expected"),
+    ('VERTEX 5.0 0 0 0', "VERTEX: '5.0' is not a whole number of 64 bits; expected"),
+    ('VERTEX 9223372036854775808 0 0 0',
+     "VERTEX: '9223372036854775808' is not a whole number of 64 bits; expected"),
+    ('EDGE 3 7.5 1 0 0 1 0 0 1 0 1', "EDGE: '7.5' is not a whole number of 64 bits"),
+    ('EDGE 3 x 1 0 0 1 0 0 1 0 1', "EDGE: 'x' is not a whole number of 64 bits"),
+    ('EDGE 3 7 1 inf 0 1 0 0 1 0 1', "EDGE: 'inf' is not a finite number; expected"),
+    ('EDGE 3 7 1 0 0 nan 0 0 1 0 1', "EDGE: 'nan' is not a finite number; expected"),
+    ('EDGE 3 7 1 0 0 -1e99 0 0 1 0 1', "EDGE: '-1e99' is beyond 1e+30; expected"),
+    ('EDGE 3 7 1 0 0 0 0 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected a positive'),
+    ('EDGE 3 8 1 0 0 1 0 0 1 0 1', 'vertex 8 is unknown; expected one of the 3 vertices'),
+    ('EDGE 100 3 1 0 0 1 0 0 1 0 1', 'vertex 100 is unknown; expected one of the 3 vertices'),
+    ('VERTEX 7 0 0 0', 'vertex 7 stands twice, before at line 2; expected each once'),
+    ('EGDE_SE2 3 7 1 0 0 1 0 0 1 0 1', "unknown tag 'EGDE_SE2'; expected VERTEX_SE2, EDGE_SE2, "),
+    ('vertex_se2 5 0 0 0', "unknown tag 'vertex_se2'; expected VERTEX_SE2, EDGE_SE2, "),
+    ('VERTEX_SE3:QUAT 5 0 0 0 0 0 0 1', "'VERTEX_SE3:QUAT': 3D graphs are not supported yet; "
+     'expected a graph in the plane (EDGE_SE2 or EDGE2 lines)'),
+    ('EDGE_SE3:QUAT 5 6', "'EDGE_SE3:QUAT': 3D graphs are not supported yet"),
+    ('VERTEX_SE3:EXPMAP 5 6', "'VERTEX_SE3:EXPMAP': 3D graphs are not supported yet"),
+    ('VERTEX_TRACKXYZ 5 6', "'VERTEX_TRACKXYZ': 3D graphs are not supported yet"),
+    ('VERTEX3 5 0 0 0 0 0 0', "'VERTEX3': 3D graphs are not supported yet"),
+    ('EDGE3 5 6', "'EDGE3': 3D graphs are not supported yet"),
+]
+
+
+def with_tags(text, tags):
+    return re.sub(r'\b(VERTEX|EDGE)\b', lambda word: tags[word[0]], text)
+
+
+@pytest.mark.parametrize(('square', 'tags'), [
+    (SQUARE, {'VERTEX': 'VERTEX_SE2', 'EDGE': 'EDGE_SE2'}),
+    (TORO_SQUARE, {'VERTEX': 'VERTEX2', 'EDGE': 'EDGE2'}),
+], ids=['g2o', 'toro'])
+@pytest.mark.parametrize(('line', 'message'), MALFORMED)
+def test_each_malformed_line_is_named(write, square, tags, line, message):
+    # A good line follows: it is not the last one that is named, nor the first of its tag.
+    text = square + with_tags(line, tags) + '\n' + square.splitlines()[4] + '\n'
+    assert message_of(write(text)).startswith(f':9: {with_tags(message, tags)}')
+
+
+@pytest.mark.parametrize(('line', 'message'), [
+    ('EDGE_SE2 3 7 1 0 0 1 2 0 1 0 1',
+     'information [1 2 0 2 1 0 0 0 1]; expected a positive definite matrix'),
+    ('EDGE2 3 7 1 0 0 1 2 1 1 0 0',
+     'information [1 2 0 2 1 0 0 0 1]; expected a positive definite matrix'),
+    # Positive definite in one order, not in the other.
+    ('EDGE2 3 7 1 0 0 1 0 0 1 0 1', 'information [1 0 0 0 0 1 0 1 1]; expected a positive'),
+    ('EDGE_PRIOR_SE2 3 1 0 0 1 0 0 1 0 -1', 'information [1 0 0 0 1 0 0 0 -1]; expected'),
+    ('EDGE_PRIOR_SE2 -1 1 0 0 1 0 0 1 0 1', 'vertex -1 is unknown; expected one of the 3'),
+    ('EDGE_PRIOR_SE2 3 7 1 0 0 1 0 0 1 0 1', 'EDGE_PRIOR_SE2: 11 fields; expected 1 whole and 9'),
+])
+def test_each_order_of_the_information_is_its_own(write, line, message):
+    assert message_of(write(SQUARE + line + '\n')).startswith(f':9: {message}')
+
+
+@pytest.mark.parametrize(('content', 'message'), [
+    ('', ': the file is empty; expected EDGE_SE2 or EDGE2 lines'),
+    ('# nothing\n\n', ': the file is empty; expected EDGE_SE2 or EDGE2 lines'),
+    ('VERTEX_SE2 0 0 0 0\n', ': no edges; expected EDGE_SE2 or EDGE2 lines'),
+    ('0 1 2\n', ":1: unknown tag '0'; expected VERTEX_SE2, "),
+    (b'\x89MCAP0\r\n', ': byte 0x89 at offset 0; expected a text file'),
+    (b'\x00' * 1000, ":1: unknown tag '\\x00"),
+    (b'VERTEX_SE2 0 0 0 0\n\x00\x01 EDGE\n', ":2: unknown tag '\\x00\\x01'; expected"),
+])
+def test_what_is_no_graph_is_told(write, content, message):
+    found = message_of(write(content))
+    assert found.startswith(message)
+    assert len(found) < 400
+
+
+def test_no_file_and_a_directory(tmp_path):
+    assert message_of(tmp_path / 'none.g2o') == ': cannot be read: No such file or directory'
+    assert message_of(tmp_path) == ': cannot be read: Is a directory'
+
+
+@pytest.mark.skipif(not hasattr(os, 'geteuid') or os.geteuid() == 0, reason='root reads all')
+def test_an_unreadable_file(write):
+    path = write(SQUARE)
+    path.chmod(0)
+    assert message_of(path) == ': cannot be read: Permission denied'
+
+
+def random_record(rng, n=40, stamps=True):
+    graph = FactorGraph(se2)
+    graph.add_poses(n)
+    i = np.concatenate((np.arange(n - 1), rng.integers(0, n - 5, 60)))
+    j = np.concatenate((np.arange(1, n), i[n - 1:] + rng.integers(1, 5, 60)))
+    A = rng.normal(size=(len(i), 3, 3))
+    graph.add_between(i, j, rng.normal(size=(len(i), 3)),
+                      A @ A.transpose(0, 2, 1) + 0.1 * np.eye(3))
+    graph.add_prior(np.array([3]), rng.normal(size=(1, 3)), 7.7 * np.eye(3)[None])
+    ids = np.sort(rng.choice(10**12, n, replace=False))
+    return GraphRecord(graph, rng.normal(size=(n, 3)) * 1e3, ids,
+                       np.cumsum(rng.integers(1, 10**12, n)) if stamps else None)
+
+
+def assert_same(a, b):
+    assert (a.ids == b.ids).all()
+    assert (a.poses == b.poses).all()
+    for x, y in ((a.graph.between, b.graph.between), (a.graph.prior, b.graph.prior)):
+        assert (x.i == y.i).all()
+        assert (x.measurement == y.measurement).all()
+        np.testing.assert_allclose(x.sqrt_information, y.sqrt_information, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize('suffix, tag, information', [
+    ('g2o', 'EDGE_SE2', '1 0 0 1 0 1'), ('graph', 'EDGE2', '1 0 1 1 0 0')])
+def test_edges_from_a_vertex_to_itself_are_left_out(tmp_path, suffix, tag, information):
+    """Whatever else is wrong with them; and a vertex that has no other edge is none."""
+    path, edge = tmp_path / f'a.{suffix}', f'{tag} {{}} 1 0 0 {information}'.format
+    circles = [edge('7 7'), f'{tag} 99 99 1 0 0 0 0 0 0 0 0', edge('3 3'), edge('3 3')]
+    for count, said in (
+            (1, '1 edge from a vertex to itself not used: line 2'),
+            (3, '3 edges from a vertex to itself not used: lines 2, 3, 4'),
+            (4, '4 edges from a vertex to itself not used: lines 2, 3, 4, ...')):
+        path.write_text('\n'.join([edge('3 7'), *circles[:count], edge('7 11')]))
+        record = read_graph_file(path)
+        assert record.skipped == (said,)
+        assert record.ids.tolist() == [3, 7, 11]
+        assert record.ids[record.graph.between.pairs].tolist() == [[3, 7], [7, 11]]
+    path.write_text(edge('3 3'))
+    with pytest.raises(FileError, match='no edges; expected'):
+        read_graph_file(path)
+
+
+def test_round_trip(tmp_path, rng):
+    record = random_record(rng)
+    write_graph_file(tmp_path / 'a.g2o', record)
+    back = read_graph_file(tmp_path / 'a.g2o')
+    assert_same(record, back)
+    assert (back.stamps == record.stamps).all()
+    assert {p.name for p in tmp_path.iterdir()} == {'a.g2o', 'a.g2o.stamps.txt'}
+
+
+def test_toro_round_trip_and_what_it_cannot_hold(tmp_path, rng):
+    record = random_record(rng, stamps=False)
+    path = tmp_path / 'a.graph'
+    with pytest.raises(FileError, match='toro has no line for a prior of SE2'):
+        write_graph_file(path, record)
+    assert not path.exists()
+    write_graph_file(tmp_path / 'a.g2o', record)
+    text = (tmp_path / 'a.g2o').read_text()
+    (tmp_path / 'b.g2o').write_text(
+        ''.join(f'{line}\n' for line in text.splitlines() if 'PRIOR' not in line))
+    record = read_graph_file(tmp_path / 'b.g2o')
+    write_graph_file(path, record)
+    assert {line.split()[0] for line in path.read_text().splitlines()} == {'VERTEX2', 'EDGE2'}
+    assert_same(record, read_graph_file(path))
+
+
+@pytest.mark.parametrize('name', ['intel', 'manhattan3500', 'city10000'])
+def test_the_papers_graphs_come_back_number_by_number(datasets, tmp_path, name):
+    source, copy = datasets / f'{name}.g2o', tmp_path / 'copy.g2o'
+    write_graph_file(copy, read_graph_file(source))
+
+    def rows(path, tag):
+        lines = [line.split() for line in path.read_text().splitlines()]
+        return [[float(v) for v in line[1:]] for line in lines if line and line[0] == tag]
+
+    assert rows(copy, 'VERTEX_SE2') == sorted(rows(source, 'VERTEX_SE2'))
+    assert rows(copy, 'EDGE_SE2') == rows(source, 'EDGE_SE2')
+
+
+def test_what_the_papers_graphs_hold(datasets):
+    record = read_graph_file(datasets / 'manhattan3500.g2o')
+    assert record.graph.n_poses == 3500
+    assert len(record.graph.between) == 5598
+    assert record.graph.between.is_odometry.sum() == 3499
+
+
+@pytest.mark.parametrize(('name', 'tag'), [
+    ('sphere2500', 'VERTEX_SE3:QUAT'), ('parking-garage', 'VERTEX_SE3:QUAT')])
+def test_3d_graphs_are_refused(datasets, name, tag):
+    assert message_of(datasets / f'{name}.g2o') == (
+        f":1: '{tag}': 3D graphs are not supported yet; expected a graph in the plane "
+        '(EDGE_SE2 or EDGE2 lines)')
+
+
+@pytest.mark.parametrize('exponent', [-30, -8, 0, 8, 25])
+def test_information_of_many_digits_keeps_them(tmp_path, rng, exponent):
+    information = np.diag(rng.uniform(1, 10, 3) * 10.0**exponent)[None]
+    graph = FactorGraph(se2)
+    graph.add_poses(2)
+    graph.add_between(np.array([0]), np.array([1]), np.ones((1, 3)), information)
+    write_graph_file(tmp_path / 'a.g2o', GraphRecord(graph, None, np.array([0, 1])))
+    back = read_graph_file(tmp_path / 'a.g2o')
+    np.testing.assert_allclose(back.graph.between.sqrt_information,
+                               square_root_information(information), rtol=1e-15, atol=0)
+
+
+def test_a_graph_without_stamps_does_not_inherit_those_of_its_predecessor(tmp_path, rng):
+    path, record = tmp_path / 'a.g2o', random_record(rng)
+    write_graph_file(path, record)
+    write_graph_file(path, replace(record, stamps=None))
+    assert read_graph_file(path).stamps is None
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def with_trust(record, rows):
+    """Return the record with only these rows of its factors trusted."""
+    graph, factors = FactorGraph(se2), record.graph.between
+    graph.add_poses(record.graph.n_poses)
+    graph.add_between(factors.i, factors.j, factors.measurement, information_of(factors),
+                      np.isin(np.arange(len(factors)), rows))
+    return replace(record, graph=graph)
+
+
+@pytest.mark.parametrize('name', ['a.g2o', 'a.graph'])
+def test_trust_comes_back_with_the_graph(tmp_path, rng, name):
+    path, record = tmp_path / name, random_record(rng)
+    factors = record.graph.between
+    pairs = np.stack((factors.i, factors.j), axis=1)
+    rows = [row for row in range(len(factors) - 1, 39, -7)  # loops that nothing runs along
+            if (pairs == pairs[row]).all(axis=1).sum() == 1]
+    assert len(rows) > 3
+    write_graph_file(path, with_trust(record, rows))
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        name, f'{name}.stamps.txt', f'{name}.trusted.txt']
+    assert sorted(tuple(map(int, line.split()))
+                  for line in trusted_path(path).read_text().splitlines()) == sorted(
+        map(tuple, record.ids[pairs[rows]].tolist()))
+    back = read_graph_file(path)
+    assert sorted(rows) == np.flatnonzero(back.graph.between.trusted).tolist()
+    assert (back.poses == record.poses).all() and (back.stamps == record.stamps).all()
+
+
+def test_trust_joins_loops_either_way_round_and_leaves_odometry(write):
+    path = write(SQUARE + 'EDGE_SE2 7 3 1 0 0 1 0 0 1 0 1\nEDGE_SE2 3 9 1 0 0 1 0 0 1 0 1\n')
+    trusted_path(path).write_text('3 7\n7 9\n')
+    assert read_graph_file(path).graph.between.trusted.tolist() == [False] * 3 + [True, False]
+    trusted_path(path).write_text('3 9\n')
+    assert read_graph_file(path).graph.between.trusted.tolist() == [
+        False, False, True, False, True]
+
+
+@pytest.mark.parametrize(('text', 'message'), [
+    ('3 9\n\n3 x\n', ":3: trusted loop: 'x' is not a whole number of 64 bits; expected 2 whole"),
+    ('3 9 1\n', ':1: trusted loop: 3 fields; expected 2 whole numbers'),
+    ('9 3\n3 8\n', ':2: no edge between 3 and 8 in '),
+    ('9 3\n0 1\n', ':2: no edge between 0 and 1 in '),
+])
+def test_damaged_trust_is_named(write, text, message):
+    path = write(SQUARE)
+    trusted_path(path).write_text(text)
+    assert message_of(path).startswith(f'.trusted.txt{message}')
+
+
+def test_a_graph_without_trust_is_not_lent_that_of_its_predecessor(tmp_path, rng):
+    path, record = tmp_path / 'a.g2o', random_record(rng)
+    write_graph_file(path, with_trust(record, [50, 60]))
+    assert trusted_path(path).exists()
+    write_graph_file(path, record)
+    assert not trusted_path(path).exists()
+    assert not read_graph_file(path).graph.between.trusted.any()
+
+
+def test_graph_stamps_and_trust_are_replaced_together_or_not_at_all(tmp_path, rng):
+    path, record = tmp_path / 'a.g2o', random_record(rng)
+    other = replace(record, poses=record.poses + 1, stamps=record.stamps + 1)
+    write_graph_file(path, record)
+    trusted_path(path).mkdir()
+    before = {p: p.is_dir() or p.read_bytes() for p in tmp_path.iterdir()}
+    for changed, word in (with_trust(other, [50]), 'written'), (other, 'removed'):
+        with pytest.raises(FileError, match=f'{trusted_path(path)}: cannot be {word}'):
+            write_graph_file(path, changed)
+        assert {p: p.is_dir() or p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+def test_the_graph_survives_a_failing_replacement(tmp_path, rng):
+    path, record = tmp_path / 'a.g2o', random_record(rng)
+    write_graph_file(path, record)
+    before = {p: p.read_bytes() for p in tmp_path.iterdir()}
+    for number in np.nan, np.inf, -1.1e30:
+        poses = record.poses.copy()
+        poses[2, 1] = number
+        with pytest.raises(FileError, match=f'VERTEX_SE2 {record.ids[2]} would be .* expected'):
+            write_graph_file(path, replace(record, poses=poses))
+        assert {p: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize(('text', 'message'), [
+    ('3 1.5\n7 2.5\n', ': 2 stamps that are not those of the 3 vertices; expected one for each'),
+    ('3 1\n7 2\n8 3\n', ': 3 stamps that are not those of the 3 vertices'),
+    ('3 1\n7 2\n7 2\n9 3\n', ': 4 stamps that are not those of the 3 vertices'),
+    ('3 1\n# x\n7 two\n9 3\n', ":3: '7 two'; expected a vertex id and seconds"),
+    ('3 1\n7\n9 3\n', ":2: '7'; expected a vertex id and seconds"),
+])
+def test_damaged_stamps_are_named(write, text, message):
+    path = write(SQUARE)
+    stamps_path(path).write_text(text)
+    with pytest.raises(FileError) as caught:
+        read_graph_file(path)
+    assert str(caught.value).startswith(f'{stamps_path(path)}{message}')
+
+
+def test_stamps_of_any_order(write):
+    path = write(SQUARE)
+    stamps_path(path).write_text('9 3\n# c\n3 1.25\n7 2.000000001\n')
+    assert read_graph_file(path).stamps.tolist() == [1250000000, 2000000001, 3000000000]
+
+
+def test_vertices_alone(write):
+    ids, poses = read_vertices(write('VERTEX_SE2 4 1 2 3\nVERTEX_SE2 2 4 5 6\n'))
+    assert ids.tolist() == [2, 4]
+    assert poses.tolist() == [[4, 5, 6], [1, 2, 3]]
+    with pytest.raises(FileError, match='no vertices; expected VERTEX_SE2 or VERTEX2 lines'):
+        read_vertices(write('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n'))
+
+
+def test_the_readers_need_no_bag_or_plot_library():
+    modules = ['files', 'graphs.graph_file', 'graphs.side_files', 'trajectory', 'bags.reader',
+               'messages.conversion', 'bags.from_graph']
+    code = (''.join(f'import l1slam_ros.io.{name}\n' for name in modules)
+            + 'import sys\nprint([m for m in sys.modules if m.split(".")[0] in '
+              '("rosbags", "mcap", "matplotlib", "yaml", "rclpy")])')
+    out = subprocess.run([sys.executable, '-c', code], check=True, capture_output=True, text=True,
+                         cwd=Path(__file__).parents[3])
+    assert out.stdout.strip() == '[]'

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages in: rosbags' and rclpy's alike; garbage is refused under its cause."""
+
+import math
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from l1slam_ros.core.errors import MessageError
+from l1slam_ros.io.messages.conversion import (
+    loop_closure,
+    odometry_sample,
+    reference_frame_id,
+    stamp_of,
+)
+
+NS = 10**9
+
+
+def rosbags_class(name):
+    return get_typestore(Stores.ROS2_JAZZY).types[name]
+
+
+def rclpy_class(name):
+    package, _, leaf = name.split('/')
+    module = pytest.importorskip(f'{package}.msg')
+    return getattr(module, leaf)
+
+
+@pytest.fixture(params=[rosbags_class, rclpy_class], ids=['rosbags', 'rclpy'])
+def new(request):
+    """Return a function that makes a message of either library from its fields."""
+    return lambda name, **fields: request.param(name)(**fields)
+
+
+def pose_with_covariance(new, position=(1.0, 2.0, 0.0), quaternion=(0.0, 0.0, 0.0, 1.0)):
+    return new('geometry_msgs/msg/PoseWithCovariance', covariance=np.arange(36.0), pose=new(
+        'geometry_msgs/msg/Pose',
+        position=new('geometry_msgs/msg/Point', **dict(zip('xyz', position, strict=True))),
+        orientation=new('geometry_msgs/msg/Quaternion',
+                        **dict(zip('xyzw', quaternion, strict=True)))))
+
+
+def header(new, sec=12, nanosec=5, frame='odom'):
+    return new('std_msgs/msg/Header', frame_id=frame,
+               stamp=new('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec))
+
+
+def odometry(new, head=None, **pose):
+    def vector():
+        return new('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
+
+    return new(
+        'nav_msgs/msg/Odometry', header=head or header(new), child_frame_id='base_link',
+        pose=pose_with_covariance(new, **pose),
+        twist=new('geometry_msgs/msg/TwistWithCovariance', covariance=-np.arange(36.0),
+                  twist=new('geometry_msgs/msg/Twist', linear=vector(), angular=vector())))
+
+
+def loop(new, frame='base_link@10.000000007', **pose):
+    return new('geometry_msgs/msg/PoseWithCovarianceStamped', header=header(new, frame=frame),
+               pose=pose_with_covariance(new, **pose))
+
+
+def cause_of(call, *arguments):
+    with pytest.raises(MessageError) as caught:
+        call(*arguments)
+    assert '\n' not in str(caught.value)
+    assert 'expected' in str(caught.value)
+    return caught.value.cause
+
+
+def test_odometry(new):
+    sample = odometry_sample(odometry(new))
+    assert sample.stamp == 12 * NS + 5
+    assert sample.pose3.tolist() == [1, 2, 0, 0, 0, 0, 1]
+    assert sample.covariance.tolist() == np.arange(36.0).reshape(6, 6).tolist()
+    assert sample.twist_covariance[1, 0] == -6.0
+
+
+def test_a_sample_does_not_change_with_its_message(new):
+    message = odometry(new)
+    sample = odometry_sample(message)
+    message.pose.covariance[0] = 99.0
+    assert sample.covariance[0, 0] == 0.0
+
+
+@pytest.mark.parametrize('trusted', [True, False])
+def test_loop(new, trusted):
+    closure = loop_closure(loop(new), 'base_link', trusted)
+    assert (closure.reference_stamp, closure.stamp) == (10 * NS + 7, 12 * NS + 5)
+    assert closure.trusted is trusted
+    assert closure.pose3.tolist() == [1, 2, 0, 0, 0, 0, 1]
+    assert closure.covariance[5, 5] == 35.0
+
+
+def test_a_covariance_that_is_none_passes(new):
+    message = odometry(new)
+    message.pose.covariance[:] = math.nan
+    message.twist.covariance[:] = math.inf
+    sample = odometry_sample(message)
+    assert np.isnan(sample.covariance).all()
+    assert np.isinf(sample.twist_covariance).all()
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize('axis', range(7))
+def test_a_pose_that_is_not_finite(new, value, axis):
+    numbers = [1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    numbers[axis] = value
+    pose = {'position': numbers[:3], 'quaternion': numbers[3:]}
+    assert cause_of(odometry_sample, odometry(new, **pose)) == 'not_finite'
+    assert cause_of(loop_closure, loop(new, **pose), '', False) == 'not_finite'
+
+
+@pytest.mark.parametrize('position', [(1e308, 0.0, 0.0), (0.0, -2e9, 0.0)])
+def test_a_pose_out_of_this_world(new, position):
+    assert cause_of(odometry_sample, odometry(new, position=position)) == 'range'
+
+
+@pytest.mark.parametrize('quaternion', [
+    (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.8), (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 1e200, 1e200)])
+def test_a_quaternion_that_is_none(new, quaternion):
+    assert cause_of(odometry_sample, odometry(new, quaternion=quaternion)) == 'quaternion'
+
+
+def test_a_quaternion_of_few_digits_is_normalised(new):
+    sample = odometry_sample(odometry(new, quaternion=(0.0, 0.0, 0.7, 0.7)))
+    np.testing.assert_allclose(sample.pose3[3:], [0, 0, np.sqrt(0.5), np.sqrt(0.5)], rtol=1e-15)
+
+
+@pytest.mark.parametrize(('sec', 'nanosec'), [(0, 0), (-1, 5), (3, NS), (3, 2**32 - 1)])
+def test_a_stamp_that_is_none(new, sec, nanosec):
+    head = header(new, sec, nanosec)
+    assert cause_of(stamp_of, head) == 'stamp'
+    assert cause_of(odometry_sample, odometry(new, head)) == 'stamp'
+
+
+@pytest.mark.parametrize('frame', [
+    '', 'map', 'odom', 'base_link', 'base_link@', 'base_link@10', 'base_link@10.5',
+    'base_link@10.0000000070', 'base_link@-1.000000000', 'base_link@1e1.000000000',
+    'base_link@10.000000007 ', '@10.000000007', 'base_link@10,000000007',
+    'base_link@9999999999.000000000', 'base_link@\u0661\u0660.000000007'])
+@pytest.mark.parametrize('base_frame', ['base_link', ''])
+def test_a_frame_that_names_no_time(new, frame, base_frame):
+    assert cause_of(loop_closure, loop(new, frame), base_frame, False) == 'frame'
+
+
+def test_the_frame_of_another_robot(new):
+    message = loop(new, 'other/base@10.000000007')
+    assert cause_of(loop_closure, message, 'base_link', False) == 'frame'
+    assert loop_closure(message, '', False).reference_stamp == 10 * NS + 7
+    assert loop_closure(message, 'other/base', False).reference_stamp == 10 * NS + 7
+
+
+@pytest.mark.parametrize('reference', ['12.000000005', '12.000000006', '2000000000.000000000'])
+def test_a_reference_that_is_not_earlier(new, reference):
+    assert cause_of(loop_closure, loop(new, f'base_link@{reference}'), '', False) == 'order'
+
+
+@pytest.mark.parametrize('stamp', [1, NS - 1, NS, 1305031102175300121])
+def test_the_frame_says_the_stamp_exactly(new, stamp):
+    frame = reference_frame_id('a@b', stamp)
+    message = loop(new, frame)
+    message.header = header(new, 2**31 - 1, 0, frame)
+    assert loop_closure(message, 'a@b', False).reference_stamp == stamp
+    assert reference_frame_id('base', 1000100000000) == 'base@1000.100000000'

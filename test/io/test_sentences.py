@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What people are told of the loops that were refused, and of the noise."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.robust.batch import INCONSISTENT, MOSTLY_REFUSED, Doubt
+from l1slam_ros.core.robust.robust_map import RobustMap, minimise_robustly
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
+from l1slam_ros.core.solvers.nonlinear import Solution
+from l1slam_ros.core.solvers.optimality import Status
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.sentences import doubt_sentence, verdict
+
+N, LOOPS = 30, 27  # keyframes k with the ids 10 + 3 k; loops (k, k + 2)
+
+
+@pytest.fixture
+def record():
+    graph = FactorGraph(se2)
+    graph.add_poses(N)
+    first = np.concatenate((np.arange(N - 1), np.arange(LOOPS)))
+    last = first + np.repeat([1, 2], [N - 1, LOOPS])
+    m = len(first)
+    graph.add_between(first, last, np.zeros((m, 3)), np.tile(np.eye(3), (m, 1, 1)))
+    return GraphRecord(graph, None, 10 + 3 * np.arange(N))
+
+
+def judgement(refused=(), suspect=(), slips=(), variance=(1.0, 1.0)):
+    """Return a judgement; refused : sigmas of loops; suspect : loops; slips : steps."""
+    poses, m = np.zeros((N, 3)), N - 1 + LOOPS
+    sigmas, doubtful = np.ones(m), np.zeros(m, bool)
+    accepted = np.ones(m, bool)
+    for loop, value in dict(refused).items():
+        sigmas[N - 1 + loop], accepted[N - 1 + loop] = value, False
+    for loop in suspect:
+        doubtful[N - 1 + loop], accepted[N - 1 + loop] = True, False
+    for step in slips:
+        sigmas[step], accepted[step] = 40.0 + step, False
+    solution = Solution(poses, 0.0, Status.CONVERGED, 0, 0, np.zeros(1), np.zeros(3 * m))
+    return RobustMap(solution, poses, accepted, doubtful, sigmas, np.array(slips, np.int64),
+                     np.array(variance), None)
+
+
+def test_nothing_refused_is_one_sentence(record):
+    assert list(verdict(record, judgement())) == ['0 of 27 loops refused']
+
+
+def test_refused_loops_are_named_by_their_vertices_the_worst_first(record):
+    assert list(verdict(record, judgement({1: 5.04, 20: 123.45, 7: 9.0}))) == [
+        '3 of 27 loops refused',
+        '  70 - 76: 123.5 sigmas off the accepted ones',
+        '  31 - 37: 9.0 sigmas off the accepted ones',
+        '  13 - 19: 5.0 sigmas off the accepted ones']
+
+
+@pytest.mark.parametrize('count, more', [(19, None), (20, None), (21, 1), (27, 7)])
+def test_of_many_the_worst_twenty_are_named(record, count, more):
+    said = list(verdict(record, judgement({k: 10.0 + k for k in range(count)})))
+    assert said[0] == f'{count} of 27 loops refused'
+    named = [line for line in said if ' sigmas off the accepted ones' in line]
+    assert len(named) == min(count, 20)
+    assert named[0].startswith(f'  {10 + 3 * (count - 1)} - ')
+    rest = said[1 + len(named):]
+    assert rest == ([] if more is None else [f'  and {more} more; `--json` lists all'])
+
+
+def test_suspects_are_counted_apart(record):
+    said = list(verdict(record, judgement({3: 8.0}, suspect=[5, 6])))
+    assert said[:2] == ['1 of 27 loops refused', '  19 - 25: 8.0 sigmas off the accepted ones']
+    assert said[2:] == ['suspect and left out, because nothing vouches for them: 2 that fit where '
+                        'they stand, but could as well do so by chance']
+
+
+def test_odometry_that_lies_is_said_first_and_is_no_loop(record):
+    said = list(verdict(record, judgement({0: 8.0}, slips=[2, 9])))
+    assert said == [
+        'odometry 16 - 19 lies: 42.0 sigmas off what the loops say; left out',
+        'odometry 37 - 40 lies: 49.0 sigmas off what the loops say; left out',
+        '1 of 27 loops refused', '  10 - 16: 8.0 sigmas off the accepted ones']
+
+
+NOISY_ODOMETRY = ('the odometry is about {} times as noisy as it says: loops far apart in time '
+                  'are judged by little')
+NOISY_LOOPS = ('the loops are about {} times as noisy as they say: a false one that is little '
+               'off passes for noise')
+
+
+@pytest.mark.parametrize('variance, said', [
+    ((3.99, 3.99), []), ((1e-4, 0.0), []),
+    ((4.0, 3.0), [NOISY_ODOMETRY.format('2.0')]),
+    ((9.61, 0.01), [NOISY_ODOMETRY.format('3.1')]),
+    ((1.0, 1e4), [NOISY_LOOPS.format('100.0')]),
+    ((6.25, 20.25), [NOISY_ODOMETRY.format('2.5'), NOISY_LOOPS.format('4.5')])])
+def test_what_is_twice_as_noisy_as_it_says_or_more_is_told_last(record, variance, said):
+    assert list(verdict(record, judgement(suspect=[5], variance=variance)))[2:] == said
+
+
+@pytest.mark.parametrize('stamps, when', [
+    (None, ''), (10**9 * np.arange(N), ' (2.000000000 s to 7.000000000 s)')])
+def test_a_doubt_says_why_and_where(stamps, when):
+    ids, where = 10 + 3 * np.arange(N), f'between 16 and 31{when}'
+    said = [doubt_sentence(Doubt(kind, 1234, 2, 7), ids, stamps)
+            for kind in (INCONSISTENT, MOSTLY_REFUSED)]
+    assert said == [
+        'doubtful: 1,234 refused loops agree with each other, but not with the odometry '
+        f'{where}, and to leave out one step of it does not reconcile them; the map may be bent '
+        'there',
+        f'doubtful: 1,234 loops, most of all, are refused or suspect, {where}; either they are '
+        'false, or the odometry is worse than it says']
+
+
+def test_a_lone_loop_is_one_loop(record):
+    graph = FactorGraph(se2)
+    graph.add_poses(3)
+    graph.add_between(np.array([0, 1, 0]), np.array([1, 2, 2]), np.zeros((3, 3)),
+                      np.tile(np.eye(3), (3, 1, 1)))
+    believed = replace(judgement(), accepted=np.ones(3, bool), suspect=np.zeros(3, bool),
+                       sigmas=np.ones(3))
+    said = list(verdict(GraphRecord(graph, None, np.arange(3)), believed))
+    assert said == ['0 of 1 loop refused']
+
+
+def test_what_a_solve_finds_of_the_noise_is_told():
+    world = simulate_world(200, 400, WorldOptions(), np.random.default_rng(2))
+    factors = world.graph.between
+    information = factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information
+    # The odometry boasts of a fifth of its sigmas, the loops tell the truth.
+    boast = np.where(factors.is_odometry, 25.0, 1.0)[:, None, None]
+    graph = FactorGraph(se2)
+    graph.add_poses(world.graph.n_poses)
+    graph.add_between(factors.i, factors.j, factors.measurement, information * boast)
+    found = minimise_robustly(graph, lambda part, poses: minimise_l2(
+        part, poses, LeastSquaresOptions(), cholesky_of(part)))
+    said = list(verdict(GraphRecord(graph, None, np.arange(200)), found))[-1]
+    times = re.fullmatch(re.escape(NOISY_ODOMETRY).replace(r'\{\}', r'(\d+\.\d)'), said)
+    assert 3 < float(times[1]) < 6

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo bag is what its README says, and its summary tells the truth."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point, Pose, PoseStamped
+from nav_msgs.msg import Path as PathMessage
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from l1slam_ros.cli.main import main
+from l1slam_ros.io.bags.reader import read_messages
+from l1slam_ros.ros import demo
+from l1slam_ros.ros.demo import (
+    BAG,
+    CALM,
+    DemoError,
+    Heard,
+    Listener,
+    read_recording,
+    require_the_truth,
+    summarise,
+)
+from l1slam_ros.ros.publishing import header
+
+DEMO = Path(__file__).parents[2] / BAG
+DEADLINE = 60.0
+
+
+def numbers(bag):
+    """Return all numbers of all messages of a bag, (k,)."""
+    values = []
+    for _, _, stamp, message in read_messages(bag):
+        pose = message.pose
+        stamped = pose.pose if hasattr(pose, 'covariance') else pose
+        p, q = stamped.position, stamped.orientation
+        values += [stamp, p.x, p.y, q.z, q.w, *getattr(pose, 'covariance', ())]
+    return np.array(values)
+
+
+def test_the_bag_is_made_by_the_command_its_readme_gives(tmp_path):
+    command = next(line.split() for line in (DEMO.parent / 'README.md').read_text().splitlines()
+                   if line.startswith('    l1slam simulate'))
+    assert command[2] == str(BAG)
+    assert main(['simulate', str(tmp_path / 'demo'), *command[3:]]) == 0
+    np.testing.assert_allclose(numbers(tmp_path / 'demo'), numbers(DEMO), rtol=1e-9, atol=1e-12)
+    made, kept = (Path(f'{bag}.false.txt').read_text() for bag in (tmp_path / 'demo', DEMO))
+    assert made == kept and len(kept.splitlines()) == 10
+
+
+def test_the_summary_of_a_perfect_map_is_an_error_of_zero(tmp_path):
+    recording = read_recording(DEMO)
+    assert (len(recording.stamps), len(recording.loops)) == (1000, 611)
+    turned = recording.truth @ np.array([[0.0, -1.0], [1.0, 0.0]]) + (5.0, 6.0)
+    path = PathMessage(poses=[
+        PoseStamped(header=header('map', int(stamp)), pose=Pose(position=Point(x=x, y=y)))
+        for stamp, (x, y) in zip(recording.stamps, turned, strict=True)])
+    heard = Heard(path, [0.0, 0.25, 0.5], states_of(recording))
+    for is_false in True, False:  # one of each is told apart wrongly
+        ends = recording.loop_stamps[np.argmax(recording.is_false == is_false)]
+        heard.states[ends] = 'accepted' if is_false else 'rejected'
+    text = summarise(recording, heard, tmp_path / 'demo' / 'map.png')
+    assert '0.000 m in the map' in text and '2.880 m by odometry' in text
+    assert '1000 keyframes, 611 loops, 10 of them false' in text
+    assert '9 false loops, 1 true ones' in text
+    assert '4.0 updates per second' in text
+    assert (tmp_path / 'demo' / 'map.png').read_bytes().startswith(b'\x89PNG')
+
+
+def states_of(recording):
+    """Return what is to become of each loop."""
+    return {ends: 'rejected' if is_false else 'accepted' for ends, is_false
+            in zip(recording.loop_stamps, recording.is_false, strict=True)}
+
+
+@pytest.mark.parametrize('wrong', [None, 'a false one accepted', 'a true one refused'])
+def test_the_demo_fails_unless_it_refuses_the_false_loops_and_no_other(wrong):
+    recording = read_recording(DEMO)
+    heard = Heard(states=states_of(recording))
+    if wrong is None:
+        require_the_truth(recording, heard)
+        return
+    row = np.argmax(recording.is_false == (wrong == 'a false one accepted'))
+    heard.states[recording.loop_stamps[row]] = 'accepted' if recording.is_false[row] else 'suspect'
+    with pytest.raises(DemoError, match='expected the 10 false loops to be refused and no true'):
+        require_the_truth(recording, heard)
+
+
+@pytest.fixture
+def listener(ros):
+    node = ros.create_node('listener')
+    recording = read_recording(DEMO)
+    listener = Listener(node, recording)
+    listener.path = PathMessage(poses=[
+        PoseStamped(header=header('map', int(stamp)))
+        for stamp in recording.stamps])
+    yield listener
+    node.destroy_node()
+
+
+def diagnostics(updates):
+    """Return what a node says of its map, and of a topic of which it always says another thing."""
+    rate = KeyValue(key='rate', value=str(time.monotonic()))
+    return DiagnosticArray(status=[
+        DiagnosticStatus(message='ok', values=[KeyValue(key='updates', value=str(updates)), rate]),
+        DiagnosticStatus(message='odom', values=[rate])])
+
+
+def say(listener, publisher, *messages):
+    """Publish messages; wait until the listener has heard of each."""
+    deadline = time.monotonic() + DEADLINE
+    while not publisher.get_subscription_count():
+        assert time.monotonic() < deadline
+        rclpy.spin_once(listener.node, timeout_sec=0.1)
+    for message in messages:
+        before = listener.heard.calm, listener.moved
+        publisher.publish(message)
+        while (listener.heard.calm, listener.moved) == before:
+            assert time.monotonic() < deadline
+            rclpy.spin_once(listener.node, timeout_sec=0.1)
+
+
+def test_the_map_is_final_when_it_is_whole_and_the_node_says_the_same_of_it(listener):
+    heard = listener.heard
+    publisher = listener.node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+    paths = listener.node.create_publisher(
+        PathMessage, 'path', QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    say(listener, publisher, *[diagnostics(7)] * 5)
+    assert heard.calm > CALM and not listener.is_final()  # nothing is in the map yet
+    say(listener, paths, listener.path)
+    say(listener, publisher, *[diagnostics(8)] * 5)
+    assert not listener.is_final()  # no loop is yet
+    heard.states |= states_of(listener.recording)
+    assert listener.is_final()
+    heard.states[listener.recording.loop_stamps[5]] = 'waiting'
+    assert not listener.is_final()
+    heard.states[listener.recording.loop_stamps[5]] = 'suspect'
+    assert listener.is_final()
+    say(listener, publisher, diagnostics(9))
+    assert not listener.is_final()  # another update
+
+
+def test_what_the_node_logs_of_its_work_is_a_move_and_its_complaints_are_none(listener, ros):
+    began, backend = listener.moved, ros.create_node('backend')
+    backend.get_logger().warning('update failed')
+    backend.get_logger().info('compiled 3 of 12')
+    moves, deadline = set(), time.monotonic() + DEADLINE
+    while not moves:
+        assert time.monotonic() < deadline
+        rclpy.spin_once(listener.node, timeout_sec=0.1)
+        moves |= {listener.moved} - {began}
+    rclpy.spin_once(listener.node, timeout_sec=0.1)
+    assert moves == {listener.moved} and listener.heard.calm == 0
+    backend.destroy_node()
+
+
+def test_the_demo_ends_with_a_sentence_when_the_node_has_died(listener):
+    process = subprocess.Popen([sys.executable, '-c', 'raise SystemExit(7)'])
+    with pytest.raises(DemoError, match='^backend ended with exit code 7; 0 of 1000 keyframes'):
+        listener.wait(process, lambda: False)
+
+
+def test_the_demo_ends_with_a_sentence_when_nothing_moves(listener, monkeypatch):
+    monkeypatch.setattr(demo, 'PATIENCE', 0.2)
+    waiting = subprocess.Popen([sys.executable, '-c', 'input()'], stdin=subprocess.PIPE)
+    with waiting, pytest.raises(DemoError, match='^nothing has moved for .*; 0 of 1000 keyfr'):
+        listener.wait(waiting, lambda: False)

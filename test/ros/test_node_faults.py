@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whatever is raised inside the node: it goes on, says so, answers, and keeps its good map."""
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from node_bench import call, odometry
+
+from l1slam_ros.core.graph.measurements import OdometrySample
+from l1slam_ros.core.online import shared_backend
+from l1slam_ros.io.graphs import saved_map
+from l1slam_ros.ros import node
+from l1slam_ros.ros.publishing import header
+
+FAULTS = ['ValueError', 'MemoryError', 'nan']
+
+
+def spoilt(result):
+    """Return a map or a sample with a pose that is not finite."""
+    if isinstance(result, OdometrySample):
+        return replace(result, pose3=result.pose3 * math.nan)
+    return replace(result, poses=result.poses * math.nan)
+
+
+class Fault:
+    """Stands before a function of a module: while it is on, calls end in a fault."""
+
+    def __init__(self, monkeypatch, module, name, kind):
+        self.on, self.calls, self.original = False, 0, getattr(module, name)
+        self.kind = kind
+        monkeypatch.setattr(module, name, self)
+
+    def __call__(self, *arguments):
+        if not self.on:
+            return self.original(*arguments)
+        self.calls += 1
+        if self.kind == 'nan':
+            return spoilt(self.original(*arguments))
+        raise {'ValueError': ValueError('injected'), 'MemoryError': MemoryError()}[self.kind]
+
+    @property
+    def said(self):
+        return {'nan': 'not finite', 'ValueError': 'ValueError: injected'}.get(
+            self.kind, self.kind)
+
+
+def drive(b, first, last):
+    for k in range(first, last):
+        b.send('/odom', odometry((k + 1) * 10**9, 1.0 * k))
+
+
+def is_error(b, *words):
+    level, sentence, _ = b.status()
+    return level == DiagnosticStatus.ERROR and all(word in sentence for word in words)
+
+
+def is_ok(b):
+    return b.status()[0] == DiagnosticStatus.OK
+
+
+def assert_all_finite(b):
+    for message in b.received['pose']:
+        assert np.isfinite([message.pose.position.x, message.pose.orientation.w]).all()
+    for message in b.received['path']:
+        assert np.isfinite([p.pose.position.x for p in message.poses]).all()
+    for message in b.received['map_to_odom']:
+        assert np.isfinite(message.transform.translation.x)
+
+
+@pytest.mark.parametrize('kind', FAULTS)
+def test_an_update_that_fails(bench, monkeypatch, tmp_path, kind):
+    fault = Fault(monkeypatch, shared_backend, 'improve', kind)
+    b = bench(save_path=str(tmp_path / 'map.g2o'))
+    drive(b, 0, 3)
+    b.until(lambda: len(b.path().poses) == 3 and is_ok(b), 'a map')
+    fault.on = True
+    drive(b, 3, 5)
+    b.until(lambda: is_error(b, 'update failed', fault.said), 'it says so')
+    b.until(lambda: len(b.received['pose']) == 5, 'odometry is answered')
+    assert len(b.path().poses) == 3
+    assert call(b, 'save').success and call(b, 'optimize').success
+    fault.on = False
+    drive(b, 5, 6)
+    b.until(lambda: len(b.path().poses) == 6 and is_ok(b), 'it is over')
+    assert_all_finite(b)
+
+
+def test_an_update_that_always_fails_is_not_tried_all_the_time(bench, monkeypatch):
+    fault = Fault(monkeypatch, shared_backend, 'improve', 'ValueError')
+    fault.on = True
+    b = bench(**{'update.period': 0.001})
+    drive(b, 0, 3)
+    b.until(lambda: fault.calls, 'a first update')
+    began = time.monotonic()
+    b.until(lambda: time.monotonic() > began + 2.0, 'two seconds later')
+    # After pauses of .2, .4, .8, 1.6 s: ten times as often would be a core's work.
+    assert 2 <= fault.calls <= 6
+    # Whoever replaces the map is not to wait for a pause to be over.
+    fault.on = False
+    assert call(b, 'reset').success
+    b.until(lambda: is_ok(b), 'it is over')
+
+
+@pytest.mark.parametrize('kind, service, module, function', [
+    ('ValueError', 'save', saved_map, 'write_graph_file'),
+    ('MemoryError', 'load', saved_map, 'read_graph_file'),
+    ('MemoryError', 'optimize', shared_backend, 'optimise'),
+    ('nan', 'optimize', shared_backend, 'optimise')])
+def test_a_service_that_fails(bench, monkeypatch, tmp_path, kind, service, module, function):
+    fault = Fault(monkeypatch, module, function, kind)
+    b = bench(save_path=str(tmp_path / 'map.g2o'))
+    drive(b, 0, 3)
+    b.until(lambda: len(b.path().poses) == 3, 'a map')
+    assert call(b, 'save').success
+    fault.on = True
+    answer = call(b, service)
+    assert not answer.success and fault.said in answer.message
+    b.until(lambda: is_error(b, f'~/{service} failed', fault.said), 'it says so')
+    drive(b, 3, 4)
+    b.until(lambda: len(b.path().poses) == 4, 'updates go on')
+    fault.on = False
+    assert call(b, service).success
+    b.until(lambda: is_ok(b), 'it is over')
+    assert_all_finite(b)
+
+
+@pytest.mark.parametrize('kind', FAULTS)
+def test_a_callback_that_fails(bench, monkeypatch, kind):
+    fault = Fault(monkeypatch, node, 'odometry_sample', kind)
+    b = bench()
+    drive(b, 0, 3)
+    b.until(lambda: len(b.path().poses) == 3, 'a map')
+    fault.on = True
+    drive(b, 3, 5)
+    b.until(lambda: is_error(b, 'odom failed', fault.said), 'it says so')
+    fault.on = False
+    drive(b, 5, 7)
+    b.until(lambda: len(b.path().poses) == 5 and is_ok(b), 'it is over')
+    assert_all_finite(b)
+
+
+def test_a_publisher_that_fails(bench, monkeypatch):
+    fault = Fault(monkeypatch, node, 'path_bytes', 'ValueError')
+    fault.on = True
+    b = bench()
+    drive(b, 0, 3)
+    b.until(lambda: is_error(b, 'update failed', fault.said), 'it says so')
+    fault.on = False
+    b.until(lambda: len(b.path().poses) == 3 and is_ok(b), 'the map is published after all')
+
+
+def test_each_kind_of_failure_is_logged_once_in_full(bench, monkeypatch, capfd):
+    fault = Fault(monkeypatch, shared_backend, 'improve', 'ValueError')
+    fault.on = True
+    b = bench()
+    drive(b, 0, 3)
+    b.until(lambda: fault.calls >= 3, 'three failures')
+    assert capfd.readouterr().err.count('Traceback') == 1
+
+
+def test_a_refused_message_is_a_warning_and_counted(bench):
+    b = bench()
+    drive(b, 0, 2)
+    b.until(lambda: len(b.path().poses) == 2, 'a map')
+    message = PoseWithCovarianceStamped(header=header('base_link@1.000000000', 2 * 10**9))
+    message.pose.pose.position.x = math.inf
+    b.send('/loop_closures', message)
+    b.until(lambda: b.status()[2].get('refused.not_finite') == '1', 'it is counted')
+    level, sentence, values = b.status()
+    assert level == DiagnosticStatus.WARN and '1 not_finite' in sentence
+    assert values['refused.not_finite.last_minute'] == '1'
+    assert (values['odom.received'], values['loop_closures.received']) == ('2', '1')

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Callbacks, services and the solver side by side: who waits for whom, and in which order."""
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+from node_bench import call, odometry, poses_of
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool, Trigger
+
+from l1slam_ros.core.online import shared_backend
+from l1slam_ros.ros.threads import solver_thread
+
+DEADLINE = 60.0
+
+
+def drive(b, first, last):
+    for k in range(first, last):
+        b.send('/odom', odometry((k + 1) * 10**9, 1.0 * k))
+
+
+@pytest.fixture
+def compiling(monkeypatch):
+    """Let compiling last until the event that is returned is set, or the node ends."""
+    finish = threading.Event()
+
+    def fill_cache(report, stopped):
+        report(1, 2)
+        while not stopped() and not finish.wait(0.01):
+            pass
+
+    monkeypatch.setattr(solver_thread, 'fill_cache', fill_cache)
+    return finish
+
+
+def test_while_the_solver_is_compiled_all_else_is_served(bench, compiling, tmp_path):
+    b = bench(save_path=str(tmp_path / 'map.g2o'))
+    drive(b, 0, 4)
+    b.until(lambda: len(b.received['pose']) == 4, 'odometry is answered')
+    assert call(b, 'save').message.startswith('4 keyframes saved')
+    assert call(b, 'pause', SetBool.Request(data=False)).success
+    assert call(b, 'reset').success and call(b, 'load').success
+    b.until(lambda: b.status()[1] == 'compiling the solver: 1 of 2', 'it says how far it is')
+    client = b.peer.create_client(Trigger, '/backend/optimize')
+    b.until(client.service_is_ready, 'optimize is offered')
+    waiting = client.call_async(Trigger.Request())
+    drive(b, 4, 6)
+    b.until(lambda: b.status()[2]['odom.received'] == '6', 'odometry is taken in')
+    assert not waiting.done() and not b.received['path']
+    compiling.set()
+    b.until(waiting.done, 'optimize is answered')
+    assert waiting.result().success
+    # After a load the first message says where odometry goes on.
+    b.until(lambda: len(b.path().poses) == 5, 'the map with all that came meanwhile')
+
+
+def test_the_node_ends_while_the_solver_is_compiled(bench, compiling):
+    b = bench()
+    assert b.backend.close(DEADLINE)
+
+
+def test_callbacks_need_no_compiled_code(tmp_path):
+    """A node that only listens, saves and tells: without numba, which cannot be imported."""
+    done = subprocess.run([sys.executable, '-c', """
+import sys
+sys.modules['numba'] = None
+from pathlib import Path
+from problems import loop, odometry
+from l1slam_ros.ros import node
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.io.node_options import NodeOptions
+from l1slam_ros.core.online.shared_backend import SharedBackend
+from l1slam_ros.io.graphs.saved_map import load_map, save_map
+backend = SharedBackend(se2, NodeOptions())
+for k in range(20):
+    backend.add_odometry(odometry(k + 1.0, (k, 0.0, 0.0)))
+backend.add_loop(loop(1.0, 20.0, (19.0, 0.0, 0.0)))
+assert backend.state().loops.state.tolist() == [1] and backend.counts()[0]['keyframes'] == 20
+path = Path(sys.argv[1])
+assert save_map(path, backend.snapshot()) == 20
+backend.restore(*load_map(path))
+assert len(backend.state().poses) == 20
+""", str(tmp_path / 'map.g2o')], capture_output=True, text=True, timeout=DEADLINE,
+                          cwd=Path(__file__).parents[1])
+    assert done.returncode == 0, done.stderr
+
+
+def test_orders_are_carried_out_in_the_order_they_came(bench):
+    b = bench()
+    begin, done = threading.Event(), []
+    orders = [b.backend._orders.place('first', lambda: str(begin.wait(DEADLINE)))]
+    for k in range(20):
+        orders.append(b.backend._orders.place('next', lambda k=k: str(done.append(k))))
+    begin.set()
+    b.until(lambda: all(order.done() for order in orders), 'all are answered')
+    assert done == list(range(20))
+    assert all(order.result().success for order in orders)
+
+
+def patient(problem, options, budget, check):
+    """Stand for an update of a huge map: it ends when it is told to."""
+    while True:
+        check()
+
+
+def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
+    b = bench(save_path=str(tmp_path / 'map.g2o'))
+    drive(b, 0, 3)
+    b.until(lambda: len(b.path().poses) == 3, 'a map')
+    began, improve = threading.Event(), shared_backend.improve
+    monkeypatch.setattr(shared_backend, 'improve', lambda *a: began.set() or patient(*a))
+    drive(b, 3, 5)
+    b.until(began.is_set, 'an update that takes for ever')
+    assert call(b, 'save').message.startswith('5 keyframes')
+    assert call(b, 'optimize').success
+    b.until(lambda: len(b.path().poses) == 5, 'the optimised map')
+    assert call(b, 'reset').success
+    b.until(lambda: len(b.path().poses) == 0, 'the map is empty')
+    assert call(b, 'load').success
+    b.until(lambda: len(b.path().poses) == 5, 'the map is back')
+    assert call(b, 'pause', SetBool.Request(data=True)).success
+    b.until(lambda: not b.backend._backend._solving.locked(), 'the update stops')
+    monkeypatch.setattr(shared_backend, 'improve', improve)
+    assert call(b, 'pause', SetBool.Request(data=False)).success
+    drive(b, 5, 8)
+    b.until(lambda: len(b.path().poses) == 7, 'updates go on')
+
+
+def test_after_a_load_the_pose_is_right_at_once(bench, tmp_path):
+    """Not only from the next keyframe on."""
+    b = bench(save_path=str(tmp_path / 'map.g2o'))
+    drive(b, 0, 3)
+    b.until(lambda: len(b.path().poses) == 3, 'a map')
+    assert call(b, 'save').success and call(b, 'load').success
+    # The robot was switched off meanwhile: its odometry begins at 50 m.
+    b.send('/odom', odometry(10 * 10**9, 50.0))
+    b.send('/odom', odometry(11 * 10**9, 50.1))
+    b.until(lambda: len(b.received['pose']) == 5, 'both are answered')
+    x = [message.pose.position.x for message in b.received['pose'][-2:]]
+    np.testing.assert_allclose(x, [2.0, 2.1], atol=1e-9)
+    b.received['map_to_odom'].clear()
+    b.until(lambda: b.received['map_to_odom'], 'a transform')
+    assert b.received['map_to_odom'][-1].transform.translation.x == pytest.approx(-48.0)
+
+
+@pytest.mark.parametrize('choice', ['reset', 'ignore'])
+def test_when_the_clock_jumps_back(bench, choice):
+    b = bench(use_sim_time=True, on_time_jump=choice)
+    publisher = b.peer.create_publisher(Clock, '/clock', 10)
+    b.until(publisher.get_subscription_count, 'the node looks at the clock')
+
+    def tell(seconds):
+        message = Clock()
+        message.clock.sec = seconds
+        publisher.publish(message)
+        b.until(lambda: b.backend.get_clock().now().nanoseconds == seconds * 10**9,
+                f'it is {seconds}')
+
+    tell(100)
+    drive(b, 0, 3)
+    b.until(lambda: len(b.path().poses) == 3, 'a map, though the clock stands still')
+    tell(101)
+    tell(50)
+    if choice == 'reset':
+        b.until(lambda: len(b.path().poses) == 0, 'the map begins anew')
+        drive(b, 0, 2)
+    else:
+        drive(b, 3, 5)
+    expected = 2 if choice == 'reset' else 5
+    b.until(lambda: len(b.path().poses) == expected, f'the map has {expected} keyframes')
+    assert poses_of(b.path())[-1, 0] == pytest.approx(expected - 1)
+
+
+def test_what_a_full_queue_has_dropped_is_said_to_be_lost(bench):
+    b = bench()
+    b.send('/odom', odometry(10**9, 0.0))
+    b.until(lambda: b.received['pose'], 'the first one')
+    for k in range(1, 3000):
+        b.publishers['/odom'].publish(odometry((k + 1) * 10**9, 0.0))
+    b.until(lambda: int(b.status()[2].get('odom.received', 0)) >= 1000, 'a part comes')
+    b.until(lambda: sum(int(b.status()[2][f'odom.{name}']) for name in ('received', 'lost'))
+            == 3000, 'all are accounted for')
+    _, _, values = b.status()
+    assert int(values['odom.lost']) > 0 and float(values['odom.rate']) > 0
+    assert values['loop_closures.received'] == '0'
+
+
+def test_the_jump_of_the_transform_is_said(bench):
+    """A trusted loop says that the robot came but 4 m in what odometry says were 5."""
+    from geometry_msgs.msg import PoseWithCovarianceStamped
+
+    from l1slam_ros.ros.publishing import header
+
+    b = bench()
+    vouch = b.peer.create_publisher(PoseWithCovarianceStamped, 'trusted_loop_closures', 10)
+    b.until(vouch.get_subscription_count, 'the node listens')
+    drive(b, 0, 6)
+    b.until(lambda: len(b.path().poses) == 6, 'a map')
+    loop = PoseWithCovarianceStamped(header=header('base_link@1.000000000', 6 * 10**9))
+    loop.pose.pose.position.x, loop.pose.pose.orientation.w = 4.0, 1.0
+    loop.pose.covariance = (1e-8 * np.eye(6)).ravel()
+    vouch.publish(loop)
+    b.until(lambda: float(b.status()[2].get('jump.translation', 0)) == pytest.approx(1.0, abs=.01),
+            'a jump of a metre')

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The installed executables as processes: `replay` plays a bag into `backend`, signals end it."""
+
+import re
+import signal
+import subprocess
+import time
+from collections import Counter
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip('rclpy')
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.bags.from_graph import write_graph_bag
+from l1slam_ros.io.bags.reader import read_raw
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.ros.demo import executable
+
+DEADLINE = 300.0  # [s] the solver can have to be compiled first
+
+
+@pytest.fixture
+def backend():
+    process = subprocess.Popen([executable('backend')], stderr=subprocess.PIPE, text=True)
+    # The node says when it is ready; before that a signal would meet a half-started process.
+    assert 'ready' in process.stderr.readline()
+    yield process
+    process.kill()
+    process.communicate()
+
+
+@pytest.fixture
+def bag(tmp_path, rng):
+    world = simulate_world(200, 300, WorldOptions(), rng)
+    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(200)))
+    return tmp_path / 'bag'
+
+
+def replay(*arguments):
+    return subprocess.run([executable('replay'), *map(str, arguments)], capture_output=True,
+                          text=True, timeout=DEADLINE)
+
+
+@contextmanager
+def waiting_replay(*arguments):
+    """Yield a replay that nobody subscribes to, once it has said so."""
+    process = subprocess.Popen([executable('replay'), *map(str, arguments)],
+                               stderr=subprocess.PIPE, text=True)
+    try:
+        assert 'waiting for a subscriber of /loop_closures, /odom' in process.stderr.readline()
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def complaints(played):
+    """Return what a replay said, but for that it waited: a busy machine is slow to subscribe."""
+    return [line for line in played.stderr.splitlines() if 'waiting for a subscr' not in line]
+
+
+@pytest.fixture
+def paths(ros):
+    """Return what comes on `path`, and a function that waits for a condition on it."""
+    node = ros.create_node('listener')
+    heard = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(PathMessage, 'path', heard.append, latched)
+
+    def until(condition):
+        deadline = time.monotonic() + DEADLINE
+        while not (heard and condition(heard[-1])):
+            assert time.monotonic() < deadline, (
+                f'{len(heard)} paths; the last has {len(heard[-1].poses) if heard else 0} poses')
+            ros.spin_once(node, timeout_sec=0.1)
+        return heard[-1]
+
+    yield until
+    node.destroy_node()
+
+
+def test_replay_plays_a_bag_into_backend_and_a_map_comes_out(backend, bag, paths):
+    played = replay(bag, '--rate', '10')
+    assert (played.returncode, complaints(played)) == (0, [])
+    path = paths(lambda path: len(path.poses) == 200)
+    assert path.header.frame_id == 'map'
+    stamps = [p.header.stamp.sec * 10**9 + p.header.stamp.nanosec for p in path.poses]
+    assert stamps == [1000 * 10**9 + k * 10**8 for k in range(200)]
+    backend.send_signal(signal.SIGINT)
+    assert backend.wait(DEADLINE) == 0
+
+
+def test_a_part_of_a_bag_on_other_topics(backend, bag, paths):
+    played = replay(bag, '--rate', '10', '--start', '5', '--duration', '10',
+                    '--topics', '/odom', '--remap', '/odom:=/other', '--wait', '0')
+    assert played.returncode == 0
+    played = replay(bag, '--rate', '10', '--start', '2', '--duration', '3', '--topics', '/odom')
+    assert played.returncode == 0
+    path = paths(lambda path: len(path.poses) == 30)
+    assert path.poses[0].header.stamp.sec == 1002
+
+
+@pytest.mark.parametrize('name', ['SIGINT', 'SIGTERM'])
+def test_signals_end_backend_with_exit_code_0(backend, name):
+    backend.send_signal(getattr(signal, name))
+    assert backend.wait(DEADLINE) == 0
+    assert 'Traceback' not in backend.stderr.read()
+
+
+def test_replay_waits_for_subscribers_and_loses_neither_the_first_nor_the_last(bag, ros):
+    with waiting_replay(bag, '--rate', '20') as process:
+        node, heard = ros.create_node('late'), Counter()
+        for kind, topic in (Odometry, '/odom'), (PoseWithCovarianceStamped, '/loop_closures'):
+            node.create_subscription(
+                kind, topic, lambda _, topic=topic: heard.update([topic]), QoSProfile(depth=1000))
+        sent = Counter(message.topic for message in read_raw(bag, None, lambda _: None))
+        deadline = time.monotonic() + DEADLINE
+        while process.poll() is None or heard != sent:
+            assert time.monotonic() < deadline, f'{heard} of {sent}'
+            ros.spin_once(node, timeout_sec=0.1)
+        assert process.returncode == 0 and process.stderr.read() == ''
+    node.destroy_node()
+
+
+@pytest.mark.parametrize('name', ['SIGINT', 'SIGTERM'])
+def test_a_signal_ends_a_replay_that_waits(bag, name):
+    with waiting_replay(bag) as process:
+        process.send_signal(getattr(signal, name))
+        assert process.wait(DEADLINE) == 0
+        assert process.stderr.read() == ''
+
+
+@pytest.mark.parametrize(('seconds', 'said'), [
+    ('0', []), ('0.5', ['nobody subscribed for 0.5 s; playing all the same'])])
+def test_replay_plays_to_nobody_after_as_long_as_it_is_told(bag, seconds, said):
+    played = replay(bag, '--rate', '100', '--wait', seconds)
+    assert played.returncode == 0
+    assert [line.split(': ')[-1] for line in played.stderr.splitlines()] == said
+
+
+def test_replay_is_paced(backend, bag):
+    began = time.monotonic()
+    assert replay(bag, '--rate', '5', '--duration', '10').returncode == 0
+    assert time.monotonic() - began >= 2.0
+
+
+@pytest.mark.parametrize('arguments, complaint', [
+    (('/no/such/bag',), 'no such file'),
+    ((__file__,), 'no bag'),
+])
+def test_replay_of_no_bag_is_one_line_and_exit_code_2(arguments, complaint):
+    played = replay(*arguments)
+    assert played.returncode == 2
+    assert complaint in played.stderr and played.stderr.count('\n') == 1
+
+
+def test_replay_of_a_damaged_bag_plays_a_part_says_so_and_exits_with_3(backend, bag, paths):
+    file = bag / 'bag.mcap'
+    file.write_bytes(file.read_bytes()[:file.stat().st_size // 2])
+    odometry = sum(message.topic == '/odom' for message in read_raw(file, None, lambda _: None))
+    assert 50 < odometry < 150
+    played = replay(bag, '--rate', '10')
+    assert played.returncode == 3
+    (complaint,) = complaints(played)
+    assert re.fullmatch(rf'replay: {file} is damaged: it breaks off after [0-9,]+ bytes; '
+                        '[0-9,]+ messages before that were used', complaint)
+    paths(lambda path: len(path.poses) == odometry)
+
+
+def test_replay_of_a_topic_that_is_not_there_names_those_that_are(bag):
+    played = replay(bag, '--topics', '/scan')
+    assert played.returncode == 2
+    assert '/scan' in played.stderr and '/loop_closures, /odom' in played.stderr
+
+
+def test_a_refused_parameter_is_one_line_and_exit_code_1():
+    run = subprocess.run(
+        [executable('backend'), '--ros-args', '-p', 'keyframe.translation:=-1.0'],
+        capture_output=True, text=True, timeout=DEADLINE)
+    assert run.returncode == 1
+    assert 'keyframe.translation' in run.stderr and 'Traceback' not in run.stderr

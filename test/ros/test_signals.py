@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A signal ends the node soon, with exit code 0 and in silence, whatever it is doing."""
+
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip('rclpy')
+
+from std_srvs.srv import Trigger
+
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
+from l1slam_ros.ros.demo import executable
+
+DEADLINE = 60.0
+# [s] Two are promised; a busy machine takes its part.
+SOON = 6.0
+SIGNALS = [signal.SIGINT, signal.SIGTERM]
+
+
+@pytest.fixture
+def start():
+    """Return what starts the node in a session of its own, which must be empty afterwards."""
+    processes = []
+
+    def begin(*arguments, **environment):
+        processes.append(subprocess.Popen(
+            [executable('backend'), *arguments], stderr=subprocess.PIPE, text=True,
+            start_new_session=True, env={**os.environ, **environment}))
+        return processes[-1]
+
+    yield begin
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def until(condition, what):
+    deadline = time.monotonic() + DEADLINE
+    while not condition():
+        assert time.monotonic() < deadline, f'waited {DEADLINE} s in vain until {what}'
+        time.sleep(0.01)
+
+
+def catches(process, number):
+    """Tell whether a process has a handler for a signal."""
+    status = Path(f'/proc/{process.pid}/status').read_text()
+    caught = int(status.split('SigCgt:')[1].split()[0], 16)
+    return bool(caught >> (number - 1) & 1)
+
+
+def session(process):
+    """Return the live processes of the session that a process began."""
+    alive = []
+    for entry in Path('/proc').glob('[0-9]*/stat'):
+        try:
+            fields = entry.read_text().rsplit(')', 1)[1].split()
+        except OSError:
+            continue
+        if int(fields[3]) == process.pid and fields[0] != 'Z':
+            alive.append(int(entry.parent.name))
+    return alive
+
+
+def assert_ends(process, number):
+    process.send_signal(number)
+    began = time.monotonic()
+    _, said = process.communicate(timeout=DEADLINE)
+    assert time.monotonic() - began < SOON
+    assert process.returncode == 0, said
+    assert 'Traceback' not in said and 'ERROR' not in said and 'terminate' not in said, said
+    until(lambda: not session(process), 'its children have ended too')
+
+
+@pytest.mark.parametrize('number', SIGNALS)
+def test_while_it_is_being_imported(start, number):
+    process = start()
+    until(lambda: catches(process, signal.SIGTERM), 'it takes signals')
+    assert_ends(process, number)
+
+
+@pytest.mark.parametrize('delay', [0.05, 0.2, 0.4, 0.6, 0.8, 1.0])
+def test_at_any_moment_of_its_start(start, delay):
+    process = start()
+    until(lambda: catches(process, signal.SIGTERM), 'it takes signals')
+    moment = time.monotonic() + delay
+    until(lambda: time.monotonic() > moment, 'it is on its way')
+    assert_ends(process, signal.SIGINT)
+
+
+def test_while_it_compiles(start, tmp_path):
+    process = start(NUMBA_CACHE_DIR=str(tmp_path))
+    assert 'ready' in process.stderr.readline()
+    assert 'compiling the solver' in process.stderr.readline()
+    assert_ends(process, signal.SIGTERM)
+
+
+@pytest.fixture(scope='module')
+def large(tmp_path_factory):
+    world = simulate_world(8000, 13000, WorldOptions(), np.random.default_rng(0))
+    path = tmp_path_factory.mktemp('large') / 'map.g2o'
+    write_graph_file(path, GraphRecord(world.graph, world.odometry, np.arange(8000),
+                                       10**9 + 10**8 * np.arange(8000)))
+    return path
+
+
+@pytest.mark.parametrize('service', ['load', 'save', 'optimize'])
+def test_while_it_works(start, ros, large, service):
+    """Right after a load an update of a map far from its optimum goes on."""
+    process = start('--ros-args', '-p', f'save_path:={large}')
+    node = ros.create_node('caller')
+
+    def call(name):
+        client = node.create_client(Trigger, f'/backend/{name}')
+        assert client.wait_for_service(DEADLINE)
+        return client.call_async(Trigger.Request())
+
+    rclpy.spin_until_future_complete(node, loaded := call('load'), timeout_sec=DEADLINE)
+    assert loaded.result().success
+    if service != 'load':
+        call(service)
+    moment = time.monotonic() + 0.3
+    until(lambda: time.monotonic() > moment, 'it is at work')
+    assert_ends(process, signal.SIGTERM)
+    node.destroy_node()
+    assert read_graph_file(large).graph.n_poses == 8000
+    assert not list(large.parent.glob('.*'))
+
+
+def test_when_ros_is_shut_down_already(start):
+    """Twice is no more than once."""
+    process = start()
+    assert 'ready' in process.stderr.readline()
+    process.send_signal(signal.SIGTERM)
+    assert_ends(process, signal.SIGINT)
