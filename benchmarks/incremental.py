@@ -20,7 +20,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions, optimise
-from l1slam_ros.core.online.graph_builder import GrowthOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file
 from l1slam_ros.io.trajectory import invented_stamps
@@ -50,7 +50,7 @@ def measurements(record: GraphRecord) -> Iterator[tuple[OdometrySample, list[Loo
 
 def run(record: GraphRecord, every: int, budget: float) -> tuple[list[float], list[float]]:
     """Return seconds of each update, and the excess [%] at each checkpoint."""
-    growth = GrowthOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
+    growth = GraphBuilderOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
     options = BackendOptions(growth.keyframe, growth.odometry, growth.loop)
     backend = Backend(se2, options)
     seconds: list[float] = []

@@ -14,7 +14,7 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.spanning_tree import odometry_poses, pair_key
 from l1slam_ros.core.online.backend import Backend, BackendOptions
-from l1slam_ros.core.online.graph_builder import GrowthOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.robust.batch import INCONSISTENT
@@ -112,7 +112,7 @@ OURS = (RobustSolver('ours, L1', True, 'odometry', _robust(_l1)),
 
 def _drive(graph: FactorGraph, every: int) -> Driven:
     """Feed the back end as the node does, robust as it is by default."""
-    growth = GrowthOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
+    growth = GraphBuilderOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
     backend = Backend(se2, BackendOptions(growth.keyframe, growth.odometry, growth.loop))
     record = GraphRecord(graph, None, np.arange(graph.n_poses))
     maps, seconds = [], 0.0
@@ -137,7 +137,7 @@ def _updated(backend: Backend, budget: float) -> float:
 
 def _accepted(backend: Backend, graph: FactorGraph) -> Mask:
     """Return which factors of the graph, whose rows have another order, the back end uses."""
-    states, grown = backend.loop_states(), backend.growth.graph
+    states, grown = backend.loop_states(), backend.builder.graph
     is_accepted = states.state[: len(states.rows)] == ACCEPTED
     accepted = graph.between.is_odometry.copy()
     accepted[_by_pair(graph, np.flatnonzero(~accepted))] = is_accepted[

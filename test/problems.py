@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.online.graph_builder import GraphGrowth
+from l1slam_ros.core.online.graph_builder import GraphBuilder
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ def true_loop(poses, reference, sample, covariance=UNKNOWN):
 
 def grown(poses, options, covariance=UNKNOWN):
     """Return the growth after the samples of `poses` (n, 3), one every .1 s from 0."""
-    growth = GraphGrowth(se2, options)
+    growth = GraphBuilder(se2, options)
     drive_on(growth, poses, 0, covariance)
     return growth
 

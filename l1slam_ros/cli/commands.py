@@ -109,13 +109,13 @@ def plot(arguments: argparse.Namespace) -> Ending:
 
 def read(arguments: argparse.Namespace, path: Path) -> GraphRecord:
     """Return the graph of an input, as the options for bags say."""
-    growth = None
+    options = None
     if arguments.params_file:
         from l1slam_ros.io.node_options import read_params_file
 
-        growth = read_params_file(arguments.params_file)
+        options = read_params_file(arguments.params_file)
     topics = Topics(arguments.odom_topic, arguments.loop_topic, arguments.trusted_topic)
-    return formats.read_input(path, growth, topics)
+    return formats.read_input(path, options, topics)
 
 
 @contextmanager

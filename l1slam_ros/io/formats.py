@@ -19,13 +19,13 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_
 from l1slam_ros.io.trajectory import invented_stamps, write_tum
 
 if TYPE_CHECKING:
-    from l1slam_ros.core.online.graph_builder import GrowthOptions
+    from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
 
 GRAPH_SUFFIXES = ('.g2o', '.graph')
 
 
 def read_input(
-    path: Path, options: 'GrowthOptions | None' = None, topics: Topics = DEFAULT_TOPICS
+    path: Path, options: 'GraphBuilderOptions | None' = None, topics: Topics = DEFAULT_TOPICS
 ) -> GraphRecord:
     """
     Read a graph file or grow a graph from a bag.

@@ -4,7 +4,7 @@
 
 Callbacks convert a message and append it to the back end; none of it is compiled code. A timer
 wakes the solver's thread, which improves the map and publishes it; another thread carries out what
-services ask for. See `shared_backend` for why none waits for the other.
+services ask for. See `core.online.shared_backend` for why none waits for the other.
 """
 
 import time

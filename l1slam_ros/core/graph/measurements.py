@@ -17,7 +17,7 @@ class OdometrySample:
     The pose of the robot in the odometry frame at one time.
 
     stamp : [ns]; pose3 : (7,) x y z qx qy qz qw [m]; covariance, twist_covariance : (6, 6),
-    rows x y z rx ry rz, as they came in the message: `growth` decides what they mean.
+    rows x y z rx ry rz, as they came in the message: `graph_builder` decides what they mean.
     """
 
     stamp: int

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-How the factors of a linear system lie in memory for the compiled loop of `halpern`.
+How the factors of a linear system lie in memory for the compiled loop of `restarted_pdhg`.
 
 In: values per factor, (m, c), in the order of the system. Out: tiles (t, c, lanes) of single
 precision, factors side by side, sorted by keyframe, so that what one factor fetches of x the next

@@ -20,7 +20,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.online.graph_builder import GraphGrowth, GrowthOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.loop_states import LoopStates
 from l1slam_ros.core.online.snapshot import Problem, Snapshot
 from l1slam_ros.core.options import Options, option
@@ -55,7 +55,7 @@ class RobustOptions(Options):
 
 
 @dataclass(frozen=True)
-class BackendOptions(GrowthOptions):
+class BackendOptions(GraphBuilderOptions):
     """Everything the back end can be told."""
 
     solver: OptimiserOptions = OptimiserOptions()
@@ -101,7 +101,7 @@ class Backend:
     def __init__(self, manifold: Manifold, options: BackendOptions):
         self._manifold = manifold
         self._options = options
-        self.growth = GraphGrowth(manifold, options)
+        self.builder = GraphBuilder(manifold, options)
         self._poses = manifold.identity(0)
         self._dual: Array = np.zeros(0)
         self._belief = Belief.nothing()
@@ -113,9 +113,9 @@ class Backend:
     @property
     def version(self) -> tuple[int, int, int]:
         """Other than an earlier one where there may be something new to do or to tell."""
-        growth = self.growth
+        builder = self.builder
         # While loops wait, any sample may be the one that they wait for, or one too many.
-        return (self._changes, growth.graph.n_poses, self._samples if growth.n_waiting else 0)
+        return (self._changes, builder.graph.n_poses, self._samples if builder.n_waiting else 0)
 
     @property
     def poses(self) -> Array:
@@ -125,12 +125,12 @@ class Backend:
     @property
     def map_to_odom(self) -> Array:
         """The odometry frame seen from the map, (1, p): what the last optimised keyframe says."""
-        last, manifold, offset = len(self._poses) - 1, self._manifold, self.growth.offset
+        last, manifold, offset = len(self._poses) - 1, self._manifold, self.builder.offset
         if last < 0:
             return manifold.identity(1)
         # Asked for with every sample: worked out when an update or a new offset changes it.
         if self._map_to_odom is None or self._map_to_odom[0] is not offset:
-            odometry = self.growth.odometry[last : last + 1]
+            odometry = self.builder.odometry[last : last + 1]
             to_kept = manifold.compose(self._poses[last:], manifold.inverse(odometry))
             self._map_to_odom = offset, manifold.compose(to_kept, offset)
         return self._map_to_odom[1]
@@ -146,45 +146,45 @@ class Backend:
         if options.robust != self._options.robust:
             self._belief, self._status = Belief.nothing(), Status.OUT_OF_TIME
         self._options = options
-        self.growth.options = options
+        self.builder.options = options
 
     def restore(self, graph: FactorGraph, poses: Array, stamps: Indices) -> None:
-        """Begin with the map of an earlier run: see `GraphGrowth.restore`; call it first."""
-        self.growth.restore(graph, stamps, poses)
+        """Begin with the map of an earlier run: see `GraphBuilder.restore`; call it first."""
+        self.builder.restore(graph, stamps, poses)
         self._poses, self._map_to_odom = poses, None
         self._changes += 1
 
     def add_odometry(self, sample: OdometrySample) -> bool:
-        """Add one sample; see `GraphGrowth.add_odometry`."""
+        """Add one sample; see `GraphBuilder.add_odometry`."""
         _require_finite(sample.pose3)
         self._samples += 1
-        graph = self.growth.graph
-        made = self.growth.add_odometry(sample)
-        if self.growth.graph is not graph:
+        graph = self.builder.graph
+        made = self.builder.add_odometry(sample)
+        if self.builder.graph is not graph:
             self._forget_stray()
         return made
 
     def begin_anew(self) -> None:
-        """Forget the only sample so far; see `GraphGrowth.begin_anew`."""
-        self.growth.begin_anew()
+        """Forget the only sample so far; see `GraphBuilder.begin_anew`."""
+        self.builder.begin_anew()
         self._forget_stray()
 
     def _forget_stray(self) -> None:
         """Forget the pose of a first sample that was none: an update may have looked at it."""
-        if self.growth.graph.n_poses < 2:
+        if self.builder.graph.n_poses < 2:
             self._poses = self._poses[:0]
         self._map_to_odom = None
         self._changes += 1
 
     def add_loop(self, loop: LoopClosure) -> None:
-        """Add one loop closure; see `GraphGrowth.add_loop`."""
+        """Add one loop closure; see `GraphBuilder.add_loop`."""
         _require_finite(loop.pose3)
         self._changes += 1
-        self.growth.add_loop(loop)
+        self.builder.add_loop(loop)
 
     def snapshot(self) -> Snapshot:
         """Return the back end as it is, the due loops in its graph, to be read at leisure."""
-        self.growth.add_due_loops()
+        self.builder.add_due_loops()
         return self._now()
 
     def problem(self) -> Problem:
@@ -192,12 +192,12 @@ class Backend:
         return self.snapshot().problem()
 
     def _now(self) -> Snapshot:
-        growth = self.growth
+        builder = self.builder
         at_rest = (self._status in (Status.CONVERGED, Status.STALLED)
                    or self._quiet_updates >= _QUIET_UPDATES)
         return Snapshot(
-            self.version, growth.graph.copy(), growth.stamps, growth.odometry, self.map_to_odom,
-            growth.loop_rows, growth.loop_stamps, self._poses, self._dual, self._belief,
+            self.version, builder.graph.copy(), builder.stamps, builder.odometry, self.map_to_odom,
+            builder.loop_rows, builder.loop_stamps, self._poses, self._dual, self._belief,
             self._options.robust.enabled, self._last_cost, at_rest)
 
     def adopt(self, improvement: Improvement) -> None:

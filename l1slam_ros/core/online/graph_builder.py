@@ -60,7 +60,7 @@ class LoopOptions(Options):
 
 
 @dataclass(frozen=True)
-class GrowthOptions(Options):
+class GraphBuilderOptions(Options):
     """What makes keyframes and factors of messages."""
 
     keyframe: KeyframeOptions = KeyframeOptions()
@@ -68,14 +68,14 @@ class GrowthOptions(Options):
     loop: LoopOptions = LoopOptions()
 
 
-class GraphGrowth:
+class GraphBuilder:
     """
     Grows a factor graph from messages.
 
     Parameters
     ----------
     manifold : what the poses live on
-    options : see `GrowthOptions`; may be replaced at any time
+    options : see `GraphBuilderOptions`; may be replaced at any time
     verbatim : the messages are those of a graph: each is a measurement as it is stated, none a
         loop sent again or odometry that jumps
 
@@ -88,7 +88,7 @@ class GraphGrowth:
 
     """
 
-    def __init__(self, manifold: Manifold, options: GrowthOptions, verbatim: bool = False):
+    def __init__(self, manifold: Manifold, options: GraphBuilderOptions, verbatim: bool = False):
         self.options = options
         self.graph = FactorGraph(manifold)
         self.notes = Notes()

@@ -86,24 +86,24 @@ class SharedBackend:
         """
         Add one sample; return map_to_odom (1, p) for it.
 
-        None: it is held, not used yet; see `GraphGrowth.add_odometry`.
+        None: it is held, not used yet; see `GraphBuilder.add_odometry`.
         """
         with self._lock:
             self._backend.add_odometry(sample)
-            return None if self._backend.growth.held else self._backend.map_to_odom
+            return None if self._backend.builder.held else self._backend.map_to_odom
 
     def begin_anew(self) -> None:
-        """Forget the only sample so far; see `GraphGrowth.begin_anew`."""
+        """Forget the only sample so far; see `GraphBuilder.begin_anew`."""
         with self._lock:
             self._backend.begin_anew()
 
     def news(self) -> list[str]:
-        """Return what is new in the notes on messages; see `GraphGrowth.notes`."""
+        """Return what is new in the notes on messages; see `GraphBuilder.notes`."""
         with self._lock:
-            return self._backend.growth.notes.news()
+            return self._backend.builder.notes.news()
 
     def add_loop(self, loop: LoopClosure) -> None:
-        """Add one loop closure; see `GraphGrowth.add_loop`."""
+        """Add one loop closure; see `GraphBuilder.add_loop`."""
         with self._lock:
             self._backend.add_loop(loop)
 
@@ -121,7 +121,7 @@ class SharedBackend:
         """Return the sizes of the graph, and how many loops were refused for which cause."""
         with self._lock:
             version = self._backend, self._backend.version
-            refused = dict(self._backend.growth.refused)
+            refused = dict(self._backend.builder.refused)
         if self._counted[0] != version:
             now = self.snapshot()
             sizes = {'keyframes': now.graph.n_poses, 'factors': len(now.graph.between)}

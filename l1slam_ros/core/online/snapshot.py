@@ -47,7 +47,7 @@ class Snapshot:
     What a back end knows.
 
     version : see `Backend.version`; graph : the factors so far; stamps (n,) [ns] and odometry
-    (n, p) of the keyframes; map_to_odom : (1, p); loop_rows, loop_stamps : see `GraphGrowth`;
+    (n, p) of the keyframes; map_to_odom : (1, p); loop_rows, loop_stamps : see `GraphBuilder`;
     optimised (k, p), dual, belief and last_cost : as the last update left them, for the first
     keyframes and factors; robust : loops may be doubted; at_rest : more updates of the same
     factors would hardly change the map.

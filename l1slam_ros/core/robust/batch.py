@@ -6,8 +6,8 @@ In: a graph, of which nothing is believed but the odometry and the trusted loops
 that are believed, and the L2 map of these. No loop is factored before it is believed, so none
 bends what it is judged by. Each round
 
-1. predicts every undecided loop with its covariance (`prediction`),
-2. accepts those that hardly can be false (`belief`), the share of false ones being what the loops
+1. predicts every undecided loop with its covariance (`innovation`),
+2. accepts those that hardly can be false (`gating`), the share of false ones being what the loops
    themselves say it is; where there is none, pairs of loops that vouch for each other: a group of
    loops that may be one mistake has one vote; where there is none either, asks whether an odometry
    factor lies (`slips`),
@@ -16,7 +16,7 @@ bends what it is judged by. Each round
 The noise of odometry and of loops is measured on the way: files are often off by a constant. In
 the last rounds factors may be as noisy as they say, so that none is refused for being worse than
 its like. What fits where it stands, but could as well be chance, stays suspect. Source: ours,
-defended by `test_robust.py`.
+defended by `test_batch.py`.
 """
 
 from collections.abc import Callable, Iterator

@@ -201,7 +201,7 @@ def _l2_poses(graph: FactorGraph) -> Array:
 
 def _system(graph: FactorGraph, poses: Array) -> LinearSystem:
     """
-    Return `linearise` of a graph without priors by the verbs of its manifold, nothing compiled.
+    Return the linear system of a graph without priors by its manifold's verbs, nothing compiled.
 
     A look at a graph is over before compiled loops are there. With B = Xi^-1 Xj the residual is
     that of B seen from Z; a step s of i moves B on the right by -Ad(B^-1) s.

@@ -3,7 +3,7 @@
 What is believed of the factors of a graph while it grows.
 
 In: the belief of the last update and the graph as it is now. Out: the belief after new evidence.
-The rounds are those of the batch solve (`robust`), from the state that is there.
+The rounds are those of the batch solve (`batch`), from the state that is there.
 """
 
 import time

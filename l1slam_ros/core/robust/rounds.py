@@ -2,7 +2,7 @@
 """
 The rounds of a robust solve: predict, believe, solve, doubt.
 
-In: a graph and what is believed of it. Out: the same with more loops believed. See `robust`.
+In: a graph and what is believed of it. Out: the same with more loops believed. See `batch`.
 """
 
 import copy

@@ -6,8 +6,8 @@ In: a robust solve in which nothing more can be believed. Out: one in which an o
 left out, and the loops that were refused because of it are accepted.
 
 Three ways lead to a factor that may lie: it moves as the robot never did; believed loops across
-speak against it; or refused loops across agree with each other (`accord`). Each is tried, and
-counts when leaving it out brings more loops in than it costs, of several places.
+speak against it; or refused loops across agree with each other (`pairwise_consistency`). Each is
+tried, and counts when leaving it out brings more loops in than it costs, of several places.
 """
 
 from collections.abc import Callable, Iterator

@@ -3,7 +3,7 @@
 Bags in: rosbag2 directories, bare `.mcap` and `.db3` files, `.bag` files of ROS 1.
 
 The bag library reads them while it can; where it gives up, `salvage` goes on. The bag libraries
-are imported by `bag`, `bag_writer`, `salvage` and the walks alone, and only where needed.
+are imported by `reader`, `writer`, `salvage` and the walks alone, and only where needed.
 """
 
 import math

@@ -8,7 +8,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError, MessageError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.online.graph_builder import GraphGrowth, GrowthOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.io.bags.from_graph import GRAPH_NOTE, VERBATIM_NOTE
 from l1slam_ros.io.bags.reader import BagMessage, bag_summary, read_messages, read_note
@@ -20,7 +20,7 @@ from l1slam_ros.io.messages.conversion import loop_closure, odometry_sample
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 
 
-def graph_from_bag(path: Path, options: GrowthOptions | None, topics: Topics) -> GraphRecord:
+def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topics) -> GraphRecord:
     """
     Grow a graph from the messages of a bag, damaged or not.
 
@@ -57,8 +57,8 @@ def graph_from_bag(path: Path, options: GrowthOptions | None, topics: Topics) ->
 class _Growing:
     """A graph that grows message by message."""
 
-    def __init__(self, options: GrowthOptions, topics: Topics, verbatim: bool):
-        self._growth = GraphGrowth(se2, options, verbatim)
+    def __init__(self, options: GraphBuilderOptions, topics: Topics, verbatim: bool):
+        self._builder = GraphBuilder(se2, options, verbatim)
         self._topics, self._types = topics, topics.types()
         self._base_frame = BaseFrame('')
         self.seen: set[str] = set()
@@ -67,7 +67,7 @@ class _Growing:
         """Use a message, or note why not."""
         topic, expected = message.topic, self._types[message.topic]
         self.seen.add(topic)
-        notes = self._growth.notes
+        notes = self._builder.notes
         try:
             if message.msgtype != expected:
                 raise MessageError('type', f'{message.msgtype} on {topic}; expected {expected}')
@@ -75,7 +75,7 @@ class _Growing:
                 self._add_odometry(self._base_frame.take(
                     message.message.child_frame_id, odometry_sample(message.message)))
             else:
-                self._growth.add_loop(loop_closure(
+                self._builder.add_loop(loop_closure(
                     message.message, self._base_frame.name, topic == self._topics.trusted))
         except MessageError as error:
             notes.refuse(error.cause, str(error))
@@ -85,34 +85,34 @@ class _Growing:
 
     def _add_odometry(self, found: Sorted) -> None:
         if found.anew:
-            self._growth.begin_anew()
+            self._builder.begin_anew()
         for error in found.others:
-            self._growth.notes.refuse(error.cause, str(error))
+            self._builder.notes.refuse(error.cause, str(error))
         for sample in found.ours:
             try:
-                self._growth.add_odometry(sample)
+                self._builder.add_odometry(sample)
             except MessageError as error:
-                self._growth.notes.refuse(error.cause, str(error))
+                self._builder.notes.refuse(error.cause, str(error))
 
     def record(self, damage: str) -> GraphRecord:
         """Return the graph that has grown; damage : of the bag."""
-        growth = self._growth
+        builder = self._builder
         self._add_odometry(Sorted(others=self._base_frame.rest()))
-        growth.finish()
-        growth.add_due_loops()
-        skipped = growth.notes.sentences()
-        if growth.held:
-            skipped.append(f'the last message is not used: {growth.held}')
-        if growth.n_waiting == 1:
+        builder.finish()
+        builder.add_due_loops()
+        skipped = builder.notes.sentences()
+        if builder.held:
+            skipped.append(f'the last message is not used: {builder.held}')
+        if builder.n_waiting == 1:
             skipped.append('1 loop names a time after the last odometry')
-        elif growth.n_waiting:
-            skipped.append(f'{growth.n_waiting} loops name times after the last odometry')
-        return GraphRecord(growth.graph, None, np.arange(growth.graph.n_poses), growth.stamps,
+        elif builder.n_waiting:
+            skipped.append(f'{builder.n_waiting} loops name times after the last odometry')
+        return GraphRecord(builder.graph, None, np.arange(builder.graph.n_poses), builder.stamps,
                            tuple(skipped), damage)
 
 
-def _noted_options(note: dict[str, str]) -> GrowthOptions:
-    options = GrowthOptions()
+def _noted_options(note: dict[str, str]) -> GraphBuilderOptions:
+    options = GraphBuilderOptions()
     if note.get('keyframes') == GRAPH_NOTE['keyframes']:
         options = replace(options, keyframe=KeyframeOptions(0.0, 0.0, 0.0))
     if note.get('covariance') == GRAPH_NOTE['covariance']:

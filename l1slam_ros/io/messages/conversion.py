@@ -11,7 +11,7 @@ A message that cannot be used raises `MessageError` with one of these causes:
     frame        a loop whose frame is not `<base_frame>@<sec>.<nanosec, 9 digits>`
     order        a loop whose reference is not earlier than its stamp
 
-Covariances pass as they come: `growth` decides what they are worth.
+Covariances pass as they come: `graph_builder` decides what they are worth.
 """
 
 import math

@@ -144,7 +144,7 @@ def test_a_loop_alone_settles_nothing_new(world):
     settled(backend)
     backend.add_loop(loop(0.0, 100.0, (1.0, 0.0, 0.0)))
     assert backend.update(PLENTY) is None
-    assert backend.growth.n_waiting == 1
+    assert backend.builder.n_waiting == 1
 
 
 # Time
@@ -323,7 +323,7 @@ def clean_errors(careful):
 def states_by_truth(backend, world):
     """Return the states of the false loops of the graph, and those of the true ones."""
     states = backend.loop_states()
-    false = is_false(world, backend.growth.graph.between)[states.rows]
+    false = is_false(world, backend.builder.graph.between)[states.rows]
     in_graph = states.state[: len(states.rows)]
     return in_graph[false], in_graph[~false]
 
@@ -414,7 +414,7 @@ def test_what_is_not_believed_costs_nothing_and_pulls_at_nothing():
     assert improvement.cost == pytest.approx(0.0, abs=1e-6)
     rows = backend.loop_states().rows
     assert_array_equal(improvement.dual.reshape(-1, 3)[rows], 0)
-    assert len(improvement.dual) == 3 * len(backend.growth.graph.between)
+    assert len(improvement.dual) == 3 * len(backend.builder.graph.between)
 
 
 def test_the_dual_of_each_factor_is_at_its_own_rows(careful):
@@ -447,7 +447,7 @@ def test_each_loop_has_a_state_and_its_own_stamps(careful):
     backend.add_loop(loop(2.0, 50.0, (1.0, 0.0, 0.0)))
     backend.update(PLENTY)
     states = backend.loop_states()
-    factors, loops = backend.growth.graph.between, len(states.rows)
+    factors, loops = backend.builder.graph.between, len(states.rows)
     assert_array_equal(states.rows, np.flatnonzero(~factors.is_odometry))
     ends = np.stack((factors.i, factors.j), axis=1)[states.rows]
     assert_array_equal(states.stamps[:loops], ends * seconds(PERIOD))
@@ -486,14 +486,14 @@ def restored(world, n):
     first, second = Backend(se2, EVERY), Backend(se2, EVERY)
     play(first, world, 0, n)
     settled(first)
-    second.restore(first.problem().graph, first.poses, first.growth.stamps)
+    second.restore(first.problem().graph, first.poses, first.builder.stamps)
     return first, second
 
 
 def test_a_restored_map_is_the_map_it_was(world):
     first, second = restored(world, 80)
     assert_array_equal(second.poses, first.poses)
-    assert_array_equal(second.growth.stamps, first.growth.stamps)
+    assert_array_equal(second.builder.stamps, first.builder.stamps)
     second.update(PLENTY)
     # Started anew it may end nearer to the optimum, of which a settled map is within 2e-4.
     before, after = first.problem().last_cost, second.problem().last_cost
@@ -529,10 +529,10 @@ def test_the_dual_of_old_rows_is_kept_and_new_rows_start_at_zero(world):
     improvement = improve(backend.problem(), EVERY.solver, PLENTY)
     backend.adopt(improvement)
     rows = len(improvement.dual)
-    assert rows == 3 * len(backend.growth.graph.between)
+    assert rows == 3 * len(backend.builder.graph.between)
     play(backend, world, 100, 110)
     dual = backend.problem().dual
-    assert len(dual) == 3 * len(backend.growth.graph.between) > rows
+    assert len(dual) == 3 * len(backend.builder.graph.between) > rows
     assert_array_equal(dual[:rows], improvement.dual)
     assert_array_equal(dual[rows:], 0)
     assert np.abs(improvement.dual).max() == 1.0

@@ -53,8 +53,8 @@ def test_intel_with_absurd_variances_and_every_loop_five_times(datasets, robust)
     assert off.max() < 0.15
     assert (spoiled.loop_states().state == ACCEPTED).sum() == 893
     # 895 loops, two of which stand in the file twice.
-    assert spoiled.growth.refused['repeated'] == 5 * 895 - 893
-    assert spoiled.growth.notes.warned['odometry_variance'] == 80 * 3
+    assert spoiled.builder.refused['repeated'] == 5 * 895 - 893
+    assert spoiled.builder.notes.warned['odometry_variance'] == 80 * 3
 
 
 VARIANCES = [1e-300, 1e-30, 1e-20, 1e-12, 1e-8, 1e-4, 1.0, 1e4, 1e12, 1e30, 1e300]
@@ -87,14 +87,14 @@ def test_no_variance_makes_an_update_fail(source, component, period, rng):
                 backend.add_loop(loop(factors.i[loops[n]] * PERIOD, k * PERIOD,
                                       factors.measurement[loops[n]],
                                       stated(n, source == 'loop')))
-        backend.growth.add_due_loops()
+        backend.builder.add_due_loops()
     for _ in range(3):
         backend.update(0.1)
     backend.adopt(optimise(backend.problem(), options.solver))
-    assert np.isfinite(backend.poses).all() and len(backend.poses) == backend.growth.graph.n_poses
+    assert np.isfinite(backend.poses).all() and len(backend.poses) == backend.builder.graph.n_poses
     off = np.hypot(*(se2.between(backend.poses[:1], backend.poses))[:, :2].T)
     assert off.max() < 2 * np.hypot(*chain[:, :2].T).max() + 10
-    assert backend.growth.notes.warned
+    assert backend.builder.notes.warned
 
 
 def exact_world(n, edges, rng, false_loops):
@@ -137,6 +137,6 @@ def test_loops_without_noise_while_the_map_grows(lies, rng):
     assert (states.state == ACCEPTED).sum() == 1001
     # False ones came in the order of their ends: told by what they measure.
     rows = states.rows[states.state[:len(states.rows)] == ACCEPTED]
-    used = backend.growth.graph.between
+    used = backend.builder.graph.between
     exact = se2.between(truth[used.i[rows]], truth[used.j[rows]])
     assert np.abs(se2.local(exact, used.measurement[rows])).max() < 1e-6

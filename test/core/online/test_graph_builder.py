@@ -27,17 +27,17 @@ from problems import (
 
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.online.graph_builder import GraphGrowth, GrowthOptions, LoopOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions, LoopOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 
-EVERY = GrowthOptions(keyframe=KeyframeOptions(0.0, 0.0, 0.0))
-DEFAULTS = GrowthOptions()
+EVERY = GraphBuilderOptions(keyframe=KeyframeOptions(0.0, 0.0, 0.0))
+DEFAULTS = GraphBuilderOptions()
 
 
-def assert_true(growth, poses):
+def assert_true(builder, poses):
     """Every loop factor is the true relative pose of its keyframes."""
-    i, j, measurement = loops_of(growth)
-    keyframes = keyframe_samples(growth)
+    i, j, measurement = loops_of(builder)
+    keyframes = keyframe_samples(builder)
     true = se2.between(poses[keyframes[i]], poses[keyframes[j]])
     assert_allclose(se2.local(true, measurement), 0, atol=1e-9)
 
@@ -46,35 +46,35 @@ def assert_true(growth, poses):
 
 
 def test_nothing_yet():
-    growth = GraphGrowth(se2, DEFAULTS)
-    assert growth.graph.n_poses == growth.n_waiting == growth.add_due_loops() == 0
-    assert growth.stamps.shape == (0,) and growth.odometry.shape == (0, 3)
+    builder = GraphBuilder(se2, DEFAULTS)
+    assert builder.graph.n_poses == builder.n_waiting == builder.add_due_loops() == 0
+    assert builder.stamps.shape == (0,) and builder.odometry.shape == (0, 3)
 
 
 def test_the_first_sample_is_keyframe_0_wherever_it_is():
-    growth = GraphGrowth(se2, DEFAULTS)
-    assert growth.add_odometry(odometry(5.0, (1.0, 2.0, 3.0)))
-    assert_array_equal(growth.stamps, [seconds(5.0)])
-    assert_allclose(growth.odometry, [[1.0, 2.0, 3.0]])
-    assert growth.graph.n_poses == 1 and len(growth.graph.between) == 0
+    builder = GraphBuilder(se2, DEFAULTS)
+    assert builder.add_odometry(odometry(5.0, (1.0, 2.0, 3.0)))
+    assert_array_equal(builder.stamps, [seconds(5.0)])
+    assert_allclose(builder.odometry, [[1.0, 2.0, 3.0]])
+    assert builder.graph.n_poses == 1 and len(builder.graph.between) == 0
 
 
 def test_every_sample_can_be_a_keyframe(rng):
     poses = drive(30, rng)
-    growth = grown(poses, EVERY)
-    factors = growth.graph.between
-    assert_array_equal(growth.stamps, [seconds(k * PERIOD) for k in range(30)])
-    assert_allclose(growth.odometry, poses, atol=1e-12)
+    builder = grown(poses, EVERY)
+    factors = builder.graph.between
+    assert_array_equal(builder.stamps, [seconds(k * PERIOD) for k in range(30)])
+    assert_allclose(builder.odometry, poses, atol=1e-12)
     assert_array_equal(np.stack((factors.i, factors.j)), [np.arange(29), np.arange(1, 30)])
     assert_allclose(factors.measurement, se2.between(poses[:-1], poses[1:]), atol=1e-12)
 
 
 def test_keyframes_come_when_the_motion_passes_a_threshold():
     poses = curve(200)
-    growth = GraphGrowth(se2, DEFAULTS)
+    builder = GraphBuilder(se2, DEFAULTS)
     last, expected = 0, [0]
     for k, pose in enumerate(poses):
-        made = growth.add_odometry(odometry(k * PERIOD, pose))
+        made = builder.add_odometry(odometry(k * PERIOD, pose))
         moved = se2.between(poses[last : last + 1], pose[None])[0]
         due = k == 0 or np.hypot(*moved[:2]) >= 0.5 or abs(moved[2]) >= 0.2
         assert made == due
@@ -82,44 +82,44 @@ def test_keyframes_come_when_the_motion_passes_a_threshold():
             expected.append(k)
             last = k
     assert 20 < len(expected) < 60
-    assert_array_equal(growth.stamps, [seconds(k * PERIOD) for k in expected])
+    assert_array_equal(builder.stamps, [seconds(k * PERIOD) for k in expected])
     keyframes = poses[expected]
-    assert_allclose(growth.graph.between.measurement,
+    assert_allclose(builder.graph.between.measurement,
                     se2.between(keyframes[:-1], keyframes[1:]), atol=1e-12)
 
 
 def test_a_factor_has_the_covariance_of_the_whole_motion(rng):
     covariance = 1e-4 * random_information(1, rng)[0]
-    options = GrowthOptions(KeyframeOptions(0.0, 0.0, 0.5), OdometryOptions('increment'))
-    growth = grown(curve(11), options, covariance6(covariance))
+    options = GraphBuilderOptions(KeyframeOptions(0.0, 0.0, 0.5), OdometryOptions('increment'))
+    builder = grown(curve(11), options, covariance6(covariance))
     poses, expected = curve(11), np.zeros((3, 3))
     for k in range(1, 6):
         Ad = se2.adjoint(se2.between(poses[5:6], poses[k : k + 1]))[0]
         expected += Ad @ covariance @ Ad.T
-    assert_array_equal(growth.stamps, [0, seconds(0.5), seconds(1.0)])
-    assert_allclose(covariance_of(growth, 0), expected, rtol=1e-9)
+    assert_array_equal(builder.stamps, [0, seconds(0.5), seconds(1.0)])
+    assert_allclose(covariance_of(builder, 0), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize('time', [0.9, 0.5, 0.0])
 def test_an_old_stamp_is_refused_and_nothing_is_added(time):
     poses = curve(12)
-    growth = grown(poses[:10], EVERY)
+    builder = grown(poses[:10], EVERY)
     with pytest.raises(MessageError) as caught:
-        growth.add_odometry(odometry(time, (100.0, 100.0, 1.0)))
+        builder.add_odometry(odometry(time, (100.0, 100.0, 1.0)))
     assert caught.value.cause == 'old_stamp'
     assert str(caught.value) == (f'odometry stamp {seconds(time)} ns is not after the last one, '
                                  f'{seconds(0.9)} ns')
-    assert growth.graph.n_poses == len(growth.stamps) == 10
-    growth.add_odometry(odometry(1.0, poses[10]))
-    assert_allclose(growth.graph.between.measurement[9:], se2.between(poses[9:10], poses[10:11]),
+    assert builder.graph.n_poses == len(builder.stamps) == 10
+    builder.add_odometry(odometry(1.0, poses[10]))
+    assert_allclose(builder.graph.between.measurement[9:], se2.between(poses[9:10], poses[10:11]),
                     atol=1e-12)
 
 
 def test_snapshots_stay_as_they_were():
-    growth = grown(curve(5), EVERY)
-    stamps, poses = growth.stamps, growth.odometry
+    builder = grown(curve(5), EVERY)
+    stamps, poses = builder.stamps, builder.odometry
     before = stamps.copy(), poses.copy()
-    drive_on(growth, curve(200), 5)
+    drive_on(builder, curve(200), 5)
     assert_array_equal(stamps, before[0])
     assert_array_equal(poses, before[1])
 
@@ -132,23 +132,23 @@ def test_snapshots_stay_as_they_were():
 def test_a_true_loop_becomes_the_true_pose_between_keyframes(reference, sample):
     """Whatever keyframes are nearest: raw odometry carries it there."""
     poses = curve(200)
-    growth = grown(poses, DEFAULTS)
-    growth.add_loop(true_loop(poses, reference, sample))
-    assert growth.add_due_loops() == 1 and growth.n_waiting == 0
-    assert_true(growth, poses)
-    (i,), (j,), _ = loops_of(growth)
-    keyframes = keyframe_samples(growth)
+    builder = grown(poses, DEFAULTS)
+    builder.add_loop(true_loop(poses, reference, sample))
+    assert builder.add_due_loops() == 1 and builder.n_waiting == 0
+    assert_true(builder, poses)
+    (i,), (j,), _ = loops_of(builder)
+    keyframes = keyframe_samples(builder)
     assert abs(keyframes[i] - reference) == np.abs(keyframes - reference).min()
     assert abs(keyframes[j] - sample) == np.abs(keyframes - sample).min()
 
 
 def test_a_loop_between_two_samples_is_interpolated():
     """On a straight line at 1 m/s: exact."""
-    growth = grown([(k * PERIOD, 0.0, 0.0) for k in range(100)], DEFAULTS)
-    growth.add_loop(loop(1.03, 7.77, (6.74, 0.0, 0.0)))
-    growth.add_due_loops()
-    (i,), (j,), measurement = loops_of(growth)
-    x = growth.odometry[:, 0]
+    builder = grown([(k * PERIOD, 0.0, 0.0) for k in range(100)], DEFAULTS)
+    builder.add_loop(loop(1.03, 7.77, (6.74, 0.0, 0.0)))
+    builder.add_due_loops()
+    (i,), (j,), measurement = loops_of(builder)
+    x = builder.odometry[:, 0]
     assert (x[i], x[j]) == (pytest.approx(1.0), pytest.approx(8.0))
     assert_allclose(measurement, [[7.0, 0, 0]], atol=1e-9)
 
@@ -158,10 +158,10 @@ def test_the_odometry_of_the_way_alone_is_used():
     poses = curve(200)
     drifted = np.concatenate((poses[:100], se2.compose(
         np.broadcast_to([5.0, 3.0, 1.0], (100, 3)), poses[100:])))
-    growth = grown(drifted, DEFAULTS)
-    growth.add_loop(true_loop(poses, 7, 151))
-    assert growth.add_due_loops() == 1
-    assert_true(growth, poses)
+    builder = grown(drifted, DEFAULTS)
+    builder.add_loop(true_loop(poses, 7, 151))
+    assert builder.add_due_loops() == 1
+    assert_true(builder, poses)
 
 
 def test_a_loop_before_its_odometry_gives_the_same_factor():
@@ -169,7 +169,7 @@ def test_a_loop_before_its_odometry_gives_the_same_factor():
     poses = curve(200)
     loops = [true_loop(poses, 7, 151), true_loop(poses, 33, 188), true_loop(poses, 2, 90)]
     after = grown(poses, EVERY)
-    before, middle = GraphGrowth(se2, EVERY), GraphGrowth(se2, EVERY)
+    before, middle = GraphBuilder(se2, EVERY), GraphBuilder(se2, EVERY)
     for one in loops:
         before.add_loop(one)
         after.add_loop(one)
@@ -178,16 +178,16 @@ def test_a_loop_before_its_odometry_gives_the_same_factor():
     for one in loops:
         middle.add_loop(one)
     drive_on(middle, poses, 100)
-    for growth in (after, before, middle):
-        assert growth.add_due_loops() == 3
-        for ours, theirs in zip(loops_of(growth), loops_of(after), strict=True):
+    for builder in (after, before, middle):
+        assert builder.add_due_loops() == 3
+        for ours, theirs in zip(loops_of(builder), loops_of(after), strict=True):
             assert_array_equal(ours, theirs)
 
 
 def test_the_factor_does_not_hang_on_when_the_timer_fires():
     poses = curve(30)
     loops = [true_loop(poses, 0, k) for k in range(3, 26)]
-    offline, live = GraphGrowth(se2, DEFAULTS), GraphGrowth(se2, DEFAULTS)
+    offline, live = GraphBuilder(se2, DEFAULTS), GraphBuilder(se2, DEFAULTS)
     for one in loops:
         offline.add_loop(one)
         live.add_loop(one)
@@ -201,66 +201,66 @@ def test_the_factor_does_not_hang_on_when_the_timer_fires():
 
 def test_a_loop_waits_for_its_odometry():
     poses = curve(100)
-    growth = grown(poses[:50], DEFAULTS)
-    growth.add_loop(true_loop(poses, 3, 60))
-    growth.add_loop(true_loop(poses, 3, 40))
-    assert growth.n_waiting == 2
-    assert growth.add_due_loops() == 1 and growth.n_waiting == 1
+    builder = grown(poses[:50], DEFAULTS)
+    builder.add_loop(true_loop(poses, 3, 60))
+    builder.add_loop(true_loop(poses, 3, 40))
+    assert builder.n_waiting == 2
+    assert builder.add_due_loops() == 1 and builder.n_waiting == 1
     for k in range(50, 61):
-        assert growth.add_due_loops() == 0
-        growth.add_odometry(odometry(k * PERIOD, poses[k]))
-    assert growth.add_due_loops() == 1 and growth.n_waiting == 0
-    assert growth.add_due_loops() == 0 and not +growth.refused
+        assert builder.add_due_loops() == 0
+        builder.add_odometry(odometry(k * PERIOD, poses[k]))
+    assert builder.add_due_loops() == 1 and builder.n_waiting == 0
+    assert builder.add_due_loops() == 0 and not +builder.refused
 
 
 def test_a_loop_expires_when_it_has_waited_too_long():
     poses = curve(100)
-    growth = grown(poses[:21], GrowthOptions(loop=LoopOptions(wait=1.0)))
-    growth.add_loop(true_loop(poses, 3, 60))
+    builder = grown(poses[:21], GraphBuilderOptions(loop=LoopOptions(wait=1.0)))
+    builder.add_loop(true_loop(poses, 3, 60))
     for k in range(21, 31):
-        growth.add_odometry(odometry(k * PERIOD, poses[k]))
-        assert growth.add_due_loops() == 0
-        assert growth.n_waiting == 1 and not +growth.refused
-    growth.add_odometry(odometry(31 * PERIOD, poses[31]))
-    growth.add_due_loops()
-    assert growth.n_waiting == 0 and +growth.refused == {'expired': 1}
-    drive_on(growth, poses[:70], 32)
-    assert growth.add_due_loops() == 0 and loops_of(growth)[0] == []
+        builder.add_odometry(odometry(k * PERIOD, poses[k]))
+        assert builder.add_due_loops() == 0
+        assert builder.n_waiting == 1 and not +builder.refused
+    builder.add_odometry(odometry(31 * PERIOD, poses[31]))
+    builder.add_due_loops()
+    assert builder.n_waiting == 0 and +builder.refused == {'expired': 1}
+    drive_on(builder, poses[:70], 32)
+    assert builder.add_due_loops() == 0 and loops_of(builder)[0] == []
 
 
 def test_a_loop_that_came_before_any_odometry_expires_too():
-    growth = GraphGrowth(se2, DEFAULTS)
-    growth.add_loop(loop(5.0, 1e6, (1.0, 0.0, 0.0)))
+    builder = GraphBuilder(se2, DEFAULTS)
+    builder.add_loop(loop(5.0, 1e6, (1.0, 0.0, 0.0)))
     for k in range(100):
-        growth.add_odometry(odometry(k, (k, 0.0, 0.0)))
-    growth.add_due_loops()
-    assert growth.n_waiting == 0 and +growth.refused == {'expired': 1}
+        builder.add_odometry(odometry(k, (k, 0.0, 0.0)))
+    builder.add_due_loops()
+    assert builder.n_waiting == 0 and +builder.refused == {'expired': 1}
 
 
 @pytest.mark.parametrize('reference, time, cause', [
     (-1.0, 5.0, 'before_start'), (-5.0, -1.0, 'before_start'), (-1e-9, 9.0, 'before_start'),
     (5.0, 5.01, 'same_keyframe'), (0.0, 0.1, 'same_keyframe')])
 def test_a_loop_that_can_be_no_factor_is_counted(reference, time, cause):
-    growth = grown(curve(101), GrowthOptions(keyframe=KeyframeOptions(0.0, 0.0, 1.0)))
-    growth.add_loop(loop(reference, time, (1.0, 0.0, 0.0)))
-    assert growth.add_due_loops() == 0
-    assert +growth.refused == {cause: 1}
-    assert growth.n_waiting == 0 and loops_of(growth)[0] == []
+    builder = grown(curve(101), GraphBuilderOptions(keyframe=KeyframeOptions(0.0, 0.0, 1.0)))
+    builder.add_loop(loop(reference, time, (1.0, 0.0, 0.0)))
+    assert builder.add_due_loops() == 0
+    assert +builder.refused == {cause: 1}
+    assert builder.n_waiting == 0 and loops_of(builder)[0] == []
 
 
 def test_good_loops_among_bad_ones_keep_their_order():
     poses = curve(200)
-    growth = grown(poses, DEFAULTS)
+    builder = grown(poses, DEFAULTS)
     good = [(10, 120), (30, 150), (20, 195), (5, 60)]
     for k, (reference, sample) in enumerate(good):
-        growth.add_loop(true_loop(poses, reference, sample))
-        growth.add_loop(loop(-1.0, 5.0, (1.0, k, 0.0)))
-        growth.add_loop(loop(100.0, 200.0, (1.0, k, 0.0)))
-    assert growth.add_due_loops() == 4
-    assert growth.n_waiting == 4 and +growth.refused == {'before_start': 4}
-    assert_true(growth, poses)
-    i, j, _ = loops_of(growth)
-    pairs = keyframe_samples(growth)[np.stack((i, j), axis=1)]
+        builder.add_loop(true_loop(poses, reference, sample))
+        builder.add_loop(loop(-1.0, 5.0, (1.0, k, 0.0)))
+        builder.add_loop(loop(100.0, 200.0, (1.0, k, 0.0)))
+    assert builder.add_due_loops() == 4
+    assert builder.n_waiting == 4 and +builder.refused == {'before_start': 4}
+    assert_true(builder, poses)
+    i, j, _ = loops_of(builder)
+    pairs = keyframe_samples(builder)[np.stack((i, j), axis=1)]
     assert np.abs(pairs - good).max() <= 4
 
 
@@ -272,58 +272,58 @@ def stamps_of(*loops):
 
 
 def test_no_loops_have_no_stamps():
-    growth = GraphGrowth(se2, DEFAULTS)
-    assert [part.shape for part in growth.loop_stamps] == [(0, 2)] * 3
-    assert growth.loop_rows.shape == (0,)
+    builder = GraphBuilder(se2, DEFAULTS)
+    assert [part.shape for part in builder.loop_stamps] == [(0, 2)] * 3
+    assert builder.loop_rows.shape == (0,)
 
 
 def test_each_loop_of_the_graph_has_its_row_and_the_stamps_it_came_with():
     """Its own, not those of the keyframes it was carried to; refused ones leave no row."""
     poses = curve(200)
-    growth = grown(poses, DEFAULTS)
+    builder = grown(poses, DEFAULTS)
     good = [true_loop(poses, *pair) for pair in ((7, 151), (33, 188), (2, 90))]
     early, same = loop(-1.0, 5.0, (1.0, 0.0, 0.0)), loop(5.0, 5.01, (0.1, 0.0, 0.0))
     for one in (good[0], early, good[1], same):
-        growth.add_loop(one)
-    growth.add_due_loops()
-    drive_on(growth, np.concatenate((poses, poses[-1] + np.outer(np.arange(1, 30), [1, 0, 0]))),
+        builder.add_loop(one)
+    builder.add_due_loops()
+    drive_on(builder, np.concatenate((poses, poses[-1] + np.outer(np.arange(1, 30), [1, 0, 0]))),
              200)
-    growth.add_loop(good[2])
-    growth.add_due_loops()
-    in_graph, waiting, expired = growth.loop_stamps
+    builder.add_loop(good[2])
+    builder.add_due_loops()
+    in_graph, waiting, expired = builder.loop_stamps
     assert in_graph.tolist() == stamps_of(*good)
     assert len(waiting) == len(expired) == 0
-    factors = growth.graph.between
-    assert_array_equal(growth.loop_rows, np.flatnonzero(~factors.is_odometry))
-    ends = growth.stamps[np.stack((factors.i, factors.j), axis=1)[growth.loop_rows]]
+    factors = builder.graph.between
+    assert_array_equal(builder.loop_rows, np.flatnonzero(~factors.is_odometry))
+    ends = builder.stamps[np.stack((factors.i, factors.j), axis=1)[builder.loop_rows]]
     assert 0 < np.abs(ends - in_graph).max() < seconds(0.5)
 
 
 def test_loops_that_wait_and_loops_that_expired_keep_their_stamps():
     poses = curve(100)
-    growth = grown(poses[:20], GrowthOptions(loop=LoopOptions(wait=2.0)))
+    builder = grown(poses[:20], GraphBuilderOptions(loop=LoopOptions(wait=2.0)))
     loops = [true_loop(poses, 3, 95), true_loop(poses, 3, 30), true_loop(poses, 4, 99)]
     for one in loops:
-        growth.add_loop(one)
-    growth.add_due_loops()
-    assert [part.tolist() for part in growth.loop_stamps] == [[], stamps_of(*loops), []]
-    drive_on(growth, poses[:50], 20)
+        builder.add_loop(one)
+    builder.add_due_loops()
+    assert [part.tolist() for part in builder.loop_stamps] == [[], stamps_of(*loops), []]
+    drive_on(builder, poses[:50], 20)
     late = true_loop(poses, 5, 60)
-    growth.add_loop(late)
-    growth.add_due_loops()
-    assert [part.tolist() for part in growth.loop_stamps] == [
+    builder.add_loop(late)
+    builder.add_due_loops()
+    assert [part.tolist() for part in builder.loop_stamps] == [
         stamps_of(loops[1]), stamps_of(late), stamps_of(loops[0], loops[2])]
-    assert +growth.refused == {'expired': 2} and growth.n_waiting == 1
+    assert +builder.refused == {'expired': 2} and builder.n_waiting == 1
 
 
 def test_a_trusted_loop_becomes_a_trusted_factor():
     poses = curve(200)
-    growth = grown(poses, DEFAULTS)
-    growth.add_loop(true_loop(poses, 7, 151))
-    growth.add_loop(replace(true_loop(poses, 33, 188), trusted=True))
-    growth.add_due_loops()
-    trusted = growth.graph.between.trusted
-    assert trusted[growth.loop_rows].tolist() == [False, True] and trusted.sum() == 1
+    builder = grown(poses, DEFAULTS)
+    builder.add_loop(true_loop(poses, 7, 151))
+    builder.add_loop(replace(true_loop(poses, 33, 188), trusted=True))
+    builder.add_due_loops()
+    trusted = builder.graph.between.trusted
+    assert trusted[builder.loop_rows].tolist() == [False, True] and trusted.sum() == 1
 
 
 def test_the_loops_of_an_earlier_run_are_those_of_its_keyframes():
@@ -332,7 +332,7 @@ def test_the_loops_of_an_earlier_run_are_those_of_its_keyframes():
     for pair in ((4, 40), (3, 55)):
         first.add_loop(true_loop(poses, *pair))
     first.add_due_loops()
-    second = GraphGrowth(se2, EVERY)
+    second = GraphBuilder(se2, EVERY)
     second.restore(first.graph, first.stamps, poses)
     second.add_loop(loop(0.0, 6.2, (1.0, 0.0, 0.0)))
     for k in range(60, 64):
@@ -350,17 +350,17 @@ def test_the_loops_of_an_earlier_run_are_those_of_its_keyframes():
 def test_a_loop_sent_again_is_used_once(times):
     """At once, while it waits, and long after; also where it was carried to other keyframes."""
     poses = curve(200)
-    growth = grown(poses[:100], DEFAULTS)
+    builder = grown(poses[:100], DEFAULTS)
     loops = [true_loop(poses, 7, 90), true_loop(poses, 33, 120)]
     for k in range(times):
         for one in loops:
-            growth.add_loop(one)
+            builder.add_loop(one)
         if k == times // 2:
-            drive_on(growth, poses, 100)
-        growth.add_due_loops()
-    assert len(loops_of(growth)[0]) == 2
-    assert +growth.refused == {'repeated': 2 * (times - 1)}
-    assert growth.notes.sentences() == [
+            drive_on(builder, poses, 100)
+        builder.add_due_loops()
+    assert len(loops_of(builder)[0]) == 2
+    assert +builder.refused == {'repeated': 2 * (times - 1)}
+    assert builder.notes.sentences() == [
         f'{2 * (times - 1)} messages refused: a loop from 700000000 ns to 9000000000 ns was sent '
         'before; expected each loop once']
 
@@ -368,25 +368,25 @@ def test_a_loop_sent_again_is_used_once(times):
 def test_other_measurements_of_a_pair_are_other_loops():
     """Another pose, another covariance, another trust, or the whole a nanosecond later."""
     poses = curve(200)
-    growth, one = grown(poses, EVERY), true_loop(poses, 7, 151, 0.01 * np.eye(6))
+    builder, one = grown(poses, EVERY), true_loop(poses, 7, 151, 0.01 * np.eye(6))
     others = [one, replace(one, pose3=np.nextafter(one.pose3, 9)), replace(one, trusted=True),
               replace(one, covariance=0.0101 * np.eye(6)), replace(one, stamp=one.stamp + 1)]
     for other in others + others:
-        growth.add_loop(other)
-    assert growth.add_due_loops() == len(others)
-    assert +growth.refused == {'repeated': len(others)}
+        builder.add_loop(other)
+    assert builder.add_due_loops() == len(others)
+    assert +builder.refused == {'repeated': len(others)}
 
 
 def test_a_loop_that_expired_may_be_sent_again():
     poses = curve(100)
-    growth = grown(poses[:20], GrowthOptions(loop=LoopOptions(wait=1.0)))
+    builder = grown(poses[:20], GraphBuilderOptions(loop=LoopOptions(wait=1.0)))
     one = true_loop(poses, 3, 60)
-    growth.add_loop(one)
-    drive_on(growth, poses[:50], 20)
-    assert growth.add_due_loops() == 0 and +growth.refused == {'expired': 1}
-    drive_on(growth, poses, 50)
-    growth.add_loop(one)
-    assert growth.add_due_loops() == 1 and +growth.refused == {'expired': 1}
+    builder.add_loop(one)
+    drive_on(builder, poses[:50], 20)
+    assert builder.add_due_loops() == 0 and +builder.refused == {'expired': 1}
+    drive_on(builder, poses, 50)
+    builder.add_loop(one)
+    assert builder.add_due_loops() == 1 and +builder.refused == {'expired': 1}
 
 
 def test_a_loop_of_an_earlier_run_is_known_by_the_keyframes_it_named(rng):
@@ -396,7 +396,7 @@ def test_a_loop_of_an_earlier_run_is_known_by_the_keyframes_it_named(rng):
     for one in loops:
         first.add_loop(one)
     first.add_due_loops()
-    second = GraphGrowth(se2, EVERY)
+    second = GraphBuilder(se2, EVERY)
     second.restore(first.graph, first.stamps, poses)
     for one in loops:
         second.add_loop(one)
@@ -416,7 +416,7 @@ def test_loops_that_wait_or_expired_cost_nothing():
     """10,000 of each, against one that waits; looking through them takes 300 times as long."""
     idle = grown(curve(20), DEFAULTS)
     idle.add_loop(loop(1.0, 1e6, (1.0, 0.0, 0.0)))
-    busy = grown(curve(20), GrowthOptions(loop=LoopOptions(wait=100.0)))
+    busy = grown(curve(20), GraphBuilderOptions(loop=LoopOptions(wait=100.0)))
     for k in range(10_000):
         busy.add_loop(loop(1.0, 1e5 + k, (1.0, 0.0, 0.0)))
     drive_on(busy, np.zeros((2000, 3)), 20)
@@ -434,10 +434,10 @@ def test_loops_that_wait_or_expired_cost_nothing():
 
 def test_a_loop_on_keyframes_keeps_its_covariance(rng):
     covariance = random_information(1, rng)[0]
-    growth = grown(curve(50), EVERY)
-    growth.add_loop(true_loop(curve(50), 4, 40, covariance6(covariance)))
-    growth.add_due_loops()
-    assert_allclose(covariance_of(growth, -1), covariance)
+    builder = grown(curve(50), EVERY)
+    builder.add_loop(true_loop(curve(50), 4, 40, covariance6(covariance)))
+    builder.add_due_loops()
+    assert_allclose(covariance_of(builder, -1), covariance)
 
 
 def test_the_covariance_is_carried_to_the_keyframe(rng):
@@ -446,19 +446,19 @@ def test_the_covariance_is_carried_to_the_keyframe(rng):
     reference, sample, h = 7, 151, 1e-6
 
     def measured(step):
-        growth = grown(poses, DEFAULTS)
+        builder = grown(poses, DEFAULTS)
         true = se2.between(poses[reference][None], poses[sample][None])
-        growth.add_loop(loop(reference * PERIOD, sample * PERIOD,
+        builder.add_loop(loop(reference * PERIOD, sample * PERIOD,
                              se2.retract(true, step[None])[0], covariance6(covariance)))
-        growth.add_due_loops()
-        return growth, loops_of(growth)[2]
+        builder.add_due_loops()
+        return builder, loops_of(builder)[2]
 
-    growth, middle = measured(np.zeros(3))
+    builder, middle = measured(np.zeros(3))
     columns = [(se2.local(middle, measured(h * unit)[1])
                 - se2.local(middle, measured(-h * unit)[1]))[0] / (2 * h) for unit in np.eye(3)]
     J = np.stack(columns, axis=1)
     assert np.abs(J - np.eye(3)).max() > 0.05  # it is carried some way indeed
-    assert_allclose(covariance_of(growth, -1), J @ covariance @ J.T, rtol=1e-6, atol=1e-12)
+    assert_allclose(covariance_of(builder, -1), J @ covariance @ J.T, rtol=1e-6, atol=1e-12)
 
 
 MODEL = LoopOptions(sigma_translation=0.3, sigma_rotation=0.2)
@@ -470,10 +470,10 @@ ALWAYS_MODEL = LoopOptions('model', 0.3, 0.2)
     (np.full((6, 6), 9999.0), MODEL), (np.full((6, 6), 1e308), MODEL), (np.eye(6), ALWAYS_MODEL),
 ], ids=['0', '-1', 'nan', '9999', '1e308', 'as told'])
 def test_the_model_speaks_where_it_has_to(stated, options):
-    growth = grown(curve(50), GrowthOptions(EVERY.keyframe, loop=options))
-    growth.add_loop(true_loop(curve(50), 4, 40, stated))
-    growth.add_due_loops()
-    assert_allclose(covariance_of(growth, -1), np.diag([0.09, 0.09, 0.04]), atol=1e-12)
+    builder = grown(curve(50), GraphBuilderOptions(EVERY.keyframe, loop=options))
+    builder.add_loop(true_loop(curve(50), 4, 40, stated))
+    builder.add_due_loops()
+    assert_allclose(covariance_of(builder, -1), np.diag([0.09, 0.09, 0.04]), atol=1e-12)
 
 
 # What must not break it
@@ -481,29 +481,29 @@ def test_the_model_speaks_where_it_has_to(stated, options):
 
 @pytest.mark.parametrize('metres', [2e7, 1e9])
 def test_a_jump_of_a_graph_is_only_a_bad_factor(metres):
-    """`messages` lets through what is within 1e9 m."""
-    growth = GraphGrowth(se2, EVERY, verbatim=True)
-    drive_on(growth, [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (metres, 0.0, 0.0)], 0)
-    assert len(growth.graph.between) == growth.graph.n_poses - 1 == 2
+    """`io.messages` lets through what is within 1e9 m."""
+    builder = GraphBuilder(se2, EVERY, verbatim=True)
+    drive_on(builder, [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (metres, 0.0, 0.0)], 0)
+    assert len(builder.graph.between) == builder.graph.n_poses - 1 == 2
 
 
 @pytest.mark.parametrize('options', [
-    GrowthOptions(odometry=OdometryOptions(sigma_translation=1e6)),
-    GrowthOptions(odometry=OdometryOptions(sigma_translation=0.0, floor_translation=1e-9)),
-    GrowthOptions(loop=LoopOptions('model', 1e-9, 0.05)),
+    GraphBuilderOptions(odometry=OdometryOptions(sigma_translation=1e6)),
+    GraphBuilderOptions(odometry=OdometryOptions(sigma_translation=0.0, floor_translation=1e-9)),
+    GraphBuilderOptions(loop=LoopOptions('model', 1e-9, 0.05)),
 ], ids=['sigma', 'floor', 'loop'])
 def test_every_allowed_model_works(options):
-    growth = grown([(10.0 * k, 0, k) for k in range(3)], options)
-    growth.add_loop(loop(0.0, 0.2, (20.0, 0.0, 2.0)))
-    assert growth.add_due_loops() == 1
+    builder = grown([(10.0 * k, 0, k) for k in range(3)], options)
+    builder.add_loop(loop(0.0, 0.2, (20.0, 0.0, 2.0)))
+    assert builder.add_due_loops() == 1
 
 
 @pytest.mark.parametrize('bad', [covariance6(np.diag([1e-3, 1e-3, 1e10])), 1e308 * np.eye(6)],
                          ids=['heading unknown', '1e308'])
 def test_one_strange_covariance_does_not_take_other_loops_with_it(bad):
     poses = np.array([(k, 0.0, 0.0) for k in range(300)])
-    growth = grown(poses, GrowthOptions(KeyframeOptions(100.0, 0.0, 0.0)))
-    growth.add_loop(true_loop(poses, 10, 290, 0.01 * np.eye(6)))
-    growth.add_loop(true_loop(poses, 3, 260, bad))
+    builder = grown(poses, GraphBuilderOptions(KeyframeOptions(100.0, 0.0, 0.0)))
+    builder.add_loop(true_loop(poses, 10, 290, 0.01 * np.eye(6)))
+    builder.add_loop(true_loop(poses, 3, 260, bad))
     with np.errstate(over='ignore', invalid='ignore'):
-        assert growth.add_due_loops() == 2
+        assert builder.add_due_loops() == 2

@@ -20,35 +20,35 @@ from problems import (
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import FASTEST, LONGEST_PAUSE
-from l1slam_ros.core.online.graph_builder import GraphGrowth, GrowthOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.io.bags.from_graph import write_graph_bag
 from l1slam_ros.io.bags.to_graph import DEFAULT_TOPICS, graph_from_bag
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file
 
-EVERY = GrowthOptions(KeyframeOptions(0.0, 0.0, 0.0))
+EVERY = GraphBuilderOptions(KeyframeOptions(0.0, 0.0, 0.0))
 DAY = 86400.0
 
 
 def fed(samples, verbatim=False):
-    """Return the growth after samples (time, pose), and which were refused at once."""
-    growth, refused = GraphGrowth(se2, EVERY, verbatim), []
+    """Return the builder after samples (time, pose), and which were refused at once."""
+    builder, refused = GraphBuilder(se2, EVERY, verbatim), []
     for k, (time, pose) in enumerate(samples):
         try:
-            growth.add_odometry(odometry(time, pose))
+            builder.add_odometry(odometry(time, pose))
         except MessageError as error:
             assert error.cause == 'old_stamp'
             refused.append(k)
-    return growth, refused
+    return builder, refused
 
 
 def timed(poses):
     return [(1.0 + k * PERIOD, pose) for k, pose in enumerate(poses)]
 
 
-def assert_same(growth, expected):
-    assert_array_equal(growth.stamps, expected.stamps)
-    assert_allclose(growth.graph.between.measurement, expected.graph.between.measurement,
+def assert_same(builder, expected):
+    assert_array_equal(builder.stamps, expected.stamps)
+    assert_allclose(builder.graph.between.measurement, expected.graph.between.measurement,
                     atol=1e-12)
 
 
@@ -57,31 +57,31 @@ def assert_same(growth, expected):
 def test_a_stamp_far_ahead_is_dropped_when_the_next_one_is_right(ahead, place):
     good = timed(curve(40))
     stray = (good[place][0] - 0.05 + ahead, good[place][1])
-    growth, refused = fed(good[:place] + [stray] + good[place:])
-    assert +growth.refused == {'stamp_ahead': 1} and not refused and not growth.held
-    assert_same(growth, fed(good)[0])
+    builder, refused = fed(good[:place] + [stray] + good[place:])
+    assert +builder.refused == {'stamp_ahead': 1} and not refused and not builder.held
+    assert_same(builder, fed(good)[0])
 
 
 def test_stamps_far_ahead_one_after_the_other():
     good = timed(curve(40))
     strays = [(1e6, good[9][1]), (2e6, good[9][1]), (1.5e6, good[9][1])]
-    growth, _ = fed(good[:10] + strays + good[10:])
-    assert +growth.refused == {'stamp_ahead': 3}
-    assert_same(growth, fed(good)[0])
+    builder, _ = fed(good[:10] + strays + good[10:])
+    assert +builder.refused == {'stamp_ahead': 3}
+    assert_same(builder, fed(good)[0])
 
 
 @pytest.mark.parametrize('stray', [1.7e9, 1.0 + 2 * LONGEST_PAUSE])
 def test_the_very_first_stamp_is_the_stray(stray):
     """A node that runs on simulated time says the wall's until it has heard the clock."""
     poses = curve(40)
-    growth = GraphGrowth(se2, EVERY)
-    growth.add_odometry(odometry(stray, poses[0]))
-    growth.add_loop(true_loop(poses, 12, 30))
+    builder = GraphBuilder(se2, EVERY)
+    builder.add_odometry(odometry(stray, poses[0]))
+    builder.add_loop(true_loop(poses, 12, 30))
     for time, pose in timed(poses):
-        growth.add_odometry(odometry(time, pose))
-    assert +growth.refused == {'stamp_ahead': 1}
-    assert_same(growth, fed(timed(poses))[0])
-    assert growth.add_due_loops() == 1
+        builder.add_odometry(odometry(time, pose))
+    assert +builder.refused == {'stamp_ahead': 1}
+    assert_same(builder, fed(timed(poses))[0])
+    assert builder.add_due_loops() == 1
 
 
 @pytest.mark.parametrize('pause', [3.0, LONGEST_PAUSE + 1, 10 * 60.0, DAY])
@@ -91,9 +91,9 @@ def test_a_robot_that_pauses_loses_nothing(pause):
     for drift in (0.0, 3.0):
         samples = [(time + (pause if k >= 20 else 0.0), pose + [drift * (k >= 20), 0.0, 0.0])
                    for k, (time, pose) in enumerate(timed(poses))]
-        growth, _ = fed(samples)
-        assert growth.graph.n_poses == 40 and not growth.refused and not growth.notes.warned
-        assert_allclose(growth.odometry, [pose for _, pose in samples], atol=1e-9)
+        builder, _ = fed(samples)
+        assert builder.graph.n_poses == 40 and not builder.refused and not builder.notes.warned
+        assert_allclose(builder.odometry, [pose for _, pose in samples], atol=1e-9)
 
 
 @pytest.mark.parametrize('jump', [(5e8, 0.0), (0.0, -3e5), (1.2 * FASTEST * PERIOD, 0.0)])
@@ -102,11 +102,11 @@ def test_a_jump_and_back_again_leaves_the_map_unharmed(jump, count):
     """Garbage is dropped, also two pieces of it that do not agree."""
     good = timed(curve(60))
     bad = [(time, (*(k + 1) * np.array(jump), 1.0)) for k, (time, _) in enumerate(good[30:32])]
-    growth, _ = fed(good[:30] + bad[:count] + good[30 + count:])
+    builder, _ = fed(good[:30] + bad[:count] + good[30 + count:])
     expected, _ = fed(good[:30] + good[30 + count:])
-    assert +growth.refused == {'jump': count} and not growth.notes.warned
-    assert_same(growth, expected)
-    said = growth.notes.sentences()[0]
+    assert +builder.refused == {'jump': count} and not builder.notes.warned
+    assert_same(builder, expected)
+    said = builder.notes.sentences()[0]
     assert said.startswith(f'{count} message{"s" * (count > 1)} refused: odometry ')
     assert f'at stamp {seconds(4.0)} ns; expected a motion that robots make' in said
 
@@ -119,31 +119,31 @@ def test_odometry_that_moves_its_frame_goes_on_from_where_the_robot_was(new_fram
     poses = curve(200)
     after = np.repeat(poses[120:121], 80, axis=0) if not moving else poses[120:]
     moved = se2.compose(np.array([new_frame]), se2.between(poses[120:121], after))
-    growth, _ = fed(timed(np.concatenate((poses[:120], moved))))
-    assert growth.graph.n_poses == 200 and not +growth.refused
-    assert growth.notes.warned == {'moved': 1}
-    assert 'the robot is taken to be where it was' in growth.notes.sentences()[0]
+    builder, _ = fed(timed(np.concatenate((poses[:120], moved))))
+    assert builder.graph.n_poses == 200 and not +builder.refused
+    assert builder.notes.warned == {'moved': 1}
+    assert 'the robot is taken to be where it was' in builder.notes.sentences()[0]
     # The robot did not move from 119 to 120, as far as is known; then as its odometry says.
     expected = se2.compose(poses[119:120], se2.between(poses[120:121], after))
-    assert_allclose(growth.odometry[:120], poses[:120], atol=1e-9)
-    assert_allclose(se2.local(expected, growth.odometry[120:]), 0, atol=1e-9)
+    assert_allclose(builder.odometry[:120], poses[:120], atol=1e-9)
+    assert_allclose(se2.local(expected, builder.odometry[120:]), 0, atol=1e-9)
     model = OdometryOptions()
-    known = np.diag(covariance_of(growth, 118))
-    assert (np.sqrt(np.diag(covariance_of(growth, 119))) >= 0.1).all() and known.max() < 1e-3
+    known = np.diag(covariance_of(builder, 118))
+    assert (np.sqrt(np.diag(covariance_of(builder, 119))) >= 0.1).all() and known.max() < 1e-3
     assert known.max() >= model.floor_translation**2
-    assert_allclose(growth.offset, se2.compose(poses[119:120], se2.inverse(moved[:1])), atol=1e-9)
+    assert_allclose(builder.offset, se2.compose(poses[119:120], se2.inverse(moved[:1])), atol=1e-9)
 
 
 def test_where_the_frame_moves_there_is_a_keyframe():
     """Or the transform from the map would be that of the old frame until the robot moves on."""
-    growth = GraphGrowth(se2, GrowthOptions())
-    drive_on(growth, np.linspace((0, 0, 0), (2, 0, 0), 20), 0)
-    before = growth.graph.n_poses
+    builder = GraphBuilder(se2, GraphBuilderOptions())
+    drive_on(builder, np.linspace((0, 0, 0), (2, 0, 0), 20), 0)
+    before = builder.graph.n_poses
     for k in range(20, 24):
-        growth.add_odometry(odometry(k * PERIOD, (0.0, 0.0, 0.0)))
-    assert growth.graph.n_poses == before + 1 and growth.stamps[-1] == seconds(2.0)
-    assert_allclose(growth.odometry[-1], (2, 0, 0), atol=1e-9)
-    assert_allclose(growth.offset, [(2, 0, 0)], atol=1e-9)
+        builder.add_odometry(odometry(k * PERIOD, (0.0, 0.0, 0.0)))
+    assert builder.graph.n_poses == before + 1 and builder.stamps[-1] == seconds(2.0)
+    assert_allclose(builder.odometry[-1], (2, 0, 0), atol=1e-9)
+    assert_allclose(builder.offset, [(2, 0, 0)], atol=1e-9)
 
 
 @pytest.mark.parametrize('speed, period', [(40.0, 0.1), (40.0, 1.0), (40.0, 0.02), (320.0, 0.1)])
@@ -153,52 +153,52 @@ def test_a_fast_robot_is_a_robot(speed, period):
     times = np.insert(times, 60, times[60] - 1e-6)
     samples = [(time, (speed * (time - 1.0), 0.0, 0.0)) for time in times]
     samples = [(0.7 + 0.01 * k, (0.0, 0.0, 0.0)) for k in range(20)] + samples
-    growth, _ = fed(samples)
-    assert growth.graph.n_poses == len(samples)
-    assert not growth.refused and not growth.notes.warned
+    builder, _ = fed(samples)
+    assert builder.graph.n_poses == len(samples)
+    assert not builder.refused and not builder.notes.warned
 
 
 def test_a_robot_that_comes_home_exactly_is_no_restart():
     """On a grid without noise, at once or after a rest."""
     steps = [(1, 0), (1, 0), (0, 0), (0, 0), (-1, 0), (-1, 0), (0, 1), (0, -1), (1, 0), (-1, 0)]
-    growth, _ = fed(timed([(*at, 0.0) for at in np.cumsum([(0, 0), *steps], axis=0)]))
-    assert not growth.refused and not growth.notes.warned and growth.graph.n_poses == 11
+    builder, _ = fed(timed([(*at, 0.0) for at in np.cumsum([(0, 0), *steps], axis=0)]))
+    assert not builder.refused and not builder.notes.warned and builder.graph.n_poses == 11
 
 
 def test_the_last_sample_is_held_and_said_not_lost_in_silence():
     good = timed(curve(20))
-    growth, _ = fed([*good[:19], (1e6, good[19][1])])
-    growth.finish()
-    assert growth.graph.n_poses == 19 and not growth.refused
-    assert growth.held.startswith('odometry stamp 1000000000000000 ns is ')
+    builder, _ = fed([*good[:19], (1e6, good[19][1])])
+    builder.finish()
+    assert builder.graph.n_poses == 19 and not builder.refused
+    assert builder.held.startswith('odometry stamp 1000000000000000 ns is ')
     with pytest.raises(MessageError, match='is not after the last one, 1000000000000000 ns'):
-        growth.add_odometry(odometry(1e6, good[19][1]))
-    growth.add_odometry(odometry(1e6 + 0.1, good[19][1]))
-    assert growth.graph.n_poses == 21 and not growth.held and not growth.refused
+        builder.add_odometry(odometry(1e6, good[19][1]))
+    builder.add_odometry(odometry(1e6 + 0.1, good[19][1]))
+    assert builder.graph.n_poses == 21 and not builder.held and not builder.refused
 
 
 @pytest.mark.parametrize('period', [1.0, 2.5, 30.0])
 def test_slow_odometry_passes(period):
     """Messages are confirmed one by the other; the last of a recording needs none."""
     poses = curve(21)
-    growth, _ = fed([(1.0 + k * period, pose) for k, pose in enumerate(poses[:20])])
-    growth.finish()
-    assert growth.graph.n_poses == 20 and not growth.refused and not growth.held
-    growth, _ = fed([(1.0 + k * period, pose) for k, pose in enumerate(poses)])
-    growth.finish()
-    assert growth.graph.n_poses == 21 and not growth.refused and not growth.held
+    builder, _ = fed([(1.0 + k * period, pose) for k, pose in enumerate(poses[:20])])
+    builder.finish()
+    assert builder.graph.n_poses == 20 and not builder.refused and not builder.held
+    builder, _ = fed([(1.0 + k * period, pose) for k, pose in enumerate(poses)])
+    builder.finish()
+    assert builder.graph.n_poses == 21 and not builder.refused and not builder.held
 
 
 def test_one_old_header_is_dropped_while_another_sample_is_held():
     good = timed(curve(20))
-    growth, refused = fed([*good[:10], (1e6, good[9][1]), (1.5, good[9][1]), *good[10:]])
-    assert refused == [11] and +growth.refused == {'stamp_ahead': 1}
-    assert_same(growth, fed(good)[0])
+    builder, refused = fed([*good[:10], (1e6, good[9][1]), (1.5, good[9][1]), *good[10:]])
+    assert refused == [11] and +builder.refused == {'stamp_ahead': 1}
+    assert_same(builder, fed(good)[0])
 
 
 def test_a_restored_map_does_not_begin_anew():
     first, poses = grown(curve(60), EVERY), curve(60)
-    second = GraphGrowth(se2, EVERY)
+    second = GraphBuilder(se2, EVERY)
     second.restore(first.graph, first.stamps, poses)
     second.add_odometry(odometry(1e6, (0.0, 0.0, 0.0)))
     for k in range(3):
@@ -210,25 +210,25 @@ def test_a_restored_map_does_not_begin_anew():
 def test_of_a_graph_each_message_is_meant():
     poses = [(0.0, 0.0, 0.0), (5e5, 0.0, 0.0), (5e5, 1.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)]
     times = [1.0, 1.1, 1e6, 1e6 + 0.1, 2e9]
-    growth, _ = fed(zip(times, poses, strict=True), verbatim=True)
-    assert not growth.refused and not growth.notes.warned
-    assert_allclose(growth.odometry, poses, atol=1e-6)
+    builder, _ = fed(zip(times, poses, strict=True), verbatim=True)
+    assert not builder.refused and not builder.notes.warned
+    assert_allclose(builder.odometry, poses, atol=1e-6)
 
 
 def test_a_graph_of_odd_messages_comes_back_from_a_bag_exactly(tmp_path):
     """Loops twice, years between keyframes, steps of kilometres, variances of 1e-12 and 1e9."""
-    growth = GraphGrowth(se2, EVERY, verbatim=True)
+    builder = GraphBuilder(se2, EVERY, verbatim=True)
     for k, (time, x) in enumerate([(1.0, 0.0), (1.1, 9e3), (1.2, 0.0), (1e9, 1.0), (2e9, 3.0)]):
-        growth.add_odometry(odometry(time, (x, 0.0, 0.1 * k)))
+        builder.add_odometry(odometry(time, (x, 0.0, 0.1 * k)))
     for _ in range(2):
-        growth.add_loop(loop(1.0, 1.2, (1.0, 2.0, 0.3), np.diag([1e-12, 1e9, 1, 1, 1, 0.1])))
-    assert growth.add_due_loops() == 2
-    record = GraphRecord(growth.graph, None, np.arange(5), growth.stamps)
+        builder.add_loop(loop(1.0, 1.2, (1.0, 2.0, 0.3), np.diag([1e-12, 1e9, 1, 1, 1, 0.1])))
+    assert builder.add_due_loops() == 2
+    record = GraphRecord(builder.graph, None, np.arange(5), builder.stamps)
     write_graph_bag(tmp_path / 'bag', record)
     read = graph_from_bag(tmp_path / 'bag', None, DEFAULT_TOPICS)
     assert read.skipped == ()
-    ours, theirs = growth.graph.between, read.graph.between
-    assert_array_equal(read.stamps, growth.stamps)
+    ours, theirs = builder.graph.between, read.graph.between
+    assert_array_equal(read.stamps, builder.stamps)
     assert_array_equal(np.sort(theirs.pairs, axis=0), np.sort(ours.pairs, axis=0))
     assert_allclose(theirs.measurement, ours.measurement, atol=1e-9)
     assert_allclose(theirs.sqrt_information, ours.sqrt_information, rtol=1e-6, atol=1e-6)
@@ -247,20 +247,20 @@ def test_no_recorded_graph_is_taken_for_a_fault(datasets, name):
     for k, step in enumerate(steps):
         poses[k + 1] = se2.compose(poses[k : k + 1], step[None])[0]
     for period in (0.1, 0.001):
-        growth = GraphGrowth(se2, GrowthOptions(KeyframeOptions(1e6, 0.0, 0.0)))
+        builder = GraphBuilder(se2, GraphBuilderOptions(KeyframeOptions(1e6, 0.0, 0.0)))
         for k, pose in enumerate(poses):
-            growth.add_odometry(odometry(1.0 + k * period, pose))
-        assert not growth.refused and not growth.notes.warned and not growth.held
+            builder.add_odometry(odometry(1.0 + k * period, pose))
+        assert not builder.refused and not builder.notes.warned and not builder.held
 
 
 def test_loops_across_a_restart_join_the_right_places():
     poses = curve(200)
     moved = se2.between(np.repeat(poses[119:120], 80, axis=0), poses[120:])
     moved[0] = 0.0
-    growth, _ = fed(timed(np.concatenate((poses[:120], moved))))
-    growth.add_loop(loop(1.7, 1.0 + 150 * PERIOD, se2.between(poses[7:8], poses[150:151])[0]))
-    assert growth.add_due_loops() == 1
-    assert loops_of(growth)[:2] == ([7], [150])
+    builder, _ = fed(timed(np.concatenate((poses[:120], moved))))
+    builder.add_loop(loop(1.7, 1.0 + 150 * PERIOD, se2.between(poses[7:8], poses[150:151])[0]))
+    assert builder.add_due_loops() == 1
+    assert loops_of(builder)[:2] == ([7], [150])
 
 
 @pytest.mark.parametrize('seed', range(30))
@@ -268,7 +268,8 @@ def test_whatever_comes_each_sample_is_used_held_or_counted(seed):
     """Stamps, poses and covariances of any size, also in a row and from the second message on."""
     rng = np.random.default_rng(seed)
     source = ('model', 'increment', 'twist')[seed % 3]
-    growth, old = GraphGrowth(se2, GrowthOptions(EVERY.keyframe, OdometryOptions(source))), 0
+    options = GraphBuilderOptions(EVERY.keyframe, OdometryOptions(source))
+    builder, old = GraphBuilder(se2, options), 0
     for k in range(200):
         time, pose, kind = 100.0 + k * PERIOD, (0.1 * k, 0.0, 0.0), rng.random()
         if kind < 0.1:
@@ -281,15 +282,15 @@ def test_whatever_comes_each_sample_is_used_held_or_counted(seed):
             pose = (0.0, 0.0, 0.0)
         covariance = np.diag(10 ** rng.uniform(-300, 300, 6))
         try:
-            growth.add_odometry(odometry(time, pose, covariance, covariance))
+            builder.add_odometry(odometry(time, pose, covariance, covariance))
         except MessageError as error:
             assert error.cause == 'old_stamp'
             old += 1
-        growth.add_loop(loop(time - 5.0, time, rng.normal(size=3), covariance))
-        growth.add_due_loops()
-    assert growth.refused['jump'] + growth.notes.warned['moved'] > 0
-    lost = sum(growth.refused[cause] for cause in ('stamp_ahead', 'jump', 'old_stamp'))
-    assert growth.graph.n_poses + bool(growth.held) + lost + old == 200
-    assert (np.diff(growth.stamps) > 0).all()
-    factors = growth.graph.between
+        builder.add_loop(loop(time - 5.0, time, rng.normal(size=3), covariance))
+        builder.add_due_loops()
+    assert builder.refused['jump'] + builder.notes.warned['moved'] > 0
+    lost = sum(builder.refused[cause] for cause in ('stamp_ahead', 'jump', 'old_stamp'))
+    assert builder.graph.n_poses + bool(builder.held) + lost + old == 200
+    assert (np.diff(builder.stamps) > 0).all()
+    factors = builder.graph.between
     assert np.isfinite(factors.sqrt_information).all() and np.isfinite(factors.measurement).all()

@@ -161,7 +161,7 @@ def test_others_may_lean_on_what_is_trusted(trusted):
     """Two loops that agree, eight sigmas off the odometry: believed if one is vouched for."""
     backend, truth = Backend(se2, EVERY), roundabout(160)
     drive_roundabout(backend, truth)
-    graph, poses = backend.growth.graph, backend.poses
+    graph, poses = backend.builder.graph, backend.poses
     off = se2.between(truth[10:11], truth[100:101]) + np.array([[20.0, 0.0, 0.0]])
     for vouched in (trusted, False):
         graph.add_between(np.array([10]), np.array([100]), off,

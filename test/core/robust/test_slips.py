@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry factors that lie are left out, others stay; the rest of it is in `test_robust.py`."""
+"""Odometry factors that lie are left out, others stay; the rest of it is in `test_batch.py`."""
 
 import numpy as np
 import pytest

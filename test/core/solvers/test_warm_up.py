@@ -72,7 +72,7 @@ for enabled in (True, False):
     backend.adopt(optimise(backend.problem(), options.solver))
     look(f'optimise, robust {enabled}')
     after = Backend(se2, options)
-    after.restore(backend.growth.graph, backend.poses, backend.growth.stamps)
+    after.restore(backend.builder.graph, backend.poses, backend.builder.stamps)
     after.update(60.0)
     look(f'restored, robust {enabled}')
 

@@ -11,13 +11,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from bags import KINDS, TYPES, mcap_file, recording_of, rosbag2_directory, write_world
 from l1slam_ros.cli.main import main
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.core.online.graph_builder import GrowthOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_raw
 from l1slam_ros.io.bags.to_graph import Topics
 from l1slam_ros.io.formats import read_input
 
-EVERY = GrowthOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
+EVERY = GraphBuilderOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 ODOMETRY = 'nav_msgs/msg/Odometry'
 SECOND = 10**9
 
@@ -95,7 +95,7 @@ def test_a_robot_without_our_note_goes_by_the_defaults_of_the_node(tmp_path, wor
         recording.append(('/odom', ODOMETRY, time, bytes(TYPES.serialize_cdr(template, ODOMETRY))))
     path = rosbag2_directory(tmp_path / 'a', recording, StoragePlugin.MCAP, note=None)
     record = read_input(path)
-    default = GrowthOptions()
+    default = GraphBuilderOptions()
     assert np.diff(record.stamps).tolist() == [8 * SECOND // 20] * 20
     steps = record.graph.between.measurement
     np.testing.assert_allclose(steps, [[default.keyframe.translation, 0, 0]] * 20, atol=1e-12)
