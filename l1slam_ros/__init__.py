@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A pose-graph SLAM back end that minimises the L1 norm and refuses loop closures that lie.
+
+    import l1slam_ros as l1
+
+    graph, poses = l1.read_graph('intel.g2o')
+    solution = l1.solve(graph)
+    l1.write_graph('solved.g2o', graph, solution.poses)
+
+Importing this imports neither ROS nor numba; a name is fetched when it is first used.
+"""
+
+from importlib import import_module
+from typing import Any
+
+_HOMES = {
+    'read_graph': 'io.graphs.door',
+    'write_graph': 'io.graphs.door',
+    'solve': 'core.robust.door',
+    'Solution': 'core.robust.door',
+    'FactorGraph': 'core.graph.factor_graph',
+    'OdometrySample': 'core.graph.measurements',
+    'LoopClosure': 'core.graph.measurements',
+    'Backend': 'core.online.backend',
+    'BackendOptions': 'core.online.backend',
+    'L1SlamError': 'core.errors',
+}
+
+__all__ = list(_HOMES)  # noqa: PLE0604
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    value = getattr(import_module(f'{__name__}.{_HOMES[name]}'), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

@@ -14,7 +14,7 @@ from l1slam_ros.io.graphs.side_files import false_loops_path, read_false_loops
 from l1slam_ros.io.plot import Curve, MapDrawing
 
 if TYPE_CHECKING:
-    from l1slam_ros.cli.offline import Outcome
+    from l1slam_ros.core.robust.batch_map import Outcome
     from l1slam_ros.core.robust.robust_map import RobustMap
 
 

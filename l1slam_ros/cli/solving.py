@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from l1slam_ros.cli import offline
 from l1slam_ros.cli.commands import Ending, check_counts, named, read, warn, write_spoiled
 from l1slam_ros.cli.reference import Truth, position_error, read_truth, true_path
 from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.robust.batch_map import Outcome, Wish
+from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import SENTENCES
@@ -66,20 +67,19 @@ def solve(arguments: argparse.Namespace) -> Ending:
     return ending
 
 
-def _solved(
-    arguments: argparse.Namespace, record: GraphRecord, wish: offline.Wish
-) -> offline.Outcome:
+def _solved(arguments: argparse.Namespace, record: GraphRecord, wish: Wish) -> Outcome:
     steps = (wish.options.outer_iterations if wish.norm == 'l1'
              else wish.least_squares.iterations)
     quiet = arguments.quiet
     with (named(arguments.input), Progress(None, 'round', quiet, 'judging loops') as judging,
           Progress(steps, 'step', quiet, 'solving') as solving):
-        return offline.solve(
-            record, wish, solving.report,
-            lambda _, accepted: judging.advance(1, f'{counted(accepted, "loop")} believed'))
+        return solve_graph(
+            record.graph, record.poses, wish, solving.report,
+            lambda _, accepted: judging.advance(1, f'{counted(accepted, "loop")} believed'),
+            record.ids)
 
 
-def _steps(wish: offline.Wish) -> tuple[str, ...]:
+def _steps(wish: Wish) -> tuple[str, ...]:
     """Return what to compile for a solve; a graph that fills in compiles more on its way."""
     judgement = () if wish.robust is False else JUDGEMENT
     dense = DENSE if wish.norm == 'l1' and wish.solver == PRIMAL_DUAL else ()
@@ -102,7 +102,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
         check_picture(arguments.plot)
 
 
-def _wish(arguments: argparse.Namespace) -> offline.Wish:
+def _wish(arguments: argparse.Namespace) -> Wish:
     solver, least_squares, robust = OptimiserOptions(), LeastSquaresOptions(), arguments.robust
     if arguments.params_file:
         options = read_params_file(arguments.params_file)
@@ -114,11 +114,11 @@ def _wish(arguments: argparse.Namespace) -> offline.Wish:
         least_squares = replace(least_squares, iterations=arguments.outer)
     if arguments.inner is not None:
         solver = replace(solver, inner=replace(solver.inner, iterations=arguments.inner))
-    return offline.Wish(arguments.start, arguments.norm, arguments.solver, robust, solver,
+    return Wish(arguments.start, arguments.norm, arguments.solver, robust, solver,
                         least_squares)
 
 
-def _report(record: GraphRecord, norm: str, outcome: offline.Outcome) -> dict[str, object]:
+def _report(record: GraphRecord, norm: str, outcome: Outcome) -> dict[str, object]:
     solution, factors, judgement = outcome.solution, record.graph.between, outcome.judgement
     suspect = judgement.suspect if judgement else np.zeros(len(factors), bool)
     refused = ~judgement.accepted & ~suspect if judgement else suspect
@@ -143,7 +143,7 @@ def _report(record: GraphRecord, norm: str, outcome: offline.Outcome) -> dict[st
     }
 
 
-def _print_report(report: dict[str, object], norm: str, outcome: offline.Outcome) -> None:
+def _print_report(report: dict[str, object], norm: str, outcome: Outcome) -> None:
     solution = outcome.solution
     seed = f'seed {outcome.seed_cost:.6g}, ' if outcome.seed_cost is not None else ''
     numbers = [counted(int(str(report[name])), name[:-1]) for name in ('factors', 'loops')]
@@ -159,7 +159,7 @@ def _print_report(report: dict[str, object], norm: str, outcome: offline.Outcome
               f'{counted(len(solution.poses), "pose")} (RMSE after rigid alignment)')
 
 
-def _plot(arguments: argparse.Namespace, record: GraphRecord, outcome: offline.Outcome,
+def _plot(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
           truth: Truth | None) -> None:
     from l1slam_ros.cli.drawing import cost_curve, drawing
     from l1slam_ros.io.plot import plot_solution
@@ -190,9 +190,9 @@ def corrupt(arguments: argparse.Namespace) -> Ending:
     options = LeastSquaresOptions()
     _make_ready(SPARSE)
     with named(arguments.input), Progress(options.iterations, 'step', label='solving') as progress:
-        solution = offline.solve(
-            believed, offline.Wish(norm='l2', robust=False, least_squares=options),
-            progress.report).solution
+        solution = solve_graph(
+            believed.graph, believed.poses, Wish(norm='l2', robust=False, least_squares=options),
+            progress.report, ids=believed.ids).solution
     loops = FALSE_LOOPS[arguments.kind](record.graph, solution.poses, arguments.false_loops,
                                         np.random.default_rng(arguments.seed))
     factors = record.graph.between

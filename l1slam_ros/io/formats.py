@@ -5,13 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from l1slam_ros.core.errors import FileError, GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.graph.factor_graph import component_labels
-from l1slam_ros.core.graph.spanning_tree import odometry_poses, tree_poses
-from l1slam_ros.core.robust.inspection import odometry_gaps
+from l1slam_ros.core.robust.inspection import initial_poses
 from l1slam_ros.io.bags.reader import BAG_SUFFIXES
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
 from l1slam_ros.io.files import require_folder
@@ -60,22 +56,8 @@ def is_bag(path: Path) -> bool:
 
 
 def stored_poses(record: GraphRecord) -> Array:
-    """
-    Return the stored start, (n, p); where none is stored, the odometry chain.
-
-    Where that has gaps, the poses along a breadth-first tree from the first keyframe.
-
-    Raises
-    ------
-    GraphError : none is stored, and the graph is not connected.
-
-    """
-    if record.poses is not None:
-        return record.poses
-    require_connected(record)
-    if len(odometry_gaps(record.graph)):
-        return tree_poses(record.graph, 0)
-    return odometry_poses(record.graph)
+    """Return the stored start, (n, p), or what comes in its place; see `initial_poses`."""
+    return initial_poses(record.graph, record.poses, record.ids)
 
 
 def with_poses(record: GraphRecord) -> GraphRecord:
@@ -84,23 +66,6 @@ def with_poses(record: GraphRecord) -> GraphRecord:
         return replace(record, poses=stored_poses(record))
     except GraphError:
         return record
-
-
-def require_connected(record: GraphRecord) -> None:
-    """
-    Refuse a graph of several parts.
-
-    Raises
-    ------
-    GraphError : naming a vertex of the loose part.
-
-    """
-    labels = component_labels(record.graph)
-    loose = np.flatnonzero(labels != labels[0])
-    if len(loose):
-        others = f' and {len(loose) - 1:,} more have' if len(loose) > 1 else ' has'
-        raise GraphError(f'the graph is not connected: vertex {record.ids[loose[0]]}{others} no '
-                         f'path to vertex {record.ids[0]}; `l1slam info` lists the parts')
 
 
 def stamps_of(record: GraphRecord) -> Indices:

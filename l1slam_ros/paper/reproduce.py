@@ -16,6 +16,7 @@ from l1slam_ros.core.errors import FileError, GraphError, OptionError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.robust.inspection import require_connected
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
@@ -101,7 +102,7 @@ def read_datasets(datasets: Path) -> dict[str, GraphRecord]:
 def _read(path: Path) -> GraphRecord:
     record = formats.read_input(path)
     with _named(path):
-        formats.require_connected(record)
+        require_connected(record.graph, record.ids)
     return record
 
 

@@ -15,7 +15,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.linear_system import LinearSystem, ends, keyframes_of, step_poses
-from l1slam_ros.core.graph.spanning_tree import pair_key, tree_poses
+from l1slam_ros.core.graph.spanning_tree import odometry_poses, pair_key, tree_poses
 from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
 
 # A step this many times as long as nine in ten of all steps is no step of the same robot.
@@ -166,6 +166,42 @@ def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
             break
     odometry, loops = np.where(spare >= _FEWEST_SPARE, np.sqrt(variance), np.nan).tolist()
     return NoiseScales(odometry, loops, *ends)
+
+
+def require_connected(graph: FactorGraph, ids: Indices) -> None:
+    """
+    Refuse a graph of several parts; ids : (n,) what the keyframes are called.
+
+    Raises
+    ------
+    GraphError : naming a vertex of the loose part.
+
+    """
+    labels = component_labels(graph)
+    loose = np.flatnonzero(labels != labels[0])
+    if len(loose):
+        others = f' and {len(loose) - 1:,} more have' if len(loose) > 1 else ' has'
+        raise GraphError(f'the graph is not connected: vertex {ids[loose[0]]}{others} no path to '
+                         f'vertex {ids[0]}; `l1slam info` lists the parts')
+
+
+def initial_poses(graph: FactorGraph, stored: Array | None, ids: Indices) -> Array:
+    """
+    Return the stored poses, (n, p); where there are none, the odometry chain.
+
+    Where that has gaps, the poses along a breadth-first tree from the first keyframe.
+
+    Raises
+    ------
+    GraphError : none is stored, and the graph is not connected.
+
+    """
+    if stored is not None:
+        return stored
+    require_connected(graph, ids)
+    if len(odometry_gaps(graph)):
+        return tree_poses(graph, 0)
+    return odometry_poses(graph)
 
 
 def cost_at(graph: FactorGraph, poses: Array) -> float:

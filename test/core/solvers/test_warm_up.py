@@ -27,7 +27,7 @@ from lies import careful_world, drive_roundabout, roundabout, seen, spoilt
 from problems import play
 
 from l1slam_ros.io import formats
-from l1slam_ros.cli import offline
+from l1slam_ros.core.robust import batch_map
 from l1slam_ros.io.compilation import fill_cache
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core import kernels
@@ -94,8 +94,7 @@ def slipped(world):
     return graph
 
 def solved(graph, poses, **wish):
-    record = GraphRecord(graph, poses, np.arange(graph.n_poses))
-    offline.solve(record, offline.Wish(**wish), lambda iteration, cost: None)
+    batch_map.solve(graph, poses, batch_map.Wish(**wish))
 
 solved(slipped(world), None, robust=True)
 look('a slip')
@@ -129,15 +128,15 @@ import sys
 from pathlib import Path
 import numpy as np
 from l1slam_ros.io import formats
-from l1slam_ros.cli import offline
+from l1slam_ros.core.robust import batch_map
 from l1slam_ros.core.robust.inspection import noise_scales
 
 record = formats.read_input(Path(sys.argv[1]))
 if sys.argv[2] == 'info':
     noise_scales(record.graph, np.random.default_rng(0))
 else:
-    wish = offline.Wish(robust=sys.argv[2] == 'robust')
-    offline.solve(record, wish, lambda iteration, cost: None)
+    wish = batch_map.Wish(robust=sys.argv[2] == 'robust')
+    batch_map.solve(record.graph, record.poses, wish)
 kernels = [kernel for name in list(sys.modules) if name.startswith('l1slam_ros.core.kernels.')
            for kernel in vars(sys.modules[name]).values() if hasattr(kernel, 'takes')]
 print(sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels))

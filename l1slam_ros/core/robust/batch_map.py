@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The core without ROS: a graph -> its solution, and what is believed of the graph."""
+"""
+A whole graph -> its map, in the norm that was asked for, loops doubted or believed.
+
+In: a graph, the poses that are stored with it, if any, and how it is to be solved. Out: the
+solution, what found it, and what is believed of the loops.
+"""
 
 import time
 from collections.abc import Callable
@@ -8,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import Report as OnRound
-from l1slam_ros.core.robust.inspection import odometry_gaps
+from l1slam_ros.core.robust.inspection import initial_poses, odometry_gaps, require_connected
 from l1slam_ros.core.robust.robust_map import RobustMap, minimise_robustly
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import (
@@ -26,8 +31,6 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
 from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.solvers.solve import AUTO, Choice, choose, minimise_by
-from l1slam_ros.io.formats import require_connected, stored_poses
-from l1slam_ros.io.graphs.graph_file import GraphRecord
 
 
 @dataclass(frozen=True)
@@ -69,13 +72,20 @@ class Outcome:
 
 
 def solve(
-    record: GraphRecord, wish: Wish, report: Report,
-    on_round: OnRound = lambda round_, accepted: None,
+    graph: FactorGraph, stored: Array | None, wish: Wish,
+    report: Report = lambda iteration, cost: None,
+    on_round: OnRound = lambda round_, accepted: None, ids: Indices | None = None,
 ) -> Outcome:
     """
     Solve a graph; seconds: solving alone.
 
-    report : called with each iteration and its cost; on_round : see `robust_solve`
+    Parameters
+    ----------
+    stored : (n, p) the poses to start from with `start='file'`, and where the initial cost is
+        taken; None: those of the odometry, or where it has gaps, of a tree
+    report : called with each iteration and its cost
+    on_round : see `robust_solve`
+    ids : (n,) what errors call the keyframes; None: their numbers
 
     Raises
     ------
@@ -83,12 +93,14 @@ def solve(
         its loops cannot be judged and `wish.robust` is True.
 
     """
-    _require_start(record, wish)
-    graph, seed = record.graph, None
-    initial = odometry_poses(graph) if wish.start == 'odometry' else stored_poses(record)
+    ids = np.arange(graph.n_poses) if ids is None else ids
+    _require_start(graph, stored, wish, ids)
+    seed = None
+    initial = (odometry_poses(graph) if wish.start == 'odometry'
+               else initial_poses(graph, stored, ids))
     minimiser = _Minimiser(wish, report)
     began = time.perf_counter()
-    judgement, unjudged = _judgement(record, wish, minimiser, on_round)
+    judgement, unjudged = _judgement(graph, wish, minimiser, on_round, ids)
     if judgement:
         solution, seed = judgement.solution, judgement.seed
         graph = graph.subset(judgement.accepted)
@@ -107,14 +119,14 @@ def solve(
 
 
 def _judgement(
-    record: GraphRecord, wish: Wish, minimiser: '_Minimiser', on_round: OnRound
+    graph: FactorGraph, wish: Wish, minimiser: '_Minimiser', on_round: OnRound, ids: Indices
 ) -> tuple[RobustMap | None, str]:
     """Return the robust map; where nobody insists on one and there is none, None and why."""
     if wish.robust is False:
         return None, ''
     try:
-        _require_chain(record, 'so no chain of odometry to judge loops by')
-        return minimise_robustly(record.graph, minimiser.minimise, on_round), ''
+        _require_chain(graph, ids, 'so no chain of odometry to judge loops by')
+        return minimise_robustly(graph, minimiser.minimise, on_round), ''
     except GraphError as error:
         if wish.robust:
             raise
@@ -162,19 +174,19 @@ def cost_function(graph: FactorGraph, wish: Wish) -> Callable[[Array], float]:
     return lambda poses: of_residual[wish.norm](whitened_residual(graph, poses))
 
 
-def _require_start(record: GraphRecord, wish: Wish) -> None:
+def _require_start(graph: FactorGraph, stored: Array | None, wish: Wish, ids: Indices) -> None:
     """Refuse, before any work is done, a graph that is not connected or has no such start."""
-    require_connected(record)
-    if wish.start == 'file' and record.poses is None:
+    require_connected(graph, ids)
+    if wish.start == 'file' and stored is None:
         raise GraphError('the input stores no poses to start from; expected --start seed or '
                          'odometry')
     if wish.start == 'odometry':
-        _require_chain(record, 'so no chain of odometry to start from; expected --start seed')
+        _require_chain(graph, ids, 'so no chain of odometry to start from; expected --start seed')
 
 
-def _require_chain(record: GraphRecord, consequence: str) -> None:
+def _require_chain(graph: FactorGraph, ids: Indices, consequence: str) -> None:
     """Refuse a graph whose odometry has a gap."""
-    gaps = odometry_gaps(record.graph)
+    gaps = odometry_gaps(graph)
     if len(gaps):
-        raise GraphError(f'no edge between the consecutive vertices {record.ids[gaps[0]]} and '
-                         f'{record.ids[gaps[0] + 1]}, {consequence}')
+        raise GraphError(f'no edge between the consecutive vertices {ids[gaps[0]]} and '
+                         f'{ids[gaps[0] + 1]}, {consequence}')

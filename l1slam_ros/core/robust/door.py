@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`l1slam_ros.solve`: a graph -> its map, and which loops are in it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.errors import GraphError, OptionError
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.names import NORMS
+from l1slam_ros.core.robust import batch_map
+
+
+@dataclass(frozen=True)
+class Solution:
+    """
+    A solved graph.
+
+    poses : (n, p) [m, rad], the first keyframe where the start had it; cost : of the norm, over
+    the inliers; status : converged, iteration_limit, stalled, or doubtful: the loops could not be
+    told from lies, this is the best map there is; inliers : (m,) bool of the between factors.
+    """
+
+    poses: Array
+    cost: float
+    status: str
+    inliers: Mask
+
+
+def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
+          start: Array | None = None) -> Solution:
+    """
+    Return the map of a graph.
+
+    Parameters
+    ----------
+    graph : the factors, as of `read_graph`
+    norm : l1, the sum of the absolute whitened residuals; l2, that of their squares; huber
+    robust : refuse loops that cannot be believed; False: believe all
+    start : (n, p) poses to begin with; None: a seed computed from the graph alone, as a robust
+        solve does in any case
+
+    Raises
+    ------
+    GraphError : the graph is not connected, its odometry has a gap where loops are to be
+        judged, or `start` has another shape.
+    OptionError : there is no such norm.
+
+    """
+    if norm not in NORMS:
+        raise OptionError(f'norm is {norm!r}, expected one of {", ".join(NORMS)}')
+    expected = (graph.n_poses, graph.manifold.POSE_SIZE)
+    if start is not None and np.shape(start) != expected:
+        raise GraphError(f'start has the shape {np.shape(start)}, expected {expected}')
+    wish = batch_map.Wish('seed' if start is None else 'file', norm, robust=robust)
+    outcome = batch_map.solve(graph, None if start is None else np.asarray(start, float), wish)
+    judgement, status = outcome.judgement, outcome.solution.status.value
+    if judgement is None:
+        inliers = np.ones(len(graph.between), bool)
+    else:
+        inliers = judgement.accepted
+        status = 'doubtful' if judgement.doubt else status
+    return Solution(outcome.solution.poses, outcome.solution.cost, status, inliers)

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`l1slam_ros.read_graph` and `write_graph`: any file of a graph -> the graph, and back."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.io import formats
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+
+
+def read_graph(path: str | os.PathLike[str]) -> tuple[FactorGraph, Array | None]:
+    """
+    Return the graph in a file, and the poses (n, p) [m, rad] that it stores, None where none.
+
+    Keyframes are numbered from 0, in the order of the file's vertex ids.
+
+    Parameters
+    ----------
+    path : .g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1
+
+    Raises
+    ------
+    FileError : naming file and line, what was found and what was expected.
+
+    """
+    record = formats.read_input(Path(path))
+    return record.graph, record.poses
+
+
+def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array) -> None:
+    """
+    Write a graph with poses (n, p), whole or not at all.
+
+    Parameters
+    ----------
+    path : .g2o, .graph, .tum (the poses alone), or a name without a suffix for a bag directory
+
+    Raises
+    ------
+    FileError : it cannot be written, or the format has no place for a part of the graph.
+    GraphError : poses of another shape.
+
+    """
+    expected = (graph.n_poses, graph.manifold.POSE_SIZE)
+    if np.shape(poses) != expected:
+        raise GraphError(f'poses have the shape {np.shape(poses)}, expected {expected}')
+    formats.write_output(Path(path), GraphRecord(graph, np.asarray(poses, float),
+                                                 np.arange(graph.n_poses)))

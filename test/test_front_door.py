@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`import l1slam_ros`: light, and the README's example of it runs."""
+
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import l1slam_ros as l1
+from l1slam_ros.cli.main import main
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / 'README.md').read_text()
+EXAMPLE = re.search(r'## From Python.*?```python\n(.*?)```', README, re.S)[1]
+
+
+@pytest.fixture(scope='module')
+def world(tmp_path_factory):
+    path = tmp_path_factory.mktemp('world') / 'world.g2o'
+    assert main(['simulate', str(path), '--poses', '200', '--edges', '320',
+                 '--false-loops', '10']) == 0
+    return path
+
+
+def test_the_import_is_light():
+    code = ('import sys, l1slam_ros; print(sorted({"rclpy", "numba", "scipy", "matplotlib", '
+            '"numpy"} & sys.modules.keys()), *dir(l1slam_ros))')
+    said = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True,
+                          check=True).stdout
+    assert said.startswith('[] ')
+    assert set(l1.__all__) <= set(said.split())
+
+
+def test_the_example_of_the_readme_runs_and_says_what_it_found(world):
+    assert len(EXAMPLE.splitlines()) <= 30
+    ran = subprocess.run([sys.executable, '-c', EXAMPLE], cwd=world.parent, capture_output=True,
+                         text=True, check=False)
+    assert (ran.returncode, ran.stderr) == (0, '')
+    assert re.match(r'converged: L1 cost [0-9.]+, 10 loops refused\n', ran.stdout)
+    assert len(l1.read_graph(world.parent / 'solved.g2o')[1]) == 200
+
+
+@pytest.mark.parametrize('name', l1.__all__)
+def test_every_name_explains_itself(name):
+    assert len(inspect.getdoc(getattr(l1, name))) > 30
+
+
+def test_the_refused_are_the_false_and_a_start_is_begun_from(world):
+    graph, poses = l1.read_graph(world)
+    solution = l1.solve(graph)
+    false = np.loadtxt(world.parent / 'world.g2o.false.txt', int)
+    np.testing.assert_array_equal(np.sort(graph.between.pairs[~solution.inliers], axis=0),
+                                  np.sort(false, axis=0))
+    moved = poses + [5.0, 0.0, 0.0]
+    from_there = l1.solve(graph, norm='l2', robust=False, start=moved)
+    np.testing.assert_allclose(from_there.poses[0], moved[0])
+    assert from_there.inliers.all()
+
+
+def test_what_cannot_be_solved_is_said(world):
+    graph, poses = l1.read_graph(world)
+    with pytest.raises(l1.L1SlamError, match="norm is 'l3', expected one of l1, l2, huber"):
+        l1.solve(graph, norm='l3')
+    with pytest.raises(l1.L1SlamError, match=r'start has the shape \(3, 3\), expected \(200, 3\)'):
+        l1.solve(graph, start=poses[:3])
+    with pytest.raises(l1.L1SlamError, match=r'poses have the shape \(3, 3\)'):
+        l1.write_graph(world.parent / 'x.g2o', graph, poses[:3])
+    with pytest.raises(l1.L1SlamError, match='no such file'):
+        l1.read_graph(world.parent / 'missing.g2o')
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        l1.nothing  # noqa: B018
