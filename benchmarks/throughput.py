@@ -67,14 +67,15 @@ def _measure(count: int, rate: float, backend: int) -> tuple[dict[str, str], flo
     said: dict[str, str] = {}
     node.create_subscription(
         DiagnosticArray, '/diagnostics',
-        lambda m: said.update({v.key: v.value for s in m.status for v in s.values}), 10)
+        lambda m: said.update({v.key: v.value for s in m.status for v in s.values},
+                              message=m.status[0].message), 10)
     _until(node, lambda: publisher.get_subscription_count() == 2 and 'odom.received' in said
-           and 'compiling' not in said)
-    before, began = _cpu_seconds(backend), time.monotonic()
+           and 'compiling' not in said['message'])
+    before, began = cpu_seconds(backend), time.monotonic()
     for k, data in enumerate(_messages(count, rate)):
         publisher.publish(data)
         time.sleep(max(began + k / rate - time.monotonic(), 0.0))
-    seconds, cpu = time.monotonic() - began, _cpu_seconds(backend) - before
+    seconds, cpu = time.monotonic() - began, cpu_seconds(backend) - before
     # Until two reports in a row say the same.
     seen = ''
     while seen != said['odom.received']:
@@ -101,7 +102,8 @@ def _until(node: Any, condition: Any) -> None:
         rclpy.spin_once(node, timeout_sec=0.1)
 
 
-def _cpu_seconds(process: int) -> float:
+def cpu_seconds(process: int) -> float:
+    """Return the processor's time that a process has taken [s]."""
     with open(f'/proc/{process}/stat') as file:
         fields = file.read().rsplit(')', 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')

@@ -62,8 +62,8 @@ def solve(arguments: argparse.Namespace) -> Ending:
                           else value for name, value in report.items()}))
     elif not arguments.quiet:
         _print_report(report, arguments.norm, outcome)
-        if judgement:
-            print('\n'.join(verdict(record, judgement)))
+        for sentence in verdict(record, judgement) if judgement else ():
+            print(sentence)
     return ending
 
 

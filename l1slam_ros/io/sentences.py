@@ -48,8 +48,9 @@ def verdict(record: GraphRecord, judgement: RobustMap) -> Iterator[str]:
     if len(refused) > _NAMED:
         yield f'  and {len(refused) - _NAMED:,} more; `--json` lists all'
     if len(suspect):
-        yield (f'suspect and left out, because nothing vouches for them: {len(suspect):,} that '
-               'fit where they stand, but could as well do so by chance')
+        them, they = ('it', 'it') if len(suspect) == 1 else ('them', 'they')
+        yield (f'{counted(len(suspect), "loop")} suspect and left out: nothing vouches for '
+               f'{them}, and {they} could as well fit by chance')
     for sentence, times in zip(_NOISE, np.sqrt(judgement.variance).tolist(), strict=True):
         if times >= _NOISY:
             yield sentence.format(times=times)

@@ -56,6 +56,13 @@ def solve_json(capsys, *arguments):
     return json.loads(run(capsys, 'solve', *arguments, '--json')[0])
 
 
+def test_of_a_graph_without_loops_nothing_is_said_of_loops(capsys, tmp_path):
+    chain = tmp_path / 'chain.g2o'
+    chain.write_text('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0 1 0 0 1 0 1\n')
+    lines = run(capsys, 'solve', chain)[0].splitlines()
+    assert all(lines) and 'refused' not in ''.join(lines)
+
+
 def test_solve_reports_what_it_wrote(capsys, world, tmp_path):
     output, picture = tmp_path / 'out.g2o', tmp_path / 'map.png'
     report = solve_json(capsys, world, '--output', output, '--plot', picture,
