@@ -208,18 +208,10 @@ def _global_curves(costs: Costs) -> dict[str, Array]:
             for method, history in histories.items()}
 
 
-def _table_1(results: Results, folder: Path) -> list[str]:
-    return report.table_1(results)
-
-
-def _table_2(results: Results, folder: Path) -> list[str]:
-    return report.table_2(results)
-
-
 # Title -> what draws the section's pictures into a folder and returns its lines.
 SECTIONS: dict[str, Callable[[Results, Path], list[str]]] = {
-    'Table I: the cost': _table_1,
-    'Table II: the time per iteration': _table_2,
+    'Table I: the cost': lambda results, _: report.table_1(results),
+    'Table II: the time per iteration': lambda results, _: report.table_2(results),
     'Figure 2: cost against iterations': figures.figure_2,
     'Figure 3: the maps': figures.figure_3,
     'Figure 4: a start that is mostly noise': figures.figure_4,
