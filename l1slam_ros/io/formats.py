@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Any input file -> graph, and a graph -> any output file; nothing is solved here."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -101,6 +103,15 @@ def require_connected(record: GraphRecord) -> None:
         others = f' and {len(loose) - 1:,} more have' if len(loose) > 1 else ' has'
         raise GraphError(f'the graph is not connected: vertex {record.ids[loose[0]]}{others} no '
                          f'path to vertex {record.ids[0]}; `l1slam info` lists the parts')
+
+
+@contextmanager
+def named(path: Path | str) -> Iterator[None]:
+    """Let what is wrong with a graph name the file it came from."""
+    try:
+        yield
+    except GraphError as error:
+        raise FileError(path, str(error)) from error
 
 
 def stamps_of(record: GraphRecord) -> Indices:

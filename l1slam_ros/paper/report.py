@@ -41,10 +41,10 @@ _HEAD = ('J. J. Casafranca, L. M. Paz and P. Pinies, "L1 Factor Graph SLAM: goin
          '(`l1slam reproduce`). *As printed* is the algorithm without what this package adds to '
          'it: no primal weight, full steps, and in Algorithm 4 a dual that starts from zero at '
          'each linearisation.')
-_COSTS = ("A graph is the paper's own where both costs of its start agree, in the 4 to 6 digits that "
-          "the paper prints; the costs of any other do not compare. (*) is simulated anew in the size "
-          f"of the paper's (`l1slam simulate`, seed {WORLD_SEED}). (+) was ended before it had "
-          'settled, because the graph is so large.')
+_COSTS = ("A graph is the paper's own where both costs of its start agree, in the 4 to 6 digits "
+          'that the paper prints; the costs of any other do not compare. (*) is simulated anew in '
+          f"the size of the paper's (`l1slam simulate`, seed {WORLD_SEED}). (+) was ended before "
+          'it had settled, because the graph is so large.')
 _SECONDS = ('The paper ran C++ on an Intel i7 at 2.9 GHz, this is another machine: within one row '
             'the ratios count. Ours is processor time. *Plain* is Algorithm 2 as printed, in '
             'SciPy; *fused* the compiled form of it that this package uses.')
