@@ -99,8 +99,9 @@ def head(results: Results) -> list[str]:
     if files:
         lines += ['', f"**Not run: {', '.join(g.name for g in files)}**, the paper's own graphs. "
                   f'They come with Vertigo ({_SOURCE_OF_FILES}, folder `datasets`; its '
-                  '`manhattanOlson3500.g2o` is `manhattan3500.g2o` here). Name a folder with '
-                  f'{", ".join(f"`{g.file}`" for g in files)} with `--datasets`.']
+                  '`manhattanOlson3500.g2o` is `manhattan3500.g2o` here). Put '
+                  f'{", ".join(f"`{g.file}`" for g in files)} into one folder and name it with '
+                  '`--datasets`.']
     if worlds:
         lines += ['', f'**Not run: {", ".join(g.name for g in worlds)}**; `--worlds all` '
                   'simulates all such worlds.']

@@ -18,9 +18,7 @@ from l1slam_ros.io.bags.damaged.walk import (
     BrokenRecordError,
     RawMessage,
     broken_at,
-    decoded,
-    lz4_decoder,
-    zstd_decoder,
+    uncompressed,
 )
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -85,11 +83,10 @@ def is_indexed(path: Path) -> bool:
         if summary is None or summary.statistics is None:
             return False
         end = file.seek(-_FOOTER.size - len(MAGIC), 2)
-        footer = file.read(_FOOTER.size)
-        _, _, start, _, checksum = _FOOTER.unpack(footer)
+        _, _, start, _, checksum = _FOOTER.unpack(file.read(_FOOTER.size))
         file.seek(start)
-        index = file.read(end - start)
-    if checksum and zlib.crc32(index + footer[:-_CHECKSUM]) != checksum:
+        covered = file.read(end + _FOOTER.size - _CHECKSUM - start)
+    if checksum and zlib.crc32(covered) != checksum:
         return False
     chunks = summary.chunk_indexes
     return (all(chunk.message_index_offsets for chunk in chunks)
@@ -152,7 +149,7 @@ class _Channels:
     def chunk(self, content: bytes) -> Iterator[RawMessage]:
         """Yield the messages of a chunk, in part where it is damaged."""
         chunk = _parsed('Chunk', content)
-        rows = _uncompressed(chunk.data, chunk.compression)
+        rows = uncompressed(chunk.data, chunk.compression)
         whole = len(rows) == chunk.uncompressed_size
         messages = self._rows(rows)
         if whole and chunk.uncompressed_crc and zlib.crc32(rows) != chunk.uncompressed_crc:
@@ -182,9 +179,3 @@ def _before_a_break(messages: Iterator[RawMessage]) -> list[RawMessage]:
     except Exception:
         return found
     return []
-
-
-def _uncompressed(data: bytes, compression: str) -> bytes:
-    """Return the content of a chunk, as far as it goes."""
-    decoders = {'zstd': zstd_decoder, 'lz4': lz4_decoder}
-    return decoded(decoders[compression], data) if compression else data
