@@ -3,14 +3,13 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from l1slam_ros.core.errors import FileError, GraphError, OptionError
+from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.io import formats
 from l1slam_ros.io.bags.topics import Topics
@@ -34,7 +33,7 @@ def convert(arguments: argparse.Namespace) -> Ending:
     formats.check_output(arguments.output)
     record = read(arguments, arguments.input)
     warn(record.skipped)
-    with named(arguments.input):
+    with formats.named(arguments.input):
         formats.write_output(arguments.output, formats.with_poses(record))
     return Ending(record.damage)
 
@@ -96,7 +95,7 @@ def plot(arguments: argparse.Namespace) -> Ending:
     for path in arguments.input:
         record = read(arguments, path)
         warn(record.skipped)
-        with named(path):
+        with formats.named(path):
             poses = formats.stored_poses(record)
         known, truth = truth_path(path), None
         if known.exists():
@@ -116,15 +115,6 @@ def read(arguments: argparse.Namespace, path: Path) -> GraphRecord:
         options = read_params_file(arguments.params_file)
     topics = Topics(arguments.odom_topic, arguments.loop_topic, arguments.trusted_topic)
     return formats.read_input(path, options, topics)
-
-
-@contextmanager
-def named(path: Path) -> Iterator[None]:
-    """Let what is wrong with a graph name the file it came from."""
-    try:
-        yield
-    except GraphError as error:
-        raise FileError(path, str(error)) from error
 
 
 def warn(sentences: tuple[str, ...], quiet: bool = False) -> None:

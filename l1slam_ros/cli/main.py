@@ -156,7 +156,7 @@ def _parser() -> argparse.ArgumentParser:
                       'world.g2o --poses 1000 --edges 2000 --seed 1'))
     _add_corrupt(add('corrupt', 'add false loops to a graph',
                      'graph.g2o spoiled.g2o --false-loops 20 --kind grouped'))
-    _add_info(add('info', 'say what is in a graph or a bag, and what looks wrong', 'graph.g2o'))
+    _add_input(add('info', 'say what is in a graph or a bag, and what looks wrong', 'graph.g2o'))
     _add_plot(add('plot', 'draw maps beside each other, known false loops black',
                   'graph.g2o solved.g2o --output maps.png'))
     _add_reproduce(add('reproduce',
@@ -238,10 +238,6 @@ def _add_randomness(parser: argparse.ArgumentParser) -> None:
                         default=KINDS_OF_FALSE_LOOPS[0], help=_KIND)
     parser.add_argument('--seed', type=int, default=0, metavar='S',
                         help='another one, another draw (default: %(default)s)')
-
-
-def _add_info(parser: argparse.ArgumentParser) -> None:
-    _add_input(parser)
 
 
 def _add_plot(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from l1slam_ros.cli.commands import Ending, check_counts, named, read, warn, write_spoiled
+from l1slam_ros.cli.commands import Ending, check_counts, read, warn, write_spoiled
 from l1slam_ros.cli.reference import Truth, position_error, read_truth, true_path
 from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.robust.batch_map import Outcome, Wish
@@ -47,7 +47,7 @@ def solve(arguments: argparse.Namespace) -> Ending:
     judgement = outcome.judgement
     ending = Ending(record.damage, doubt_sentence(judgement.doubt, record.ids, record.stamps)
                     if judgement and judgement.doubt else '')
-    report = _report(record, arguments.norm, outcome)
+    report = _report(record, outcome)
     report['warnings'] = [*warnings, *filter(None, ending)]
     if truth:
         report['ate'] = position_error(record, outcome.solution.poses, truth)
@@ -71,7 +71,8 @@ def _solved(arguments: argparse.Namespace, record: GraphRecord, wish: Wish) -> O
     steps = (wish.options.outer_iterations if wish.norm == 'l1'
              else wish.least_squares.iterations)
     quiet = arguments.quiet
-    with (named(arguments.input), Progress(None, 'round', quiet, 'judging loops') as judging,
+    with (formats.named(arguments.input),
+          Progress(None, 'round', quiet, 'judging loops') as judging,
           Progress(steps, 'step', quiet, 'solving') as solving):
         return solve_graph(
             record.graph, record.poses, wish, solving.report,
@@ -118,7 +119,7 @@ def _wish(arguments: argparse.Namespace) -> Wish:
                         least_squares)
 
 
-def _report(record: GraphRecord, norm: str, outcome: Outcome) -> dict[str, object]:
+def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
     solution, factors, judgement = outcome.solution, record.graph.between, outcome.judgement
     suspect = judgement.suspect if judgement else np.zeros(len(factors), bool)
     refused = ~judgement.accepted & ~suspect if judgement else suspect
@@ -189,7 +190,8 @@ def corrupt(arguments: argparse.Namespace) -> Ending:
     believed = replace(record, graph=record.graph.subset(~former))
     options = LeastSquaresOptions()
     _make_ready(SPARSE)
-    with named(arguments.input), Progress(options.iterations, 'step', label='solving') as progress:
+    with (formats.named(arguments.input),
+          Progress(options.iterations, 'step', label='solving') as progress):
         solution = solve_graph(
             believed.graph, believed.poses, Wish(norm='l2', robust=False, least_squares=options),
             progress.report, ids=believed.ids).solution
@@ -201,7 +203,7 @@ def corrupt(arguments: argparse.Namespace) -> Ending:
     spoiled = formats.with_poses(replace(record, graph=insert_loops(record.graph, loops)))
     # A bag has no vertex ids: read back, it counts its keyframes from 0.
     ids = record.ids[pairs] if arguments.output.suffix else pairs
-    with named(arguments.input):
+    with formats.named(arguments.input):
         write_spoiled(arguments.output, ids,
                       lambda: formats.write_output(arguments.output, spoiled))
     return Ending(record.damage)

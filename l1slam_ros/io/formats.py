@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Any input file -> graph, and a graph -> any output file; nothing is solved here."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -66,6 +68,15 @@ def with_poses(record: GraphRecord) -> GraphRecord:
         return replace(record, poses=stored_poses(record))
     except GraphError:
         return record
+
+
+@contextmanager
+def named(path: Path | str) -> Iterator[None]:
+    """Let what is wrong with a graph name the file it came from."""
+    try:
+        yield
+    except GraphError as error:
+        raise FileError(path, str(error)) from error
 
 
 def stamps_of(record: GraphRecord) -> Indices:

@@ -110,16 +110,13 @@ def measure_costs(
     """Return what the solvers make of a graph from its seed; start, seed : (n, p) poses."""
     solution, solver = minimise_by(choose(AUTO, graph), graph, seed, OptimiserOptions(),
                                    report)
-    bearable = replace(effort, outer=min(effort.outer, _most_linearisations(graph, effort)))
+    most = max(1, int(_MOST_PASSES / (effort.inner * max(len(graph.between), 1))))
+    bearable = replace(effort, outer=min(effort.outer, most))
     printed = printed_costs(graph, seed, bearable, report)
     cut_short = bearable.outer < effort.outer and not _has_settled(printed)
     l2 = minimise_l2(graph, seed, LeastSquaresOptions(), cholesky_of(graph), report)
     return Costs(_cost(graph, start), _cost(graph, seed), _cost(graph, l2.poses), printed,
                  cut_short, solution, solver)
-
-
-def _most_linearisations(graph: FactorGraph, effort: Effort) -> int:
-    return max(1, int(_MOST_PASSES / (effort.inner * max(len(graph.between), 1))))
 
 
 def printed_costs(

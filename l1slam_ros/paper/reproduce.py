@@ -2,17 +2,16 @@
 """`l1slam reproduce`: runs the paper's experiments and writes the report, its pictures beside."""
 
 import os
-import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from l1slam_ros.core.errors import FileError, GraphError, OptionError
+from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
@@ -101,18 +100,9 @@ def read_datasets(datasets: Path) -> dict[str, GraphRecord]:
 
 def _read(path: Path) -> GraphRecord:
     record = formats.read_input(path)
-    with _named(path):
+    with formats.named(path):
         require_connected(record.graph, record.ids)
     return record
-
-
-@contextmanager
-def _named(file: Path | str) -> Iterator[None]:
-    """Let what is wrong with a graph name the file it came from."""
-    try:
-        yield
-    except GraphError as error:
-        raise FileError(file, str(error)) from error
 
 
 def run(
@@ -156,7 +146,7 @@ def _run_false_loops(
         if record is None:
             continue
         print(f'l1slam: {graph.name} with false loops', file=sys.stderr)
-        with _named(graph.file), Progress(1 + effort.draws, 'draw') as progress:
+        with formats.named(graph.file), Progress(1 + effort.draws, 'draw') as progress:
             trials[graph.name] = try_false_loops(
                 record.graph, formats.stored_poses(record), count, effort,
                 np.random.default_rng(WORLD_SEED), progress.advance)
@@ -209,18 +199,10 @@ def _global_curves(costs: Costs) -> dict[str, Array]:
             for method, history in histories.items()}
 
 
-def _table_1(results: Results, folder: Path) -> list[str]:
-    return report.table_1(results)
-
-
-def _table_2(results: Results, folder: Path) -> list[str]:
-    return report.table_2(results)
-
-
 # Title -> what draws the section's pictures into a folder and returns its lines.
 SECTIONS: dict[str, Callable[[Results, Path], list[str]]] = {
-    'Table I: the cost': _table_1,
-    'Table II: the time per iteration': _table_2,
+    'Table I: the cost': lambda results, _: report.table_1(results),
+    'Table II: the time per iteration': lambda results, _: report.table_2(results),
     'Figure 2: cost against iterations': figures.figure_2,
     'Figure 3: the maps': figures.figure_3,
     'Figure 4: a start that is mostly noise': figures.figure_4,
@@ -238,21 +220,19 @@ def _check_folder(output: Path) -> None:
 @contextmanager
 def _filling(output: Path) -> Iterator[Path]:
     """Yield a new folder, whose files go into the folder `output` when the block succeeds."""
-    target, scratch = Path(os.path.abspath(output)), None
+    target = Path(os.path.abspath(output))
     try:
-        scratch = Path(mkdtemp(prefix=f'.{target.name}.', suffix='.tmp', dir=target.parent))
-        # One of our own inside it: what `mkdtemp` makes is for its owner only.
-        made = scratch / target.name
-        made.mkdir()
-        yield made
-        if target.is_dir():
-            # The report last: it names the others.
-            for file in sorted(made.iterdir(), key=lambda file: file.name == REPORT):
-                os.replace(file, target / file.name)
-        else:
-            os.rename(made, target)
+        with TemporaryDirectory('.tmp', f'.{target.name}.', target.parent,
+                                ignore_cleanup_errors=True) as scratch:
+            # One of our own inside it: what `tempfile` makes is for its owner only.
+            made = Path(scratch, target.name)
+            made.mkdir()
+            yield made
+            if target.is_dir():
+                # The report last: it names the others.
+                for file in sorted(made.iterdir(), key=lambda file: file.name == REPORT):
+                    os.replace(file, target / file.name)
+            else:
+                os.rename(made, target)
     except OSError as error:
         raise FileError(output, f'cannot be written: {error.strerror or error}') from error
-    finally:
-        if scratch is not None:
-            shutil.rmtree(scratch, ignore_errors=True)

@@ -33,17 +33,13 @@ GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
 # And besides, where a reader of messages would take some for faults: see `_note`.
 VERBATIM_NOTE = {'messages': 'verbatim'}
 
-_TRUTH_FRAME = 'map'
+_BASE_FRAME = 'base_link'
 # builtin_interfaces/Time holds its seconds in 32 bits.
 _LAST_STAMP = 2**31 * NANOSECONDS - 1
 
 
 def write_graph_bag(
-    path: str | os.PathLike[str],
-    record: GraphRecord,
-    truth: Array | None = None,
-    odom_frame: str = 'odom',
-    base_frame: str = 'base_link',
+    path: str | os.PathLike[str], record: GraphRecord, truth: Array | None = None
 ) -> None:
     """
     Write a graph as the messages a robot would have sent.
@@ -53,7 +49,6 @@ def write_graph_bag(
     path : the bag's directory; a bag already there is replaced once the new one is complete
     record : its stamps, or invented ones; its stored poses and vertex ids have no place in a bag
     truth : (n, p) poses in the map frame, or None
-    odom_frame, base_frame : the frames of the messages
 
     Raises
     ------
@@ -66,7 +61,7 @@ def write_graph_bag(
     if truth is not None and len(truth) != len(stamps):
         raise GraphError(f'{len(truth)} true poses; expected {len(stamps)}, one for each vertex')
     with new_bag(path, _note(record, stamps, steps)) as writer:
-        factors = _FactorWriter(writer, graph, odom_frame, base_frame)
+        factors = _FactorWriter(writer, graph)
         chain = graph.manifold.to_pose3(_chain(graph, steps)).tolist()
         true = None if truth is None else _PoseWriter(writer, graph, truth)
         for k, stamp in enumerate(stamps):
@@ -80,16 +75,16 @@ def write_graph_bag(
 class _FactorWriter:
     """Writes /odom and /loop_closures, filling one message of each anew for every factor."""
 
-    def __init__(self, writer: BagWriter, graph: FactorGraph, odom_frame: str, base_frame: str):
+    def __init__(self, writer: BagWriter, graph: FactorGraph):
         manifold, roots = graph.manifold, np.linalg.inv(graph.between.sqrt_information)
-        self._writer, self._base_frame = writer, base_frame
+        self._writer = writer
         self._measured = manifold.to_pose3(graph.between.measurement).tolist()
         self._covariances = roots @ roots.transpose(0, 2, 1)
         rows = np.array(manifold.COVARIANCE_ROWS)
         self._entries = (6 * rows[:, None] + rows).ravel()
         self._topics = [TRUSTED_LOOP_TOPIC if trusted else LOOP_TOPIC
                         for trusted in (graph.between.trusted & ~graph.between.is_odometry)]
-        self._odometry = _blank_odometry(writer.types, odom_frame, base_frame)
+        self._odometry = _blank_odometry(writer.types)
         self._loop = _blank_loop(writer.types)
         writer.add_topic(ODOMETRY_TOPIC, self._odometry.__msgtype__)
         for topic in sorted({LOOP_TOPIC, *self._topics}):
@@ -104,7 +99,7 @@ class _FactorWriter:
     def write_loop(self, stamp: int, reference_stamp: int, loop: int) -> None:
         """Write the factor `loop`, between the keyframes of two stamps [ns]."""
         _fill(self._loop.header, self._loop.pose.pose, stamp, self._measured[loop])
-        self._loop.header.frame_id = reference_frame_id(self._base_frame, reference_stamp)
+        self._loop.header.frame_id = reference_frame_id(_BASE_FRAME, reference_stamp)
         self._loop.pose.covariance = self._covariance(loop)
         self._writer.write(self._topics[loop], stamp, self._loop)
 
@@ -124,7 +119,7 @@ class _PoseWriter:
         self._writer = writer
         self._pose3 = graph.manifold.to_pose3(truth).tolist()
         self._message = types['geometry_msgs/msg/PoseStamped'](
-            _header(types, _TRUTH_FRAME), _blank_pose(types))
+            _header(types, 'map'), _blank_pose(types))
         writer.add_topic(TRUTH_TOPIC, self._message.__msgtype__)
 
     def write(self, stamp: int, k: int) -> None:
@@ -133,11 +128,11 @@ class _PoseWriter:
         self._writer.write(TRUTH_TOPIC, stamp, self._message)
 
 
-def _blank_odometry(types: dict[str, Any], odom_frame: str, base_frame: str) -> Any:
+def _blank_odometry(types: dict[str, Any]) -> Any:
     twist = types['geometry_msgs/msg/Twist'](
         *(types['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0) for _ in range(2)))
     return types['nav_msgs/msg/Odometry'](
-        _header(types, odom_frame), base_frame,
+        _header(types, 'odom'), _BASE_FRAME,
         types['geometry_msgs/msg/PoseWithCovariance'](_blank_pose(types), np.zeros(36)),
         types['geometry_msgs/msg/TwistWithCovariance'](twist, np.zeros(36)))
 

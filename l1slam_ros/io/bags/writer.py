@@ -8,13 +8,12 @@ metadata.yaml of its version 9, and a copy of it in the file.
 """
 
 import os
-import shutil
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import StringIO
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from l1slam_ros.core.errors import FileError
@@ -166,24 +165,21 @@ def _refuse_other_than_bag(target: Path) -> None:
 @contextmanager
 def _replacing_directory(target: Path) -> Iterator[Path]:
     """Yield the name of a directory to make, which takes the place of `target` in the end."""
-    scratch = None
     try:
         _refuse_other_than_bag(target)
-        scratch = Path(mkdtemp(prefix=f'.{target.name}.', suffix='.tmp', dir=target.parent))
-        # The bag is made under its own name: that of the file inside repeats it.
-        made = scratch / target.name
-        yield made
-        for file in made.iterdir():
-            with file.open('rb') as written:
-                os.fsync(written.fileno())
-        sync_folder(made)
-        _swap(made, target, scratch / f'{target.name}.former')
-        sync_folder(target.parent)
+        with TemporaryDirectory('.tmp', f'.{target.name}.', target.parent,
+                                ignore_cleanup_errors=True) as scratch:
+            # The bag is made under its own name: that of the file inside repeats it.
+            made = Path(scratch, target.name)
+            yield made
+            for file in made.iterdir():
+                with file.open('rb') as written:
+                    os.fsync(written.fileno())
+            sync_folder(made)
+            _swap(made, target, Path(scratch, f'{target.name}.former'))
+            sync_folder(target.parent)
     except OSError as error:
         raise FileError(target, f'cannot be written: {error.strerror or error}') from error
-    finally:
-        if scratch is not None:
-            shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _swap(made: Path, target: Path, former: Path) -> None:

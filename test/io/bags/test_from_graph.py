@@ -148,7 +148,7 @@ def test_the_stamps_of_the_graph_are_kept(tmp_path, rng):
 def test_truth_and_frames(tmp_path, rng):
     record = record_of([(0, 1), (1, 2), (0, 2)], rng)
     truth = rng.uniform(-3, 3, (3, 3))
-    write_graph_bag(tmp_path / 'bag', record, truth, odom_frame='o', base_frame='robot/base')
+    write_graph_bag(tmp_path / 'bag', record, truth)
     messages = read_with_rosbags(tmp_path / 'bag')
     poses = [m for topic, _, m in messages if topic == '/ground_truth']
     assert [stamp_of(m.header) for m in poses] == (10**12 + 10**8 * np.arange(3)).tolist()
@@ -157,9 +157,9 @@ def test_truth_and_frames(tmp_path, rng):
              ((m.pose.position, m.pose.orientation) for m in poses)]
     np.testing.assert_allclose(found, truth, rtol=0, atol=1e-15)
     loop = next(m for topic, _, m in messages if topic == '/loop_closures')
-    assert loop.header.frame_id == 'robot/base@1000.000000000'
+    assert loop.header.frame_id == 'base_link@1000.000000000'
     odometry = messages[0][2]
-    assert (odometry.header.frame_id, odometry.child_frame_id) == ('o', 'robot/base')
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ('odom', 'base_link')
 
 
 def test_metadata_as_rosbag2_writes_it(tmp_path, rng):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the walks through bag files share: each yields messages from the start to the damage."""
 
+import bz2
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -56,6 +57,17 @@ def lz4_decoder() -> Any:
     import lz4.frame  # type: ignore[import-untyped]  # comes with both bag libraries
 
     return lz4.frame.LZ4FrameDecompressor()
+
+
+# By their names in MCAP and in bags of ROS 1.
+_DECODERS = {'zstd': zstd_decoder, 'lz4': lz4_decoder, 'bz2': bz2.BZ2Decompressor}
+
+
+def uncompressed(data: bytes, compression: str) -> bytes:
+    """Return the content of a chunk, as far as it goes."""
+    if compression in ('', 'none'):
+        return data
+    return decoded(_DECODERS[compression], data)
 
 
 def decoded(make_decoder: Callable[[], Any], data: bytes, sure: int = 0,

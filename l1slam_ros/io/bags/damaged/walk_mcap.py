@@ -12,15 +12,13 @@ import zlib
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from l1slam_ros.io.bags.damaged.walk import (
     BrokenRecordError,
     RawMessage,
     broken_at,
-    decoded,
-    lz4_decoder,
-    zstd_decoder,
+    uncompressed,
 )
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -68,14 +66,11 @@ def walk_mcap(path: Path, definitions: dict[str, str]) -> Iterator[RawMessage]:
 
 def mcap_metadata(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield the name and the entries of each metadata record of a file, up to its first damage."""
-    from mcap.data_stream import ReadDataStream
-    from mcap.records import Metadata
-
     with path.open('rb') as file:
         file.seek(len(MAGIC))
         for _, opcode, length in _records(file, path.stat().st_size):
             if opcode == _METADATA:
-                record = Metadata.read(ReadDataStream(BytesIO(file.read(length))))
+                record = _parsed('Metadata', file.read(length))
                 yield record.name, record.metadata
 
 
@@ -88,11 +83,10 @@ def is_indexed(path: Path) -> bool:
         if summary is None or summary.statistics is None:
             return False
         end = file.seek(-_FOOTER.size - len(MAGIC), 2)
-        footer = file.read(_FOOTER.size)
-        _, _, start, _, checksum = _FOOTER.unpack(footer)
+        _, _, start, _, checksum = _FOOTER.unpack(file.read(_FOOTER.size))
         file.seek(start)
-        index = file.read(end - start)
-    if checksum and zlib.crc32(index + footer[:-_CHECKSUM]) != checksum:
+        covered = file.read(end + _FOOTER.size - _CHECKSUM - start)
+    if checksum and zlib.crc32(covered) != checksum:
         return False
     chunks = summary.chunk_indexes
     return (all(chunk.message_index_offsets for chunk in chunks)
@@ -118,6 +112,13 @@ def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
         start += _HEAD.size + length
 
 
+def _parsed(kind: str, content: bytes) -> Any:
+    """Return a record as the mcap library has it, by the name of its kind there."""
+    from mcap import data_stream, records
+
+    return getattr(records, kind).read(data_stream.ReadDataStream(BytesIO(content)))
+
+
 class _Channels:
     """Turns records into messages, by the channels announced before them."""
 
@@ -129,32 +130,26 @@ class _Channels:
 
     def record(self, opcode: int, content: bytes) -> Iterator[RawMessage]:
         """Yield the message that a record is; of any other, learn what it says."""
-        from mcap.data_stream import ReadDataStream
-        from mcap.records import Channel, Schema
-
         if opcode == _MESSAGE:
             channel_id, _, time, _ = _MESSAGE_HEAD.unpack_from(content)
             topic = self._topics[channel_id]
             if topic is not None:
                 yield RawMessage(*topic, time, content[_MESSAGE_HEAD.size:])
         elif opcode == _SCHEMA:
-            schema = Schema.read(ReadDataStream(BytesIO(content)))
+            schema = _parsed('Schema', content)
             self._schemas[schema.id] = schema.name
             if schema.encoding == 'ros2msg':
                 self._definitions[schema.name] = schema.data.decode()
         elif opcode == _CHANNEL:
-            channel = Channel.read(ReadDataStream(BytesIO(content)))
+            channel = _parsed('Channel', content)
             self._topics[channel.id] = (
                 (channel.topic, self._schemas[channel.schema_id])
                 if channel.message_encoding == 'cdr' else None)
 
     def chunk(self, content: bytes) -> Iterator[RawMessage]:
         """Yield the messages of a chunk, in part where it is damaged."""
-        from mcap.data_stream import ReadDataStream
-        from mcap.records import Chunk
-
-        chunk = Chunk.read(ReadDataStream(BytesIO(content)))
-        rows = _uncompressed(chunk.data, chunk.compression)
+        chunk = _parsed('Chunk', content)
+        rows = uncompressed(chunk.data, chunk.compression)
         whole = len(rows) == chunk.uncompressed_size
         messages = self._rows(rows)
         if whole and chunk.uncompressed_crc and zlib.crc32(rows) != chunk.uncompressed_crc:
@@ -184,9 +179,3 @@ def _before_a_break(messages: Iterator[RawMessage]) -> list[RawMessage]:
     except Exception:
         return found
     return []
-
-
-def _uncompressed(data: bytes, compression: str) -> bytes:
-    """Return the content of a chunk, as far as it goes."""
-    decoders = {'zstd': zstd_decoder, 'lz4': lz4_decoder}
-    return decoded(decoders[compression], data) if compression else data

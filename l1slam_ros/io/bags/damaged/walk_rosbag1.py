@@ -6,9 +6,8 @@ A record is a header (fields `name=value`) and data, each with its length before
 a chunk are such records again. Messages are turned into CDR, as ROS 2 serialises them.
 """
 
-import bz2
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -17,9 +16,8 @@ from l1slam_ros.io.bags.damaged.walk import (
     BrokenRecordError,
     RawMessage,
     broken_at,
-    decoded,
-    lz4_decoder,
     ros1_types,
+    uncompressed,
 )
 
 _MAGIC = b'#ROSBAG V2.0\n'
@@ -106,7 +104,7 @@ class _Connections:
 
     def chunk(self, header: dict[str, bytes], data: bytes) -> Iterator[RawMessage]:
         """Yield the messages of a chunk, in part where it is damaged."""
-        rows = _uncompressed(data, header['compression'].decode())
+        rows = uncompressed(data, header['compression'].decode())
         stream = BytesIO(rows)
         for _, inner, content in _records(stream, len(rows)):
             yield from self.record(inner, content)
@@ -124,9 +122,3 @@ class _Connections:
             self._types = ros1_types(self._fields)
             self._definitions[msgtype] = text
         return msgtype
-
-
-def _uncompressed(data: bytes, compression: str) -> bytes:
-    """Return the content of a chunk, as far as it goes."""
-    decoders: dict[str, Callable[[], Any]] = {'bz2': bz2.BZ2Decompressor, 'lz4': lz4_decoder}
-    return data if compression == 'none' else decoded(decoders[compression], data)
