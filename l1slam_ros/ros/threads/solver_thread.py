@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 from l1slam_ros.core.errors import Interrupted
-from l1slam_ros.core.online.backend import Improvement
-from l1slam_ros.core.online.shared_backend import SharedBackend
+from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.compilation import fill_cache
 from l1slam_ros.ros.threads.failures import Failures
 
@@ -32,7 +32,7 @@ class SolverThread:
 
     """
 
-    def __init__(self, backend: SharedBackend, failures: Failures, logger: Any,
+    def __init__(self, backend: Backend, failures: Failures, logger: Any,
                  budget: Callable[[], float], tell: Callable[[Improvement | None], None]):
         self._backend, self._failures, self._logger = backend, failures, logger
         self._budget, self._tell = budget, tell

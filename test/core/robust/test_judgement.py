@@ -159,9 +159,9 @@ def test_every_look_gets_on_however_short_the_time(bad):
 @pytest.mark.parametrize('trusted', [True, False])
 def test_others_may_lean_on_what_is_trusted(trusted):
     """Two loops that agree, eight sigmas off the odometry: believed if one is vouched for."""
-    backend, truth = Backend(se2, EVERY), roundabout(160)
+    backend, truth = Backend(EVERY), roundabout(160)
     drive_roundabout(backend, truth)
-    graph, poses = backend.builder.graph, backend.poses
+    graph, poses = backend.snapshot().graph, backend.poses
     off = se2.between(truth[10:11], truth[100:101]) + np.array([[20.0, 0.0, 0.0]])
     for vouched in (trusted, False):
         graph.add_between(np.array([10]), np.array([100]), off,
