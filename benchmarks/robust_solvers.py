@@ -16,7 +16,7 @@ from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
-from l1slam_ros.core.robust.batch import INCONSISTENT
+from l1slam_ros.core.robust.judgement import INCONSISTENT
 from l1slam_ros.core.robust.robust_map import minimise_robustly
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
@@ -96,11 +96,11 @@ def _robust(
     def solve(graph: FactorGraph, poses: Array) -> Found:
         began = clock()
         found = minimise_robustly(graph, minimise)
-        if found.doubt and found.doubt.kind == INCONSISTENT:
+        if found.judgement.doubt and found.judgement.doubt.kind == INCONSISTENT:
             return Found(odometry_poses(graph), clock() - began, graph.between.is_odometry.copy(),
                          refused=True)
-        return Found(found.solution.poses, clock() - began, found.accepted,
-                     tuple(found.slips.tolist()))
+        return Found(found.solution.poses, clock() - began, found.judgement.accepted,
+                     tuple(found.judgement.slips.tolist()))
 
     return solve
 

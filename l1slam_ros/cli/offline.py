@@ -14,6 +14,7 @@ from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import Report as OnRound
 from l1slam_ros.core.robust.inspection import odometry_gaps
+from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.robust.robust_map import RobustMap, minimise_robustly
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import (
@@ -63,7 +64,7 @@ class Outcome:
     initial_cost: float
     seed_cost: float | None
     seconds: float
-    judgement: RobustMap | None
+    judgement: Judgement | None
     unjudged: str
     parts: int
 
@@ -88,10 +89,10 @@ def solve(
     initial = odometry_poses(graph) if wish.start == 'odometry' else stored_poses(record)
     minimiser = _Minimiser(wish, report)
     began = time.perf_counter()
-    judgement, unjudged = _judgement(record, wish, minimiser, on_round)
-    if judgement:
-        solution, seed = judgement.solution, judgement.seed
-        graph = graph.subset(judgement.accepted)
+    robust, unjudged = _robust_map(record, wish, minimiser, on_round)
+    if robust:
+        solution, seed = robust.solution, robust.seed
+        graph = graph.subset(robust.judgement.accepted)
     else:
         choice = minimiser.choose(graph)
         seed = seed_poses(graph, choice.cholesky) if wish.start == 'seed' else None
@@ -102,11 +103,12 @@ def solve(
     if not np.isfinite([cost(initial), seed_cost or 0.0, solution.cost]).all():
         raise GraphError('the cost leaves double precision: measurements and information of the '
                          'graph are too large, or too different from each other')
+    judgement = robust.judgement if robust else None
     return Outcome(solution, minimiser.solver, minimiser.reason, cost(initial), seed_cost, seconds,
                    judgement, unjudged, int(component_labels(graph).max()) + 1)
 
 
-def _judgement(
+def _robust_map(
     record: GraphRecord, wish: Wish, minimiser: '_Minimiser', on_round: OnRound
 ) -> tuple[RobustMap | None, str]:
     """Return the robust map; where nobody insists on one and there is none, None and why."""

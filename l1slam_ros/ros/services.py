@@ -63,9 +63,10 @@ class MapServices:
         improvement = self._backend.settle(self._stopped)
         if improvement is None:
             return 'there are no factors yet'
-        if improvement.doubt:
+        doubt = improvement.judgement.doubt
+        if doubt:
             stamps = self._backend.snapshot().stamps
-            raise DoubtfulError(doubt_sentence(improvement.doubt, np.arange(len(stamps)), stamps))
+            raise DoubtfulError(doubt_sentence(doubt, np.arange(len(stamps)), stamps))
         return (f'L1 cost {improvement.cost_before:.6g} -> {improvement.cost:.6g}, '
                 f'{improvement.status.value}, {improvement.seconds:.2f} s')
 

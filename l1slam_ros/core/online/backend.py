@@ -32,7 +32,7 @@ from l1slam_ros.core.online.loop_states import LoopStates
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
 from l1slam_ros.core.online.update import Improvement, improve, optimise
 from l1slam_ros.core.options import Options, option
-from l1slam_ros.core.robust.judgement import Belief
+from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import Status
 
@@ -192,7 +192,7 @@ class Backend:
         with self._lock:
             self._changes += 1
             if options.robust != self._options.robust:
-                self._optimised = replace(self._optimised, belief=Belief.nothing(),
+                self._optimised = replace(self._optimised, judgement=Judgement.nothing(),
                                           status=Status.OUT_OF_TIME)
             self._options = self._builder.options = options
         self._wake()

@@ -21,7 +21,7 @@ from l1slam_ros.core.online.loop_states import (
     WAITING,
     LoopStates,
 )
-from l1slam_ros.core.robust.judgement import Belief
+from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.optimality import Status
 
 # A large map gets but one linearisation into an update, and never meets a test that takes two of
@@ -35,7 +35,7 @@ class Problem:
     A snapshot to improve: graph, poses (n, p), dual (rows,) and the cost the last update left.
 
     map : number of the map that it is of, other after `Backend.reset` and `Backend.restore`;
-    belief : of all factors; robust : loops may be doubted; settled : nothing has come since an
+    judgement : of all factors; robust : loops may be doubted; settled : nothing has come since an
     update that converged.
     """
 
@@ -43,7 +43,7 @@ class Problem:
     graph: FactorGraph
     poses: Array
     dual: Array
-    belief: Belief
+    judgement: Judgement
     robust: bool
     last_cost: float
     settled: bool
@@ -54,13 +54,13 @@ class Optimised:
     """
     What updates have made so far, of the first keyframes and factors.
 
-    poses : (k, p); dual : (rows,); belief, cost and status : as the last update left them;
+    poses : (k, p); dual : (rows,); judgement, cost and status : as the last update left them;
     quiet_updates : how many in a row hardly lowered the cost.
     """
 
     poses: Array
     dual: Array
-    belief: Belief
+    judgement: Judgement
     cost: float
     status: Status
     quiet_updates: int
@@ -68,7 +68,7 @@ class Optimised:
     @staticmethod
     def nothing(poses: Array) -> 'Optimised':
         """Return what stands before the first update: poses at most."""
-        return Optimised(poses, np.zeros(0), Belief.nothing(), 0.0, Status.OUT_OF_TIME, 0)
+        return Optimised(poses, np.zeros(0), Judgement.nothing(), 0.0, Status.OUT_OF_TIME, 0)
 
     @property
     def at_rest(self) -> bool:
@@ -115,21 +115,21 @@ class Snapshot:
         last, rows = self.optimised, len(self.graph.between) * self.graph.manifold.TANGENT_SIZE
         # Rows are only ever appended, so the dual of the old ones stays; new ones start at zero.
         dual = np.concatenate((last.dual, np.zeros(rows - len(last.dual))))
-        belief = last.belief.extended(self.graph, self.robust)
+        judgement = last.judgement.extended(self.graph, self.robust)
         grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
-        settled = not grown and belief.settled and last.at_rest
-        return Problem(self.map, self.graph, self.poses, dual, belief, self.robust, last.cost,
+        settled = not grown and judgement.settled and last.at_rest
+        return Problem(self.map, self.graph, self.poses, dual, judgement, self.robust, last.cost,
                        settled)
 
     def loop_states(self) -> LoopStates:
         """Return what has become of each loop, those of the graph first, in its order."""
         in_graph, waiting, expired = self.loop_stamps
-        belief = self.optimised.belief.extended(self.graph, self.robust)
+        judgement = self.optimised.judgement.extended(self.graph, self.robust)
         rows = self.loop_rows
-        state = np.where(belief.accepted[rows], ACCEPTED,
-                         np.where(belief.suspect[rows], SUSPECT, REJECTED))
+        state = np.where(judgement.accepted[rows], ACCEPTED,
+                         np.where(judgement.suspect[rows], SUSPECT, REJECTED))
         others = np.repeat([WAITING, EXPIRED], [len(waiting), len(expired)])
-        sigmas = np.concatenate((belief.sigmas[rows], np.full(len(others), np.nan)))
+        sigmas = np.concatenate((judgement.sigmas[rows], np.full(len(others), np.nan)))
         return LoopStates(rows, np.concatenate((in_graph, waiting, expired)),
                           np.concatenate((state, others)), sigmas)
 

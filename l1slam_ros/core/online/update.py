@@ -8,7 +8,7 @@ may have to stop the work hands in a check.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.online.snapshot import Optimised, Problem
-from l1slam_ros.core.robust.batch import Doubt
-from l1slam_ros.core.robust.judgement import Belief, judge
+from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.robust.robust_map import minimise_robustly
+from l1slam_ros.core.robust.running import judge
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.nonlinear import (
     OptimiserOptions,
@@ -39,18 +39,17 @@ Check = Callable[[], None]
 @dataclass(frozen=True)
 class Improvement:
     """
-    What one update did: new poses (n, p), dual (rows,) and belief, and the account of it.
+    What one update did: new poses (n, p), dual (rows,) and judgement, and the account of it.
 
     map, robust : of the `Problem`; cost_before, cost : L1 cost of the accepted factors;
     reweighted_steps : factorisations for the long-range part; outer, inner : iterations of
-    Algorithm 4; gap : of its last linear problem; seconds : all of it; doubt : why the map is not
-    to be relied on, if so.
+    Algorithm 4; gap : of its last linear problem; seconds : all of it.
     """
 
     map: int
     poses: Array
     dual: Array
-    belief: Belief
+    judgement: Judgement
     robust: bool
     cost_before: float
     cost: float
@@ -60,7 +59,6 @@ class Improvement:
     inner_iterations: int
     gap: float
     seconds: float
-    doubt: Doubt | None = None
 
     def taken_over(self, before: Optimised, tolerance: float) -> Optimised:
         """
@@ -74,9 +72,9 @@ class Improvement:
         for name in ('poses', 'dual', 'cost'):
             if not np.isfinite(getattr(self, name)).all():
                 raise ArithmeticError(f'the {name} of a new map is not finite; the map stays')
-        quiet = (self.belief.settled and len(self.dual) == len(before.dual)
+        quiet = (self.judgement.settled and len(self.dual) == len(before.dual)
                  and self.cost_before - self.cost <= tolerance * self.cost)
-        return Optimised(self.poses, self.dual, self.belief, self.cost, self.status,
+        return Optimised(self.poses, self.dual, self.judgement, self.cost, self.status,
                          before.quiet_updates + 1 if quiet else 0)
 
 
@@ -92,15 +90,15 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
     """
     start = time.monotonic()
     deadline = start + budget
-    belief, starts = problem.belief, [problem.poses]
-    if not belief.settled:
-        belief, judged = judge(problem.graph, problem.poses, belief, deadline, check)
+    judgement, starts = problem.judgement, [problem.poses]
+    if not judgement.settled:
+        judgement, judged = judge(problem.graph, problem.poses, judgement, deadline, check)
         # After a loop has closed, the L2 map of the judgement is nearer.
         starts.append(judged)
     check()
-    graph = problem.graph.subset(belief.accepted)
+    graph = problem.graph.subset(judgement.accepted)
     size = graph.manifold.TANGENT_SIZE
-    dual = problem.dual.reshape(-1, size)[belief.accepted].ravel()
+    dual = problem.dual.reshape(-1, size)[judgement.accepted].ravel()
     costs = [l1_cost(whitened_residual(graph, poses)) for poses in starts]
     before, cost = costs[0], min(costs)
     poses = starts[costs.index(cost)]
@@ -115,7 +113,7 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
         steps += 1
         far = is_far(previous, cost)
     solution = minimise(graph, poses, options, cholesky, dual, deadline, lambda *_: check())
-    return _improvement(solution, problem, belief, before, steps, start)
+    return _improvement(solution, problem, judgement, before, steps, start)
 
 
 def optimise(problem: Problem, options: OptimiserOptions,
@@ -126,19 +124,18 @@ def optimise(problem: Problem, options: OptimiserOptions,
     Else from its own poses and from the seed, whichever ends lower.
     """
     start = time.monotonic()
-    graph, belief, doubt = problem.graph, problem.belief, None
+    graph, judgement = problem.graph, problem.judgement
     if problem.robust:
         found = minimise_robustly(
             graph, lambda part, poses: _solved(part, poses, options, check), check=check)
-        solution, doubt, belief = found.solution, found.doubt, Belief(
-            found.accepted, found.suspect, found.sigmas, found.variance)
+        solution, judgement = found.solution, found.judgement
     else:
         starts = (problem.poses, seed_poses(graph, choose(AUTO, graph).cholesky, check=check))
         solution = min((_solved(graph, poses, options, check) for poses in starts),
                        key=lambda s: s.cost)
-    part = graph.subset(belief.accepted)
+    part = graph.subset(judgement.accepted)
     before = l1_cost(whitened_residual(part, problem.poses))
-    return replace(_improvement(solution, problem, belief, before, 0, start), doubt=doubt)
+    return _improvement(solution, problem, judgement, before, 0, start)
 
 
 def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
@@ -147,12 +144,12 @@ def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
     return minimise_by(choose(AUTO, graph), graph, poses, options, lambda *_: check())[0]
 
 
-def _improvement(solution: Solution, problem: Problem, belief: Belief, before: float, steps: int,
-                 start: float) -> Improvement:
-    size = problem.graph.manifold.TANGENT_SIZE
+def _improvement(solution: Solution, problem: Problem, judgement: Judgement, before: float,
+                 steps: int, start: float) -> Improvement:
+    accepted = judgement.accepted
     # The rows of what is not believed have no dual yet.
-    dual = np.zeros((len(belief.accepted), size))
-    dual[belief.accepted] = solution.dual.reshape(-1, dual.shape[1])
-    return Improvement(problem.map, solution.poses, dual.ravel(), belief, problem.robust, before,
-                       solution.cost, solution.status, steps, solution.outer_iterations,
+    dual = np.zeros((len(accepted), problem.graph.manifold.TANGENT_SIZE))
+    dual[accepted] = solution.dual.reshape(-1, dual.shape[1])
+    return Improvement(problem.map, solution.poses, dual.ravel(), judgement, problem.robust,
+                       before, solution.cost, solution.status, steps, solution.outer_iterations,
                        solution.inner_iterations, solution.gap, time.monotonic() - start)

@@ -103,7 +103,7 @@ class SolverThread:
         self._behind_since = self._behind_since or time.monotonic()
         improvement = self._backend.update(
             self._budget(), lambda: self._paused or self._closing)
-        if improvement is None or improvement.belief.settled:
+        if improvement is None or improvement.judgement.settled:
             self._behind_since = 0.0
         return improvement
 

@@ -204,7 +204,7 @@ def test_small_budgets_judge_to_the_end(world):
     for _ in range(20):
         backend.update(0.0)
     assert (backend.loop_states().state == ACCEPTED).all()
-    assert backend.snapshot().problem().belief.settled
+    assert backend.snapshot().problem().judgement.settled
 
 
 # What is seen from outside
@@ -358,9 +358,9 @@ def test_no_lie_is_believed_at_any_time(careful, clean_errors, kind):
     lies, truths = states_by_truth(backend, world)
     assert len(lies) == 130 and (lies == REJECTED).mean() > 0.95
     assert np.count_nonzero(truths != ACCEPTED) <= 0.01 * len(truths)
-    online = backend.snapshot().problem().belief.accepted
+    online = backend.snapshot().problem().judgement.accepted
     backend.settle()
-    whole = backend.snapshot().problem().belief.accepted
+    whole = backend.snapshot().problem().judgement.accepted
     assert np.count_nonzero(whole != online) <= 0.01 * len(truths)
 
 
@@ -437,7 +437,7 @@ def test_the_dual_of_each_factor_is_at_its_own_rows(careful):
     backend, world = Backend(EVERY), spoilt(careful, 'random', 130)
     play(backend, world, 0, 150)
     improvement = backend.update(PLENTY)
-    graph, accepted = backend.snapshot().problem().graph, improvement.belief.accepted
+    graph, accepted = backend.snapshot().problem().graph, improvement.judgement.accepted
     assert 20 < np.count_nonzero(~accepted) == np.count_nonzero(is_false(world, graph.between))
     dual = improvement.dual.reshape(-1, 3)
     residual = whitened_residual(graph, backend.poses).reshape(-1, 3)
@@ -589,12 +589,12 @@ def test_what_was_judged_by_other_options_is_not_adopted(careful):
     backend, world = Backend(EVERY), spoilt(careful, 'random', 130)
     play(backend, world, 0, 150)
     doubting = improve(backend.snapshot().problem(), EVERY.solver, PLENTY)
-    assert not doubting.belief.accepted.all()
+    assert not doubting.judgement.accepted.all()
     backend.set_options(CREDULOUS)
     before = backend.poses
     backend.adopt(doubting)
     assert_array_equal(backend.poses, before)
-    assert backend.snapshot().problem().belief.accepted.all()
+    assert backend.snapshot().problem().judgement.accepted.all()
 
 
 @pytest.mark.parametrize('name', ['poses', 'dual', 'cost'])
@@ -620,7 +620,7 @@ def test_work_can_be_stopped_at_many_moments(careful, work):
     backend = Backend(CREDULOUS if work == 'optimise all' else EVERY)
     play(backend, world)
     problem = backend.snapshot().problem()
-    kept = problem.poses.copy(), problem.belief.accepted.copy()
+    kept = problem.poses.copy(), problem.judgement.accepted.copy()
     limit, count = 10**9, 0
 
     def check():
@@ -644,7 +644,7 @@ def test_work_can_be_stopped_at_many_moments(careful, work):
             run()
         assert count == limit + 1, 'it went on after it was stopped'
     assert_array_equal(problem.poses, kept[0])
-    assert_array_equal(problem.belief.accepted, kept[1])
+    assert_array_equal(problem.judgement.accepted, kept[1])
 
 
 def test_a_large_map_comes_to_rest_though_no_update_ends_by_its_tests(world):

@@ -81,7 +81,7 @@ def test_nobody_sees_new_poses_with_an_old_judgement(monkeypatch):
 
     class Slow(Improvement):
         def __getattribute__(self, name):
-            if name == 'belief':
+            if name == 'judgement':
                 meeting()  # it is being taken over
             return super().__getattribute__(name)
 
