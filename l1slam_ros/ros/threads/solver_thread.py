@@ -78,8 +78,12 @@ class SolverThread:
 
     def _work(self) -> None:
         self._compile()
-        while self._woken.wait() and not self._closing:
+        while True:
+            self._woken.wait()
+            # In this order, or the call to close is lost.
             self._woken.clear()
+            if self._closing:
+                return
             if time.monotonic() < self._not_before:
                 continue
             try:
