@@ -19,9 +19,10 @@ import numpy as np
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.online.backend import Backend, BackendOptions, optimise
+from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.update import optimise
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file
 from l1slam_ros.io.trajectory import invented_stamps
 
@@ -52,7 +53,7 @@ def run(record: GraphRecord, every: int, budget: float) -> tuple[list[float], li
     """Return seconds of each update, and the excess [%] at each checkpoint."""
     growth = GraphBuilderOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
     options = BackendOptions(growth.keyframe, growth.odometry, growth.loop)
-    backend = Backend(se2, options)
+    backend = Backend(options)
     seconds: list[float] = []
     excess: list[float] = []
     checkpoint = max(record.graph.n_poses // CHECKPOINTS // every, 1) * every
@@ -66,7 +67,8 @@ def run(record: GraphRecord, every: int, budget: float) -> tuple[list[float], li
         improvement = backend.update(budget)
         seconds.append(time.perf_counter() - began)
         if k % checkpoint == 0 and improvement is not None and improvement.cost > 0:
-            best = min(optimise(backend.problem(), options.solver).cost, improvement.cost)
+            problem = backend.snapshot().problem()
+            best = min(optimise(problem, options.solver).cost, improvement.cost)
             excess.append(100 * (improvement.cost / best - 1))
     return seconds, excess
 

@@ -27,7 +27,7 @@ def undecidable(case: FalseCase) -> float:
     rng, factors = np.random.default_rng(case.seed), case.clean.between
     is_loop, rows = ~factors.is_odometry, np.arange(len(factors))
     # The loops are as noisy as they are in the public graph.
-    loops = robust_solve(case.place.graph).variance[1]
+    loops = robust_solve(case.place.graph)[0].variance[1]
     graph = case.clean.subset(rows, np.where(is_loop, loops, NOISIER[case.kind] ** 2))
     cholesky = cholesky_of(graph)
     poses = minimise_l2(graph, case.place.best, LeastSquaresOptions(), cholesky).poses

@@ -8,7 +8,6 @@ import incremental
 import numpy as np
 from measuring import clock
 
-from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -17,7 +16,7 @@ from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
-from l1slam_ros.core.robust.batch import INCONSISTENT
+from l1slam_ros.core.robust.judgement import INCONSISTENT
 from l1slam_ros.core.robust.robust_map import minimise_robustly
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
@@ -97,11 +96,11 @@ def _robust(
     def solve(graph: FactorGraph, poses: Array) -> Found:
         began = clock()
         found = minimise_robustly(graph, minimise)
-        if found.doubt and found.doubt.kind == INCONSISTENT:
+        if found.judgement.doubt and found.judgement.doubt.kind == INCONSISTENT:
             return Found(odometry_poses(graph), clock() - began, graph.between.is_odometry.copy(),
                          refused=True)
-        return Found(found.solution.poses, clock() - began, found.accepted,
-                     tuple(found.slips.tolist()))
+        return Found(found.solution.poses, clock() - began, found.judgement.accepted,
+                     tuple(found.judgement.slips.tolist()))
 
     return solve
 
@@ -113,7 +112,7 @@ OURS = (RobustSolver('ours, L1', True, 'odometry', _robust(_l1)),
 def _drive(graph: FactorGraph, every: int) -> Driven:
     """Feed the back end as the node does, robust as it is by default."""
     growth = GraphBuilderOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
-    backend = Backend(se2, BackendOptions(growth.keyframe, growth.odometry, growth.loop))
+    backend = Backend(BackendOptions(growth.keyframe, growth.odometry, growth.loop))
     record = GraphRecord(graph, None, np.arange(graph.n_poses))
     maps, seconds = [], 0.0
     for k, (sample, loops) in enumerate(incremental.measurements(record), 1):
@@ -137,7 +136,7 @@ def _updated(backend: Backend, budget: float) -> float:
 
 def _accepted(backend: Backend, graph: FactorGraph) -> Mask:
     """Return which factors of the graph, whose rows have another order, the back end uses."""
-    states, grown = backend.loop_states(), backend.builder.graph
+    states, grown = backend.loop_states(), backend.snapshot().graph
     is_accepted = states.state[: len(states.rows)] == ACCEPTED
     accepted = graph.between.is_odometry.copy()
     accepted[_by_pair(graph, np.flatnonzero(~accepted))] = is_accepted[

@@ -15,11 +15,11 @@ from l1slam_ros.io.plot import Curve, MapDrawing
 
 if TYPE_CHECKING:
     from l1slam_ros.core.robust.batch_map import Outcome
-    from l1slam_ros.core.robust.robust_map import RobustMap
+    from l1slam_ros.core.robust.judgement import Judgement
 
 
 def drawing(path: Path, record: GraphRecord, poses: Array, truth: Array | None,
-            name: str, note: str = '', judgement: 'RobustMap | None' = None) -> MapDrawing:
+            name: str, note: str = '', judgement: 'Judgement | None' = None) -> MapDrawing:
     """
     Return the map of poses (n, p), with its odometry, and the path of the truth (l, k) if known.
 

@@ -6,13 +6,14 @@ They become ROS parameters and lines of a YAML file, so a field is a bool, int, 
 another `Options`. A default is written once, at its field.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
 from l1slam_ros.core.errors import OptionError
 
 Scalar = bool | int | float | str
+AnyOptions = TypeVar('AnyOptions', bound='Options')
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,35 @@ class Options:
             if not meaning.allows(value):
                 raise OptionError(f'{f.name} is {value!r}, expected {meaning.expected()}')
 
+    @classmethod
+    def from_mapping(cls: 'type[AnyOptions]', values: Mapping[str, Any]) -> 'AnyOptions':
+        """
+        Return the options with the values that a mapping sets, the defaults for the rest.
 
-AnyOptions = TypeVar('AnyOptions', bound=Options)
+        values : by name; those of nested options in a mapping of their own, or by dotted names
+
+        Raises
+        ------
+        OptionError : no mapping, an unknown name, one set twice, or a value that is refused.
+
+        """
+        if not isinstance(values, Mapping):
+            raise OptionError(f'options are {values!r}, expected a mapping of names to values')
+        flat: dict[str, Scalar] = {}
+        for name, value in dotted(values):
+            if name in flat:
+                raise OptionError(f'{name} is set twice, to {flat[name]!r} and to {value!r}')
+            flat[name] = value
+        return with_values(cls(), flat)
+
+
+def dotted(values: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+    """Yield dotted name and value of everything in nested mappings."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from dotted(value, f'{prefix}{name}.')
+        else:
+            yield f'{prefix}{name}', value
 
 
 def flatten(options: Options, prefix: str = '') -> dict[str, tuple[Scalar, Meaning]]:

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the node can be told, and the YAML file that tells it; without ROS, for `l1slam` too."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.online.backend import BackendOptions
-from l1slam_ros.core.options import Options, Scalar, option, with_values
+from l1slam_ros.core.options import Options, Scalar, dotted, option, with_values
 
 
 @dataclass(frozen=True)
@@ -55,18 +54,10 @@ def read_params_file(path: Path) -> NodeOptions:
     values: dict[str, Scalar] = {}
     for node in content.values() if isinstance(content, Mapping) else ():
         if isinstance(node, Mapping) and isinstance(node.get('ros__parameters'), Mapping):
-            values.update(_flat(node['ros__parameters']))
+            values.update(dotted(node['ros__parameters']))
     if not values:
         raise FileError(path, 'sets no parameters; expected `/**: {ros__parameters: {...}}`')
     try:
         return with_values(NodeOptions(), values)
     except OptionError as error:
         raise FileError(path, str(error)) from error
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f'{prefix}{name}.')
-        else:
-            yield prefix + str(name), value

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Indices
-from l1slam_ros.core.robust.batch import INCONSISTENT, Doubt
-from l1slam_ros.core.robust.robust_map import RobustMap
+from l1slam_ros.core.robust.judgement import INCONSISTENT, Doubt, Judgement
 from l1slam_ros.io.files import stamp_text
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.wording import counted
@@ -22,7 +21,7 @@ _NAMED = 20
 _SLIP = 'odometry {pair} lies: {sigmas:.1f} sigmas off what the loops say; left out'
 # Sigmas so many times the stated ones are worth a word; less is what people are wrong by.
 _NOISY = 2.0
-# Of odometry and of loops, as `RobustMap.variance` has them.
+# Of odometry and of loops, as `Judgement.variance` has them.
 _NOISE = (
     'the odometry is about {times:.1f} times as noisy as it says: loops far apart in time are '
     'judged by little',
@@ -31,7 +30,7 @@ _NOISE = (
 )
 
 
-def verdict(record: GraphRecord, judgement: RobustMap) -> Iterator[str]:
+def verdict(record: GraphRecord, judgement: Judgement) -> Iterator[str]:
     """Yield what was refused and why, the worst first; then what is noisier than it says."""
     factors, accepted = record.graph.between, judgement.accepted
     is_loop = ~factors.is_odometry

@@ -201,7 +201,7 @@ def _maps(graph: FactorGraph, stored: Array) -> tuple[dict[str, Array], Mask]:
         graph, stored, LeastSquaresOptions(huber_delta=width), cholesky).poses
         for width in HUBER_WIDTHS}
     return {SEED: seed, JOINT: _minimise_l1(graph, seed).poses, **hubers,
-            ROBUST: robust.solution.poses}, robust.accepted
+            ROBUST: robust.solution.poses}, robust.judgement.accepted
 
 
 def _loops(graph: FactorGraph) -> Indices:

@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.online.backend import Improvement
+from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.solver_thread import SolverThread
 from l1slam_ros.ros.traffic import Traffic

@@ -4,7 +4,7 @@
 
 Callbacks convert a message and append it to the back end; none of it is compiled code. A timer
 wakes the solver's thread, which improves the map and publishes it; another thread carries out what
-services ask for. See `core.online.shared_backend` for why none waits for the other.
+services ask for. See `core.online.backend` for why none waits for the other.
 """
 
 import time
@@ -23,10 +23,9 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core.errors import L1SlamError, MessageError
-from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import OdometrySample
-from l1slam_ros.core.online.backend import Improvement
-from l1slam_ros.core.online.shared_backend import SharedBackend
+from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.messages import cdr
 from l1slam_ros.io.messages.base_frame import BaseFrame
 from l1slam_ros.io.messages.conversion import loop_closure, odometry_sample
@@ -55,7 +54,7 @@ _REPEAT_WARNING = 5.0  # [s]
 
 class BackendNode(Node):
     """
-    The ROS face of `shared_backend.SharedBackend`.
+    The ROS face of `core.online.backend.Backend`.
 
     Parameters
     ----------
@@ -75,8 +74,8 @@ class BackendNode(Node):
         super().__init__('backend', **keywords)
         self._declared = NodeParameters(self, NodeOptions(), self._on_options)
         options = self.options
-        self._manifold = se2
-        self._backend = SharedBackend(self._manifold, options)
+        self._backend = Backend(options)
+        self._manifold = self._backend.manifold
         self._base_frame = BaseFrame(options.base_frame)
         self._refused: Counter[str] = Counter()
         self._last_stamp = 0
@@ -240,21 +239,22 @@ class BackendNode(Node):
         self._told_version = version
 
     def _publish_map(self) -> None:
-        state = self._backend.state()
-        if not np.isfinite(state.poses).all() or not np.isfinite(state.map_to_odom).all():
+        now = self._backend.snapshot()
+        poses, loops = now.poses, now.loop_states()
+        if not np.isfinite(poses).all() or not np.isfinite(now.map_to_odom).all():
             raise ArithmeticError('a pose of the map is not finite: it is not published')
         self._diagnosis.note_jump(
             self._manifold, self._manifold.compose(self._told_transform, self._last_pose),
-            self._manifold.compose(state.map_to_odom, self._last_pose))
-        self._map_to_odom = self._told_transform = state.map_to_odom
+            self._manifold.compose(now.map_to_odom, self._last_pose))
+        self._map_to_odom = self._told_transform = now.map_to_odom
         frame, stamp = self.options.map_frame, self._last_stamp
-        pose3 = self._manifold.to_pose3(state.poses)
-        self._path.publish(path_bytes(frame, stamp, state.stamps, pose3))
+        pose3 = self._manifold.to_pose3(poses)
+        self._path.publish(path_bytes(frame, stamp, now.stamps, pose3))
         self._publish_transform()
-        self._loop_status.publish(state.loops)
+        self._loop_status.publish(loops)
         # Markers are slow to make: not unless somebody looks.
         if self._graph.get_subscription_count():
-            self._graph.publish(graph_markers(frame, stamp, pose3, state.factors, state.loops))
+            self._graph.publish(graph_markers(frame, stamp, pose3, now.graph.between, loops))
 
     def _publish_transform(self) -> None:
         options = self.options

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.core.errors import DoubtfulError, OptionError
-from l1slam_ros.core.online.shared_backend import SharedBackend, Stopped
+from l1slam_ros.core.online.backend import Backend, Stopped
 from l1slam_ros.io.graphs.saved_map import load_map, save_map
 from l1slam_ros.io.sentences import doubt_sentence
 from l1slam_ros.ros.threads.orders import Orders
@@ -31,7 +31,7 @@ class MapServices:
 
     """
 
-    def __init__(self, node: Node, backend: SharedBackend, orders: Orders,
+    def __init__(self, node: Node, backend: Backend, orders: Orders,
                  save_path: Callable[[], str], pause: Callable[[bool], None], stopped: Stopped):
         self._backend, self._orders = backend, orders
         self._save_path, self._pause, self._stopped = save_path, pause, stopped
@@ -60,12 +60,13 @@ class MapServices:
         return response
 
     def _optimise(self) -> str:
-        improvement = self._backend.optimise(self._stopped)
+        improvement = self._backend.settle(self._stopped)
         if improvement is None:
             return 'there are no factors yet'
-        if improvement.doubt:
-            stamps = self._backend.state().stamps
-            raise DoubtfulError(doubt_sentence(improvement.doubt, np.arange(len(stamps)), stamps))
+        doubt = improvement.judgement.doubt
+        if doubt:
+            stamps = self._backend.snapshot().stamps
+            raise DoubtfulError(doubt_sentence(doubt, np.arange(len(stamps)), stamps))
         return (f'L1 cost {improvement.cost_before:.6g} -> {improvement.cost:.6g}, '
                 f'{improvement.status.value}, {improvement.seconds:.2f} s')
 

@@ -12,7 +12,7 @@ import yaml
 
 import l1slam_ros.core
 from l1slam_ros.core.errors import L1SlamError, OptionError
-from l1slam_ros.core.options import Options, flatten, option, with_values
+from l1slam_ros.core.options import Options, dotted, flatten, option, with_values
 from l1slam_ros.io.node_options import NodeOptions
 
 SHIPPED = Path(__file__).parents[2] / 'config' / 'backend.yaml'
@@ -111,6 +111,30 @@ def test_a_bad_name_or_value_is_named_in_full(values, said):
     assert str(caught.value) == said
 
 
+@pytest.mark.parametrize('values', [
+    {'name': 'other', 'rear': {'spokes': 12, 'radius': 1}},
+    {'name': 'other', 'rear.spokes': 12, 'rear': {'radius': 1}},
+    {'name': 'other', 'rear.spokes': 12, 'rear.radius': 1, 'front': {}}])
+def test_a_mapping_sets_values_by_nested_or_dotted_names(values):
+    assert Cart.from_mapping(values) == Cart('other', rear=Wheel(1.0, 12))
+    assert type(NodeOptions.from_mapping({})) is NodeOptions
+
+
+@pytest.mark.parametrize('values, said', [
+    ({'front': {'wings': 2}}, 'no option is called front.wings'),
+    ({'front': {'spokes': {'left': 4}}}, 'no option is called front.spokes.left'),
+    ({'front': 2}, 'no option is called front'),
+    ({7: 2}, 'no option is called 7'),
+    ({'rear': {'radius': [1]}}, 'rear.radius is [1], expected a value of type float'),
+    ({'rear': {'spokes': 3}, 'rear.spokes': 4}, 'rear.spokes is set twice, to 3 and to 4'),
+    (['lights'], "options are ['lights'], expected a mapping of names to values"),
+    (None, 'options are None, expected a mapping of names to values')])
+def test_a_mapping_of_nonsense_is_refused(values, said):
+    with pytest.raises(OptionError) as caught:
+        Cart.from_mapping(values)
+    assert str(caught.value) == said
+
+
 # Every option of the package
 
 
@@ -154,18 +178,10 @@ def test_every_option_refuses_nonsense(kind):
                 kind(**{f.name: value})
 
 
-def flat_yaml(tree, prefix=''):
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            yield from flat_yaml(value, f'{prefix}{name}.')
-        else:
-            yield prefix + name, value
-
-
 def test_the_shipped_file_equals_the_defaults():
     content = yaml.safe_load(SHIPPED.read_text())
     assert list(content) == ['/**'] and list(content['/**']) == ['ros__parameters']
-    pairs = list(flat_yaml(content['/**']['ros__parameters']))
+    pairs = list(dotted(content['/**']['ros__parameters']))
     shipped, defaults = dict(pairs), {name: value for name, (value, _) in
                                       flatten(NodeOptions()).items()}
     assert len(pairs) == len(shipped)

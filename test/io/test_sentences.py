@@ -9,12 +9,15 @@ import pytest
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.robust.batch import INCONSISTENT, MOSTLY_REFUSED, Doubt
-from l1slam_ros.core.robust.robust_map import RobustMap, minimise_robustly
+from l1slam_ros.core.robust.judgement import (
+    INCONSISTENT,
+    MOSTLY_REFUSED,
+    Doubt,
+    Judgement,
+)
+from l1slam_ros.core.robust.robust_map import minimise_robustly
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.solvers.nonlinear import Solution
-from l1slam_ros.core.solvers.optimality import Status
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.sentences import doubt_sentence, verdict
@@ -35,7 +38,7 @@ def record():
 
 def judgement(refused=(), suspect=(), slips=(), variance=(1.0, 1.0)):
     """Return a judgement; refused : sigmas of loops; suspect : loops; slips : steps."""
-    poses, m = np.zeros((N, 3)), N - 1 + LOOPS
+    m = N - 1 + LOOPS
     sigmas, doubtful = np.ones(m), np.zeros(m, bool)
     accepted = np.ones(m, bool)
     for loop, value in dict(refused).items():
@@ -44,9 +47,7 @@ def judgement(refused=(), suspect=(), slips=(), variance=(1.0, 1.0)):
         doubtful[N - 1 + loop], accepted[N - 1 + loop] = True, False
     for step in slips:
         sigmas[step], accepted[step] = 40.0 + step, False
-    solution = Solution(poses, 0.0, Status.CONVERGED, 0, 0, np.zeros(1), np.zeros(3 * m))
-    return RobustMap(solution, poses, accepted, doubtful, sigmas, np.array(slips, np.int64),
-                     np.array(variance), None)
+    return Judgement(accepted, doubtful, sigmas, np.array(variance), np.array(slips, np.int64))
 
 
 def test_nothing_refused_is_one_sentence(record):
@@ -143,6 +144,6 @@ def test_what_a_solve_finds_of_the_noise_is_told():
     graph.add_between(factors.i, factors.j, factors.measurement, information * boast)
     found = minimise_robustly(graph, lambda part, poses: minimise_l2(
         part, poses, LeastSquaresOptions(), cholesky_of(part)))
-    said = list(verdict(GraphRecord(graph, None, np.arange(200)), found))[-1]
+    said = list(verdict(GraphRecord(graph, None, np.arange(200)), found.judgement))[-1]
     times = re.fullmatch(re.escape(NOISY_ODOMETRY).replace(r'\{\}', r'(\d+\.\d)'), said)
     assert 3 < float(times[1]) < 6

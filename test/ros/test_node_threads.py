@@ -15,7 +15,7 @@ from node_bench import call, odometry, poses_of
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
-from l1slam_ros.core.online import shared_backend
+from l1slam_ros.core.online import backend as backend_module
 from l1slam_ros.ros.threads import solver_thread
 
 DEADLINE = 60.0
@@ -74,19 +74,18 @@ sys.modules['numba'] = None
 from pathlib import Path
 from problems import loop, odometry
 from l1slam_ros.ros import node
-from l1slam_ros.core.geometry import se2
 from l1slam_ros.io.node_options import NodeOptions
-from l1slam_ros.core.online.shared_backend import SharedBackend
+from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.io.graphs.saved_map import load_map, save_map
-backend = SharedBackend(se2, NodeOptions())
+backend = Backend(NodeOptions())
 for k in range(20):
     backend.add_odometry(odometry(k + 1.0, (k, 0.0, 0.0)))
 backend.add_loop(loop(1.0, 20.0, (19.0, 0.0, 0.0)))
-assert backend.state().loops.state.tolist() == [1] and backend.counts()[0]['keyframes'] == 20
+assert backend.loop_states().state.tolist() == [1] and backend.counts()[0]['keyframes'] == 20
 path = Path(sys.argv[1])
 assert save_map(path, backend.snapshot()) == 20
 backend.restore(*load_map(path))
-assert len(backend.state().poses) == 20
+assert len(backend.snapshot().poses) == 20
 """, str(tmp_path / 'map.g2o')], capture_output=True, text=True, timeout=DEADLINE,
                           cwd=Path(__file__).parents[1])
     assert done.returncode == 0, done.stderr
@@ -114,8 +113,8 @@ def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
     b = bench(save_path=str(tmp_path / 'map.g2o'))
     drive(b, 0, 3)
     b.until(lambda: len(b.path().poses) == 3, 'a map')
-    began, improve = threading.Event(), shared_backend.improve
-    monkeypatch.setattr(shared_backend, 'improve', lambda *a: began.set() or patient(*a))
+    began, improve = threading.Event(), backend_module.improve
+    monkeypatch.setattr(backend_module, 'improve', lambda *a: began.set() or patient(*a))
     drive(b, 3, 5)
     b.until(began.is_set, 'an update that takes for ever')
     assert call(b, 'save').message.startswith('5 keyframes')
@@ -127,7 +126,7 @@ def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
     b.until(lambda: len(b.path().poses) == 5, 'the map is back')
     assert call(b, 'pause', SetBool.Request(data=True)).success
     b.until(lambda: not b.backend._backend._solving.locked(), 'the update stops')
-    monkeypatch.setattr(shared_backend, 'improve', improve)
+    monkeypatch.setattr(backend_module, 'improve', improve)
     assert call(b, 'pause', SetBool.Request(data=False)).success
     drive(b, 5, 8)
     b.until(lambda: len(b.path().poses) == 7, 'updates go on')

@@ -1,48 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The incremental back end: samples and loops in, optimised poses out.
+The incremental back end: samples and loops in, optimised poses out, from as many threads as like.
 
-`Backend` owns the growing graph, the poses and the dual. An update is three calls, so that a
-caller with threads need hold its lock for two short moments only, `snapshot` and `adopt`:
+It owns the growing graph, the poses and the dual. An update is three steps:
 
     problem = backend.snapshot().problem()
     improvement = improve(problem, options, budget)     # the work; touches nothing of the backend
     backend.adopt(improvement)                          # poses and dual for the next warm start
+
+One lock is held to append, to take a snapshot and to adopt, never while solving, reading or
+writing a file. A second one lets one thread at a time solve.
+
+What is being solved for a map that is replaced meanwhile, or that `settle` is to solve in the
+place of an update, is told to stop, and never adopted.
 """
 
-import time
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from l1slam_ros.core.errors import Interrupted, OptionError
+from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.online.background import Background
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.loop_states import LoopStates
-from l1slam_ros.core.online.snapshot import Problem, Snapshot
+from l1slam_ros.core.online.snapshot import Optimised, Snapshot
+from l1slam_ros.core.online.update import Improvement, improve, optimise
 from l1slam_ros.core.options import Options, option
-from l1slam_ros.core.robust.batch import Doubt
-from l1slam_ros.core.robust.judgement import Belief, judge
-from l1slam_ros.core.robust.robust_map import minimise_robustly
-from l1slam_ros.core.solvers.block_cholesky import cholesky_of
-from l1slam_ros.core.solvers.nonlinear import (
-    OptimiserOptions,
-    Solution,
-    backtrack,
-    is_far,
-    minimise,
-)
-from l1slam_ros.core.solvers.optimality import Status, l1_cost, smoothing
-from l1slam_ros.core.solvers.reweighting import reweighted_step
-from l1slam_ros.core.solvers.seed import seed_poses
-from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
+from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
+from l1slam_ros.core.solvers.optimality import Status
 
-# A large map gets but one linearisation into an update, and never meets a test that takes two of
-# them. It is at rest when so many updates in a row lowered the cost by less than is looked for.
-_QUIET_UPDATES = 5
+# What poses live on, by the dimension of the world.
+_MANIFOLDS: dict[int, Manifold] = {2: se2}
+
+# Asked on the way, often: whether to stop.
+Stopped = Callable[[], bool]
 
 
 @dataclass(frozen=True)
@@ -62,78 +60,127 @@ class BackendOptions(GraphBuilderOptions):
     robust: RobustOptions = RobustOptions()
 
 
-@dataclass(frozen=True)
-class Improvement:
-    """
-    What one update did: new poses (n, p), dual (rows,) and belief, and the account of it.
-
-    cost_before, cost : L1 cost of the accepted factors; reweighted_steps : factorisations for
-    the long-range part; outer, inner : iterations of Algorithm 4; gap : of its last linear
-    problem; seconds : all of it; doubt : why the map is not to be relied on, if so.
-    """
-
-    poses: Array
-    dual: Array
-    belief: Belief
-    robust: bool
-    cost_before: float
-    cost: float
-    status: Status
-    reweighted_steps: int
-    outer_iterations: int
-    inner_iterations: int
-    gap: float
-    seconds: float
-    doubt: Doubt | None = None
-
-
 class Backend:
     """
     Keeps a map while it grows.
 
     Parameters
     ----------
-    manifold : what the poses live on
     options : see `BackendOptions`
+    dimension : of the world: 2
+    background : update in a thread of its own whenever there is something new, until `close` or
+        the end of the `with` block
+
+    Attributes
+    ----------
+    manifold : what the poses live on
+    maps : how many maps there were: one more with each that was adopted or took another's place
+
+    Raises
+    ------
+    OptionError : the dimension is not supported.
 
     """
 
-    def __init__(self, manifold: Manifold, options: BackendOptions):
-        self._manifold = manifold
+    def __init__(self, options: BackendOptions = BackendOptions(),  # noqa: B008
+                 dimension: int = 2, background: bool = False):
+        if dimension not in _MANIFOLDS:
+            raise OptionError(f'dimension {dimension!r} is not supported yet, expected 2')
+        self.manifold = _MANIFOLDS[dimension]
         self._options = options
-        self.builder = GraphBuilder(manifold, options)
-        self._poses = manifold.identity(0)
-        self._dual: Array = np.zeros(0)
-        self._belief = Belief.nothing()
-        self._last_cost = 0.0
-        self._status = Status.OUT_OF_TIME
-        self._changes = self._samples = self._quiet_updates = 0
-        self._map_to_odom: tuple[Array, Array] | None = None
+        self._lock, self._solving = threading.Lock(), threading.Lock()
+        self._make_way = False
+        self.maps = self._map = self._changes = self._samples = 0
+        # The version at which an update found nothing to do.
+        self._at_rest: object = None
+        self._counted: tuple[object, dict[str, int]] = (None, {})
+        self._background: Background | None = None
+        self.reset()
+        self.maps = 0
+        if background:
+            self._background = Background(lambda stopped: self.update(stopped=stopped))
+
+    def __enter__(self) -> 'Backend':
+        """Return the back end; the end of the block closes it."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """See `close`."""
+        self.close()
+
+    def close(self) -> None:
+        """End updates in the background; raise what one of them raised, if any did."""
+        if self._background is not None:
+            self._background.close()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._replace(GraphBuilder(self.manifold, self._options), self.manifold.identity(0))
+
+    def restore(self, graph: FactorGraph, poses: Array, stamps: Indices) -> None:
+        """Replace the map by one of an earlier run; see `GraphBuilder.restore`."""
+        builder = GraphBuilder(self.manifold, self._options)
+        builder.restore(graph, stamps, poses)
+        self._replace(builder, poses)
+
+    def _replace(self, builder: GraphBuilder, poses: Array) -> None:
+        """Begin a map with the graph of a builder; what is made for the one before is left."""
+        with self._lock:
+            self.maps += 1
+            self._map += 1
+            self._changes += 1
+            # Options may have changed since it was made.
+            builder.options = self._options
+            self._builder = builder
+            self._optimised = Optimised.nothing(poses)
+            self._map_to_odom: tuple[Array, Array] | None = None
+        self._wake()
 
     @property
     def version(self) -> tuple[int, int, int]:
         """Other than an earlier one where there may be something new to do or to tell."""
-        builder = self.builder
+        with self._lock:
+            return self._version()
+
+    def _version(self) -> tuple[int, int, int]:
+        builder = self._builder
         # While loops wait, any sample may be the one that they wait for, or one too many.
         return (self._changes, builder.graph.n_poses, self._samples if builder.n_waiting else 0)
 
     @property
     def poses(self) -> Array:
         """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
-        return self._now().poses
+        return self.snapshot().poses
 
-    @property
-    def map_to_odom(self) -> Array:
-        """The odometry frame seen from the map, (1, p): what the last optimised keyframe says."""
-        last, manifold, offset = len(self._poses) - 1, self._manifold, self.builder.offset
-        if last < 0:
-            return manifold.identity(1)
-        # Asked for with every sample: worked out when an update or a new offset changes it.
-        if self._map_to_odom is None or self._map_to_odom[0] is not offset:
-            odometry = self.builder.odometry[last : last + 1]
-            to_kept = manifold.compose(self._poses[last:], manifold.inverse(odometry))
-            self._map_to_odom = offset, manifold.compose(to_kept, offset)
-        return self._map_to_odom[1]
+    def loop_states(self) -> LoopStates:
+        """Return what has become of each loop, those of the graph first, in its order."""
+        return self.snapshot().loop_states()
+
+    def snapshot(self) -> Snapshot:
+        """Return the back end as it is now, the due loops in its graph, to be read at leisure."""
+        with self._lock:
+            return self._snapshot()
+
+    def _snapshot(self) -> Snapshot:
+        builder = self._builder
+        builder.add_due_loops()
+        return Snapshot(
+            self._map, self._version(), builder.graph.copy(), builder.stamps, builder.odometry,
+            self._map_to_odom_now(), builder.loop_rows, builder.loop_stamps, self._optimised,
+            self._options.robust.enabled)
+
+    def counts(self) -> tuple[dict[str, int], dict[str, int]]:
+        """Return the sizes of the graph, and how many loops were refused for which cause."""
+        with self._lock:
+            version, refused = self._version(), dict(self._builder.refused)
+        if self._counted[0] != version:
+            self._counted = version, self.snapshot().sizes()
+        return self._counted[1], refused
+
+    def news(self) -> list[str]:
+        """Return what is new in the notes on messages; see `GraphBuilder.notes`."""
+        with self._lock:
+            return self._builder.notes.news()
 
     def set_options(self, options: BackendOptions) -> None:
         """
@@ -142,189 +189,157 @@ class Backend:
         Where loops are to be doubted that were not before, or the other way round, all are judged
         anew.
         """
-        self._changes += 1
-        if options.robust != self._options.robust:
-            self._belief, self._status = Belief.nothing(), Status.OUT_OF_TIME
-        self._options = options
-        self.builder.options = options
+        with self._lock:
+            self._changes += 1
+            if options.robust != self._options.robust:
+                self._optimised = replace(self._optimised, judgement=Judgement.nothing(),
+                                          status=Status.OUT_OF_TIME)
+            self._options = self._builder.options = options
+        self._wake()
 
-    def restore(self, graph: FactorGraph, poses: Array, stamps: Indices) -> None:
-        """Begin with the map of an earlier run: see `GraphBuilder.restore`; call it first."""
-        self.builder.restore(graph, stamps, poses)
-        self._poses, self._map_to_odom = poses, None
-        self._changes += 1
+    def add_odometry(self, sample: OdometrySample) -> Array | None:
+        """
+        Add one sample; return the odometry frame seen from the map for it, (1, p).
 
-    def add_odometry(self, sample: OdometrySample) -> bool:
-        """Add one sample; see `GraphBuilder.add_odometry`."""
+        None: it is held, not used yet; see `GraphBuilder.add_odometry`.
+        """
         _require_finite(sample.pose3)
-        self._samples += 1
-        graph = self.builder.graph
-        made = self.builder.add_odometry(sample)
-        if self.builder.graph is not graph:
-            self._forget_stray()
-        return made
+        with self._lock:
+            self._samples += 1
+            graph = self._builder.graph
+            self._builder.add_odometry(sample)
+            if self._builder.graph is not graph:
+                self._forget_stray()
+            map_to_odom = None if self._builder.held else self._map_to_odom_now()
+        self._wake()
+        return map_to_odom
 
     def begin_anew(self) -> None:
         """Forget the only sample so far; see `GraphBuilder.begin_anew`."""
-        self.builder.begin_anew()
-        self._forget_stray()
+        with self._lock:
+            self._builder.begin_anew()
+            self._forget_stray()
 
     def _forget_stray(self) -> None:
         """Forget the pose of a first sample that was none: an update may have looked at it."""
-        if self.builder.graph.n_poses < 2:
-            self._poses = self._poses[:0]
+        if self._builder.graph.n_poses < 2:
+            self._optimised = Optimised.nothing(self.manifold.identity(0))
         self._map_to_odom = None
         self._changes += 1
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Add one loop closure; see `GraphBuilder.add_loop`."""
         _require_finite(loop.pose3)
-        self._changes += 1
-        self.builder.add_loop(loop)
+        with self._lock:
+            self._changes += 1
+            self._builder.add_loop(loop)
+        self._wake()
 
-    def snapshot(self) -> Snapshot:
-        """Return the back end as it is, the due loops in its graph, to be read at leisure."""
-        self.builder.add_due_loops()
-        return self._now()
+    def update(self, budget: float = 0.1, stopped: Stopped = lambda: False) -> Improvement | None:
+        """
+        Improve the map for about `budget` seconds; None: there was nothing to do.
 
-    def problem(self) -> Problem:
-        """Return what an update begins with."""
-        return self.snapshot().problem()
+        Raises
+        ------
+        Interrupted : told to stop, or to make way for `settle`, or the map was replaced.
 
-    def _now(self) -> Snapshot:
-        builder = self.builder
-        at_rest = (self._status in (Status.CONVERGED, Status.STALLED)
-                   or self._quiet_updates >= _QUIET_UPDATES)
-        return Snapshot(
-            self.version, builder.graph.copy(), builder.stamps, builder.odometry, self.map_to_odom,
-            builder.loop_rows, builder.loop_stamps, self._poses, self._dual, self._belief,
-            self._options.robust.enabled, self._last_cost, at_rest)
+        """
+        with self._solving:
+            with self._lock:
+                if self._at_rest == self._version():
+                    return None
+                now, solver = self._snapshot(), self._options.solver
+            problem = now.problem()
+            if problem.settled or not problem.graph.n_poses:
+                self._at_rest = now.version
+                return None
+
+            def check() -> None:
+                if self._make_way or stopped() or problem.map != self._map:
+                    raise Interrupted
+
+            improvement = improve(problem, solver, budget, check)
+            check()
+            self.adopt(improvement)
+        return improvement
+
+    def settle(self, stopped: Stopped = lambda: False) -> Improvement | None:
+        """
+        Judge all loops and solve to the end; None: there are no factors yet.
+
+        An update that is under way makes way.
+
+        Raises
+        ------
+        Interrupted : told to stop, or the map was replaced.
+
+        """
+        self._make_way = True
+        with self._solving:
+            self._make_way = False
+            with self._lock:
+                now, solver = self._snapshot(), self._options.solver
+            problem = now.problem()
+            if not len(problem.graph.between):
+                return None
+
+            def check() -> None:
+                if stopped() or problem.map != self._map:
+                    raise Interrupted
+
+            improvement = optimise(problem, solver, check)
+            check()
+            self.adopt(improvement)
+        self._wake()
+        return improvement
 
     def adopt(self, improvement: Improvement) -> None:
         """
-        Take over what `improve` made of a snapshot; keyframes since then follow along.
+        Take over what was made of a snapshot; keyframes since then follow along.
 
         What was made when loops were judged otherwise is left.
 
         Raises
         ------
+        Interrupted : it was made for a map that is there no more.
         ArithmeticError : it is not finite; nothing is taken over.
 
         """
-        if improvement.robust != self._options.robust.enabled:
-            return
-        for name in ('poses', 'dual', 'cost'):
-            if not np.isfinite(getattr(improvement, name)).all():
-                raise ArithmeticError(f'the {name} of a new map is not finite; the map stays')
-        self._changes += 1
-        fell = improvement.cost_before - improvement.cost
-        quiet = (improvement.belief.settled and len(improvement.dual) == len(self._dual)
-                 and fell <= self._options.solver.outer_tolerance * improvement.cost)
-        self._quiet_updates = self._quiet_updates + 1 if quiet else 0
-        self._map_to_odom = None
-        self._poses = improvement.poses
-        self._dual = improvement.dual
-        self._belief = improvement.belief
-        self._last_cost = improvement.cost
-        self._status = improvement.status
+        with self._lock:
+            if improvement.map != self._map:
+                raise Interrupted
+            if improvement.robust == self._options.robust.enabled:
+                self._optimised = improvement.taken_over(
+                    self._optimised, self._options.solver.outer_tolerance)
+                self._map_to_odom = None
+                self._changes += 1
+            self.maps += 1
 
-    def loop_states(self) -> LoopStates:
-        """Return what has become of each loop, those of the graph first, in its order."""
-        return self._now().loop_states()
+    def alone(self, work: Callable[[], bool]) -> bool:
+        """Do some work while nothing is being solved, nor begins to be; return what it returns."""
+        with self._solving:
+            return work()
 
-    def update(self, budget: float) -> Improvement | None:
-        """Improve the map for about `budget` seconds; None: there was nothing to do."""
-        problem = self.problem()
-        if problem.settled or not problem.graph.n_poses:
-            return None
-        improvement = improve(problem, self._options.solver, budget)
-        self.adopt(improvement)
-        return improvement
+    def _map_to_odom_now(self) -> Array:
+        """Return the odometry frame seen from the map: what the last optimised keyframe says."""
+        poses, manifold, offset = self._optimised.poses, self.manifold, self._builder.offset
+        last = len(poses) - 1
+        if last < 0:
+            return manifold.identity(1)
+        # Asked for with every sample: worked out when an update or a new offset changes it.
+        if self._map_to_odom is None or self._map_to_odom[0] is not offset:
+            odometry = self._builder.odometry[last : last + 1]
+            to_kept = manifold.compose(poses[last:], manifold.inverse(odometry))
+            self._map_to_odom = offset, manifold.compose(to_kept, offset)
+        return self._map_to_odom[1]
 
-
-# Called on the way, often; raises where the work shall stop.
-Check = Callable[[], None]
-
-
-def improve(problem: Problem, options: OptimiserOptions, budget: float,
-            check: Check = lambda: None) -> Improvement:
-    """
-    Judge the loops that have come and lower the L1 cost of a snapshot, for about `budget` seconds.
-
-    While the cost is far above what the last update left (a loop has closed), reweighted least
-    squares steps carry the long-range part: one factorisation bends the whole chain, where a
-    first-order method moves it a few keyframes per iteration. Then, always, Algorithm 4 from the
-    kept dual.
-    """
-    start = time.monotonic()
-    deadline = start + budget
-    belief, starts = problem.belief, [problem.poses]
-    if not belief.settled:
-        belief, judged = judge(problem.graph, problem.poses, belief, deadline, check)
-        # After a loop has closed, the L2 map of the judgement is nearer.
-        starts.append(judged)
-    check()
-    graph = problem.graph.subset(belief.accepted)
-    size = graph.manifold.TANGENT_SIZE
-    dual = problem.dual.reshape(-1, size)[belief.accepted].ravel()
-    costs = [l1_cost(whitened_residual(graph, poses)) for poses in starts]
-    before, cost = costs[0], min(costs)
-    poses = starts[costs.index(cost)]
-    steps, far = 0, is_far(cost, problem.last_cost)
-    cholesky = cholesky_of(graph) if far else None
-    while cholesky and far and (not steps or time.monotonic() < deadline):
-        check()
-        system = linearise(graph, poses)
-        step, dual = reweighted_step(system, cholesky, system.b, smoothing(system.b))
-        previous = cost
-        poses, cost = backtrack(graph, poses, step, cost)
-        steps += 1
-        far = is_far(previous, cost)
-    solution = minimise(graph, poses, options, cholesky, dual, deadline, lambda *_: check())
-    return _improvement(solution, problem, belief, before, steps, start)
-
-
-def optimise(problem: Problem, options: OptimiserOptions,
-             check: Check = lambda: None) -> Improvement:
-    """
-    Solve a snapshot to the end; where loops are doubted, after judging all of them anew.
-
-    Else from its own poses and from the seed, whichever ends lower.
-    """
-    start = time.monotonic()
-    graph, belief, doubt = problem.graph, problem.belief, None
-    if problem.robust:
-        found = minimise_robustly(
-            graph, lambda part, poses: _solved(part, poses, options, check), check=check)
-        solution, doubt, belief = found.solution, found.doubt, Belief(
-            found.accepted, found.suspect, found.sigmas, found.variance)
-    else:
-        starts = (problem.poses, seed_poses(graph, choose(AUTO, graph).cholesky, check=check))
-        solution = min((_solved(graph, poses, options, check) for poses in starts),
-                       key=lambda s: s.cost)
-    part = graph.subset(belief.accepted)
-    before = l1_cost(whitened_residual(part, problem.poses))
-    return replace(_improvement(solution, problem, belief, before, 0, start), doubt=doubt)
+    def _wake(self) -> None:
+        """Tell the background that there may be something to do."""
+        if self._background is not None:
+            self._background.wake()
 
 
 def _require_finite(pose3: Array) -> None:
     # It would spoil all that comes after it.
     if not np.isfinite(pose3).all():
         raise ArithmeticError(f'pose {pose3} is not finite')
-
-
-def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
-            check: Check) -> Solution:
-    check()
-    return minimise_by(choose(AUTO, graph), graph, poses, options, lambda *_: check())[0]
-
-
-def _improvement(solution: Solution, problem: Problem, belief: Belief, before: float, steps: int,
-                 start: float) -> Improvement:
-    size = problem.graph.manifold.TANGENT_SIZE
-    # The rows of what is not believed have no dual yet.
-    dual = np.zeros((len(belief.accepted), size))
-    dual[belief.accepted] = solution.dual.reshape(-1, dual.shape[1])
-    return Improvement(solution.poses, dual.ravel(), belief, problem.robust, before,
-                       solution.cost, solution.status, steps, solution.outer_iterations,
-                       solution.inner_iterations, solution.gap, time.monotonic() - start)

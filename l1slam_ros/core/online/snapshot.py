@@ -15,12 +15,18 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.online.loop_states import (
     ACCEPTED,
     EXPIRED,
+    LOOP_STATES,
     REJECTED,
     SUSPECT,
     WAITING,
     LoopStates,
 )
-from l1slam_ros.core.robust.judgement import Belief
+from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.solvers.optimality import Status
+
+# A large map gets but one linearisation into an update, and never meets a test that takes two of
+# them. It is at rest when so many updates in a row lowered the cost by less than is looked for.
+_QUIET_UPDATES = 5
 
 
 @dataclass(frozen=True)
@@ -28,17 +34,47 @@ class Problem:
     """
     A snapshot to improve: graph, poses (n, p), dual (rows,) and the cost the last update left.
 
-    belief : of all factors; robust : loops may be doubted; settled : nothing has come since an
+    map : number of the map that it is of, other after `Backend.reset` and `Backend.restore`;
+    judgement : of all factors; robust : loops may be doubted; settled : nothing has come since an
     update that converged.
     """
 
+    map: int
     graph: FactorGraph
     poses: Array
     dual: Array
-    belief: Belief
+    judgement: Judgement
     robust: bool
     last_cost: float
     settled: bool
+
+
+@dataclass(frozen=True)
+class Optimised:
+    """
+    What updates have made so far, of the first keyframes and factors.
+
+    poses : (k, p); dual : (rows,); judgement, cost and status : as the last update left them;
+    quiet_updates : how many in a row hardly lowered the cost.
+    """
+
+    poses: Array
+    dual: Array
+    judgement: Judgement
+    cost: float
+    status: Status
+    quiet_updates: int
+
+    @staticmethod
+    def nothing(poses: Array) -> 'Optimised':
+        """Return what stands before the first update: poses at most."""
+        return Optimised(poses, np.zeros(0), Judgement.nothing(), 0.0, Status.OUT_OF_TIME, 0)
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether more updates of the same factors would hardly change the map."""
+        return (self.status in (Status.CONVERGED, Status.STALLED)
+                or self.quiet_updates >= _QUIET_UPDATES)
 
 
 @dataclass(frozen=True)
@@ -46,13 +82,12 @@ class Snapshot:
     """
     What a back end knows.
 
-    version : see `Backend.version`; graph : the factors so far; stamps (n,) [ns] and odometry
-    (n, p) of the keyframes; map_to_odom : (1, p); loop_rows, loop_stamps : see `GraphBuilder`;
-    optimised (k, p), dual, belief and last_cost : as the last update left them, for the first
-    keyframes and factors; robust : loops may be doubted; at_rest : more updates of the same
-    factors would hardly change the map.
+    map : its number; version : see `Backend.version`; graph : the factors so far; stamps (n,)
+    [ns] and odometry (n, p) of the keyframes; map_to_odom : (1, p); loop_rows, loop_stamps : see
+    `GraphBuilder`; robust : loops may be doubted.
     """
 
+    map: int
     version: tuple[int, int, int]
     graph: FactorGraph
     stamps: Indices
@@ -60,41 +95,46 @@ class Snapshot:
     map_to_odom: Array
     loop_rows: Indices
     loop_stamps: tuple[Indices, Indices, Indices]
-    optimised: Array
-    dual: Array
-    belief: Belief
+    optimised: Optimised
     robust: bool
-    last_cost: float
-    at_rest: bool
 
     @property
     def poses(self) -> Array:
         """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
-        known, manifold = len(self.optimised), self.graph.manifold
+        optimised, manifold = self.optimised.poses, self.graph.manifold
+        known = len(optimised)
         new = self.odometry[known:]
         if known and len(new):
             start = np.broadcast_to(self.odometry[known - 1], new.shape)
-            last = np.broadcast_to(self.optimised[-1], new.shape)
+            last = np.broadcast_to(optimised[-1], new.shape)
             new = manifold.compose(last, manifold.between(start, new))
-        return np.concatenate((self.optimised, new))
+        return np.concatenate((optimised, new))
 
     def problem(self) -> Problem:
         """Return what an update begins with: the graph, and the warm start for all of it."""
-        rows = len(self.graph.between) * self.graph.manifold.TANGENT_SIZE
+        last, rows = self.optimised, len(self.graph.between) * self.graph.manifold.TANGENT_SIZE
         # Rows are only ever appended, so the dual of the old ones stays; new ones start at zero.
-        dual = np.concatenate((self.dual, np.zeros(rows - len(self.dual))))
-        belief = self.belief.extended(self.graph, self.robust)
-        grown = len(self.optimised) < self.graph.n_poses or len(self.dual) < rows
-        settled = not grown and belief.settled and self.at_rest
-        return Problem(self.graph, self.poses, dual, belief, self.robust, self.last_cost, settled)
+        dual = np.concatenate((last.dual, np.zeros(rows - len(last.dual))))
+        judgement = last.judgement.extended(self.graph, self.robust)
+        grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
+        settled = not grown and judgement.settled and last.at_rest
+        return Problem(self.map, self.graph, self.poses, dual, judgement, self.robust, last.cost,
+                       settled)
 
     def loop_states(self) -> LoopStates:
         """Return what has become of each loop, those of the graph first, in its order."""
         in_graph, waiting, expired = self.loop_stamps
-        belief, rows = self.belief.extended(self.graph, self.robust), self.loop_rows
-        state = np.where(belief.accepted[rows], ACCEPTED,
-                         np.where(belief.suspect[rows], SUSPECT, REJECTED))
+        judgement = self.optimised.judgement.extended(self.graph, self.robust)
+        rows = self.loop_rows
+        state = np.where(judgement.accepted[rows], ACCEPTED,
+                         np.where(judgement.suspect[rows], SUSPECT, REJECTED))
         others = np.repeat([WAITING, EXPIRED], [len(waiting), len(expired)])
-        sigmas = np.concatenate((belief.sigmas[rows], np.full(len(others), np.nan)))
+        sigmas = np.concatenate((judgement.sigmas[rows], np.full(len(others), np.nan)))
         return LoopStates(rows, np.concatenate((in_graph, waiting, expired)),
                           np.concatenate((state, others)), sigmas)
+
+    def sizes(self) -> dict[str, int]:
+        """Return how many keyframes, factors and loops of each state there are, by name."""
+        loops = np.bincount(self.loop_states().state, minlength=len(LOOP_STATES))
+        return {'keyframes': self.graph.n_poses, 'factors': len(self.graph.between)} | {
+            f'{name}_loops': int(count) for name, count in zip(LOOP_STATES, loops, strict=True)}

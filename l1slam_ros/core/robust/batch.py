@@ -20,16 +20,16 @@ defended by `test_batch.py`.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.innovation import chi2_quantile
+from l1slam_ros.core.robust.judgement import INCONSISTENT, MOSTLY_REFUSED, Doubt, Judgement
 from l1slam_ros.core.robust.pairwise_consistency import accord, weakest_steps
 from l1slam_ros.core.robust.rounds import REFUSED, Growth, solve
 from l1slam_ros.core.robust.slips import VOTES, without_slip
@@ -37,48 +37,8 @@ from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 
 # Every round accepts a loop, hence there is an end; this one is for the patience of people.
 _MOST_ROUNDS = 200
-# Refused loops of several places agree with each other; hardly a loop is believed.
-INCONSISTENT, MOSTLY_REFUSED = KINDS_OF_DOUBT = ('inconsistent', 'mostly refused')
 # Of fewer loops most may well be refused.
 _HANDFUL = 5
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """
-    Why a map is not to be relied on.
-
-    kind : of `KINDS_OF_DOUBT`; loops : how many speak against it; first, last : the keyframes
-    between which they do.
-    """
-
-    kind: str
-    loops: int
-    first: int
-    last: int
-
-
-@dataclass(frozen=True)
-class RobustSolution:
-    """
-    What a robust solve believes.
-
-    poses : (n, p) the L2 map of the accepted factors; accepted : (m,) bool of the between factors;
-    suspect : (m,) bool, loops that fit but could as well be chance; sigmas : (m,) how far off each
-    factor is, in units of its noise, as stated or larger if it was found so: the length of the
-    residual, and where it is not accepted, of that over the uncertainty of the map; slips : (k,)
-    the odometry factors that lie, not accepted; variance : (2,) of odometry and of loops as it was
-    found, in units of what they state; rounds : how many it took; doubt : None where all is well.
-    """
-
-    poses: Array
-    accepted: Mask
-    suspect: Mask
-    sigmas: Array
-    slips: Indices
-    variance: Array
-    rounds: int
-    doubt: Doubt | None
 
 
 # From the round and the loops accepted so far.
@@ -88,9 +48,9 @@ Report = Callable[[int, int], None]
 def robust_solve(
     graph: FactorGraph, report: Report = lambda round_, accepted: None,
     check: Callable[[], None] = lambda: None,
-) -> RobustSolution:
+) -> tuple[Judgement, Array]:
     """
-    Find out which loops to believe, from the graph alone.
+    Return which loops to believe, from the graph alone, and the L2 map (n, p) of these.
 
     Parameters
     ----------
@@ -104,13 +64,11 @@ def robust_solve(
     """
     first = growth = Growth(graph, check)
     first.begin()
-    number = 0
     for number, growth in enumerate(rounds(first, without_slip), 1):
         report(number, int(np.count_nonzero(growth.accepted & growth.is_loop)))
     square, suspect = outlook(growth)
-    return RobustSolution(growth.poses, growth.accepted, suspect, np.sqrt(square),
-                          np.flatnonzero(~growth.accepted & ~growth.is_loop), growth.variance,
-                          number, _contradiction(growth))
+    return Judgement(growth.accepted, suspect, np.sqrt(square), growth.variance, growth.slips(),
+                     _contradiction(growth)), growth.poses
 
 
 def rounds(growth: Growth, repaired: Callable[[Growth], Growth | None]) -> Iterator[Growth]:

@@ -19,6 +19,7 @@ from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import Report as OnRound
 from l1slam_ros.core.robust.inspection import initial_poses, odometry_gaps, require_connected
+from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.robust.robust_map import RobustMap, minimise_robustly
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import (
@@ -66,7 +67,7 @@ class Outcome:
     initial_cost: float
     seed_cost: float | None
     seconds: float
-    judgement: RobustMap | None
+    judgement: Judgement | None
     unjudged: str
     parts: int
 
@@ -100,10 +101,10 @@ def solve(
                else initial_poses(graph, stored, ids))
     minimiser = _Minimiser(wish, report)
     began = time.perf_counter()
-    judgement, unjudged = _judgement(graph, wish, minimiser, on_round, ids)
-    if judgement:
-        solution, seed = judgement.solution, judgement.seed
-        graph = graph.subset(judgement.accepted)
+    robust, unjudged = _robust_map(graph, wish, minimiser, on_round, ids)
+    if robust:
+        solution, seed = robust.solution, robust.seed
+        graph = graph.subset(robust.judgement.accepted)
     else:
         choice = minimiser.choose(graph)
         seed = seed_poses(graph, choice.cholesky) if wish.start == 'seed' else None
@@ -114,11 +115,12 @@ def solve(
     if not np.isfinite([cost(initial), seed_cost or 0.0, solution.cost]).all():
         raise GraphError('the cost leaves double precision: measurements and information of the '
                          'graph are too large, or too different from each other')
+    judgement = robust.judgement if robust else None
     return Outcome(solution, minimiser.solver, minimiser.reason, cost(initial), seed_cost, seconds,
                    judgement, unjudged, int(component_labels(graph).max()) + 1)
 
 
-def _judgement(
+def _robust_map(
     graph: FactorGraph, wish: Wish, minimiser: '_Minimiser', on_round: OnRound, ids: Indices
 ) -> tuple[RobustMap | None, str]:
     """Return the robust map; where nobody insists on one and there is none, None and why."""

@@ -17,9 +17,9 @@ import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.quantiles import beta_quantile, gamma_quantile
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import LinearSystem, linearise
-from l1slam_ros.core.robust.quantiles import beta_quantile, gamma_quantile
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
 # A covariance from that many samples has standard deviations right to 15% (1 / sqrt(2 SAMPLES)).

@@ -1,49 +1,64 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-What is believed of the factors of a graph while it grows.
+"""What is believed of the factors of a graph, by the batch solve and by a running back end."""
 
-In: the belief of the last update and the graph as it is now. Out: the belief after new evidence.
-The rounds are those of the batch solve (`batch`), from the state that is there.
-"""
-
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.robust.batch import outlook, reconsidered, rounds
-from l1slam_ros.core.robust.rounds import Growth
+
+# Refused loops of several places agree with each other; hardly a loop is believed.
+INCONSISTENT, MOSTLY_REFUSED = KINDS_OF_DOUBT = ('inconsistent', 'mostly refused')
 
 
 @dataclass(frozen=True)
-class Belief:
+class Doubt:
     """
-    A judgement on the first m between factors of a graph.
+    Why a map is not to be relied on.
 
-    accepted, suspect : (m,) bool, a loop that is neither is rejected; sigmas : (m,), see
-    `RobustSolution`, NaN before a loop was looked at; variance : (2,) of odometry and loops;
-    settled : no more is to be found out from the factors that are there.
+    kind : of `KINDS_OF_DOUBT`; loops : how many speak against it; first, last : the keyframes
+    between which they do.
+    """
+
+    kind: str
+    loops: int
+    first: int
+    last: int
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """
+    What is believed of the first m between factors of a graph.
+
+    accepted, suspect : (m,) bool, suspect is a loop that fits but could as well be chance, a loop
+    that is neither is rejected; sigmas : (m,) how far off each factor is, in units of its noise,
+    as stated or larger if it was found so: the length of the residual, and where it is not
+    accepted, of that over the uncertainty of the map, NaN before a loop was looked at; variance :
+    (2,) of odometry and of loops as it was found, in units of what they state; slips : (k,) the
+    odometry factors that lie, not accepted; doubt : None where all is well; settled : no more is
+    to be found out from the factors that are there.
     """
 
     accepted: Mask
     suspect: Mask
     sigmas: Array
     variance: Array
+    slips: Indices
+    doubt: Doubt | None = None
     settled: bool = True
 
     @staticmethod
-    def nothing() -> 'Belief':
-        """Return the belief before there are factors."""
+    def nothing() -> 'Judgement':
+        """Return the judgement before there are factors."""
         none = np.zeros(0, bool)
-        return Belief(none, none, np.zeros(0), np.ones(2))
+        return Judgement(none, none, np.zeros(0), np.ones(2), np.zeros(0, np.int64))
 
-    def extended(self, graph: FactorGraph, robust: bool) -> 'Belief':
+    def extended(self, graph: FactorGraph, robust: bool) -> 'Judgement':
         """
-        Return the belief of all factors that the graph has by now.
+        Return the judgement of all factors that the graph has by now.
 
         Of the new ones, odometry and what is trusted is believed; a loop is suspect until it was
         looked at, or where no loop is to be doubted, believed too.
@@ -57,37 +72,7 @@ class Belief:
         if not robust:
             accepted = np.ones(len(accepted), bool)
         suspect = np.concatenate((self.suspect, ~sure)) & ~accepted
-        unknown = np.full(len(factors) - known, np.nan)
-        return Belief(accepted, suspect, np.concatenate((self.sigmas, unknown)), self.variance,
-                      not robust or (self.settled and not new_loops))
-
-
-def judge(
-    graph: FactorGraph, poses: Array, belief: Belief, deadline: float,
-    check: Callable[[], None] = lambda: None,
-) -> tuple[Belief, Array]:
-    """
-    Return what is to be believed, after looking again at all loops that are not, and its L2 map.
-
-    A lie of the odometry is not looked for: that takes too long to do while driving.
-
-    Parameters
-    ----------
-    poses : (n, p) the map of what was believed
-    deadline : `time.monotonic()` [s] after which no second round begins
-    check : called before long steps, raises where the work shall stop
-
-    """
-    first, settled = Growth(graph, check), True
-    first.resume(poses, belief.accepted, belief.variance)
-    growth = first
-    for growth in rounds(first, lambda _: None):
-        # The end is not put off once it is in sight, or short budgets would never get there.
-        if time.monotonic() > deadline and not growth.takes_at_their_word:
-            settled = False
-            break
-    square, suspect = outlook(growth)
-    # What fits the map as it is may come in; what was believed stays until evidence is against it.
-    accepted = growth.accepted | reconsidered(graph, growth.poses, growth.accepted)
-    judged = Belief(accepted, suspect & ~accepted, np.sqrt(square), growth.variance, settled)
-    return judged, growth.poses
+        sigmas = np.concatenate((self.sigmas, np.full(len(factors) - known, np.nan)))
+        return replace(
+            self, accepted=accepted, suspect=suspect, sigmas=sigmas,
+            settled=not robust or (self.settled and not new_loops))

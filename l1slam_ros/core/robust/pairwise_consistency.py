@@ -12,11 +12,11 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import whiten
+from l1slam_ros.core.geometry.quantiles import gamma_probability
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
 from l1slam_ros.core.graph.linear_system import anchor
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.innovation import Posterior, claimed_volume, log_likelihood_ratio
-from l1slam_ros.core.robust.quantiles import gamma_probability
 from l1slam_ros.core.robust.rounds import Growth
 
 # So many refused loops are asked.

@@ -8,19 +8,18 @@ on a few; L2 map and choice follow each other until nothing changes.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust.batch import (
-    Doubt,
     Report,
     minimise_accepted,
     mostly_refused,
     reconsidered,
     robust_solve,
 )
+from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.nonlinear import Solution
 
 # Measured: one or two until the choice stands; this ends one that swings.
@@ -29,23 +28,11 @@ _MOST_ROUNDS = 10
 
 @dataclass(frozen=True)
 class RobustMap:
-    """
-    The map of the believed factors, and the judgement on all.
-
-    seed : (n, p) the L2 map it began with; accepted : (m,) bool of the between factors; suspect :
-    (m,) bool, loops that are not accepted though they fit: nothing vouches for them; sigmas : (m,)
-    how far off each factor is, slips : (k,) odometry factors that lie, variance : (2,), doubt :
-    None where all is well, see `RobustSolution`.
-    """
+    """The map of the believed factors, the L2 map (n, p) it began with, the judgement on all."""
 
     solution: Solution
     seed: Array
-    accepted: Mask
-    suspect: Mask
-    sigmas: Array
-    slips: Indices
-    variance: Array
-    doubt: Doubt | None
+    judgement: Judgement
 
 
 def minimise_robustly(
@@ -57,8 +44,8 @@ def minimise_robustly(
 
     minimise : from a graph and poses (n, p) to its solution; report, check : see `robust_solve`
     """
-    found = robust_solve(graph, report, check)
-    accepted, poses = found.accepted, found.poses
+    found, poses = robust_solve(graph, report, check)
+    accepted = found.accepted
     for _ in range(_MOST_ROUNDS):
         poses, before = minimise_accepted(graph, poses, accepted, check), accepted
         accepted = reconsidered(graph, poses, before)
@@ -66,5 +53,5 @@ def minimise_robustly(
             break
     solution = minimise(graph.subset(before), poses)
     doubt = found.doubt or mostly_refused(graph, before)
-    return RobustMap(solution, poses, before, found.suspect & ~before, found.sigmas, found.slips,
-                     found.variance, doubt)
+    return RobustMap(solution, poses, replace(
+        found, accepted=before, suspect=found.suspect & ~before, doubt=doubt))

@@ -92,6 +92,10 @@ class Growth:
         """The measurement of the later keyframe from the earlier one, (m, p)."""
         return ends_in_time(self.graph)[2]
 
+    def slips(self) -> Indices:
+        """Return the odometry factors that lie, (k,)."""
+        return np.flatnonzero(~self.accepted & ~self.is_loop)
+
     def begin(self) -> None:
         """Solve for what is accepted, and learn from the loops how large their noise is."""
         self.settle()

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 from l1slam_ros.core.errors import Interrupted
-from l1slam_ros.core.online.backend import Improvement
-from l1slam_ros.core.online.shared_backend import SharedBackend
+from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.compilation import fill_cache
 from l1slam_ros.ros.threads.failures import Failures
 
@@ -32,7 +32,7 @@ class SolverThread:
 
     """
 
-    def __init__(self, backend: SharedBackend, failures: Failures, logger: Any,
+    def __init__(self, backend: Backend, failures: Failures, logger: Any,
                  budget: Callable[[], float], tell: Callable[[Improvement | None], None]):
         self._backend, self._failures, self._logger = backend, failures, logger
         self._budget, self._tell = budget, tell
@@ -78,8 +78,12 @@ class SolverThread:
 
     def _work(self) -> None:
         self._compile()
-        while self._woken.wait() and not self._closing:
+        while True:
+            self._woken.wait()
+            # In this order, or the call to close is lost.
             self._woken.clear()
+            if self._closing:
+                return
             if time.monotonic() < self._not_before:
                 continue
             try:
@@ -103,7 +107,7 @@ class SolverThread:
         self._behind_since = self._behind_since or time.monotonic()
         improvement = self._backend.update(
             self._budget(), lambda: self._paused or self._closing)
-        if improvement is None or improvement.belief.settled:
+        if improvement is None or improvement.judgement.settled:
             self._behind_since = 0.0
         return improvement
 

@@ -18,16 +18,10 @@ from lies import (
 from numpy.testing import assert_allclose, assert_array_equal
 from problems import PERIOD, loop, odometry, play, seconds
 
-from l1slam_ros.core.errors import Interrupted
+from l1slam_ros.core.errors import Interrupted, OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
-from l1slam_ros.core.online.backend import (
-    Backend,
-    BackendOptions,
-    RobustOptions,
-    improve,
-    optimise,
-)
+from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.graph_builder import LoopOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loop_states import (
@@ -38,6 +32,7 @@ from l1slam_ros.core.online.loop_states import (
     SUSPECT,
     WAITING,
 )
+from l1slam_ros.core.online.update import improve, optimise
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, minimise
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
@@ -75,9 +70,9 @@ def settled(backend):
 
 
 def test_played_back_the_graph_is_that_of_the_world(world):
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     play(backend, world)
-    ours, theirs = backend.problem().graph.between, world.graph.between
+    ours, theirs = backend.snapshot().problem().graph.between, world.graph.between
 
     def rows(factors):
         information = factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information
@@ -90,13 +85,13 @@ def test_played_back_the_graph_is_that_of_the_world(world):
 
 def test_incremental_ends_at_the_cost_of_batch(world):
     """Within 2 parts in 10,000; on the way each update ends within 1%."""
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     for k in range(0, 150, 10):
         play(backend, world, k, k + 10)
         improvement = backend.update(PLENTY)
         assert improvement.cost <= improvement.cost_before
         if k in (40, 90, 140):
-            graph = backend.problem().graph
+            graph = backend.snapshot().problem().graph
             batch = batch_of(graph)
             assert cost(graph, backend.poses) == pytest.approx(batch.cost, rel=1e-2)
     settled(backend)
@@ -104,9 +99,9 @@ def test_incremental_ends_at_the_cost_of_batch(world):
 
 
 def test_a_solve_to_the_end_is_as_good(world):
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     play(backend, world)
-    problem = backend.problem()
+    problem = backend.snapshot().problem()
     solved = optimise(problem, EVERY.solver)
     batch = batch_of(world.graph)
     assert solved.cost == cost(problem.graph, solved.poses) == pytest.approx(batch.cost, rel=2e-4)
@@ -116,35 +111,53 @@ def test_a_solve_to_the_end_is_as_good(world):
 
 
 def test_nothing_to_do_is_none(world):
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     assert backend.update(PLENTY) is None
     play(backend, world, 0, 60)
     assert settled(backend) >= 1
     poses = backend.poses
-    assert backend.problem().settled and backend.update(PLENTY) is None
+    assert backend.snapshot().problem().settled and backend.update(PLENTY) is None
     assert_array_equal(backend.poses, poses)
     play(backend, world, 60, 61)
-    assert not backend.problem().settled
+    assert not backend.snapshot().problem().settled
     assert backend.update(PLENTY) is not None
 
 
+def test_settled_the_map_is_the_optimum_and_all_loops_are_judged(careful):
+    world = spoilt(careful, 'random', 130)
+    with Backend(EVERY) as backend:
+        assert backend.settle() is None
+        play(backend, world)
+        problem = backend.snapshot().problem()
+        assert backend.settle().cost == optimise(problem, EVERY.solver).cost
+        states = backend.loop_states()
+        assert set(states.state) == {ACCEPTED, REJECTED} and np.isfinite(states.sigmas).all()
+        assert backend.update() is None
+
+
+@pytest.mark.parametrize('dimension', [3, 0, '2', None])
+def test_a_dimension_that_is_not_there_is_refused(dimension):
+    with pytest.raises(OptionError, match=f'dimension {dimension!r} is not supported yet, exp'):
+        Backend(EVERY, dimension)
+
+
 def test_one_keyframe_is_no_trouble():
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     backend.add_odometry(odometry(1.0, (3.0, 4.0, 0.5)))
     improvement = backend.update(PLENTY)
     assert (improvement.status, improvement.cost) == (Status.CONVERGED, 0.0)
     assert_allclose(backend.poses, [[3.0, 4.0, 0.5]])
-    assert_allclose(backend.map_to_odom, [[0.0, 0.0, 0.0]], atol=1e-15)
+    assert_allclose(backend.snapshot().map_to_odom, [[0.0, 0.0, 0.0]], atol=1e-15)
 
 
 def test_a_loop_alone_settles_nothing_new(world):
     """A loop that still waits is no reason to work."""
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     play(backend, world, 0, 30)
     settled(backend)
     backend.add_loop(loop(0.0, 100.0, (1.0, 0.0, 0.0)))
     assert backend.update(PLENTY) is None
-    assert backend.builder.n_waiting == 1
+    assert backend._builder.n_waiting == 1
 
 
 # Time
@@ -156,9 +169,9 @@ def test_the_budget_is_kept(budget):
     world = simulate_world(800, 1800, WorldOptions(), np.random.default_rng(0))
     options = BackendOptions(EVERY.keyframe, EVERY.odometry, solver=OptimiserOptions(
         outer_iterations=10**6, inner=PrimalDualOptions(iterations=10**7, tolerance=0.0)))
-    backend = Backend(se2, options)
+    backend = Backend(options)
     play(backend, world)
-    problem = backend.problem()
+    problem = backend.snapshot().problem()
     start = time.monotonic()
     improvement = improve(problem, options.solver, budget)
     spent = time.monotonic() - start
@@ -170,7 +183,7 @@ def test_the_budget_is_kept(budget):
 
 def test_small_budgets_add_up(world):
     """The costs of one set of loops: those that are yet to be believed would add theirs."""
-    backend = Backend(se2, CREDULOUS)
+    backend = Backend(CREDULOUS)
     play(backend, world)
     costs = []
     for _ in range(400):
@@ -186,50 +199,50 @@ def test_small_budgets_add_up(world):
 
 def test_small_budgets_judge_to_the_end(world):
     """A budget too short for one look at the loops still gets on with every update."""
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     play(backend, world)
     for _ in range(20):
         backend.update(0.0)
     assert (backend.loop_states().state == ACCEPTED).all()
-    assert backend.problem().belief.settled
+    assert backend.snapshot().problem().judgement.settled
 
 
 # What is seen from outside
 
 
 def test_before_an_update_the_poses_are_the_odometry(world):
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     play(backend, world, 0, 20)
     assert_allclose(backend.poses, world.odometry[:20], atol=1e-12)
-    assert_allclose(backend.map_to_odom, [[0, 0, 0]], atol=1e-12)
+    assert_allclose(backend.snapshot().map_to_odom, [[0, 0, 0]], atol=1e-12)
 
 
 def test_map_to_odom_puts_the_last_optimised_keyframe_in_its_place(world):
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     play(backend, world, 0, 140)
     settled(backend)
-    there = se2.compose(backend.map_to_odom, world.odometry[139:140])
+    there = se2.compose(backend.snapshot().map_to_odom, world.odometry[139:140])
     assert_allclose(se2.local(backend.poses[139:], there), 0, atol=1e-9)
-    assert np.abs(backend.map_to_odom).max() > 0.05
+    assert np.abs(backend.snapshot().map_to_odom).max() > 0.05
 
 
 def test_keyframes_after_an_update_follow_the_map(world):
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     play(backend, world, 0, 100)
     settled(backend)
-    before, transform = backend.poses, backend.map_to_odom
+    before, transform = backend.poses, backend.snapshot().map_to_odom
     play(backend, world, 100, 120)
     assert_array_equal(backend.poses[:100], before)
-    assert_array_equal(backend.map_to_odom, transform)
+    assert_array_equal(backend.snapshot().map_to_odom, transform)
     expected = se2.compose(np.broadcast_to(transform, (20, 3)), world.odometry[100:120])
     assert_allclose(se2.local(backend.poses[100:], expected), 0, atol=1e-12)
 
 
 def test_keyframes_during_an_update_follow_the_map(world):
     """Between problem() and adopt(), as with the node's worker."""
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     play(backend, world, 0, 100)
-    problem = backend.problem()
+    problem = backend.snapshot().problem()
     frozen = problem.poses.copy(), len(problem.graph.between), problem.graph.n_poses
     play(backend, world, 100, 125)
     improvement = improve(problem, EVERY.solver, PLENTY)
@@ -242,13 +255,13 @@ def test_keyframes_during_an_update_follow_the_map(world):
     assert_allclose(moved, se2.between(world.odometry[99:124], world.odometry[100:125]),
                     atol=1e-9)
     settled(backend)
-    graph = backend.problem().graph
+    graph = backend.snapshot().problem().graph
     batch = batch_of(graph)
     assert cost(graph, backend.poses) == pytest.approx(batch.cost, rel=1e-3)
 
 
 def test_poses_are_always_finite(world, rng):
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     for k in range(0, 150, 30):
         play(backend, world, k, k + 30)
         for _ in range(3):  # and loops that are nonsense, with covariances that are none
@@ -256,7 +269,8 @@ def test_poses_are_always_finite(world, rng):
             backend.add_loop(loop(i * PERIOD, j * PERIOD, 1e3 * rng.standard_normal(3),
                                   rng.choice([0.0, -1.0, np.nan, 9999.0]) * np.eye(6)))
         backend.update(0.02)
-        assert np.isfinite(backend.poses).all() and np.isfinite(backend.map_to_odom).all()
+        assert np.isfinite(backend.poses).all()
+        assert np.isfinite(backend.snapshot().map_to_odom).all()
         assert len(backend.poses) == k + 30
 
 
@@ -268,7 +282,7 @@ def test_several_loops_at_once_bring_a_drifted_drive_back():
         step = np.array([[1.0, 0.0, np.pi / 2 if k % side == 0 else 0.0]])
         truth[k] = se2.compose(truth[k - 1 : k], step)[0]
         drifted[k] = se2.compose(drifted[k - 1 : k], step + [[0.0, 0.0, 0.02]])[0]
-    backend = Backend(se2, CREDULOUS)
+    backend = Backend(CREDULOUS)
     for k in range(n):
         backend.add_odometry(odometry(k * PERIOD, drifted[k], np.diag([1e-3] * 6)))
     assert np.abs(se2.positions(drifted - truth)).max() > 5
@@ -317,13 +331,13 @@ def errors_on_the_way(world, backend, look=lambda backend: None):
 
 @pytest.fixture(scope='module')
 def clean_errors(careful):
-    return errors_on_the_way(careful, Backend(se2, EVERY))
+    return errors_on_the_way(careful, Backend(EVERY))
 
 
 def states_by_truth(backend, world):
     """Return the states of the false loops of the graph, and those of the true ones."""
     states = backend.loop_states()
-    false = is_false(world, backend.builder.graph.between)[states.rows]
+    false = is_false(world, backend.snapshot().graph.between)[states.rows]
     in_graph = states.state[: len(states.rows)]
     return in_graph[false], in_graph[~false]
 
@@ -338,15 +352,16 @@ def test_no_lie_is_believed_at_any_time(careful, clean_errors, kind):
         assert not (lies == ACCEPTED).any()
         assert np.count_nonzero(truths == REJECTED) <= 0.01 * len(truths) + 1
 
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     errors = errors_on_the_way(world, backend, look)
     assert (errors < 1.2 * clean_errors + 0.1).all()
     lies, truths = states_by_truth(backend, world)
     assert len(lies) == 130 and (lies == REJECTED).mean() > 0.95
     assert np.count_nonzero(truths != ACCEPTED) <= 0.01 * len(truths)
-    online = backend.problem().belief.accepted
-    backend.adopt(optimise(backend.problem(), EVERY.solver))
-    assert np.count_nonzero(backend.problem().belief.accepted != online) <= 0.01 * len(truths)
+    online = backend.snapshot().problem().judgement.accepted
+    backend.settle()
+    whole = backend.snapshot().problem().judgement.accepted
+    assert np.count_nonzero(whole != online) <= 0.01 * len(truths)
 
 
 def test_who_does_not_doubt_is_led_astray(careful, clean_errors):
@@ -356,13 +371,13 @@ def test_who_does_not_doubt_is_led_astray(careful, clean_errors):
     def look(backend):
         assert (backend.loop_states().state == ACCEPTED).all()
 
-    errors = errors_on_the_way(world, Backend(se2, CREDULOUS), look)
+    errors = errors_on_the_way(world, Backend(CREDULOUS), look)
     assert errors.max() > 1 > 3 * clean_errors.max()
 
 
 def test_a_trusted_loop_is_accepted_however_absurd(careful):
     """And the other loops are judged by the map that it makes."""
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     absurd = replace(loop(10 * PERIOD, 40 * PERIOD, (50.0, -20.0, 2.0), 1e-6 * np.eye(6)),
                      trusted=True)
     mine = [seconds(10 * PERIOD), seconds(40 * PERIOD)]
@@ -373,7 +388,7 @@ def test_a_trusted_loop_is_accepted_however_absurd(careful):
         states = backend.loop_states()
         (row,) = np.flatnonzero((states.stamps == mine).all(axis=1))
         assert states.state[row] == (WAITING if k < 40 else ACCEPTED)
-    backend.adopt(optimise(backend.problem(), EVERY.solver))
+    backend.settle()
     assert backend.loop_states().state[row] == ACCEPTED
     error = se2.local(se2.between(backend.poses[10:11], backend.poses[40:41]),
                       np.array([[50.0, -20.0, 2.0]]))
@@ -382,7 +397,7 @@ def test_a_trusted_loop_is_accepted_however_absurd(careful):
 
 def test_a_loop_is_suspect_until_others_vouch_for_it():
     """Loops beside each other may be one mistake; one at another place says they are none."""
-    backend, truth = Backend(se2, EVERY), roundabout(220)
+    backend, truth = Backend(EVERY), roundabout(220)
     drive_roundabout(backend, truth)
     settled(backend)
     drifted = position_error(backend.poses, truth)
@@ -399,30 +414,30 @@ def test_a_loop_is_suspect_until_others_vouch_for_it():
 
 
 def test_a_solve_to_the_end_leaves_a_lone_loop_suspect_too():
-    backend, truth = Backend(se2, EVERY), roundabout(220)
+    backend, truth = Backend(EVERY), roundabout(220)
     drive_roundabout(backend, truth)
     backend.add_loop(seen(truth, 3, 203))
-    backend.adopt(optimise(backend.problem(), EVERY.solver))
+    backend.settle()
     assert backend.loop_states().state.tolist() == [SUSPECT]
 
 
 def test_what_is_not_believed_costs_nothing_and_pulls_at_nothing():
-    backend, truth = Backend(se2, EVERY), roundabout(220)
+    backend, truth = Backend(EVERY), roundabout(220)
     drive_roundabout(backend, truth)
     backend.add_loop(seen(truth, 3, 203))
     improvement = backend.update(PLENTY)
     assert improvement.cost == pytest.approx(0.0, abs=1e-6)
     rows = backend.loop_states().rows
     assert_array_equal(improvement.dual.reshape(-1, 3)[rows], 0)
-    assert len(improvement.dual) == 3 * len(backend.builder.graph.between)
+    assert len(improvement.dual) == 3 * len(backend.snapshot().graph.between)
 
 
 def test_the_dual_of_each_factor_is_at_its_own_rows(careful):
     """What is believed pulls this way or that, wherever lies stand between it."""
-    backend, world = Backend(se2, EVERY), spoilt(careful, 'random', 130)
+    backend, world = Backend(EVERY), spoilt(careful, 'random', 130)
     play(backend, world, 0, 150)
     improvement = backend.update(PLENTY)
-    graph, accepted = backend.problem().graph, improvement.belief.accepted
+    graph, accepted = backend.snapshot().problem().graph, improvement.judgement.accepted
     assert 20 < np.count_nonzero(~accepted) == np.count_nonzero(is_false(world, graph.between))
     dual = improvement.dual.reshape(-1, 3)
     residual = whitened_residual(graph, backend.poses).reshape(-1, 3)
@@ -432,7 +447,7 @@ def test_the_dual_of_each_factor_is_at_its_own_rows(careful):
 
 
 def test_each_loop_has_a_state_and_its_own_stamps(careful):
-    backend = Backend(se2, replace(EVERY, loop=LoopOptions(wait=3.0)))
+    backend = Backend(replace(EVERY, loop=LoopOptions(wait=3.0)))
     assert [LOOP_STATES[k] for k in (WAITING, SUSPECT, ACCEPTED, REJECTED, EXPIRED)] == [
         'waiting', 'suspect', 'accepted', 'rejected', 'expired']
     assert len(backend.loop_states().state) == 0
@@ -447,7 +462,7 @@ def test_each_loop_has_a_state_and_its_own_stamps(careful):
     backend.add_loop(loop(2.0, 50.0, (1.0, 0.0, 0.0)))
     backend.update(PLENTY)
     states = backend.loop_states()
-    factors, loops = backend.builder.graph.between, len(states.rows)
+    factors, loops = backend.snapshot().graph.between, len(states.rows)
     assert_array_equal(states.rows, np.flatnonzero(~factors.is_odometry))
     ends = np.stack((factors.i, factors.j), axis=1)[states.rows]
     assert_array_equal(states.stamps[:loops], ends * seconds(PERIOD))
@@ -459,16 +474,16 @@ def test_each_loop_has_a_state_and_its_own_stamps(careful):
 
 
 def test_a_loop_just_come_is_suspect_and_has_no_sigmas(careful):
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     play(backend, careful, 0, 60)
-    backend.problem()
+    backend.snapshot().problem()
     states = backend.loop_states()
     assert len(states.rows) and (states.state == SUSPECT).all()
     assert np.isnan(states.sigmas).all()
 
 
 def test_who_stops_doubting_believes_the_loops_to_come(careful):
-    backend, world = Backend(se2, EVERY), spoilt(careful, 'random', 130)
+    backend, world = Backend(EVERY), spoilt(careful, 'random', 130)
     play(backend, world, 0, 150)
     settled(backend)
     assert (backend.loop_states().state == REJECTED).any()
@@ -483,20 +498,20 @@ def test_who_stops_doubting_believes_the_loops_to_come(careful):
 
 def restored(world, n):
     """Return the first n keyframes as one run left them, and a run that goes on from there."""
-    first, second = Backend(se2, EVERY), Backend(se2, EVERY)
+    first, second = Backend(EVERY), Backend(EVERY)
     play(first, world, 0, n)
     settled(first)
-    second.restore(first.problem().graph, first.poses, first.builder.stamps)
+    second.restore(first.snapshot().problem().graph, first.poses, first.snapshot().stamps)
     return first, second
 
 
 def test_a_restored_map_is_the_map_it_was(world):
     first, second = restored(world, 80)
     assert_array_equal(second.poses, first.poses)
-    assert_array_equal(second.builder.stamps, first.builder.stamps)
+    assert_array_equal(second.snapshot().stamps, first.snapshot().stamps)
     second.update(PLENTY)
     # Started anew it may end nearer to the optimum, of which a settled map is within 2e-4.
-    before, after = first.problem().last_cost, second.problem().last_cost
+    before, after = first.snapshot().problem().last_cost, second.snapshot().problem().last_cost
     assert (1 - 5e-4) * before <= after <= (1 + 1e-4) * before
 
 
@@ -509,43 +524,45 @@ def test_after_a_restore_odometry_may_begin_anywhere(world):
         backend.add_odometry(odometry(100.0 + k, raw[0], 1e-3 * np.eye(6)))
         there = se2.compose(end, np.array([[float(k), 0.0, 0.0]]))
         assert_allclose(se2.local(backend.poses[-1:], there), 0, atol=1e-9)
-        assert_allclose(se2.local(se2.compose(backend.map_to_odom, raw), there), 0, atol=1e-9)
+        moved = se2.compose(backend.snapshot().map_to_odom, raw)
+        assert_allclose(se2.local(moved, there), 0, atol=1e-9)
     # Half a metre off: nobody would believe it who was not told to.
     seen = loop(7.9, 104.0, (4.5, 0.0, 0.0), 1e-6 * np.eye(6))
     backend.add_loop(replace(seen, trusted=True))
     settled(backend)
     seen = se2.between(backend.poses[79:80], backend.poses[-1:])
     assert_allclose(seen, [[4.5, 0.0, 0.0]], atol=1e-2)
-    assert_allclose(se2.local(backend.poses[-1:], se2.compose(backend.map_to_odom, raw)), 0,
-                    atol=1e-9)
+    moved = se2.compose(backend.snapshot().map_to_odom, raw)
+    assert_allclose(se2.local(backend.poses[-1:], moved), 0, atol=1e-9)
 
 
 # The warm start
 
 
 def test_the_dual_of_old_rows_is_kept_and_new_rows_start_at_zero(world):
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     play(backend, world, 0, 100)
-    improvement = improve(backend.problem(), EVERY.solver, PLENTY)
+    improvement = improve(backend.snapshot().problem(), EVERY.solver, PLENTY)
     backend.adopt(improvement)
     rows = len(improvement.dual)
-    assert rows == 3 * len(backend.builder.graph.between)
+    assert rows == 3 * len(backend.snapshot().graph.between)
     play(backend, world, 100, 110)
-    dual = backend.problem().dual
-    assert len(dual) == 3 * len(backend.builder.graph.between) > rows
+    dual = backend.snapshot().problem().dual
+    assert len(dual) == 3 * len(backend.snapshot().graph.between) > rows
     assert_array_equal(dual[:rows], improvement.dual)
     assert_array_equal(dual[rows:], 0)
     assert np.abs(improvement.dual).max() == 1.0
 
 
 def test_a_warm_update_does_more_with_little_work_than_a_cold_one(world):
-    warm, cold = Backend(se2, EVERY), Backend(se2, EVERY)
+    warm, cold = Backend(EVERY), Backend(EVERY)
     play(warm, world, 0, 149)
     settled(warm)
     play(warm, world, 149)
     play(cold, world)
     options = OptimiserOptions(outer_iterations=2, inner=PrimalDualOptions(iterations=100))
-    first, second = (improve(backend.problem(), options, PLENTY) for backend in (warm, cold))
+    first, second = (improve(backend.snapshot().problem(), options, PLENTY)
+                     for backend in (warm, cold))
     best = batch_of(world.graph).cost
     assert first.cost_before < 0.2 * second.cost_before
     assert first.reweighted_steps == 0 < second.reweighted_steps
@@ -553,41 +570,41 @@ def test_a_warm_update_does_more_with_little_work_than_a_cold_one(world):
 
 
 def test_the_account_of_an_update_is_true(world):
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     play(backend, world, 0, 80)
-    problem = backend.problem()
+    problem = backend.snapshot().problem()
     improvement = improve(problem, EVERY.solver, PLENTY)
     assert improvement.cost_before == cost(problem.graph, problem.poses)
     assert improvement.cost == cost(problem.graph, improvement.poses)
     assert improvement.cost <= improvement.cost_before
     assert improvement.reweighted_steps >= 1
     backend.adopt(improvement)
-    assert backend.problem().last_cost == improvement.cost
+    assert backend.snapshot().problem().last_cost == improvement.cost
 
 
 # Options and errors
 
 
 def test_what_was_judged_by_other_options_is_not_adopted(careful):
-    backend, world = Backend(se2, EVERY), spoilt(careful, 'random', 130)
+    backend, world = Backend(EVERY), spoilt(careful, 'random', 130)
     play(backend, world, 0, 150)
-    doubting = improve(backend.problem(), EVERY.solver, PLENTY)
-    assert not doubting.belief.accepted.all()
+    doubting = improve(backend.snapshot().problem(), EVERY.solver, PLENTY)
+    assert not doubting.judgement.accepted.all()
     backend.set_options(CREDULOUS)
     before = backend.poses
     backend.adopt(doubting)
     assert_array_equal(backend.poses, before)
-    assert backend.problem().belief.accepted.all()
+    assert backend.snapshot().problem().judgement.accepted.all()
 
 
 @pytest.mark.parametrize('name', ['poses', 'dual', 'cost'])
 def test_what_is_not_finite_is_not_adopted(world, name):
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     play(backend, world, 0, 40)
     settled(backend)
     before = backend.poses
     play(backend, world, 40, 60)
-    good = improve(backend.problem(), EVERY.solver, PLENTY)
+    good = improve(backend.snapshot().problem(), EVERY.solver, PLENTY)
     value = np.copy(getattr(good, name))
     value.flat[-1] = np.nan
     with pytest.raises(ArithmeticError, match=f'the {name} of a new map is not finite'):
@@ -600,10 +617,10 @@ def test_what_is_not_finite_is_not_adopted(world, name):
 @pytest.mark.parametrize('work', ['improve', 'optimise', 'optimise all'])
 def test_work_can_be_stopped_at_many_moments(careful, work):
     world = spoilt(careful, 'random', 130)
-    backend = Backend(se2, CREDULOUS if work == 'optimise all' else EVERY)
+    backend = Backend(CREDULOUS if work == 'optimise all' else EVERY)
     play(backend, world)
-    problem = backend.problem()
-    kept = problem.poses.copy(), problem.belief.accepted.copy()
+    problem = backend.snapshot().problem()
+    kept = problem.poses.copy(), problem.judgement.accepted.copy()
     limit, count = 10**9, 0
 
     def check():
@@ -627,23 +644,23 @@ def test_work_can_be_stopped_at_many_moments(careful, work):
             run()
         assert count == limit + 1, 'it went on after it was stopped'
     assert_array_equal(problem.poses, kept[0])
-    assert_array_equal(problem.belief.accepted, kept[1])
+    assert_array_equal(problem.judgement.accepted, kept[1])
 
 
 def test_a_large_map_comes_to_rest_though_no_update_ends_by_its_tests(world):
     """As where the budget is over after one linearisation, update after update."""
     options = replace(EVERY, solver=OptimiserOptions(outer_iterations=1))
-    backend = Backend(se2, options)
+    backend = Backend(options)
     play(backend, world)
     updates = settled(backend)
-    assert backend.problem().settled and updates > 5
+    assert backend.snapshot().problem().settled and updates > 5
     assert cost(world.graph, backend.poses) == pytest.approx(batch_of(world.graph).cost, rel=1e-3)
     play(backend, careful_world(151, 320), 150, 151)
-    assert not backend.problem().settled
+    assert not backend.snapshot().problem().settled
 
 
 def test_options_may_change_on_the_way(world):
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     play(backend, world, 0, 40)
     settled(backend)
     poses = backend.poses
@@ -656,7 +673,7 @@ def test_options_may_change_on_the_way(world):
 
 
 def test_a_variance_of_nearly_zero_does_not_end_the_map():
-    backend = Backend(se2, EVERY)
+    backend = Backend(EVERY)
     for k in range(5):
         backend.add_odometry(odometry(k, (k, 0.0, 0.0), 1e-308 * np.eye(6)))
     backend.add_loop(loop(0.0, 4.0, (4.1, 0.0, 0.0)))
@@ -665,7 +682,7 @@ def test_a_variance_of_nearly_zero_does_not_end_the_map():
 
 
 def test_whether_loops_are_doubted_can_be_changed_while_it_runs():
-    backend = Backend(se2, CREDULOUS)
+    backend = Backend(CREDULOUS)
     for k in range(60):
         backend.add_odometry(odometry(k * PERIOD, (float(k), 0.1 * (k % 3), 0.01 * (k % 5)),
                                       1e-4 * np.eye(6)))

@@ -31,7 +31,7 @@ from l1slam_ros.core.robust import batch_map
 from l1slam_ros.io.compilation import fill_cache
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core import kernels
-from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions, optimise
+from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.robust.inspection import connected_parts
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
@@ -63,21 +63,21 @@ every = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('incremen
 world = spoilt(careful_world(150, 300), 'grouped', 60)
 for enabled in (True, False):
     options = replace(every, robust=RobustOptions(enabled))
-    backend = Backend(se2, options)
+    backend = Backend(options)
     for k in range(0, 150, 15):
         play(backend, world, k, k + 15)
         backend.update(0.001 if k % 2 else 60.0)
     backend.loop_states()
     look(f'updates, robust {enabled}')
-    backend.adopt(optimise(backend.problem(), options.solver))
+    backend.settle()
     look(f'optimise, robust {enabled}')
-    after = Backend(se2, options)
-    after.restore(backend.builder.graph, backend.poses, backend.builder.stamps)
+    after = Backend(options)
+    after.restore(backend.snapshot().graph, backend.poses, backend.snapshot().stamps)
     after.update(60.0)
     look(f'restored, robust {enabled}')
 
 truth = roundabout(220)
-backend = Backend(se2, every)
+backend = Backend(every)
 drive_roundabout(backend, truth)
 for i, j in ((3, 203), (30, 140)):
     backend.add_loop(seen(truth, i, j))

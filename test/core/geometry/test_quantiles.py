@@ -4,7 +4,7 @@
 import pytest
 from scipy.special import betaincinv, gammainc, gammaincinv
 
-from l1slam_ros.core.robust.quantiles import beta_quantile, gamma_probability, gamma_quantile
+from l1slam_ros.core.geometry.quantiles import beta_quantile, gamma_probability, gamma_quantile
 
 PROBABILITIES = [1e-6, 0.01, 0.5, 0.95, 0.999, 1 - 1e-6, 1 - 1e-9]
 

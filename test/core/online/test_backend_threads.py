@@ -2,6 +2,7 @@
 """Threads that meet at the back end: what one of them sees is whole, whatever the others do."""
 
 import threading
+import time
 from dataclasses import fields
 
 import numpy as np
@@ -9,13 +10,12 @@ import pytest
 from problems import covariance6, loop, odometry
 
 from l1slam_ros.core.errors import Interrupted
-from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.online import shared_backend
-from l1slam_ros.core.online.backend import BackendOptions, Improvement, improve
+from l1slam_ros.core.online import backend as backend_module
+from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
-from l1slam_ros.core.online.shared_backend import SharedBackend
+from l1slam_ros.core.online.update import Improvement, improve
 
 OPTIONS = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 DEADLINE = 30.0
@@ -58,7 +58,7 @@ def meanwhile(work):
 
 
 def test_nobody_sees_a_keyframe_without_its_odometry(monkeypatch):
-    backend, meeting, add_poses = SharedBackend(se2, OPTIONS), Meeting(), FactorGraph.add_poses
+    backend, meeting, add_poses = Backend(OPTIONS), Meeting(), FactorGraph.add_poses
     drive(backend, 0, 1)
 
     def slowly(graph, count=1):
@@ -67,41 +67,40 @@ def test_nobody_sees_a_keyframe_without_its_odometry(monkeypatch):
 
     monkeypatch.setattr(FactorGraph, 'add_poses', slowly)
     adding = meanwhile(lambda: drive(backend, 1, 2))
-    state = meeting.look(backend.state)
+    state = meeting.look(backend.snapshot)
     adding.join()
-    assert len(state.stamps) - len(state.factors) == 1
-    assert len(backend.state().stamps) == 2
+    assert len(state.stamps) - len(state.graph.between) == 1
+    assert len(backend.snapshot().stamps) == 2
 
 
 def test_nobody_sees_new_poses_with_an_old_judgement(monkeypatch):
-    backend, meeting = SharedBackend(se2, OPTIONS), Meeting()
+    backend, meeting = Backend(OPTIONS), Meeting()
     drive(backend, 0, 30)
     backend.add_loop(loop(1.0, 30.0, (28.9, 0.0, 0.0), 1e-8 * np.eye(6)))
-    before = backend.state()
+    before = backend.snapshot()
 
     class Slow(Improvement):
         def __getattribute__(self, name):
-            get = super().__getattribute__
-            if name == 'belief' and backend._backend._poses is get('poses'):
-                meeting()  # half of it has been taken over
-            return get(name)
+            if name == 'judgement':
+                meeting()  # it is being taken over
+            return super().__getattribute__(name)
 
     def slowly(*arguments):
         made = improve(*arguments)
         return Slow(**{field.name: getattr(made, field.name) for field in fields(made)})
 
-    monkeypatch.setattr(shared_backend, 'improve', slowly)
+    monkeypatch.setattr(backend_module, 'improve', slowly)
     updating = meanwhile(lambda: backend.update(DEADLINE, go_on))
-    seen = meeting.look(backend.state)
+    seen = meeting.look(backend.snapshot)
     updating.join()
-    after = backend.state()
-    assert (before.poses != after.poses).any() and after.loops.state.tolist() == [ACCEPTED]
+    after = backend.snapshot()
+    assert (before.poses != after.poses).any() and after.loop_states().state.tolist() == [ACCEPTED]
     new_poses = (seen.poses == after.poses).all()
-    assert new_poses == (seen.loops.state == after.loops.state).all()
+    assert new_poses == (seen.loop_states().state == after.loop_states().state).all()
 
 
 def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):
-    backend, meeting = SharedBackend(se2, OPTIONS), Meeting()
+    backend, meeting = Backend(OPTIONS), Meeting()
     drive(backend, 0, 5)
     ended = []
 
@@ -116,13 +115,13 @@ def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):
         except Interrupted as interrupted:
             ended.append(interrupted)
 
-    monkeypatch.setattr(shared_backend, 'improve', slowly)
+    monkeypatch.setattr(backend_module, 'improve', slowly)
     updating = meanwhile(update)
     meeting.look(backend.reset)
     updating.join()
-    assert isinstance(ended[0], Interrupted) and not len(backend.state().poses)
+    assert isinstance(ended[0], Interrupted) and not len(backend.snapshot().poses)
     drive(backend, 100, 102)
-    np.testing.assert_allclose(backend.state().poses[:, 0], [100, 101])
+    np.testing.assert_allclose(backend.snapshot().poses[:, 0], [100, 101])
 
 
 def patient(problem, options, budget, check):
@@ -131,9 +130,9 @@ def patient(problem, options, budget, check):
         check()
 
 
-@pytest.mark.parametrize('interrupt', ['reset', 'restore', 'optimise', 'stopped'])
+@pytest.mark.parametrize('interrupt', ['reset', 'restore', 'settle', 'stopped'])
 def test_an_update_is_interrupted_at_once(monkeypatch, interrupt):
-    backend, stopped, begun = SharedBackend(se2, OPTIONS), threading.Event(), threading.Event()
+    backend, stopped, begun = Backend(OPTIONS), threading.Event(), threading.Event()
     drive(backend, 0, 5)
     now = backend.snapshot()
 
@@ -141,15 +140,15 @@ def test_an_update_is_interrupted_at_once(monkeypatch, interrupt):
         with pytest.raises(Interrupted):
             backend.update(DEADLINE, lambda: begun.set() or stopped.is_set())
 
-    monkeypatch.setattr(shared_backend, 'improve', patient)
+    monkeypatch.setattr(backend_module, 'improve', patient)
     updating = meanwhile(update)
     assert begun.wait(DEADLINE)
     # What needs no solver does not interrupt it, and is not held up.
     assert len(backend.snapshot().poses) == 5 and updating.is_alive()
     drive(backend, 5, 6)
     assert backend.counts()[0]['keyframes'] == 6 and updating.is_alive()
-    if interrupt == 'optimise':
-        assert backend.optimise(go_on).cost == pytest.approx(0.0, abs=1e-6)
+    if interrupt == 'settle':
+        assert backend.settle(go_on).cost == pytest.approx(0.0, abs=1e-6)
     elif interrupt == 'restore':
         backend.restore(now.graph, now.poses, now.stamps)
     elif interrupt == 'reset':
@@ -161,7 +160,7 @@ def test_an_update_is_interrupted_at_once(monkeypatch, interrupt):
 
 
 def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
-    backend = SharedBackend(se2, OPTIONS)
+    backend = Backend(OPTIONS)
     drive(backend, 0, 30)
 
     def settle():
@@ -172,8 +171,8 @@ def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
 
     assert settle() > 0
     looked = []
-    snapshot = backend._backend.snapshot
-    monkeypatch.setattr(backend._backend, 'snapshot', lambda: looked.append(1) or snapshot())
+    snapshot = backend._snapshot
+    monkeypatch.setattr(backend, '_snapshot', lambda: looked.append(1) or snapshot())
     version = backend.version
     backend.counts()
     looked.clear()
@@ -184,10 +183,69 @@ def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
     assert backend.version != version
     assert settle() > 0 and backend.loop_states().state.tolist() == [ACCEPTED]
     drive(backend, 30, 31)
-    assert settle() > 0 and len(backend.state().poses) == 31
+    assert settle() > 0 and len(backend.snapshot().poses) == 31
     # A loop that waits for odometry which makes no keyframe.
     backend.set_options(BackendOptions(KeyframeOptions(1e6, 0.0, 0.0), OPTIONS.odometry))
     backend.add_loop(loop(2.0, 33.0, (30.9, 0.0, 0.0), 1e-4 * np.eye(6)))
     assert settle() == 0
     drive(backend, 32, 33)
     assert settle() > 0 and len(backend.loop_states().rows) == 2
+
+
+# In the background
+
+
+def wait_until(holds):
+    end = time.monotonic() + DEADLINE
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.001)
+
+
+def of_threads():
+    return [thread for thread in threading.enumerate() if thread.name == 'updates']
+
+
+def test_in_the_background_what_comes_is_judged_and_the_thread_ends():
+    with Backend(OPTIONS, background=True) as backend:
+        drive(backend, 0, 30)
+        backend.add_loop(loop(1.0, 30.0, (28.9, 0.0, 0.0), 1e-4 * np.eye(6)))
+        wait_until(lambda: backend.loop_states().state.tolist() == [ACCEPTED])
+        wait_until(lambda: backend.update() is None)
+        now = backend.snapshot()
+        # A map that takes the place of another is woken for too.
+        backend.restore(now.graph, now.poses, now.stamps)
+        wait_until(lambda: backend.snapshot().optimised.at_rest)
+        assert len(of_threads()) == 1
+    assert not of_threads()
+    drive(backend, 30, 31)
+    assert backend.update() is not None
+
+
+@pytest.mark.parametrize('end', ['close', 'settle', 'reset'])
+def test_the_background_makes_way(monkeypatch, end):
+    begun = threading.Event()
+    monkeypatch.setattr(backend_module, 'improve', lambda *a: begun.set() or patient(*a))
+    with Backend(OPTIONS, background=True) as backend:
+        drive(backend, 0, 5)
+        assert begun.wait(DEADLINE)
+        ended = meanwhile(getattr(backend, end))
+        ended.join(DEADLINE)
+        assert not ended.is_alive()
+        assert len(of_threads()) == (end != 'close')
+    assert not of_threads()
+
+
+def test_what_fails_in_the_background_is_raised_at_the_end(monkeypatch):
+    failed = threading.Event()
+
+    def fail(*_):
+        failed.set()
+        raise MemoryError('no more')
+
+    monkeypatch.setattr(backend_module, 'improve', fail)
+    with pytest.raises(MemoryError, match='no more'), Backend(OPTIONS, background=True) as backend:
+        drive(backend, 0, 5)
+        assert failed.wait(DEADLINE)
+    assert not of_threads()
+    backend.close()
