@@ -190,7 +190,8 @@ def _rounds(arguments: argparse.Namespace, summary: BagSummary, topics: list[str
 
 def _play(arguments: argparse.Namespace, damage: _Damage) -> None:
     summary = bag_summary(arguments.bag)
-    node = rclpy.create_node('replay')
+    # Without /rosout: a line that is logged just when a signal comes would be an error there.
+    node = rclpy.create_node('replay', enable_rosout=False)
     try:
         player = Player(node, summary, arguments.topics, arguments.remap, arguments.clock)
         if not player.publishers:
