@@ -120,7 +120,7 @@ def bounds(found: Array, used: Array, out: Mask) -> list[tuple[float, float]]:
     return list(zip(*variances, strict=True))
 
 
-def fingerprint(reference: int, stamp: int, measurement: Array, covariance: Array,
+def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Array,
                 trusted: bool) -> bytes:
     """
     Return what equal measurements have in common: stamps, pose and, to six digits, covariance.

@@ -20,7 +20,7 @@ from l1slam_ros.core.geometry.noise import (
     Mask,
     at_most,
     bounds,
-    fingerprint,
+    loop_identity,
     or_model,
     root_of_inverse,
     usable,
@@ -233,14 +233,14 @@ class GraphBuilder:
         covariances = roots @ roots.transpose(0, 2, 1)
         for (reference, stamp), row, covariance in zip(ends.tolist(), rows, covariances,
                                                        strict=True):
-            self._seen.add(fingerprint(reference, stamp, factors.measurement[row], covariance,
+            self._seen.add(loop_identity(reference, stamp, factors.measurement[row], covariance,
                                        bool(factors.trusted[row])))
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Take a loop closure in, once; it becomes a factor in `add_due_loops`."""
         measurement = self.graph.manifold.from_pose3(loop.pose3[None])
         covariance = self._loop_covariance(loop)
-        key = fingerprint(loop.reference_stamp, loop.stamp, measurement, covariance, loop.trusted)
+        key = loop_identity(loop.reference_stamp, loop.stamp, measurement, covariance, loop.trusted)
         if key in self._seen and not self._verbatim:
             self._refuse('repeated', loop, 'was sent before; expected each loop once')
             return
