@@ -240,7 +240,8 @@ class GraphBuilder:
         """Take a loop closure in, once; it becomes a factor in `add_due_loops`."""
         measurement = self.graph.manifold.from_pose3(loop.pose3[None])
         covariance = self._loop_covariance(loop)
-        key = loop_identity(loop.reference_stamp, loop.stamp, measurement, covariance, loop.trusted)
+        key = loop_identity(loop.reference_stamp, loop.stamp, measurement, covariance,
+                            loop.trusted)
         if key in self._seen and not self._verbatim:
             self._refuse('repeated', loop, 'was sent before; expected each loop once')
             return
