@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 from l1slam_ros.core.errors import FileError, GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.robust.inspection import initial_poses
-from l1slam_ros.io.bags.reader import BAG_SUFFIXES
-from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
+from l1slam_ros.io.bags.topics import BAG_SUFFIXES, DEFAULT_TOPICS, Topics
 from l1slam_ros.io.files import require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 from l1slam_ros.io.trajectory import invented_stamps, write_tum

@@ -28,9 +28,9 @@ from l1slam_ros.io.bags.damaged.sqlite_pages import is_cut
 from l1slam_ros.io.bags.damaged.walk import RawMessage, ros1_types
 from l1slam_ros.io.bags.damaged.walk_mcap import is_indexed, mcap_metadata
 from l1slam_ros.io.bags.damaged.walk_sqlite import has_journal, sqlite_metadata
+from l1slam_ros.io.bags.topics import BAG_SUFFIXES
 from l1slam_ros.io.bags.writer import NOTE_KEY
 
-BAG_SUFFIXES = ('.mcap', '.db3', '.bag')
 _TO_ITS_END = 'expected a bag that can be read to its end'
 # Told of damage, in one sentence.
 OnDamage = Callable[[str], None]

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a bag has what; imports nothing that takes time, so that a command line can offer it."""
+"""How bags are called, and where one has what; imports nothing that takes time."""
 
 from dataclasses import dataclass
 
+BAG_SUFFIXES = ('.mcap', '.db3', '.bag')
 ODOMETRY_TOPIC = '/odom'
 LOOP_TOPIC = '/loop_closures'
 TRUSTED_LOOP_TOPIC = '/trusted_loop_closures'
