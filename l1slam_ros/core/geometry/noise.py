@@ -57,21 +57,6 @@ def square_root_information(information: Array) -> Array:
     return root.astype(np.float64, copy=False)
 
 
-def information_from_covariance(covariance: Array) -> Array:
-    """
-    Return the inverse of each (m, d, d) covariance.
-
-    Raises
-    ------
-    NoiseError : naming the first one that is not finite, symmetric and positive definite.
-
-    """
-    root = square_root_information(covariance)  # the same demands hold for a covariance
-    inverse = np.linalg.inv(root)
-    product: Array = inverse @ inverse.transpose(0, 2, 1)
-    return product
-
-
 def usable(covariance: Array) -> Mask:
     """Tell which of (m, d, d) matrices are covariances, (m,): messages carry zeros and worse."""
     with np.errstate(over='ignore', invalid='ignore'):

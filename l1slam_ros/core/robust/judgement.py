@@ -10,7 +10,7 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 
 # Refused loops of several places agree with each other; hardly a loop is believed.
-INCONSISTENT, MOSTLY_REFUSED = KINDS_OF_DOUBT = ('inconsistent', 'mostly refused')
+INCONSISTENT, MOSTLY_REFUSED = 'inconsistent', 'mostly refused'
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Doubt:
     """
     Why a map is not to be relied on.
 
-    kind : of `KINDS_OF_DOUBT`; loops : how many speak against it; first, last : the keyframes
+    kind : one of the two above; loops : how many speak against it; first, last : the keyframes
     between which they do.
     """
 
