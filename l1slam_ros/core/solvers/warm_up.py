@@ -9,12 +9,14 @@ modules of `kernels` know not of each other, so each can be made ready in a proc
 import importlib
 from collections.abc import Callable
 
-# What a sparse graph is solved by, what false loops are told by, what a dense graph is solved by:
-# modules of `kernels`, those first that take long to compile.
+# What a sparse graph is solved by, what false loops are told by, what a dense graph is solved by,
+# what keeps up with a graph that grows: modules of `kernels`, those first that take long to
+# compile.
 SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interior_point', 'se2')
 JUDGEMENT = ('prediction',)
 DENSE = ('halpern', 'tiles')
-STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *SPARSE[2:], 'tiles')
+ONLINE = ('border',)
+STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:], 'tiles')
 
 
 def warm_up(report: Callable[[str], None] = lambda step: None) -> None:

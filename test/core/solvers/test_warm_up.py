@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from l1slam_ros.core import kernels
-from l1slam_ros.core.solvers.warm_up import DENSE, JUDGEMENT, SPARSE, STEPS, warm_up
+from l1slam_ros.core.solvers.warm_up import DENSE, JUDGEMENT, ONLINE, SPARSE, STEPS, warm_up
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.compilation import fill_cache
 from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
@@ -186,4 +186,4 @@ def test_each_step_is_reported_once_it_is_done():
 def test_every_module_of_loops_is_a_step():
     modules = {module.name for module in pkgutil.iter_modules(kernels.__path__)}
     assert sorted(STEPS) == sorted(modules - {'compiled'})
-    assert set(STEPS) == {*SPARSE, *JUDGEMENT, *DENSE}
+    assert set(STEPS) == {*SPARSE, *JUDGEMENT, *DENSE, *ONLINE}
