@@ -49,8 +49,10 @@ class Prediction:
 @dataclass(frozen=True)
 class Steps:
     """
-    The steps of all keyframes at one moment: of those in the border, (b, k), and what pulls at the
-    others: gradient (t, k) at the keyframes touched (t,).
+    The steps of all keyframes at one moment.
+
+    cholesky, size : see `Border`; touched, gradient : what pulls at the old keyframes (t,), (t, k);
+    new : the steps of the border's, (b, k).
     """
 
     cholesky: BlockCholesky
@@ -142,8 +144,8 @@ class Border:
             return z[-2 - name].copy()
         if name == FIXED or not len(z):
             return np.zeros(self._k)
-        return -np.tensordot(self._covariance[name, :len(self._touched)], self._gradient(),
-                             ((0, 2), (0, 1)))
+        pulled: Array = self._covariance[name, :len(self._touched)] @ self._gradient()[:, :, None]
+        return -pulled.sum(axis=0)[:, 0]
 
     def steps(self) -> Steps:
         """Return the steps of all keyframes as they are now."""
