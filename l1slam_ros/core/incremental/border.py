@@ -51,8 +51,8 @@ class Steps:
     """
     The steps of all keyframes at one moment.
 
-    cholesky, size : see `Border`; touched, gradient : what pulls at the old keyframes (t,), (t, k);
-    new : the steps of the border's, (b, k).
+    cholesky, size : see `Border`; touched (t,), gradient (t, k) : what pulls at which of the old
+    keyframes; new : the steps of the border's, (b, k).
     """
 
     cholesky: BlockCholesky
@@ -100,6 +100,16 @@ class Border:
         """How many rows the dense system has."""
         return len(self._right)
 
+    @property
+    def keyframes(self) -> int:
+        """How many keyframes there are, old and new."""
+        return self._size + len(self._home)
+
+    @property
+    def touched(self) -> int:
+        """How many of the old ones were asked for."""
+        return len(self._touched)
+
     def predict(self, ends: tuple[int, int], blocks: Array) -> Prediction:
         """
         Return what is known of J_i x_i + J_j x_j.
@@ -141,11 +151,13 @@ class Border:
         """Return the step of a keyframe, (k,)."""
         name, z = self._name(keyframe), self._solved()
         if name < -1:
-            return z[-2 - name].copy()
+            own: Array = z[-2 - name]
+            return own
         if name == FIXED or not len(z):
             return np.zeros(self._k)
-        pulled: Array = self._covariance[name, :len(self._touched)] @ self._gradient()[:, :, None]
-        return -pulled.sum(axis=0)[:, 0]
+        pulled = self._covariance[name, :len(self._touched)] @ self._gradient()[:, :, None]
+        step: Array = -pulled.sum(axis=0)[:, 0]
+        return step
 
     def steps(self) -> Steps:
         """Return the steps of all keyframes as they are now."""

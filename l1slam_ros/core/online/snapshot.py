@@ -6,12 +6,15 @@ In: references to arrays that are never written to again. Out: what is worked ou
 problem of the next update first of all.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.incremental.growing_map import View
 from l1slam_ros.core.online.loop_states import (
     ACCEPTED,
     EXPIRED,
@@ -23,6 +26,7 @@ from l1slam_ros.core.online.loop_states import (
 )
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.optimality import Status
+from l1slam_ros.core.solvers.solve import AUTO, PRIMAL_DUAL, Choice, choose
 
 # A large map gets but one linearisation into an update, and never meets a test that takes two of
 # them. It is at rest when so many updates in a row lowered the cost by less than is looked for.
@@ -35,27 +39,50 @@ class Problem:
     A snapshot to improve: graph, poses (n, p), dual (rows,) and the cost the last update left.
 
     map : number of the map that it is of, other after `Backend.reset` and `Backend.restore`;
-    judgement : of all factors; robust : loops may be doubted; settled : nothing has come since an
-    update that converged.
+    starts : poses to start from, `poses` the first; judgement : of all factors; robust : loops may
+    be doubted; settled : nothing has come since an update that converged; may_be_far : there is
+    news that no front knows.
     """
 
     map: int
     graph: FactorGraph
-    poses: Array
+    starts: list[Array]
     dual: Array
     judgement: Judgement
     robust: bool
     last_cost: float
     settled: bool
+    may_be_far: bool
+
+    @property
+    def poses(self) -> Array:
+        """Where the keyframes are, (n, p)."""
+        return self.starts[0]
+
+    @cached_property
+    def part(self) -> FactorGraph:
+        """The factors that are believed."""
+        return self.graph.subset(self.judgement.accepted)
+
+    @cached_property
+    def choice(self) -> Choice:
+        """What to solve them by."""
+        return choose(AUTO, self.part)
+
+    @property
+    def is_sparse(self) -> bool:
+        """Whether they are solved by factorisations."""
+        return self.choice.solver != PRIMAL_DUAL
 
 
 @dataclass(frozen=True)
 class Optimised:
     """
-    What updates have made so far, of the first keyframes and factors.
+    What has been made so far, of the first keyframes and factors.
 
-    poses : (k, p); dual : (rows,); judgement, cost and status : as the last update left them;
-    quiet_updates : how many in a row hardly lowered the cost.
+    poses : (k, p); dual : (rows,); cost and status : as the last map left them; used : (m,) the
+    factors it is of; quiet_updates : how many in a row hardly lowered the cost; falls : it still
+    does; judgement : of the first factors, made beside the map; judged : (n, p) the map of it.
     """
 
     poses: Array
@@ -63,18 +90,28 @@ class Optimised:
     judgement: Judgement
     cost: float
     status: Status
-    quiet_updates: int
+    used: Mask
+    quiet_updates: int = 0
+    falls: bool = False
+    judged: Array | None = None
 
     @staticmethod
     def nothing(poses: Array) -> 'Optimised':
         """Return what stands before the first update: poses at most."""
-        return Optimised(poses, np.zeros(0), Judgement.nothing(), 0.0, Status.OUT_OF_TIME, 0)
+        return Optimised(poses, np.zeros(0), Judgement.nothing(), 0.0, Status.OUT_OF_TIME,
+                         np.zeros(0, bool))
 
     @property
     def at_rest(self) -> bool:
         """Whether more updates of the same factors would hardly change the map."""
-        return (self.status in (Status.CONVERGED, Status.STALLED)
-                or self.quiet_updates >= _QUIET_UPDATES)
+        return not self.rejudged and (self.status in (Status.CONVERGED, Status.STALLED)
+                                      or self.quiet_updates >= _QUIET_UPDATES)
+
+    @cached_property
+    def rejudged(self) -> bool:
+        """Whether the map is not that of what is believed."""
+        both = min(len(self.used), len(self.judgement.accepted))
+        return bool((self.used[:both] != self.judgement.accepted[:both]).any())
 
 
 @dataclass(frozen=True)
@@ -84,7 +121,9 @@ class Snapshot:
 
     map : its number; version : see `Backend.version`; graph : the factors so far; stamps (n,)
     [ns] and odometry (n, p) of the keyframes; map_to_odom : (1, p); loop_rows, loop_stamps : see
-    `GraphBuilder`; robust : loops may be doubted.
+    `GraphBuilder`; robust : loops may be doubted; looks : (k, 3) what the front says of
+    the factors after those that are judged: accepted, suspect, sigmas; all_judged : no loop is
+    among them; views : the L1 and L2 map of the front, where there is one.
     """
 
     map: int
@@ -97,35 +136,57 @@ class Snapshot:
     loop_stamps: tuple[Indices, Indices, Indices]
     optimised: Optimised
     robust: bool
+    looks: Array
+    all_judged: bool
+    views: tuple[View, ...]
 
-    @property
+    @cached_property
     def poses(self) -> Array:
         """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
-        optimised, manifold = self.optimised.poses, self.graph.manifold
-        known = len(optimised)
-        new = self.odometry[known:]
+        return self._followed(self.views[0].poses if self.views else self.optimised.poses,
+                              self.odometry)
+
+    def _followed(self, poses: Array, others: Array) -> Array:
+        """Return poses (k, p) and all keyframes after them, as they follow in others (n, p)."""
+        manifold, known = self.graph.manifold, len(poses)
+        new = others[known:]
         if known and len(new):
-            start = np.broadcast_to(self.odometry[known - 1], new.shape)
-            last = np.broadcast_to(optimised[-1], new.shape)
+            start = np.broadcast_to(others[known - 1], new.shape)
+            last = np.broadcast_to(poses[-1], new.shape)
             new = manifold.compose(last, manifold.between(start, new))
-        return np.concatenate((optimised, new))
+        return np.concatenate((poses, new))
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """What is believed of all factors."""
+        last = self.optimised.judgement
+        accepted, suspect, sigmas = self.looks.T
+        looked = replace(
+            last, accepted=np.concatenate((last.accepted, accepted > 0)),
+            suspect=np.concatenate((last.suspect, suspect > 0)),
+            sigmas=np.concatenate((last.sigmas, sigmas)),
+            settled=not self.robust or (last.settled and self.all_judged))
+        return looked.extended(self.graph, self.robust)
 
     def problem(self) -> Problem:
         """Return what an update begins with: the graph, and the warm start for all of it."""
         last, rows = self.optimised, len(self.graph.between) * self.graph.manifold.TANGENT_SIZE
         # Rows are only ever appended, so the dual of the old ones stays; new ones start at zero.
         dual = np.concatenate((last.dual, np.zeros(rows - len(last.dual))))
-        judgement = last.judgement.extended(self.graph, self.robust)
+        starts, judged = [self.poses], last.judged
+        starts += [self._followed(view.poses, self.poses) for view in self.views[1:]]
+        if judged is not None and last.rejudged:
+            # After a loop has closed, the L2 map of the judgement is nearer.
+            starts.append(self._followed(judged, self.poses))
         grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
-        settled = not grown and judgement.settled and last.at_rest
-        return Problem(self.map, self.graph, self.poses, dual, judgement, self.robust, last.cost,
-                       settled)
+        settled = not grown and self.judgement.settled and last.at_rest
+        return Problem(self.map, self.graph, starts, dual, self.judgement, self.robust, last.cost,
+                       settled, last.rejudged or not self.views)
 
     def loop_states(self) -> LoopStates:
         """Return what has become of each loop, those of the graph first, in its order."""
         in_graph, waiting, expired = self.loop_stamps
-        judgement = self.optimised.judgement.extended(self.graph, self.robust)
-        rows = self.loop_rows
+        judgement, rows = self.judgement, self.loop_rows
         state = np.where(judgement.accepted[rows], ACCEPTED,
                          np.where(judgement.suspect[rows], SUSPECT, REJECTED))
         others = np.repeat([WAITING, EXPIRED], [len(waiting), len(expired)])
