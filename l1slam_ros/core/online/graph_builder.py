@@ -4,7 +4,7 @@ How the graph grows: odometry samples and loop closures in, keyframes and factor
 
 A loop closure names two times. It waits until odometry has reached both, is then carried to the
 nearest keyframes by the raw odometry in between, and becomes a between factor. An absolute pose
-names one, the other end of its factor is the world.
+names one time: its factor is seen from the world.
 """
 
 from collections import Counter
@@ -241,8 +241,7 @@ class GraphBuilder:
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Take a loop closure or an absolute pose in, once; see `add_due_loops`."""
-        covariance = self._loop_covariance(loop)
-        if covariance is None:
+        if (covariance := self._loop_covariance(loop)) is None:
             return
         measurement = said(self.graph.manifold, loop, covariance)
         key = loop_identity(*loop.stamps, measurement, covariance, loop.trusted)
