@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from l1slam_ros.core.solvers.warm_up import STEPS, make_ready
+from l1slam_ros.io.progress import Progress
 
 _KERNELS = Path(__file__).parents[1] / 'core' / 'kernels'
 # [s] How often the caller is asked whether to stop.
@@ -31,6 +32,12 @@ _LOOK = 0.1
 _NICE = 5
 # What a processor is known by, of all that the kernel of Linux says of it.
 _PROCESSOR = ('model name', 'flags', 'Features', 'CPU implementer', 'CPU part')
+
+
+def compile_now(steps: Sequence[str], quiet: bool = False) -> None:
+    """Compile some of `warm_up.STEPS`, which takes long only at the first use on a machine."""
+    with Progress(None, 'part', quiet, 'compiling, once on this machine', delay=1.0) as progress:
+        fill_cache(progress.reach, lambda: False, steps)
 
 
 def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],

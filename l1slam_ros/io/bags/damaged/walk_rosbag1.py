@@ -12,6 +12,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from rosbags.typesys import get_types_from_msg
+
 from l1slam_ros.io.bags.damaged.walk import (
     BrokenRecordError,
     RawMessage,
@@ -113,8 +115,6 @@ class _Connections:
 
     def _learned(self, connection: dict[str, bytes]) -> str:
         """Return the type of a connection, by its name in ROS 2, once its definition is known."""
-        from rosbags.typesys import get_types_from_msg
-
         package, name = connection['type'].decode().split('/')
         msgtype, text = f'{package}/msg/{name}', connection['message_definition'].decode()
         if msgtype not in self._fields:
