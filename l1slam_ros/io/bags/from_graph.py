@@ -5,10 +5,11 @@ A graph as the messages of a bag, such that it can be had back exactly.
     /odom            one nav_msgs/Odometry per keyframe: the odometry factors, chained
     /loop_closures   one geometry_msgs/PoseWithCovarianceStamped per other factor;
                      /trusted_loop_closures for those that are never doubted
+    /absolute_poses  the same per absolute factor
     /ground_truth    geometry_msgs/PoseStamped, where the truth is known
 
 Covariances are those of the factors, in the axes of the measured pose: of an odometry message
-that of the motion since the message before.
+that of the motion since the message before. What is left unsaid has an infinite variance.
 """
 
 import os
@@ -18,10 +19,21 @@ import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.geometry.noise import LEAST_VARIANCE, MOST_OF_ODOMETRY, MOST_VARIANCE
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.geometry.noise import (
+    LEAST_VARIANCE,
+    MOST_OF_ODOMETRY,
+    MOST_VARIANCE,
+    covariance_of,
+)
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.measurements import FASTEST, LONGEST_PAUSE, SHORTEST_STEP
-from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUSTED_LOOP_TOPIC, TRUTH_TOPIC
+from l1slam_ros.io.bags.topics import (
+    ABSOLUTE_TOPIC,
+    LOOP_TOPIC,
+    ODOMETRY_TOPIC,
+    TRUSTED_LOOP_TOPIC,
+    TRUTH_TOPIC,
+)
 from l1slam_ros.io.bags.writer import new_bag
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.graphs.graph_file import GraphRecord
@@ -65,12 +77,13 @@ def write_graph_bag(
     to_pose3, factors = graph.manifold.to_pose3, graph.between
     covariances = _covariances(graph)
     chain, measured = to_pose3(_chain(graph, steps)), to_pose3(factors.measurement)
+    topics = np.where(factors.is_absolute, ABSOLUTE_TOPIC, np.where(
+        factors.trusted & ~factors.is_odometry, TRUSTED_LOOP_TOPIC, LOOP_TOPIC)).tolist()
     with new_bag(path, _note(record, stamps, steps)) as writer:
         messages = _Messages(writer.types)
         writer.add_topic(ODOMETRY_TOPIC, _ODOMETRY)
-        writer.add_topic(LOOP_TOPIC, _LOOP)
-        if factors.trusted[~factors.is_odometry].any():
-            writer.add_topic(TRUSTED_LOOP_TOPIC, _LOOP)
+        for topic in sorted({LOOP_TOPIC, *topics}):
+            writer.add_topic(topic, _LOOP)
         if truth is not None:
             writer.add_topic(TRUTH_TOPIC, _TRUTH)
             true = to_pose3(truth)
@@ -80,9 +93,9 @@ def write_graph_bag(
             if truth is not None:
                 writer.write(TRUTH_TOPIC, stamp, messages.pose_stamped('map', stamp, true[k]))
             for loop in loops[k]:
-                frame = reference_frame_id(_BASE_FRAME, stamps[factors.i[loop]])
-                topic = TRUSTED_LOOP_TOPIC if factors.trusted[loop] else LOOP_TOPIC
-                writer.write(topic, stamp, messages.loop(
+                i = factors.i[loop]
+                frame = 'map' if i == WORLD else reference_frame_id(_BASE_FRAME, stamps[i])
+                writer.write(topics[loop], stamp, messages.loop(
                     frame, stamp, measured[loop], covariances[loop]))
 
 
@@ -125,9 +138,12 @@ class _Messages:
 
 def _covariances(graph: FactorGraph) -> Array:
     """Return the covariance of each factor as messages have it, (m, 36)."""
-    roots, rows = np.linalg.inv(graph.between.sqrt_information), graph.manifold.COVARIANCE_ROWS
-    covariances = np.zeros((len(roots), 6, 6))
-    covariances[np.ix_(range(len(roots)), rows, rows)] = roots @ roots.transpose(0, 2, 1)
+    manifold, factors = graph.manifold, graph.between
+    rows, diagonal = manifold.COVARIANCE_ROWS, np.arange(manifold.TANGENT_SIZE)
+    of_manifold = covariance_of(factors.sqrt_information)
+    of_manifold[:, diagonal, diagonal] += np.where(factors.speaks, 0.0, np.inf)
+    covariances = np.zeros((len(factors), 6, 6))
+    covariances[np.ix_(range(len(factors)), rows, rows)] = of_manifold
     return covariances.reshape(-1, 36)
 
 
@@ -145,8 +161,8 @@ def _note(record: GraphRecord, stamps: list[int], steps: Indices) -> dict[str, s
     manifold = record.graph.manifold
     metres, _ = manifold.motion(
         manifold.local(manifold.identity(len(steps)), factors.measurement[steps]))
-    roots = np.linalg.inv(factors.sqrt_information)
-    variances = (roots**2).sum(axis=2)
+    variances = np.where(factors.speaks, np.diagonal(
+        covariance_of(factors.sqrt_information), axis1=1, axis2=2), 1.0)
     meant = (len(np.unique(equal, axis=0)) < len(equal) or (seconds > LONGEST_PAUSE).any()
              or (metres > FASTEST * np.maximum(seconds, SHORTEST_STEP)).any()
              or variances.min(initial=1.0) < LEAST_VARIANCE
@@ -166,18 +182,24 @@ def _steps(record: GraphRecord) -> Indices:
         raise GraphError(f'no edge between the consecutive vertices {ids[k]} and {ids[k + 1]}; '
                          'a bag needs the odometry of every vertex')
     _refuse_backward(record, rows)
+    unsaid = first[~factors.speaks[rows].all(axis=1)]
+    if len(unsaid):
+        raise GraphError(f'the odometry from vertex {ids[unsaid[0]]} leaves a component unsaid; '
+                         'in a bag it says all')
     return rows[np.argsort(first)]
 
 
 def _loops(record: GraphRecord) -> list[list[int]]:
     """Return the loops that end at each keyframe, in the order of the graph."""
-    if len(record.graph.prior):
-        k = record.ids[record.graph.prior.i[0]]
-        raise GraphError(f'a prior on vertex {k}; a bag carries between factors only')
-    rows = np.flatnonzero(~record.graph.between.is_odometry)
+    factors = record.graph.between
+    trusted = factors.j[factors.is_absolute & factors.trusted]
+    if len(trusted):
+        raise GraphError(f'a trusted absolute pose of vertex {record.ids[trusted[0]]}; in a bag '
+                         'it would be doubted')
+    rows = np.flatnonzero(~factors.is_odometry)
     _refuse_backward(record, rows)
     loops: list[list[int]] = [[] for _ in record.ids]
-    for row, j in zip(rows.tolist(), record.graph.between.j[rows].tolist(), strict=True):
+    for row, j in zip(rows.tolist(), factors.j[rows].tolist(), strict=True):
         loops[j].append(row)
     return loops
 
