@@ -22,7 +22,7 @@ from l1slam_ros.io.compilation import compile_now
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.node_options import read_params_file
 from l1slam_ros.io.progress import Progress
-from l1slam_ros.io.sentences import DOUBTFUL, doubt_sentence, verdict
+from l1slam_ros.io.sentences import DOUBTFUL, doubt_sentence, judgement_sentences
 from l1slam_ros.io.wording import counted
 
 
@@ -61,7 +61,7 @@ def solve(arguments: argparse.Namespace) -> Ending:
                           else value for name, value in report.items()}))
     elif not arguments.quiet:
         _print_report(report, arguments.norm, outcome)
-        for sentence in verdict(record, judgement) if judgement else ():
+        for sentence in judgement_sentences(record, judgement) if judgement else ():
             print(sentence)
     return ending
 
