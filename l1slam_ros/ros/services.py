@@ -76,14 +76,12 @@ class MapServices:
         return 'the map is empty'
 
     def _save(self) -> str:
-        path = self._file()
-        return f'{save_map(path, self._backend.snapshot())} keyframes saved to {path}'
+        return save_map(self._file(), self._backend.saved())
 
     def _load(self) -> str:
-        path = self._file()
-        graph, poses, stamps = load_map(path)
-        self._backend.restore(graph, poses, stamps)
-        return f'{len(poses)} keyframes loaded from {path}'
+        saved, sentence = load_map(self._file())
+        self._backend.restore(saved)
+        return sentence
 
     def _file(self) -> Path:
         path = self._save_path()
