@@ -118,7 +118,7 @@ class Backend:
     def saved(self) -> SavedMap | None:
         """Return all that another back end goes on from; None: there are no factors yet."""
         with self._lock:
-            if not len(self._builder.graph.between):
+            if self._builder.graph.between.is_absolute.all():
                 return None
             now, growth = self._snapshot(), self._builder.grown()
         return SavedMap(growth, now.optimised.of_all(now.problem()), now.robust)

@@ -122,9 +122,6 @@ def _read(path: Path) -> SavedMap:
     record = read_graph_file(path)
     if record.poses is None or record.stamps is None:
         raise FileError(path, 'has no poses or no stamps; expected a saved map')
-    if len(record.graph.prior):
-        raise FileError(path, 'has prior factors, which a growing map has no rows for; '
-                        'expected a saved map')
     growth = Growth.of_graph(record.graph, record.poses, record.stamps)
     optimised, values = Optimised.nothing(record.poses), dict(record.remarks or {})
     if not values:

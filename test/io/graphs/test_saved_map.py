@@ -42,7 +42,11 @@ def first_half(world):
     play(backend, world, 0, 50)
     backend.add_loop(loop(0.5, 4.0, (30.0, 40.0, 0.0), 1e-4 * np.eye(6)))
     backend.add_loop(replace(loop(0.7, 4.1, (3.0, 1.0, 0.5), 0.5 * np.eye(6)), trusted=True))
+    backend.add_loop(replace(loop(0.0, 2.0, (20.0, 0.0, 0.3), 0.1 * np.eye(6)),
+                             reference_stamp=None))
     settle(backend)
+    backend.add_loop(replace(loop(0.0, 6.0, (7.0, 8.0, 0.0), np.diag([1, 1, 0, 0, 0, np.inf])),
+                             reference_stamp=None))
     backend.add_loop(loop(0.5, 7.0, (30.0, 40.0, 0.0), 1e-4 * np.eye(6)))
     return backend
 
@@ -85,7 +89,7 @@ def test_all_comes_back(halfway, tmp_path):
     assert said == f'50 keyframes loaded from {path}'
     assert_equal(saved, back)
     assert [p.name for p in tmp_path.iterdir()] == ['map.g2o']
-    assert len(saved.growth.waiting) == 2 and len(saved.growth.seen) == 17
+    assert len(saved.growth.waiting) == 3 and len(saved.growth.seen) == 19
 
 
 def test_what_is_loaded_goes_on_as_if_nothing_had_been(world, halfway, tmp_path, monkeypatch):
@@ -104,7 +108,7 @@ def test_what_is_loaded_goes_on_as_if_nothing_had_been(world, halfway, tmp_path,
         settle(one)
     a, b = (one.saved().optimised for one in (backend, undisturbed))
     np.testing.assert_allclose(a.poses, b.poses, atol=1e-6)
-    assert a.cost == pytest.approx(b.cost, rel=1e-9)
+    assert a.cost == pytest.approx(b.cost, rel=1e-6)
     assert_equal(backend.saved().growth, undisturbed.saved().growth)
     np.testing.assert_array_equal(backend.loop_states().state, undisturbed.loop_states().state)
 
@@ -308,8 +312,11 @@ def test_converted_it_keeps_stamps_and_trust(halfway, tmp_path):
 
 def test_what_is_no_map_is_refused(halfway, tmp_path):
     path = tmp_path / 'map.g2o'
+    backend = Backend(EVERY)
+    backend.add_loop(replace(loop(0.0, 2.0, (20.0, 0.0, 0.3)), reference_stamp=None))
+    backend.add_odometry(odometry(2.0, (0.0, 0.0, 0.0)))
     with pytest.raises(FileError, match='there is no graph yet to be saved'):
-        save_map(path, Backend(EVERY).saved())
+        save_map(path, backend.saved())
     saved = halfway.saved()
     write_graph_file(path, GraphRecord(saved.growth.graph, saved.optimised.poses, np.arange(50)))
     with pytest.raises(FileError, match='has no poses or no stamps; expected a saved map'):
