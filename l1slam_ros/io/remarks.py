@@ -40,11 +40,12 @@ def _unproven(lines: Iterable[str], values: Mapping[str, Any]) -> Iterator[str]:
     yield _FIRST
     yield from lines
     for name, value in values.items():
-        rows = (value + 0).tolist() if isinstance(value, np.ndarray) else value  # 1, not true
-        parts = [rows[k : k + _AT_ONCE] for k in range(0, len(rows), _AT_ONCE)] if (
-            isinstance(rows, list)) else [rows]
-        yield from (_KEYWORD + f'{name} ' + json.dumps(part, separators=(',', ':'))
-                    for part in parts or [[]])
+        parts = [value]
+        if isinstance(value, np.ndarray | list):
+            parts = [value[k : k + _AT_ONCE] for k in range(0, max(len(value), 1), _AT_ONCE)]
+        for part in parts:
+            rows = (part + 0).tolist() if isinstance(part, np.ndarray) else part  # 1, not true
+            yield f'{_KEYWORD}{name} ' + json.dumps(rows, separators=(',', ':'))
 
 
 def is_proven(path: object, content: bytes) -> bool:
@@ -59,7 +60,7 @@ def is_proven(path: object, content: bytes) -> bool:
     last = content[-_LAST:]
     if not content.startswith(_KEYWORD.encode()) and not last.startswith(_PROOF.encode()):
         return False
-    if last != f'{_PROOF}{sha256(content[:-_LAST]).hexdigest()}\n'.encode():
+    if last != f'{_PROOF}{sha256(memoryview(content)[:-_LAST]).hexdigest()}\n'.encode():
         raise FileError(path, 'is damaged: its last line is not the checksum of those before; '
                         'expected a saved map as it was written')
     if not content.startswith(f'{_FIRST}\n'.encode()):

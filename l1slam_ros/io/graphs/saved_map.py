@@ -44,11 +44,11 @@ def save_map(path: Path, saved: SavedMap | None) -> str:
     return f'{_count(saved)} keyframes saved to {path}'
 
 
-def load_map(path: Path) -> tuple[SavedMap, str]:
+def load_map(path: Path) -> tuple[SavedMap, str, bool]:
     """
     Return the map in a file, or that before it where this one is damaged or missing.
 
-    And a sentence that says which.
+    And a sentence that says which, and whether it is the newer one.
 
     Raises
     ------
@@ -57,15 +57,31 @@ def load_map(path: Path) -> tuple[SavedMap, str]:
     """
     before = _before(path)
     try:
-        saved, which = _read(path), f'{path}'
+        saved, which, whole = _read(path), f'{path}', True
     except FileError as error:
         if not before.exists():
             raise
         try:
-            saved, which = _read(before), f'{before}, the map before, because {error}'
+            saved, which, whole = _read(before), f'{before}, the map before: {error}', False
         except FileError as another:
             raise FileError(path, f'cannot be loaded: {error}; {another}') from another
-    return saved, f'{_count(saved)} keyframes loaded from {which}'
+    return saved, f'{_count(saved)} keyframes loaded from {which}', whole
+
+
+def keep_as(path: Path, another: Path) -> None:
+    """
+    Let a file have another name, too, in the place of what has that.
+
+    Raises
+    ------
+    FileError : it cannot be.
+
+    """
+    with replacing(another) as temporary:
+        try:
+            os.link(path, temporary)
+        except OSError:  # not every file system has links
+            shutil.copyfile(path, temporary)
 
 
 def is_map(path: Path) -> bool:
@@ -85,15 +101,10 @@ def _count(saved: SavedMap) -> int:
 
 
 def _keep(path: Path) -> None:
-    """Let the file of a path be that before it, too, unless it is damaged and that is not."""
+    """Let a file be that before it, too, unless it is damaged and that is not."""
     before = _before(path)
-    if not path.exists() or (not is_map(path) and is_map(before)):
-        return
-    with replacing(before) as another:
-        try:
-            os.link(path, another)
-        except OSError:  # not every file system has links
-            shutil.copyfile(path, another)
+    if path.exists() and (is_map(path) or not is_map(before)):
+        keep_as(path, before)
 
 
 def _remove_leftovers(path: Path) -> None:

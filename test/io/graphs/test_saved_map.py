@@ -85,8 +85,8 @@ def test_all_comes_back(halfway, tmp_path):
                        variance=np.array([0.1, 2 / 3]), slips=np.array([7, 9]))
     saved = replace(saved, optimised=replace(saved.optimised, judgement=doubtful))
     assert save_map(path, saved) == f'50 keyframes saved to {path}'
-    back, said = load_map(path)
-    assert said == f'50 keyframes loaded from {path}'
+    back, said, whole = load_map(path)
+    assert whole and said == f'50 keyframes loaded from {path}'
     assert_equal(saved, back)
     assert [p.name for p in tmp_path.iterdir()] == ['map.g2o']
     assert len(saved.growth.waiting) == 3 and len(saved.growth.seen) == 19
@@ -183,16 +183,16 @@ def test_what_is_damaged_is_noticed_and_the_map_before_taken(two, rng):
     for damaged in damages(content, rng):
         two.write_bytes(damaged)
         assert not is_map(two)
-        saved, said = load_map(two)
-        assert len(saved.optimised.poses) == 5
-        assert said.startswith(f'5 keyframes loaded from {two}.1, the map before, because {two}:')
+        saved, said, whole = load_map(two)
+        assert len(saved.optimised.poses) == 5 and not whole
+        assert said.startswith(f'5 keyframes loaded from {two}.1, the map before: {two}: ')
     two.write_bytes(content)
     assert load_map(two)[1] == f'6 keyframes loaded from {two}'
 
 
 def test_what_is_missing_is_noticed_and_the_map_before_taken(two):
     two.unlink()
-    assert '.1, the map before, because ' in load_map(two)[1]
+    assert '.1, the map before: ' in load_map(two)[1]
     two.with_name('map.g2o.1').write_text('')
     with pytest.raises(FileError, match='map.g2o: cannot be loaded: .*map.g2o: cannot be read.*'
                        'map.g2o.1: the file is empty'):
