@@ -396,6 +396,8 @@ def with_trust(record, rows):
 @pytest.mark.parametrize('name', ['a.g2o', 'a.graph'])
 def test_trust_comes_back_with_the_graph(tmp_path, rng, name):
     path, record = tmp_path / name, random_record(rng)
+    if name.endswith('.graph'):  # TORO has no line for an absolute pose
+        record = replace(record, graph=record.graph.subset(~record.graph.between.is_absolute))
     factors = record.graph.between
     pairs = np.stack((factors.i, factors.j), axis=1)
     rows = [row for row in range(len(factors) - 1, 39, -7)  # loops that nothing runs along
