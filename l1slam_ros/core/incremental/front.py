@@ -14,7 +14,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
+from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise
 from l1slam_ros.core.incremental.growing_map import Factor, GrowingMap, Predicted, View
 from l1slam_ros.core.robust.innovation import chi2_quantile, claimed_volume
@@ -50,7 +50,8 @@ class Gate:
            refused: int) -> 'Gate':
         """Return the gate of a map, poses (n, p), that so many loops were believed for or not."""
         volume = claimed_volume(manifold, poses, np.random.default_rng(0))
-        return Gate(variance, max(0.0, float(np.log((refused + 1) / (accepted + 1)))), volume)
+        return Gate(variance, max(0.0, float(np.log((refused + 1) / (accepted + 1)))),
+                    float(volume.sum()))
 
 
 @dataclass(frozen=True)
@@ -133,15 +134,17 @@ class Front:
         """
         row, count = self.rows, self.keyframes
         pair = int(factors.i[row]), int(factors.j[row])
-        # Where something new is tied to nothing, or the gauge is another: the next map's.
-        if (max(pair) > count or min(pair) < self._l1.fixed - 1 or self.border > _MOST_ROWS
+        # The first that is believed of those that name the world gives the map another gauge.
+        other_gauge = min(pair) == WORLD and self._l1.fixed > 0
+        if (max(pair) > count or (accept and other_gauge) or self.border > _MOST_ROWS
                 or self._l2.touched > _MOST_TOUCHED):
             self.closed = True
             return None
         self.rows += 1
-        if accept is False:
-            return Look(False, False, np.nan)
         factor = Factor(pair, factors.measurement[row:row + 1], factors.sqrt_information[row])
+        # What is silent of some component is for the judgement, too.
+        if accept is False or other_gauge or (accept is None and not np.diag(factor.root).all()):
+            return Look(False, accept is None, np.nan)
         new = count in pair
         variance = np.full(len(factor.root), self._gate.variance[0 if new else 1])
         predicted = self._l2.predict(factor)
@@ -159,8 +162,8 @@ class Front:
         square = float(innovation @ innovation)
         log_ratio = (self._gate.log_volume + np.log(np.diag(predicted.factor.root)).sum()
                      - square / 2 - k * np.log(2 * np.pi) / 2 - np.log(np.diag(root)).sum())
-        fits = square < chi2_quantile(1 - _REFUSED, k)
+        fits = square < float(chi2_quantile(1 - _REFUSED, np.array([k]))[0])
         left = variance * np.linalg.solve(root.T, innovation)
-        if sure or (fits and log_ratio > np.log(_SURE - 1) + self._gate.log_odds):
+        if sure or (fits and float(log_ratio) > np.log(_SURE - 1) + self._gate.log_odds):
             return Look(True, False, float(np.sqrt((left * left / variance).sum()))), left
         return Look(False, fits, float(np.sqrt(square))), left

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.linear_system import anchor
 from l1slam_ros.core.incremental.border import FIXED, Border, Prediction, Steps
@@ -153,4 +153,6 @@ class GrowingMap:
         return max(keyframe - self.fixed, FIXED)
 
     def _first_pose(self, keyframe: int) -> Array:
+        if keyframe == WORLD:
+            return self._manifold.identity(1)
         return self._first.view()[keyframe:keyframe + 1]

@@ -3,7 +3,8 @@
 How the graph grows: odometry samples and loop closures in, keyframes and factors out.
 
 A loop closure names two times. It waits until odometry has reached both, is then carried to the
-nearest keyframes by the raw odometry in between, and becomes a between factor.
+nearest keyframes by the raw odometry in between, and becomes a between factor. An absolute pose
+names one time: its factor is seen from the world.
 """
 
 from collections import Counter
@@ -18,14 +19,10 @@ from l1slam_ros.core.geometry.noise import (
     MOST_OF_ODOMETRY,
     MOST_VARIANCE,
     Mask,
-    at_most,
-    bounds,
     loop_identity,
-    or_model,
     root_of_inverse,
-    usable,
 )
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.keyframes import (
@@ -36,13 +33,17 @@ from l1slam_ros.core.online.keyframes import (
     reduced_covariance,
 )
 from l1slam_ros.core.online.notes import Notes
-from l1slam_ros.core.online.odometry_stream import OdometryStream, Point
+from l1slam_ros.core.online.odometry_stream import UNSEEN_TURN, OdometryStream, Point
 from l1slam_ros.core.online.odometry_track import OdometryTrack
-from l1slam_ros.core.online.waiting_loops import WaitingLoop, WaitingLoops
+from l1slam_ros.core.online.snapshot import Growth
+from l1slam_ros.core.online.waiting_loops import (
+    WaitingLoop,
+    WaitingLoops,
+    carried,
+    loop_covariance,
+    said,
+)
 from l1slam_ros.core.options import Options, option
-
-# [rad/s] A robot that nobody saw may have turned so fast.
-_UNSEEN_TURN = 1.0
 
 
 @dataclass(frozen=True)
@@ -101,8 +102,7 @@ class GraphBuilder:
         self._moved = self._resumed = False
         self._waiting = WaitingLoops()
         self._seen: set[bytes] = set()
-        self._expired = GrowingArray((2,), np.int64)
-        self._loop_stamps = GrowingArray((2,), np.int64)
+        self._expired, self._loop_stamps = (GrowingArray((2,), np.int64) for _ in range(2))
         self._loop_rows = GrowingArray((), np.int64)
 
     @property
@@ -176,14 +176,16 @@ class GraphBuilder:
             self._begin_keyframe(point.stamp, point.pose)
             return True
         manifold, pose = self.graph.manifold, point.pose
-        if not self._glued or point.unseen:
+        if point.unseen or not (
+                self._glued or self._track.goes_on(point.stamp, pose, self.offset)):
             self.offset = manifold.compose(self._track.last_pose, manifold.inverse(pose))
-            self._glued = self._moved = True
+            self._moved = True
+        self._glued = True
         if self._moved:
             pose = manifold.compose(self.offset, pose)
         self._track.append(point.stamp, pose)
         if point.unseen:
-            self._motion.add_unseen(point.sample, point.unseen, _UNSEEN_TURN * point.seconds)
+            self._motion.add_unseen(point.sample, point.unseen, UNSEEN_TURN * point.seconds)
         else:
             self._motion.add(point.sample, pose, self.options.odometry)
         # Where the frame has moved there is a keyframe: what is published goes by the last one.
@@ -212,42 +214,44 @@ class GraphBuilder:
         self._track = OdometryTrack(self.graph.manifold)
         self._waiting.forget_arrivals()
 
-    def restore(self, graph: FactorGraph, stamps: Indices, poses: Array) -> None:
-        """
-        Take over a graph of an earlier run, its stamps (n,) [ns] and poses (n, p).
+    def grown(self) -> Growth:
+        """Return what another builder goes on from; there are keyframes."""
+        return Growth(
+            self.graph.copy(), self.stamps, self.odometry, self.offset, self._track.last,
+            self._track.last_pose, self._motion.covariance(self.options.odometry, self._verbatim),
+            self.loop_rows, self._loop_stamps.view(), self._expired.view(),
+            self._waiting.arrivals(), frozenset(self._seen))
 
-        The robot is taken to stand where that run ended; its odometry may begin anywhere. A loop
-        of that run that is sent again is known where it named the stamps of keyframes: others
-        were carried there and are not what was sent.
-        """
-        self.graph = graph
-        self._track.extend_by_keyframes(stamps, poses)
-        self._motion = Motion(graph.manifold, int(stamps[-1]), poses[-1:])
-        self._glued, self._resumed = False, True
-        self._stream = OdometryStream(graph.manifold, self.notes, resumed=True)
-        factors = graph.between
-        rows = np.flatnonzero(~factors.is_odometry)
-        ends = stamps[factors.pairs[rows]]
-        self._note_loops(rows, np.sort(ends, axis=1))
-        roots = np.linalg.inv(factors.sqrt_information[rows])
-        covariances = roots @ roots.transpose(0, 2, 1)
-        for (reference, stamp), row, covariance in zip(ends.tolist(), rows, covariances,
-                                                       strict=True):
-            self._seen.add(loop_identity(reference, stamp, factors.measurement[row], covariance,
-                                       bool(factors.trusted[row])))
+    def restore(self, growth: Growth) -> None:
+        """Go on where a run ended; odometry that begins elsewhere is taken to begin there."""
+        self.graph, self.offset = growth.graph, growth.offset
+        self._track.extend_by_keyframes(growth.stamps, growth.odometry)
+        self._motion = Motion(self.graph.manifold, self._track.last, self._track.last_pose)
+        if growth.end > self._track.last:
+            self._track.append(growth.end, growth.end_pose)
+            self._motion.add_known(
+                growth.end, growth.end_pose, growth.end_covariance, self.options.odometry)
+        self._glued, self._moved, self._resumed = False, True, True
+        self._stream = OdometryStream(self.graph.manifold, self.notes, resumed=True)
+        self._note_loops(growth.loop_rows, growth.loop_stamps)
+        self._expired.extend(growth.expired)
+        for loop, arrival in growth.waiting:
+            self.add_loop(loop, arrival)
+        self._seen.update(growth.seen)
 
-    def add_loop(self, loop: LoopClosure) -> None:
-        """Take a loop closure in, once; it becomes a factor in `add_due_loops`."""
-        measurement = self.graph.manifold.from_pose3(loop.pose3[None])
+    def add_loop(self, loop: LoopClosure, arrival: int | None = None) -> None:
+        """Take a loop closure or an absolute pose in, once, which came at `arrival` or now."""
         covariance = self._loop_covariance(loop)
-        key = loop_identity(loop.reference_stamp, loop.stamp, measurement, covariance,
-                            loop.trusted)
+        if covariance is None:
+            return
+        measurement = said(self.graph.manifold, loop, covariance)
+        key = loop_identity(*loop.stamps, measurement, covariance, loop.trusted)
         if key in self._seen and not self._verbatim:
             self._refuse('repeated', loop, 'was sent before; expected each loop once')
             return
         self._seen.add(key)
-        arrival = self._track.last if len(self._track) else 0
-        self._waiting.add(WaitingLoop(loop, arrival, measurement, covariance, key))
+        came = self._track.last if arrival is None and len(self._track) else arrival or 0
+        self._waiting.add(WaitingLoop(loop, came, measurement, covariance, key))
 
     def add_due_loops(self) -> int:
         """
@@ -262,7 +266,7 @@ class GraphBuilder:
         due = self._waiting.due(now)
         since = now - int(self.options.loop.wait * 1e9)
         for one in self._waiting.expired(since) if self._track.first < since else ():
-            self._expired.extend(np.array([(one.loop.reference_stamp, one.loop.stamp)]))
+            self._expired.extend(np.array([one.loop.stamps]))
             self._refuse('expired', one.loop, f'waited for odometry until {now} ns; expected '
                          'odometry of its times')
             # Sent again when odometry has come that far, it is welcome.
@@ -271,7 +275,7 @@ class GraphBuilder:
 
     def _add_loops(self, due: list[WaitingLoop]) -> int:
         manifold = self.graph.manifold
-        stamps = np.array([(one.loop.reference_stamp, one.loop.stamp) for one in due])
+        stamps = np.array([one.loop.stamps for one in due])
         known = self._track.known_until(np.array([one.arrival for one in due]), stamps[:, 1])
         i, j = (self._track.nearest_keyframe(end, known) for end in stamps.T)
         keep = self._can_be_factors([one.loop for one in due], i, j)
@@ -281,14 +285,9 @@ class GraphBuilder:
         i, j, stamps = i[keep], j[keep], stamps[keep]
         to_reference = manifold.between(self.odometry[i], self._track.at(stamps[:, 0]))
         to_keyframe = manifold.between(self._track.at(stamps[:, 1]), self.odometry[j])
-        measured = np.concatenate([one.measurement for one in used])
-        measurement = manifold.compose(manifold.compose(to_reference, measured), to_keyframe)
-        # The error lives in the axes of the measured pose; see it from the keyframe instead.
-        Ad = manifold.adjoint(manifold.inverse(to_keyframe))
-        stated = np.concatenate([one.covariance for one in used])
-        covariance = Ad @ stated @ Ad.transpose(0, 2, 1)
-        # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
-        covariance = np.where(usable(covariance)[:, None, None], covariance, self._loop_model())
+        measurement, covariance, sound = carried(manifold, used, to_reference, to_keyframe)
+        covariance = np.where(sound[:, None, None], covariance, self._loop_model())
+        i = np.where([one.loop.is_absolute for one in used], WORLD, i)
         self.graph.append_between(i, j, measurement, root_of_inverse(covariance),
                                   np.array([one.loop.trusted for one in used]))
         last = len(self.graph.between)
@@ -298,8 +297,8 @@ class GraphBuilder:
     def _can_be_factors(self, loops: list[LoopClosure], i: Indices, j: Indices) -> Mask:
         """Return which loops between the keyframes i, j (m,) can be factors, and note the rest."""
         first = self._track.first
-        early = np.array([loop.reference_stamp < first for loop in loops])
-        same = (i == j) & ~early
+        early = np.array([loop.stamps[0] < first for loop in loops])
+        same = (i == j) & ~early & ~np.array([loop.is_absolute for loop in loops])
         for row in np.flatnonzero(early | same).tolist():
             if early[row]:
                 self._refuse('before_start', loops[row], 'begins before the odometry; expected '
@@ -307,16 +306,15 @@ class GraphBuilder:
             else:
                 self._refuse('same_keyframe', loops[row], 'begins and ends at one keyframe; '
                              'expected two')
-        can: Mask = ~(early | same)
-        return can
+        return np.asarray(~(early | same))
 
     def _note_loops(self, rows: Indices, stamps: Indices) -> None:
         self._loop_rows.extend(rows)
         self._loop_stamps.extend(stamps)
 
     def _refuse(self, cause: str, loop: LoopClosure, why: str) -> None:
-        self.notes.refuse(
-            cause, f'a loop from {loop.reference_stamp} ns to {loop.stamp} ns {why}')
+        what = 'an absolute pose at' if loop.is_absolute else f'a loop from {loop.stamps[0]} ns to'
+        self.notes.refuse(cause, f'{what} {loop.stamp} ns {why}')
 
     def _note_bounds(self, what: str, stamp: int, bounded: list[tuple[float, float]],
                      most: float) -> None:
@@ -324,17 +322,21 @@ class GraphBuilder:
             self.notes.warn(f'{what}_variance', f'variance {found:g} of {what} at {stamp} ns; '
                             f'expected {LEAST_VARIANCE:g} to {most:g}; {used:g} is used')
 
-    def _loop_covariance(self, loop: LoopClosure) -> Array:
-        """Return what a loop states, the model where that is no covariance, (1, d, d)."""
-        model = self._loop_model()
+    def _loop_covariance(self, loop: LoopClosure) -> Array | None:
+        """
+        Return what a loop states, zeros for what it leaves unsaid, (1, d, d).
+
+        Where that is no covariance, the model; there is none of absolute poses: None, refused.
+        """
         stated = reduced_covariance(self.graph.manifold, loop.covariance[None])
-        if self.options.loop.covariance_source == 'model' or not usable(stated)[0]:
+        model, absolute = self._loop_model(), loop.is_absolute
+        if self.options.loop.covariance_source == 'model' and not absolute:
             return model[None]
-        if self._verbatim:
-            return stated
-        cut, large = at_most(stated, MOST_VARIANCE)
-        used, small = or_model(cut, model)
-        self._note_bounds('loop', loop.stamp, bounds(stated, used, large | small), MOST_VARIANCE)
+        used, bounded = loop_covariance(stated, None if absolute else model, self._verbatim)
+        self._note_bounds('loop', loop.stamp, bounded, MOST_VARIANCE)
+        if used is None:
+            self._refuse('covariance', loop, f'has the variances {np.diagonal(stated[0])}; '
+                         f'expected one above 0, to {MOST_VARIANCE:g}')
         return used
 
     def _loop_model(self) -> Array:

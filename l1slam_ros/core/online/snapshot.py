@@ -12,8 +12,8 @@ from functools import cached_property
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.incremental.growing_map import View
 from l1slam_ros.core.online.loop_states import (
     ACCEPTED,
@@ -76,13 +76,47 @@ class Problem:
 
 
 @dataclass(frozen=True)
+class Growth:
+    """
+    What a graph builder has made of messages, for another to go on from.
+
+    graph : the factors; stamps (n,) [ns] and odometry (n, p) of the keyframes; offset : see
+    `GraphBuilder`; end : stamp [ns] of the last sample, end_pose (1, p) and end_covariance (d, d)
+    of the motion to it from the last keyframe; loop_rows (k,), loop_stamps (k, 2) and expired
+    (l, 2) [ns] : see `GraphBuilder`; waiting : loops, and when each came [ns]; seen : the identity
+    of each loop that came.
+    """
+
+    graph: FactorGraph
+    stamps: Indices
+    odometry: Array
+    offset: Array
+    end: int
+    end_pose: Array
+    end_covariance: Array
+    loop_rows: Indices
+    loop_stamps: Indices
+    expired: Indices
+    waiting: tuple[tuple[LoopClosure, int], ...]
+    seen: frozenset[bytes]
+
+    @staticmethod
+    def of_graph(graph: FactorGraph, poses: Array, stamps: Indices) -> 'Growth':
+        """Return that of a graph alone, whose odometry went from pose to pose (n, p)."""
+        d, none = graph.manifold.TANGENT_SIZE, np.zeros((0, 2), np.int64)
+        loops = np.flatnonzero(~graph.between.is_odometry)
+        ends = np.sort(stamps[graph.between.pairs[loops]], axis=1)
+        return Growth(graph, stamps, poses, graph.manifold.identity(1), int(stamps[-1]),
+                      poses[-1:], np.zeros((d, d)), loops, ends, none, (), frozenset())
+
+
+@dataclass(frozen=True)
 class Optimised:
     """
     What has been made so far, of the first keyframes and factors.
 
-    poses : (k, p); dual : (rows,); cost and status : as the last map left them; used : (m,) the
-    factors it is of; quiet_updates : how many in a row hardly lowered the cost; falls : it still
-    does; judgement : of the first factors, made beside the map; judged : (n, p) the map of it.
+    poses : (k, p); dual : (rows,); cost, status : as the last map left them; judgement : of the
+    first factors, made beside the map; quiet_updates : how many in a row hardly lowered the cost.
     """
 
     poses: Array
@@ -90,28 +124,35 @@ class Optimised:
     judgement: Judgement
     cost: float
     status: Status
-    used: Mask
-    quiet_updates: int = 0
-    falls: bool = False
-    judged: Array | None = None
+    quiet_updates: int
 
     @staticmethod
     def nothing(poses: Array) -> 'Optimised':
         """Return what stands before the first update: poses at most."""
-        return Optimised(poses, np.zeros(0), Judgement.nothing(), 0.0, Status.OUT_OF_TIME,
-                         np.zeros(0, bool))
+        return Optimised(poses, np.zeros(0), Judgement.nothing(), 0.0, Status.OUT_OF_TIME, 0)
 
     @property
     def at_rest(self) -> bool:
         """Whether more updates of the same factors would hardly change the map."""
-        return not self.rejudged and (self.status in (Status.CONVERGED, Status.STALLED)
-                                      or self.quiet_updates >= _QUIET_UPDATES)
+        return (self.status in (Status.CONVERGED, Status.STALLED)
+                or self.quiet_updates >= _QUIET_UPDATES)
 
-    @cached_property
-    def rejudged(self) -> bool:
-        """Whether the map is not that of what is believed."""
-        both = min(len(self.used), len(self.judgement.accepted))
-        return bool((self.used[:both] != self.judgement.accepted[:both]).any())
+    def unjudged(self) -> 'Optimised':
+        """Return the same where nothing is known of any loop."""
+        return replace(self, judgement=Judgement.nothing(), status=Status.OUT_OF_TIME)
+
+
+@dataclass(frozen=True)
+class SavedMap:
+    """All that another back end goes on from; robust : loops were doubted."""
+
+    growth: Growth
+    optimised: Optimised
+    robust: bool
+
+    def as_judged(self, robust: bool) -> Optimised:
+        """Return what updates have made, unjudged where loops were judged otherwise."""
+        return self.optimised if self.robust == robust else self.optimised.unjudged()
 
 
 @dataclass(frozen=True)
@@ -123,7 +164,8 @@ class Snapshot:
     [ns] and odometry (n, p) of the keyframes; map_to_odom : (1, p); loop_rows, loop_stamps : see
     `GraphBuilder`; robust : loops may be doubted; looks : (k, 3) what the front says of
     the factors after those that are judged: accepted, suspect, sigmas; all_judged : no loop is
-    among them; views : the L1 and L2 map of the front, where there is one.
+    among them; judged : (k, p) the L2 map of a judgement that the map does not follow yet, None:
+    it does; views : the L1 and L2 map of the front, where there is one.
     """
 
     map: int
@@ -138,6 +180,7 @@ class Snapshot:
     robust: bool
     looks: Array
     all_judged: bool
+    judged: Array | None
     views: tuple[View, ...]
 
     @cached_property
@@ -173,15 +216,24 @@ class Snapshot:
         last, rows = self.optimised, len(self.graph.between) * self.graph.manifold.TANGENT_SIZE
         # Rows are only ever appended, so the dual of the old ones stays; new ones start at zero.
         dual = np.concatenate((last.dual, np.zeros(rows - len(last.dual))))
-        starts, judged = [self.poses], last.judged
+        starts = [self.poses]
         starts += [self._followed(view.poses, self.poses) for view in self.views[1:]]
-        if judged is not None and last.rejudged:
+        if self.judged is not None:
             # After a loop has closed, the L2 map of the judgement is nearer.
-            starts.append(self._followed(judged, self.poses))
+            starts.append(self._followed(self.judged, self.poses))
         grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
-        settled = not grown and self.judgement.settled and last.at_rest
+        settled = (not grown and self.judgement.settled and last.at_rest
+                   and self.judged is None)
         return Problem(self.map, self.graph, starts, dual, self.judgement, self.robust, last.cost,
-                       settled, last.rejudged or not self.views)
+                       settled, self.judged is not None or not self.views)
+
+    def known(self) -> Optimised:
+        """Return what was made, of all keyframes and factors that there are."""
+        problem, last = self.problem(), self.optimised
+        same = len(last.poses) == len(problem.poses) and len(last.dual) == len(problem.dual)
+        return replace(last, poses=problem.poses, dual=problem.dual, judgement=problem.judgement,
+                       status=last.status if same else Status.OUT_OF_TIME,
+                       quiet_updates=last.quiet_updates if same else 0)
 
     def loop_states(self) -> LoopStates:
         """Return what has become of each loop, those of the graph first, in its order."""

@@ -16,6 +16,7 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
+from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.incremental.front import Front, Gate
 from l1slam_ros.core.online.snapshot import Optimised, Problem
 from l1slam_ros.core.robust.judgement import Judgement
@@ -47,7 +48,7 @@ class Improvement:
     """
     What one update did: new poses (n, p), dual (rows,) and judgement, and the account of it.
 
-    map, robust : of the `Problem`; cost_before, cost : L1 cost of the accepted factors;
+    map : of the `Problem`; cost_before, cost : L1 cost of the accepted factors;
     reweighted_steps : factorisations for the long-range part; outer, inner : iterations of
     Algorithm 4; gap : of its last linear problem; seconds : all of it.
     """
@@ -56,7 +57,6 @@ class Improvement:
     poses: Array
     dual: Array
     judgement: Judgement
-    robust: bool
     cost_before: float
     cost: float
     status: Status
@@ -80,12 +80,14 @@ class Improvement:
                 raise ArithmeticError(f'the {name} of a new map is not finite; the map stays')
         same = len(self.dual) == len(before.dual)
         quiet = same and self.cost_before - self.cost <= tolerance * self.cost
-        return Optimised(
-            self.poses, self.dual, before.judgement, self.cost, self.status,
-            self.judgement.accepted, before.quiet_updates + 1 if quiet else 0,
-            self.status not in (Status.CONVERGED, Status.STALLED)
-            and self.cost_before - self.cost > _FALLS * self.cost,
-            before.judged)
+        return Optimised(self.poses, self.dual, before.judgement, self.cost, self.status,
+                         before.quiet_updates + 1 if quiet else 0)
+
+    @property
+    def falls(self) -> bool:
+        """Whether another round at once is worth it."""
+        return (self.status not in (Status.CONVERGED, Status.STALLED)
+                and self.cost_before - self.cost > _FALLS * self.cost)
 
 
 def improve(problem: Problem, options: OptimiserOptions, budget: float,
@@ -107,9 +109,13 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
         solution = minimise_by(problem.choice, graph, problem.poses, options,
                                lambda *_: check())[0]
         return _improvement(solution, problem, problem.judgement, before, 0, start)
-    costs = [l1_cost(whitened_residual(graph, poses)) for poses in problem.starts]
+    starts = problem.starts
+    if graph.between.is_absolute.any():
+        # The map may not have come to the world yet.
+        starts = [*starts, placed(graph, problem.poses)]
+    costs = [l1_cost(whitened_residual(graph, poses)) for poses in starts]
     before, cost = costs[0], min(costs)
-    poses = problem.starts[costs.index(cost)]
+    poses = starts[costs.index(cost)]
     dual = _dual_of(problem, poses)
     steps, far = 0, problem.may_be_far and is_far(cost, problem.last_cost)
     cholesky = problem.choice.cholesky if far else None
@@ -194,6 +200,6 @@ def _improvement(solution: Solution, problem: Problem, judgement: Judgement, bef
     # The rows of what is not believed have no dual yet.
     dual = np.zeros((len(accepted), problem.graph.manifold.TANGENT_SIZE))
     dual[accepted] = solution.dual.reshape(-1, dual.shape[1])
-    return Improvement(problem.map, solution.poses, dual.ravel(), judgement, problem.robust,
+    return Improvement(problem.map, solution.poses, dual.ravel(), judgement,
                        before, solution.cost, solution.status, steps, solution.outer_iterations,
                        solution.inner_iterations, solution.gap, time.monotonic() - start)

@@ -11,11 +11,11 @@ from problems import covariance6, loop, odometry
 
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.online import backend as backend_module
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.online.update import Improvement, improve
+from l1slam_ros.core.online.upkeep import upkeep
 
 OPTIONS = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 DEADLINE = 30.0
@@ -89,7 +89,7 @@ def test_nobody_sees_new_poses_with_an_old_judgement(monkeypatch):
         made = improve(*arguments)
         return Slow(**{field.name: getattr(made, field.name) for field in fields(made)})
 
-    monkeypatch.setattr(backend_module, 'improve', slowly)
+    monkeypatch.setattr(upkeep, 'improve', slowly)
     updating = meanwhile(lambda: backend.update(DEADLINE, go_on))
     seen = meeting.look(backend.snapshot)
     updating.join()
@@ -115,7 +115,7 @@ def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):
         except Interrupted as interrupted:
             ended.append(interrupted)
 
-    monkeypatch.setattr(backend_module, 'improve', slowly)
+    monkeypatch.setattr(upkeep, 'improve', slowly)
     updating = meanwhile(update)
     meeting.look(backend.reset)
     updating.join()
@@ -134,13 +134,13 @@ def patient(problem, options, budget, check):
 def test_an_update_is_interrupted_at_once(monkeypatch, interrupt):
     backend, stopped, begun = Backend(OPTIONS), threading.Event(), threading.Event()
     drive(backend, 0, 5)
-    now = backend.snapshot()
+    now = backend.saved()
 
     def update():
         with pytest.raises(Interrupted):
             backend.update(DEADLINE, lambda: begun.set() or stopped.is_set())
 
-    monkeypatch.setattr(backend_module, 'improve', patient)
+    monkeypatch.setattr(upkeep, 'improve', patient)
     updating = meanwhile(update)
     assert begun.wait(DEADLINE)
     # What needs no solver does not interrupt it, and is not held up.
@@ -150,7 +150,7 @@ def test_an_update_is_interrupted_at_once(monkeypatch, interrupt):
     if interrupt == 'settle':
         assert backend.settle(go_on).cost == pytest.approx(0.0, abs=1e-6)
     elif interrupt == 'restore':
-        backend.restore(now.graph, now.poses, now.stamps)
+        backend.restore(now)
     elif interrupt == 'reset':
         backend.reset()
     else:
@@ -212,9 +212,9 @@ def test_in_the_background_what_comes_is_judged_and_the_thread_ends():
         backend.add_loop(loop(1.0, 30.0, (28.9, 0.0, 0.0), 1e-4 * np.eye(6)))
         wait_until(lambda: backend.loop_states().state.tolist() == [ACCEPTED])
         wait_until(lambda: backend.update() is None)
-        now = backend.snapshot()
+        now = backend.saved()
         # A map that takes the place of another is woken for too.
-        backend.restore(now.graph, now.poses, now.stamps)
+        backend.restore(now)
         wait_until(lambda: backend.snapshot().optimised.at_rest)
         assert len(of_threads()) == 1
     assert not of_threads()
@@ -225,7 +225,7 @@ def test_in_the_background_what_comes_is_judged_and_the_thread_ends():
 @pytest.mark.parametrize('end', ['close', 'settle', 'reset'])
 def test_the_background_makes_way(monkeypatch, end):
     begun = threading.Event()
-    monkeypatch.setattr(backend_module, 'improve', lambda *a: begun.set() or patient(*a))
+    monkeypatch.setattr(upkeep, 'improve', lambda *a: begun.set() or patient(*a))
     with Backend(OPTIONS, background=True) as backend:
         drive(backend, 0, 5)
         assert begun.wait(DEADLINE)
@@ -243,7 +243,7 @@ def test_what_fails_in_the_background_is_raised_at_the_end(monkeypatch):
         failed.set()
         raise MemoryError('no more')
 
-    monkeypatch.setattr(backend_module, 'improve', fail)
+    monkeypatch.setattr(upkeep, 'improve', fail)
     with pytest.raises(MemoryError, match='no more'), Backend(OPTIONS, background=True) as backend:
         drive(backend, 0, 5)
         assert failed.wait(DEADLINE)
