@@ -10,6 +10,8 @@ from l1slam_ros.core.incremental.border import FIXED, Border
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, find_pattern
 
 OLD, NEW = 14, 6
+CASES = [pytest.param(shape, k, id=f'{shape.__name__} {k}')
+         for shape in SHAPES for k in ([3, 6] if shape is SHAPES[-1] else [3])]
 
 
 class Whole:
@@ -60,8 +62,7 @@ def factored(k, shape, rng):
     return system, weights, cholesky
 
 
-@pytest.mark.parametrize('k', [2, 3, 6])
-@pytest.mark.parametrize('shape', SHAPES, ids=lambda shape: shape.__name__)
+@pytest.mark.parametrize('shape, k', CASES)
 def test_a_climb_is_the_inverse_factor_where_that_is_not_zero(k, shape, rng):
     system, weights, cholesky = factored(k, shape, rng)
     A = system.A.toarray()
@@ -74,8 +75,7 @@ def test_a_climb_is_the_inverse_factor_where_that_is_not_zero(k, shape, rng):
     assert_allclose(climbs @ climbs.T, inverse, atol=1e-9 * np.abs(inverse).max())
 
 
-@pytest.mark.parametrize('k', [2, 3, 6])
-@pytest.mark.parametrize('shape', SHAPES, ids=lambda shape: shape.__name__)
+@pytest.mark.parametrize('shape, k', CASES)
 def test_a_border_is_the_whole_problem(k, shape, rng):
     """Old, new and fixed keyframes in all mixtures: steps, and what is predicted, are exact."""
     system, weights, cholesky = factored(k, shape, rng)

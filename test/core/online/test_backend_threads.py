@@ -73,11 +73,11 @@ def test_nobody_sees_a_keyframe_without_its_odometry(monkeypatch):
     assert len(backend.snapshot().stamps) == 2
 
 
-def test_nobody_sees_new_poses_with_an_old_judgement(monkeypatch):
+def test_nobody_sees_the_front_of_one_map_with_the_poses_of_another(monkeypatch):
     backend, meeting = Backend(OPTIONS), Meeting()
     drive(backend, 0, 30)
+    backend.update(DEADLINE, go_on)
     backend.add_loop(loop(1.0, 30.0, (28.9, 0.0, 0.0), 1e-8 * np.eye(6)))
-    before = backend.snapshot()
 
     class Slow(Improvement):
         def __getattribute__(self, name):
@@ -90,13 +90,14 @@ def test_nobody_sees_new_poses_with_an_old_judgement(monkeypatch):
         return Slow(**{field.name: getattr(made, field.name) for field in fields(made)})
 
     monkeypatch.setattr(upkeep, 'improve', slowly)
-    updating = meanwhile(lambda: backend.update(DEADLINE, go_on))
+    # The first one leaves the loop to the front.
+    updating = meanwhile(lambda: [backend.update(DEADLINE, go_on) for _ in range(2)])
     seen = meeting.look(backend.snapshot)
     updating.join()
     after = backend.snapshot()
-    assert (before.poses != after.poses).any() and after.loop_states().state.tolist() == [ACCEPTED]
-    new_poses = (seen.poses == after.poses).all()
-    assert new_poses == (seen.loop_states().state == after.loop_states().state).all()
+    assert after.loop_states().state.tolist() == [ACCEPTED]
+    assert (seen.poses == seen.optimised.poses).all() or (
+        seen.optimised.poses != after.optimised.poses).any()
 
 
 def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):

@@ -81,8 +81,7 @@ class Upkeep:
         number = self._live.number + 1 if hasattr(self, '_live') else 1
         self._builder = builder
         self._live = LiveMap(number, builder, optimised, self._robust)
-        self._map_to_odom = None
-        self._grown = None if builder.graph.n_poses else self._live.growth()
+        self._map_to_odom, self._grown = None, self._live.growth()
         self._changes += 1
 
     @property
@@ -207,7 +206,9 @@ class Upkeep:
         problem = now.problem()
         check()
         round_ = max(budget, _LEAST_ROUND)
-        if problem.is_sparse and (idle or live.round_took < round_):
+        # For the first front of a map that was loaded nobody shall wait long.
+        thorough = idle and live.front is not None
+        if problem.is_sparse and (thorough or live.round_took < round_):
             improvement = improve(problem, solver, np.inf, check)
             live.round_took = time.thread_time() - start
         else:
