@@ -32,6 +32,10 @@ class NodeOptions(BackendOptions):
     publish_tf: bool = option(
         True, 'publish map -> odom on /tf, where tf2_msgs is installed', fixed=True)
     save_path: str = option('', 'the .g2o file of ~/save and ~/load')
+    autosave_period: float = option(
+        60.0, 'with a save_path, how often a map that changed is saved, and at the end; 0: off',
+        's', 0, 1e9)
+    load_on_start: bool = option(False, 'load the map of save_path at start', fixed=True)
     on_time_jump: str = option(
         'ignore', 'what to do when the ROS clock jumps back: go on, or begin a new map', '',
         choices=('reset', 'ignore'))

@@ -488,7 +488,8 @@ def test_stamps_of_any_order(write):
 
 
 def test_vertices_alone(write):
-    ids, poses = read_vertices(write('VERTEX_SE2 4 1 2 3\nVERTEX_SE2 2 4 5 6\n'))
+    ids, poses, stamps = read_vertices(write('VERTEX_SE2 4 1 2 3\nVERTEX_SE2 2 4 5 6\n'))
+    assert stamps is None
     assert ids.tolist() == [2, 4]
     assert poses.tolist() == [[4, 5, 6], [1, 2, 3]]
     with pytest.raises(FileError, match='no vertices; expected VERTEX_SE2 or VERTEX2 lines'):
