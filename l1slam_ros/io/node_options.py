@@ -29,10 +29,12 @@ class NodeOptions(BackendOptions):
         '', "the robot's frame; empty: the first child_frame_id seen", fixed=True)
     publish_tf: bool = option(
         True, 'publish map -> odom on /tf, where tf2_msgs is installed', fixed=True)
+    transform_period: float = option(
+        0.05, 'how often map -> odom is published', 's', 1e-3, 3600, fixed=True)
+    transform_tolerance: float = option(
+        0.1, 'how far ahead of the newest odometry map -> odom is stamped: until then it holds',
+        's', 0, 3600)
     save_path: str = option('', 'the .g2o file of ~/save and ~/load')
-    on_time_jump: str = option(
-        'ignore', 'what to do when the ROS clock jumps back: go on, or begin a new map', '',
-        choices=('reset', 'ignore'))
     update: UpdateOptions = UpdateOptions()
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
@@ -34,17 +34,13 @@ from l1slam_ros.ros.diagnostics import Diagnosis
 from l1slam_ros.ros.loop_status import LoopStatus
 from l1slam_ros.ros.markers import graph_markers
 from l1slam_ros.ros.parameters import NodeParameters
-from l1slam_ros.ros.publishing import path_bytes, pose_bytes, transform_stamped
+from l1slam_ros.ros.publishing import path_bytes, pose_bytes
 from l1slam_ros.ros.services import MapServices
 from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.orders import Orders
 from l1slam_ros.ros.threads.solver_thread import SolverThread
 from l1slam_ros.ros.traffic import Traffic
-
-try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:  # the ROS wheels on PyPI have none
-    TFMessage = None
+from l1slam_ros.ros.transform import MapToOdom
 
 _DEPTH = 1000
 # Messages of one topic at most before other callbacks have their turn.
@@ -78,10 +74,7 @@ class BackendNode(Node):
         self._manifold = self._backend.manifold
         self._base_frame = BaseFrame(options.base_frame)
         self._refused: Counter[str] = Counter()
-        self._last_stamp = 0
-        self._last_pose = self._map_to_odom = self._manifold.identity(1)
         self._told_map, self._told_version = 0, self._backend.version
-        self._told_transform = self._map_to_odom
         self.failures = Failures(self.get_logger(), self.context.ok)
         self._solver = SolverThread(self._backend, self.failures, self.get_logger(),
                                     lambda: self.options.update.budget, self._tell)
@@ -100,7 +93,10 @@ class BackendNode(Node):
         guarded = self.failures.guarded
         # By a clock that goes on where simulated time stands still, or a bag has ended.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(options.update.period, guarded('timer', self._on_timer), clock=steady)
+        self.create_timer(options.update.period, guarded('timer', self._solver.wake), clock=steady)
+        self.create_timer(options.transform_period,
+                          guarded('transform', lambda: self._transform.publish(self.options)),
+                          clock=steady)
         self.create_timer(1.0, guarded('diagnostics', self._on_second), clock=steady)
         self._solver.start()
 
@@ -123,11 +119,8 @@ class BackendNode(Node):
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._path = self.create_publisher(Path, 'path', latched)
         self._pose = self.create_publisher(PoseStamped, 'pose', 10)
-        self._transform = self.create_publisher(TransformStamped, 'map_to_odom', 10)
         self._graph = self.create_publisher(MarkerArray, 'graph', latched)
-        self._tf = None
-        if TFMessage is not None and self.options.publish_tf:
-            self._tf = self.create_publisher(TFMessage, '/tf', 100)
+        self._transform = MapToOdom(self, self._backend, self.options.publish_tf)
         self._loop_status = LoopStatus(self)
 
     def _make_subscriptions(self) -> None:
@@ -190,9 +183,8 @@ class BackendNode(Node):
             return
         if map_to_odom is None:
             return
-        self._map_to_odom, manifold = map_to_odom, self._manifold
-        self._last_stamp, self._last_pose = sample.stamp, manifold.from_pose3(sample.pose3[None])
-        pose = manifold.compose(self._map_to_odom, self._last_pose)
+        manifold = self._manifold
+        pose = manifold.compose(map_to_odom, manifold.from_pose3(sample.pose3[None]))
         self._pose.publish(pose_bytes(self.options.map_frame, sample.stamp,
                                       manifold.to_pose3(pose)[0]))
 
@@ -213,11 +205,6 @@ class BackendNode(Node):
     def _refuse(self, error: L1SlamError) -> None:
         self._refused[error.cause if isinstance(error, MessageError) else 'unusable'] += 1
         self.get_logger().warning(f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
-
-    def _on_timer(self) -> None:
-        self._solver.wake()
-        if self._last_stamp:
-            self._publish_transform()
 
     def _on_second(self) -> None:
         for sentence in self._backend.news():
@@ -243,26 +230,18 @@ class BackendNode(Node):
         poses, loops = now.poses, now.loop_states()
         if not np.isfinite(poses).all() or not np.isfinite(now.map_to_odom).all():
             raise ArithmeticError('a pose of the map is not finite: it is not published')
-        self._diagnosis.note_jump(
-            self._manifold, self._manifold.compose(self._told_transform, self._last_pose),
-            self._manifold.compose(now.map_to_odom, self._last_pose))
-        self._map_to_odom = self._told_transform = now.map_to_odom
-        frame, stamp = self.options.map_frame, self._last_stamp
+        robot = self._backend.robot()
+        if robot is not None:
+            before, after = (self._manifold.compose(transform, robot.odometry)
+                             for transform in self._backend.moved)
+            self._diagnosis.note_jump(self._manifold, before, after)
+        frame, stamp = self.options.map_frame, robot.stamp if robot is not None else 0
         pose3 = self._manifold.to_pose3(poses)
         self._path.publish(path_bytes(frame, stamp, now.stamps, pose3))
-        self._publish_transform()
         self._loop_status.publish(loops)
         # Markers are slow to make: not unless somebody looks.
         if self._graph.get_subscription_count():
             self._graph.publish(graph_markers(frame, stamp, pose3, now.graph.between, loops))
-
-    def _publish_transform(self) -> None:
-        options = self.options
-        transform = transform_stamped(options.map_frame, options.odom_frame, self._last_stamp,
-                                      self._manifold.to_pose3(self._map_to_odom)[0])
-        self._transform.publish(transform)
-        if self._tf is not None:
-            self._tf.publish(TFMessage(transforms=[transform]))
 
     def _report(self, improvement: Improvement) -> None:
         self._diagnosis.note(improvement)

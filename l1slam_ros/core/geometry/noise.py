@@ -105,8 +105,7 @@ def bounds(found: Array, used: Array, out: Mask) -> list[tuple[float, float]]:
     return list(zip(*variances, strict=True))
 
 
-def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Array,
-                trusted: bool) -> bytes:
+def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Array) -> bytes:
     """
     Return what equal measurements have in common: stamps, pose and, to six digits, covariance.
 
@@ -115,7 +114,7 @@ def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Ar
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)).ravel()
     correlation = covariance.reshape(len(sigma), -1) / np.outer(sigma, sigma)
     digits = np.rint(1e6 * np.concatenate((np.log(sigma), correlation.ravel()))).astype(np.int64)
-    return b'%d %d %d ' % (reference, stamp, trusted) + measurement.tobytes() + digits.tobytes()
+    return b'%d %d ' % (reference, stamp) + measurement.tobytes() + digits.tobytes()
 
 
 def root_of_inverse(covariance: Array) -> Array:

@@ -24,8 +24,8 @@ class BetweenFactors:
     Measurements of the pose of keyframe j seen from keyframe i.
 
     i, j : (m,) keyframe indices; measurement : (m, p) relative poses;
-    sqrt_information : (m, d, d) upper triangular roots, see `noise`; trusted : (m,) bool, a person
-    or a marker vouches for it.
+    sqrt_information : (m, d, d) upper triangular roots, see `noise`; trusted, struck : (m,) bool,
+    a person or a marker vouches for it, or has struck it out.
     """
 
     i: Indices
@@ -33,6 +33,7 @@ class BetweenFactors:
     measurement: Array
     sqrt_information: Array
     trusted: Mask
+    struck: Mask
 
     def __len__(self) -> int:
         return len(self.i)
@@ -83,7 +84,8 @@ class FactorGraph:
         self.n_poses = 0
         p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
         self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
-                         GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_)]
+                         GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_),
+                         GrowingArray((), np.bool_)]
         self._prior = [GrowingArray((), np.int64), GrowingArray((p,)), GrowingArray((d, d))]
 
     def copy(self) -> 'FactorGraph':
@@ -107,10 +109,10 @@ class FactorGraph:
         part = FactorGraph(self.manifold)
         part.n_poses = self.n_poses
         part._prior = [column.copy() for column in self._prior]
-        i, j, measurement, root, trusted = (column.view()[chosen] for column in self._between)
+        i, j, measurement, root, *said = (column.view()[chosen] for column in self._between)
         if variance is not None:
             root = root / np.sqrt(variance)[:, None, None]
-        self._append(part._between, (i, j, measurement, root, trusted))
+        self._append(part._between, (i, j, measurement, root, *said))
         return part
 
     @property
@@ -155,7 +157,16 @@ class FactorGraph:
     ) -> None:
         """Append between factors that are known to be sound, with the roots (m, d, d) at hand."""
         self._append(self._between, (i, j, measurement, sqrt_information,
-                                     np.broadcast_to(trusted, len(i))))
+                                     np.broadcast_to(trusted, len(i)), np.zeros(len(i), bool)))
+
+    def say(self, rows: Indices, trusted: bool) -> None:
+        """Let some between factors be vouched for, or else struck out; the last word counts."""
+        for column, value in ((-2, trusted), (-1, not trusted)):
+            said = self._between[column].view().copy()
+            said[rows] = value
+            # What was seen of the column before stays as it was.
+            self._between[column] = GrowingArray((), np.bool_)
+            self._between[column].extend(said)
 
     def add_prior(self, i: Indices, measurement: Array, information: Array) -> None:
         """Append prior factors: i (m,), measurement (m, p), information (m, d, d); as above."""
@@ -205,6 +216,15 @@ def component_labels(graph: FactorGraph) -> Indices:
         np.minimum.at(lowest, np.maximum(a, b), np.minimum(a, b))
         while (lowest[lowest] != lowest).any():
             lowest = lowest[lowest]
+
+
+def gaps(graph: FactorGraph) -> Indices:
+    """Return the keyframes k > 0 that no odometry joins to k - 1, (g,)."""
+    factors = graph.between
+    rows = factors.is_odometry
+    joined = np.zeros(graph.n_poses, bool)
+    joined[np.maximum(factors.i[rows], factors.j[rows])] = True
+    return 1 + np.flatnonzero(~joined[1:])
 
 
 def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:

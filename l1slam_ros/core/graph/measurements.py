@@ -3,6 +3,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from l1slam_ros.core.geometry.manifold import Array
 
 # [m/s] The speed of sound: no vehicle on the ground has been faster (Thrust SSC, 341 m/s). Stamps
@@ -32,7 +34,8 @@ class LoopClosure:
     The pose of the robot at `stamp`, seen from the robot at the earlier `reference_stamp`.
 
     stamps : [ns]; pose3 : (7,) x y z qx qy qz qw [m]; covariance : (6, 6), rows x y z rx ry rz,
-    in the axes of the measured pose; trusted : a person or a marker vouches for it.
+    in the axes of the measured pose; trusted : a person or a marker vouches for it; struck : it is
+    a person's word that the loop of these stamps is false, whatever it measures.
     """
 
     reference_stamp: int
@@ -40,3 +43,10 @@ class LoopClosure:
     pose3: Array
     covariance: Array
     trusted: bool = False
+    struck: bool = False
+
+
+def require_finite(pose3: Array) -> None:
+    """Raise an ArithmeticError where a pose is not finite: it would spoil all after it."""
+    if not np.isfinite(pose3).all():
+        raise ArithmeticError(f'pose {pose3} is not finite')

@@ -2,61 +2,35 @@
 """
 How the graph grows: odometry samples and loop closures in, keyframes and factors out.
 
-A loop closure names two times. It waits until odometry has reached both, is then carried to the
-nearest keyframes by the raw odometry in between, and becomes a between factor.
+Where the odometry does not go on from where it was (stamps go back, its frame is another one), a
+new part of the map begins: at the end of the one before, which is a guess that no factor says.
+Loops join the parts, if there are any.
 """
 
 from collections import Counter
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import (
-    LEAST_VARIANCE,
-    MOST_OF_ODOMETRY,
-    MOST_VARIANCE,
-    Mask,
-    at_most,
-    bounds,
-    loop_identity,
-    or_model,
-    root_of_inverse,
-    usable,
-)
-from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.growable_array import GrowingArray
+from l1slam_ros.core.geometry.noise import MOST_OF_ODOMETRY, root_of_inverse
+from l1slam_ros.core.graph.factor_graph import FactorGraph, gaps
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.online.keyframes import (
-    KeyframeOptions,
-    Motion,
-    OdometryOptions,
-    diagonal_covariance,
-    reduced_covariance,
-)
+from l1slam_ros.core.online.keyframes import KeyframeOptions, Motion, OdometryOptions
+from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
 from l1slam_ros.core.online.notes import Notes
-from l1slam_ros.core.online.odometry_stream import OdometryStream, Point
-from l1slam_ros.core.online.odometry_track import OdometryTrack
-from l1slam_ros.core.online.waiting_loops import WaitingLoop, WaitingLoops
+from l1slam_ros.core.online.odometry.odometry_stream import OdometryStream, Point
+from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
 from l1slam_ros.core.options import Options, option
 
 # [rad/s] A robot that nobody saw may have turned so fast.
 _UNSEEN_TURN = 1.0
-
-
-@dataclass(frozen=True)
-class LoopOptions(Options):
-    """How loop closures are read."""
-
-    covariance_source: str = option(
-        'message', 'message: as stated, the model where that is unusable; model: the sigmas below',
-        '', choices=('message', 'model'))
-    sigma_translation: float = option(0.1, 'model: of the position', 'm', 1e-9, 1e6)
-    sigma_rotation: float = option(0.05, 'model: of the heading', 'rad', 1e-9, 1e6)
-    wait: float = option(
-        10.0, 'how long a loop for times not yet seen waits, on the clock of the odometry', 's',
-        0, 1e9)
+# What a gap in the odometry is to the map: the cause it is counted by, and what is said of it.
+_SAID = {'new_segment': ('new_part', 'a new part of the map begins where the last one ends'),
+         'reset': ('reset', 'the map begins anew'),
+         'ignore': ('moved', 'the robot is taken to be where it was')}
 
 
 @dataclass(frozen=True)
@@ -66,6 +40,11 @@ class GraphBuilderOptions(Options):
     keyframe: KeyframeOptions = KeyframeOptions()
     odometry: OdometryOptions = OdometryOptions()
     loop: LoopOptions = LoopOptions()
+    on_time_jump: str = option(
+        'new_segment', "when the ROS clock or the odometry's stamps jump back, or odometry jumps "
+        'further than any robot moves: the map stays and a new part begins, which loops may join '
+        'to it; or the map begins anew; or the robot is taken to be where it was, and old stamps '
+        'are dropped', '', choices=tuple(_SAID))
 
 
 class GraphBuilder:
@@ -84,7 +63,7 @@ class GraphBuilder:
     graph : the factor graph so far; loops enter it in `add_due_loops`
     notes : of messages that were not used, or otherwise than they say
     offset : (1, p) takes poses of the odometry frame to those kept here: the identity, until
-        after `restore`, or when the odometry moves its frame, it goes on from where the robot was
+        after `restore`, or at a gap, the odometry goes on from where the robot was
 
     """
 
@@ -94,16 +73,17 @@ class GraphBuilder:
         self.notes = Notes()
         self._verbatim = verbatim
         self._stream = OdometryStream(manifold, self.notes)
-        self._track = OdometryTrack(manifold)
+        self._loops = LoopFactors(manifold, self.notes, verbatim)
         self._motion: Motion
-        self._glued = True
-        self.offset = manifold.identity(1)
-        self._moved = self._resumed = False
-        self._waiting = WaitingLoops()
-        self._seen: set[bytes] = set()
-        self._expired = GrowingArray((2,), np.int64)
-        self._loop_stamps = GrowingArray((2,), np.int64)
-        self._loop_rows = GrowingArray((), np.int64)
+        self._resumed = False
+        self._begin(FactorGraph(manifold))
+
+    def _begin(self, graph: FactorGraph) -> None:
+        """Begin with a graph, of which no keyframe is known yet."""
+        self.graph = graph
+        self._track = OdometryTrack(graph.manifold)
+        self.offset = graph.manifold.identity(1)
+        self._moved, self._glued = False, True
 
     @property
     def refused(self) -> Counter[str]:
@@ -121,9 +101,19 @@ class GraphBuilder:
         return self._track.keyframe_poses
 
     @property
+    def gaps(self) -> Indices:
+        """Keyframes that no odometry joins to the ones before them, (g,)."""
+        return self._track.gaps
+
+    @property
     def n_waiting(self) -> int:
         """How many loops are not in the graph yet, nor refused."""
-        return len(self._waiting)
+        return len(self._loops.waiting)
+
+    @property
+    def last(self) -> Point | None:
+        """The last sample that was used since this map began or was restored."""
+        return self._stream.last
 
     @property
     def held(self) -> str:
@@ -137,12 +127,12 @@ class GraphBuilder:
 
         Those in the graph are in the order of `loop_rows`, to which they stay tied.
         """
-        return self._loop_stamps.view(), self._waiting.stamps(), self._expired.view()
+        return self._loops.stamps
 
     @property
     def loop_rows(self) -> Indices:
         """Which between factors of the graph are loops, (k,)."""
-        return self._loop_rows.view()
+        return self._loops.rows
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """
@@ -156,10 +146,12 @@ class GraphBuilder:
         MessageError : `old_stamp`, the stamp is not after the last one; nothing is added.
 
         """
-        if not self._glued and sample.stamp <= self._track.last:
+        ignore, track = self.options.on_time_jump == 'ignore', self._track
+        if ignore and not self._glued and sample.stamp <= track.last_stamp:
             raise MessageError('old_stamp', f'odometry stamp {sample.stamp} ns is not after the '
-                               f'last one, {self._track.last} ns')
-        keyframes = [self._add(point) for point in self._stream.take(sample, self._verbatim)]
+                               f'last one, {track.last_stamp} ns')
+        points = self._stream.take(sample, self._verbatim, not ignore)
+        keyframes = [self._add(point) for point in points]
         return any(keyframes)
 
     def finish(self) -> None:
@@ -169,29 +161,46 @@ class GraphBuilder:
 
     def _add(self, point: Point) -> bool:
         """Add a sample of the robot's motion; return whether it made a keyframe."""
-        if point.anew:
+        on_gap, gap = self.options.on_time_jump, point.gap
+        if not self._glued and point.stamp <= self._track.last_stamp:
+            gap = f'odometry stamp {point.stamp} ns is before the end of the map'
+        if gap:
+            cause, said = _SAID[on_gap]
+            self.notes.warn(cause, f'{gap}; {said}')
+        if point.anew or (gap and on_gap == 'reset'):
             self._forget()
         if not len(self._track):
             self._track.append(point.stamp, point.pose)
             self._begin_keyframe(point.stamp, point.pose)
             return True
         manifold, pose = self.graph.manifold, point.pose
-        if not self._glued or point.unseen:
+        if gap or not self._glued:
             self.offset = manifold.compose(self._track.last_pose, manifold.inverse(pose))
             self._glued = self._moved = True
         if self._moved:
             pose = manifold.compose(self.offset, pose)
+        if gap and on_gap == 'new_segment':
+            self.add_due_loops()
+            if self._track.begin_part(point.stamp):
+                self._loops.waiting.begin_anew(self._track.time)
+            self._track.append(point.stamp, pose)
+            self._begin_keyframe(point.stamp, pose)
+            return True
+        return self._go_on(point, pose)
+
+    def _go_on(self, point: Point, pose: Array) -> bool:
+        """Add a sample at a pose (1, p) that goes on from the last one."""
         self._track.append(point.stamp, pose)
-        if point.unseen:
+        if point.gap:
             self._motion.add_unseen(point.sample, point.unseen, _UNSEEN_TURN * point.seconds)
         else:
             self._motion.add(point.sample, pose, self.options.odometry)
         # Where the frame has moved there is a keyframe: what is published goes by the last one.
-        if not point.unseen and not self._motion.is_keyframe(self.options.keyframe):
+        if not point.gap and not self._motion.is_keyframe(self.options.keyframe):
             return False
         motion = self._motion
         covariance = motion.covariance(self.options.odometry, self._verbatim)
-        self._note_bounds('odometry', point.stamp, motion.bounded, MOST_OF_ODOMETRY)
+        self.notes.warn_bounds('odometry', point.stamp, motion.bounded, MOST_OF_ODOMETRY)
         self._begin_keyframe(point.stamp, pose)
         k = self.graph.n_poses - 1
         self.graph.append_between(np.array([k - 1]), np.array([k]), motion.pose,
@@ -207,10 +216,10 @@ class GraphBuilder:
         self._forget()
 
     def _forget(self) -> None:
-        """Forget the only sample; loops that came may yet find odometry of their times."""
-        self.graph = FactorGraph(self.graph.manifold)
-        self._track = OdometryTrack(self.graph.manifold)
-        self._waiting.forget_arrivals()
+        """Begin anew; loops that came may yet find odometry of their times."""
+        self._begin(FactorGraph(self.graph.manifold))
+        self._resumed = False
+        self._loops.forget()
 
     def restore(self, graph: FactorGraph, stamps: Indices, poses: Array) -> None:
         """
@@ -220,34 +229,18 @@ class GraphBuilder:
         of that run that is sent again is known where it named the stamps of keyframes: others
         were carried there and are not what was sent.
         """
-        self.graph = graph
-        self._track.extend_by_keyframes(stamps, poses)
+        self._begin(graph)
+        starts = [0, *gaps(graph).tolist(), graph.n_poses]
+        for first, end in pairwise(starts):
+            self._track.extend_by_part(stamps[first:end], poses[first:end])
         self._motion = Motion(graph.manifold, int(stamps[-1]), poses[-1:])
         self._glued, self._resumed = False, True
         self._stream = OdometryStream(graph.manifold, self.notes, resumed=True)
-        factors = graph.between
-        rows = np.flatnonzero(~factors.is_odometry)
-        ends = stamps[factors.pairs[rows]]
-        self._note_loops(rows, np.sort(ends, axis=1))
-        roots = np.linalg.inv(factors.sqrt_information[rows])
-        covariances = roots @ roots.transpose(0, 2, 1)
-        for (reference, stamp), row, covariance in zip(ends.tolist(), rows, covariances,
-                                                       strict=True):
-            self._seen.add(loop_identity(reference, stamp, factors.measurement[row], covariance,
-                                       bool(factors.trusted[row])))
+        self._loops.restore(graph, stamps)
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Take a loop closure in, once; it becomes a factor in `add_due_loops`."""
-        measurement = self.graph.manifold.from_pose3(loop.pose3[None])
-        covariance = self._loop_covariance(loop)
-        key = loop_identity(loop.reference_stamp, loop.stamp, measurement, covariance,
-                            loop.trusted)
-        if key in self._seen and not self._verbatim:
-            self._refuse('repeated', loop, 'was sent before; expected each loop once')
-            return
-        self._seen.add(key)
-        arrival = self._track.last if len(self._track) else 0
-        self._waiting.add(WaitingLoop(loop, arrival, measurement, covariance, key))
+        self._loops.add(loop, self._track, self.options.loop)
 
     def add_due_loops(self) -> int:
         """
@@ -256,91 +249,7 @@ class GraphBuilder:
         Loops that can never become one are counted in `refused`: `before_start` (a time before
         the first odometry), `same_keyframe`, `expired`.
         """
-        if not len(self._waiting) or not len(self._track):
-            return 0
-        now = self._track.last
-        due = self._waiting.due(now)
-        since = now - int(self.options.loop.wait * 1e9)
-        for one in self._waiting.expired(since) if self._track.first < since else ():
-            self._expired.extend(np.array([(one.loop.reference_stamp, one.loop.stamp)]))
-            self._refuse('expired', one.loop, f'waited for odometry until {now} ns; expected '
-                         'odometry of its times')
-            # Sent again when odometry has come that far, it is welcome.
-            self._seen.discard(one.key)
-        return self._add_loops(due) if due else 0
-
-    def _add_loops(self, due: list[WaitingLoop]) -> int:
-        manifold = self.graph.manifold
-        stamps = np.array([(one.loop.reference_stamp, one.loop.stamp) for one in due])
-        known = self._track.known_until(np.array([one.arrival for one in due]), stamps[:, 1])
-        i, j = (self._track.nearest_keyframe(end, known) for end in stamps.T)
-        keep = self._can_be_factors([one.loop for one in due], i, j)
-        if not keep.any():
-            return 0
-        used = [one for one, kept in zip(due, keep, strict=True) if kept]
-        i, j, stamps = i[keep], j[keep], stamps[keep]
-        to_reference = manifold.between(self.odometry[i], self._track.at(stamps[:, 0]))
-        to_keyframe = manifold.between(self._track.at(stamps[:, 1]), self.odometry[j])
-        measured = np.concatenate([one.measurement for one in used])
-        measurement = manifold.compose(manifold.compose(to_reference, measured), to_keyframe)
-        # The error lives in the axes of the measured pose; see it from the keyframe instead.
-        Ad = manifold.adjoint(manifold.inverse(to_keyframe))
-        stated = np.concatenate([one.covariance for one in used])
-        covariance = Ad @ stated @ Ad.transpose(0, 2, 1)
-        # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
-        covariance = np.where(usable(covariance)[:, None, None], covariance, self._loop_model())
-        self.graph.append_between(i, j, measurement, root_of_inverse(covariance),
-                                  np.array([one.loop.trusted for one in used]))
-        last = len(self.graph.between)
-        self._note_loops(np.arange(last - len(used), last), stamps)
-        return len(used)
-
-    def _can_be_factors(self, loops: list[LoopClosure], i: Indices, j: Indices) -> Mask:
-        """Return which loops between the keyframes i, j (m,) can be factors, and note the rest."""
-        first = self._track.first
-        early = np.array([loop.reference_stamp < first for loop in loops])
-        same = (i == j) & ~early
-        for row in np.flatnonzero(early | same).tolist():
-            if early[row]:
-                self._refuse('before_start', loops[row], 'begins before the odometry; expected '
-                             f'times from {first} ns on')
-            else:
-                self._refuse('same_keyframe', loops[row], 'begins and ends at one keyframe; '
-                             'expected two')
-        can: Mask = ~(early | same)
-        return can
-
-    def _note_loops(self, rows: Indices, stamps: Indices) -> None:
-        self._loop_rows.extend(rows)
-        self._loop_stamps.extend(stamps)
-
-    def _refuse(self, cause: str, loop: LoopClosure, why: str) -> None:
-        self.notes.refuse(
-            cause, f'a loop from {loop.reference_stamp} ns to {loop.stamp} ns {why}')
-
-    def _note_bounds(self, what: str, stamp: int, bounded: list[tuple[float, float]],
-                     most: float) -> None:
-        for found, used in bounded:
-            self.notes.warn(f'{what}_variance', f'variance {found:g} of {what} at {stamp} ns; '
-                            f'expected {LEAST_VARIANCE:g} to {most:g}; {used:g} is used')
-
-    def _loop_covariance(self, loop: LoopClosure) -> Array:
-        """Return what a loop states, the model where that is no covariance, (1, d, d)."""
-        model = self._loop_model()
-        stated = reduced_covariance(self.graph.manifold, loop.covariance[None])
-        if self.options.loop.covariance_source == 'model' or not usable(stated)[0]:
-            return model[None]
-        if self._verbatim:
-            return stated
-        cut, large = at_most(stated, MOST_VARIANCE)
-        used, small = or_model(cut, model)
-        self._note_bounds('loop', loop.stamp, bounds(stated, used, large | small), MOST_VARIANCE)
-        return used
-
-    def _loop_model(self) -> Array:
-        options = self.options.loop
-        return diagonal_covariance(
-            self.graph.manifold, options.sigma_translation, options.sigma_rotation)
+        return self._loops.add_due(self.graph, self._track, self.options.loop)
 
     def _begin_keyframe(self, stamp: int, pose: Array) -> None:
         self._track.mark_keyframe()

@@ -35,12 +35,13 @@ class Problem:
     A snapshot to improve: graph, poses (n, p), dual (rows,) and the cost the last update left.
 
     map : number of the map that it is of, other after `Backend.reset` and `Backend.restore`;
-    judgement : of all factors; robust : loops may be doubted; settled : nothing has come since an
-    update that converged.
+    gaps : (g,) keyframes that no odometry joins to the ones before; judgement : of all factors;
+    robust : loops may be doubted; settled : nothing has come since an update that converged.
     """
 
     map: int
     graph: FactorGraph
+    gaps: Indices
     poses: Array
     dual: Array
     judgement: Judgement
@@ -78,18 +79,28 @@ class Optimised:
 
 
 @dataclass(frozen=True)
+class Robot:
+    """Where the robot is: stamp [ns] and pose (1, p) of its odometry, and map -> odom (1, p)."""
+
+    stamp: int
+    odometry: Array
+    map_to_odom: Array
+
+
+@dataclass(frozen=True)
 class Snapshot:
     """
     What a back end knows.
 
-    map : its number; version : see `Backend.version`; graph : the factors so far; stamps (n,)
-    [ns] and odometry (n, p) of the keyframes; map_to_odom : (1, p); loop_rows, loop_stamps : see
-    `GraphBuilder`; robust : loops may be doubted.
+    map : its number; version : see `Backend.version`; graph : the factors so far; gaps : as in
+    `Problem`; stamps (n,) [ns] and odometry (n, p) of the keyframes; map_to_odom : (1, p);
+    loop_rows, loop_stamps : see `GraphBuilder`; robust : loops may be doubted.
     """
 
     map: int
     version: tuple[int, int, int]
     graph: FactorGraph
+    gaps: Indices
     stamps: Indices
     odometry: Array
     map_to_odom: Array
@@ -117,9 +128,10 @@ class Snapshot:
         dual = np.concatenate((last.dual, np.zeros(rows - len(last.dual))))
         judgement = last.judgement.extended(self.graph, self.robust)
         grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
-        settled = not grown and judgement.settled and last.at_rest
-        return Problem(self.map, self.graph, self.poses, dual, judgement, self.robust, last.cost,
-                       settled)
+        told = grown or not np.array_equal(judgement.accepted, last.judgement.accepted)
+        settled = not told and judgement.settled and last.at_rest
+        return Problem(self.map, self.graph, self.gaps, self.poses, dual, judgement, self.robust,
+                       last.cost, settled)
 
     def loop_states(self) -> LoopStates:
         """Return what has become of each loop, those of the graph first, in its order."""

@@ -248,7 +248,8 @@ def _without_circles(edges: _Rows) -> tuple[_Rows, list[str]]:
 def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices,
                edges: _Rows) -> None:
     i, j = _index(path, ids, edges).T
-    doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), np.zeros(len(edges), bool))
+    none = np.zeros(len(edges), bool)
+    doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), none, none)
     graph.add_between(i, j, edges.pose, edges.information, read_trusted(path, ids, doubted))
 
 
