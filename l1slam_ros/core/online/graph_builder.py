@@ -239,7 +239,7 @@ class GraphBuilder:
         self._loops.restore(graph, stamps)
 
     def add_loop(self, loop: LoopClosure) -> None:
-        """Take a loop closure in, once; it becomes a factor in `add_due_loops`."""
+        """Take a loop closure or an absolute pose in, once; see `add_due_loops`."""
         self._loops.add(loop, self._track, self.options.loop)
 
     def add_due_loops(self) -> int:

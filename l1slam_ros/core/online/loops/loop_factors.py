@@ -3,7 +3,8 @@
 Loop closures -> factors.
 
 A loop closure names two times. It waits until odometry has reached both, is then carried to the
-nearest keyframes by the raw odometry in between, and becomes a between factor.
+nearest keyframes by the raw odometry in between, and becomes a between factor. An absolute pose
+names one, the other end of its factor is the world.
 
 A person may vouch for a loop or strike it out, before it comes or after: the last word counts.
 """
@@ -16,18 +17,21 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import (
     MOST_VARIANCE,
     Mask,
-    at_most,
-    bounds,
+    covariance_of,
     loop_identity,
-    or_model,
     root_of_inverse,
-    usable,
 )
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.online.keyframes import diagonal_covariance, reduced_covariance
-from l1slam_ros.core.online.loops.waiting_loops import WaitingLoop, WaitingLoops
+from l1slam_ros.core.online.loops.waiting_loops import (
+    WaitingLoop,
+    WaitingLoops,
+    carried,
+    loop_covariance,
+    said,
+)
 from l1slam_ros.core.online.notes import Notes
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
 from l1slam_ros.core.options import Options, option
@@ -95,10 +99,9 @@ class LoopFactors:
         """Take the loops of an earlier run for seen; stamps (n,) [ns] of its keyframes."""
         factors = graph.between
         rows = np.flatnonzero(~factors.is_odometry)
-        ends = stamps[factors.pairs[rows]]
+        ends = stamps[np.where(factors.i == WORLD, factors.j, [factors.i, factors.j]).T[rows]]
         self._note(rows, np.sort(ends, axis=1))
-        roots = np.linalg.inv(factors.sqrt_information[rows])
-        covariances = roots @ roots.transpose(0, 2, 1)
+        covariances = covariance_of(factors.sqrt_information[rows])
         for (reference, stamp), row, covariance in zip(ends.tolist(), rows.tolist(), covariances,
                                                        strict=True):
             key = loop_identity(reference, stamp, factors.measurement[row], covariance)
@@ -106,19 +109,21 @@ class LoopFactors:
         self._struck.update(map(tuple, factors.pairs[factors.struck].tolist()))
 
     def add(self, loop: LoopClosure, track: OdometryTrack, options: LoopOptions) -> None:
-        """Take a loop closure in, once; it becomes a factor in `add_due`."""
-        measurement = self._manifold.from_pose3(loop.pose3[None])
+        """Take a loop closure or an absolute pose in, once; it becomes a factor in `add_due`."""
         covariance = self._covariance(loop, options)
-        key = loop_identity(loop.reference_stamp, loop.stamp, measurement, covariance)
+        if covariance is None:
+            return
+        measurement = said(self._manifold, loop, covariance)
+        key = loop_identity(*loop.stamps, measurement, covariance)
         if not loop.struck:
             known = self._seen.get(key)
             if known is not None and known >= loop.trusted and not self._verbatim:
                 self._refuse('repeated', loop, 'was sent before; expected each loop once')
                 return
             self._seen[key] = loop.trusted
+        begin, end = map(track.time, loop.stamps)
         arrival = track.last if len(track) else 0
-        self.waiting.add(WaitingLoop(loop, arrival, track.time(loop.reference_stamp),
-                                     track.time(loop.stamp), measurement, covariance, key))
+        self.waiting.add(WaitingLoop(loop, arrival, begin, end, measurement, covariance, key))
 
     def add_due(self, graph: FactorGraph, track: OdometryTrack, options: LoopOptions) -> int:
         """Make factors of the loops whose times odometry has reached; return how many."""
@@ -128,7 +133,7 @@ class LoopFactors:
         due = self.waiting.due(now)
         since = now - int(options.wait * 1e9)
         for one in self.waiting.expired(since) if track.first < since else ():
-            self._expired.extend(np.array([(one.loop.reference_stamp, one.loop.stamp)]))
+            self._expired.extend(np.array([one.loop.stamps]))
             self._refuse('expired', one.loop, f'waited for odometry until {track.last_stamp} ns; '
                          'expected odometry of its times')
             # Sent again when odometry has come that far, it is welcome.
@@ -162,29 +167,23 @@ class LoopFactors:
         begin, end = np.array([(one.begin, one.end) for one in loops]).T
         to_reference = manifold.between(ends[:, 0], track.at(begin))
         to_keyframe = manifold.between(track.at(end), ends[:, 1])
-        measured = np.concatenate([one.measurement for one in loops])
-        measurement = manifold.compose(manifold.compose(to_reference, measured), to_keyframe)
-        # The error lives in the axes of the measured pose; see it from the keyframe instead.
-        Ad = manifold.adjoint(manifold.inverse(to_keyframe))
-        stated = np.concatenate([one.covariance for one in loops])
-        covariance = Ad @ stated @ Ad.transpose(0, 2, 1)
-        # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
-        covariance = np.where(usable(covariance)[:, None, None], covariance, self._model(options))
-        graph.append_between(pairs[:, 0], pairs[:, 1], measurement, root_of_inverse(covariance),
+        measurement, covariance, sound = carried(manifold, loops, to_reference, to_keyframe)
+        covariance = np.where(sound[:, None, None], covariance, self._model(options))
+        i = np.where([one.loop.is_absolute for one in loops], WORLD, pairs[:, 0])
+        graph.append_between(i, pairs[:, 1], measurement, root_of_inverse(covariance),
                              np.array([one.loop.trusted for one in loops]))
-        last = len(graph.between)
-        self._note(np.arange(last - len(loops), last),
-                   np.array([(one.loop.reference_stamp, one.loop.stamp) for one in loops]))
+        rows = len(graph.between) + np.arange(-len(loops), 0)
+        self._note(rows, np.array([one.loop.stamps for one in loops]))
 
     def _say(self, one: WaitingLoop, pair: tuple[int, int], graph: FactorGraph) -> None:
         """Let what a person says of a loop between two keyframes count, now or before."""
         loop = one.loop
         if loop.struck:
             self._struck.add(pair)
-            ends = (loop.reference_stamp, loop.stamp)
             factors = graph.between.pairs[self.rows]
-            graph.say(self.rows[(factors == pair).all(axis=1) | (factors == pair[::-1]).all(axis=1)
-                                | (self._stamps.view() == ends).all(axis=1)], trusted=False)
+            graph.say(self.rows[
+                (factors == pair).all(axis=1) | (factors == pair[::-1]).all(axis=1)
+                | (self._stamps.view() == loop.stamps).all(axis=1)], trusted=False)
         elif loop.trusted:
             self._struck.discard(pair)
             graph.say(np.array([self._row_of[one.key]]), trusted=True)
@@ -194,7 +193,8 @@ class LoopFactors:
     def _can_be_factors(self, loops: list[WaitingLoop], pairs: Indices, first: int) -> Mask:
         """Return which loops between keyframes (m, 2) can be factors, and note the rest."""
         early = np.array([one.begin < first for one in loops])
-        same = (pairs[:, 0] == pairs[:, 1]) & ~early
+        same = (pairs[:, 0] == pairs[:, 1]) & ~early & ~np.array(
+            [one.loop.is_absolute for one in loops])
         for row in np.flatnonzero(early | same).tolist():
             if early[row]:
                 self._refuse('before_start', loops[row].loop, 'begins before the odometry; '
@@ -210,21 +210,24 @@ class LoopFactors:
         self._stamps.extend(stamps)
 
     def _refuse(self, cause: str, loop: LoopClosure, why: str) -> None:
-        self._notes.refuse(
-            cause, f'a loop from {loop.reference_stamp} ns to {loop.stamp} ns {why}')
+        what = 'an absolute pose at' if loop.is_absolute else f'a loop from {loop.stamps[0]} ns to'
+        self._notes.refuse(cause, f'{what} {loop.stamp} ns {why}')
 
-    def _covariance(self, loop: LoopClosure, options: LoopOptions) -> Array:
-        """Return what a loop states, the model where that is no covariance, (1, d, d)."""
-        model = self._model(options)
+    def _covariance(self, loop: LoopClosure, options: LoopOptions) -> Array | None:
+        """
+        Return what a loop states, zeros for what it leaves unsaid, (1, d, d).
+
+        Where that is no covariance, the model; there is none of absolute poses: None, refused.
+        """
         stated = reduced_covariance(self._manifold, loop.covariance[None])
-        if options.covariance_source == 'model' or not usable(stated)[0]:
+        model, absolute = self._model(options), loop.is_absolute
+        if options.covariance_source == 'model' and not absolute:
             return model[None]
-        if self._verbatim:
-            return stated
-        cut, large = at_most(stated, MOST_VARIANCE)
-        used, small = or_model(cut, model)
-        self._notes.warn_bounds('loop', loop.stamp, bounds(stated, used, large | small),
-                                MOST_VARIANCE)
+        used, bounded = loop_covariance(stated, None if absolute else model, self._verbatim)
+        self._notes.warn_bounds('loop', loop.stamp, bounded, MOST_VARIANCE)
+        if used is None:
+            self._refuse('covariance', loop, f'has the variances {np.diagonal(stated[0])}; '
+                         f'expected one above 0, to {MOST_VARIANCE:g}')
         return used
 
     def _model(self, options: LoopOptions) -> Array:
