@@ -20,21 +20,26 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core.errors import L1SlamError, MessageError
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.core.online.marginal import newest_covariance
 from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.messages import cdr
 from l1slam_ros.io.messages.base_frame import BaseFrame
-from l1slam_ros.io.messages.conversion import absolute_pose, loop_closure, odometry_sample
+from l1slam_ros.io.messages.conversion import (
+    absolute_pose,
+    false_loop,
+    loop_closure,
+    odometry_sample,
+)
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.diagnostics import Diagnosis
 from l1slam_ros.ros.loop_status import LoopStatus
-from l1slam_ros.ros.markers import graph_markers
+from l1slam_ros.ros.markers import GraphMarkers
 from l1slam_ros.ros.parameters import NodeParameters
-from l1slam_ros.ros.publishing import path_bytes, pose_bytes
+from l1slam_ros.ros.publishing import path_bytes, pose_bytes, pose_with_covariance
 from l1slam_ros.ros.services import MapServices
 from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.orders import Orders
@@ -119,7 +124,9 @@ class BackendNode(Node):
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._path = self.create_publisher(Path, 'path', latched)
         self._pose = self.create_publisher(PoseStamped, 'pose', 10)
-        self._graph = self.create_publisher(MarkerArray, 'graph', latched)
+        self._covariance = self.create_publisher(
+            PoseWithCovarianceStamped, 'pose_with_covariance', 10)
+        self._markers = GraphMarkers(self)
         self._transform = MapToOdom(self, self._backend, self.options.publish_tf)
         self._loop_status = LoopStatus(self)
 
@@ -128,6 +135,7 @@ class BackendNode(Node):
             (Odometry, 'odom', self._on_odometry),
             (PoseWithCovarianceStamped, 'loop_closures', self._on_loop),
             (PoseWithCovarianceStamped, 'trusted_loop_closures', self._on_trusted_loop),
+            (PoseWithCovarianceStamped, 'false_loop_closures', self._on_false_loop),
             (PoseWithCovarianceStamped, 'absolute_poses', self._on_absolute_pose),
         ):
             self._subscribe(kind, topic, callback)
@@ -195,6 +203,9 @@ class BackendNode(Node):
     def _on_trusted_loop(self, message: PoseWithCovarianceStamped) -> None:
         self._add_loop(loop_closure, message, self._base_frame.name, True)
 
+    def _on_false_loop(self, message: PoseWithCovarianceStamped) -> None:
+        self._add_loop(false_loop, message, self._base_frame.name)
+
     def _on_absolute_pose(self, message: PoseWithCovarianceStamped) -> None:
         self._add_loop(absolute_pose, message, self.options.map_frame)
 
@@ -227,6 +238,8 @@ class BackendNode(Node):
         elif version != self._told_version:
             # Nothing new in the map, but a loop can have come for later, or expired.
             self._loop_status.publish(self._backend.loop_states())
+        elif self._markers.someone_new:
+            self._markers.publish(self.options.map_frame, self._newest(), self._backend.snapshot())
         self._told_version = version
 
     def _publish_map(self) -> None:
@@ -239,13 +252,22 @@ class BackendNode(Node):
             before, after = (self._manifold.compose(transform, robot.odometry)
                              for transform in self._backend.moved)
             self._diagnosis.note_jump(self._manifold, before, after)
-        frame, stamp = self.options.map_frame, robot.stamp if robot is not None else 0
+        frame, stamp = self.options.map_frame, self._newest()
         pose3 = self._manifold.to_pose3(poses)
         self._path.publish(path_bytes(frame, stamp, now.stamps, pose3))
         self._loop_status.publish(loops)
-        # Markers are slow to make: not unless somebody looks.
-        if self._graph.get_subscription_count():
-            self._graph.publish(graph_markers(frame, stamp, pose3, now.graph.between, loops))
+        self._markers.publish(frame, stamp, now)
+        # It takes a factorisation: not unless somebody listens.
+        if self._covariance.get_subscription_count() and len(poses):
+            covariance = newest_covariance(now)
+            if covariance is not None:
+                self._covariance.publish(pose_with_covariance(
+                    frame, int(now.stamps[-1]), self._manifold, poses[-1:], covariance))
+
+    def _newest(self) -> int:
+        """Return the stamp of the newest odometry [ns], 0 where there is none."""
+        robot = self._backend.robot()
+        return robot.stamp if robot is not None else 0
 
     def _report(self, improvement: Improvement) -> None:
         self._diagnosis.note(improvement)

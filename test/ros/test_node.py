@@ -16,7 +16,6 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 from torn import torn_graph
-from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.graph.linear_system import whitened_residual
@@ -297,27 +296,6 @@ def test_diagnostics_count_what_was_refused(bench):
     b.until(lambda: any(
         {v.key: v.value for v in status.values}.get('refused.old_stamp') == '1'
         for message in heard for status in message.status), 'the refusal is reported')
-
-
-def test_the_graph_is_drawn_for_who_looks(bench, tmp_path, rng):
-    world = simulate_world(40, 60, WorldOptions(), rng)
-    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(40)))
-    b = bench(**EVERY_MESSAGE)
-    heard = []
-    b.peer.create_subscription(MarkerArray, 'graph', heard.append, 1)
-    b.until(lambda: b.backend._graph.get_subscription_count(), 'somebody looks')
-    play(b, tmp_path / 'bag')
-
-    def sizes():
-        return {m.ns: len(m.points) for m in heard[-1].markers} if heard else {}
-
-    def all_are_drawn():
-        points = sizes()
-        loops = [points.pop(name, 0) for name in ('loops', 'suspect_loops', 'rejected_loops')]
-        return points == {'keyframes': 40, 'odometry': 2 * 39} and sum(loops) == 2 * 21
-
-    b.until(all_are_drawn, 'keyframes and both ends of each factor are drawn')
-    assert sizes()['loops'] > 2 * 14
 
 
 def test_the_solver_never_starves_the_callbacks(bench, tmp_path, rng):
