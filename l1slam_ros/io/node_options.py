@@ -23,6 +23,9 @@ class UpdateOptions(Options):
 class NodeOptions(BackendOptions):
     """Everything the node can be told: the back end's options and its own."""
 
+    autostart: bool = option(
+        True, 'be active from the start, as a node that nobody manages', fixed=True)
+    dimension: int = option(2, 'of the world: SE(2) or SE(3)', '', 2, 3, fixed=True)
     map_frame: str = option('map', 'frame of the optimised poses', fixed=True)
     odom_frame: str = option('odom', 'frame of the odometry', fixed=True)
     base_frame: str = option(

@@ -17,7 +17,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
-from rclpy.node import Node
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
@@ -53,9 +53,12 @@ _AT_ONCE = 100
 _REPEAT_WARNING = 5.0  # [s]
 
 
-class BackendNode(Node):
+class BackendNode(LifecycleNode):
     """
     The ROS face of `core.online.backend.Backend`.
+
+    A managed node: messages are used, and map -> odom is published, while it is active, which it
+    is at once unless `autostart` is off. To clean it up empties the map.
 
     Parameters
     ----------
@@ -75,10 +78,11 @@ class BackendNode(Node):
         super().__init__('backend', **keywords)
         self._declared = NodeParameters(self, NodeOptions(), self._on_options)
         options = self.options
-        self._backend = Backend(options)
+        self._backend = Backend(options, options.dimension)
         self._manifold = self._backend.manifold
         self._base_frame = BaseFrame(options.base_frame)
         self._refused: Counter[str] = Counter()
+        self._active = False
         self._told_map, self._told_version = 0, self._backend.version
         self.failures = Failures(self.get_logger(), self.context.ok)
         self._solver = SolverThread(self._backend, self.failures, self.get_logger(),
@@ -100,10 +104,27 @@ class BackendNode(Node):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(options.update.period, guarded('timer', self._solver.wake), clock=steady)
         self.create_timer(options.transform_period,
-                          guarded('transform', lambda: self._transform.publish(self.options)),
-                          clock=steady)
+                          guarded('transform', self._on_transform), clock=steady)
         self.create_timer(1.0, guarded('diagnostics', self._on_second), clock=steady)
         self._solver.start()
+        if options.autostart:
+            self.trigger_configure()
+            self.trigger_activate()
+
+    def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Use messages from now on."""
+        self._active = True
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Leave messages alone, and the map as it is."""
+        self._active = False
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Empty the map."""
+        self._orders.place('clean up', self._map_services.reset)
+        return TransitionCallbackReturn.SUCCESS
 
     @property
     def options(self) -> NodeOptions:
@@ -141,8 +162,12 @@ class BackendNode(Node):
             self._subscribe(kind, topic, callback)
 
     def _subscribe(self, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
-        use = self.failures.guarded(topic, callback)
+        guarded = self.failures.guarded(topic, callback)
         raw = kind is Odometry
+
+        def use(message: Any) -> None:
+            if self._active:
+                guarded(message)
 
         def received(message: Any, information: Any) -> None:
             traffic.note(information)
@@ -221,11 +246,25 @@ class BackendNode(Node):
         self._refused[error.cause if isinstance(error, MessageError) else 'unusable'] += 1
         self.get_logger().warning(f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
 
+    def _on_transform(self) -> None:
+        if self._active:
+            self._transform.publish(self.options)
+
     def _on_second(self) -> None:
         for sentence in self._backend.news():
             self.get_logger().warning(sentence)
         counts, refused = self._backend.counts()
-        self._diagnosis.publish(counts, self._refused + Counter(refused))
+        self._diagnosis.publish(counts, self._refused + Counter(refused), self._twins())
+
+    def _twins(self) -> str:
+        """Return what is wrong where another node has this one's name; else nothing."""
+        own = self.get_name(), self.get_namespace()
+        count = self.get_node_names_and_namespaces().count(own)
+        if count < 2:
+            return ''
+        wrong = f'{count} nodes are called {self.get_fully_qualified_name()}; expected one'
+        self.get_logger().warning(wrong, throttle_duration_sec=_REPEAT_WARNING)
+        return wrong
 
     def _tell(self, improvement: Improvement | None) -> None:
         """Publish what is new; the solver's thread calls it."""
