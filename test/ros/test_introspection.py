@@ -2,8 +2,11 @@
 """What `ros2 node info`, `ros2 param describe` and `ros2 lifecycle` show: the node's interface."""
 
 import gc
+import re
+from pathlib import Path
 
 import pytest
+import yaml
 
 pytest.importorskip('rclpy')
 
@@ -14,6 +17,7 @@ from node_bench import odometry
 from rcl_interfaces.srv import DescribeParameters, ListParameters
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
+CONFIG = Path(__file__).parents[2] / 'config'
 INPUTS = {
     '/odom': 'nav_msgs/msg/Odometry',
     '/loop_closures': 'geometry_msgs/msg/PoseWithCovarianceStamped',
@@ -110,6 +114,15 @@ def test_parameters_are_described_with_unit_and_range(bench):
             assert (value, described.read_only) == (default, fixed), name
             assert unit in described.description and (f'[{unit}]' in described.description
                                                       or not unit), name
+
+
+@pytest.mark.parametrize('name', ['l1slam.rviz', 'foxglove.json'])
+def test_layouts_show_what_the_node_publishes(name):
+    text = (CONFIG / name).read_text()
+    layout = yaml.safe_load(text)  # JSON is YAML, too
+    topics = set(re.findall(r'["\s](/[a-z_]+)', text))
+    assert layout and {'/path', '/graph', '/pose', '/pose_with_covariance'} <= topics
+    assert topics <= OUTPUTS.keys() | INPUTS.keys()
 
 
 def change(b, transition):
