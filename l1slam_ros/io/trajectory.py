@@ -24,7 +24,6 @@ from l1slam_ros.io.files import (
     write_lines,
 )
 from l1slam_ros.io.graphs.graph_file import read_vertices
-from l1slam_ros.io.graphs.side_files import read_stamps
 from l1slam_ros.io.messages.conversion import QUATERNION_NORM_ERROR
 from l1slam_ros.io.wording import counted
 
@@ -114,9 +113,8 @@ def read_reference(
 
 
 def _read_vertices(path: str | os.PathLike[str], by_stamps: bool) -> Reference:
-    ids, poses = read_vertices(path)
-    stamps = read_stamps(path, ids) if by_stamps else None
-    if stamps is None:
+    ids, poses, stamps = read_vertices(path)
+    if stamps is None or not by_stamps:
         return Reference(ids, poses, stamped=False)
     first = np.unique(stamps, return_index=True)[1]
     return Reference(stamps[first], poses[first], stamped=True)

@@ -26,6 +26,7 @@ from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.marginal import newest_covariance
 from l1slam_ros.core.online.update import Improvement
+from l1slam_ros.io.graphs.map_file import MapFile
 from l1slam_ros.io.messages import cdr
 from l1slam_ros.io.messages.base_frame import BaseFrame
 from l1slam_ros.io.messages.conversion import (
@@ -51,6 +52,8 @@ _DEPTH = 1000
 # Messages of one topic at most before other callbacks have their turn.
 _AT_ONCE = 100
 _REPEAT_WARNING = 5.0  # [s]
+# [s] The end of the node waits so much longer for a map that is being saved.
+_SAVING = 4.0
 
 
 class BackendNode(LifecycleNode):
@@ -89,11 +92,14 @@ class BackendNode(LifecycleNode):
                                     lambda: self.options.update.budget, self._tell)
         self._orders = Orders(self, self.failures, self._solver.hurry)
         self._make_publishers()
+        self._map_file = MapFile(self._backend, lambda: self.options, self.get_logger().warning)
+        if options.load_on_start:
+            self.get_logger().info(self._map_file.load_at_start())
         self._topics: dict[str, Traffic] = {}
         self._make_subscriptions()
         self._diagnosis = Diagnosis(self, self._topics, self._solver, self.failures)
         self._map_services = MapServices(
-            self, self._backend, self._orders, lambda: self.options.save_path,
+            self, self._backend, self._orders, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
@@ -102,10 +108,11 @@ class BackendNode(LifecycleNode):
         guarded = self.failures.guarded
         # By a clock that goes on where simulated time stands still, or a bag has ended.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(options.update.period, guarded('timer', self._solver.wake), clock=steady)
+        self.create_timer(options.update.period, guarded('timer', self._on_timer), clock=steady)
         self.create_timer(options.transform_period,
                           guarded('transform', self._on_transform), clock=steady)
         self.create_timer(1.0, guarded('diagnostics', self._on_second), clock=steady)
+        self._tell(None)  # a map may have been loaded
         self._solver.start()
         if options.autostart:
             self.trigger_configure()
@@ -135,11 +142,17 @@ class BackendNode(LifecycleNode):
         """End the threads and the node; return whether they ended within some seconds."""
         deadline = time.monotonic() + seconds
         self._solver.close(0.0)  # what it works at for an order stops
-        ended = self._orders.close(seconds)
+        self._map_services.autosave(at_end=True)
+        ended = self._orders.close(seconds) or (
+            self._map_file.is_saving and self._orders.close(_SAVING))
         ended &= self._solver.close(max(deadline - time.monotonic(), 0.0))
         if ended:
             self.destroy_node()
         return ended
+
+    def is_saving(self) -> bool:
+        """Return whether the map is being saved."""
+        return self._map_file.is_saving
 
     def _make_publishers(self) -> None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -245,6 +258,10 @@ class BackendNode(LifecycleNode):
     def _refuse(self, error: L1SlamError) -> None:
         self._refused[error.cause if isinstance(error, MessageError) else 'unusable'] += 1
         self.get_logger().warning(f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
+
+    def _on_timer(self) -> None:
+        self._solver.wake()
+        self._map_services.autosave()
 
     def _on_transform(self) -> None:
         if self._active:

@@ -17,23 +17,20 @@ place of an update, is told to stop, and never adopted.
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from l1slam_ros.core.errors import Interrupted, OptionError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_finite
 from l1slam_ros.core.online.background import Background
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.loop_states import LoopStates
 from l1slam_ros.core.online.parts import as_one, of_all
-from l1slam_ros.core.online.snapshot import Optimised, Robot, Snapshot
+from l1slam_ros.core.online.snapshot import Optimised, Robot, SavedMap, Snapshot
 from l1slam_ros.core.online.update import Improvement, improve, optimise
 from l1slam_ros.core.options import Options, option
-from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
-from l1slam_ros.core.solvers.optimality import Status
 
 # What poses live on, by the dimension of the world.
 _MANIFOLDS: dict[int, Manifold] = {2: se2}
@@ -117,21 +114,30 @@ class Backend:
 
     def reset(self) -> None:
         """Forget everything."""
-        self._replace(GraphBuilder(self.manifold, self._options), self.manifold.identity(0))
+        self._replace(GraphBuilder(self.manifold, self._options),
+                      Optimised.nothing(self.manifold.identity(0)))
 
-    def restore(self, graph: FactorGraph, poses: Array, stamps: Indices) -> None:
-        """Replace the map by one of an earlier run; see `GraphBuilder.restore`."""
+    def saved(self) -> SavedMap | None:
+        """Return all that another back end goes on from; None: there are no factors yet."""
+        with self._lock:
+            if self._builder.graph.between.is_absolute.all():
+                return None
+            now, growth = self._snapshot(), self._builder.grown()
+        return SavedMap(growth, now.optimised.of_all(now.problem()), now.robust)
+
+    def restore(self, saved: SavedMap) -> None:
+        """Go on from what another back end has `saved`, in the place of the map there is."""
         builder = GraphBuilder(self.manifold, self._options)
-        builder.restore(graph, stamps, poses)
-        self._replace(builder, poses)
+        builder.restore(saved.growth)
+        self._replace(builder, saved.as_judged(self._options.robust.enabled))
 
-    def _replace(self, builder: GraphBuilder, poses: Array) -> None:
+    def _replace(self, builder: GraphBuilder, optimised: Optimised) -> None:
         """Begin a map with the graph of a builder; what is made for the one before is left."""
         with self._lock:
             # Options may have changed since it was made.
             builder.options = self._options
             self._builder = builder
-            self._begin_map(poses)
+            self._begin_map(optimised)
         self._wake()
 
     @property
@@ -190,8 +196,7 @@ class Backend:
         with self._lock:
             self._changes += 1
             if options.robust != self._options.robust:
-                self._optimised = replace(self._optimised, judgement=Judgement.nothing(),
-                                          status=Status.OUT_OF_TIME)
+                self._optimised = self._optimised.unjudged()
             self._options = self._builder.options = options
         self._wake()
 
@@ -204,10 +209,8 @@ class Backend:
         require_finite(sample.pose3)
         with self._lock:
             self._samples += 1
-            graph = self._builder.graph
             self._builder.add_odometry(sample)
-            if self._builder.graph is not graph:
-                self._begin_map(self.manifold.identity(0))
+            self._follow()
             map_to_odom = None if self._builder.held else self._map_to_odom_now()
         self._wake()
         return map_to_odom
@@ -221,17 +224,20 @@ class Backend:
     def begin_anew(self) -> None:
         """Forget the only sample so far; see `GraphBuilder.begin_anew`."""
         with self._lock:
-            graph = self._builder.graph
             self._builder.begin_anew()
-            if self._builder.graph is not graph:
-                self._begin_map(self.manifold.identity(0))
+            self._follow()
 
-    def _begin_map(self, poses: Array) -> None:
-        """Leave what was made of the graph that there was; poses (k, p) : known of the new one."""
+    def _follow(self) -> None:
+        """Begin a map where the builder did."""
+        if self._builder.graph is not self._graph:
+            self._begin_map(Optimised.nothing(self.manifold.identity(0)))
+
+    def _begin_map(self, optimised: Optimised) -> None:
+        """Leave what was made of the graph that there was, for what is known of another."""
         self.maps += 1
         self._map += 1
         self._changes += 1
-        self._optimised = Optimised.nothing(poses)
+        self._graph, self._optimised = self._builder.graph, optimised
         self._map_to_odom: tuple[Array, Array] | None = None
 
     def add_loop(self, loop: LoopClosure) -> None:

@@ -9,7 +9,6 @@ Loops join the parts, if there are any.
 
 from collections import Counter
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -21,12 +20,11 @@ from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.keyframes import KeyframeOptions, Motion, OdometryOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
 from l1slam_ros.core.online.notes import Notes
-from l1slam_ros.core.online.odometry.odometry_stream import OdometryStream, Point
+from l1slam_ros.core.online.odometry.odometry_stream import UNSEEN_TURN, OdometryStream, Point
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
+from l1slam_ros.core.online.snapshot import Growth
 from l1slam_ros.core.options import Options, option
 
-# [rad/s] A robot that nobody saw may have turned so fast.
-_UNSEEN_TURN = 1.0
 # What a gap in the odometry is to the map: the cause it is counted by, and what is said of it.
 _SAID = {'new_segment': ('new_part', 'a new part of the map begins where the last one ends'),
          'reset': ('reset', 'the map begins anew'),
@@ -174,9 +172,10 @@ class GraphBuilder:
             self._begin_keyframe(point.stamp, point.pose)
             return True
         manifold, pose = self.graph.manifold, point.pose
-        if gap or not self._glued:
+        if gap or not (self._glued or self._track.goes_on(point.stamp, pose, self.offset)):
             self.offset = manifold.compose(self._track.last_pose, manifold.inverse(pose))
-            self._glued = self._moved = True
+            self._moved = True
+        self._glued = True
         if self._moved:
             pose = manifold.compose(self.offset, pose)
         if gap and on_gap == 'new_segment':
@@ -192,7 +191,7 @@ class GraphBuilder:
         """Add a sample at a pose (1, p) that goes on from the last one."""
         self._track.append(point.stamp, pose)
         if point.gap:
-            self._motion.add_unseen(point.sample, point.unseen, _UNSEEN_TURN * point.seconds)
+            self._motion.add_unseen(point.sample, point.unseen, UNSEEN_TURN * point.seconds)
         else:
             self._motion.add(point.sample, pose, self.options.odometry)
         # Where the frame has moved there is a keyframe: what is published goes by the last one.
@@ -221,22 +220,30 @@ class GraphBuilder:
         self._resumed = False
         self._loops.forget()
 
-    def restore(self, graph: FactorGraph, stamps: Indices, poses: Array) -> None:
-        """
-        Take over a graph of an earlier run, its stamps (n,) [ns] and poses (n, p).
+    def grown(self) -> Growth:
+        """Return what another builder goes on from; there are keyframes."""
+        track, loops = self._track, self._loops
+        in_graph, _, expired = loops.stamps
+        return Growth(
+            self.graph.copy(), self.stamps, self.odometry, self.offset, track.last_stamp,
+            track.last_pose, self._motion.covariance(self.options.odometry, self._verbatim),
+            loops.rows, in_graph, expired, loops.waiting.arrivals(track.last), loops.seen())
 
-        The robot is taken to stand where that run ended; its odometry may begin anywhere. A loop
-        of that run that is sent again is known where it named the stamps of keyframes: others
-        were carried there and are not what was sent.
-        """
-        self._begin(graph)
-        starts = [0, *gaps(graph).tolist(), graph.n_poses]
-        for first, end in pairwise(starts):
-            self._track.extend_by_part(stamps[first:end], poses[first:end])
-        self._motion = Motion(graph.manifold, int(stamps[-1]), poses[-1:])
-        self._glued, self._resumed = False, True
-        self._stream = OdometryStream(graph.manifold, self.notes, resumed=True)
-        self._loops.restore(graph, stamps)
+    def restore(self, growth: Growth) -> None:
+        """Go on where a run ended; odometry that begins elsewhere is taken to begin there."""
+        self._begin(growth.graph)
+        track, stamps = self._track, growth.stamps
+        for part in np.split(np.arange(len(stamps)), gaps(self.graph)):
+            track.extend_by_part(stamps[part], growth.odometry[part])
+        self.offset = growth.offset
+        self._motion = Motion(self.graph.manifold, track.last_stamp, track.last_pose)
+        if growth.end > track.last_stamp:
+            track.append(growth.end, growth.end_pose)
+            self._motion.add_known(
+                growth.end, growth.end_pose, growth.end_covariance, self.options.odometry)
+        self._glued, self._moved, self._resumed = False, True, True
+        self._stream = OdometryStream(self.graph.manifold, self.notes, resumed=True)
+        self._loops.restore(growth, track, self.options.loop)
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Take a loop closure or an absolute pose in, once; see `add_due_loops`."""

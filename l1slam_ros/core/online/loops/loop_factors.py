@@ -17,7 +17,6 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import (
     MOST_VARIANCE,
     Mask,
-    covariance_of,
     loop_identity,
     root_of_inverse,
 )
@@ -34,6 +33,7 @@ from l1slam_ros.core.online.loops.waiting_loops import (
 )
 from l1slam_ros.core.online.notes import Notes
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
+from l1slam_ros.core.online.snapshot import Growth
 from l1slam_ros.core.options import Options, option
 
 
@@ -95,21 +95,26 @@ class LoopFactors:
         """Which between factors of the graph are loops, (k,)."""
         return self._rows.view()
 
-    def restore(self, graph: FactorGraph, stamps: Indices) -> None:
-        """Take the loops of an earlier run for seen; stamps (n,) [ns] of its keyframes."""
-        factors = graph.between
-        rows = np.flatnonzero(~factors.is_odometry)
-        ends = stamps[np.where(factors.i == WORLD, factors.j, [factors.i, factors.j]).T[rows]]
-        self._note(rows, np.sort(ends, axis=1))
-        covariances = covariance_of(factors.sqrt_information[rows])
-        for (reference, stamp), row, covariance in zip(ends.tolist(), rows.tolist(), covariances,
-                                                       strict=True):
-            key = loop_identity(reference, stamp, factors.measurement[row], covariance)
-            self._seen[key], self._row_of[key] = bool(factors.trusted[row]), row
+    def seen(self) -> dict[bytes, int]:
+        """Return of each loop that came, by its identity, its factor, -1 for none."""
+        return {key: self._row_of.get(key, -1) for key in self._seen}
+
+    def restore(self, growth: Growth, track: OdometryTrack, options: LoopOptions) -> None:
+        """Go on with the loops of an earlier run."""
+        self._note(growth.loop_rows, growth.loop_stamps)
+        self._expired.extend(growth.expired)
+        for loop, age in growth.waiting:
+            self.add(loop, track, options, age)
+        factors = growth.graph.between
+        for key, row in growth.seen.items():
+            if row >= 0:
+                self._row_of[key] = row
+            self._seen[key] = self._seen.get(key, False) or bool(row >= 0 and factors.trusted[row])
         self._struck.update(map(tuple, factors.pairs[factors.struck].tolist()))
 
-    def add(self, loop: LoopClosure, track: OdometryTrack, options: LoopOptions) -> None:
-        """Take a loop closure or an absolute pose in, once; it becomes a factor in `add_due`."""
+    def add(self, loop: LoopClosure, track: OdometryTrack, options: LoopOptions,
+            age: int = 0) -> None:
+        """Take a loop closure or an absolute pose in, once, that came so long ago [ns]."""
         covariance = self._covariance(loop, options)
         if covariance is None:
             return
@@ -122,7 +127,7 @@ class LoopFactors:
                 return
             self._seen[key] = loop.trusted
         begin, end = map(track.time, loop.stamps)
-        arrival = track.last if len(track) else 0
+        arrival = track.last - age if len(track) else 0
         self.waiting.add(WaitingLoop(loop, arrival, begin, end, measurement, covariance, key))
 
     def add_due(self, graph: FactorGraph, track: OdometryTrack, options: LoopOptions) -> int:

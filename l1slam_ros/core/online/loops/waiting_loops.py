@@ -102,6 +102,10 @@ class WaitingLoops:
         self._by_end = [(one.end, number) for number, one in self._loops.items()]
         heapq.heapify(self._by_end)
 
+    def arrivals(self, now: int) -> tuple[tuple[LoopClosure, int], ...]:
+        """Return each loop and how long it has waited until `now`, in the order they came."""
+        return tuple((one.loop, now - one.arrival) for one in self._loops.values())
+
     def stamps(self) -> Indices:
         """Return reference and end [ns] of each, (k, 2)."""
         if self._stamps is None:
