@@ -115,7 +115,7 @@ class _Samples:
         poses, keyframe = odometry_poses(graph), factors.j[rows]
         self._manifold, self._fixes = manifold, BetweenFactors(
             factors.i[rows], keyframe, factors.measurement[rows],
-            factors.sqrt_information[rows], factors.trusted[rows])
+            factors.sqrt_information[rows], factors.trusted[rows], factors.struck[rows])
         self._way = manifold.between(poses[keyframe[:-1]], poses[keyframe[1:]])
         self._drift = _samples(_drift(graph, poses, keyframe), rng)
         self._noise = _samples(covariance_of(self._fixes.sqrt_information), rng)

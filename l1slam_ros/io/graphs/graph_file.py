@@ -238,10 +238,12 @@ def _without_circles(edges: _Rows) -> tuple[_Rows, list[str]]:
 def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, edges: _Rows,
                remarks: Remarks) -> None:
     i, j = _index(path, ids, edges).T
-    i = np.where(edges.alone, WORLD, i)
-    doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), np.zeros(len(edges), bool))
+    i, none = np.where(edges.alone, WORLD, i), np.zeros(len(edges), bool)
+    doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), none, none)
     trusted = remarks['trusted'] if remarks else read_trusted(path, ids, doubted)
     graph.add_between(i, j, edges.pose, edges.information, trusted)
+    if remarks:
+        graph.say(np.flatnonzero(remarks['struck']), trusted=False)
 
 
 def _index(path: object, ids: Indices, rows: _Rows) -> Indices:
