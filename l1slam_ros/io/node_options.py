@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import yaml
+
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.online.backend import BackendOptions
 from l1slam_ros.core.options import Options, Scalar, dotted, option, with_values
@@ -49,8 +51,6 @@ def read_params_file(path: Path) -> NodeOptions:
     FileError : it cannot be read, is no parameter file, or sets something that is refused.
 
     """
-    import yaml
-
     try:
         content = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:

@@ -4,7 +4,7 @@ How the graph grows: odometry samples and loop closures in, keyframes and factor
 
 A loop closure names two times. It waits until odometry has reached both, is then carried to the
 nearest keyframes by the raw odometry in between, and becomes a between factor. An absolute pose
-names one, the other end of its factor is the world.
+names one time: its factor is seen from the world.
 """
 
 from collections import Counter

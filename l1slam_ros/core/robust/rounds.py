@@ -14,8 +14,10 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, ends_in_time
+from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.linear_system import anchor, linearise, step_poses, whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.robust.gating import (
     DOUBT,
     believable,
@@ -57,6 +59,8 @@ _KNOWN = 20
 # fit exactly, as of a simulator, say of ever less that it is still too much. At a thirtieth of
 # the stated deviations the map has long stopped to change.
 _LEAST_VARIANCE = 1e-3
+# While driving so many of the last absolute factors are looked at, with their neighbours.
+_LATEST = 50
 # Pairs are formed of so many loops that fit best.
 _CANDIDATES = 200
 # [keyframes] Loops whose ends are nearer to each other, in sum, may be one and the same mistake.
@@ -81,7 +85,7 @@ class Growth:
         self.high = np.maximum(self.factors.i, self.factors.j)
         self.is_loop: Mask = ~self.factors.is_odometry
         self.accepted: Mask = ~self.is_loop | self.trusted
-        self.poses = odometry_poses(graph)
+        self.poses = placed(self.graph.subset(self.accepted), odometry_poses(graph))
         self.variance = np.ones(2)
         self._least_variance = _LEAST_VARIANCE
         self.posterior: Posterior
@@ -98,20 +102,50 @@ class Growth:
 
     def begin(self) -> None:
         """Solve for what is accepted, and learn from the loops how large their noise is."""
+        self._tie_to_world()
         self.settle()
-        rows = self.undecided()
+        rows = self.undecided_loops()
         if len(rows):
             self._scale_variance(common_scale(self.innovations(rows)))
             self.settle()
 
     def resume(self, poses: Array, accepted: Mask, variance: Array) -> None:
         """Go on from an earlier state: poses (n, p), accepted (m,), variance (2,)."""
-        self.poses, self.variance = poses, variance
+        self.poses, self.variance = poses, variance.copy()
         self.accepted = accepted | self.trusted
+        self._tie_to_world(_LATEST)
         if (self.accepted & self.is_loop).any():
             self.settle()
         else:
             self.begin()
+
+    @property
+    def _tied(self) -> bool:
+        """Whether an absolute factor is accepted."""
+        return bool((self.accepted & self.factors.is_absolute).any())
+
+    def _tie_to_world(self, latest: int | None = None) -> None:
+        """
+        Accept the absolute factors that agree with their neighbours, if these are more than are.
+
+        Until some are, the map says nothing of any; and behind a long way, little of the next.
+
+        latest : so many of them are looked at; None: all
+        """
+        absolute = self.factors.is_absolute
+        held = self.accepted & absolute
+        if (held == absolute).all():
+            return
+        # As many may have been accepted for want of others.
+        known = np.count_nonzero(held) > self.graph.manifold.TRANSLATION.stop
+        rows, variance = first_fixes(self.graph, latest, self.variance[0] if known else None)
+        if not (known and held[rows].any()):
+            if len(rows) <= np.count_nonzero(held):
+                return
+            self.accepted &= ~absolute | self.trusted
+            self.variance[0] = max(variance, _LEAST_VARIANCE)
+        self.accepted[rows] = True
+        self.poses = placed(self.graph.subset(self.accepted), self.poses)
 
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
@@ -138,13 +172,14 @@ class Growth:
 
     def undecided(self) -> Indices:
         """Return the factors that may yet be accepted, (k,)."""
-        undecided: Indices = np.flatnonzero(~self.accepted & (self._drops < _CHANCES))
+        may = ~self.accepted & (self._drops < _CHANCES)
+        undecided: Indices = np.flatnonzero(may & (self._tied | ~self.factors.is_absolute))
         return undecided
 
     def undecided_loops(self) -> Indices:
-        """Return the loops among them, (k,)."""
+        """Return the loops between keyframes among them, (k,)."""
         rows = self.undecided()
-        return rows[self.is_loop[rows]]
+        return rows[(self.is_loop & ~self.factors.is_absolute)[rows]]
 
     def gate(self, freedom: Indices) -> Array:
         """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""
