@@ -22,7 +22,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from l1slam_ros.core.solvers.warm_up import STEPS, make_ready
+from l1slam_ros.core.solvers.warm_up import STEPS, make_ready, module_of
 
 _KERNELS = Path(__file__).parents[1] / 'core' / 'kernels'
 # [s] How often the caller is asked whether to stop.
@@ -130,7 +130,7 @@ def work() -> None:
     while True:
         step = steps.get()
         folder = make_ready(step)
-        files = sorted(map(str, Path(folder).glob(f'{step}.*.nbi'))) if folder else []
+        files = sorted(map(str, Path(folder).glob(f'{module_of(step)}.*.nbi'))) if folder else []
         print(json.dumps(files), flush=True)
 
 

@@ -19,13 +19,13 @@ from l1slam_ros.io.files import (
     parse_rows,
     quoted,
     read_lines,
+    refuse_quaternions,
     stamp_from_text,
     stamp_text,
     write_lines,
 )
 from l1slam_ros.io.graphs.graph_file import read_vertices
 from l1slam_ros.io.graphs.side_files import read_stamps
-from l1slam_ros.io.messages.conversion import QUATERNION_NORM_ERROR
 from l1slam_ros.io.wording import counted
 
 _TUM_COLUMNS = 8
@@ -103,18 +103,21 @@ def read_reference(
         return _read_csv(path, lines, manifold)
     columns = len(lines.texts[0].split())
     if lines.texts[0].split()[0][0].isalpha():
-        return _read_vertices(path, by_stamps)
-    if columns == _TUM_COLUMNS:
+        return _read_vertices(path, manifold, by_stamps)
+    # Poses in space have as many numbers as TUM's lines; a stamp has a point, an id has none.
+    of_ids = columns == 1 + manifold.POSE_SIZE and lines.texts[0].split()[0].isdecimal()
+    if columns == _TUM_COLUMNS and not of_ids:
         return _sorted(path, lines, *_read_tum(path, lines, manifold), stamped=True)
-    if columns == 1 + manifold.POSE_SIZE:
+    if of_ids or columns == 1 + manifold.POSE_SIZE:
         ids, poses = parse_rows(path, 'pose', lines, 1, manifold.POSE_SIZE)
         return _sorted(path, lines, ids[:, 0], poses, stamped=False)
     raise FileError(path, f'{counted(columns, "column")}; expected {_TUM_COLUMNS} (TUM), '
                     f'{1 + manifold.POSE_SIZE} (id and pose) or a graph file', lines.numbers[0])
 
 
-def _read_vertices(path: str | os.PathLike[str], by_stamps: bool) -> Reference:
-    ids, poses = read_vertices(path)
+def _read_vertices(path: str | os.PathLike[str], manifold: Manifold,
+                   by_stamps: bool) -> Reference:
+    ids, poses = read_vertices(path, manifold)
     stamps = read_stamps(path, ids) if by_stamps else None
     if stamps is None:
         return Reference(ids, poses, stamped=False)
@@ -141,11 +144,7 @@ def _read_tum(path: object, lines: TextLines, manifold: Manifold) -> tuple[Indic
     """Return stamps [ns] (n,) and poses (n, p)."""
     exact = _whole_stamps(path, lines)
     stamps, pose3 = parse_rows(path, 'TUM pose', exact, 1, _TUM_COLUMNS - 1)
-    far = np.abs(np.linalg.norm(pose3[:, 3:], axis=1) - 1.0) > QUATERNION_NORM_ERROR
-    if far.any():
-        k = int(np.argmax(far))
-        raise FileError(path, f'quaternion {pose3[k, 3:].tolist()}; expected one of norm 1',
-                        lines.numbers[k])
+    refuse_quaternions(path, pose3[:, 3:], lines.numbers)
     return stamps[:, 0], manifold.from_pose3(pose3)
 
 

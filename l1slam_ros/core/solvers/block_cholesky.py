@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, keyframes_of
+from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, keyframes_of, size_of_blocks
 
 Places = NDArray[np.int32]
 
@@ -145,8 +145,7 @@ class _Layout:
     def __init__(self, pattern: Pattern, keyframe: Indices, block_size: int):
         from l1slam_ros.core.kernels.symbolic import block_addresses
 
-        # Blocks of whole poses are worth loops of their own.
-        self.size = (0,) * 3 if block_size == 3 else np.zeros(block_size)
+        self.size = size_of_blocks(block_size)
         areas = np.diff(pattern.first) * np.diff(pattern.start) * block_size**2
         offset = np.concatenate(([0], np.cumsum(areas))).astype(np.int64)
         self.panels = np.empty(offset[-1])

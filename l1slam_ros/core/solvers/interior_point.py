@@ -50,7 +50,7 @@ _DAMPING_FACTOR = 10.0
 # factorisation), and the part of the cost that is a gap small enough.
 _PROJECTIONS, _CLOSE = 10, 1e-4
 # A row at its bound still gives way a little, or there might be no feasible dual nearby.
-_LEAST_WEIGHT = 1e-9
+_LEAST_WEIGHT = 1e-3
 
 Report = Callable[[int, float], None]
 
@@ -142,7 +142,7 @@ class _Regularisation:
     def factorise(self, problem: Problem, at: _Iterate, weights: Array,
                   cholesky: BlockCholesky) -> bool:
         """Factor J'QJ + kappa C + D I; take less curvature while that is not definite."""
-        C = problem.curvature(at.poses, at.system, at.y)
+        C = problem.curvature(at.poses, at.y)
         kappa, damping = self._kappa, self._damping
         for share in (0.5, 0.5, 0.0, None):
             definite = cholesky.factorise(at.system, weights, damping, C, kappa)

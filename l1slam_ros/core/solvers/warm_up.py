@@ -7,7 +7,7 @@ modules of `kernels` know not of each other, so each can be made ready in a proc
 """
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 # What a sparse graph is solved by, what false loops are told by, what a dense graph is solved by:
 # modules of `kernels`, those first that take long to compile.
@@ -15,11 +15,17 @@ SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interio
 JUDGEMENT = ('prediction',)
 DENSE = ('halpern', 'tiles')
 STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *SPARSE[2:], 'tiles')
+# What poses in space need besides; after the colon: the versions for them of that module's loops.
+_SPACE = ':space'
+SPARSE_IN_SPACE = (f'cholesky{_SPACE}', f'blocks{_SPACE}', 'se3')
+DENSE_IN_SPACE = (f'halpern{_SPACE}',)
+STEPS_IN_SPACE = (*DENSE_IN_SPACE, *SPARSE_IN_SPACE)
 
 
-def warm_up(report: Callable[[str], None] = lambda step: None) -> None:
-    """Make all loops ready in this process; report : called with each of `STEPS` once it is."""
-    for step in STEPS:
+def warm_up(report: Callable[[str], None] = lambda step: None,
+            steps: Sequence[str] = STEPS) -> None:
+    """Make loops ready in this process; report : called with each of the steps once it is."""
+    for step in steps:
         make_ready(step)
         report(step)
 
@@ -28,9 +34,14 @@ def make_ready(step: str) -> str:
     """Compile the loops of one step, or read them; return where they are kept, empty: nowhere."""
     from l1slam_ros.core.kernels import compiled
 
-    module = importlib.import_module(f'l1slam_ros.core.kernels.{step}')
+    module = importlib.import_module(f'l1slam_ros.core.kernels.{module_of(step)}')
     folder = ''
     for kernel in list(vars(module).values()):
         if hasattr(kernel, 'takes'):
-            folder = compiled.make_ready(kernel)
+            folder = compiled.make_ready(kernel, step.endswith(_SPACE)) or folder
     return folder
+
+
+def module_of(step: str) -> str:
+    """Return the module of `kernels` that a step makes ready."""
+    return step.removesuffix(_SPACE)

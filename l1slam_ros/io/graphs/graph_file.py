@@ -1,20 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Pose graphs as text: g2o (`.g2o`) and TORO (`.graph`), read and written by one table of tags.
+Pose graphs as text: g2o (`.g2o`) and TORO (`.graph`), read and written by one table, `tags`.
 
-A line is a tag, one or two vertex ids, a pose, and the upper triangle of an information matrix:
-
-    VERTEX_SE2 id x y theta                                VERTEX2 id x y theta
-    EDGE_SE2 i j x y theta xx xy xt yy yt tt               EDGE2 i j x y theta xx xy yy tt xt yt
-    EDGE_PRIOR_SE2 id x y theta xx xy xt yy yt tt
-
-**TORO orders the information otherwise** (forward, sideways, rotation: `ff fs ss rr fr sr`).
 Stamps and trust in loops, which neither format knows, live beside the graph: see `side_files`.
 """
 
 import os
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +15,9 @@ import numpy as np
 from l1slam_ros.core.errors import FileError, NoiseError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import square_root_information
+from l1slam_ros.core.geometry.noise import Mask, square_root_information
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
+from l1slam_ros.core.names import QUATERNION
 from l1slam_ros.io.files import (
     LARGEST,
     TextLines,
@@ -33,11 +27,13 @@ from l1slam_ros.io.files import (
     put_lines,
     quoted,
     read_lines,
+    refuse_quaternions,
     replacing,
     settled,
 )
 from l1slam_ros.io.graphs.side_files import read_stamps, read_trusted, write_beside
-from l1slam_ros.io.graphs.tags_left_out import SENSORS, TAGS_3D, TAGS_LEFT_OUT
+from l1slam_ros.io.graphs.tags import FORMAT_OF_SUFFIX, TAGS
+from l1slam_ros.io.graphs.tags_left_out import SENSORS, TAGS_LEFT_OUT
 from l1slam_ros.io.wording import counted
 
 
@@ -49,7 +45,8 @@ class GraphRecord:
     graph : the factors, in the order of the file; poses : (n, p) the stored start, None when
     the file has none; ids : (n,) vertex ids, ascending: keyframe k is vertex ids[k];
     stamps : (n,) [ns] or None; skipped : a sentence on each kind of line that was not used;
-    damage : a sentence where only a part of the input could be read, else empty.
+    damage : a sentence where only a part of the input could be read, else empty;
+    rotation_information : what the rotation block in a g2o file of it is of, of `names`.
     """
 
     graph: FactorGraph
@@ -58,35 +55,9 @@ class GraphRecord:
     stamps: Indices | None = None
     skipped: tuple[str, ...] = ()
     damage: str = ''
+    rotation_information: str = QUATERNION
 
 
-@dataclass(frozen=True)
-class _Tag:
-    """
-    How the lines of one tag are read.
-
-    kind : vertex, between or prior; ids : how many vertex ids lead; information : row and
-    column of each entry of the upper triangle, in the order of the file; none for a vertex.
-    """
-
-    file_format: str
-    kind: str
-    manifold: Manifold
-    ids: int
-    information: tuple[tuple[int, int], ...] = ()
-
-
-_G2O_2D = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-_TORO_2D = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
-
-_TAGS = {
-    'VERTEX_SE2': _Tag('g2o', 'vertex', se2, 1),
-    'EDGE_SE2': _Tag('g2o', 'between', se2, 2, _G2O_2D),
-    'EDGE_PRIOR_SE2': _Tag('g2o', 'prior', se2, 1, _G2O_2D),
-    'VERTEX2': _Tag('toro', 'vertex', se2, 1),
-    'EDGE2': _Tag('toro', 'between', se2, 2, _TORO_2D),
-}
-_FORMAT_OF_SUFFIX = {'.graph': 'toro'}
 # So many lines are named in one sentence.
 _NAMED = 3
 
@@ -96,19 +67,31 @@ class _Rows:
     """
     The lines of one kind, in the order of the file.
 
-    lines : (m,) line numbers; ids : (m, 1 or 2); pose : (m, p); information : (m, d, d).
+    lines : (m,) line numbers; ids : (m, 1 or 2); pose : (m, p); information : (m, d, d) as in the
+    file; units : (m, d) of it, see `Tag.units`.
     """
 
     lines: Indices
     ids: Indices
     pose: Array
     information: Array
+    units: Array
 
     def __len__(self) -> int:
         return len(self.lines)
 
+    def subset(self, chosen: Indices | Mask) -> '_Rows':
+        return _Rows(self.lines[chosen], self.ids[chosen], self.pose[chosen],
+                     self.information[chosen], self.units[chosen])
 
-def read_graph_file(path: str | os.PathLike[str]) -> GraphRecord:
+    @property
+    def scaled(self) -> Array:
+        """The information in the units of the residual, (m, d, d)."""
+        return self.units[:, :, None] * self.information * self.units[:, None, :]
+
+
+def read_graph_file(path: str | os.PathLike[str],
+                    rotation_information: str = QUATERNION) -> GraphRecord:
     """
     Read a g2o or TORO file, and beside it the stamps and which loops are trusted.
 
@@ -121,33 +104,40 @@ def read_graph_file(path: str | os.PathLike[str]) -> GraphRecord:
 
     """
     groups = _group(path)
-    edges, priors = _rows(path, groups, 'between'), _rows(path, groups, 'prior')
+    manifold = _manifold(path, groups)
+    edges, priors = (_rows(path, groups, kind, manifold, rotation_information)
+                     for kind in ('between', 'prior'))
     edges, skipped = _without_circles(edges)
     if not len(edges):
         raise FileError(path, f'no edges; expected {_expected("between")} lines')
-    vertices = _vertices(path, groups)
+    vertices = _vertices(path, groups, manifold)
     ids = vertices.ids[:, 0] if len(vertices) else np.unique(edges.ids)
-    graph = FactorGraph(se2)
+    graph = FactorGraph(manifold)
     graph.add_poses(len(ids))
     _add_edges(path, graph, ids, edges)
     _add_priors(path, graph, ids, priors)
     return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
-                       read_stamps(path, ids), (*skipped, *_skipped(groups, ids)))
+                       read_stamps(path, ids), (*skipped, *_skipped(groups, ids)),
+                       rotation_information=rotation_information)
 
 
-def read_vertices(path: str | os.PathLike[str]) -> tuple[Indices, Array]:
+def read_vertices(path: str | os.PathLike[str], manifold: Manifold) -> tuple[Indices, Array]:
     """
-    Return the ids (n,), ascending, and the poses (n, p) of the vertices of a graph file.
+    Return the ids (n,), ascending, and the poses (n, p), of this manifold, of a graph's vertices.
 
     Raises
     ------
     FileError : the file has none, or is no graph.
 
     """
-    vertices = _vertices(path, _group(path))
+    groups = _group(path)
+    found = _manifold(path, groups)
+    vertices = _vertices(path, groups, found)
     if not len(vertices):
         raise FileError(path, f'no vertices; expected {_expected("vertex")} lines')
-    return vertices.ids[:, 0], vertices.pose
+    poses = vertices.pose
+    return vertices.ids[:, 0], poses if found is manifold else manifold.from_pose3(
+        found.to_pose3(poses))
 
 
 def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
@@ -187,42 +177,57 @@ def _group(path: str | os.PathLike[str]) -> dict[str, TextLines]:
 
 
 def _refuse_unknown(path: object, tag: str, line: int) -> None:
-    if tag in _TAGS or tag in TAGS_LEFT_OUT or tag == 'FIX' or tag.startswith('PARAMS_'):
+    if tag in TAGS or tag in TAGS_LEFT_OUT or tag == 'FIX' or tag.startswith('PARAMS_'):
         return
-    if tag in TAGS_3D or 'SE3' in tag or 'SIM3' in tag:
-        raise FileError(path, f'{quoted(tag)}: 3D graphs are not supported yet; expected a graph '
-                        f'in the plane ({_expected("between")} lines)', line)
-    raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(_TAGS)}', line)
+    raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(TAGS)}', line)
 
 
 def _expected(kind: str) -> str:
-    return ' or '.join(name for name, tag in _TAGS.items() if tag.kind == kind)
+    *most, last = (name for name, tag in TAGS.items() if tag.kind == kind)
+    return f'{", ".join(most)} or {last}'
 
 
-def _rows(path: object, groups: dict[str, TextLines], kind: str) -> _Rows:
+def _manifold(path: object, groups: dict[str, TextLines]) -> Manifold:
+    """Return what the poses of a file are of; there must be but one."""
+    found = sorted((lines.numbers[0], name) for name, lines in groups.items() if name in TAGS)
+    for line, name in found[1:]:
+        if TAGS[name].manifold is not TAGS[found[0][1]].manifold:
+            raise FileError(path, f'{name}: a line of {TAGS[name].manifold.NAME} beside '
+                            f'{found[0][1]} at line {found[0][0]}; expected all poses in the '
+                            'plane, or all in space', line)
+    return TAGS[found[0][1]].manifold if found else se2
+
+
+def _rows(path: object, groups: dict[str, TextLines], kind: str, manifold: Manifold,
+          rotation_information: str = QUATERNION) -> _Rows:
     """Return the lines of one kind, whatever their tags."""
-    parts = [_parse(path, name, groups.get(name, TextLines([], [])))
-             for name, tag in _TAGS.items() if tag.kind == kind]
-    lines = np.concatenate([part.lines for part in parts])
-    order = np.argsort(lines)
-    return _Rows(lines[order], np.concatenate([part.ids for part in parts])[order],
-                 np.concatenate([part.pose for part in parts])[order],
-                 np.concatenate([part.information for part in parts])[order])
+    parts = [_parse(path, name, groups.get(name, TextLines([], [])), rotation_information)
+             for name, tag in TAGS.items() if (tag.kind, tag.manifold) == (kind, manifold)]
+    if not parts:
+        p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
+        return _Rows(np.empty(0, np.int64), np.empty((0, 1), np.int64), np.empty((0, p)),
+                     np.empty((0, d, d)), np.empty((0, d)))
+    together = _Rows(*(np.concatenate([getattr(part, column.name) for part in parts])
+                       for column in fields(_Rows)))
+    return together.subset(np.argsort(together.lines))
 
 
-def _parse(path: object, name: str, lines: TextLines) -> _Rows:
-    tag = _TAGS[name]
-    p, d = tag.manifold.POSE_SIZE, tag.manifold.TANGENT_SIZE
+def _parse(path: object, name: str, lines: TextLines, rotation_information: str) -> _Rows:
+    tag = TAGS[name]
+    p, d = tag.pose, tag.manifold.TANGENT_SIZE
     ids, values = parse_rows(path, name, lines, tag.ids, p + len(tag.information))
+    if tag.has_quaternion:
+        refuse_quaternions(path, values[:, p - 4:p], lines.numbers)
     information = np.zeros((len(ids), d, d))
     for k, (row, column) in enumerate(tag.information):
         information[:, row, column] = information[:, column, row] = values[:, p + k]
-    return _Rows(np.array(lines.numbers, np.int64), ids, values[:, :p], information)
+    return _Rows(np.array(lines.numbers, np.int64), ids, tag.read(values[:, :p]), information,
+                 np.tile(tag.units(rotation_information), (len(ids), 1)))
 
 
-def _vertices(path: object, groups: dict[str, TextLines]) -> _Rows:
+def _vertices(path: object, groups: dict[str, TextLines], manifold: Manifold) -> _Rows:
     """Return the vertices in ascending order of their ids."""
-    rows = _rows(path, groups, 'vertex')
+    rows = _rows(path, groups, 'vertex', manifold)
     order = np.argsort(rows.ids[:, 0], kind='stable')
     ids, lines = rows.ids[order], rows.lines[order]
     again = np.flatnonzero(ids[1:, 0] == ids[:-1, 0]) + 1
@@ -230,7 +235,7 @@ def _vertices(path: object, groups: dict[str, TextLines]) -> _Rows:
         k = again[np.argmin(lines[again])]
         raise FileError(path, f'vertex {ids[k, 0]} stands twice, before at line {lines[k - 1]}; '
                         'expected each once', int(lines[k]))
-    return _Rows(lines, ids, rows.pose[order], rows.information[order])
+    return rows.subset(order)
 
 
 def _without_circles(edges: _Rows) -> tuple[_Rows, list[str]]:
@@ -238,24 +243,24 @@ def _without_circles(edges: _Rows) -> tuple[_Rows, list[str]]:
     circle = edges.ids[:, 0] == edges.ids[:, 1]
     if not circle.any():
         return edges, []
-    lines, k = edges.lines[circle].tolist(), ~circle
+    lines = edges.lines[circle].tolist()
     names = [str(number) for number in lines[:_NAMED]] + ['...'] * (len(lines) > _NAMED)
     sentence = (f'{counted(len(lines), "edge")} from a vertex to itself not used: '
                 f'{"line" if len(lines) == 1 else "lines"} {", ".join(names)}')
-    return _Rows(edges.lines[k], edges.ids[k], edges.pose[k], edges.information[k]), [sentence]
+    return edges.subset(~circle), [sentence]
 
 
 def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices,
                edges: _Rows) -> None:
     i, j = _index(path, ids, edges).T
     doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), np.zeros(len(edges), bool))
-    graph.add_between(i, j, edges.pose, edges.information, read_trusted(path, ids, doubted))
+    graph.add_between(i, j, edges.pose, edges.scaled, read_trusted(path, ids, doubted))
 
 
 def _add_priors(path: object, graph: FactorGraph, ids: Indices, priors: _Rows) -> None:
     index = _index(path, ids, priors)
     _roots(path, priors)
-    graph.add_prior(index[:, 0], priors.pose, priors.information)
+    graph.add_prior(index[:, 0], priors.pose, priors.scaled)
 
 
 def _index(path: object, ids: Indices, rows: _Rows) -> Indices:
@@ -274,13 +279,13 @@ def _roots(path: object, rows: _Rows) -> Array:
     """Return the square roots of the information, (m, d, d); each must have one."""
     def works(part: slice) -> bool:
         try:
-            square_root_information(rows.information[part])
+            square_root_information(rows.scaled[part])
         except NoiseError:
             return False
         return True
 
     try:
-        return square_root_information(rows.information)
+        return square_root_information(rows.scaled)
     except NoiseError as error:
         k = first_failure(len(rows), works)
         entries = ' '.join(f'{v:g}' for v in rows.information[k].ravel())
@@ -296,7 +301,7 @@ def _skipped(groups: dict[str, TextLines], ids: Indices) -> tuple[str, ...]:
         sentences.append(f'FIX {quoted(" ".join(fixed))} is not used: the first vertex, {ids[0]}, '
                          'is the one held fixed')
     for tag, group in groups.items():
-        if tag not in _TAGS and tag != 'FIX':
+        if tag not in TAGS and tag != 'FIX':
             lines = counted(len(group.texts), f'{quoted(tag)} line is', f'{quoted(tag)} lines are')
             sentences.append(f'{lines} not used: '
                              f'{TAGS_LEFT_OUT.get(tag, SENSORS)}')
@@ -309,29 +314,32 @@ def _text(path: Path, record: GraphRecord) -> list[str]:
     none = np.empty((0, graph.manifold.TANGENT_SIZE, graph.manifold.TANGENT_SIZE))
     lines = []
     if record.poses is not None:
-        lines += _lines(path, graph, 'vertex', ids[:, None], record.poses, none)
+        lines += _lines(path, record, 'vertex', ids[:, None], record.poses, none)
     if len(graph.prior):
-        lines += _lines(path, graph, 'prior', ids[graph.prior.i][:, None],
+        lines += _lines(path, record, 'prior', ids[graph.prior.i][:, None],
                         graph.prior.measurement, graph.prior.sqrt_information)
     pairs = ids[graph.between.pairs]
-    return lines + _lines(path, graph, 'between', pairs, graph.between.measurement,
+    return lines + _lines(path, record, 'between', pairs, graph.between.measurement,
                           graph.between.sqrt_information)
 
 
-def _lines(path: Path, graph: FactorGraph, kind: str, ids: Indices, pose: Array,
+def _lines(path: Path, record: GraphRecord, kind: str, ids: Indices, pose: Array,
            roots: Array) -> list[str]:
     """Return the lines of one kind: ids (m, k), pose (m, p), roots (m, d, d) of information."""
-    file_format = _FORMAT_OF_SUFFIX.get(path.suffix.lower(), 'g2o')
-    names = [name for name, tag in _TAGS.items() if (tag.file_format, tag.kind, tag.manifold)
-             == (file_format, kind, graph.manifold)]
+    file_format = FORMAT_OF_SUFFIX.get(path.suffix.lower(), 'g2o')
+    manifold = record.graph.manifold
+    names = [name for name, tag in TAGS.items() if (tag.file_format, tag.kind, tag.manifold)
+             == (file_format, kind, manifold)]
     if not names:
-        raise FileError(path, f'{file_format} has no line for a {kind} of {graph.manifold.NAME}; '
+        raise FileError(path, f'{file_format} has no line for a {kind} of {manifold.NAME}; '
                         'expected another suffix')
-    values = pose
-    if _TAGS[names[0]].information:
-        rows, columns = np.array(_TAGS[names[0]].information).T
+    tag = TAGS[names[0]]
+    values = tag.write(pose)
+    if tag.information:
+        rows, columns = np.array(tag.information).T
+        roots = roots / tag.units(record.rotation_information)
         information = settled(roots.transpose(0, 2, 1) @ roots)
-        values = np.concatenate((pose, information[:, rows, columns]), axis=1)
+        values = np.concatenate((values, information[:, rows, columns]), axis=1)
     readable = (np.abs(values) <= LARGEST).all(axis=1)
     if not readable.all():
         k = int(np.argmin(readable))

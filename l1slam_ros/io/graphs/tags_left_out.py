@@ -1,11 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lines of graph files that are known and not used, and why."""
 
-# Besides all that have SE3 or SIM3 in their names.
-TAGS_3D = frozenset({
-    'VERTEX3', 'EDGE3', 'VERTEX_TRACKXYZ', 'EDGE_POINTXYZ', 'EDGE_XYZPRIOR', 'EDGE_PROJECT_DEPTH',
-    'EDGE_PROJECT_DISPARITY',
-})
 _LANDMARKS = 'landmarks are no part of a pose graph'
 SENSORS = 'sensor data and calibration are no part of a pose graph'
 # Known and left out, with the reason that is told; PARAMS_... and FIX are, too.
@@ -15,6 +10,8 @@ TAGS_LEFT_OUT = {
         'EDGE_SE2_POINTXY_OFFSET', 'EDGE_SE2_TWOPOINTSXY', 'EDGE_SE2_LOTSOFXY',
         'VERTEX_SEGMENT2D', 'VERTEX_LINE2D', 'EDGE_SE2_SEGMENT2D', 'EDGE_SE2_SEGMENT2D_LINE',
         'EDGE_SE2_SEGMENT2D_POINTLINE', 'EDGE_SE2_LINE2D', 'EDGE_LINE2D', 'EDGE_LINE2D_POINTXY',
+        'VERTEX_TRACKXYZ', 'EDGE_SE3_TRACKXYZ', 'EDGE_POINTXYZ', 'EDGE_XYZPRIOR',
+        'EDGE_PROJECT_DEPTH', 'EDGE_PROJECT_DISPARITY',
     ), _LANDMARKS),
     **dict.fromkeys((
         'ROBOTLASER1', 'RAWLASER1', 'FRONTLASER1', 'REARLASER1', 'VERTEX_TAG', 'VERTEX_ELLIPSE',
