@@ -114,7 +114,7 @@ def read(arguments: argparse.Namespace, path: Path) -> GraphRecord:
 
         options = read_params_file(arguments.params_file)
     topics = Topics(arguments.odom_topic, arguments.loop_topic, arguments.trusted_topic)
-    return formats.read_input(path, options, topics)
+    return formats.read_input(path, options, topics, arguments.rotation_information)
 
 
 def warn(sentences: tuple[str, ...], quiet: bool = False) -> None:

@@ -10,14 +10,14 @@ import numpy as np
 
 from l1slam_ros.cli.commands import Ending, check_counts, read, warn, write_spoiled
 from l1slam_ros.cli.reference import Truth, position_error, read_truth, true_path
-from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.geometry.manifold import Indices, Manifold
 from l1slam_ros.core.robust.batch_map import Outcome, Wish
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import SENTENCES
 from l1slam_ros.core.solvers.solve import PRIMAL_DUAL
-from l1slam_ros.core.solvers.warm_up import DENSE, JUDGEMENT, SPARSE, STEPS
+from l1slam_ros.core.solvers.warm_up import DENSE, JUDGEMENT, SPARSE, STEPS, with_space
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import fill_cache
@@ -38,7 +38,7 @@ def solve(arguments: argparse.Namespace) -> Ending:
     if arguments.reference:
         truth = read_truth(arguments.reference, record, arguments.input)
         warn(truth.skipped, arguments.quiet)
-    _make_ready(_steps(wish), arguments.quiet)
+    _make_ready(_steps(wish, record.graph.manifold), arguments.quiet)
     outcome = _solved(arguments, record, wish)
     warnings = [*record.skipped, *(truth.skipped if truth else ())]
     if outcome.unjudged:
@@ -80,11 +80,11 @@ def _solved(arguments: argparse.Namespace, record: GraphRecord, wish: Wish) -> O
             record.ids)
 
 
-def _steps(wish: Wish) -> tuple[str, ...]:
+def _steps(wish: Wish, manifold: Manifold) -> tuple[str, ...]:
     """Return what to compile for a solve; a graph that fills in compiles more on its way."""
     judgement = () if wish.robust is False else JUDGEMENT
     dense = DENSE if wish.norm == 'l1' and wish.solver == PRIMAL_DUAL else ()
-    return (*SPARSE, *judgement, *dense)
+    return with_space((*SPARSE, *judgement, *dense), manifold)
 
 
 def _make_ready(steps: tuple[str, ...], quiet: bool = False) -> None:
@@ -189,7 +189,7 @@ def corrupt(arguments: argparse.Namespace) -> Ending:
     former = known_false(arguments.input, record)
     believed = replace(record, graph=record.graph.subset(~former))
     options = LeastSquaresOptions()
-    _make_ready(SPARSE)
+    _make_ready(with_space(SPARSE, record.graph.manifold))
     with (formats.named(arguments.input),
           Progress(options.iterations, 'step', label='solving') as progress):
         solution = solve_graph(

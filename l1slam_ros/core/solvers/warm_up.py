@@ -9,6 +9,8 @@ modules of `kernels` know not of each other, so each can be made ready in a proc
 import importlib
 from collections.abc import Callable, Sequence
 
+from l1slam_ros.core.geometry.manifold import Manifold
+
 # What a sparse graph is solved by, what false loops are told by, what a dense graph is solved by:
 # modules of `kernels`, those first that take long to compile.
 SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interior_point', 'se2')
@@ -17,9 +19,16 @@ DENSE = ('halpern', 'tiles')
 STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *SPARSE[2:], 'tiles')
 # What poses in space need besides; after the colon: the versions for them of that module's loops.
 _SPACE = ':space'
-SPARSE_IN_SPACE = (f'cholesky{_SPACE}', f'blocks{_SPACE}', 'se3')
-DENSE_IN_SPACE = (f'halpern{_SPACE}',)
-STEPS_IN_SPACE = (*DENSE_IN_SPACE, *SPARSE_IN_SPACE)
+_IN_SPACE = {'halpern': f'halpern{_SPACE}', 'cholesky': f'cholesky{_SPACE}',
+             'blocks': f'blocks{_SPACE}', 'se2': 'se3'}
+STEPS_IN_SPACE = tuple(_IN_SPACE.values())
+
+
+def with_space(steps: tuple[str, ...], manifold: Manifold) -> tuple[str, ...]:
+    """Return the steps, and where the poses are not in the plane, what they need besides."""
+    if manifold.NAME == 'SE2':
+        return steps
+    return (*(_IN_SPACE[step] for step in steps if step in _IN_SPACE), *steps)
 
 
 def warm_up(report: Callable[[str], None] = lambda step: None,
