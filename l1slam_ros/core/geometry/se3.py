@@ -208,6 +208,23 @@ def positions(pose: Array) -> Array:
     return pose[..., :3]
 
 
+def from_rotation(R: Array, t: Array) -> Array:
+    """Return poses from rotation matrices (n, 3, 3) and positions (n, 3), (n, 7)."""
+    # 4 q q', of which the row with the largest entry is the most exact.
+    square = np.empty((*R.shape[:-2], 4, 4))
+    square[..., :3, :3] = R + np.swapaxes(R, -1, -2)
+    trace = np.trace(R, axis1=-2, axis2=-1)
+    diagonal = 1 - trace[..., None] + 2 * np.diagonal(R, axis1=-2, axis2=-1)
+    for k in range(3):
+        m, n = (k + 1) % 3, (k + 2) % 3
+        square[..., k, k] = diagonal[..., k]
+        square[..., k, 3] = square[..., 3, k] = R[..., n, m] - R[..., m, n]
+    square[..., 3, 3] = 1 + trace
+    largest = np.argmax(np.diagonal(square, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(square, largest[..., None, None], axis=-2)[..., 0, :]
+    return _pose(t, q)
+
+
 def from_pose3(pose3: Array) -> Array:
     """Return the poses with their quaternions normalised and qw >= 0, (n, 7)."""
     return _pose(pose3[..., :3], pose3[..., 3:])

@@ -32,7 +32,7 @@ class Problem(Protocol):
         """Return the poses moved by x (columns,)."""
 
     def curvature(self, poses: Array, dual: Array) -> Array | None:
-        """Return the Hessian of dual'e for each of the first factors, (m', 2 k, 2 k)."""
+        """Return the Hessian of dual'e for each factor, (m, 2 k, 2 k)."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,7 @@ class GraphProblem:
 
         manifold, factors = self.graph.manifold, self.graph.between
         k = manifold.TANGENT_SIZE
-        dual = unwhiten(factors.sqrt_information, dual[: len(factors) * k].reshape(-1, k),
-                        (0,) * k)
+        dual = unwhiten(factors.sqrt_information, dual.reshape(-1, k), (0,) * k)
         return manifold.residual_curvature(factors.measurement, *ends(self.graph, poses), dual)
 
 

@@ -127,7 +127,7 @@ def outlook(growth: Growth) -> tuple[Array, Mask]:
     square[accepted] = (growth.posterior.residual**2).sum(axis=1)
     outside = np.flatnonzero(~accepted)
     square[outside] = growth.innovations(outside).square
-    return square, ~accepted & (square < growth.gate()) & growth.is_loop
+    return square, ~accepted & (square < growth.gate(growth.factors.freedom)) & growth.is_loop
 
 
 def reconsidered(graph: FactorGraph, poses: Array, accepted: Mask) -> Mask:
@@ -138,12 +138,11 @@ def reconsidered(graph: FactorGraph, poses: Array, accepted: Mask) -> Mask:
     than that, in theirs. To be repeated, with the map of what it returns, until nothing changes.
     """
     factors, k = graph.between, graph.manifold.TANGENT_SIZE
-    rows = whitened_residual(graph, poses)[: len(factors) * k]
-    square = (rows.reshape(-1, k) ** 2).sum(axis=1)
-    is_loop = ~factors.is_odometry
-    believed = square[accepted & is_loop]
-    scale = max(1.0, float(believed.mean()) / k) if len(believed) else 1.0
-    fits = square < scale * chi2_quantile(1 - REFUSED, k)
+    square = (whitened_residual(graph, poses).reshape(-1, k) ** 2).sum(axis=1)
+    is_loop, freedom = ~factors.is_odometry, factors.freedom
+    believed = accepted & is_loop & ~factors.is_absolute
+    scale = max(1.0, float(square[believed].sum()) / max(float(freedom[believed].sum()), 1.0))
+    fits = square < np.where(factors.is_absolute, 1.0, scale) * chi2_quantile(1 - REFUSED, freedom)
     return np.where(is_loop, fits | factors.trusted, accepted)
 
 

@@ -62,11 +62,12 @@ def common_scale(found: Innovations) -> float:
     """
     best = np.argsort(found.log_det, kind='stable')[:_BEST_PREDICTED]
     k, square, scale = found.system.block_size, found.square[best], 1.0
+    share = found.freedom[best] / k
     for _ in range(_ROUNDS):
         log_ratio = found.log_ratio(scale)[best]
         true = probability(log_ratio - log_odds_of_false(log_ratio, 0))
         # The one pseudo-factor of scale 1 is for crowds without a true one.
-        before, scale = scale, float((true @ square + k) / (k * (true.sum() + 1)))
+        before, scale = scale, float((true @ square + k) / (k * ((true * share).sum() + 1)))
         if abs(scale / before - 1) < _SAME:
             break
     return scale

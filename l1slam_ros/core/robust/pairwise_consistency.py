@@ -14,9 +14,14 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.geometry.quantiles import gamma_probability
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
-from l1slam_ros.core.graph.linear_system import anchor
+from l1slam_ros.core.graph.linear_system import with_world
 from l1slam_ros.core.robust.gating import DOUBT
-from l1slam_ros.core.robust.innovation import Posterior, claimed_volume, log_likelihood_ratio
+from l1slam_ros.core.robust.innovation import (
+    Posterior,
+    claimed_volume,
+    log_claims,
+    log_likelihood_ratio,
+)
 from l1slam_ros.core.robust.rounds import Growth
 
 # So many refused loops are asked.
@@ -35,12 +40,14 @@ def accord(growth: Growth) -> tuple[Indices, float]:
     rows = growth.undecided_loops()
     if not len(rows):
         return rows, 1.0
-    rows = growth.some(rows[growth.innovations(rows).square > growth.gate()], _ASKED)
+    found = growth.innovations(rows)
+    rows = growth.some(rows[found.square > growth.gate(found.freedom)], _ASKED)
     if not len(rows):
         return rows, 1.0
     volume = claimed_volume(growth.graph.manifold, growth.poses, growth.rng)
-    one, other, log_ratio = agreement(growth.part(rows), growth.poses, growth.posterior, volume,
-                                      growth.gate())
+    part = growth.part(rows)
+    one, other, log_ratio = agreement(part, growth.poses, growth.posterior, volume,
+                                      growth.gate(part.between.freedom))
     # Each could have agreed by chance with any of the others.
     sure, camps = log_ratio - np.log(len(rows)), [rows[other[one == k]] for k in range(len(rows))]
     votes = [sure[one == k][growth.heads(camp)].sum() for k, camp in enumerate(camps)]
@@ -74,14 +81,14 @@ def weakest_steps(growth: Growth, camp: Indices) -> Indices:
 def spanned(low: Indices, high: Indices, n: int) -> Indices:
     """Return how many factors span the step from each of n keyframes to the next, (n - 1,)."""
     change = np.zeros(n, np.int64)
-    np.add.at(change, low, 1)
+    np.add.at(change, np.maximum(low, 0), 1)  # the world is before all keyframes
     np.add.at(change, high, -1)
     count: Indices = np.cumsum(change)[:-1]
     return count
 
 
 def agreement(
-    graph: FactorGraph, poses: Array, posterior: Posterior, log_volume: float, limit: float,
+    graph: FactorGraph, poses: Array, posterior: Posterior, log_volume: Array, limit: Array,
 ) -> tuple[Indices, Indices, Array]:
     """
     Return the pairs of between factors of a graph that rather agree than not, three (pairs,).
@@ -94,8 +101,8 @@ def agreement(
 
     Parameters
     ----------
-    log_volume : see `claimed_volume`
-    limit : of the squared difference of what follows and what is measured, over its covariance
+    log_volume : (k,) see `claimed_volume`
+    limit : (m,) of the squared difference of what follows and what is measured
 
     """
     from l1slam_ros.core.kernels.prediction import normalise
@@ -107,7 +114,8 @@ def agreement(
     near = np.argsort(np.einsum('mi,ij,mj->m', error, scatter, error), kind='stable')
     near = near[: _NEAREST * len(graph.between)]
     a, b, error = a[near], b[near], error[near]
-    roots, fixed = graph.between.sqrt_information[b], anchor(graph)
+    factors, fixed = graph.between, posterior.fixed
+    roots = factors.sqrt_information[b]
     start = manifold.identity(len(a))
     there = manifold.retract(start, error)
     k, steps = manifold.TANGENT_SIZE, posterior.samples[:-1].transpose(2, 0, 1)
@@ -118,9 +126,9 @@ def agreement(
         change = whiten(roots, manifold.local(there, here))
         covariance += change[:, :, None] * change[:, None, :] / len(steps)
     square, log_det = normalise(covariance, whiten(roots, error))
-    claim = log_volume + np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
-    log_ratio = log_likelihood_ratio(square, log_det, claim, k)
-    good = np.flatnonzero((square < limit) & (log_ratio > np.log(len(graph.between))))
+    log_ratio = log_likelihood_ratio(square, log_det, log_claims(factors, log_volume)[b],
+                                     factors.freedom[b])
+    good = np.flatnonzero((square < limit[b]) & (log_ratio > np.log(len(factors))))
     good = good[np.argsort(-log_ratio[good], kind='stable')]
     a, b, log_ratio = a[good], b[good], log_ratio[good]
     return np.stack((a, b), 1).ravel(), np.stack((b, a), 1).ravel(), np.repeat(log_ratio, 2)
@@ -135,6 +143,7 @@ def _difference(
     ends : of `ends_in_time`
     """
     low, high, Z = ends
+    poses = with_world(manifold, poses)
     first = manifold.between(poses[low[b]], poses[low[a]])
     second = manifold.between(poses[high[a]], poses[high[b]])
     return manifold.local(Z[b], manifold.compose(manifold.compose(first, Z[a]), second))

@@ -123,7 +123,8 @@ class Growth:
         """Return the graph of some factors, with the noise as it was found."""
         self._check()  # with this, each long step begins
         variance = np.maximum(self.variance, self._least_variance)
-        return self.graph.subset(rows, variance[self.is_loop[rows].astype(np.int64)])
+        return self.graph.subset(rows, np.where(
+            self.factors.is_absolute[rows], 1.0, variance[self.is_loop[rows].astype(np.int64)]))
 
     def take_at_their_word(self) -> None:
         """From now on let factors be as noisy as they say, if they are not noisier."""
@@ -145,9 +146,9 @@ class Growth:
         rows = self.undecided()
         return rows[self.is_loop[rows]]
 
-    def gate(self, factors: int = 1) -> float:
-        """Return what the squared innovation of so many true factors stays below."""
-        return sampled_quantile(1 - REFUSED, factors * self.graph.manifold.TANGENT_SIZE)
+    def gate(self, freedom: Indices) -> Array:
+        """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""
+        return sampled_quantile(1 - REFUSED, freedom)
 
     def settle(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
@@ -174,25 +175,30 @@ class Growth:
 
     def _misfits(self, rows: Indices) -> Indices:
         """Return the accepted loops that do not fit, or that all others speak against."""
-        k = self.graph.manifold.TANGENT_SIZE
+        freedom = self.factors.freedom[rows]
         may_go = self.is_loop[rows] & ~self.trusted[rows]
-        far = (self.posterior.residual**2).sum(axis=1) > chi2_quantile(1 - _DROPPED, k)
+        far = (self.posterior.residual**2).sum(axis=1) > chi2_quantile(1 - _DROPPED, freedom)
         against = np.where(may_go, self.posterior.left_out(), 0.0)
         # Next to a false loop the true ones look bad too: only the worst go.
-        far |= against > max(self.doubted(), against.max(initial=0.0) / 2)
+        far |= against > np.maximum(self.doubted(freedom), against.max(initial=0.0) / 2)
         misfits: Indices = rows[far & may_go]
         return misfits
 
-    def doubted(self) -> float:
-        """Return what `Posterior.left_out` of no factor exceeds if all accepted ones are true."""
+    def doubted(self, freedom: Indices) -> Array:
+        """Return what `Posterior.left_out` stays below, (m,), if all accepted ones are true."""
         accepted = int(np.count_nonzero(self.accepted))
-        return sampled_quantile(1 - _DOUBTED / accepted, self.graph.manifold.TANGENT_SIZE)
+        return sampled_quantile(1 - _DOUBTED / accepted, freedom)
 
     def _learn_variance(self, rows: Indices) -> None:
-        """Compare the residuals with what the noise makes of them, for odometry and for loops."""
+        """
+        Compare the residuals with what the noise makes of them, for odometry and for loops.
+
+        Absolute factors are as noisy as they say: of theirs a few tell nothing.
+        """
         kind, known = self.is_loop[rows], _KNOWN * self.graph.manifold.TANGENT_SIZE
-        found = np.bincount(kind, (self.posterior.residual**2).sum(axis=1), 2)
-        stated = np.bincount(kind, np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
+        own = np.where(self.factors.is_absolute[rows], 0.0, 1.0)
+        found = np.bincount(kind, own * (self.posterior.residual**2).sum(axis=1), 2)
+        stated = np.bincount(kind, own * np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
         self._scale_variance((found + known) / (stated + known))
 
     def _scale_variance(self, scale: Array | float) -> None:
@@ -208,7 +214,7 @@ class Growth:
         if not len(rows):
             return rows
         found = self.innovations(rows)
-        fits = np.flatnonzero(found.square < self.gate())
+        fits = np.flatnonzero(found.square < self.gate(found.freedom))
         log_ratio = found.log_ratio()[fits]
         # Taken at their word all are noisier than they are, so that more fit by chance: then only
         # the rest says how many of the rest are false.
@@ -232,7 +238,7 @@ class Growth:
         square, log_ratio = found.joint(self.posterior, a, b)
         # To both being false by chance, the second one being so is as likely as the first.
         sure = log_ratio > np.log(1 / DOUBT - 1) + odds + max(odds, 0.0)
-        good = sure & (square < self.gate(2))
+        good = sure & (square < self.gate(found.freedom[a] + found.freedom[b]))
         believed: Indices = rows[np.unique(np.concatenate((a[good], b[good])))]
         return believed
 
@@ -256,7 +262,7 @@ def solve(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
     """
     # In units of its noise, chi2 is about as large as there are spare measurements.
     k = graph.manifold.TANGENT_SIZE
-    spare = k * max(len(graph.between) - graph.n_poses + 1, 1)
+    spare = max(int(graph.between.freedom.sum()) - k * (graph.n_poses - anchor(graph)), k)
     chi2 = _chi2(graph, poses)
     if chi2 > _FITS * spare:
         linear = _two_linear_steps(graph, poses, cholesky)

@@ -16,6 +16,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
+from l1slam_ros.core.graph.linear_system import with_world
 from l1slam_ros.core.robust.gating import DOUBT, log_odds_of_false
 from l1slam_ros.core.robust.innovation import (
     chi2_quantile,
@@ -58,8 +59,8 @@ def _is_gross(growth: Growth, left_out: Indices) -> bool:
     trial.take_at_their_word()
     trial.settle()
     square = exact_squares(trial.part(left_out), trial.poses, trial.posterior)
-    steps, k = np.count_nonzero(~growth.is_loop), growth.graph.manifold.TANGENT_SIZE
-    return bool(square.min() > chi2_quantile(1 - DOUBT / steps, k))
+    steps, freedom = np.count_nonzero(~growth.is_loop), growth.factors.freedom[left_out]
+    return bool((square > chi2_quantile(1 - DOUBT / steps, freedom)).all())
 
 
 def _believe(growth: Growth) -> None:
@@ -82,7 +83,7 @@ def _without_unusual(growth: Growth) -> Iterator[Growth]:
     rows = np.flatnonzero(growth.accepted & ~growth.is_loop)
     square = unusual_motion(growth.graph, growth.forward[rows])
     most = np.argsort(-square, kind='stable')[:_TRIED]
-    limit = chi2_quantile(1 - DOUBT / len(rows), growth.graph.manifold.TANGENT_SIZE)
+    limit = chi2_quantile(1 - DOUBT / len(rows), growth.factors.freedom[rows[most]])
     for row in rows[most[square[most] > limit]].tolist():
         trial = growth.copy()
         trial.accepted[row] = False
@@ -109,8 +110,8 @@ def _without_worst(growth: Growth) -> Iterator[Growth]:
     """Leave out the odometry factor that all others speak against."""
     inside = np.flatnonzero(growth.accepted)
     against = np.where(growth.is_loop[inside], 0.0, growth.posterior.left_out())
-    k = growth.graph.manifold.TANGENT_SIZE
-    if against.max() < chi2_quantile(1 - DOUBT / len(inside), k):
+    limit = chi2_quantile(1 - DOUBT / len(inside), growth.factors.freedom[inside])
+    if (against < limit).all():
         return
     trial, worst = growth.copy(), int(inside[np.argmax(against)])
     # Steps between which no believed loop ends share what speaks against them.
@@ -236,7 +237,7 @@ def _support(growth: Growth, rows: Indices, poses: Array) -> Array:
     volume = claimed_volume(graph.manifold, poses, np.random.default_rng(0))
     found = innovations(graph, poses, growth.posterior, volume)
     # The loop that mended the poses is as uncertain as the one that is judged by it.
-    fits = found.square < 2 * growth.gate()
+    fits = found.square < 2 * growth.gate(found.freedom)
     log_ratio = found.log_ratio(2.0)
     odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)))
     return np.where(fits & (log_ratio > odds + np.log(1 / DOUBT - 1)), log_ratio - odds, 0.0)
@@ -252,5 +253,6 @@ def _mended_poses(growth: Growth, poses: Array, loop: int, step: int) -> Array:
 def _motion_to_fit(growth: Growth, poses: Array, factor: int) -> Array:
     """Return how the later end of a factor is to be moved for the factor to fit, (1, p)."""
     manifold, low, high = growth.graph.manifold, growth.low[factor], growth.high[factor]
-    wanted = manifold.compose(poses[low, None], growth.forward[factor, None])
+    start = with_world(manifold, poses)[low, None]
+    wanted = manifold.compose(start, growth.forward[factor, None])
     return manifold.compose(wanted, manifold.inverse(poses[high, None]))

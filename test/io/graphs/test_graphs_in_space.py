@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se3
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.names import ANGLE, QUATERNION
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 
@@ -130,3 +130,31 @@ def test_each_malformed_line_is_named(write, tags, line, message):
 def test_a_quaternion_that_is_none_is_named(write, turn):
     with pytest.raises(FileError, match=r'a\.g2o:5: quaternion \[.*\]; expected one of norm 1'):
         read_graph_file(write(SQUARE + f'VERTEX_SE3:QUAT 9 0 0 0 {turn}\n'))
+
+
+ABSOLUTE = f"""\
+PARAMS_SE3OFFSET 4 0 0 0 0 0 0 1
+EDGE_SE3_PRIOR 7 4 1 2 3 0 0 0.6 0.8 {UNIT}
+EDGE_SE3_XYZPRIOR 3 4 1 2 3 10 0 0 10 0 30
+"""
+
+
+def test_absolute_poses(write, tmp_path):
+    record = read_graph_file(write(SQUARE + ABSOLUTE))
+    for _ in range(2):
+        factors = record.graph.between
+        assert record.skipped == ()
+        assert factors.i.tolist() == [0, WORLD, WORLD] and factors.j.tolist() == [1, 1, 0]
+        assert_allclose(factors.measurement[1:], [[1, 2, 3, 0, 0, 0.6, 0.8],
+                                                  [1, 2, 3, 0, 0, 0, 1]])
+        assert_allclose([np.diag(one) for one in information_of(record.graph)[1:]],
+                        [[1, 1, 1, 0.25, 0.25, 0.25], [10, 10, 30, 0, 0, 0]])
+        write_graph_file(tmp_path / 'b.g2o', record)
+        record = read_graph_file(tmp_path / 'b.g2o')
+    assert (tmp_path / 'b.g2o').read_text().count('PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1') == 1
+
+
+def test_what_was_measured_elsewhere_than_at_the_robot_is_named(write):
+    beside = ABSOLUTE.replace('4 0 0 0', '4 0 0.5 0')
+    with pytest.raises(FileError, match=r'a\.g2o:6: EDGE_SE3_PRIOR: measured by PARAMS'):
+        read_graph_file(write(SQUARE + beside))
