@@ -94,6 +94,9 @@ class Manifold(Protocol):
     def positions(self, pose: Array) -> Array:
         """Return the coordinates of the body's origin in the map [m], (n, 2 or 3)."""
 
+    def rotation(self, pose: Array) -> Array:
+        """Return the rotation matrices of poses, (n, k, k), k = 2 or 3."""
+
     def from_rotation(self, R: Array, t: Array) -> Array:
         """Return poses from rotation matrices (n, k, k) and positions (n, k), k = 2 or 3."""
 

@@ -145,6 +145,12 @@ def positions(pose: Array) -> Array:
     return pose[..., :2]
 
 
+def rotation(pose: Array) -> Array:
+    """Return R(theta), (n, 2, 2)."""
+    R: Array = local_jacobian(identity(len(pose)), pose)[..., :2, :2]
+    return R
+
+
 def from_rotation(R: Array, t: Array) -> Array:
     """Return poses from rotation matrices (n, 2, 2) and positions (n, 2), (n, 3)."""
     return _pose(t[..., 0], t[..., 1], np.arctan2(R[..., 1, 0], R[..., 0, 0]))

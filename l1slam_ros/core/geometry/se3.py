@@ -208,6 +208,11 @@ def positions(pose: Array) -> Array:
     return pose[..., :3]
 
 
+def rotation(pose: Array) -> Array:
+    """Return R(q), (n, 3, 3)."""
+    return _matrix(pose[..., 3:])
+
+
 def from_rotation(R: Array, t: Array) -> Array:
     """Return poses from rotation matrices (n, 3, 3) and positions (n, 3), (n, 7)."""
     # 4 q q', of which the row with the largest entry is the most exact.

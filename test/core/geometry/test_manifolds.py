@@ -237,6 +237,14 @@ def test_pose3_composes_as_rigid_motions_of_space_do(manifold, triple):
     assert_allclose(product[:, :3], first[:, :3] + R_a.apply(second[:, :3]), atol=1e-12)
 
 
+def test_rotation_matrices_there_and_back(manifold, triple):
+    a = triple[0]
+    R, k = manifold.rotation(a), manifold.positions(a).shape[1]
+    expected = Rotation.from_quat(manifold.to_pose3(a)[:, 3:]).as_matrix()
+    assert_allclose(R, expected[:, :k, :k], atol=1e-12)
+    assert_same(manifold, manifold.from_rotation(R, manifold.positions(a)), a)
+
+
 @pytest.mark.parametrize('factor', [-1.0, 0.95, -1.07])
 def test_a_quaternion_and_its_multiples_are_one_pose(manifold, triple, factor):
     pose3 = manifold.to_pose3(triple[0])
