@@ -25,7 +25,6 @@ from l1slam_ros.io.files import (
     write_lines,
 )
 from l1slam_ros.io.graphs.graph_file import read_vertices
-from l1slam_ros.io.graphs.side_files import read_stamps
 from l1slam_ros.io.wording import counted
 
 _TUM_COLUMNS = 8
@@ -117,9 +116,8 @@ def read_reference(
 
 def _read_vertices(path: str | os.PathLike[str], manifold: Manifold,
                    by_stamps: bool) -> Reference:
-    ids, poses = read_vertices(path, manifold)
-    stamps = read_stamps(path, ids) if by_stamps else None
-    if stamps is None:
+    ids, poses, stamps = read_vertices(path, manifold)
+    if stamps is None or not by_stamps:
         return Reference(ids, poses, stamped=False)
     first = np.unique(stamps, return_index=True)[1]
     return Reference(stamps[first], poses[first], stamped=True)

@@ -11,7 +11,6 @@ pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from node_bench import DEADLINE, TYPES, Bench, call, odometry, poses_of
-from problems import add_absolute
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
@@ -22,7 +21,7 @@ from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions
-from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED
+from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.options import with_values
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
@@ -223,9 +222,7 @@ def test_a_loaded_map_trusts_the_loop_that_was_vouched_for(bench, tmp_path):
     assert call(b, 'load').success and states() == [ACCEPTED]
     b.until(lambda: len(b.path().poses) == 6, 'the map is back')
     assert b.backend._backend.snapshot().graph.between.trusted.tolist() == [False] * 5 + [True]
-    (tmp_path / 'map.g2o.trusted.txt').unlink()
-    assert call(b, 'load').success
-    b.until(lambda: states() == [REJECTED], 'without the file the loop is doubted')
+    assert [p.name for p in tmp_path.iterdir()] == ['map.g2o']
 
 
 def test_optimize_answers_with_the_cost_and_a_broken_file_leaves_the_map(bench, tmp_path, rng):
@@ -260,18 +257,6 @@ def test_optimize_takes_a_doubtful_map_and_says_so(bench, tmp_path):
     assert np.abs(taken.poses - poses).max() > 1
     assert (taken.loop_states().state == ACCEPTED).sum() > 200
     b.until(lambda: np.allclose(poses_of(b.path()), taken.poses, atol=1e-9), 'it is published')
-
-
-def test_a_map_with_priors_is_refused_and_the_node_goes_on(bench, tmp_path, rng):
-    graph = simulate_world(10, 12, WorldOptions(), rng).graph
-    add_absolute(graph, np.array([0]), np.zeros((1, 3)), np.eye(3)[None])
-    record = GraphRecord(graph, np.zeros((10, 3)), np.arange(10), 10**9 + np.arange(10))
-    write_graph_file(tmp_path / 'map.g2o', record)
-    b = bench(save_path=str(tmp_path / 'map.g2o'))
-    answer = call(b, 'load')
-    assert not answer.success and 'prior' in answer.message
-    b.send('/odom', odometry(2 * 10**9, 0.0))
-    b.until(lambda: len(b.path().poses) == 1, 'a new map begins')
 
 
 def test_no_update_while_paused(bench):

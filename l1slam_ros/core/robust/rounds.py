@@ -14,8 +14,10 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, ends_in_time
+from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.linear_system import anchor, linearise, step_poses, whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.robust.gating import (
     DOUBT,
     believable,
@@ -81,7 +83,7 @@ class Growth:
         self.high = np.maximum(self.factors.i, self.factors.j)
         self.is_loop: Mask = ~self.factors.is_odometry
         self.accepted: Mask = ~self.is_loop | self.trusted
-        self.poses = odometry_poses(graph)
+        self.poses = placed(self.graph.subset(self.accepted), odometry_poses(graph))
         self.variance = np.ones(2)
         self._least_variance = _LEAST_VARIANCE
         self.posterior: Posterior
@@ -98,8 +100,9 @@ class Growth:
 
     def begin(self) -> None:
         """Solve for what is accepted, and learn from the loops how large their noise is."""
+        self._tie_to_world()
         self.settle()
-        rows = self.undecided()
+        rows = self.undecided_loops()
         if len(rows):
             self._scale_variance(common_scale(self.innovations(rows)))
             self.settle()
@@ -108,10 +111,25 @@ class Growth:
         """Go on from an earlier state: poses (n, p), accepted (m,), variance (2,)."""
         self.poses, self.variance = poses, variance
         self.accepted = accepted | self.trusted
+        self._tie_to_world()
         if (self.accepted & self.is_loop).any():
             self.settle()
         else:
             self.begin()
+
+    @property
+    def _tied(self) -> bool:
+        """Whether an absolute factor is accepted."""
+        return bool((self.accepted & self.factors.is_absolute).any())
+
+    def _tie_to_world(self) -> None:
+        """Accept absolute factors where none is: until then the map says nothing of any."""
+        if self._tied or not self.factors.is_absolute.any():
+            return
+        rows, variance = first_fixes(self.graph)
+        self.accepted[rows] = True
+        self._scale_variance(np.array([variance, 1.0]))
+        self.poses = placed(self.graph.subset(self.accepted), self.poses)
 
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
@@ -138,13 +156,14 @@ class Growth:
 
     def undecided(self) -> Indices:
         """Return the factors that may yet be accepted, (k,)."""
-        undecided: Indices = np.flatnonzero(~self.accepted & (self._drops < _CHANCES))
+        may = ~self.accepted & (self._drops < _CHANCES)
+        undecided: Indices = np.flatnonzero(may & (self._tied | ~self.factors.is_absolute))
         return undecided
 
     def undecided_loops(self) -> Indices:
-        """Return the loops among them, (k,)."""
+        """Return the loops between keyframes among them, (k,)."""
         rows = self.undecided()
-        return rows[self.is_loop[rows]]
+        return rows[(self.is_loop & ~self.factors.is_absolute)[rows]]
 
     def gate(self, freedom: Indices) -> Array:
         """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""

@@ -2,7 +2,7 @@
 """
 Pose graphs as text: g2o (`.g2o`) and TORO (`.graph`), read and written by one table, `tags`.
 
-Stamps and trust in loops, which neither format knows, live beside the graph: see `side_files`.
+Stamps and trust in loops, which neither format knows: see `side_files`, and `remarks`.
 """
 
 import os
@@ -46,6 +46,7 @@ from l1slam_ros.io.graphs.tags import (
     TAGS,
     TAGS_LEFT_OUT,
 )
+from l1slam_ros.io.remarks import Remarks
 from l1slam_ros.io.wording import counted
 
 
@@ -58,7 +59,8 @@ class GraphRecord:
     the file has none; ids : (n,) vertex ids, ascending: keyframe k is vertex ids[k];
     stamps : (n,) [ns] or None; skipped : a sentence on each kind of line that was not used;
     damage : a sentence where only a part of the input could be read, else empty;
-    rotation_information : what the rotation block in a g2o file of it is of, of `names`.
+    rotation_information : what the rotation block in a g2o file of it is of, of `names`;
+    remarks : of a saved map.
     """
 
     graph: FactorGraph
@@ -68,6 +70,7 @@ class GraphRecord:
     skipped: tuple[str, ...] = ()
     damage: str = ''
     rotation_information: str = QUATERNION
+    remarks: Remarks = None
 
 
 _NAMES = {'vertex': 'a vertex', 'between': 'an edge', 'absolute': 'an absolute pose',
@@ -77,7 +80,7 @@ _NAMES = {'vertex': 'a vertex', 'between': 'an edge', 'absolute': 'an absolute p
 def read_graph_file(path: str | os.PathLike[str],
                     rotation_information: str = QUATERNION) -> GraphRecord:
     """
-    Read a g2o or TORO file, and beside it the stamps and which loops are trusted.
+    Read a g2o or TORO file, and in it or beside it the stamps and which loops are trusted.
 
     Vertices may stand anywhere and in any order, or not at all: then they are those the edges
     name, and `poses` is None. Whether the graph is connected is not looked at.
@@ -87,7 +90,7 @@ def read_graph_file(path: str | os.PathLike[str],
     FileError : naming the line, when the file is no such graph or those beside it are of another.
 
     """
-    groups = lines_by_tag(path)
+    groups, remarks = lines_by_tag(path)
     manifold = manifold_of(path, groups)
     edges, skipped = without_circles(
         rows_of(path, groups, manifold, FACTORS, rotation_information))
@@ -97,29 +100,34 @@ def read_graph_file(path: str | os.PathLike[str],
     ids = vertices.ids[:, 0] if len(vertices) else np.unique(edges.ids)
     graph = FactorGraph(manifold)
     graph.add_poses(len(ids))
-    _add_edges(path, graph, ids, edges)
+    _add_edges(path, graph, ids, edges, remarks)
     return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
-                       read_stamps(path, ids), (*skipped, *_skipped(groups, ids)),
-                       rotation_information=rotation_information)
+                       _stamps(path, ids, remarks), (*skipped, *_skipped(groups, ids)),
+                       rotation_information=rotation_information, remarks=remarks)
 
 
-def read_vertices(path: str | os.PathLike[str], manifold: Manifold) -> tuple[Indices, Array]:
+def read_vertices(
+    path: str | os.PathLike[str], manifold: Manifold
+) -> tuple[Indices, Array, Indices | None]:
     """
-    Return the ids (n,), ascending, and the poses (n, p), of this manifold, of a graph's vertices.
+    Return of a graph's vertices ids (n,), ascending, poses (n, p), and stamps (n,) [ns], if any.
+
+    manifold : the poses are wanted on it, whatever they are of in the file
 
     Raises
     ------
     FileError : the file has none, or is no graph.
 
     """
-    groups = lines_by_tag(path)
+    groups, remarks = lines_by_tag(path)
     found = manifold_of(path, groups)
     vertices = vertices_of(path, groups, found)
     if not len(vertices):
         raise FileError(path, f'no vertices; expected {expected_tags("vertex")} lines')
-    poses = vertices.pose
-    return vertices.ids[:, 0], poses if found is manifold else manifold.from_pose3(
-        found.to_pose3(poses))
+    ids, poses = vertices.ids[:, 0], vertices.pose
+    if found is not manifold:
+        poses = manifold.from_pose3(found.to_pose3(poses))
+    return ids, poses, _stamps(path, ids, remarks)
 
 
 def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
@@ -135,19 +143,23 @@ def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
 
     """
     path = Path(path)
-    lines = _text(path, record)
     with replacing(path) as temporary:
-        put_lines(temporary, lines)
+        put_lines(temporary, graph_lines(path, record))
         # Before the graph takes its place: it must never meet the stamps or the trust of another.
         write_beside(path, record.ids, record.stamps, record.graph.between)
 
 
-def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices,
-               edges: Rows) -> None:
+def _stamps(path: str | os.PathLike[str], ids: Indices, remarks: Remarks) -> Indices | None:
+    return np.array(remarks['stamps'], np.int64) if remarks else read_stamps(path, ids)
+
+
+def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, edges: Rows,
+               remarks: Remarks) -> None:
     i, j = _index(path, ids, edges).T
     i = np.where(edges.alone, WORLD, i)
     doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), np.zeros(len(edges), bool))
-    graph.add_between(i, j, edges.pose, edges.scaled, read_trusted(path, ids, doubted))
+    trusted = remarks['trusted'] if remarks else read_trusted(path, ids, doubted)
+    graph.add_between(i, j, edges.pose, edges.scaled, trusted)
 
 
 def _index(path: object, ids: Indices, rows: Rows) -> Indices:
@@ -195,8 +207,8 @@ def _skipped(groups: dict[str, TextLines], ids: Indices) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def _text(path: Path, record: GraphRecord) -> list[str]:
-    """Return the lines of the file, many to a string."""
+def graph_lines(path: Path, record: GraphRecord) -> list[str]:
+    """Return the lines of a graph file, many to a string."""
     graph, ids = record.graph, record.ids
     d = graph.manifold.TANGENT_SIZE
     lines = [] if record.poses is None else _lines(

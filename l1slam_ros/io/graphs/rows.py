@@ -14,6 +14,7 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.names import QUATERNION
 from l1slam_ros.io.files import TextLines, parse_rows, quoted, read_lines, refuse_quaternions
 from l1slam_ros.io.graphs.tags import OFFSET, TAGS, TAGS_LEFT_OUT
+from l1slam_ros.io.remarks import Remarks
 from l1slam_ros.io.wording import counted
 
 # So many lines are named in one sentence.
@@ -50,8 +51,8 @@ class Rows:
         return self.units[:, :, None] * self.information * self.units[:, None, :]
 
 
-def lines_by_tag(path: str | os.PathLike[str]) -> dict[str, TextLines]:
-    """Return the lines of each tag, without the tag; every tag is known."""
+def lines_by_tag(path: str | os.PathLike[str]) -> tuple[dict[str, TextLines], Remarks]:
+    """Return the lines of each tag, without the tag, and the remarks; every tag is known."""
     lines = read_lines(path)
     groups: dict[str, TextLines] = defaultdict(lambda: TextLines([], []))
     for number, text in zip(lines.numbers, lines.texts, strict=True):
@@ -63,7 +64,7 @@ def lines_by_tag(path: str | os.PathLike[str]) -> dict[str, TextLines]:
         raise FileError(path, f'the file is empty; expected {expected_tags("between")} lines')
     for tag, group in groups.items():
         _refuse_unknown(path, tag, group.numbers[0])
-    return groups
+    return groups, lines.remarks
 
 
 def _refuse_unknown(path: object, tag: str, line: int) -> None:

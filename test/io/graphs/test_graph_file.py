@@ -479,7 +479,8 @@ def test_stamps_of_any_order(write):
 
 
 def test_vertices_alone(write):
-    ids, poses = read_vertices(write('VERTEX_SE2 4 1 2 3\nVERTEX_SE2 2 4 5 6\n'), se2)
+    ids, poses, stamps = read_vertices(write('VERTEX_SE2 4 1 2 3\nVERTEX_SE2 2 4 5 6\n'), se2)
+    assert stamps is None
     assert ids.tolist() == [2, 4]
     assert poses.tolist() == [[4, 5, 6], [1, 2, 3]]
     with pytest.raises(FileError, match='no vertices; expected VERTEX_SE2, VERTEX2, '):
