@@ -121,8 +121,8 @@ class BlockCholesky:
             curvature = np.empty((0, 2 * k, 2 * k))
         added = np.full(system.size * k, diagonal, float).reshape(-1, k)
         if len(self._loose):
-            own = system.diagonal(weights).reshape(-1, k)
-            added[self._loose] += _LOOSE * own[self._loose]
+            own = system.diagonal(weights).reshape(-1, k)[self._loose]
+            added[self._loose] += np.where(own > 0, _LOOSE * own, 1.0)
         cholesky.assemble(layout.panels, *layout.places, system.blocks, weights.reshape(-1, k),
                           added, curvature, share, layout.size)
         self._factored = layout

@@ -387,6 +387,8 @@ def with_trust(record, rows):
 @pytest.mark.parametrize('name', ['a.g2o', 'a.graph'])
 def test_trust_comes_back_with_the_graph(tmp_path, rng, name):
     path, record = tmp_path / name, random_record(rng)
+    if name.endswith('.graph'):  # TORO has no line for an absolute pose
+        record = replace(record, graph=record.graph.subset(~record.graph.between.is_absolute))
     factors = record.graph.between
     pairs = np.stack((factors.i, factors.j), axis=1)
     rows = [row for row in range(len(factors) - 1, 39, -7)  # loops that nothing runs along
@@ -488,8 +490,8 @@ def test_vertices_alone(write):
 
 
 def test_the_readers_need_no_bag_or_plot_library():
-    modules = ['files', 'graphs.graph_file', 'graphs.side_files', 'trajectory', 'bags.reader',
-               'messages.conversion', 'bags.from_graph']
+    modules = ['files', 'graphs.graph_file', 'graphs.side_files', 'trajectory', 'formats',
+               'messages.conversion']
     code = (''.join(f'import l1slam_ros.io.{name}\n' for name in modules)
             + 'import sys\nprint([m for m in sys.modules if m.split(".")[0] in '
               '("rosbags", "mcap", "matplotlib", "yaml", "rclpy")])')
