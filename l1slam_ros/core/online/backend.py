@@ -7,15 +7,13 @@ It owns the growing graph; how its map is kept is told in `upkeep`.
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_finite
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.loop_states import LoopStates
-from l1slam_ros.core.online.snapshot import Optimised, SavedMap
+from l1slam_ros.core.online.snapshot import Optimised, Robot, SavedMap
 from l1slam_ros.core.online.upkeep.threads import Background
 from l1slam_ros.core.online.upkeep.upkeep import Stopped as Stopped
 from l1slam_ros.core.online.upkeep.upkeep import Upkeep
@@ -75,6 +73,8 @@ class Backend(Upkeep):
         super().__init__(options.solver, options.robust.enabled)
         self._counted: tuple[object, dict[str, int]] = (None, {})
         self._background: Background | None = None
+        self._graph: object = None
+        self.moved = self.manifold.identity(1), self.manifold.identity(1)
         self.reset()
         self.maps = 0
         if background:
@@ -121,10 +121,10 @@ class Backend(Upkeep):
     def _replace(self, builder: GraphBuilder, optimised: Optimised) -> None:
         """Begin a map with the graph of a builder; what is made for the one before is left."""
         with self._lock:
-            self.maps += 1
             # Options may have changed since it was made.
             builder.options = self._options
-            self._begin(builder, optimised)
+            self._builder = builder
+            self._begin_map(optimised)
         self._wake()
 
     @property
@@ -171,33 +171,38 @@ class Backend(Upkeep):
 
         None: it is held, not used yet; see `GraphBuilder.add_odometry`.
         """
-        _require_finite(sample.pose3)
+        require_finite(sample.pose3)
         with self._lock:
             self._samples += 1
-            graph = self._builder.graph
             self._builder.add_odometry(sample)
-            if self._builder.graph is not graph:
-                self._forget_stray()
+            self._begin_map()
             map_to_odom = None if self._builder.held else self._map_to_odom_now()
         self._wake()
         return map_to_odom
+
+    def robot(self) -> Robot | None:
+        """Return where the robot is; None: no odometry has said yet where it is in this map."""
+        with self._lock:
+            last = self._builder.last
+            return Robot(last.stamp, last.pose, self._map_to_odom_now()) if last else None
 
     def begin_anew(self) -> None:
         """Forget the only sample so far; see `GraphBuilder.begin_anew`."""
         with self._lock:
             self._builder.begin_anew()
-            self._forget_stray()
+            self._begin_map()
 
-    def _forget_stray(self) -> None:
-        """Forget the pose of a first sample that was none: an update may have looked at it."""
-        if self._builder.graph.n_poses < 2:
-            self._begin(self._builder, Optimised.nothing(self.manifold.identity(0)))
-        self._map_to_odom = None
-        self._changes += 1
+    def _begin_map(self, optimised: Optimised | None = None) -> None:
+        """Begin with what is known of another map; None: with nothing, if the builder did."""
+        if optimised is None and self._builder.graph is self._graph:
+            return
+        self.maps += 1
+        self._graph = self._builder.graph
+        self._begin(self._builder, optimised or Optimised.nothing(self.manifold.identity(0)))
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Add one loop closure; see `GraphBuilder.add_loop`."""
-        _require_finite(loop.pose3)
+        require_finite(loop.pose3)
         with self._lock:
             self._changes += 1
             self._builder.add_loop(loop)
@@ -211,9 +216,3 @@ class Backend(Upkeep):
         """Tell the background that there may be something to do."""
         if self._background is not None:
             self._background.wake()
-
-
-def _require_finite(pose3: Array) -> None:
-    # It would spoil all that comes after it.
-    if not np.isfinite(pose3).all():
-        raise ArithmeticError(f'pose {pose3} is not finite')

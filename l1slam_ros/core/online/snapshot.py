@@ -6,6 +6,7 @@ In: references to arrays that are never written to again. Out: what is worked ou
 problem of the next update first of all.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -39,13 +40,14 @@ class Problem:
     A snapshot to improve: graph, poses (n, p), dual (rows,) and the cost the last update left.
 
     map : number of the map that it is of, other after `Backend.reset` and `Backend.restore`;
-    starts : poses to start from, `poses` the first; judgement : of all factors; robust : loops may
-    be doubted; settled : nothing has come since an update that converged; may_be_far : there is
-    news that no front knows.
+    gaps : (g,) keyframes that no odometry joins to the ones before; starts : poses to start from,
+    `poses` the first; judgement : of all factors; robust : loops may be doubted; settled : nothing
+    has come since an update that converged; may_be_far : there is news that no front knows.
     """
 
     map: int
     graph: FactorGraph
+    gaps: Indices
     starts: list[Array]
     dual: Array
     judgement: Judgement
@@ -83,8 +85,8 @@ class Growth:
     graph : the factors; stamps (n,) [ns] and odometry (n, p) of the keyframes; offset : see
     `GraphBuilder`; end : stamp [ns] of the last sample, end_pose (1, p) and end_covariance (d, d)
     of the motion to it from the last keyframe; loop_rows (k,), loop_stamps (k, 2) and expired
-    (l, 2) [ns] : see `GraphBuilder`; waiting : loops, and when each came [ns]; seen : the identity
-    of each loop that came.
+    (l, 2) [ns] : see `GraphBuilder`; waiting : loops, and how long each has waited [ns]; seen : of
+    each loop that came, by its identity, its factor, -1 for none.
     """
 
     graph: FactorGraph
@@ -98,7 +100,7 @@ class Growth:
     loop_stamps: Indices
     expired: Indices
     waiting: tuple[tuple[LoopClosure, int], ...]
-    seen: frozenset[bytes]
+    seen: Mapping[bytes, int]
 
     @staticmethod
     def of_graph(graph: FactorGraph, poses: Array, stamps: Indices) -> 'Growth':
@@ -107,7 +109,7 @@ class Growth:
         loops = np.flatnonzero(~graph.between.is_odometry)
         ends = np.sort(stamps[graph.between.pairs[loops]], axis=1)
         return Growth(graph, stamps, poses, graph.manifold.identity(1), int(stamps[-1]),
-                      poses[-1:], np.zeros((d, d)), loops, ends, none, (), frozenset())
+                      poses[-1:], np.zeros((d, d)), loops, ends, none, (), {})
 
 
 @dataclass(frozen=True)
@@ -156,21 +158,32 @@ class SavedMap:
 
 
 @dataclass(frozen=True)
+class Robot:
+    """Where the robot is: stamp [ns] and pose (1, p) of its odometry, and map -> odom (1, p)."""
+
+    stamp: int
+    odometry: Array
+    map_to_odom: Array
+
+
+@dataclass(frozen=True)
 class Snapshot:
     """
     What a back end knows.
 
-    map : its number; version : see `Backend.version`; graph : the factors so far; stamps (n,)
-    [ns] and odometry (n, p) of the keyframes; map_to_odom : (1, p); loop_rows, loop_stamps : see
-    `GraphBuilder`; robust : loops may be doubted; looks : (k, 3) what the front says of
-    the factors after those that are judged: accepted, suspect, sigmas; all_judged : no loop is
-    among them; judged : (k, p) the L2 map of a judgement that the map does not follow yet, None:
-    it does; views : the L1 and L2 map of the front, where there is one.
+    map : its number; version : see `Backend.version`; graph : the factors so far; gaps : as in
+    `Problem`; stamps (n,) [ns] and odometry (n, p) of the keyframes; map_to_odom : (1, p);
+    loop_rows, loop_stamps : see `GraphBuilder`; robust : loops may be doubted; looks : (k, 3) what
+    the front says of the factors after those that are judged: accepted, suspect, sigmas;
+    all_judged : no loop is among them; judged : (k, p) the L2 map of the judgement, None: there is
+    none; stale : the map is not of the factors that are accepted; views : the L1 and L2 map of the
+    front, where there is one.
     """
 
     map: int
     version: tuple[int, int, int]
     graph: FactorGraph
+    gaps: Indices
     stamps: Indices
     odometry: Array
     map_to_odom: Array
@@ -181,6 +194,7 @@ class Snapshot:
     looks: Array
     all_judged: bool
     judged: Array | None
+    stale: bool
     views: tuple[View, ...]
 
     @cached_property
@@ -218,14 +232,13 @@ class Snapshot:
         dual = np.concatenate((last.dual, np.zeros(rows - len(last.dual))))
         starts = [self.poses]
         starts += [self._followed(view.poses, self.poses) for view in self.views[1:]]
-        if self.judged is not None:
+        if self.judged is not None and self.stale:
             # After a loop has closed, the L2 map of the judgement is nearer.
             starts.append(self._followed(self.judged, self.poses))
         grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
-        settled = (not grown and self.judgement.settled and last.at_rest
-                   and self.judged is None)
-        return Problem(self.map, self.graph, starts, dual, self.judgement, self.robust, last.cost,
-                       settled, self.judged is not None or not self.views)
+        settled = not (grown or self.stale) and self.judgement.settled and last.at_rest
+        return Problem(self.map, self.graph, self.gaps, starts, dual, self.judgement, self.robust,
+                       last.cost, settled, self.stale or not self.views)
 
     def known(self) -> Optimised:
         """Return what was made, of all keyframes and factors that there are."""

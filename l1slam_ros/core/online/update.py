@@ -141,9 +141,10 @@ def _dual_of(problem: Problem, poses: Array) -> Array:
     return np.where(known, kept, asked).ravel()
 
 
-def front_of(problem: Problem, poses: Array, check: Check = lambda: None) -> Front | None:
+def front_of(problem: Problem, poses: Array, rows: int,
+             check: Check = lambda: None) -> Front | None:
     """
-    Return the map of a snapshot, poses (n, p), for new factors to move.
+    Return the map of a snapshot, poses (n, p), for the factors from `rows` on to move.
 
     None: its factor would take longer than what it is for, or some keyframe is not tied to others.
     """
@@ -161,7 +162,7 @@ def front_of(problem: Problem, poses: Array, check: Check = lambda: None) -> Fro
     enough = LeastSquaresOptions(_L2_STEPS, 1 / max(len(part.between), 1))
     try:
         l2_poses = minimise_l2(found, nearest, enough, choice.cholesky, lambda *_: check()).poses
-        return Front(part, poses, l2_poses, choice.cholesky, kinds, gate, len(loops))
+        return Front(part, poses, l2_poses, choice.cholesky, kinds, gate, rows)
     except GraphError:
         return None
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.incremental.front import Front
@@ -45,7 +46,8 @@ class LiveMap:
     front : takes what has come, None: there is none
     looks : (k, 3) what fronts said of the factors after those that are judged: accepted, suspect,
         sigmas
-    judged : (n, p) the L2 map of a judgement that the map does not follow yet, None: it does
+    judged : (n, p) the L2 map of the judgement, None: there is none
+    stale : the map is not of the factors that are accepted
     last : the last improvement, None: there was none
     newest : the last keyframe of the map, and its pose (1, p)
     round_took, judge_took : processor time [s] of the last exact map, time of the last judgement
@@ -57,6 +59,7 @@ class LiveMap:
         self.optimised, self.looks = optimised, GrowingArray((3,))
         self.front: Front | None = None
         self.judged: Array | None = None
+        self.stale = False
         self.last: Improvement | None = None
         self.newest: tuple[int, Array]
         self.judge_took = self._judge_at = 0.0
@@ -75,9 +78,24 @@ class LiveMap:
                                    and self._judged_loops == len(self._builder.loop_rows))
 
     @property
-    def accepted(self) -> Array:
+    def accepted(self) -> Mask:
         """Which of the factors that were looked at are accepted, (m,) bool."""
         return np.concatenate((self.optimised.judgement.accepted, self.looks.view()[:, 0] > 0))
+
+    def hear(self) -> None:
+        """Take over what a person said of factors that were looked at before."""
+        factors, before = self._builder.graph.between, self.accepted
+        count, judgement = len(before), self.optimised.judgement
+        after = (before | factors.trusted[:count]) & ~factors.struck[:count]
+        if (after == before).all():
+            return
+        known = len(judgement.accepted)
+        self.optimised = replace(self.optimised, judgement=replace(
+            judgement, accepted=after[:known], suspect=judgement.suspect & ~after[:known]))
+        looks, self.looks = self.looks.view().copy(), GrowingArray((3,))
+        looks[:, 0] = after[known:]
+        self.looks.extend(looks)
+        self._judged_loops, self.stale = -1, True
 
     def take_one(self) -> bool:
         """Let the front take one factor; return whether it did."""
@@ -86,7 +104,9 @@ class LiveMap:
             return False
         row, judged = front.rows, self.optimised.judgement.accepted
         accept: bool | None = None
-        if row < len(judged):
+        if factors.struck[row]:
+            accept = False
+        elif row < len(judged):
             accept = bool(judged[row])
         elif row < len(judged) + len(self.looks):
             accept = bool(self.looks.view()[row - len(judged), 0])
@@ -108,7 +128,7 @@ class LiveMap:
                   or not optimised.at_rest)
         late = idle or front is None or front.closed or front.border >= _MANY_ROWS
         falls = self.last is not None and self.last.falls
-        return bool(graph.n_poses) and (self.judged is not None or falls or (behind and late))
+        return bool(graph.n_poses) and (self.stale or falls or (behind and late))
 
     def is_judge_due(self, idle: bool, budget: float) -> bool:
         """Return whether to judge all loops; budget : there is so much time for it now [s]."""
@@ -130,7 +150,7 @@ class LiveMap:
         self.optimised = replace(self.optimised, judgement=judgement)
         self._judged_loops, self.judged = loops, poses
         self._judge_at = time.monotonic()
-        self._forget_judged()
+        self._compare()
 
     def adopt(self, improvement: Improvement, front: Front | None, tolerance: float) -> None:
         """
@@ -148,7 +168,7 @@ class LiveMap:
         first = len(self.optimised.judgement.accepted) + len(self.looks)
         self.looks.extend(np.column_stack(
             (judgement.accepted, judgement.suspect, judgement.sigmas))[first:])
-        self._forget_judged()
+        self._compare()
         self.note_newest()
 
     def note_newest(self) -> None:
@@ -171,9 +191,8 @@ class LiveMap:
         graph = self._builder.graph
         return graph, graph.n_poses, len(graph.between)
 
-    def _forget_judged(self) -> None:
-        """Forget the L2 map of the judgement where the map is that of the same factors."""
-        used, accepted = self._used, self.optimised.judgement.accepted
+    def _compare(self) -> None:
+        """Find out whether the map is of the factors that are accepted."""
+        used, accepted = self._used, self.accepted
         both = min(len(used), len(accepted))
-        if (used[:both] == accepted[:both]).all():
-            self.judged = None
+        self.stale = bool((used[:both] != accepted[:both]).any())

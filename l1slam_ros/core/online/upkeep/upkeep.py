@@ -28,6 +28,7 @@ from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.incremental.front import Front
 from l1slam_ros.core.online.graph_builder import GraphBuilder
+from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
 from l1slam_ros.core.online.update import Improvement, front_of, improve, optimise
 from l1slam_ros.core.online.upkeep.live_map import LiveMap
@@ -58,6 +59,7 @@ class Upkeep:
     Attributes
     ----------
     maps : how many maps there were: one more with each that was adopted or took another's place
+    moved : map -> odom before and after the last map that was adopted, (1, p) each
 
     """
 
@@ -75,6 +77,7 @@ class Upkeep:
         self._at_rest: object = None
         self._grown: object = None
         self._map_to_odom: tuple[Array, Array] | None = None
+        self.moved: tuple[Array, Array]
 
     def _begin(self, builder: GraphBuilder, optimised: Optimised) -> None:
         """Begin a map with the graph of a builder; the lock is held."""
@@ -104,10 +107,10 @@ class Upkeep:
         builder, live = self._builder, self._live
         builder.add_due_loops()
         return Snapshot(
-            live.number, self._version(), builder.graph.copy(), builder.stamps, builder.odometry,
-            self._map_to_odom_now(), builder.loop_rows, builder.loop_stamps, live.optimised,
-            live.robust, live.looks.view(), live.all_judged, live.judged,
-            live.front.views if live.front else ())
+            live.number, self._version(), builder.graph.copy(), builder.gaps, builder.stamps,
+            builder.odometry, self._map_to_odom_now(), builder.loop_rows, builder.loop_stamps,
+            live.optimised, live.robust, live.looks.view(), live.all_judged, live.judged,
+            live.stale, live.front.views if live.front else ())
 
     def _map_to_odom_now(self) -> Array:
         """Return the odometry frame seen from the map: what its last keyframe says."""
@@ -180,6 +183,7 @@ class Upkeep:
         """Let the front take what has come, until a time [s]."""
         with self._lock:
             self._builder.add_due_loops()
+            self._live.hear()
         while time.monotonic() < deadline:
             with self._lock:
                 if not self._live.take_one():
@@ -203,7 +207,8 @@ class Upkeep:
         start = time.thread_time()
         with self._lock:
             live, now, solver = self._live, self._snapshot(), self._solver
-        problem = now.problem()
+        whole = now.problem()
+        problem = as_one(whole)
         check()
         round_ = max(budget, _LEAST_ROUND)
         # For the first front of a map that was loaded nobody shall wait long.
@@ -216,7 +221,7 @@ class Upkeep:
             improvement = improve(problem, replace(solver, outer_iterations=outer),
                                   _PATIENCE * round_, check)
         check()
-        front = front_of(problem, improvement.poses, check)
+        front = front_of(problem, improvement.poses, len(whole.graph.between), check)
         for _ in range(_PASSES):
             with self._lock:
                 factors, accepted = self._builder.graph.between, live.accepted
@@ -225,16 +230,18 @@ class Upkeep:
                 if not front.add(factors, bool(accepted[front.rows])):
                     break
         check()
-        self.adopt(improvement, front)
+        self.adopt(of_all(improvement, whole), front)
 
     def _judge_anew(self, check: Callable[[], None]) -> None:
         """Look at all loops anew; no keyframe is moved."""
         start = time.monotonic()
         with self._lock:
             live, now, loops = self._live, self._snapshot(), self._live.begin_judgement()
-        problem = now.problem()
+        whole = now.problem()
+        problem = as_one(whole)
         judgement, poses = judge(problem.graph, problem.poses, problem.judgement, np.inf, check)
         check()
+        judgement = judgement_of_all(judgement, whole)
         with self._lock:
             live.take_judgement(judgement, poses, loops)
             live.judge_took = time.monotonic() - start
@@ -255,18 +262,19 @@ class Upkeep:
             with self._lock:
                 live, now, loops = self._live, self._snapshot(), self._live.begin_judgement()
                 self._grown = live.growth()
-            problem = now.problem()
-            if not len(problem.graph.between):
+            whole = now.problem()
+            if not len(whole.graph.between):
                 return None
-            check = self._check_of(live, stopped)
+            problem, check = as_one(whole), self._check_of(live, stopped)
             improvement = optimise(problem, self._solver, check)
             check()
-            judgement = improvement.judgement
-            front = front_of(replace(problem, judgement=judgement), improvement.poses, check)
+            front = front_of(replace(problem, judgement=improvement.judgement), improvement.poses,
+                             len(whole.graph.between), check)
+            improvement = of_all(improvement, whole)
             with self._lock:
                 if live is not self._live:
                     raise Interrupted
-                live.take_judgement(judgement, improvement.poses, loops)
+                live.take_judgement(improvement.judgement, improvement.poses, loops)
                 self._adopt(improvement, front)
         self._on_end()
         return improvement
@@ -289,8 +297,10 @@ class Upkeep:
             self._adopt(improvement, front)
 
     def _adopt(self, improvement: Improvement, front: Front | None) -> None:
+        before = self._map_to_odom_now()
         self._live.adopt(improvement, front, self._solver.outer_tolerance)
         self._map_to_odom = None
+        self.moved = before, self._map_to_odom_now()
         self._changes += 1
         self.maps += 1
 
