@@ -19,8 +19,8 @@ from l1slam_ros.paper import printed as paper
 BAD_INPUT, READ_IN_PART, DOUBTFUL, INTERRUPTED, BROKEN_PIPE = 2, 3, 4, 130, 141
 # By command: the module that runs it, imported only then.
 _MODULES = {
-    'solve': 'solving', 'corrupt': 'solving', 'reproduce': 'solving',
-    'convert': 'commands', 'simulate': 'commands', 'info': 'commands', 'plot': 'commands',
+    'solve': 'solving', 'convert': 'commands', 'info': 'commands', 'simulate': 'worlds',
+    'corrupt': 'worlds', 'plot': 'drawing', 'reproduce': 'reproducing',
 }
 
 _INPUT = '.g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1'
@@ -62,8 +62,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return BROKEN_PIPE
     except OSError as error:
         _forget_output()
-        _say(_in_words(error))
-        return BAD_INPUT
+        what = error.strerror or str(error)
+        return _refuse(what if error.filename is None else f'{error.filename}: {what}')
+    except L1SlamError as error:
+        return _refuse(str(error))
+    except MemoryError:
+        return _refuse('not enough memory for a graph of this size')
+    except KeyboardInterrupt:
+        return INTERRUPTED
 
 
 def _answer(arguments: Sequence[str] | None) -> int:
@@ -76,21 +82,7 @@ def _answer(arguments: Sequence[str] | None) -> int:
     if options.command is None:
         parser.print_help(sys.stderr)
         return BAD_INPUT
-    try:
-        ending = _run(options)
-    except BrokenPipeError:
-        raise
-    except L1SlamError as error:
-        _say(str(error))
-        return BAD_INPUT
-    except OSError as error:
-        _say(_in_words(error))
-        return BAD_INPUT
-    except MemoryError:
-        _say('not enough memory for a graph of this size')
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        return INTERRUPTED
+    ending = _run(options)
     for sentence in filter(None, ending):
         _say(sentence)
     if ending.doubt:
@@ -107,14 +99,14 @@ def _run(options: argparse.Namespace) -> Any:
         return getattr(module, options.command)(options)
 
 
-def _in_words(error: OSError) -> str:
-    what = error.strerror or str(error)
-    return what if error.filename is None else f'{error.filename}: {what}'
-
-
 def _say(sentence: str) -> None:
     with suppress(BrokenPipeError):
         print(f'l1slam: {sentence}', file=sys.stderr)
+
+
+def _refuse(sentence: str) -> int:
+    _say(sentence)
+    return BAD_INPUT
 
 
 def _forget_output() -> None:

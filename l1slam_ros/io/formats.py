@@ -101,9 +101,11 @@ def check_graph_output(path: Path) -> None:
                         f'{", ".join(GRAPH_SUFFIXES)}, or no suffix for a bag directory')
 
 
-def write_output(path: Path, record: GraphRecord) -> None:
+def write_output(path: Path, record: GraphRecord, truth: Array | None = None) -> None:
     """
     Write a graph with its poses, in the format that the suffix names; none: a bag.
+
+    truth : (n, p) poses, which a bag has a topic for
 
     Raises
     ------
@@ -119,4 +121,4 @@ def write_output(path: Path, record: GraphRecord) -> None:
     else:
         from l1slam_ros.io.bags.from_graph import write_graph_bag
 
-        write_graph_bag(path, record)
+        write_graph_bag(path, record, truth)

@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import yaml
+
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.online.backend import BackendOptions
 from l1slam_ros.core.options import Options, Scalar, dotted, option, with_values
@@ -30,6 +32,10 @@ class NodeOptions(BackendOptions):
     publish_tf: bool = option(
         True, 'publish map -> odom on /tf, where tf2_msgs is installed', fixed=True)
     save_path: str = option('', 'the .g2o file of ~/save and ~/load')
+    autosave_period: float = option(
+        60.0, 'with a save_path, how often a map that changed is saved, and at the end; 0: off',
+        's', 0, 1e9)
+    load_on_start: bool = option(False, 'load the map of save_path at start', fixed=True)
     on_time_jump: str = option(
         'ignore', 'what to do when the ROS clock jumps back: go on, or begin a new map', '',
         choices=('reset', 'ignore'))
@@ -45,8 +51,6 @@ def read_params_file(path: Path) -> NodeOptions:
     FileError : it cannot be read, is no parameter file, or sets something that is refused.
 
     """
-    import yaml
-
     try:
         content = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:

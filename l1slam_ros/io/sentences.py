@@ -30,7 +30,7 @@ _NOISE = (
 )
 
 
-def verdict(record: GraphRecord, judgement: Judgement) -> Iterator[str]:
+def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[str]:
     """Yield what was refused and why, the worst first; then what is noisier than it says."""
     factors, accepted = record.graph.between, judgement.accepted
     is_loop = ~factors.is_odometry

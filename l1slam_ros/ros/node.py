@@ -26,6 +26,7 @@ from l1slam_ros.core.errors import L1SlamError, MessageError
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.update import Improvement
+from l1slam_ros.io.graphs.map_file import MapFile
 from l1slam_ros.io.messages import cdr
 from l1slam_ros.io.messages.base_frame import BaseFrame
 from l1slam_ros.io.messages.conversion import absolute_pose, loop_closure, odometry_sample
@@ -50,6 +51,8 @@ _DEPTH = 1000
 # Messages of one topic at most before other callbacks have their turn.
 _AT_ONCE = 100
 _REPEAT_WARNING = 5.0  # [s]
+# [s] The end of the node waits so much longer for a map that is being saved.
+_SAVING = 4.0
 
 
 class BackendNode(Node):
@@ -87,11 +90,14 @@ class BackendNode(Node):
                                     lambda: self.options.update.budget, self._tell)
         self._orders = Orders(self, self.failures, self._solver.hurry)
         self._make_publishers()
+        self._map_file = MapFile(self._backend, lambda: self.options, self.get_logger().warning)
+        if options.load_on_start:
+            self.get_logger().info(self._map_file.load_at_start())
         self._topics: dict[str, Traffic] = {}
         self._make_subscriptions()
         self._diagnosis = Diagnosis(self, self._topics, self._solver, self.failures)
         self._map_services = MapServices(
-            self, self._backend, self._orders, lambda: self.options.save_path,
+            self, self._backend, self._orders, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
@@ -102,6 +108,7 @@ class BackendNode(Node):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(options.update.period, guarded('timer', self._on_timer), clock=steady)
         self.create_timer(1.0, guarded('diagnostics', self._on_second), clock=steady)
+        self._tell(None)  # a map may have been loaded
         self._solver.start()
 
     @property
@@ -113,11 +120,17 @@ class BackendNode(Node):
         """End the threads and the node; return whether they ended within some seconds."""
         deadline = time.monotonic() + seconds
         self._solver.close(0.0)  # what it works at for an order stops
-        ended = self._orders.close(seconds)
+        self._map_services.autosave(at_end=True)
+        ended = self._orders.close(seconds) or (
+            self._map_file.is_saving and self._orders.close(_SAVING))
         ended &= self._solver.close(max(deadline - time.monotonic(), 0.0))
         if ended:
             self.destroy_node()
         return ended
+
+    def is_saving(self) -> bool:
+        """Return whether the map is being saved."""
+        return self._map_file.is_saving
 
     def _make_publishers(self) -> None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -220,6 +233,7 @@ class BackendNode(Node):
 
     def _on_timer(self) -> None:
         self._solver.wake()
+        self._map_services.autosave()
         if self._last_stamp:
             self._publish_transform()
 

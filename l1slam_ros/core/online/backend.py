@@ -17,24 +17,21 @@ place of an update, is told to stop, and never adopted.
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from l1slam_ros.core.errors import Interrupted, OptionError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.background import Background
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.loop_states import LoopStates
-from l1slam_ros.core.online.snapshot import Optimised, Snapshot
+from l1slam_ros.core.online.snapshot import Optimised, SavedMap, Snapshot
 from l1slam_ros.core.online.update import Improvement, improve, optimise
 from l1slam_ros.core.options import Options, option
-from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
-from l1slam_ros.core.solvers.optimality import Status
 
 # What poses live on, by the dimension of the world.
 _MANIFOLDS: dict[int, Manifold] = {2: se2}
@@ -115,15 +112,24 @@ class Backend:
 
     def reset(self) -> None:
         """Forget everything."""
-        self._replace(GraphBuilder(self.manifold, self._options), self.manifold.identity(0))
+        self._replace(GraphBuilder(self.manifold, self._options),
+                      Optimised.nothing(self.manifold.identity(0)))
 
-    def restore(self, graph: FactorGraph, poses: Array, stamps: Indices) -> None:
-        """Replace the map by one of an earlier run; see `GraphBuilder.restore`."""
+    def saved(self) -> SavedMap | None:
+        """Return all that another back end goes on from; None: there are no factors yet."""
+        with self._lock:
+            if self._builder.graph.between.is_absolute.all():
+                return None
+            now, growth = self._snapshot(), self._builder.grown()
+        return SavedMap(growth, now.optimised.of_all(now.problem()), now.robust)
+
+    def restore(self, saved: SavedMap) -> None:
+        """Go on from what another back end has `saved`, in the place of the map there is."""
         builder = GraphBuilder(self.manifold, self._options)
-        builder.restore(graph, stamps, poses)
-        self._replace(builder, poses)
+        builder.restore(saved.growth)
+        self._replace(builder, saved.as_judged(self._options.robust.enabled))
 
-    def _replace(self, builder: GraphBuilder, poses: Array) -> None:
+    def _replace(self, builder: GraphBuilder, optimised: Optimised) -> None:
         """Begin a map with the graph of a builder; what is made for the one before is left."""
         with self._lock:
             self.maps += 1
@@ -132,7 +138,7 @@ class Backend:
             # Options may have changed since it was made.
             builder.options = self._options
             self._builder = builder
-            self._optimised = Optimised.nothing(poses)
+            self._optimised = optimised
             self._map_to_odom: tuple[Array, Array] | None = None
         self._wake()
 
@@ -192,8 +198,7 @@ class Backend:
         with self._lock:
             self._changes += 1
             if options.robust != self._options.robust:
-                self._optimised = replace(self._optimised, judgement=Judgement.nothing(),
-                                          status=Status.OUT_OF_TIME)
+                self._optimised = self._optimised.unjudged()
             self._options = self._builder.options = options
         self._wake()
 

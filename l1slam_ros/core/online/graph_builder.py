@@ -19,7 +19,6 @@ from l1slam_ros.core.geometry.noise import (
     MOST_OF_ODOMETRY,
     MOST_VARIANCE,
     Mask,
-    covariance_of,
     loop_identity,
     root_of_inverse,
 )
@@ -34,8 +33,9 @@ from l1slam_ros.core.online.keyframes import (
     reduced_covariance,
 )
 from l1slam_ros.core.online.notes import Notes
-from l1slam_ros.core.online.odometry_stream import OdometryStream, Point
+from l1slam_ros.core.online.odometry_stream import UNSEEN_TURN, OdometryStream, Point
 from l1slam_ros.core.online.odometry_track import OdometryTrack
+from l1slam_ros.core.online.snapshot import Growth
 from l1slam_ros.core.online.waiting_loops import (
     WaitingLoop,
     WaitingLoops,
@@ -44,9 +44,6 @@ from l1slam_ros.core.online.waiting_loops import (
     said,
 )
 from l1slam_ros.core.options import Options, option
-
-# [rad/s] A robot that nobody saw may have turned so fast.
-_UNSEEN_TURN = 1.0
 
 
 @dataclass(frozen=True)
@@ -105,8 +102,7 @@ class GraphBuilder:
         self._moved = self._resumed = False
         self._waiting = WaitingLoops()
         self._seen: set[bytes] = set()
-        self._expired = GrowingArray((2,), np.int64)
-        self._loop_stamps = GrowingArray((2,), np.int64)
+        self._expired, self._loop_stamps = (GrowingArray((2,), np.int64) for _ in range(2))
         self._loop_rows = GrowingArray((), np.int64)
 
     @property
@@ -180,14 +176,16 @@ class GraphBuilder:
             self._begin_keyframe(point.stamp, point.pose)
             return True
         manifold, pose = self.graph.manifold, point.pose
-        if not self._glued or point.unseen:
+        if point.unseen or not (
+                self._glued or self._track.goes_on(point.stamp, pose, self.offset)):
             self.offset = manifold.compose(self._track.last_pose, manifold.inverse(pose))
-            self._glued = self._moved = True
+            self._moved = True
+        self._glued = True
         if self._moved:
             pose = manifold.compose(self.offset, pose)
         self._track.append(point.stamp, pose)
         if point.unseen:
-            self._motion.add_unseen(point.sample, point.unseen, _UNSEEN_TURN * point.seconds)
+            self._motion.add_unseen(point.sample, point.unseen, UNSEEN_TURN * point.seconds)
         else:
             self._motion.add(point.sample, pose, self.options.odometry)
         # Where the frame has moved there is a keyframe: what is published goes by the last one.
@@ -216,32 +214,35 @@ class GraphBuilder:
         self._track = OdometryTrack(self.graph.manifold)
         self._waiting.forget_arrivals()
 
-    def restore(self, graph: FactorGraph, stamps: Indices, poses: Array) -> None:
-        """
-        Take over a graph of an earlier run, its stamps (n,) [ns] and poses (n, p).
+    def grown(self) -> Growth:
+        """Return what another builder goes on from; there are keyframes."""
+        return Growth(
+            self.graph.copy(), self.stamps, self.odometry, self.offset, self._track.last,
+            self._track.last_pose, self._motion.covariance(self.options.odometry, self._verbatim),
+            self.loop_rows, self._loop_stamps.view(), self._expired.view(),
+            self._waiting.arrivals(), frozenset(self._seen))
 
-        The robot is taken to stand where that run ended; its odometry may begin anywhere. A loop
-        of that run that is sent again is known where it named the stamps of keyframes: others
-        were carried there and are not what was sent.
-        """
-        self.graph = graph
-        self._track.extend_by_keyframes(stamps, poses)
-        self._motion = Motion(graph.manifold, int(stamps[-1]), poses[-1:])
-        self._glued, self._resumed = False, True
-        self._stream = OdometryStream(graph.manifold, self.notes, resumed=True)
-        factors = graph.between
-        rows = np.flatnonzero(~factors.is_odometry)
-        ends = stamps[factors.pairs[rows]]
-        self._note_loops(rows, np.sort(ends, axis=1))
-        covariances = covariance_of(factors.sqrt_information[rows])
-        for (reference, stamp), row, covariance in zip(ends.tolist(), rows, covariances,
-                                                       strict=True):
-            self._seen.add(loop_identity(reference, stamp, factors.measurement[row], covariance,
-                                       bool(factors.trusted[row])))
+    def restore(self, growth: Growth) -> None:
+        """Go on where a run ended; odometry that begins elsewhere is taken to begin there."""
+        self.graph, self.offset = growth.graph, growth.offset
+        self._track.extend_by_keyframes(growth.stamps, growth.odometry)
+        self._motion = Motion(self.graph.manifold, self._track.last, self._track.last_pose)
+        if growth.end > self._track.last:
+            self._track.append(growth.end, growth.end_pose)
+            self._motion.add_known(
+                growth.end, growth.end_pose, growth.end_covariance, self.options.odometry)
+        self._glued, self._moved, self._resumed = False, True, True
+        self._stream = OdometryStream(self.graph.manifold, self.notes, resumed=True)
+        self._note_loops(growth.loop_rows, growth.loop_stamps)
+        self._expired.extend(growth.expired)
+        for loop, arrival in growth.waiting:
+            self.add_loop(loop, arrival)
+        self._seen.update(growth.seen)
 
-    def add_loop(self, loop: LoopClosure) -> None:
-        """Take a loop closure or an absolute pose in, once; see `add_due_loops`."""
-        if (covariance := self._loop_covariance(loop)) is None:
+    def add_loop(self, loop: LoopClosure, arrival: int | None = None) -> None:
+        """Take a loop closure or an absolute pose in, once, which came at `arrival` or now."""
+        covariance = self._loop_covariance(loop)
+        if covariance is None:
             return
         measurement = said(self.graph.manifold, loop, covariance)
         key = loop_identity(*loop.stamps, measurement, covariance, loop.trusted)
@@ -249,8 +250,8 @@ class GraphBuilder:
             self._refuse('repeated', loop, 'was sent before; expected each loop once')
             return
         self._seen.add(key)
-        arrival = self._track.last if len(self._track) else 0
-        self._waiting.add(WaitingLoop(loop, arrival, measurement, covariance, key))
+        came = self._track.last if arrival is None and len(self._track) else arrival or 0
+        self._waiting.add(WaitingLoop(loop, came, measurement, covariance, key))
 
     def add_due_loops(self) -> int:
         """
@@ -305,8 +306,7 @@ class GraphBuilder:
             else:
                 self._refuse('same_keyframe', loops[row], 'begins and ends at one keyframe; '
                              'expected two')
-        can: Mask = ~(early | same)
-        return can
+        return np.asarray(~(early | same))
 
     def _note_loops(self, rows: Indices, stamps: Indices) -> None:
         self._loop_rows.extend(rows)

@@ -37,10 +37,15 @@ _NEAR = 0.5
 # [s] After a longer gap a sample is held, which costs the robot nothing but a message's delay; it
 # is confirmed by one within `LONGEST_PAUSE`, so that odometry of any rate passes.
 _GAP = 2.0
-# [m/s] A robot that nobody saw may have gone so fast.
-_UNSEEN = 1.0
+# [m/s], [rad/s] A robot that nobody saw may have gone, and turned, so fast.
+UNSEEN, UNSEEN_TURN = 1.0, 1.0
 # [m], [rad] The identity, after its way through a quaternion.
 _EXACT = 1e-9
+
+
+def is_identity(manifold: Manifold, pose: Array) -> bool:
+    """Tell whether a pose (1, p) is where odometry begins."""
+    return bool(abs(manifold.local(manifold.identity(1), pose)).max() < _EXACT)
 
 
 class Point:
@@ -100,7 +105,7 @@ class OdometryStream:
             self.held = None
             held.anew = held.doubt == 'old_stamp'
             if held.doubt == 'jump':
-                held.unseen = max((_UNSEEN * (held.stamp - last.stamp) * 1e-9, *self._recent))
+                held.unseen = max((UNSEEN * (held.stamp - last.stamp) * 1e-9, *self._recent))
                 self._notes.warn('moved', f'{self._why(last, held)}; the robot is taken to be '
                                  'where it was')
             return self._used(held) + self._used(point)
@@ -152,7 +157,7 @@ class OdometryStream:
         if length > FASTEST * max(seconds, SHORTEST_STEP):
             return 'jump'
         if length > _NEAR and length > _FAR * max(self._recent, default=0.0) and (
-                self._is_identity(point)):
+                is_identity(self._manifold, point.pose)):
             return 'jump'
         return 'stamp_ahead' if seconds > _GAP else ''
 
@@ -168,10 +173,6 @@ class OdometryStream:
     def _may_begin_anew(self, last: Point, point: Point) -> bool:
         """Tell whether the only sample so far may be a stray, its stamp far ahead of all."""
         return self._alone and (last.stamp - point.stamp) * 1e-9 > LONGEST_PAUSE
-
-    def _is_identity(self, point: Point) -> bool:
-        manifold = self._manifold
-        return bool(abs(manifold.local(manifold.identity(1), point.pose)).max() < _EXACT)
 
     def _why(self, last: Point, held: Point) -> str:
         seconds = (held.stamp - last.stamp) * 1e-9

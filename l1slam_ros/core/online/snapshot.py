@@ -6,12 +6,13 @@ In: references to arrays that are never written to again. Out: what is worked ou
 problem of the next update first of all.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.online.loop_states import (
     ACCEPTED,
     EXPIRED,
@@ -50,6 +51,41 @@ class Problem:
 
 
 @dataclass(frozen=True)
+class Growth:
+    """
+    What a graph builder has made of messages, for another to go on from.
+
+    graph : the factors; stamps (n,) [ns] and odometry (n, p) of the keyframes; offset : see
+    `GraphBuilder`; end : stamp [ns] of the last sample, end_pose (1, p) and end_covariance (d, d)
+    of the motion to it from the last keyframe; loop_rows (k,), loop_stamps (k, 2) and expired
+    (l, 2) [ns] : see `GraphBuilder`; waiting : loops, and when each came [ns]; seen : the identity
+    of each loop that came.
+    """
+
+    graph: FactorGraph
+    stamps: Indices
+    odometry: Array
+    offset: Array
+    end: int
+    end_pose: Array
+    end_covariance: Array
+    loop_rows: Indices
+    loop_stamps: Indices
+    expired: Indices
+    waiting: tuple[tuple[LoopClosure, int], ...]
+    seen: frozenset[bytes]
+
+    @staticmethod
+    def of_graph(graph: FactorGraph, poses: Array, stamps: Indices) -> 'Growth':
+        """Return that of a graph alone, whose odometry went from pose to pose (n, p)."""
+        d, none = graph.manifold.TANGENT_SIZE, np.zeros((0, 2), np.int64)
+        loops = np.flatnonzero(~graph.between.is_odometry)
+        ends = np.sort(stamps[graph.between.pairs[loops]], axis=1)
+        return Growth(graph, stamps, poses, graph.manifold.identity(1), int(stamps[-1]),
+                      poses[-1:], np.zeros((d, d)), loops, ends, none, (), frozenset())
+
+
+@dataclass(frozen=True)
 class Optimised:
     """
     What updates have made so far, of the first keyframes and factors.
@@ -75,6 +111,30 @@ class Optimised:
         """Whether more updates of the same factors would hardly change the map."""
         return (self.status in (Status.CONVERGED, Status.STALLED)
                 or self.quiet_updates >= _QUIET_UPDATES)
+
+    def unjudged(self) -> 'Optimised':
+        """Return the same where nothing is known of any loop."""
+        return replace(self, judgement=Judgement.nothing(), status=Status.OUT_OF_TIME)
+
+    def of_all(self, problem: Problem) -> 'Optimised':
+        """Return the same of all keyframes and factors that a problem has."""
+        if len(self.poses) == len(problem.poses) and len(self.dual) == len(problem.dual):
+            return self
+        return replace(self, poses=problem.poses, dual=problem.dual, judgement=problem.judgement,
+                       status=Status.OUT_OF_TIME, quiet_updates=0)
+
+
+@dataclass(frozen=True)
+class SavedMap:
+    """All that another back end goes on from; robust : loops were doubted."""
+
+    growth: Growth
+    optimised: Optimised
+    robust: bool
+
+    def as_judged(self, robust: bool) -> Optimised:
+        """Return what updates have made, unjudged where loops were judged otherwise."""
+        return self.optimised if self.robust == robust else self.optimised.unjudged()
 
 
 @dataclass(frozen=True)

@@ -85,6 +85,10 @@ class WaitingLoops:
         """Let all have come before any odometry: the clock they came by was none."""
         self._loops = {number: replace(one, arrival=0) for number, one in self._loops.items()}
 
+    def arrivals(self) -> tuple[tuple[LoopClosure, int], ...]:
+        """Return each loop and when it came, in the order they came."""
+        return tuple((one.loop, one.arrival) for one in self._loops.values())
+
     def stamps(self) -> Indices:
         """Return reference and end [ns] of each, (k, 2)."""
         if self._stamps is None:

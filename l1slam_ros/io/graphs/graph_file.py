@@ -10,7 +10,7 @@ A line is a tag, one or two vertex ids, a pose, and the upper triangle of an inf
 
 Priors are absolute factors; rows and columns of zeros in the information say nothing.
 **TORO orders the information otherwise** (forward, sideways, rotation: `ff fs ss rr fr sr`).
-Stamps and trust in loops, which neither format knows, live beside the graph: see `side_files`.
+Stamps and trust in loops, which neither format knows: see `side_files`, and `remarks`.
 """
 
 import os
@@ -39,6 +39,7 @@ from l1slam_ros.io.files import (
 )
 from l1slam_ros.io.graphs.side_files import read_stamps, read_trusted, write_beside
 from l1slam_ros.io.graphs.tags import FACTORS, SENSORS, TAGS, TAGS_3D, TAGS_LEFT_OUT
+from l1slam_ros.io.remarks import Remarks
 from l1slam_ros.io.wording import counted
 
 
@@ -50,7 +51,8 @@ class GraphRecord:
     graph : the factors, in the order of the file; poses : (n, p) the stored start, None when
     the file has none; ids : (n,) vertex ids, ascending: keyframe k is vertex ids[k];
     stamps : (n,) [ns] or None; skipped : a sentence on each kind of line that was not used;
-    damage : a sentence where only a part of the input could be read, else empty.
+    damage : a sentence where only a part of the input could be read, else empty; remarks : of a
+    saved map.
     """
 
     graph: FactorGraph
@@ -59,6 +61,7 @@ class GraphRecord:
     stamps: Indices | None = None
     skipped: tuple[str, ...] = ()
     damage: str = ''
+    remarks: Remarks = None
 
 
 _NAMES = {'vertex': 'a vertex', 'between': 'an edge', 'absolute': 'an absolute pose',
@@ -93,7 +96,7 @@ class _Rows:
 
 def read_graph_file(path: str | os.PathLike[str]) -> GraphRecord:
     """
-    Read a g2o or TORO file, and beside it the stamps and which loops are trusted.
+    Read a g2o or TORO file, and in it or beside it the stamps and which loops are trusted.
 
     Vertices may stand anywhere and in any order, or not at all: then they are those the edges
     name, and `poses` is None. Whether the graph is connected is not looked at.
@@ -103,7 +106,7 @@ def read_graph_file(path: str | os.PathLike[str]) -> GraphRecord:
     FileError : naming the line, when the file is no such graph or those beside it are of another.
 
     """
-    groups = _group(path)
+    groups, remarks = _group(path)
     edges, skipped = _without_circles(_rows(path, groups, *FACTORS))
     if edges.alone.all():
         raise FileError(path, f'no edges; expected {_expected("between")} lines')
@@ -111,24 +114,26 @@ def read_graph_file(path: str | os.PathLike[str]) -> GraphRecord:
     ids = vertices.ids[:, 0] if len(vertices) else np.unique(edges.ids)
     graph = FactorGraph(se2)
     graph.add_poses(len(ids))
-    _add_edges(path, graph, ids, edges)
+    _add_edges(path, graph, ids, edges, remarks)
     return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
-                       read_stamps(path, ids), (*skipped, *_skipped(groups, ids)))
+                       _stamps(path, ids, remarks), (*skipped, *_skipped(groups, ids)),
+                       remarks=remarks)
 
 
-def read_vertices(path: str | os.PathLike[str]) -> tuple[Indices, Array]:
+def read_vertices(path: str | os.PathLike[str]) -> tuple[Indices, Array, Indices | None]:
     """
-    Return the ids (n,), ascending, and the poses (n, p) of the vertices of a graph file.
+    Return ids (n,), ascending, poses (n, p) and stamps (n,) [ns], if any, of a graph's vertices.
 
     Raises
     ------
     FileError : the file has none, or is no graph.
 
     """
-    vertices = _vertices(path, _group(path))
+    groups, remarks = _group(path)
+    vertices = _vertices(path, groups)
     if not len(vertices):
         raise FileError(path, f'no vertices; expected {_expected("vertex")} lines')
-    return vertices.ids[:, 0], vertices.pose
+    return (ids := vertices.ids[:, 0]), vertices.pose, _stamps(path, ids, remarks)
 
 
 def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
@@ -144,15 +149,14 @@ def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
 
     """
     path = Path(path)
-    lines = _text(path, record)
     with replacing(path) as temporary:
-        put_lines(temporary, lines)
+        put_lines(temporary, graph_lines(path, record))
         # Before the graph takes its place: it must never meet the stamps or the trust of another.
         write_beside(path, record.ids, record.stamps, record.graph.between)
 
 
-def _group(path: str | os.PathLike[str]) -> dict[str, TextLines]:
-    """Return the lines of each tag, without the tag; every tag is known."""
+def _group(path: str | os.PathLike[str]) -> tuple[dict[str, TextLines], Remarks]:
+    """Return the lines of each tag, without the tag, and the remarks; every tag is known."""
     lines = read_lines(path)
     groups: dict[str, TextLines] = defaultdict(lambda: TextLines([], []))
     for number, text in zip(lines.numbers, lines.texts, strict=True):
@@ -164,7 +168,11 @@ def _group(path: str | os.PathLike[str]) -> dict[str, TextLines]:
         raise FileError(path, f'the file is empty; expected {_expected("between")} lines')
     for tag, group in groups.items():
         _refuse_unknown(path, tag, group.numbers[0])
-    return groups
+    return groups, lines.remarks
+
+
+def _stamps(path: str | os.PathLike[str], ids: Indices, remarks: Remarks) -> Indices | None:
+    return np.array(remarks['stamps'], np.int64) if remarks else read_stamps(path, ids)
 
 
 def _refuse_unknown(path: object, tag: str, line: int) -> None:
@@ -227,12 +235,13 @@ def _without_circles(edges: _Rows) -> tuple[_Rows, list[str]]:
     return edges.chosen(~circle), [sentence]
 
 
-def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices,
-               edges: _Rows) -> None:
+def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, edges: _Rows,
+               remarks: Remarks) -> None:
     i, j = _index(path, ids, edges).T
     i = np.where(edges.alone, WORLD, i)
     doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), np.zeros(len(edges), bool))
-    graph.add_between(i, j, edges.pose, edges.information, read_trusted(path, ids, doubted))
+    trusted = remarks['trusted'] if remarks else read_trusted(path, ids, doubted)
+    graph.add_between(i, j, edges.pose, edges.information, trusted)
 
 
 def _index(path: object, ids: Indices, rows: _Rows) -> Indices:
@@ -280,8 +289,8 @@ def _skipped(groups: dict[str, TextLines], ids: Indices) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def _text(path: Path, record: GraphRecord) -> list[str]:
-    """Return the lines of the file, many to a string."""
+def graph_lines(path: Path, record: GraphRecord) -> list[str]:
+    """Return the lines of a graph file, many to a string."""
     graph, ids = record.graph, record.ids
     d = graph.manifold.TANGENT_SIZE
     lines = [] if record.poses is None else _lines(

@@ -501,7 +501,7 @@ def restored(world, n):
     first, second = Backend(EVERY), Backend(EVERY)
     play(first, world, 0, n)
     settled(first)
-    second.restore(first.snapshot().problem().graph, first.poses, first.snapshot().stamps)
+    second.restore(first.saved())
     return first, second
 
 

@@ -335,7 +335,7 @@ def test_the_loops_of_an_earlier_run_are_those_of_its_keyframes():
         first.add_loop(true_loop(poses, *pair))
     first.add_due_loops()
     second = GraphBuilder(se2, EVERY)
-    second.restore(first.graph, first.stamps, poses)
+    second.restore(first.grown())
     second.add_loop(loop(0.0, 6.2, (1.0, 0.0, 0.0)))
     for k in range(60, 64):
         second.add_odometry(odometry(k * PERIOD, (k, 0.0, 0.0)))
@@ -399,7 +399,7 @@ def test_a_loop_of_an_earlier_run_is_known_by_the_keyframes_it_named(rng):
         first.add_loop(one)
     first.add_due_loops()
     second = GraphBuilder(se2, EVERY)
-    second.restore(first.graph, first.stamps, poses)
+    second.restore(first.grown())
     for one in loops:
         second.add_loop(one)
     second.add_loop(replace(loops[0], covariance=1.01 * covariance))

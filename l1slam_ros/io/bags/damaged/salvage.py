@@ -16,6 +16,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import yaml
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
 from l1slam_ros.io.bags.damaged.walk import BrokenRecordError, RawMessage, zstd_decoder
 from l1slam_ros.io.bags.damaged.walk_mcap import walk_mcap
 from l1slam_ros.io.bags.damaged.walk_rosbag1 import walk_rosbag1
@@ -114,8 +117,6 @@ class Salvage:
 
     def types(self) -> Any:
         """Return the types to decode by: of Jazzy; what it has not, as the bag defines it."""
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
         types = get_typestore(Stores.ROS2_JAZZY)
         for name, text in self._definitions.items():
             with suppress(Exception):  # a damaged definition makes the library raise anything
@@ -158,8 +159,6 @@ def complaint(error: Exception) -> str:
 
 def directory_metadata(bag: Path) -> dict[str, Any]:
     """Return what the metadata.yaml of a bag says, nothing where it cannot be read."""
-    import yaml
-
     with suppress(Exception):  # it may be missing, no text, no YAML or other YAML
         document = yaml.safe_load((bag / METADATA).read_text(encoding='utf-8'))
         return dict(document['rosbag2_bagfile_information'])

@@ -13,8 +13,8 @@ import resource
 import sys
 
 import numpy as np
-from cases import WORLD_SEED
 from measuring import clock
+from solvers.cases import WORLD_SEED
 
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions

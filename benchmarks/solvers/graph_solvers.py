@@ -4,8 +4,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from cases import Case
 from measuring import Answer
+from solvers.cases import Case
 
 from l1slam_ros.core.geometry.manifold import Array
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from cases import Case, InnerProblem, inner_problems
-from linear_peers import PEERS, clarabel_solution
-from linear_solvers import LinearSolver, Setting, normal_factor
 from measuring import Row, interleaved, report_progress, row
-from ours import INNER, PLAIN
+from solvers.cases import Case, InnerProblem, inner_problems
+from solvers.linear_peers import PEERS, clarabel_solution
+from solvers.linear_solvers import LinearSolver, Setting, normal_factor
+from solvers.ours import INNER, PLAIN
 
 from l1slam_ros.core.geometry.manifold import Array
 

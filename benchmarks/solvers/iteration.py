@@ -11,9 +11,9 @@ import statistics
 from collections.abc import Callable, Iterable
 
 import numpy as np
-from cases import Case, InnerProblem, inner_problems
 from measuring import Measured, Row, clock, report_progress, row
-from ours import ITERATIONS, Iteration
+from solvers.cases import Case, InnerProblem, inner_problems
+from solvers.ours import ITERATIONS, Iteration
 
 from l1slam_ros.core.geometry.manifold import Array
 

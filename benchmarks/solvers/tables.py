@@ -5,12 +5,9 @@ import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-import growth
-import inner
-import iteration
 import numpy as np
-import whole
 from measuring import Row, rows_of
+from solvers import growth, inner, iteration, whole
 
 Lines = list[str]
 NOT_REACHED = '–'
@@ -19,7 +16,7 @@ NOT_REACHED = '–'
 def document(recorded: Mapping[str, Mapping[str, Any]]) -> Lines:
     """Return the whole report of the parts that there are, by name."""
     lines = ['# Measurements', '',
-             'Made by `python benchmarks/solvers.py`; what is measured, and how, says '
+             'Made by `python benchmarks/solvers`; what is measured, and how, says '
              '[README.md](README.md). One core and one thread; medians; all in seconds where '
              'nothing else is said.', '', '![The same as a picture](results.png)', '']
     for part, (title, tables) in PARTS.items():

@@ -16,9 +16,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from cases import Case
-from graph_solvers import MOST_ITERATIONS, SAME_TOLERANCE, GraphSolver
 from measuring import Answer, clock, timed
+from solvers.cases import Case
+from solvers.graph_solvers import MOST_ITERATIONS, SAME_TOLERANCE, GraphSolver
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph

@@ -2,7 +2,7 @@
 """
 How many odometry messages the node takes in, beside a bare rclpy subscriber on the same topic.
 
-    python benchmarks/throughput.py [MESSAGES [RATE]]
+    python benchmarks/ros/throughput.py [MESSAGES [RATE]]
 
 Three processes: this one publishes, paced; a bare subscriber only counts; the node runs as
 shipped. Prints what each received, and what the node says that it lost.

@@ -21,13 +21,13 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from cases import InnerProblem
-from linear_solvers import TOLERANCES, ByTolerance, Setting
 from measuring import Answer, timed
+from solvers.cases import InnerProblem
+from solvers.linear_solvers import TOLERANCES, ByTolerance, Setting
 
 from l1slam_ros.core.geometry.manifold import Array
 
-_WORKER = Path(__file__).with_name('pdlp_process.py')
+_FOLDER = Path(__file__).resolve().parents[1]
 
 
 def clarabel_solution(
@@ -118,8 +118,9 @@ def _pdlp(problem: InnerProblem, setting: Setting, limit: float) -> Answer:
 def _pdlp_process() -> tuple['subprocess.Popen[str]', Path]:
     folder = tempfile.TemporaryDirectory(prefix='l1slam-')
     # What PDLP says of badly scaled problems is not ours to print.
-    process = subprocess.Popen([sys.executable, _WORKER, folder.name], stdin=subprocess.PIPE,
-                               stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    process = subprocess.Popen([sys.executable, '-m', 'solvers.pdlp_process', folder.name],
+                               cwd=_FOLDER, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                               stderr=subprocess.DEVNULL, text=True)
 
     def end() -> None:
         process.kill()

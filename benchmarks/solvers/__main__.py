@@ -2,11 +2,11 @@
 """
 Everything about speed, measured side by side with others.
 
-    python benchmarks/solvers.py --datasets DIR [--only PART,...] [--graphs NAME,...] [--compare]
+    python benchmarks/solvers --datasets DIR [--only PART,...] [--graphs NAME,...] [--compare]
 
 Makes an environment with the peers on first use, and measures in it on one core: inner problems,
 whole solves, one iteration, growth with size, perturbed starts. Writes results/PART.json,
-RESULTS.md and results.png. README.md, beside this file, says what is measured and how.
+RESULTS.md and results.png. README.md, above this folder, says what is measured and how.
 """
 
 import argparse
@@ -16,9 +16,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import peer_environment
-
-HERE = Path(__file__).resolve().parent
+HERE = Path(__file__).resolve().parents[1]
+# Python puts only the folder that it runs in front: its parts are `solvers.cases` and so on.
+sys.path.insert(0, str(HERE))
 BASELINE = HERE / 'baseline.json'
 PARTS = ('inner', 'whole', 'iteration', 'growth', 'starts')
 DENSE = 'dense'
@@ -54,10 +54,12 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
 def main() -> None:
     """Measure, write, compare."""
     arguments = parse(sys.argv[1:])
+    import peer_environment
+
     peer_environment.enter()
     # These need what only the environment has.
-    from picture import draw
-    from tables import comparison, document
+    from solvers.picture import draw
+    from solvers.tables import comparison, document
 
     from l1slam_ros.io.files import write_lines
 
@@ -79,11 +81,8 @@ def main() -> None:
 
 def _measure(part: str, arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the record of one part."""
-    import growth
-    import inner
-    import iteration
-    import whole
     from measuring import record
+    from solvers import growth, inner, iteration, whole
 
     repeats, limit = arguments.repeats, arguments.limit
     if part == 'growth':
@@ -95,7 +94,7 @@ def _measure(part: str, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _cases(arguments: argparse.Namespace) -> Iterator[Any]:
-    from cases import DENSE_WORLD, GRAPHS, public_case, simulated_case
+    from solvers.cases import DENSE_WORLD, GRAPHS, public_case, simulated_case
 
     for name in arguments.graphs or (*GRAPHS, DENSE):
         yield (simulated_case(*DENSE_WORLD) if name == DENSE

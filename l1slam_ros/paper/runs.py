@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The paper's two trials: starts that are mostly noise (Figure 4), and loops that lie (Figure 6).
+The paper's two repeated runs: starts that are mostly noise (Figure 4), loops that lie (Figure 6).
 
-In: a graph and its stored poses. Out: what the methods make of each trial, how far off the map of
+In: a graph and its stored poses. Out: what the methods make of each draw, how far off the map of
 the untouched input that is, and which loops were refused.
 """
 
@@ -31,9 +31,9 @@ START, L2, L1 = 'the start itself', 'L2', 'L1'
 SEED, JOINT, ROBUST = 'seed alone', 'seed, then L1', 'loops doubted, then L1'
 # Standard deviations of the noise on every stored pose, each [m] and [rad] alike.
 NOISES = (0.25, 0.5, 1.0, 2.0)
-# Where Huber turns linear [sigmas]; the narrower, the nearer to L1.
-HUBER_OF_G2O = 1.0
-HUBER_WIDTHS = (0.01, 0.1, HUBER_OF_G2O, 10.0)
+# Where Huber turns linear [sigmas], by name of the method; the narrower, the nearer to L1.
+HUBERS = {f'Huber, width {width:g}': width for width in (0.01, 0.1, 1.0, 10.0)}
+HUBER_OF_G2O = 'Huber, width 1'
 # A map that is further off than this part of its diagonal looks bent to the eye.
 _BENT = 0.02
 
@@ -47,101 +47,82 @@ class Map:
     error: float
 
 
-@dataclass(frozen=True)
-class StartTrial:
-    """What comes of one start; noise : one of `NOISES`; maps : by method, START among them."""
-
-    noise: float
-    maps: dict[str, Map]
+# By method.
+Maps = dict[str, Map]
 
 
 @dataclass(frozen=True)
-class StartTrials:
+class StartRuns:
     """
     What comes of noisy starts.
 
-    seed, solution : from no start at all; the trials are compared with the solution; l2 : the L2
-    map from the seed; printed : (k,) costs of Algorithm 4 as printed, from the seed; trials : the
-    draws of one noise after those of the other; loops : (m, 2); bent : [m] error from which on a
-    map has lost its shape.
+    from_seed : of no start at all, the seed as START; its L1 map is what all are compared with;
+    noisy : by noise, of each draw; printed : (k,) costs of Algorithm 4 as printed, from the seed;
+    loops : (m, 2); bent : [m] error from which on a map has lost its shape.
     """
 
-    seed: Map
-    solution: Map
-    l2: Map
+    from_seed: Maps
+    noisy: dict[float, Sequence[Maps]]
     printed: Array
-    trials: Sequence[StartTrial]
     loops: Indices
     bent: float
 
 
 @dataclass(frozen=True)
-class LoopTrial:
+class LoopRun:
     """
     What comes of one draw of false loops.
 
-    maps : by method, each compared with its own of the clean graph; refused, kept : (k, 2) pairs
+    maps : each compared with its method's own of the clean graph; refused, kept : (k, 2) pairs
     that the false loops join, by what the robust method did; lost : (l, 2) those of the true
     factors that it refused.
     """
 
-    maps: dict[str, Map]
+    maps: Maps
     refused: Indices
     kept: Indices
     lost: Indices
 
-    @property
-    def false(self) -> Indices:
-        """The pairs (k, 2) that all the false loops join."""
-        return np.concatenate((self.refused, self.kept))
-
 
 @dataclass(frozen=True)
-class LoopTrials:
+class LoopRuns:
     """
     What comes of false loops.
 
-    clean : by method, of the graph without; loops : (m, 2) its true ones; trials : one for each
-    draw; bent : as of `StartTrials`, of the clean L1 map.
+    clean : of the graph without; loops : (m, 2) its true ones; runs : one for each draw; bent : as
+    of `StartRuns`, of the clean L1 map.
     """
 
-    clean: dict[str, Map]
+    clean: Maps
     loops: Indices
-    trials: Sequence[LoopTrial]
+    runs: Sequence[LoopRun]
     bent: float
 
 
-def huber_name(width: float) -> str:
-    """Return the method's name for one of `HUBER_WIDTHS`."""
-    return f'Huber, width {width:g}'
-
-
-def try_noisy_starts(
+def run_noisy_starts(
     graph: FactorGraph, stored: Array, effort: Effort, printed: Effort,
     rng: np.random.Generator, advance: Callable[[], None] = lambda: None,
-) -> StartTrials:
+) -> StartRuns:
     """
     Return what comes of the stored poses (n, p) under every noise, as often as `effort` says.
 
-    printed : the effort of Algorithm 4 as printed; advance : called after each trial
+    printed : the effort of Algorithm 4 as printed; advance : called after each draw
     """
     cholesky = cholesky_of(graph)
     seed = seed_poses(graph, cholesky)
-    solution = _minimise_l1(graph, seed).poses
-    ours = graph.manifold.positions(solution)
-    trials = []
+    ours = _minimise_l1(graph, seed).poses
+
+    def maps(start: Array, l1: Array) -> Maps:
+        l2 = minimise_l2(graph, start, LeastSquaresOptions(), cholesky).poses
+        return _compared(graph, {START: start, L2: l2, L1: l1}, graph.manifold.positions(ours))
+
+    noisy: dict[float, list[Maps]] = {noise: [] for noise in NOISES}
     for noise in (noise for noise in NOISES for _ in range(effort.draws)):
         start = with_noise(graph, stored, noise, rng)
-        maps = {START: start,
-                L2: minimise_l2(graph, start, LeastSquaresOptions(), cholesky).poses,
-                L1: _minimise_l1(graph, start).poses}
-        trials.append(StartTrial(noise, {method: _compared(graph, poses, ours)
-                                         for method, poses in maps.items()}))
+        noisy[noise].append(maps(start, _minimise_l1(graph, start).poses))
         advance()
-    l2 = minimise_l2(graph, seed, LeastSquaresOptions(), cholesky).poses
-    return StartTrials(_compared(graph, seed, ours), _compared(graph, solution, ours),
-                       _compared(graph, l2, ours), printed_costs(graph, seed, printed), trials,
-                       _loops(graph), _bent(ours))
+    return StartRuns(maps(seed, ours), dict(noisy), printed_costs(graph, seed, printed),
+                     _loops(graph), _bent(graph, ours))
 
 
 def with_noise(
@@ -152,10 +133,10 @@ def with_noise(
     return graph.manifold.retract(poses, sigma * rng.standard_normal((len(poses), size)))
 
 
-def try_false_loops(
+def run_false_loops(
     graph: FactorGraph, stored: Array, count: int, effort: Effort,
     rng: np.random.Generator, advance: Callable[[], None] = lambda: None,
-) -> LoopTrials:
+) -> LoopRuns:
     """
     Return what comes of `count` loops between far poses that measure no motion at all.
 
@@ -167,39 +148,36 @@ def try_false_loops(
     GraphError : too few far pairs are free, or the graph is no chain of odometry with loops.
 
     """
-    poses, _ = _maps(graph, stored)
-    reference = graph.manifold.positions(poses[JOINT])
-    clean = {method: _compared(graph, p, reference) for method, p in poses.items()}
+    poses, _ = _poses(graph, stored)
+    clean = _compared(graph, poses, graph.manifold.positions(poses[JOINT]))
     advance()
-    trials = []
+    runs = []
     for _ in range(effort.draws):
         loops = identity_false_loops(graph, poses[JOINT], count, rng)
-        trials.append(_try_loops(graph, stored, loops, clean))
+        runs.append(_run_loops(graph, stored, loops, clean))
         advance()
-    return LoopTrials(clean, _loops(graph), trials, _bent(reference))
+    return LoopRuns(clean, _loops(graph), runs, _bent(graph, poses[JOINT]))
 
 
-def _try_loops(
-    graph: FactorGraph, stored: Array, loops: Loops, clean: dict[str, Map]
-) -> LoopTrial:
+def _run_loops(graph: FactorGraph, stored: Array, loops: Loops, clean: Maps) -> LoopRun:
     lying = insert_loops(graph, loops)
-    maps, accepted = _maps(lying, stored)
+    poses, accepted = _poses(lying, stored)
+    maps: Maps = {}
+    for method, found in poses.items():
+        maps |= _compared(lying, {method: found}, clean[method].positions)
     factors, n = lying.between, graph.n_poses
     false = np.isin(pair_key(factors.i, factors.j, n), pair_key(loops.i, loops.j, n))
-    compared = {method: _compared(lying, poses, clean[method].positions)
-                for method, poses in maps.items()}
-    pairs = lying.between.pairs
-    return LoopTrial(compared, refused=pairs[false & ~accepted], kept=pairs[false & accepted],
-                     lost=pairs[~false & ~accepted])
+    return LoopRun(maps, refused=factors.pairs[false & ~accepted],
+                   kept=factors.pairs[false & accepted], lost=factors.pairs[~false & ~accepted])
 
 
-def _maps(graph: FactorGraph, stored: Array) -> tuple[dict[str, Array], Mask]:
+def _poses(graph: FactorGraph, stored: Array) -> tuple[dict[str, Array], Mask]:
     """Return the poses by every method, and which factors the robust one accepted."""
     cholesky = cholesky_of(graph)
     seed, robust = seed_poses(graph, cholesky), minimise_robustly(graph, _minimise_l1)
-    hubers = {huber_name(width): minimise_huber(
+    hubers = {name: minimise_huber(
         graph, stored, LeastSquaresOptions(huber_delta=width), cholesky).poses
-        for width in HUBER_WIDTHS}
+        for name, width in HUBERS.items()}
     return {SEED: seed, JOINT: _minimise_l1(graph, seed).poses, **hubers,
             ROBUST: robust.solution.poses}, robust.judgement.accepted
 
@@ -213,12 +191,16 @@ def _minimise_l1(graph: FactorGraph, poses: Array) -> Solution:
     return minimise_by(choose(AUTO, graph), graph, poses, OptimiserOptions())[0]
 
 
-def _compared(graph: FactorGraph, poses: Array, reference: Array) -> Map:
-    """Return the map of poses (n, p), laid on the positions (n, k) of the reference."""
-    positions = graph.manifold.positions(poses)
-    return Map(aligned_positions(positions, reference), l1_cost(whitened_residual(graph, poses)),
-               absolute_trajectory_error(positions, reference))
+def _compared(graph: FactorGraph, poses: dict[str, Array], reference: Array) -> Maps:
+    """Return the maps of poses (n, p), laid on the positions (n, k) of the reference."""
+    maps = {}
+    for method, found in poses.items():
+        positions = graph.manifold.positions(found)
+        maps[method] = Map(aligned_positions(positions, reference),
+                           l1_cost(whitened_residual(graph, found)),
+                           absolute_trajectory_error(positions, reference))
+    return maps
 
 
-def _bent(positions: Array) -> float:
-    return float(_BENT * np.linalg.norm(np.ptp(positions, axis=0)))
+def _bent(graph: FactorGraph, poses: Array) -> float:
+    return float(_BENT * np.linalg.norm(np.ptp(graph.manifold.positions(poses), axis=0)))

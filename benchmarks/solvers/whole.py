@@ -10,11 +10,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
-from cases import STARTS, Case
-from graph_peers import GAUSS_NEWTON, LAGO, PEERS
-from graph_solvers import GraphSolver
 from measuring import Measured, Row, interleaved, report_progress, row
-from ours import DEFAULT, FROM_NOTHING, WHOLE
+from solvers.cases import STARTS, Case
+from solvers.graph_peers import GAUSS_NEWTON, LAGO, PEERS
+from solvers.graph_solvers import GraphSolver
+from solvers.ours import DEFAULT, FROM_NOTHING, WHOLE
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.linear_system import whitened_residual

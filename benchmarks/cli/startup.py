@@ -2,7 +2,7 @@
 """
 How long a command takes before it works, beside the imports of the libraries it stands on.
 
-    python benchmarks/startup.py [GRAPH] [--rounds N] [--cold]
+    python benchmarks/cli/startup.py [GRAPH] [--rounds N] [--cold]
 
 Whole processes, run by turns, medians of the processor's time [s], and its ratio to the import of
 numpy, of scipy.sparse and of numba alone. "one loop" reads and calls the smallest of our compiled

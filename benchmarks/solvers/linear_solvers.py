@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from cases import InnerProblem
 from measuring import Answer, timed
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import SuperLU, splu
+from solvers.cases import InnerProblem
 
 from l1slam_ros.core.geometry.manifold import Array
 

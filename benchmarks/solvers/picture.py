@@ -5,10 +5,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import growth
-import inner
 import numpy as np
 from measuring import Row, rows_of
+from solvers import growth, inner
 
 from l1slam_ros.io.files import replacing
 

@@ -2,7 +2,7 @@
 """
 What the node costs when it has nothing to do, and how soon it answers when it has much.
 
-    python benchmarks/first_contact.py GRAPH [POSES EDGES]
+    python benchmarks/ros/first_contact.py GRAPH [POSES EDGES]
 
 A saved map of GRAPH is loaded and settles: processor's time then, in % of a core, without
 odometry and with that of a robot that stands; the same after 20,000 loops have expired. Then a

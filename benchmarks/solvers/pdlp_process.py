@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from linear_solvers import least_squares_start
 from measuring import clock
 from ortools.pdlp import solvers_pb2
 from ortools.pdlp.python import pdlp
+from solvers.linear_solvers import least_squares_start
 
 from l1slam_ros.core.geometry.manifold import Array
 

@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from cases import Case, InnerProblem, seed_of
-from graph_solvers import SAME_TOLERANCE, GraphSolver
-from linear_solvers import (
+from measuring import Answer, timed
+from solvers.cases import Case, InnerProblem, seed_of
+from solvers.graph_solvers import SAME_TOLERANCE, GraphSolver
+from solvers.linear_solvers import (
     TOLERANCES,
     ByIterations,
     ByTolerance,
@@ -21,7 +22,6 @@ from linear_solvers import (
     Setting,
     least_squares_start,
 )
-from measuring import Answer, timed
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
