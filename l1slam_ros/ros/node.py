@@ -294,7 +294,7 @@ class BackendNode(LifecycleNode):
         elif version != self._told_version:
             # Nothing new in the map, but a loop can have come for later, or expired.
             self._loop_status.publish(self._backend.loop_states())
-        elif self._markers.someone_new:
+        elif self._markers.behind:
             self._markers.publish(self.options.map_frame, self._newest(), self._backend.snapshot())
         self._told_version = version
 
