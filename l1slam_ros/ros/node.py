@@ -204,6 +204,7 @@ class BackendNode(LifecycleNode):
         self._backend.set_options(options)
 
     def _on_time_jump(self, _: TimeJump) -> None:
+        self._transform.forget()
         if self.options.on_time_jump == 'reset':
             self.get_logger().warning('the clock jumped back: the map begins anew')
             self._orders.place('time jump', self._map_services.reset)

@@ -166,6 +166,13 @@ def test_when_the_clock_jumps_back(bench, choice):
     b.until(lambda: len(b.path().poses) == 3, 'a map, though the clock stands still')
     tell(101)
     tell(50)
+    for _ in range(2 if choice == 'new_segment' else 0):
+        b.received['map_to_odom'].clear()
+        count = len(b.received['/diagnostics'])
+        b.until(lambda n=count: len(b.received['/diagnostics']) > n, 'a second has passed')
+        # A transform of the time before would make tf2 ignore what comes.
+        quiet = not b.received['map_to_odom']
+    assert choice != 'new_segment' or quiet
     if choice == 'reset':
         b.until(lambda: len(b.path().poses) == 0, 'the map begins anew')
         drive(b, 0, 2)
@@ -175,7 +182,6 @@ def test_when_the_clock_jumps_back(bench, choice):
     expected, end = {'new_segment': (5, 3.0), 'reset': (2, 1.0), 'ignore': (5, 4.0)}[choice]
     b.until(lambda: len(b.path().poses) == expected, f'the map has {expected} keyframes')
     assert poses_of(b.path())[-1, 0] == pytest.approx(end)
-    assert len(b.received['pose']) == 5
 
 
 def test_what_a_full_queue_has_dropped_is_said_to_be_lost(bench):
