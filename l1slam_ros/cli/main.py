@@ -12,7 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from l1slam_ros.core.errors import L1SlamError
-from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS, NORMS, SOLVERS, STARTS
+from l1slam_ros.core.names import (
+    KINDS_OF_FALSE_LOOPS,
+    NORMS,
+    ROTATION_INFORMATION,
+    SOLVERS,
+    STARTS,
+)
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS
 from l1slam_ros.paper import printed as paper
 
@@ -164,6 +170,10 @@ def _add_input(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_bag_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        '--rotation-information', choices=ROTATION_INFORMATION, default=ROTATION_INFORMATION[0],
+        help="3D g2o files, in and out: what the information's rotation block is of, the vector "
+        'part of the quaternion, as g2o has it, or the angle (default: %(default)s)')
     add = parser.add_argument_group('how to read a bag').add_argument
     add('--odom-topic', default=DEFAULT_TOPICS.odometry, metavar='TOPIC',
         help='nav_msgs/Odometry (default: %(default)s)')

@@ -16,7 +16,7 @@ from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import SENTENCES
 from l1slam_ros.core.solvers.solve import PRIMAL_DUAL
-from l1slam_ros.core.solvers.warm_up import DENSE, JUDGEMENT, SPARSE
+from l1slam_ros.core.solvers.warm_up import DENSE, JUDGEMENT, SPARSE, with_space
 from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import compile_now
 from l1slam_ros.io.graphs.graph_file import GraphRecord
@@ -36,7 +36,7 @@ def solve(arguments: argparse.Namespace) -> Ending:
         truth = read_truth(arguments.reference, record, arguments.input)
         warn(truth.skipped, arguments.quiet)
         warnings += truth.skipped
-    compile_now(_steps(wish), arguments.quiet)
+    compile_now(with_space(_steps(wish), record.graph.manifold), arguments.quiet)
     outcome = _solved(arguments, record, wish)
     if outcome.unjudged:
         warnings.append(f'no loop was doubted: {outcome.unjudged}')

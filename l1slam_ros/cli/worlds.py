@@ -15,7 +15,7 @@ from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.robust.batch_map import Wish
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
-from l1slam_ros.core.solvers.warm_up import SPARSE
+from l1slam_ros.core.solvers.warm_up import SPARSE, with_space
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
 from l1slam_ros.io import formats
@@ -57,7 +57,7 @@ def corrupt(arguments: argparse.Namespace) -> Ending:
     former = known_false(arguments.input, record)
     believed = record.graph.subset(~former)
     options = LeastSquaresOptions()
-    compile_now(SPARSE)
+    compile_now(with_space(SPARSE, record.graph.manifold))
     with (formats.named(arguments.input),
           Progress(options.iterations, 'step', label='solving') as progress):
         solution = solve_graph(

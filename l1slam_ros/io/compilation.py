@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from l1slam_ros.core.solvers.warm_up import STEPS, make_ready
+from l1slam_ros.core.solvers.warm_up import STEPS, make_ready, module_of
 from l1slam_ros.io.progress import Progress
 
 _KERNELS = Path(__file__).parents[1] / 'core' / 'kernels'
@@ -134,7 +134,7 @@ def work() -> None:
     while True:
         step = steps.get()
         folder = make_ready(step)
-        files = sorted(map(str, Path(folder).glob(f'{step}.*.nbi'))) if folder else []
+        files = sorted(map(str, Path(folder).glob(f'{module_of(step)}.*.nbi'))) if folder else []
         print(json.dumps(files), flush=True)
 
 

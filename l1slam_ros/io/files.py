@@ -25,6 +25,8 @@ from l1slam_ros.io.wording import counted
 NANOSECONDS = 10**9
 # No pose or information is beyond this, and with less no square of one leaves the doubles.
 LARGEST = 1e30
+# Two printed digits stay below; an unset or broken quaternion does not.
+QUATERNION_NORM_ERROR = 0.1
 # The longest piece of a damaged file that is quoted in an error.
 _QUOTED = 40
 # So many lines are formatted in one go.
@@ -167,6 +169,15 @@ def parse_rows(
         raise FileError(path, f'{name}: {found}; expected {ids} whole{finite} numbers',
                         lines.numbers[k])
     return rows['ids'], rows['values']
+
+
+def refuse_quaternions(path: object, quaternions: Array, numbers: list[int]) -> None:
+    """Refuse the first of the quaternions (m, 4), at lines (m,), whose norm is far from 1."""
+    far = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > QUATERNION_NORM_ERROR
+    if far.any():
+        k = int(np.argmax(far))
+        raise FileError(path, f'quaternion {quaternions[k].tolist()}; expected one of norm 1',
+                        numbers[k])
 
 
 def first_failure(count: int, works: Callable[[slice], bool]) -> int:

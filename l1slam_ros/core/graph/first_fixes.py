@@ -24,20 +24,25 @@ _WINDOWS, _SIZE, _FOR_NOISE = 2000, 8, 100
 # By so many samples, the same each time.
 _SAMPLES, _SEED = 24, 2014
 # Variances that the odometry may have, in units of what it states.
-_SCALES = 2.0 ** np.arange(-10, 7)
+_VARIANCES = 3.0 ** np.arange(-6, 4)
 # A variance that is none, so that matrices have a root.
 _TINY = 1e-12
 # A window is believed where it agrees by chance with this probability at most; a fix of it, too.
 _CHANCE = 0.01
 
 
-def first_fixes(graph: FactorGraph) -> tuple[Indices, float]:
+def first_fixes(graph: FactorGraph, latest: int | None = None,
+                variance: float | None = None) -> tuple[Indices, float]:
     """
     Return the absolute factors that may be believed first, and the variance of the odometry.
 
     They are those of the windows that agree, as far as they overlap: the most that can be had.
-    Where no window agrees beyond chance, those that say where the map is, and no more. The
-    variance is in units of what is stated.
+    Where no window agrees beyond chance, those that say where the map is, and no more.
+
+    Parameters
+    ----------
+    latest : so many of the last fixes are looked at; None: all
+    variance : of the odometry, in units of what is stated; None: to be found
 
     Raises
     ------
@@ -46,24 +51,35 @@ def first_fixes(graph: FactorGraph) -> tuple[Indices, float]:
     """
     factors, leading = graph.between, graph.manifold.TRANSLATION.stop
     rows = np.flatnonzero(factors.is_absolute)
-    rows = rows[np.argsort(factors.j[rows], kind='stable')]
+    rows = rows[np.argsort(factors.j[rows], kind='stable')][-(latest or len(rows)):]
     size = min(_SIZE, len(rows))
     if size <= leading:
-        return rows, 1.0
-    samples, some = _Samples(graph, rows), _windows(len(rows), size, _FOR_NOISE)
-    # What follows the leading ones is as likely true as false.
-    likely = [np.logaddexp(0.0, samples.log_ratio(some, scale)[:, leading]).sum()
-              for scale in _SCALES]
-    scale = float(_SCALES[int(np.argmax(likely))])
-    windows = _windows(len(rows), size, _WINDOWS)
-    ratio = samples.log_ratio(windows, scale)
-    agreed = np.where(ratio > 0, ratio, 0.0).sum(axis=1)
-    good = ratio > -np.log(_CHANCE)
-    good[:, :leading] = True
-    sure = agreed > np.log(len(windows) / _CHANCE)
+        return rows, variance or 1.0
+    samples = _Samples(graph, rows)
+    near = [stride * np.arange(leading) for stride in range(1, (size - 1) // (leading - 1))]
+    if variance is None:
+        variance = _likeliest_variance(samples, _windows(len(rows), size, _FOR_NOISE), near)
+    leads, windows = [*near, *(size - 1 - lead for lead in near)], _windows(
+        len(rows), size, _WINDOWS)
+    ratio = np.concatenate([samples.log_ratio(windows, variance, lead) for lead in leads])
+    windows = np.tile(windows, (len(leads), 1))
+    agreed = np.where(ratio > 0, ratio, 0.0)
+    agreed[np.isinf(agreed)] = 0.0
+    sure = agreed.sum(axis=1) > np.log(len(windows) / _CHANCE)
     if not sure.any():
-        return rows[windows[np.argmax(agreed), :leading]], scale
-    return rows[_largest_group(len(rows), windows[sure], good[sure])], scale
+        best = int(np.argmax(agreed.sum(axis=1)))
+        return rows[windows[best, np.isposinf(ratio[best])]], variance
+    good = ratio[sure] > -np.log(_CHANCE)
+    return rows[_largest_group(len(rows), windows[sure], good)], variance
+
+
+def _likeliest_variance(samples: '_Samples', windows: Indices, leads: list[Indices]) -> float:
+    """Return the variance by which fixes follow best from each other, half of them true."""
+    def likely(variance: float) -> float:
+        ratios = [samples.log_ratio(windows, variance, lead) for lead in leads]
+        return sum(float(np.logaddexp(0.0, ratio[ratio < np.inf]).sum()) for ratio in ratios)
+
+    return float(max(_VARIANCES.tolist(), key=likely))
 
 
 def _windows(count: int, size: int, most: int) -> Indices:
@@ -111,27 +127,28 @@ class _Samples:
         claims = speaks * np.log(np.maximum(width, _TINY)) / 2 + np.log(diagonal)
         self._claim: Array = claims.sum(axis=1)
 
-    def log_ratio(self, windows: Indices, scale: float) -> Array:
+    def log_ratio(self, windows: Indices, variance: float, lead: Indices) -> Array:
         """
         Return how much likelier each fix is if true than if anywhere, (w, k) logarithms.
 
-        0 of those that say where the map is; scale : of the variance of the odometry.
+        Infinite of those that say where the map is, `lead`; variance : of the odometry.
         """
         manifold, fixes = self._manifold, self._fixes
         (w, k), q, d = windows.shape, _SAMPLES + 1, manifold.TANGENT_SIZE
-        leading, p = manifold.TRANSLATION.stop, manifold.POSE_SIZE
-        ways = self._retracted(self._way, np.sqrt(scale) * self._drift).reshape(q, -1, p)
+        p = manifold.POSE_SIZE
+        ways = self._retracted(self._way, np.sqrt(variance) * self._drift).reshape(q, -1, p)
         local = [np.tile(manifold.identity(1), (q * w, 1))]
         for at in range(k - 1):
             local.append(manifold.compose(local[-1], ways[:, windows[:, at]].reshape(-1, p)))
         first = [self._retracted(fixes.measurement[windows[:, at]], self._noise[:, windows[:, at]])
-                 for at in range(leading)]
-        here, there = (manifold.positions(np.stack(poses[:leading], axis=1))
-                       for poses in (local, first))
-        whole = np.tile(fixes.speaks[windows[:, 0]].all(axis=1), q)[:, None]
-        T = np.where(whole, first[0], manifold.from_rotation(*align(here, there)))
-        ratio = np.zeros((w, k))
-        for at in range(leading, k):
+                 for at in lead]
+        here, there = (manifold.positions(np.stack(poses, axis=1))
+                       for poses in ([local[at] for at in lead], first))
+        whole = np.tile(fixes.speaks[windows[:, lead[0]]].all(axis=1), q)[:, None]
+        T = np.where(whole, manifold.compose(first[0], manifold.inverse(local[lead[0]])),
+                     manifold.from_rotation(*align(here, there)))
+        ratio = np.full((w, k), np.inf)
+        for at in np.setdiff1d(np.arange(k), lead):
             row = windows[:, at]
             seen = manifold.compose(T, local[at])
             e = manifold.local(np.tile(fixes.measurement[row], (q, 1)), seen).reshape(q, w, d)

@@ -59,6 +59,8 @@ _KNOWN = 20
 # fit exactly, as of a simulator, say of ever less that it is still too much. At a thirtieth of
 # the stated deviations the map has long stopped to change.
 _LEAST_VARIANCE = 1e-3
+# While driving so many of the last absolute factors are looked at, with their neighbours.
+_LATEST = 50
 # Pairs are formed of so many loops that fit best.
 _CANDIDATES = 200
 # [keyframes] Loops whose ends are nearer to each other, in sum, may be one and the same mistake.
@@ -109,9 +111,9 @@ class Growth:
 
     def resume(self, poses: Array, accepted: Mask, variance: Array) -> None:
         """Go on from an earlier state: poses (n, p), accepted (m,), variance (2,)."""
-        self.poses, self.variance = poses, variance
+        self.poses, self.variance = poses, variance.copy()
         self.accepted = accepted | self.trusted
-        self._tie_to_world()
+        self._tie_to_world(_LATEST)
         if (self.accepted & self.is_loop).any():
             self.settle()
         else:
@@ -122,13 +124,27 @@ class Growth:
         """Whether an absolute factor is accepted."""
         return bool((self.accepted & self.factors.is_absolute).any())
 
-    def _tie_to_world(self) -> None:
-        """Accept absolute factors where none is: until then the map says nothing of any."""
-        if self._tied or not self.factors.is_absolute.any():
+    def _tie_to_world(self, latest: int | None = None) -> None:
+        """
+        Accept the absolute factors that agree with their neighbours, if these are more than are.
+
+        Until some are, the map says nothing of any; and behind a long way, little of the next.
+
+        latest : so many of them are looked at; None: all
+        """
+        absolute = self.factors.is_absolute
+        held = self.accepted & absolute
+        if (held == absolute).all():
             return
-        rows, variance = first_fixes(self.graph)
+        # As many may have been accepted for want of others.
+        known = np.count_nonzero(held) > self.graph.manifold.TRANSLATION.stop
+        rows, variance = first_fixes(self.graph, latest, self.variance[0] if known else None)
+        if not (known and held[rows].any()):
+            if len(rows) <= np.count_nonzero(held):
+                return
+            self.accepted &= ~absolute | self.trusted
+            self.variance[0] = max(variance, _LEAST_VARIANCE)
         self.accepted[rows] = True
-        self._scale_variance(np.array([variance, 1.0]))
         self.poses = placed(self.graph.subset(self.accepted), self.poses)
 
     def copy(self) -> 'Growth':

@@ -26,13 +26,11 @@ from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import silent_components
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.io.files import NANOSECONDS, quoted, stamp_text
+from l1slam_ros.io.files import NANOSECONDS, QUATERNION_NORM_ERROR, quoted, stamp_text
 
 _REFERENCE_FRAME = re.compile(r'(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
 # builtin_interfaces/Time holds its seconds in 32 bits.
 _MAX_SECONDS = 2**31 - 1
-# Two printed digits stay below; an unset or broken quaternion does not.
-QUATERNION_NORM_ERROR = 0.1
 # [m] No robot's coordinates: beyond, differences of positions lose the millimetre, then overflow.
 _FARTHEST = 1e9
 

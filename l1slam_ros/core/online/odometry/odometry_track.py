@@ -12,7 +12,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.measurements import LONGEST_PAUSE
-from l1slam_ros.core.online.odometry.odometry_stream import UNSEEN, UNSEEN_TURN, is_identity
+from l1slam_ros.core.online.odometry.odometry_stream import UNSEEN, is_identity
 
 # So many keyframes tell how fast the robot goes.
 _RECENT = 16
@@ -126,7 +126,7 @@ class OdometryTrack:
         Tell whether odometry after a pause is in the frame that it was in, by a first pose (1, p).
 
         It does not begin anew, and offset (1, p) takes it to where the robot can have gone: twice
-        as fast as of late, or as one that nobody saw.
+        as fast as of late, or as fast as one that nobody saw.
         """
         if is_identity(self._manifold, pose):
             return False
@@ -135,12 +135,10 @@ class OdometryTrack:
         times, poses = self.keyframe_stamps[recent], self.keyframe_poses[recent]
         step = self._manifold.local(np.concatenate((poses[:-1], self.last_pose)),
                                     np.concatenate((poses[1:], pose)))
-        seconds = np.append(np.diff(times), stamp - self.last_stamp) * 1e-9
-        pause = float(seconds[-1])
-        return pause <= LONGEST_PAUSE and all(
-            way[-1] <= pause * max(2 * (way[:-1] / seconds[:-1]).max(initial=0.0), unseen)
-            for way, unseen in zip(self._manifold.motion(step), (UNSEEN, UNSEEN_TURN),
-                                   strict=True))
+        way, seconds = self._manifold.motion(step)[0], np.diff(times, append=stamp) * 1e-9
+        speed = max(2 * (way[:-1] / seconds[:-1]).max(initial=0.0), UNSEEN)
+        pause = (stamp - self.last_stamp) * 1e-9
+        return bool(pause <= LONGEST_PAUSE and way[-1] <= pause * speed)
 
     def known_until(self, arrivals: Indices, times: Indices) -> Indices:
         """

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Laws every manifold obeys, by parametrisation; then what is SE(2)'s own."""
+"""Laws every manifold obeys, by parametrisation; then what is SE(2)'s and SE(3)'s own."""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry import se2, se3
 
-MANIFOLDS = [se2]
+MANIFOLDS = [se2, se3]
 N = 20
 H = 1e-6  # of a central difference
 
@@ -28,10 +28,10 @@ def anywhere(manifold, rng):
 
 
 def turned_about(manifold, rng):
-    """Headings at and next to the seam between pi and -pi."""
+    """Turns at and next to the seam between pi and -pi, about one axis: the plane's, if it may."""
     beyond_pi = np.resize([0.0, 1e-15, -1e-15, 1e-9, -1e-9, 1e-3, -1e-3], N)
-    return from_rotations(manifold, rng,
-                          Rotation.from_rotvec(np.outer(np.pi + beyond_pi, [0, 0, 1])))
+    axis = [0, 0, 1] if manifold is se2 else np.array([2, -6, 3]) / 7
+    return from_rotations(manifold, rng, Rotation.from_rotvec(np.outer(np.pi + beyond_pi, axis)))
 
 
 def from_rotations(manifold, rng, rotation):
@@ -131,9 +131,12 @@ def test_adjoint_of_a_product_is_the_product(manifold, triple):
                     manifold.adjoint(a) @ manifold.adjoint(b), atol=1e-11)
 
 
-def test_residual_is_the_local_of_the_measurement(manifold, triple):
+def test_residual_reads_the_coordinates_off_the_error(manifold, triple):
     z, a, b = triple
-    assert_allclose(manifold.residual(z, a, b), manifold.local(z, manifold.between(a, b)))
+    t, turn = np.split(manifold.local(z, manifold.between(a, b)), [manifold.TRANSLATION.stop], 1)
+    if manifold is se3:
+        turn = turn * np.sinc(np.linalg.norm(turn, axis=1, keepdims=True) / 2 / np.pi)
+    assert_allclose(manifold.residual(z, a, b), np.hstack((t, turn)), atol=1e-12)
     assert_allclose(manifold.residual(manifold.between(a, b), a, b), 0, atol=1e-12)
 
 
@@ -176,7 +179,7 @@ def test_residual_curvature_equals_differences_of_the_gradient(manifold, triple,
 
     expected = np.stack([(gradient(H * axis) - gradient(-H * axis)) / (2 * H)
                          for axis in np.eye(2 * d)], axis=2)
-    curvature = manifold.residual_curvature(a, b, gradients(manifold, z, a, b, dual))
+    curvature = manifold.residual_curvature(z, a, b, dual)
     assert_allclose(curvature, expected, atol=1e-7)
     assert_array_equal(curvature, curvature.transpose(0, 2, 1))
 
@@ -234,6 +237,14 @@ def test_pose3_composes_as_rigid_motions_of_space_do(manifold, triple):
     assert_allclose(product[:, :3], first[:, :3] + R_a.apply(second[:, :3]), atol=1e-12)
 
 
+def test_rotation_matrices_there_and_back(manifold, triple):
+    a = triple[0]
+    R, k = manifold.rotation(a), manifold.positions(a).shape[1]
+    expected = Rotation.from_quat(manifold.to_pose3(a)[:, 3:]).as_matrix()
+    assert_allclose(R, expected[:, :k, :k], atol=1e-12)
+    assert_same(manifold, manifold.from_rotation(R, manifold.positions(a)), a)
+
+
 @pytest.mark.parametrize('factor', [-1.0, 0.95, -1.07])
 def test_a_quaternion_and_its_multiples_are_one_pose(manifold, triple, factor):
     pose3 = manifold.to_pose3(triple[0])
@@ -286,8 +297,32 @@ def test_headings_come_out_within_half_a_turn(verb, rng):
     assert (theta > -np.pi).all() and (theta <= np.pi).all()
 
 
-def test_stacks_of_none_pass_through():
-    none = se2.identity(0)
-    J_r_i, J_r_j = se2.residual_jacobians(none, none, none)
-    assert se2.compose(none, none).shape == se2.residual(none, none, none).shape == (0, 3)
-    assert J_r_i.shape == J_r_j.shape == se2.adjoint(none).shape == (0, 3, 3)
+def test_stacks_of_none_pass_through(manifold):
+    none, d = manifold.identity(0), manifold.TANGENT_SIZE
+    J_r_i, J_r_j = manifold.residual_jacobians(none, none, none)
+    assert manifold.compose(none, none).shape == none.shape
+    assert manifold.residual(none, none, none).shape == manifold.local(none, none).shape == (0, d)
+    assert J_r_i.shape == J_r_j.shape == manifold.adjoint(none).shape == (0, d, d)
+
+
+# SE(3) alone
+
+
+def test_an_upright_robot_moves_as_in_the_plane(rng):
+    """The residual's turn is 2 sin(angle / 2), so small errors; Jacobians and curvature, too."""
+    flat = rng.uniform(-3, 3, (2, N, 3))
+    z = se2.retract(se2.between(*flat), 1e-7 * rng.standard_normal((N, 3)))
+    flat = (z, *flat)
+    upright = [se2.to_pose3(pose) for pose in flat]
+    plane = np.array([0, 1, 5])
+    assert_allclose(se3.residual(*upright)[:, plane], se2.residual(*flat), atol=1e-14)
+    for J, J_flat in zip(se3.residual_jacobians(*upright), se2.residual_jacobians(*flat),
+                         strict=True):
+        assert_allclose(J[:, plane[:, None], plane], J_flat, atol=1e-6)
+
+
+def test_what_is_normalised_stays_as_it_is_to_the_last_bit(rng):
+    pose3 = np.concatenate((rng.standard_normal((500, 3)), rng.standard_normal((500, 4))), axis=1)
+    once = se3.from_pose3(pose3)
+    assert (once[:, 6] >= 0).all()
+    assert_array_equal(se3.from_pose3(once), once)

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from l1slam_ros.cli.inspection import bag_numbers, complaints, numbers
+from l1slam_ros.cli.summary import bag_numbers, complaints, numbers
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
