@@ -71,7 +71,7 @@ def main() -> None:
     from robust_runs import measure
     from robust_solvers import ONLINE_OURS, OURS
 
-    from l1slam_ros.core.solvers.warm_up import warm_up
+    from l1slam_ros.io.warm_up import warm_up
 
     # Each run is a copy of this process, which has all loops compiled.
     warm_up()
