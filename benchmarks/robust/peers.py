@@ -4,8 +4,7 @@ gtsam's robust solvers: Levenberg-Marquardt with a kernel, GNC, ISAM2 with a ker
 
 Kernels are on the loops alone, the odometry of the graph is not doubted, and GNC is told that it
 need not be. Graphs are built before the clock starts. None but GNC says which loops it believes,
-so for all of them a loop counts as kept when the map that comes out agrees with it: see
-`robust_runs`.
+so for all of them a loop counts as kept when the map that comes out agrees with it: see `runs`.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,7 +14,7 @@ import numpy as np
 from graph_peers import PRIOR_SIGMA, gtsam_values, information_of
 from graph_solvers import MOST_ITERATIONS, SAME_TOLERANCE
 from measuring import clock
-from robust_solvers import Driven, Found, OnlineSolver, RobustSolver
+from robust.solvers import LOOK, Found, RobustSolver
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -116,8 +115,8 @@ def _by_gnc(graph: FactorGraph, poses: Array) -> Found:
     return _timed(optimise)
 
 
-def _isam2(kernel: str) -> Callable[[FactorGraph, int], Driven]:
-    def drive(graph: FactorGraph, every: int) -> Driven:
+def _isam2(kernel: str) -> Callable[[FactorGraph, Array], Found]:
+    def drive(graph: FactorGraph, poses: Array) -> Found:
         """Add pose by pose, each with the factors that end there."""
         import gtsam
 
@@ -133,9 +132,9 @@ def _isam2(kernel: str) -> Callable[[FactorGraph, int], Driven]:
             isam.update(new, values)
             at = isam.calculateEstimatePose2(k)
             seconds += clock() - began
-            if (k + 1) % every == 0:
+            if (k + 1) % LOOK == 0:
                 maps.append(_map(isam))
-        return Driven(maps, _map(isam), seconds)
+        return Found(_map(isam), seconds, maps=tuple(maps))
 
     return drive
 
@@ -170,7 +169,9 @@ def _map(isam: Any) -> Array:
 
 _METHODS = {'DCS': _by_kernel('DCS'), 'GM': _by_kernel('GemanMcClure'), 'GNC': _by_gnc,
             'Huber': _by_kernel('Huber'), 'Cauchy': _by_kernel('Cauchy')}
-PEERS = tuple(RobustSolver(f'gtsam {name} from {start}', False, start, solve)
-              for name, solve in _METHODS.items() for start in ('odometry', 'seed', 'stored'))
-ONLINE_PEERS = tuple(OnlineSolver(f'ISAM2 {name}', False, _isam2(kernel))
-                     for name, kernel in (('DCS', 'DCS'), ('GM', 'GemanMcClure')))
+PEERS = (
+    *(RobustSolver(f'gtsam {name} from {start}', 'l2', start, solve)
+      for name, solve in _METHODS.items() for start in ('odometry', 'seed', 'stored')),
+    *(RobustSolver(f'ISAM2 {name}', 'l2', 'odometry', _isam2(kernel), online=True)
+      for name, kernel in (('DCS', 'DCS'), ('GM', 'GemanMcClure'))),
+)

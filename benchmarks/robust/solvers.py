@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What solvers of graphs with lies are to the measurements, and our own: the only door to ours."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import incremental
+import numpy as np
+from measuring import clock
+from robust.changes import information_of
+
+from l1slam_ros.core.errors import L1SlamError
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
+from l1slam_ros.core.online.backend import Backend, BackendOptions
+from l1slam_ros.core.online.loop_states import ACCEPTED
+from l1slam_ros.core.robust import batch_map
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+
+# Online: an update after so many keyframes, for so long [s].
+_EVERY, _BUDGET = 10, 0.1
+# Updates after the last keyframe, while the robot stands still.
+_LAST_UPDATES, _LAST_BUDGET = 5, 0.5
+# [m, rad] Two measurements of one pair are the same loop.
+_SAME = 1e-6
+DOUBTFUL, REFUSED = 'doubtful', 'refused'
+
+
+@dataclass(frozen=True)
+class Found:
+    """
+    A map and what it took.
+
+    poses : (n, p); seconds : [s]; accepted : (m,) bool, None where the solver does not say;
+    slips : rows of odometry factors it takes for lies; status : its own word on the map; why :
+    it is doubtful, or there is none; maps : (k, p) each, of those on the way.
+    """
+
+    poses: Array
+    seconds: float
+    accepted: Mask | None = None
+    slips: tuple[int, ...] = ()
+    status: str = ''
+    why: str = ''
+    maps: tuple[Array, ...] = ()
+
+
+@dataclass(frozen=True)
+class RobustSolver:
+    """
+    Something that makes a map.
+
+    norm : what it minimises, l1 or l2; start : of `runs.STARTS`; solve : from a graph and poses
+    (n, p) to what it found; online : pose by pose, with maps on the way every `LOOK` keyframes.
+    """
+
+    name: str
+    norm: str
+    start: str
+    solve: Callable[[FactorGraph, Array], Found]
+    online: bool = False
+
+
+# Keyframes between two looks at the map of a running back end.
+LOOK = 50
+
+
+def _batch(norm: str) -> Callable[[FactorGraph, Array], Found]:
+    """Count all from the factor graph on; the poses are not looked at."""
+
+    def solve(graph: FactorGraph, poses: Array) -> Found:
+        began = clock()
+        try:
+            outcome = batch_map.solve(graph, None, batch_map.Wish(norm=norm, robust=True))
+        except L1SlamError as error:
+            return Found(poses, clock() - began, graph.between.is_odometry.copy(),
+                         status=REFUSED, why=str(error))
+        seconds, judgement = clock() - began, outcome.judgement
+        assert judgement is not None
+        doubt = judgement.doubt
+        return Found(outcome.solution.poses, seconds, judgement.accepted,
+                     tuple(judgement.slips.tolist()),
+                     DOUBTFUL if doubt else outcome.solution.status.value,
+                     str(doubt) if doubt else '')
+
+    return solve
+
+
+def _online(graph: FactorGraph, poses: Array) -> Found:
+    """Feed the back end as the node does, robust as it is by default."""
+    nothing = {'translation': 0.0, 'rotation': 0.0, 'period': 0.0}
+    backend = Backend(BackendOptions.from_mapping(
+        {'keyframe': nothing, 'odometry': {'covariance_source': 'increment'}}))
+    maps, seconds = [], 0.0
+    for k, (sample, loops) in enumerate(incremental.measurements(_in_time(graph)), 1):
+        backend.add_odometry(sample)
+        for loop in loops:
+            backend.add_loop(loop)
+        if k % _EVERY == 0:
+            seconds += _updated(backend, _BUDGET)
+        if k % LOOK == 0:
+            maps.append(backend.poses)
+    for _ in range(_LAST_UPDATES):
+        seconds += _updated(backend, _LAST_BUDGET)
+    return Found(backend.poses, seconds, _accepted(backend, graph), maps=tuple(maps))
+
+
+def _in_time(graph: FactorGraph) -> GraphRecord:
+    """Return the graph with each factor from the earlier keyframe to the later one."""
+    i, j, measurement = ends_in_time(graph)
+    factors, information = graph.between, information_of(graph)
+    turned = factors.i > factors.j
+    adjoint = graph.manifold.adjoint(measurement[turned])
+    information[turned] = adjoint.transpose(0, 2, 1) @ information[turned] @ adjoint
+    forward = FactorGraph(graph.manifold)
+    forward.add_poses(graph.n_poses)
+    forward.add_between(i, j, measurement, information, factors.trusted)
+    return GraphRecord(forward, None, np.arange(graph.n_poses))
+
+
+def _updated(backend: Backend, budget: float) -> float:
+    began = clock()
+    backend.update(budget)
+    return clock() - began
+
+
+def _accepted(backend: Backend, graph: FactorGraph) -> Mask:
+    """Return which factors of the graph the back end uses; it takes a repeated loop once."""
+    states, used = backend.loop_states(), backend.snapshot().graph.between
+    rows = states.rows[states.state[: len(states.rows)] == ACCEPTED]
+    measured: dict[tuple[int, int], list[Array]] = {}
+    for i, j, Z in zip(used.i[rows].tolist(), used.j[rows].tolist(), used.measurement[rows],
+                       strict=True):
+        measured.setdefault((i, j), []).append(Z)
+    accepted = graph.between.is_odometry.copy()
+    for row, (i, j, Z) in enumerate(zip(*ends_in_time(graph), strict=True)):
+        accepted[row] |= any(np.allclose(Z, other, atol=_SAME)
+                             for other in measured.get((int(i), int(j)), []))
+    return accepted
+
+
+OURS = (RobustSolver('ours L1', 'l1', 'odometry', _batch('l1')),
+        RobustSolver('ours L2', 'l2', 'odometry', _batch('l2')),
+        RobustSolver('ours online', 'l1', 'odometry', _online, online=True))
