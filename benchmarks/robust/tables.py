@@ -45,8 +45,9 @@ def _introduction(recorded: Mapping[str, Any]) -> Lines:
         '- **error**: position, RMSE after alignment, to the truth of a recording, else to the '
         'map of the true loops in the same norm. A map is **right** when its error is at most '
         f'that of its bar (most kinds: {limits}, elsewhere {HOLDS_ELSEWHERE:g} m), false loops '
-        'kept and true ones lost are within it, no slip is named that is none, and what is believed leaves '
-        'as many parts as there are. **pass**: right, or doubtful where that is an answer.',
+        'kept and true ones lost are within it, no slip is named that is none, and what is '
+        'believed leaves as many parts as there are. **pass**: right, or doubtful where that is '
+        'an answer.',
         '- **kept**, **lost**: mean of the false and of the true loops. gtsam does not say which '
         'it believes: those whose residual at its map is within the '
         f'{KEPT_PROBABILITY:.1%} quantile of chi2. **slips**: named and there, of those there; '
