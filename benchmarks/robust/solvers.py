@@ -16,6 +16,7 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.robust import batch_map
+from l1slam_ros.core.robust.judgement import Doubt
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 
 # Online: an update after so many keyframes, for so long [s].
@@ -78,13 +79,16 @@ def _batch(norm: str) -> Callable[[FactorGraph, Array], Found]:
                          status=REFUSED, why=str(error))
         seconds, judgement = clock() - began, outcome.judgement
         assert judgement is not None
-        doubt = judgement.doubt
         return Found(outcome.solution.poses, seconds, judgement.accepted,
                      tuple(judgement.slips.tolist()),
-                     DOUBTFUL if doubt else outcome.solution.status.value,
-                     str(doubt) if doubt else '')
+                     *_said(judgement.doubt, outcome.solution.status.value))
 
     return solve
+
+
+def _said(doubt: Doubt | None, status: str) -> tuple[str, str]:
+    """Return its word on the map, and why it is doubtful."""
+    return (DOUBTFUL, str(doubt)) if doubt else (status, '')
 
 
 def _online(graph: FactorGraph, poses: Array) -> Found:
@@ -103,7 +107,12 @@ def _online(graph: FactorGraph, poses: Array) -> Found:
             maps.append(backend.poses)
     for _ in range(_LAST_UPDATES):
         seconds += _updated(backend, _LAST_BUDGET)
-    return Found(backend.poses, seconds, _accepted(backend, graph), maps=tuple(maps))
+    judgement = backend.snapshot().optimised.judgement
+    used, factors = backend.snapshot().graph.between, graph.between
+    slips = np.isin(np.where(factors.is_odometry, np.minimum(factors.i, factors.j), -1),
+                    used.i[judgement.slips])
+    return Found(backend.poses, seconds, _accepted(backend, graph),
+                 tuple(np.flatnonzero(slips).tolist()), *_said(judgement.doubt, ''), tuple(maps))
 
 
 def _in_time(graph: FactorGraph) -> GraphRecord:
