@@ -35,21 +35,22 @@ def aliased_loops(graph: FactorGraph, poses: Array, streets: int, same: bool,
 
     same : one transform for all of them, else each has its own
     """
-    runs: list[tuple[Indices, Indices, Array]] = []
-    taken = np.zeros(graph.n_poses, bool)
-    wrong = None
     for _ in range(_TRIES):
-        wrong = wrong if same and wrong is not None else _wrong_transform(graph, poses, rng)
-        run = _street(graph, poses, wrong, taken, length, rng)
-        if run is None:
-            # Nowhere in this map is what this transform needs.
-            wrong = None if not runs else wrong
-            continue
-        runs.append((*run, wrong))
-        taken[run[1]] = True
-        if len(runs) == streets:
-            return _loops(graph, poses, runs)
-    raise GraphError(f'{streets} streets asked for, found room for {len(runs)}')
+        runs: list[tuple[Indices, Indices, Array]] = []
+        taken = np.zeros(graph.n_poses, bool)
+        wrong = _wrong_transform(graph, poses, rng)
+        for _ in range(_TRIES):
+            run = _street(graph, poses, wrong, taken, length, rng)
+            if run is not None:
+                runs.append((*run, wrong))
+                taken[run[1]] = True
+            elif same:
+                # This map has not enough streets that one transform makes alike.
+                break
+            if len(runs) == streets:
+                return _loops(graph, poses, runs)
+            wrong = wrong if same else _wrong_transform(graph, poses, rng)
+    raise GraphError(f'{streets} streets of {length} keyframes asked for, found no room')
 
 
 def _wrong_transform(graph: FactorGraph, poses: Array, rng: np.random.Generator) -> Array:
