@@ -48,7 +48,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument('--seeds', type=_seeds, default=range(3), metavar='N | A-B',
                         help='each case is drawn so often, or with seeds A to B')
     parser.add_argument('--solvers', type=_words, default=DEFAULT_SOLVERS, metavar='WORD,...',
-                        help='those whose names contain one of these, e.g. ours,DCS,ISAM2')
+                        help='those whose names contain one of these, e.g. ours L2,live,ISAM2')
     parser.add_argument('--limit', type=float, default=120.0,
                         help='processor time of one run [s]; who needs more gets no other seed')
     parser.add_argument('--output', type=Path,

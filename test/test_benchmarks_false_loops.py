@@ -138,7 +138,7 @@ def run_of(place, name, share, found):
                                                   lambda graph, poses: found(case)), 5.0)
 
 
-@pytest.mark.parametrize('solver', solvers.OURS, ids=lambda solver: solver.name)
+@pytest.mark.parametrize('solver', solvers.OURS[:3], ids=lambda solver: solver.name)
 def test_ours_tells_false_loops_from_true_ones(solver):
     case = cases.false_case(place_of(120), kind('random'), 0.3, 0)
     run = runs.run_of(case, solver, 60.0)

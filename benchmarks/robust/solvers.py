@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What solvers of graphs with lies are to the measurements, and our own: the only door to ours."""
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -25,6 +26,8 @@ _EVERY, _BUDGET = 10, 0.1
 _LAST_UPDATES, _LAST_BUDGET = 5, 0.5
 # [m, rad] Two measurements of one pair are the same loop.
 _SAME = 1e-6
+# Live: [s] at rest when no map came for so long, and in any case after so long.
+_REST, _LONGEST_REST = 3.0, 60.0
 DOUBTFUL, REFUSED = 'doubtful', 'refused'
 
 
@@ -91,28 +94,56 @@ def _said(doubt: Doubt | None, status: str) -> tuple[str, str]:
     return (DOUBTFUL, str(doubt)) if doubt else (status, '')
 
 
-def _online(graph: FactorGraph, poses: Array) -> Found:
-    """Feed the back end as the node does, robust as it is by default."""
-    nothing = {'translation': 0.0, 'rotation': 0.0, 'period': 0.0}
-    backend = Backend(BackendOptions.from_mapping(
-        {'keyframe': nothing, 'odometry': {'covariance_source': 'increment'}}))
-    maps, seconds = [], 0.0
-    for k, (sample, loops) in enumerate(incremental.measurements(_in_time(graph)), 1):
-        backend.add_odometry(sample)
-        for loop in loops:
-            backend.add_loop(loop)
-        if k % _EVERY == 0:
-            seconds += _updated(backend, _BUDGET)
-        if k % LOOK == 0:
-            maps.append(backend.poses)
-    for _ in range(_LAST_UPDATES):
-        seconds += _updated(backend, _LAST_BUDGET)
-    judgement = backend.snapshot().optimised.judgement
-    used, factors = backend.snapshot().graph.between, graph.between
-    slips = np.isin(np.where(factors.is_odometry, np.minimum(factors.i, factors.j), -1),
-                    used.i[judgement.slips])
-    return Found(backend.poses, seconds, _accepted(backend, graph),
-                 tuple(np.flatnonzero(slips).tolist()), *_said(judgement.doubt, ''), tuple(maps))
+def _online(rate: float) -> Callable[[FactorGraph, Array], Found]:
+    """
+    Feed the back end as the node does, robust as it is by default.
+
+    rate : keyframes a second, updates in the background; 0: the updates are waited for
+    """
+
+    def solve(graph: FactorGraph, poses: Array) -> Found:
+        maps, seconds, process, began = [], 0.0, clock(), time.monotonic()
+        nothing = dict.fromkeys(('translation', 'rotation', 'period'), 0.0)
+        options = BackendOptions.from_mapping(
+            {'keyframe': nothing, 'odometry': {'covariance_source': 'increment'}})
+        with Backend(options, background=rate > 0) as backend:
+            for k, (sample, loops) in enumerate(incremental.measurements(_in_time(graph)), 1):
+                backend.add_odometry(sample)
+                for loop in loops:
+                    backend.add_loop(loop)
+                if rate:
+                    time.sleep(max(0.0, began + k / rate - time.monotonic()))
+                elif k % _EVERY == 0:
+                    seconds += _updated(backend, _BUDGET)
+                if k % LOOK == 0:
+                    maps.append(backend.poses)
+            if rate:
+                _come_to_rest(backend)
+                seconds = clock() - process
+            else:
+                seconds += sum(_updated(backend, _LAST_BUDGET) for _ in range(_LAST_UPDATES))
+            return _found(backend, graph, seconds, tuple(maps))
+
+    return solve
+
+
+def _come_to_rest(backend: Backend) -> None:
+    """Wait, as a robot that stands still, until no map follows another."""
+    began, maps = time.monotonic(), -1
+    while backend.maps != maps and time.monotonic() - began < _LONGEST_REST:
+        maps = backend.maps
+        time.sleep(_REST)
+
+
+def _found(backend: Backend, graph: FactorGraph, seconds: float,
+           maps: tuple[Array, ...]) -> Found:
+    """Return what the back end believes, by the rows of the graph it was fed."""
+    now, factors = backend.snapshot(), graph.between
+    judgement = now.optimised.judgement
+    steps = np.where(factors.is_odometry, np.minimum(factors.i, factors.j), -1)
+    slips = np.flatnonzero(np.isin(steps, now.graph.between.i[judgement.slips]))
+    return Found(backend.poses, seconds, _accepted(backend, graph), tuple(slips.tolist()),
+                 *_said(judgement.doubt, ''), maps)
 
 
 def _in_time(graph: FactorGraph) -> GraphRecord:
@@ -151,4 +182,6 @@ def _accepted(backend: Backend, graph: FactorGraph) -> Mask:
 
 OURS = (RobustSolver('ours L1', 'l1', 'odometry', _batch('l1')),
         RobustSolver('ours L2', 'l2', 'odometry', _batch('l2')),
-        RobustSolver('ours online', 'l1', 'odometry', _online, online=True))
+        RobustSolver('ours online', 'l1', 'odometry', _online(0.0), online=True),
+        *(RobustSolver(f'ours live {rate}', 'l1', 'odometry', _online(rate), online=True)
+          for rate in (50, 150, 400)))
