@@ -124,7 +124,7 @@ def _remarks(saved: SavedMap) -> dict[str, Any]:
     return values | {
         'doubt': doubt and asdict(doubt), 'robust': saved.robust,
         'trusted': growth.graph.between.trusted, 'struck': growth.graph.between.struck,
-        'seen': {key.hex(): growth.seen[key] for key in sorted(growth.seen)},
+        'seen': [[key.hex(), growth.seen[key]] for key in sorted(growth.seen)],
         'waiting': [[loop.reference_stamp, loop.stamp, loop.trusted, loop.struck, age,
                      loop.pose3.tolist(), loop.covariance.tolist()]
                     for loop, age in growth.waiting]}
@@ -142,7 +142,7 @@ def _read(path: Path) -> SavedMap:
         (LoopClosure(reference, stamp, np.array(pose3), np.array(covariance), trusted, struck),
          age)
         for reference, stamp, trusted, struck, age, pose3, covariance in values.pop('waiting'))
-    seen = {bytes.fromhex(key): row for key, row in values.pop('seen').items()}
+    seen = {bytes.fromhex(key): row for key, row in values.pop('seen')}
     doubt = values.pop('doubt')
     judgement = replace(_restored(optimised.judgement, values), doubt=doubt and Doubt(**doubt))
     return SavedMap(replace(_restored(growth, values), waiting=waiting, seen=seen),
