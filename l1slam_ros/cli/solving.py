@@ -16,13 +16,13 @@ from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import SENTENCES
 from l1slam_ros.core.solvers.solve import PRIMAL_DUAL
-from l1slam_ros.core.solvers.warm_up import DENSE, JUDGEMENT, SPARSE, with_space
 from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import compile_now
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.node_options import read_params_file
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.sentences import DOUBTFUL, doubt_sentence, judgement_sentences
+from l1slam_ros.io.warm_up import DENSE, JUDGEMENT, SPARSE, with_space
 from l1slam_ros.io.wording import counted
 
 

@@ -3,7 +3,7 @@
 
 # The first of each is the default.
 STARTS = ('seed', 'file', 'odometry')
-NORMS = ('l1', 'l2', 'huber')
+NORMS = ('l1', 'group-l1', 'l2', 'huber')
 SOLVERS = ('auto', 'primal-dual', 'interior-point')
 KINDS_OF_FALSE_LOOPS = ('random', 'identity', 'grouped')
 # What the rotation block of the information in a g2o file of poses in space is of.

@@ -27,7 +27,7 @@ from l1slam_ros.core.online.background import Background
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.loop_states import LoopStates
 from l1slam_ros.core.online.parts import as_one, of_all
-from l1slam_ros.core.online.snapshot import Optimised, Robot, SavedMap, Snapshot
+from l1slam_ros.core.online.snapshot import Optimised, Problem, Robot, SavedMap, Snapshot
 from l1slam_ros.core.online.update import Improvement, improve, optimise
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
@@ -88,12 +88,11 @@ class Backend:
         self._lock, self._solving = threading.Lock(), threading.Lock()
         self._make_way = False
         self.maps = self._map = self._changes = self._samples = 0
-        # The version at which an update found nothing to do.
-        self._at_rest: object = None
+        self._at_rest: object = None  # the version at which an update found nothing to do
+        self._graph: object = None
         self._counted: tuple[object, dict[str, int]] = (None, {})
         self._background: Background | None = None
         self.moved = self.manifold.identity(1), self.manifold.identity(1)
-        self._optimised: Optimised
         self.reset()
         self.maps = 0
         if background:
@@ -139,6 +138,17 @@ class Backend:
             self._builder = builder
             self._begin_map(optimised)
         self._wake()
+
+    def _begin_map(self, optimised: Optimised | None = None) -> None:
+        """Begin with what is known of another map; None: with nothing, if the builder did."""
+        if optimised is None and self._builder.graph is self._graph:
+            return
+        optimised = optimised or Optimised.nothing(self.manifold.identity(0))
+        self.maps += 1
+        self._map += 1
+        self._changes += 1
+        self._graph, self._optimised = self._builder.graph, optimised
+        self._map_to_odom: tuple[Array, Array] | None = None
 
     @property
     def version(self) -> tuple[int, int, int]:
@@ -210,7 +220,7 @@ class Backend:
         with self._lock:
             self._samples += 1
             self._builder.add_odometry(sample)
-            self._follow()
+            self._begin_map()
             map_to_odom = None if self._builder.held else self._map_to_odom_now()
         self._wake()
         return map_to_odom
@@ -225,20 +235,7 @@ class Backend:
         """Forget the only sample so far; see `GraphBuilder.begin_anew`."""
         with self._lock:
             self._builder.begin_anew()
-            self._follow()
-
-    def _follow(self) -> None:
-        """Begin a map where the builder did."""
-        if self._builder.graph is not self._graph:
-            self._begin_map(Optimised.nothing(self.manifold.identity(0)))
-
-    def _begin_map(self, optimised: Optimised) -> None:
-        """Leave what was made of the graph that there was, for what is known of another."""
-        self.maps += 1
-        self._map += 1
-        self._changes += 1
-        self._graph, self._optimised = self._builder.graph, optimised
-        self._map_to_odom: tuple[Array, Array] | None = None
+            self._begin_map()
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Add one loop closure; see `GraphBuilder.add_loop`."""
@@ -266,11 +263,7 @@ class Backend:
             if problem.settled or not problem.graph.n_poses:
                 self._at_rest = now.version
                 return None
-
-            def check() -> None:
-                if self._make_way or stopped() or problem.map != self._map:
-                    raise Interrupted
-
+            check = self._asker(problem, lambda: self._make_way or stopped())
             improvement = of_all(improve(as_one(problem), solver, budget, check), problem)
             check()
             self.adopt(improvement)
@@ -295,16 +288,19 @@ class Backend:
             problem = now.problem()
             if not len(problem.graph.between):
                 return None
-
-            def check() -> None:
-                if stopped() or problem.map != self._map:
-                    raise Interrupted
-
+            check = self._asker(problem, stopped)
             improvement = of_all(optimise(as_one(problem), solver, check), problem)
             check()
             self.adopt(improvement)
         self._wake()
         return improvement
+
+    def _asker(self, problem: Problem, stopped: Stopped) -> Callable[[], None]:
+        def check() -> None:
+            if stopped() or problem.map != self._map:
+                raise Interrupted
+
+        return check
 
     def adopt(self, improvement: Improvement) -> None:
         """

@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 from l1slam_ros.core import kernels
-from l1slam_ros.core.solvers.warm_up import (
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.compilation import fill_cache
+from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
+from l1slam_ros.io.warm_up import (
     DENSE,
     JUDGEMENT,
     SPARSE,
@@ -20,9 +23,6 @@ from l1slam_ros.core.solvers.warm_up import (
     module_of,
     warm_up,
 )
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.compilation import fill_cache
-from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
 
 # Prints what a process compiles.
 WORK = """
