@@ -25,6 +25,7 @@ class UpdateOptions(Options):
 class NodeOptions(BackendOptions):
     """Everything the node can be told: the back end's options and its own."""
 
+    dimension: int = option(2, 'of the world: 2 in the plane, 3 in space', '', 2, 3, fixed=True)
     map_frame: str = option('map', 'frame of the optimised poses', fixed=True)
     odom_frame: str = option('odom', 'frame of the odometry', fixed=True)
     base_frame: str = option(

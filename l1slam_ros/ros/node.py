@@ -77,7 +77,7 @@ class BackendNode(Node):
         super().__init__('backend', **keywords)
         self._declared = NodeParameters(self, NodeOptions(), self._on_options)
         options = self.options
-        self._backend = Backend(options)
+        self._backend = Backend(options, options.dimension)
         self._manifold = self._backend.manifold
         self._base_frame = BaseFrame(options.base_frame)
         self._refused: Counter[str] = Counter()

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from l1slam_ros.core.errors import Interrupted, OptionError
-from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.background import Background
@@ -34,7 +34,7 @@ from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
 # What poses live on, by the dimension of the world.
-_MANIFOLDS: dict[int, Manifold] = {2: se2}
+_MANIFOLDS: dict[int, Manifold] = {2: se2, 3: se3}
 
 # Asked on the way, often: whether to stop.
 Stopped = Callable[[], bool]
@@ -64,7 +64,7 @@ class Backend:
     Parameters
     ----------
     options : see `BackendOptions`
-    dimension : of the world: 2
+    dimension : of the world, 2 or 3
     background : update in a thread of its own whenever there is something new, until `close` or
         the end of the `with` block
 
@@ -75,16 +75,15 @@ class Backend:
 
     Raises
     ------
-    OptionError : the dimension is not supported.
+    OptionError : there is no such dimension.
 
     """
 
     def __init__(self, options: BackendOptions = BackendOptions(),  # noqa: B008
                  dimension: int = 2, background: bool = False):
         if dimension not in _MANIFOLDS:
-            raise OptionError(f'dimension {dimension!r} is not supported yet, expected 2')
-        self.manifold = _MANIFOLDS[dimension]
-        self._options = options
+            raise OptionError(f'dimension is {dimension!r}, expected 2 or 3')
+        self.manifold, self._options = _MANIFOLDS[dimension], options
         self._lock, self._solving = threading.Lock(), threading.Lock()
         self._make_way = False
         self.maps = self._map = self._changes = self._samples = 0
@@ -125,6 +124,7 @@ class Backend:
 
     def restore(self, saved: SavedMap) -> None:
         """Go on from what another back end has `saved`, in the place of the map there is."""
+        saved.require(self.manifold)
         builder = GraphBuilder(self.manifold, self._options)
         builder.restore(saved.growth)
         self._replace(builder, saved.as_judged(self._options.robust.enabled))
