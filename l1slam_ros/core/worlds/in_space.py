@@ -17,8 +17,8 @@ from l1slam_ros.core.geometry.manifold import Array
 # there are for each floor, in laps of it.
 _LENGTH, _WIDTH = 4, 2
 _HEIGHT, _LAPS = 3.0, 5
-# Points of a curve for each pose that is wanted of it.
-_FINE = 30
+# Points of a curve for each pose of it, and the fewest poses that it has.
+_FINE, _FEWEST = 30, 30
 
 
 def building(n_poses: int, step: float, block: int, rng: np.random.Generator) -> Array:
@@ -44,24 +44,26 @@ def building(n_poses: int, step: float, block: int, rng: np.random.Generator) ->
 
 
 def sphere(n_poses: int, step: float, block: int, rng: np.random.Generator) -> Array:
-    """Return a spiral from pole to pole of a sphere, its rounds a step apart, (n, 7)."""
-    radius = step * np.sqrt(n_poses / (4 * np.pi))
-    height = np.linspace(-1, 1, _FINE * n_poses)
+    """Return a spiral from pole to pole of a sphere, its rounds a step apart in height, (n, 7)."""
+    n = max(n_poses, _FEWEST)
+    radius = step * np.sqrt(n) / np.pi
+    height = np.linspace(-1, 1, _FINE * n)
     turn = 2 * np.pi * radius / step * height
     around = np.sqrt(1 - height**2)
     normal = np.column_stack((around * np.cos(turn), around * np.sin(turn), height))
-    return _drive(*_evenly(radius * normal, normal, n_poses), n_poses)
+    return _drive(*_evenly(radius * normal, normal, n), n_poses)
 
 
 def torus(n_poses: int, step: float, block: int, rng: np.random.Generator) -> Array:
     """Return a drive round the tube of a torus and once along it, rounds a step apart, (n, 7)."""
-    radius = step * np.sqrt(n_poses / (8 * np.pi**2))
-    along = np.linspace(0, 2 * np.pi, _FINE * n_poses)
+    n = max(n_poses, _FEWEST)
+    radius = step * np.sqrt(n / (8 * np.pi**2))
+    along = np.linspace(0, 2 * np.pi, _FINE * n)
     # So many rounds that on the ring in the middle of the tube, twice as wide, they fill it.
     turn = 4 * np.pi * radius / step * along
     outward = np.column_stack((np.cos(along), np.sin(along), np.zeros_like(along)))
     normal = np.cos(turn)[:, None] * outward + np.sin(turn)[:, None] * [0.0, 0.0, 1.0]
-    return _drive(*_evenly(radius * (2 * outward + normal), normal, n_poses), n_poses)
+    return _drive(*_evenly(radius * (2 * outward + normal), normal, n), n_poses)
 
 
 DRIVES: dict[str, Callable[[int, float, int, np.random.Generator], Array]] = {
