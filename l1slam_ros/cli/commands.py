@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from l1slam_ros.cli import inspection
+from l1slam_ros.cli import summary
 from l1slam_ros.io import formats
 from l1slam_ros.io.bags.topics import Topics
 from l1slam_ros.io.graphs.graph_file import GraphRecord
@@ -36,10 +36,10 @@ def convert(arguments: argparse.Namespace) -> Ending:
 def info(arguments: argparse.Namespace) -> Ending:
     """Print what is in a graph or a bag, and what looks wrong with it."""
     if formats.is_bag(arguments.input):
-        _print_rows(inspection.bag_numbers(arguments.input))
+        _print_rows(summary.bag_numbers(arguments.input))
     record = read(arguments, arguments.input, quiet=True)
-    _print_rows(inspection.numbers(record))
-    sentences = [*record.skipped, *inspection.complaints(record)]
+    _print_rows(summary.numbers(record))
+    sentences = [*record.skipped, *summary.complaints(record)]
     for sentence in sentences:
         print(f'- {sentence}')
     if not sentences and not record.damage:

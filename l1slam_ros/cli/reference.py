@@ -125,7 +125,7 @@ def known_false(path: Path, record: GraphRecord) -> np.ndarray:
     ids = read_false_loops(side)
     index = np.minimum(np.searchsorted(record.ids, ids), n - 1)
     false = pair_key(index[:, 0], index[:, 1], n)
-    pairs = pair_key(factors.i, factors.j, n)
+    pairs = pair_key(factors.pairs[:, 0], factors.pairs[:, 1], n)
     unknown = (record.ids[index] != ids).any(axis=1) | ~np.isin(false, pairs)
     if unknown.any():
         i, j = ids[np.argmax(unknown)]

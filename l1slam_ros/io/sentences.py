@@ -69,4 +69,4 @@ def doubt_sentence(doubt: Doubt, ids: Indices, stamps: Indices | None) -> str:
 
 
 def _named(pair: np.ndarray) -> str:
-    return f'{pair[0]} - {pair[1]}'
+    return f'{pair[0]} - {pair[1]}' if pair[0] != pair[1] else f'absolute pose of {pair[1]}'

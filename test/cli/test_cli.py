@@ -20,6 +20,7 @@ from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.solvers import block_cholesky as cholesky
 from l1slam_ros.core.solvers.optimality import l1_cost
+from l1slam_ros.io import progress
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 
 VERTICES = ['VERTEX_SE2 0 0 0 0', 'VERTEX_SE2 1 1 0 0', 'VERTEX_SE2 2 2 0 0']
@@ -29,6 +30,12 @@ EDGES = ['EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1',
 
 # The costs of the odometry as it stands, every loop counted.
 ODOMETRY = ('--no-robust', '--start', 'odometry', '--outer', 0)
+
+
+@pytest.fixture(autouse=True)
+def no_progress(monkeypatch):
+    """On a machine that is busy a log would have lines on what takes long."""
+    monkeypatch.setattr(progress, '_PATIENCE', float('inf'))
 
 
 def graph_file(folder, lines):

@@ -15,7 +15,6 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 from torn import torn_graph
-from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.graph.linear_system import whitened_residual
@@ -33,7 +32,7 @@ from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bags.from_graph import write_graph_bag
 from l1slam_ros.io.bags.reader import read_raw
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
-from l1slam_ros.io.messages.conversion import loop_closure, odometry_sample
+from l1slam_ros.io.messages.conversion import loop_closure, odometry_sample, stamp_of
 from l1slam_ros.io.sentences import doubt_sentence
 from l1slam_ros.ros.publishing import header
 
@@ -140,7 +139,9 @@ def test_pose_and_transform_agree_with_the_path(bench, tmp_path, rng):
     b.received['pose'].clear()
     b.received['map_to_odom'].clear()
     b.until(lambda: b.received['map_to_odom'], 'a transform is repeated')
-    assert last.header.stamp == b.received['map_to_odom'][-1].header.stamp
+    # A look-up at the time of the newest odometry finds it.
+    ahead = [stamp_of(m.header) - stamp_of(last.header) for m in b.received['map_to_odom']]
+    assert ahead[0] == pytest.approx(10**8, abs=1e4) and (np.diff(ahead) > 0).all()
 
 
 def test_default_thresholds_make_a_keyframe_every_half_metre(bench):
@@ -280,27 +281,6 @@ def test_diagnostics_count_what_was_refused(bench):
     b.until(lambda: any(
         {v.key: v.value for v in status.values}.get('refused.old_stamp') == '1'
         for message in heard for status in message.status), 'the refusal is reported')
-
-
-def test_the_graph_is_drawn_for_who_looks(bench, tmp_path, rng):
-    world = simulate_world(40, 60, WorldOptions(), rng)
-    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(40)))
-    b = bench(**EVERY_MESSAGE)
-    heard = []
-    b.peer.create_subscription(MarkerArray, 'graph', heard.append, 1)
-    b.until(lambda: b.backend._graph.get_subscription_count(), 'somebody looks')
-    play(b, tmp_path / 'bag')
-
-    def sizes():
-        return {m.ns: len(m.points) for m in heard[-1].markers} if heard else {}
-
-    def all_are_drawn():
-        points = sizes()
-        loops = [points.pop(name, 0) for name in ('loops', 'suspect_loops', 'rejected_loops')]
-        return points == {'keyframes': 40, 'odometry': 2 * 39} and sum(loops) == 2 * 21
-
-    b.until(all_are_drawn, 'keyframes and both ends of each factor are drawn')
-    assert sizes()['loops'] > 2 * 14
 
 
 def test_the_solver_never_starves_the_callbacks(bench, tmp_path, rng):

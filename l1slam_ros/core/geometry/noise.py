@@ -140,8 +140,7 @@ def bounds(found: Array, used: Array, out: Mask) -> list[tuple[float, float]]:
     return list(zip(*variances, strict=True))
 
 
-def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Array,
-                trusted: bool) -> bytes:
+def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Array) -> bytes:
     """
     Return what equal measurements have in common: stamps, pose and, to six digits, covariance.
 
@@ -152,7 +151,7 @@ def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Ar
     sigma = np.where(sigma > 0, sigma, 1.0)
     correlation = covariance.reshape(len(sigma), -1) / np.outer(sigma, sigma)
     digits = np.rint(1e6 * np.concatenate((np.log(sigma), correlation.ravel()))).astype(np.int64)
-    whole = b'%d %d %d ' % (reference, stamp, trusted) + measurement.tobytes() + digits.tobytes()
+    whole = b'%d %d ' % (reference, stamp) + measurement.tobytes() + digits.tobytes()
     return blake2b(whole, digest_size=16).digest()
 
 

@@ -24,7 +24,7 @@ _WINDOWS, _SIZE, _FOR_NOISE = 2000, 8, 100
 # By so many samples, the same each time.
 _SAMPLES, _SEED = 24, 2014
 # Variances that the odometry may have, in units of what it states.
-_VARIANCES = 2.0 ** np.arange(-10, 7)
+_VARIANCES = 3.0 ** np.arange(-6, 4)
 # A variance that is none, so that matrices have a root.
 _TINY = 1e-12
 # A window is believed where it agrees by chance with this probability at most; a fix of it, too.
@@ -115,7 +115,7 @@ class _Samples:
         poses, keyframe = odometry_poses(graph), factors.j[rows]
         self._manifold, self._fixes = manifold, BetweenFactors(
             factors.i[rows], keyframe, factors.measurement[rows],
-            factors.sqrt_information[rows], factors.trusted[rows])
+            factors.sqrt_information[rows], factors.trusted[rows], factors.struck[rows])
         self._way = manifold.between(poses[keyframe[:-1]], poses[keyframe[1:]])
         self._drift = _samples(_drift(graph, poses, keyframe), rng)
         self._noise = _samples(covariance_of(self._fixes.sqrt_information), rng)

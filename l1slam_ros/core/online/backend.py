@@ -19,16 +19,15 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from l1slam_ros.core.errors import Interrupted, OptionError
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_finite
 from l1slam_ros.core.online.background import Background
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.loop_states import LoopStates
-from l1slam_ros.core.online.snapshot import Optimised, SavedMap, Snapshot
+from l1slam_ros.core.online.parts import as_one, of_all
+from l1slam_ros.core.online.snapshot import Optimised, Problem, Robot, SavedMap, Snapshot
 from l1slam_ros.core.online.update import Improvement, improve, optimise
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
@@ -72,6 +71,7 @@ class Backend:
     ----------
     manifold : what the poses live on
     maps : how many maps there were: one more with each that was adopted or took another's place
+    moved : map -> odom before and after the last map that was adopted, (1, p) each
 
     Raises
     ------
@@ -87,10 +87,11 @@ class Backend:
         self._lock, self._solving = threading.Lock(), threading.Lock()
         self._make_way = False
         self.maps = self._map = self._changes = self._samples = 0
-        # The version at which an update found nothing to do.
-        self._at_rest: object = None
+        self._at_rest: object = None  # the version at which an update found nothing to do
+        self._graph: object = None
         self._counted: tuple[object, dict[str, int]] = (None, {})
         self._background: Background | None = None
+        self.moved = self.manifold.identity(1), self.manifold.identity(1)
         self.reset()
         self.maps = 0
         if background:
@@ -132,15 +133,22 @@ class Backend:
     def _replace(self, builder: GraphBuilder, optimised: Optimised) -> None:
         """Begin a map with the graph of a builder; what is made for the one before is left."""
         with self._lock:
-            self.maps += 1
-            self._map += 1
-            self._changes += 1
             # Options may have changed since it was made.
             builder.options = self._options
             self._builder = builder
-            self._optimised = optimised
-            self._map_to_odom: tuple[Array, Array] | None = None
+            self._begin_map(optimised)
         self._wake()
+
+    def _begin_map(self, optimised: Optimised | None = None) -> None:
+        """Begin with what is known of another map; None: with nothing, if the builder did."""
+        if optimised is None and self._builder.graph is self._graph:
+            return
+        optimised = optimised or Optimised.nothing(self.manifold.identity(0))
+        self.maps += 1
+        self._map += 1
+        self._changes += 1
+        self._graph, self._optimised = self._builder.graph, optimised
+        self._map_to_odom: tuple[Array, Array] | None = None
 
     @property
     def version(self) -> tuple[int, int, int]:
@@ -171,9 +179,9 @@ class Backend:
         builder = self._builder
         builder.add_due_loops()
         return Snapshot(
-            self._map, self._version(), builder.graph.copy(), builder.stamps, builder.odometry,
-            self._map_to_odom_now(), builder.loop_rows, builder.loop_stamps, self._optimised,
-            self._options.robust.enabled)
+            self._map, self._version(), builder.graph.copy(), builder.gaps, builder.stamps,
+            builder.odometry, self._map_to_odom_now(), builder.loop_rows, builder.loop_stamps,
+            self._optimised, self._options.robust.enabled)
 
     def counts(self) -> tuple[dict[str, int], dict[str, int]]:
         """Return the sizes of the graph, and how many loops were refused for which cause."""
@@ -208,33 +216,30 @@ class Backend:
 
         None: it is held, not used yet; see `GraphBuilder.add_odometry`.
         """
-        _require_finite(sample.pose3)
+        require_finite(sample.pose3)
         with self._lock:
             self._samples += 1
-            graph = self._builder.graph
             self._builder.add_odometry(sample)
-            if self._builder.graph is not graph:
-                self._forget_stray()
+            self._begin_map()
             map_to_odom = None if self._builder.held else self._map_to_odom_now()
         self._wake()
         return map_to_odom
+
+    def robot(self) -> Robot | None:
+        """Return where the robot is; None: no odometry has said yet where it is in this map."""
+        with self._lock:
+            last = self._builder.last
+            return Robot(last.stamp, last.pose, self._map_to_odom_now()) if last else None
 
     def begin_anew(self) -> None:
         """Forget the only sample so far; see `GraphBuilder.begin_anew`."""
         with self._lock:
             self._builder.begin_anew()
-            self._forget_stray()
-
-    def _forget_stray(self) -> None:
-        """Forget the pose of a first sample that was none: an update may have looked at it."""
-        if self._builder.graph.n_poses < 2:
-            self._optimised = Optimised.nothing(self.manifold.identity(0))
-        self._map_to_odom = None
-        self._changes += 1
+            self._begin_map()
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Add one loop closure; see `GraphBuilder.add_loop`."""
-        _require_finite(loop.pose3)
+        require_finite(loop.pose3)
         with self._lock:
             self._changes += 1
             self._builder.add_loop(loop)
@@ -258,12 +263,8 @@ class Backend:
             if problem.settled or not problem.graph.n_poses:
                 self._at_rest = now.version
                 return None
-
-            def check() -> None:
-                if self._make_way or stopped() or problem.map != self._map:
-                    raise Interrupted
-
-            improvement = improve(problem, solver, budget, check)
+            check = self._asker(problem, lambda: self._make_way or stopped())
+            improvement = of_all(improve(as_one(problem), solver, budget, check), problem)
             check()
             self.adopt(improvement)
         return improvement
@@ -287,16 +288,19 @@ class Backend:
             problem = now.problem()
             if not len(problem.graph.between):
                 return None
-
-            def check() -> None:
-                if stopped() or problem.map != self._map:
-                    raise Interrupted
-
-            improvement = optimise(problem, solver, check)
+            check = self._asker(problem, stopped)
+            improvement = of_all(optimise(as_one(problem), solver, check), problem)
             check()
             self.adopt(improvement)
         self._wake()
         return improvement
+
+    def _asker(self, problem: Problem, stopped: Stopped) -> Callable[[], None]:
+        def check() -> None:
+            if stopped() or problem.map != self._map:
+                raise Interrupted
+
+        return check
 
     def adopt(self, improvement: Improvement) -> None:
         """
@@ -314,9 +318,11 @@ class Backend:
             if improvement.map != self._map:
                 raise Interrupted
             if improvement.robust == self._options.robust.enabled:
+                before = self._map_to_odom_now()
                 self._optimised = improvement.taken_over(
                     self._optimised, self._options.solver.outer_tolerance)
                 self._map_to_odom = None
+                self.moved = before, self._map_to_odom_now()
                 self._changes += 1
             self.maps += 1
 
@@ -342,9 +348,3 @@ class Backend:
         """Tell the background that there may be something to do."""
         if self._background is not None:
             self._background.wake()
-
-
-def _require_finite(pose3: Array) -> None:
-    # It would spoil all that comes after it.
-    if not np.isfinite(pose3).all():
-        raise ArithmeticError(f'pose {pose3} is not finite')

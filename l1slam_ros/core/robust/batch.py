@@ -125,9 +125,12 @@ def outlook(growth: Growth) -> tuple[Array, Mask]:
     """
     accepted, square = growth.accepted, np.zeros(len(growth.factors))
     square[accepted] = (growth.posterior.residual**2).sum(axis=1)
-    outside = np.flatnonzero(~accepted)
+    # While nothing ties the map to the world, nothing is known of what names it.
+    square[~accepted] = np.nan
+    outside = np.flatnonzero(~accepted & growth.may_be_predicted)
     square[outside] = growth.innovations(outside).square
-    return square, ~accepted & (square < growth.gate(growth.factors.freedom)) & growth.is_loop
+    far = square >= growth.gate(growth.factors.freedom)
+    return square, ~accepted & ~far & growth.is_loop
 
 
 def reconsidered(graph: FactorGraph, poses: Array, accepted: Mask) -> Mask:

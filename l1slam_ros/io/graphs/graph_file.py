@@ -156,10 +156,12 @@ def _stamps(path: str | os.PathLike[str], ids: Indices, remarks: Remarks) -> Ind
 def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, edges: Rows,
                remarks: Remarks) -> None:
     i, j = _index(path, ids, edges).T
-    i = np.where(edges.alone, WORLD, i)
-    doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), np.zeros(len(edges), bool))
+    i, none = np.where(edges.alone, WORLD, i), np.zeros(len(edges), bool)
+    doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), none, none)
     trusted = remarks['trusted'] if remarks else read_trusted(path, ids, doubted)
     graph.add_between(i, j, edges.pose, edges.scaled, trusted)
+    if remarks:
+        graph.say(np.flatnonzero(remarks['struck']), trusted=False)
 
 
 def _index(path: object, ids: Indices, rows: Rows) -> Indices:

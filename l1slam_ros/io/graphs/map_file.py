@@ -66,8 +66,10 @@ class MapFile:
     @property
     def is_due(self) -> bool:
         """Whether it is time for `autosave`: each ends within a period of the one before."""
-        return (time.monotonic() - self._began >= self._options().autosave_period - self._took
-                and self._is_to_be_saved())
+        options = self._options()
+        # Who asks does so once in a period of the updates.
+        wait = options.autosave_period - options.update.period - self._took
+        return time.monotonic() - self._began >= wait and self._is_to_be_saved()
 
     def autosave(self) -> None:
         """Save the map if it has changed; what stood in its place, if not its own, is kept."""

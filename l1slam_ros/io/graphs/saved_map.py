@@ -123,10 +123,11 @@ def _remarks(saved: SavedMap) -> dict[str, Any]:
     doubt = optimised.judgement.doubt
     return values | {
         'doubt': doubt and asdict(doubt), 'robust': saved.robust,
-        'trusted': growth.graph.between.trusted, 'seen': sorted(key.hex() for key in growth.seen),
-        'waiting': [[loop.reference_stamp, loop.stamp, loop.trusted, arrival,
+        'trusted': growth.graph.between.trusted, 'struck': growth.graph.between.struck,
+        'seen': [[key.hex(), growth.seen[key]] for key in sorted(growth.seen)],
+        'waiting': [[loop.reference_stamp, loop.stamp, loop.trusted, loop.struck, age,
                      loop.pose3.tolist(), loop.covariance.tolist()]
-                    for loop, arrival in growth.waiting]}
+                    for loop, age in growth.waiting]}
 
 
 def _read(path: Path) -> SavedMap:
@@ -138,9 +139,10 @@ def _read(path: Path) -> SavedMap:
     if not values:
         return SavedMap(growth, optimised, True)
     waiting = tuple(
-        (LoopClosure(reference, stamp, np.array(pose3), np.array(covariance), trusted), arrival)
-        for reference, stamp, trusted, arrival, pose3, covariance in values.pop('waiting'))
-    seen = frozenset(bytes.fromhex(key) for key in values.pop('seen'))
+        (LoopClosure(reference, stamp, np.array(pose3), np.array(covariance), trusted, struck),
+         age)
+        for reference, stamp, trusted, struck, age, pose3, covariance in values.pop('waiting'))
+    seen = {bytes.fromhex(key): row for key, row in values.pop('seen')}
     doubt = values.pop('doubt')
     judgement = replace(_restored(optimised.judgement, values), doubt=doubt and Doubt(**doubt))
     return SavedMap(replace(_restored(growth, values), waiting=waiting, seen=seen),

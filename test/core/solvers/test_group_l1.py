@@ -110,8 +110,8 @@ def test_the_gap_is_proven_by_a_dual(name, rng):
     graph, truth = noisy_graph(60, 60, rng)
     found, _ = minimise_by(choose('auto', graph, name), graph, truth, OPTIONS)
     norm, system = norm_of(name, 3), linearise(graph, found.poses)
-    tolerance = 1e-8 * np.abs(system.blocks).max()
-    assert_allclose(system.transposed_times(found.dual), 0, atol=tolerance)
+    balance = system.transposed_times(found.dual)
+    assert_allclose(balance, 0, atol=1e-8 * np.abs(system.blocks).max())
     assert_allclose(norm.resolvent(found.dual, 0.0), found.dual, atol=1e-12)
     assert norm.gap(-system.b, found.dual) == pytest.approx(found.gap, abs=1e-9)
     assert 0 <= found.gap < 1e-3 * found.cost

@@ -490,8 +490,8 @@ def test_vertices_alone(write):
 
 
 def test_the_readers_need_no_bag_or_plot_library():
-    modules = ['files', 'graphs.graph_file', 'graphs.side_files', 'trajectory', 'formats',
-               'messages.conversion']
+    modules = ['files', 'formats', 'graphs.graph_file', 'graphs.side_files', 'trajectory',
+               'bags.topics', 'messages.conversion']
     code = (''.join(f'import l1slam_ros.io.{name}\n' for name in modules)
             + 'import sys\nprint([m for m in sys.modules if m.split(".")[0] in '
               '("rosbags", "mcap", "matplotlib", "yaml", "rclpy")])')

@@ -72,7 +72,7 @@ def test_it_is_saved_no_sooner_and_nowhere_that_nobody_said(tmp_path, changes):
 
 
 def test_a_save_that_fails_is_tried_again_in_the_next_period(tmp_path):
-    robot = Robot(tmp_path / 'none' / 'map.g2o', period=0.2)
+    robot = Robot(tmp_path / 'none' / 'map.g2o', period=0.5)
     robot.drive(3)
     while not robot.map_file.is_due:
         time.sleep(0.01)

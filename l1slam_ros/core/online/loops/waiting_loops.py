@@ -3,6 +3,7 @@
 
 import heapq
 from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,14 +27,17 @@ from l1slam_ros.core.graph.measurements import LoopClosure
 @dataclass(frozen=True)
 class WaitingLoop:
     """
-    A loop, when it came on the clock of the odometry [ns], and what it says on the manifold.
+    A loop, and what it says on the manifold.
 
-    measurement : (1, p); covariance : (1, d, d), sound, zeros where it says nothing; key : what
-    equal loops have in common.
+    arrival, begin, end : times [ns], when it came, and what its stamps mean; measurement : (1, p);
+    covariance : (1, d, d), sound, zeros where it says nothing; key : what equal loops have in
+    common.
     """
 
     loop: LoopClosure
     arrival: int
+    begin: int
+    end: int
     measurement: Array
     covariance: Array
     key: bytes
@@ -44,7 +48,7 @@ class WaitingLoops:
 
     def __init__(self) -> None:
         self._loops: dict[int, WaitingLoop] = {}
-        self._by_stamp: list[tuple[int, int]] = []
+        self._by_end: list[tuple[int, int]] = []
         self._by_arrival: deque[int] = deque()
         self._count = 0
         self._stamps: Indices | None = None
@@ -52,10 +56,14 @@ class WaitingLoops:
     def __len__(self) -> int:
         return len(self._loops)
 
+    def all(self) -> Iterable[WaitingLoop]:
+        """Return the loops in the order they came."""
+        return self._loops.values()
+
     def add(self, waiting: WaitingLoop) -> None:
         """Add a loop, which comes not before those that are there."""
         self._loops[self._count] = waiting
-        heapq.heappush(self._by_stamp, (waiting.loop.stamp, self._count))
+        heapq.heappush(self._by_end, (waiting.end, self._count))
         self._by_arrival.append(self._count)
         self._count += 1
         self._stamps = None
@@ -63,8 +71,8 @@ class WaitingLoops:
     def due(self, now: int) -> list[WaitingLoop]:
         """Take out the loops whose times odometry has reached by `now`, in the order they came."""
         due = []
-        while self._by_stamp and self._by_stamp[0][0] <= now:
-            _, number = heapq.heappop(self._by_stamp)
+        while self._by_end and self._by_end[0][0] <= now:
+            _, number = heapq.heappop(self._by_end)
             if number in self._loops:  # else it has expired
                 due.append(number)
         return [self._take(number) for number in sorted(due)]
@@ -81,13 +89,22 @@ class WaitingLoops:
             self._by_arrival.popleft()
         return expired
 
-    def forget_arrivals(self) -> None:
-        """Let all have come before any odometry: the clock they came by was none."""
-        self._loops = {number: replace(one, arrival=0) for number, one in self._loops.items()}
+    def begin_anew(self, time: Callable[[int], int], arrival: int | None = None) -> None:
+        """
+        Look anew what stamps mean: the odometry went back in time.
 
-    def arrivals(self) -> tuple[tuple[LoopClosure, int], ...]:
-        """Return each loop and when it came, in the order they came."""
-        return tuple((one.loop, one.arrival) for one in self._loops.values())
+        time : of a stamp; arrival : when all are to have come, None: as they did
+        """
+        self._loops = {number: replace(
+            one, begin=time(one.loop.stamps[0]), end=time(one.loop.stamp),
+            arrival=one.arrival if arrival is None else arrival)
+            for number, one in self._loops.items()}
+        self._by_end = [(one.end, number) for number, one in self._loops.items()]
+        heapq.heapify(self._by_end)
+
+    def arrivals(self, now: int) -> tuple[tuple[LoopClosure, int], ...]:
+        """Return each loop and how long it has waited until `now`, in the order they came."""
+        return tuple((one.loop, now - one.arrival) for one in self._loops.values())
 
     def stamps(self) -> Indices:
         """Return reference and end [ns] of each, (k, 2)."""

@@ -11,7 +11,8 @@ before); nothing that is held is used, nothing is dropped without being counted:
     old_stamp     not after the sample before; also a first sample whose stamp was the stray
 
 Where the next sample speaks for a motion no robot makes, the odometry has moved its frame: it
-began at the identity again, or its source was exchanged. The sample says so (`moved`).
+began at the identity again, or its source was exchanged. Where it speaks for an old stamp, the
+clock was set back, or a bag is played again. The sample says so (`gap`).
 
 Not told from motion: a frame moved by less than robots move (34 m within .1 s), unless it is to
 the identity exactly and that is far; a restart at the identity nearer than half a metre.
@@ -34,6 +35,8 @@ from l1slam_ros.core.online.notes import Notes
 _FAR, _RECENT = 5.0, 16
 # ... and at least so far [m]: nearer, it bends the map by less than a keyframe.
 _NEAR = 0.5
+# [s] A clock that is set back is set back so far; messages that overtook each other are nearer.
+_BACK = 0.5
 # [s] After a longer gap a sample is held, which costs the robot nothing but a message's delay; it
 # is confirmed by one within `LONGEST_PAUSE`, so that odometry of any rate passes.
 _GAP = 2.0
@@ -52,18 +55,20 @@ class Point:
     """
     A sample, its pose (1, p) in the frame of its message, and its position [m].
 
-    seconds : since the sample before; doubt : the cause it was held for, else empty; unseen : how
-    far the robot may have gone [m] while the odometry moved its frame, 0 where it did not;
-    anew : the only sample before it was a stray.
+    seconds : since the sample before; doubt : the cause it was held for, else empty; gap : why no
+    motion is known from the sample before, else empty; unseen : how far the robot may have gone
+    [m] meanwhile; anew : the only sample before it was a stray.
     """
 
-    __slots__ = ('anew', 'doubt', 'pose', 'position', 'sample', 'seconds', 'stamp', 'unseen')
+    __slots__ = ('anew', 'doubt', 'gap', 'pose', 'position', 'sample', 'seconds', 'stamp',
+                 'unseen')
 
     def __init__(self, manifold: Manifold, sample: OdometrySample):
         self.sample, self.stamp = sample, sample.stamp
         self.pose: Array = manifold.from_pose3(sample.pose3[None])
         self.position: list[float] = manifold.positions(self.pose)[0].tolist()
-        self.doubt, self.unseen, self.anew, self.seconds = '', 0.0, False, 0.0
+        self.doubt = self.gap = ''
+        self.unseen, self.anew, self.seconds = 0.0, False, 0.0
 
 
 class OdometryStream:
@@ -76,44 +81,50 @@ class OdometryStream:
     notes : told of all that is dropped or moved
     resumed : a map is there already, which no stamp makes begin anew
 
+    Attributes
+    ----------
+    last : the last sample that was passed on
+    held : the one that is not yet
+
     """
 
     def __init__(self, manifold: Manifold, notes: Notes, resumed: bool = False):
         self._manifold, self._notes, self._resumed = manifold, notes, resumed
-        self._last: Point | None = None
+        self.last: Point | None = None
         self._recent: deque[float] = deque(maxlen=_RECENT)
         self._alone = False
         self.held: Point | None = None
 
-    def take(self, sample: OdometrySample, verbatim: bool) -> list[Point]:
+    def take(self, sample: OdometrySample, verbatim: bool, back: bool = False) -> list[Point]:
         """
         Return the samples that may be used now: this one, none, or a held one and this.
 
-        verbatim : none is to be doubted.
+        verbatim : none is to be doubted; back : time may go back
 
         Raises
         ------
-        MessageError : `old_stamp`, the stamp is not after the last one.
+        MessageError : `old_stamp`, the stamp is not after the last one, and time did not go back.
 
         """
-        point, last, held = Point(self._manifold, sample), self._last, self.held
+        point, last, held = Point(self._manifold, sample), self.last, self.held
         if last is None:
             used = self._used(point)
             self._alone = not self._resumed
             return used
         if held is not None and self._goes_on(last, held, point):
             self.held = None
-            held.anew = held.doubt == 'old_stamp'
-            if held.doubt == 'jump':
+            held.anew = held.doubt == 'old_stamp' and self._alone
+            if held.doubt != 'stamp_ahead' and not held.anew:
+                held.gap = self._why(last, held)
                 held.unseen = max((UNSEEN * (held.stamp - last.stamp) * 1e-9, *self._recent))
-                self._notes.warn('moved', f'{self._why(last, held)}; the robot is taken to be '
-                                 'where it was')
             return self._used(held) + self._used(point)
         point.doubt = self._doubt(last, point)
         if verbatim and point.doubt != 'old_stamp':
             return self._used(point)
         again = held is not None and point.stamp == held.stamp
-        if again or (point.doubt == 'old_stamp' and not self._may_begin_anew(last, point)):
+        known_back = (back and not verbatim) or self._may_begin_anew(last, point)
+        if again or (point.doubt == 'old_stamp' and not (
+                known_back and (last.stamp - point.stamp) * 1e-9 >= _BACK)):
             known = held.stamp if again and held is not None else last.stamp
             raise MessageError('old_stamp', f'odometry stamp {point.stamp} ns is not after the '
                                f'last one, {known} ns')
@@ -124,7 +135,7 @@ class OdometryStream:
 
     def finish(self) -> list[Point]:
         """Return, as no more will come, what is held if it came after no more than a pause."""
-        last, held = self._last, self.held
+        last, held = self.last, self.held
         if last is None or held is None or held.doubt != 'stamp_ahead' or (
                 (held.stamp - last.stamp) * 1e-9 > LONGEST_PAUSE):
             return []
@@ -133,18 +144,18 @@ class OdometryStream:
 
     def reason(self) -> str:
         """Return why a sample is held; empty: none is."""
-        if self.held is None or self._last is None:
+        if self.held is None or self.last is None:
             return ''
-        return self._why(self._last, self.held)
+        return self._why(self.last, self.held)
 
     def _used(self, point: Point) -> list[Point]:
-        last, self._last, self._alone = self._last, point, False
+        last, self.last, self._alone = self.last, point, False
         if last is not None and point.anew:
             self._notes.refuse('stamp_ahead', f'first odometry stamp {last.stamp} ns; expected '
                                f'one before that of the next, {point.stamp} ns')
         elif last is not None:
             point.seconds = (point.stamp - last.stamp) * 1e-9
-            if not point.unseen:
+            if not point.gap:
                 self._recent.append(math.dist(last.position, point.position))
         return [point]
 
@@ -163,6 +174,8 @@ class OdometryStream:
 
     def _goes_on(self, last: Point, held: Point, point: Point) -> bool:
         """Tell whether a sample speaks for the one that is held."""
+        if held.doubt == 'old_stamp' and point.stamp > last.stamp:
+            return False
         doubt = self._doubt(held, point)
         slow = doubt == 'stamp_ahead' and (point.stamp - held.stamp) * 1e-9 <= LONGEST_PAUSE
         if doubt and not slow:
@@ -180,5 +193,7 @@ class OdometryStream:
             length = math.dist(last.position, held.position)
             return (f'odometry {length:.6g} m from one message to the next, {seconds:.6g} s '
                     f'later, at stamp {held.stamp} ns; expected a motion that robots make')
+        if held.doubt == 'old_stamp':
+            return (f'odometry stamp {held.stamp} ns is not after the last one, {last.stamp} ns')
         return (f'odometry stamp {held.stamp} ns is {seconds:.6g} s after the one before; '
                 'expected the next one to go on from there')
