@@ -26,6 +26,8 @@ from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 SAMPLES = 24
 # A factor whose residual has a variance below this part of its noise is checked by no other.
 _REDUNDANT = 1e-6
+# Logarithm of the width of a standard normal density, 1 over its height.
+_UNIT_WIDTH = np.log(2 * np.pi) / 2
 
 
 @dataclass(frozen=True)
@@ -106,12 +108,14 @@ class Innovations:
     """
     Factors against a posterior that does not know them.
 
-    system : their linearisation, b minus the residual; square : (m,) the squared residual in units
-    of its covariance C; log_det : (m,) of C; log_claim : (m,) of the volume of residuals that a
-    false factor could have.
+    system : their linearisation, b minus the residual; spread : (m, k, k) covariance that the map
+    adds to the residual; square : (m,) the squared residual in units of its covariance
+    C = I + spread; log_det : (m,) of C; log_claim : (m,) of the volume of residuals that a false
+    factor could have.
     """
 
     system: LinearSystem
+    spread: Array
     square: Array
     log_det: Array
     log_claim: Array
@@ -148,22 +152,34 @@ class Innovations:
 
 
 def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
-                log_volume: float) -> Innovations:
+                log_widths: Array) -> Innovations:
     """
     Return the innovations of the between factors of a graph, none of which made the posterior.
 
-    log_volume : of `claimed_volume`
+    log_widths : of `claimed_widths`
     """
     from l1slam_ros.core.kernels import prediction
 
     count = len(graph.between)
     system = _between_part(linearise(graph, poses), count)
     k = system.block_size
-    covariance = prediction.spreads(system.keyframe, system.blocks, posterior.samples)
-    covariance += np.eye(k)
-    square, log_det = prediction.normalise(covariance, -system.b.reshape(count, k))
-    roots = np.diagonal(graph.between.sqrt_information, axis1=1, axis2=2)
-    return Innovations(system, square, log_det, log_volume + np.log(roots).sum(axis=1))
+    spread = prediction.spreads(system.keyframe, system.blocks, posterior.samples)
+    square, log_det = prediction.normalise(spread + np.eye(k), -system.b.reshape(count, k))
+    return Innovations(system, spread, square, log_det,
+                       log_claim(graph.between.sqrt_information, log_widths))
+
+
+def log_claim(roots: Array, log_widths: Array) -> Array:
+    """
+    Return ln of the whitened volume that false factors fill, (m,); roots : (m, k, k) whiten.
+
+    A component without information has the residual 0 whether true or false: no evidence.
+    """
+    diagonal = np.abs(np.diagonal(roots, axis1=1, axis2=2))
+    known = diagonal > 0
+    widths = np.where(known, np.log(np.where(known, diagonal, 1.0)) + log_widths, _UNIT_WIDTH)
+    volume: Array = widths.sum(axis=1)
+    return volume
 
 
 def exact_squares(graph: FactorGraph, poses: Array, posterior: Posterior) -> Array:
@@ -195,18 +211,19 @@ def _between_part(system: LinearSystem, count: int) -> LinearSystem:
                         system.size)
 
 
-def claimed_volume(manifold: Manifold, poses: Array, rng: np.random.Generator) -> float:
+def claimed_widths(manifold: Manifold, poses: Array, rng: np.random.Generator) -> Array:
     """
-    Return the logarithm of the volume that the claims of false factors fill.
+    Return the logarithms of how wide the claims of false factors spread, (k,).
 
-    That of a Gaussian, (2 pi)^(k/2) sqrt(det M), as wide in each direction as the positions of
+    The volume of a Gaussian, (2 pi)^(1/2) sigma in each direction, as wide as the positions of
     random pairs lie apart (a false factor need not know of the corridor), with any rotation.
     """
     apart = manifold.local(poses, poses[rng.permutation(len(poses))])
     variance = np.full(manifold.TANGENT_SIZE, np.pi**2 / 3)
     variance[manifold.TRANSLATION] = (apart[:, manifold.TRANSLATION] ** 2).mean()
     with np.errstate(divide='ignore'):
-        return float(np.log(2 * np.pi * variance).sum()) / 2
+        widths: Array = np.log(variance) / 2 + _UNIT_WIDTH
+    return widths
 
 
 @cache

@@ -47,7 +47,7 @@ class Judgement:
     sigmas: Array
     variance: Array
     slips: Indices
-    doubt: Doubt | None = None
+    doubts: tuple[Doubt, ...] = ()
     settled: bool = True
 
     @staticmethod

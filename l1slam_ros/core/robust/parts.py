@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Graphs in several parts, made whole for a solver, at no cost to what they say.
+
+In: a graph whose odometry has gaps, or that nothing accepted ties together. Out: the same with a
+factor in each gap that no other factor speaks against.
+"""
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
+from l1slam_ros.core.robust.inspection import odometry_gaps
+
+
+def bridged(graph: FactorGraph) -> FactorGraph:
+    """Return the graph with a factor for each gap of its odometry, behind all others."""
+    gaps = odometry_gaps(graph)
+    return _with_steps(graph, gaps, graph.manifold.identity(len(gaps)))
+
+
+def tied(graph: FactorGraph, poses: Array) -> FactorGraph:
+    """
+    Return the graph with its parts tied together where they are, poses (n, p).
+
+    Each but the first gets one more factor, behind all others, from its first keyframe to the one
+    before, which is of an earlier part. They form a tree, so the optimum leaves no residual.
+    """
+    first = np.unique(component_labels(graph), return_index=True)[1][1:]
+    return _with_steps(graph, first - 1, graph.manifold.between(poses[first - 1], poses[first]))
+
+
+def _with_steps(graph: FactorGraph, at: Indices, Z: Array) -> FactorGraph:
+    """Return the graph with steps Z (k, p) from keyframes `at` (k,), as sure as its odometry."""
+    if not len(at):
+        return graph
+    whole, roots = graph.copy(), graph.between.sqrt_information
+    usual = (np.median(roots[graph.between.is_odometry], axis=0) if graph.between.is_odometry.any()
+             else np.eye(graph.manifold.TANGENT_SIZE))
+    whole.append_between(at, at + 1, Z, np.broadcast_to(usual, (len(at), *usual.shape)))
+    return whole
