@@ -8,7 +8,7 @@ from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 
@@ -144,6 +144,11 @@ def graph_of(truth, pairs, noise=None, information=None):
     graph.add_poses(len(truth))
     graph.add_between(i, j, measurement, information)
     return graph
+
+
+def add_absolute(graph, k, measurement, information):
+    """Append absolute factors of keyframes k (m,)."""
+    graph.add_between(np.full_like(k, WORLD), k, measurement, information)
 
 
 def chain_and_loops(n, n_loops, rng):

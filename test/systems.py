@@ -66,7 +66,7 @@ def parallel(n):
 
 
 def tied_down(n):
-    """Return the pairs of keyframes that have priors, no two of them joined, but the last two."""
+    """Return the pairs of keyframes tied to the world, no two of them joined, but the last two."""
     return [(k, n) for k in range(n)] + [(n - 2, n - 1)]
 
 

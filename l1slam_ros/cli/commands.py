@@ -113,7 +113,8 @@ def read(arguments: argparse.Namespace, path: Path) -> GraphRecord:
         from l1slam_ros.io.node_options import read_params_file
 
         options = read_params_file(arguments.params_file)
-    topics = Topics(arguments.odom_topic, arguments.loop_topic, arguments.trusted_topic)
+    topics = Topics(arguments.odom_topic, arguments.loop_topic, arguments.trusted_topic,
+                    arguments.absolute_topic)
     return formats.read_input(path, options, topics)
 
 

@@ -50,17 +50,18 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
     """Return what is worth knowing of a graph: names and values, without a judgement."""
     graph, ids = record.graph, record.ids
     factors = graph.between
-    is_loop = ~factors.is_odometry
+    absolute = int(factors.is_absolute.sum())
+    is_loop = ~factors.is_odometry & ~factors.is_absolute
     parallel = int(is_loop[parallel_factors(graph)].sum())
     beside = f', {parallel:,} of them beside another edge' if parallel else ''
     rows = [
         ('poses', f'{graph.n_poses:,} in {graph.manifold.NAME}, ids {ids[0]} to {ids[-1]}'),
-        ('odometry', f'{len(factors) - int(is_loop.sum()):,}, {step_lengths(graph).sum():,.1f} m'),
+        ('odometry', f'{int(factors.is_odometry.sum()):,}, {step_lengths(graph).sum():,.1f} m'),
         ('loops', f'{int(is_loop.sum()):,}{beside}'),
         ('components', f'{len(connected_parts(graph)):,}'),
     ]
-    if len(graph.prior):
-        rows.insert(3, ('priors', f'{len(graph.prior):,}'))
+    if absolute:
+        rows.insert(3, ('absolute poses', f'{absolute:,}'))
     if record.stamps is not None:
         rows.append(('time', f'{(record.stamps[-1] - record.stamps[0]) / NANOSECONDS:,.1f} s'))
     if record.poses is not None:
@@ -159,8 +160,8 @@ def _on_noise(record: GraphRecord) -> Iterator[str]:
 
 def _edges(record: GraphRecord, factors: Indices) -> list[str]:
     """Return the vertex ids of the first few factors, in words."""
-    between = record.graph.between
-    return [f'{record.ids[between.i[k]]} to {record.ids[between.j[k]]}' for k in factors[:_NAMED]]
+    pairs = record.ids[record.graph.between.pairs[factors[:_NAMED]]]
+    return [f'{i} to {j}' if i != j else f'the world to {j}' for i, j in pairs.tolist()]
 
 
 def _listed(name: str, examples: list[str], count: int, plural: str = '') -> str:

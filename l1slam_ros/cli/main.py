@@ -179,6 +179,8 @@ def _add_bag_options(parser: argparse.ArgumentParser) -> None:
         help='geometry_msgs/PoseWithCovarianceStamped (default: %(default)s)')
     add('--trusted-topic', default=DEFAULT_TOPICS.trusted, metavar='TOPIC',
         help='the same, loops somebody vouches for (default: %(default)s)')
+    add('--absolute-topic', default=DEFAULT_TOPICS.absolute, metavar='TOPIC',
+        help='the same, poses in the map frame (default: %(default)s)')
     add('--params-file', type=Path, metavar='YAML',
         help="the node's parameter file: what makes keyframes, their noise, and the solver; "
         'without it, what a bag of l1slam notes of itself, or the defaults of the node')

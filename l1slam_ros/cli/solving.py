@@ -127,7 +127,7 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
     doubtful = judgement is not None and judgement.doubt is not None
     return {
         'poses': record.graph.n_poses,
-        'factors': len(factors) + len(record.graph.prior),
+        'factors': len(factors),
         'loops': int((~factors.is_odometry).sum()),
         'initial_cost': outcome.initial_cost,
         'seed_cost': outcome.seed_cost,

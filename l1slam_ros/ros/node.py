@@ -23,12 +23,12 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core.errors import L1SlamError, MessageError
-from l1slam_ros.core.graph.measurements import OdometrySample
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.messages import cdr
 from l1slam_ros.io.messages.base_frame import BaseFrame
-from l1slam_ros.io.messages.conversion import loop_closure, odometry_sample
+from l1slam_ros.io.messages.conversion import absolute_pose, loop_closure, odometry_sample
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.diagnostics import Diagnosis
 from l1slam_ros.ros.loop_status import LoopStatus
@@ -135,6 +135,7 @@ class BackendNode(Node):
             (Odometry, 'odom', self._on_odometry),
             (PoseWithCovarianceStamped, 'loop_closures', self._on_loop),
             (PoseWithCovarianceStamped, 'trusted_loop_closures', self._on_trusted_loop),
+            (PoseWithCovarianceStamped, 'absolute_poses', self._on_absolute_pose),
         ):
             self._subscribe(kind, topic, callback)
 
@@ -197,14 +198,17 @@ class BackendNode(Node):
                                       manifold.to_pose3(pose)[0]))
 
     def _on_loop(self, message: PoseWithCovarianceStamped) -> None:
-        self._add_loop(message, trusted=False)
+        self._add_loop(loop_closure, message, self._base_frame.name, False)
 
     def _on_trusted_loop(self, message: PoseWithCovarianceStamped) -> None:
-        self._add_loop(message, trusted=True)
+        self._add_loop(loop_closure, message, self._base_frame.name, True)
 
-    def _add_loop(self, message: PoseWithCovarianceStamped, trusted: bool) -> None:
+    def _on_absolute_pose(self, message: PoseWithCovarianceStamped) -> None:
+        self._add_loop(absolute_pose, message, self.options.map_frame)
+
+    def _add_loop(self, read: Callable[..., LoopClosure], *message: Any) -> None:
         try:
-            loop = loop_closure(message, self._base_frame.name, trusted)
+            loop = read(*message)
         except L1SlamError as error:
             self._refuse(error)
             return

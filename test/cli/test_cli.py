@@ -694,7 +694,7 @@ def test_corrupting_to_a_bag_counts_as_the_bag_does(capsys, odd, tmp_path):
 
 
 def test_a_graph_that_cannot_be_written_leaves_no_file_of_false_loops(capsys, world, tmp_path):
-    # The priors of a graph have no place in TORO.
+    # Absolute factors have no place in TORO.
     path = tmp_path / 'prior.g2o'
     path.write_text(world.read_text() + 'EDGE_PRIOR_SE2 0 0 0 0 1 0 0 1 0 1\n')
     there = sorted(tmp_path.iterdir())

@@ -11,6 +11,7 @@ pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from node_bench import DEADLINE, TYPES, Bench, call, odometry, poses_of
+from problems import add_absolute
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
@@ -263,7 +264,7 @@ def test_optimize_takes_a_doubtful_map_and_says_so(bench, tmp_path):
 
 def test_a_map_with_priors_is_refused_and_the_node_goes_on(bench, tmp_path, rng):
     graph = simulate_world(10, 12, WorldOptions(), rng).graph
-    graph.add_prior(np.array([0]), np.zeros((1, 3)), np.eye(3)[None])
+    add_absolute(graph, np.array([0]), np.zeros((1, 3)), np.eye(3)[None])
     record = GraphRecord(graph, np.zeros((10, 3)), np.arange(10), 10**9 + np.arange(10))
     write_graph_file(tmp_path / 'map.g2o', record)
     b = bench(save_path=str(tmp_path / 'map.g2o'))

@@ -43,11 +43,11 @@ def align(estimate: Array, truth: Array) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    estimate, truth : (n, k) positions [m] of the same times, k = 2 or 3
+    estimate, truth : (..., n, k) positions [m] of the same times, k = 2 or 3
 
     Returns
     -------
-    R : (k, k) rotation, never a reflection; t : (k,) [m].
+    R : (..., k, k) rotation, never a reflection; t : (..., k) [m].
 
     Raises
     ------
@@ -59,15 +59,17 @@ def align(estimate: Array, truth: Array) -> tuple[Array, Array]:
     (1991), equations 40, 41 and 43, with scale 1.
 
     """
-    if estimate.shape != truth.shape or not len(estimate):
-        raise GraphError(f'{len(estimate)} positions of {estimate.shape[1]} coordinates to align '
-                         f'with {len(truth)} of {truth.shape[1]}, expected as many, 1 or more')
-    mean_estimate, mean_truth = estimate.mean(axis=0), truth.mean(axis=0)
-    U, _, Vt = np.linalg.svd((truth - mean_truth).T @ (estimate - mean_estimate))
-    sign = np.ones(len(U))
-    sign[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    R = (U * sign) @ Vt
-    return R, mean_truth - R @ mean_estimate
+    if estimate.shape != truth.shape or not estimate.shape[-2]:
+        raise GraphError(f'{len(estimate)} positions of {estimate.shape[-1]} coordinates to align '
+                         f'with {len(truth)} of {truth.shape[-1]}, expected as many, 1 or more')
+    mean_estimate = estimate.mean(axis=-2, keepdims=True)
+    mean_truth = truth.mean(axis=-2, keepdims=True)
+    spread = np.swapaxes(truth - mean_truth, -1, -2) @ (estimate - mean_estimate)
+    U, _, Vt = np.linalg.svd(spread)
+    U[..., -1] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[..., None]
+    R: Array = U @ Vt
+    t: Array = (mean_truth - mean_estimate @ np.swapaxes(R, -1, -2))[..., 0, :]
+    return R, t
 
 
 def aligned_positions(estimate: Array, truth: Array) -> Array:

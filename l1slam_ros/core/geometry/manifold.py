@@ -9,7 +9,8 @@ Step
     Tangent vector, translation first, rotation after; rows of an (n, d) array, d =
     `TANGENT_SIZE`. **Steps apply on the right**, in the axes of the body: X (+) s = X v2t(s).
 Residual
-    `e = t2v(Z^-1 Xi^-1 Xj)`: the error of the relative pose, in the axes of the measured pose.
+    `e = t2v(Z^-1 Xi^-1 Xj)`: the error of the relative pose, in the axes of the measured pose. Xi
+    may be the world: the identity, which never moves.
     t2v reads the coordinates off (as g2o does); it is not the logarithm.
 Jacobian
     `J_r_i`: derivative of the residual r with respect to the step of pose i, at step zero.
@@ -93,6 +94,9 @@ class Manifold(Protocol):
 
     def positions(self, pose: Array) -> Array:
         """Return the coordinates of the body's origin in the map [m], (n, 2 or 3)."""
+
+    def from_rotation(self, R: Array, t: Array) -> Array:
+        """Return poses from rotation matrices (n, k, k) and positions (n, k), k = 2 or 3."""
 
     def from_pose3(self, pose3: Array) -> Array:
         """Return poses from rows x y z qx qy qz qw (ROS order), (n, 7) -> (n, p)."""

@@ -6,6 +6,9 @@ Whitening is `r = L' e` with information = L L' (Cholesky, L lower triangular). 
 root gives the same cost; under L1 it does not. Cholesky is taken because the paper's costs come
 out with it, and because the last rows of L' then involve the rotation alone, which is what lets
 Algorithm 3 solve for the angles first.
+
+A measurement may say nothing of some components: their rows and columns are zeros, in the
+information, in its root, and in the covariance that stands for it here.
 """
 
 import numpy as np
@@ -41,20 +44,50 @@ def square_root_information(information: Array) -> Array:
 
     Raises
     ------
-    NoiseError : naming the first matrix that is not finite, symmetric and positive definite.
+    NoiseError : naming the first matrix that is not finite, symmetric and, but for rows and
+        columns of zeros, positive definite; or that is all zeros.
 
     """
     information = np.asarray(information, float)
+    silent = np.asarray((information == 0).all(axis=2))
+    _refuse(np.asarray(silent.all(axis=1)), information, 'positive definite')
+    whole = filled(information, silent)
     finite = np.isfinite(information).all(axis=(1, 2))
     _refuse(np.logical_not(finite), information, 'finite')
     scale = np.abs(information).max(axis=(1, 2), initial=0.0)
     skew = np.abs(information - information.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
     _refuse(skew > _ASYMMETRY * scale, information, 'symmetric')
-    _refuse(np.logical_not(_is_definite(information)), information, 'positive definite')
-    _refuse(np.logical_not(_is_representable(information)), information,
+    _refuse(np.logical_not(_is_definite(whole)), information, 'positive definite')
+    _refuse(np.logical_not(_is_representable(whole)), information,
             f'within {_SMALLEST:g} to {_LARGEST:g} on its diagonal')
-    root = np.linalg.cholesky(information).transpose(0, 2, 1)
-    return root.astype(np.float64, copy=False)
+    root = np.linalg.cholesky(whole).transpose(0, 2, 1)
+    return silenced(root.astype(np.float64, copy=False), silent)
+
+
+def filled(matrices: Array, silent: Mask) -> Array:
+    """Return matrices (m, d, d) with the identity in rows and columns that are silent, (m, d)."""
+    if not silent.any():
+        return matrices
+    return silenced(matrices, silent) + silent[:, :, None] * np.eye(silent.shape[1])
+
+
+def silenced(matrices: Array, silent: Mask) -> Array:
+    """Return matrices (m, d, d) with zeros in rows and columns that are silent, (m, d)."""
+    if not silent.any():
+        return matrices
+    return np.where(silent[:, :, None] | silent[:, None, :], 0.0, matrices)
+
+
+def silent_components(covariance: Array, absolute: bool) -> Mask:
+    """
+    Tell which components of measurements say nothing, by covariances of messages, (m, d).
+
+    An infinite variance; of an absolute pose also one that is 0 or less, or above `MOST_VARIANCE`.
+    """
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    if not absolute:
+        return np.asarray(np.isposinf(variance))
+    return np.logical_not((variance > 0) & (variance <= MOST_VARIANCE))
 
 
 def usable(covariance: Array) -> Mask:
@@ -113,6 +146,7 @@ def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Ar
     Fewer digits than it has: a covariance that went through a file comes back to rounding.
     """
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)).ravel()
+    sigma = np.where(sigma > 0, sigma, 1.0)
     correlation = covariance.reshape(len(sigma), -1) / np.outer(sigma, sigma)
     digits = np.rint(1e6 * np.concatenate((np.log(sigma), correlation.ravel()))).astype(np.int64)
     return b'%d %d %d ' % (reference, stamp, trusted) + measurement.tobytes() + digits.tobytes()
@@ -120,10 +154,21 @@ def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Ar
 
 def root_of_inverse(covariance: Array) -> Array:
     """Return the root L', see `square_root_information`, for sound covariances (m, d, d)."""
+    silent = _without_variance(covariance)
     # Cholesky from the last row up gives U U' with U upper triangular, and L' = U^-1.
-    lower = np.linalg.cholesky(covariance[:, ::-1, ::-1])
-    root: Array = np.linalg.inv(lower[:, ::-1, ::-1])
-    return root
+    lower = np.linalg.cholesky(filled(covariance, silent)[:, ::-1, ::-1])
+    return silenced(np.linalg.inv(lower[:, ::-1, ::-1]), silent)
+
+
+def covariance_of(sqrt_information: Array) -> Array:
+    """Return the covariances (m, d, d) of the roots L'."""
+    silent = _without_variance(sqrt_information)
+    inverse = np.linalg.inv(filled(sqrt_information, silent))
+    return silenced(inverse @ inverse.transpose(0, 2, 1), silent)
+
+
+def _without_variance(matrices: Array) -> Mask:
+    return np.asarray(np.diagonal(matrices, axis1=1, axis2=2) == 0)
 
 
 def _is_definite(matrices: Array) -> Mask:

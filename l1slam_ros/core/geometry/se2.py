@@ -144,6 +144,11 @@ def positions(pose: Array) -> Array:
     return pose[..., :2]
 
 
+def from_rotation(R: Array, t: Array) -> Array:
+    """Return poses from rotation matrices (n, 2, 2) and positions (n, 2), (n, 3)."""
+    return _pose(t[..., 0], t[..., 1], np.arctan2(R[..., 1, 0], R[..., 0, 0]))
+
+
 def from_pose3(pose3: Array) -> Array:
     """Project x y z qx qy qz qw (n, 7) onto the plane: x, y and the yaw, (n, 3)."""
     qx, qy, qz, qw = np.moveaxis(pose3[..., 3:], -1, 0)

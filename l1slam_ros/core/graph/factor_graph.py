@@ -17,15 +17,19 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask, square_root_information
 from l1slam_ros.core.graph.growable_array import GrowingArray
 
+# The first end of an absolute factor: the map frame, a keyframe that never moves. As an index into
+# poses with the identity behind them it picks that; see `linear_system.with_world`.
+WORLD = -1
+
 
 @dataclass(frozen=True)
 class BetweenFactors:
     """
-    Measurements of the pose of keyframe j seen from keyframe i.
+    Measurements of the pose of keyframe j seen from keyframe i, or from the world.
 
-    i, j : (m,) keyframe indices; measurement : (m, p) relative poses;
-    sqrt_information : (m, d, d) upper triangular roots, see `noise`; trusted : (m,) bool, a person
-    or a marker vouches for it.
+    i, j : (m,) keyframe indices, i may be `WORLD`: an absolute factor; measurement : (m, p)
+    relative poses; sqrt_information : (m, d, d) upper triangular roots, see `noise`, a zero row
+    says nothing; trusted : (m,) bool, a person or a marker vouches for it.
     """
 
     i: Indices
@@ -39,33 +43,32 @@ class BetweenFactors:
 
     @property
     def pairs(self) -> Indices:
-        """The keyframes i and j of each, (m, 2)."""
-        return np.stack((self.i, self.j), axis=1)
+        """The keyframes i and j of each, (m, 2); of an absolute one its only keyframe twice."""
+        return np.stack((np.where(self.is_absolute, self.j, self.i), self.j), axis=1)
+
+    @property
+    def is_absolute(self) -> Mask:
+        """(m,) bool: those that the world is an end of."""
+        return np.asarray(self.i == WORLD)
 
     @cached_property
-    def is_odometry(self) -> np.ndarray:
+    def is_odometry(self) -> Mask:
         """(m,) bool: the first factor between each two consecutive keyframes, either way round."""
-        consecutive = np.flatnonzero(np.abs(self.i - self.j) == 1)
+        consecutive = np.flatnonzero((np.abs(self.i - self.j) == 1) & ~self.is_absolute)
         _, first = np.unique(np.minimum(self.i, self.j)[consecutive], return_index=True)
         mask = np.zeros(len(self), bool)
         mask[consecutive[first]] = True
         return mask
 
+    @cached_property
+    def speaks(self) -> Mask:
+        """(m, d) bool: which rows of the residual say something."""
+        return np.asarray(np.diagonal(self.sqrt_information, axis1=1, axis2=2) != 0)
 
-@dataclass(frozen=True)
-class PriorFactors:
-    """
-    Measurements of the pose of keyframe i in the map frame.
-
-    i : (m,) keyframe indices; measurement : (m, p) poses; sqrt_information : (m, d, d).
-    """
-
-    i: Indices
-    measurement: Array
-    sqrt_information: Array
-
-    def __len__(self) -> int:
-        return len(self.i)
+    @property
+    def freedom(self) -> Indices:
+        """How many rows of each say something, (m,): its degrees of freedom."""
+        return np.asarray(np.count_nonzero(self.speaks, axis=1))
 
 
 class FactorGraph:
@@ -84,19 +87,17 @@ class FactorGraph:
         p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
         self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
                          GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_)]
-        self._prior = [GrowingArray((), np.int64), GrowingArray((p,)), GrowingArray((d, d))]
 
     def copy(self) -> 'FactorGraph':
         """Return a graph that shares all factors so far; either may grow without the other."""
         clone = FactorGraph(self.manifold)
         clone.n_poses = self.n_poses
         clone._between = [column.copy() for column in self._between]
-        clone._prior = [column.copy() for column in self._prior]
         return clone
 
     def subset(self, chosen: Indices | Mask, variance: Array | None = None) -> 'FactorGraph':
         """
-        Return a graph of all keyframes, all priors and some of the between factors.
+        Return a graph of all keyframes and some of the factors.
 
         Parameters
         ----------
@@ -106,22 +107,16 @@ class FactorGraph:
         """
         part = FactorGraph(self.manifold)
         part.n_poses = self.n_poses
-        part._prior = [column.copy() for column in self._prior]
         i, j, measurement, root, trusted = (column.view()[chosen] for column in self._between)
         if variance is not None:
             root = root / np.sqrt(variance)[:, None, None]
-        self._append(part._between, (i, j, measurement, root, trusted))
+        part.append_between(i, j, measurement, root, trusted)
         return part
 
     @property
     def between(self) -> BetweenFactors:
-        """All between factors so far: a snapshot that later appends do not change."""
+        """All factors so far: a snapshot that later appends do not change."""
         return BetweenFactors(*(column.view() for column in self._between))
-
-    @property
-    def prior(self) -> PriorFactors:
-        """All prior factors so far: a snapshot that later appends do not change."""
-        return PriorFactors(*(column.view() for column in self._prior))
 
     def add_poses(self, count: int = 1) -> None:
         """Let `count` more keyframes exist; the next index is `n_poses` before the call."""
@@ -134,19 +129,35 @@ class FactorGraph:
         """
         Append between factors: i, j (m,), measurement (m, p), information (m, d, d), trusted (m,).
 
+        Where i is `WORLD` the measurement is the pose of keyframe j in the map frame. Components
+        without any information, whole rows and columns of zeros, say nothing.
+
         Raises
         ------
         GraphError : an index without a keyframe, a self loop, a measurement that is not finite.
-        NoiseError : an information matrix that is not positive definite.
+        NoiseError : an information matrix that is not positive definite where it says something,
+            or that says nothing at all.
 
         Nothing is appended when anything is wrong.
 
         """
         i, j = np.atleast_1d(i), np.atleast_1d(j)
-        self._check_shapes(measurement, information, i, j)
+        m, p, d = len(i), self.manifold.POSE_SIZE, self.manifold.TANGENT_SIZE
+        found = [np.shape(a) for a in (i, j, measurement, information)]
+        expected = [(m,), (m,), (m, p), (m, d, d)]
+        if found != expected:
+            raise GraphError(f'indices, measurements and information have the shapes {found}, '
+                             f'expected {expected}')
         if (i == j).any():
             raise GraphError(f'keyframe {i[np.argmax(i == j)]} has a factor to itself')
-        self._check(np.concatenate((i, j)), measurement)
+        ends = np.concatenate((i[i != WORLD], j))
+        unknown = (ends < 0) | (ends >= self.n_poses)
+        if unknown.any():
+            raise GraphError(f'a factor names keyframe {ends[np.argmax(unknown)]}, '
+                             f'the graph has 0 to {self.n_poses - 1}')
+        if not np.isfinite(measurement).all():
+            row = int(np.argmin(np.isfinite(measurement).all(axis=1)))
+            raise GraphError(f'measurement {row} is not finite: {measurement[row]}')
         self.append_between(i, j, measurement, square_root_information(information), trusted)
 
     def append_between(
@@ -154,36 +165,8 @@ class FactorGraph:
         trusted: Mask | bool = False,
     ) -> None:
         """Append between factors that are known to be sound, with the roots (m, d, d) at hand."""
-        self._append(self._between, (i, j, measurement, sqrt_information,
-                                     np.broadcast_to(trusted, len(i))))
-
-    def add_prior(self, i: Indices, measurement: Array, information: Array) -> None:
-        """Append prior factors: i (m,), measurement (m, p), information (m, d, d); as above."""
-        i = np.atleast_1d(i)
-        self._check_shapes(measurement, information, i)
-        self._check(i, measurement)
-        self._append(self._prior, (i, measurement, square_root_information(information)))
-
-    def _check_shapes(self, measurement: Array, information: Array, *indices: Indices) -> None:
-        m, p, d = len(indices[0]), self.manifold.POSE_SIZE, self.manifold.TANGENT_SIZE
-        found = [np.shape(a) for a in (*indices, measurement, information)]
-        expected = [(m,)] * len(indices) + [(m, p), (m, d, d)]
-        if found != expected:
-            raise GraphError(f'indices, measurements and information have the shapes {found}, '
-                             f'expected {expected}')
-
-    def _check(self, indices: Indices, measurement: Array) -> None:
-        unknown = (indices < 0) | (indices >= self.n_poses)
-        if unknown.any():
-            raise GraphError(f'a factor names keyframe {indices[np.argmax(unknown)]}, '
-                             f'the graph has 0 to {self.n_poses - 1}')
-        if not np.isfinite(measurement).all():
-            row = int(np.argmin(np.isfinite(measurement).all(axis=1)))
-            raise GraphError(f'measurement {row} is not finite: {measurement[row]}')
-
-    @staticmethod
-    def _append(columns: list['GrowingArray'], values: tuple[np.ndarray, ...]) -> None:
-        for column, value in zip(columns, values, strict=True):
+        values = i, j, measurement, sqrt_information, np.broadcast_to(trusted, len(i))
+        for column, value in zip(self._between, values, strict=True):
             column.extend(value)
 
 
@@ -191,16 +174,26 @@ def component_labels(graph: FactorGraph) -> Indices:
     """
     Return a component number for each keyframe, (n,), in the order of their first keyframes.
 
-    Every keyframe points to a lower one of its component, or to itself; factors pull what both
-    ends point to down to the lower one, and pointers are doubled, until nothing moves.
+    The world is a vertex: keyframes that only absolute factors tie together are of one component.
+    """
+    return np.unique(lowest_joined(graph)[:-1], return_inverse=True)[1]
+
+
+def lowest_joined(graph: FactorGraph) -> Indices:
+    """
+    Return the first keyframe of the component of each keyframe, and of the world, (n + 1,).
+
+    Every vertex points to a lower one of its component, or to itself, the world being the highest;
+    factors pull what both ends point to down to the lower one, and pointers are doubled, until
+    nothing moves.
     """
     i, j = graph.between.i, graph.between.j
-    lowest = np.arange(graph.n_poses)
+    lowest = np.arange(graph.n_poses + 1)
     while True:
         a, b = lowest[i], lowest[j]
         apart = a != b
         if not apart.any():
-            return np.unique(lowest, return_inverse=True)[1]
+            return lowest
         i, j, a, b = i[apart], j[apart], a[apart], b[apart]
         np.minimum.at(lowest, np.maximum(a, b), np.minimum(a, b))
         while (lowest[lowest] != lowest).any():
@@ -208,7 +201,11 @@ def component_labels(graph: FactorGraph) -> Indices:
 
 
 def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:
-    """Return of all between factors the earlier and later keyframe (m,), and that from this."""
+    """
+    Return of all between factors the earlier and later keyframe (m,), and that from this.
+
+    The world is earlier than any keyframe, and `WORLD` here, too.
+    """
     i, j, Z = graph.between.i, graph.between.j, graph.between.measurement
     forward = np.where((i > j)[:, None], graph.manifold.inverse(Z), Z)
     return np.minimum(i, j), np.maximum(i, j), forward

@@ -32,7 +32,7 @@ class Problem(Protocol):
         """Return the poses moved by x (columns,)."""
 
     def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> Array | None:
-        """Return the Hessian of dual'e for each of the first factors, (m', 2 k, 2 k)."""
+        """Return the Hessian of dual'e for each factor, (m, 2 k, 2 k)."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class GraphProblem:
 
     def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> Array:
         """See `Problem`."""
-        gradient = system.gradients(dual)[: len(self.graph.between)]
-        return self.graph.manifold.residual_curvature(*ends(self.graph, poses), gradient)
+        pair = ends(self.graph, poses)
+        return self.graph.manifold.residual_curvature(*pair, system.gradients(dual))
 
 
 @dataclass(frozen=True)

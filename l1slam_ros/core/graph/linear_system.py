@@ -3,18 +3,21 @@
 From graph and poses to one sparse linear system: minimise |A x - b| over the step x.
 
 In: a graph and its poses. Out: A and b, whitened, b the negative residual, the gauge removed.
-Rows keep the order of the factors, all priors after the between factors; columns keep the order of
-the free keyframes.
+Rows keep the order of the factors, columns that of the free keyframes.
+
+The gauge: the world never moves; where no factor names it, keyframe 0 does not either. Factors
+that leave a component unsaid may tie a part of the graph by less than it takes: a single position
+fix leaves the map free to turn. What nothing determines stays as it is: see `loose_keyframes`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.graph.factor_graph import FactorGraph, lowest_joined
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -26,7 +29,7 @@ class LinearSystem:
     |A x - b|, with A kept as the two square blocks of each factor.
 
     keyframe : (m, 2) which free keyframe's step each block multiplies, `size` for none: that of a
-        keyframe held fixed, the second one of a prior;
+        keyframe held fixed, or of the world;
     blocks : (m, 2, k, k) whitened Jacobians; b : (rows,) minus the whitened residual, rows = m k;
     size : free keyframes; columns = size k.
     """
@@ -83,6 +86,10 @@ class LinearSystem:
         product: Array = gradients(self.blocks, y.reshape(-1, k), (0,) * k)
         return product
 
+    def diagonal(self, weights: Array) -> Array:
+        """Return the diagonal of A'WA, (columns,); weights : (rows,)."""
+        return replace(self, blocks=self.blocks**2).transposed_times(weights)
+
     def part(self, entries: slice) -> 'LinearSystem':
         """Return the system of only these rows of each factor and columns of each keyframe."""
         blocks = np.ascontiguousarray(self.blocks[:, :, entries, entries])
@@ -91,13 +98,35 @@ class LinearSystem:
 
 
 def anchor(graph: FactorGraph) -> int:
-    """Return how many leading keyframes are held fixed: one, unless a prior fixes the gauge."""
-    return 0 if len(graph.prior) else min(1, graph.n_poses)
+    """Return how many leading keyframes are held fixed: one, unless a factor names the world."""
+    return 0 if graph.between.is_absolute.any() else min(1, graph.n_poses)
+
+
+def loose_keyframes(graph: FactorGraph) -> Indices:
+    """
+    Return the free keyframes, columns (k,), that may stand for a motion that nothing determines.
+
+    Keyframes that are joined by factors which say everything are rigid: one of each such part,
+    the first, but for the part that is held fixed, or tied to the world, by one.
+    """
+    factors = graph.between
+    whole = factors.freedom == graph.manifold.TANGENT_SIZE
+    if whole.all():
+        return np.zeros(0, np.int64)
+    lowest, fixed = lowest_joined(graph.subset(whole)), anchor(graph)
+    first = np.unique(lowest[:-1])
+    loose: Indices = first[first != lowest[-1]][fixed:] - fixed
+    return loose
+
+
+def with_world(manifold: Manifold, poses: Array) -> Array:
+    """Return the poses (n, p) with that of the world behind them, where index `WORLD` finds it."""
+    return np.concatenate((poses, manifold.identity(1)))
 
 
 def ends(graph: FactorGraph, poses: Array) -> tuple[Array, Array]:
-    """Return the poses of keyframes i and j of each between factor, (m, p) each."""
-    factors = graph.between
+    """Return the poses of the ends i and j of each between factor, (m, p) each."""
+    factors, poses = graph.between, with_world(graph.manifold, poses)
     return poses.take(factors.i, axis=0), poses.take(factors.j, axis=0)
 
 
@@ -105,47 +134,42 @@ def whitened_residual(graph: FactorGraph, poses: Array) -> Array:
     """Return the whitened residual of every row, (rows,), in the order of `LinearSystem`."""
     from l1slam_ros.core.kernels.blocks import whiten
 
-    manifold, factors, prior = graph.manifold, graph.between, graph.prior
-    sizes = (0,) * manifold.TANGENT_SIZE
+    manifold, factors = graph.manifold, graph.between
     e = manifold.residual(factors.measurement, *ends(graph, poses))
-    whitened: Array = whiten(factors.sqrt_information, e, sizes).ravel()
-    if not len(prior):
-        return whitened
-    e_prior = manifold.local(prior.measurement, poses[prior.i])
-    return np.concatenate((whitened, whiten(prior.sqrt_information, e_prior, sizes).ravel()))
+    whitened: Array = whiten(factors.sqrt_information, e, (0,) * manifold.TANGENT_SIZE)
+    return whitened.ravel()
 
 
 def linearise(
-    graph: FactorGraph, poses: Array, residual: Array | None = None
+    graph: FactorGraph, poses: Array, residual: Array | None = None, fixed: int | None = None
 ) -> LinearSystem:
     """
     Return the system at `poses` (n, p); Jacobians with respect to right steps.
 
+    Parameters
+    ----------
     residual : of these poses, where it is known already
+    fixed : how many keyframes are held in the gauge of another graph; None: see `anchor`
+
     """
     from l1slam_ros.core.kernels.blocks import whiten_blocks
 
-    manifold, factors, prior, m = graph.manifold, graph.between, graph.prior, len(graph.between)
-    d, size = manifold.TANGENT_SIZE, graph.n_poses - anchor(graph)
-    blocks = np.zeros((m + len(prior), 2, d, d))
+    manifold, factors = graph.manifold, graph.between
+    d = manifold.TANGENT_SIZE
+    blocks = np.empty((len(factors), 2, d, d))
     pair = manifold.residual_jacobians(factors.measurement, *ends(graph, poses))
     for side, J in enumerate(pair):
-        whiten_blocks(factors.sqrt_information, J, side, blocks[:m], (0,) * d)
-    if len(prior):
-        J_prior = manifold.local_jacobian(prior.measurement, poses[prior.i])
-        whiten_blocks(prior.sqrt_information, J_prior, 0, blocks[m:], (0,) * d)
+        whiten_blocks(factors.sqrt_information, J, side, blocks, (0,) * d)
     if residual is None:
         residual = whitened_residual(graph, poses)
-    return LinearSystem(keyframes_of(graph), blocks, -residual, size)
+    fixed = anchor(graph) if fixed is None else fixed
+    return LinearSystem(keyframes_of(graph, fixed), blocks, -residual, graph.n_poses - fixed)
 
 
-def keyframes_of(graph: FactorGraph) -> Indices:
+def keyframes_of(graph: FactorGraph, fixed: int) -> Indices:
     """Return the free keyframes that each factor moves, (m, 2); see `LinearSystem`."""
-    factors, prior, fixed = graph.between, graph.prior, anchor(graph)
-    keyframe = np.full((len(factors) + len(prior), 2), graph.n_poses, np.int64)
-    keyframe[: len(factors), 0], keyframe[: len(factors), 1] = factors.i, factors.j
-    keyframe[len(factors):, 0] = prior.i
-    return np.where(keyframe < fixed, graph.n_poses, keyframe) - fixed
+    keyframe = np.stack((graph.between.i, graph.between.j), axis=1) - fixed
+    return np.where(keyframe < 0, graph.n_poses - fixed, keyframe)
 
 
 def step_poses(graph: FactorGraph, poses: Array, x: Array) -> Array:

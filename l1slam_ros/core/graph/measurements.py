@@ -31,12 +31,26 @@ class LoopClosure:
     """
     The pose of the robot at `stamp`, seen from the robot at the earlier `reference_stamp`.
 
+    Without a reference it is an absolute pose, seen from the map frame: GPS, a marker, a person.
+
     stamps : [ns]; pose3 : (7,) x y z qx qy qz qw [m]; covariance : (6, 6), rows x y z rx ry rz,
-    in the axes of the measured pose; trusted : a person or a marker vouches for it.
+    in the axes of the measured pose, those of the map where an absolute pose has no heading: its
+    component says nothing if the variance is 0 or less, infinite or above 1e6; trusted : a person
+    or a marker vouches for it.
     """
 
-    reference_stamp: int
+    reference_stamp: int | None
     stamp: int
     pose3: Array
     covariance: Array
     trusted: bool = False
+
+    @property
+    def is_absolute(self) -> bool:
+        """Whether it has no reference."""
+        return self.reference_stamp is None
+
+    @property
+    def stamps(self) -> tuple[int, int]:
+        """Reference and end [ns]; of an absolute pose its own stamp twice."""
+        return self.stamp if self.reference_stamp is None else self.reference_stamp, self.stamp

@@ -9,7 +9,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 
 
 def odometry_poses(graph: FactorGraph) -> Array:
@@ -30,7 +30,8 @@ def tree_poses(graph: FactorGraph, root: int) -> Array:
     """
     Return the poses along the breadth-first tree from `root`, (n, p).
 
-    The tree has the shortest chains, so the least drift, of all spanning trees from there.
+    The tree has the shortest chains, so the least drift, of all spanning trees from there. What
+    only the world ties to the root is a tree of its own, see `world_frame.placed`.
 
     Raises
     ------
@@ -43,20 +44,30 @@ def tree_poses(graph: FactorGraph, root: int) -> Array:
 
 
 def _breadth_first(graph: FactorGraph, root: int) -> Indices:
-    """Return the parent of each keyframe, (n,), the root its own; -1: it has no path to it."""
-    i, j, n = graph.between.i, graph.between.j, graph.n_poses
+    """
+    Return the parent of each keyframe, (n,), the root its own; -1: it has no path to it.
+
+    Where a path leads through the world, another tree begins: the first keyframe there is its own
+    parent, too.
+    """
+    factors, n, labels = graph.between, graph.n_poses, component_labels(graph)
+    tied = factors.j[factors.is_absolute]
+    i, j = factors.i[~factors.is_absolute], factors.j[~factors.is_absolute]
     near, far = np.concatenate((i, j)), np.concatenate((j, i))
     order = np.lexsort((far, np.arange(len(near)) >= len(i), near))
     start = np.searchsorted(near[order], np.arange(n + 1)).tolist()
     neighbours = far[order].tolist()
-    # One by one: a graph is often nearly a chain, with as many levels as keyframes.
-    parent, reached = [-1] * n, [root]
-    parent[root] = root
-    for k in reached:
-        for other in neighbours[start[k]:start[k + 1]]:
-            if parent[other] < 0:
-                parent[other] = k
-                reached.append(other)
+    parent = [-1] * n
+    for first in (root, *tied[labels[tied] == labels[root]].tolist()):
+        if parent[first] >= 0:
+            continue
+        # One by one: a graph is often nearly a chain, with as many levels as keyframes.
+        parent[first], reached = first, [first]
+        for k in reached:
+            for other in neighbours[start[k]:start[k + 1]]:
+                if parent[other] < 0:
+                    parent[other] = k
+                    reached.append(other)
     return np.array(parent)
 
 
@@ -83,6 +94,7 @@ def _compose_along(graph: FactorGraph, parent: Indices, candidates: Indices) -> 
     if (parent[child] < 0).any():
         lost = child[np.argmax(parent[child] < 0)]
         raise GraphError(f'keyframe {lost} has no path to the rest of the graph')
+    candidates = candidates[~factors.is_absolute[candidates]]
     i, j = factors.i[candidates], factors.j[candidates]
     pairs, first = np.unique(pair_key(i, j, n), return_index=True)
     wanted = pair_key(parent[child], child, n)
@@ -100,6 +112,6 @@ def _compose_along(graph: FactorGraph, parent: Indices, candidates: Indices) -> 
 
 
 def pair_key(i: Indices, j: Indices, n: int) -> Indices:
-    """Return one number for each pair of keyframes of n, whichever way round, (m,)."""
+    """Return one number for each pair of ends, whichever way round, (m,); n : of keyframes."""
     key: Indices = np.minimum(i, j) * n + np.maximum(i, j)
     return key

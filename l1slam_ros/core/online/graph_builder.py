@@ -3,7 +3,8 @@
 How the graph grows: odometry samples and loop closures in, keyframes and factors out.
 
 A loop closure names two times. It waits until odometry has reached both, is then carried to the
-nearest keyframes by the raw odometry in between, and becomes a between factor.
+nearest keyframes by the raw odometry in between, and becomes a between factor. An absolute pose
+names one, the other end of its factor is the world.
 """
 
 from collections import Counter
@@ -18,14 +19,11 @@ from l1slam_ros.core.geometry.noise import (
     MOST_OF_ODOMETRY,
     MOST_VARIANCE,
     Mask,
-    at_most,
-    bounds,
+    covariance_of,
     loop_identity,
-    or_model,
     root_of_inverse,
-    usable,
 )
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.keyframes import (
@@ -38,7 +36,13 @@ from l1slam_ros.core.online.keyframes import (
 from l1slam_ros.core.online.notes import Notes
 from l1slam_ros.core.online.odometry_stream import OdometryStream, Point
 from l1slam_ros.core.online.odometry_track import OdometryTrack
-from l1slam_ros.core.online.waiting_loops import WaitingLoop, WaitingLoops
+from l1slam_ros.core.online.waiting_loops import (
+    WaitingLoop,
+    WaitingLoops,
+    carried,
+    loop_covariance,
+    said,
+)
 from l1slam_ros.core.options import Options, option
 
 # [rad/s] A robot that nobody saw may have turned so fast.
@@ -229,19 +233,19 @@ class GraphBuilder:
         rows = np.flatnonzero(~factors.is_odometry)
         ends = stamps[factors.pairs[rows]]
         self._note_loops(rows, np.sort(ends, axis=1))
-        roots = np.linalg.inv(factors.sqrt_information[rows])
-        covariances = roots @ roots.transpose(0, 2, 1)
+        covariances = covariance_of(factors.sqrt_information[rows])
         for (reference, stamp), row, covariance in zip(ends.tolist(), rows, covariances,
                                                        strict=True):
             self._seen.add(loop_identity(reference, stamp, factors.measurement[row], covariance,
                                        bool(factors.trusted[row])))
 
     def add_loop(self, loop: LoopClosure) -> None:
-        """Take a loop closure in, once; it becomes a factor in `add_due_loops`."""
-        measurement = self.graph.manifold.from_pose3(loop.pose3[None])
+        """Take a loop closure or an absolute pose in, once; see `add_due_loops`."""
         covariance = self._loop_covariance(loop)
-        key = loop_identity(loop.reference_stamp, loop.stamp, measurement, covariance,
-                            loop.trusted)
+        if covariance is None:
+            return
+        measurement = said(self.graph.manifold, loop, covariance)
+        key = loop_identity(*loop.stamps, measurement, covariance, loop.trusted)
         if key in self._seen and not self._verbatim:
             self._refuse('repeated', loop, 'was sent before; expected each loop once')
             return
@@ -262,7 +266,7 @@ class GraphBuilder:
         due = self._waiting.due(now)
         since = now - int(self.options.loop.wait * 1e9)
         for one in self._waiting.expired(since) if self._track.first < since else ():
-            self._expired.extend(np.array([(one.loop.reference_stamp, one.loop.stamp)]))
+            self._expired.extend(np.array([one.loop.stamps]))
             self._refuse('expired', one.loop, f'waited for odometry until {now} ns; expected '
                          'odometry of its times')
             # Sent again when odometry has come that far, it is welcome.
@@ -271,7 +275,7 @@ class GraphBuilder:
 
     def _add_loops(self, due: list[WaitingLoop]) -> int:
         manifold = self.graph.manifold
-        stamps = np.array([(one.loop.reference_stamp, one.loop.stamp) for one in due])
+        stamps = np.array([one.loop.stamps for one in due])
         known = self._track.known_until(np.array([one.arrival for one in due]), stamps[:, 1])
         i, j = (self._track.nearest_keyframe(end, known) for end in stamps.T)
         keep = self._can_be_factors([one.loop for one in due], i, j)
@@ -281,14 +285,9 @@ class GraphBuilder:
         i, j, stamps = i[keep], j[keep], stamps[keep]
         to_reference = manifold.between(self.odometry[i], self._track.at(stamps[:, 0]))
         to_keyframe = manifold.between(self._track.at(stamps[:, 1]), self.odometry[j])
-        measured = np.concatenate([one.measurement for one in used])
-        measurement = manifold.compose(manifold.compose(to_reference, measured), to_keyframe)
-        # The error lives in the axes of the measured pose; see it from the keyframe instead.
-        Ad = manifold.adjoint(manifold.inverse(to_keyframe))
-        stated = np.concatenate([one.covariance for one in used])
-        covariance = Ad @ stated @ Ad.transpose(0, 2, 1)
-        # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
-        covariance = np.where(usable(covariance)[:, None, None], covariance, self._loop_model())
+        measurement, covariance, sound = carried(manifold, used, to_reference, to_keyframe)
+        covariance = np.where(sound[:, None, None], covariance, self._loop_model())
+        i = np.where([one.loop.is_absolute for one in used], WORLD, i)
         self.graph.append_between(i, j, measurement, root_of_inverse(covariance),
                                   np.array([one.loop.trusted for one in used]))
         last = len(self.graph.between)
@@ -298,8 +297,8 @@ class GraphBuilder:
     def _can_be_factors(self, loops: list[LoopClosure], i: Indices, j: Indices) -> Mask:
         """Return which loops between the keyframes i, j (m,) can be factors, and note the rest."""
         first = self._track.first
-        early = np.array([loop.reference_stamp < first for loop in loops])
-        same = (i == j) & ~early
+        early = np.array([loop.stamps[0] < first for loop in loops])
+        same = (i == j) & ~early & ~np.array([loop.is_absolute for loop in loops])
         for row in np.flatnonzero(early | same).tolist():
             if early[row]:
                 self._refuse('before_start', loops[row], 'begins before the odometry; expected '
@@ -315,8 +314,8 @@ class GraphBuilder:
         self._loop_stamps.extend(stamps)
 
     def _refuse(self, cause: str, loop: LoopClosure, why: str) -> None:
-        self.notes.refuse(
-            cause, f'a loop from {loop.reference_stamp} ns to {loop.stamp} ns {why}')
+        what = 'an absolute pose at' if loop.is_absolute else f'a loop from {loop.stamps[0]} ns to'
+        self.notes.refuse(cause, f'{what} {loop.stamp} ns {why}')
 
     def _note_bounds(self, what: str, stamp: int, bounded: list[tuple[float, float]],
                      most: float) -> None:
@@ -324,17 +323,21 @@ class GraphBuilder:
             self.notes.warn(f'{what}_variance', f'variance {found:g} of {what} at {stamp} ns; '
                             f'expected {LEAST_VARIANCE:g} to {most:g}; {used:g} is used')
 
-    def _loop_covariance(self, loop: LoopClosure) -> Array:
-        """Return what a loop states, the model where that is no covariance, (1, d, d)."""
-        model = self._loop_model()
+    def _loop_covariance(self, loop: LoopClosure) -> Array | None:
+        """
+        Return what a loop states, zeros for what it leaves unsaid, (1, d, d).
+
+        Where that is no covariance, the model; there is none of absolute poses: None, refused.
+        """
         stated = reduced_covariance(self.graph.manifold, loop.covariance[None])
-        if self.options.loop.covariance_source == 'model' or not usable(stated)[0]:
+        model, absolute = self._loop_model(), loop.is_absolute
+        if self.options.loop.covariance_source == 'model' and not absolute:
             return model[None]
-        if self._verbatim:
-            return stated
-        cut, large = at_most(stated, MOST_VARIANCE)
-        used, small = or_model(cut, model)
-        self._note_bounds('loop', loop.stamp, bounds(stated, used, large | small), MOST_VARIANCE)
+        used, bounded = loop_covariance(stated, None if absolute else model, self._verbatim)
+        self._note_bounds('loop', loop.stamp, bounded, MOST_VARIANCE)
+        if used is None:
+            self._refuse('covariance', loop, f'has the variances {np.diagonal(stated[0])}; '
+                         f'expected one above 0, to {MOST_VARIANCE:g}')
         return used
 
     def _loop_model(self) -> Array:

@@ -89,4 +89,4 @@ def fits(growth: Growth) -> tuple[Array, Mask]:
     cut, growth.cut = growth.cut, np.zeros_like(growth.cut)
     square[outside] = growth.innovations(outside).square
     growth.cut = cut
-    return square, ~accepted & (square < growth.gate()) & growth.is_loop
+    return square, ~accepted & (square < growth.gate(growth.factors.freedom)) & growth.is_loop

@@ -70,28 +70,30 @@ def noise_variance(found: Innovations) -> Array:
     from l1slam_ros.core.kernels.prediction import normalise
 
     best = np.argsort(found.log_det, kind='stable')[:_BEST_PREDICTED]
-    k, log_claim = found.system.block_size, found.log_claim[best]
+    k, log_claim, freedom = found.system.block_size, found.log_claim[best], found.freedom[best]
     residual, spread = -found.system.b.reshape(-1, k)[best], found.spread[best]
     fits: list[tuple[float, float, float]] = []
     for ratio in _RATIOS:
         square, log_det = normalise(spread + ratio * np.eye(k), residual)
+        log_det -= (k - freedom) * np.log(ratio)  # what says nothing has no noise
         for start in (1.0, *(np.quantile(square, (0.1, 0.5)) / k).tolist()):
-            likelihood, scale = _fitted_scale(square, log_det, log_claim, k, start)
+            likelihood, scale = _fitted_scale(square, log_det, log_claim, freedom, start)
             fits.append((likelihood - _RATIO_COSTS * len(best) * (ratio != 1), scale, ratio))
     _, scale, ratio = max(fits)
     return np.array([scale, ratio * scale])
 
 
-def _fitted_scale(square: Array, log_det: Array, log_claim: Array, k: int, start: float
+def _fitted_scale(square: Array, log_det: Array, log_claim: Array, freedom: Indices, start: float
                   ) -> tuple[float, float]:
     """Return the log likelihood of the best scale of C near a start, and that scale."""
     scale = start = max(start, _LEAST_START)
     for _ in range(_ROUNDS):
-        log_ratio = log_likelihood_ratio(square / scale, log_det + k * np.log(scale), log_claim, k)
+        log_ratio = log_likelihood_ratio(square / scale, log_det + freedom * np.log(scale),
+                                         log_claim, freedom)
         odds = log_odds_of_false(log_ratio, 0)
         true = probability(log_ratio - odds)
         # The one pseudo-factor at the start is for crowds without a true one.
-        before, scale = scale, float((true @ square + k * start) / (k * (true.sum() + 1)))
+        before, scale = scale, float((true @ square + start) / (true @ freedom + 1))
         if abs(scale / before - 1) < _SAME:
             break
     likelihood = np.logaddexp(log_ratio - odds, 0.0).sum() - len(square) * np.logaddexp(0, -odds)

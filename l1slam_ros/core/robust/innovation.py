@@ -9,6 +9,7 @@ map's uncertainty adds to the residual of a factor outside the graph, and that o
 the covariance of the residual of one inside. Two dozen samples cost a few ordinary solutions.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from math import lgamma
@@ -17,17 +18,17 @@ import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.noise import Mask, filled
 from l1slam_ros.core.geometry.quantiles import beta_quantile, gamma_quantile
-from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.linear_system import LinearSystem, linearise
+from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
+from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, linearise
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
+_beta_quantile, _gamma_quantile = cache(beta_quantile), cache(gamma_quantile)
 # A covariance from that many samples has standard deviations right to 15% (1 / sqrt(2 SAMPLES)).
 SAMPLES = 24
 # A factor whose residual has a variance below this part of its noise is checked by no other.
 _REDUNDANT = 1e-6
-# Logarithm of the width of a standard normal density, 1 over its height.
-_UNIT_WIDTH = np.log(2 * np.pi) / 2
 
 
 @dataclass(frozen=True)
@@ -37,13 +38,16 @@ class Posterior:
 
     cholesky : of its normal matrix; samples : (free keyframes + 1, k, SAMPLES) steps from it, as
     probable as the noise makes them, the last one of what is held fixed; residual : (m, k)
-    whitened, of each between factor; moment : (m, k, k) what noise as stated would make of it.
+    whitened, of each factor; moment : (m, k, k) what noise as stated would make of it; speaks :
+    (m, k) bool, see `BetweenFactors`; fixed : keyframes that are held, see `anchor`.
     """
 
     cholesky: BlockCholesky
     samples: Array
     residual: Array
     moment: Array
+    speaks: Mask
+    fixed: int
 
     def left_out(self) -> Array:
         """
@@ -55,7 +59,8 @@ class Posterior:
         """
         from l1slam_ros.core.kernels.prediction import normalise
 
-        square: Array = normalise(self.moment.copy(), self.residual)[0]
+        moment = filled(self.moment, ~self.speaks).copy()
+        square: Array = normalise(moment, self.residual)[0]
         alone = np.trace(self.moment, axis1=1, axis2=2) < _REDUNDANT
         return np.where(alone | ~np.isfinite(square), 0.0, square)
 
@@ -80,27 +85,37 @@ def sample_posterior(
     m, k = len(system.blocks), system.block_size
     # Signs have the covariance of white noise, and are quicker to draw.
     noise = 2.0 * rng.integers(0, 2, (m, k, SAMPLES), dtype=np.int8) - 1.0
+    speaks = graph.between.speaks
+    noise[~speaks] = 0.0
     right = np.zeros((system.size + 1, k, SAMPLES))
     gather(system.keyframe, system.blocks, noise, right)
     samples = np.zeros_like(right)
     samples[:-1] = cholesky.solve_many(right[:-1])
     moment = left_over(system.keyframe, system.blocks, samples, noise)
-    count = len(graph.between)
-    return Posterior(cholesky, samples, -system.b.reshape(m, k)[:count], moment[:count])
+    return Posterior(cholesky, samples, -system.b.reshape(m, k), moment, speaks,
+                     anchor(graph))
 
 
-def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array, size: int) -> Array:
+def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array,
+                         freedom: Indices) -> Array:
     """
-    Return ln p(residual) + ln(volume of a false one's), (m,); size : of a residual.
+    Return ln p(residual) + ln(volume of a false one's), (m,); freedom : (m,) of the residuals.
 
     p is Student's: what a covariance from `SAMPLES` samples says of one more (Jeffreys' prior).
     Where nothing but the noise speaks, that is a little generous.
     """
     q = SAMPLES
-    constant = lgamma((q + 1) / 2) - lgamma((q + 1 - size) / 2) - size * np.log(np.pi * q) / 2
+    constant = by_freedom(lambda size: lgamma((q + 1) / 2) - lgamma((q + 1 - size) / 2)
+                          - size * np.log(np.pi * q) / 2, freedom)
     density = constant - (log_det + (q + 1) * np.log1p(square / q)) / 2
     ratio: Array = log_claim + density
     return ratio
+
+
+def by_freedom(value: Callable[[int], float], freedom: Indices) -> Array:
+    """Return a value for each of (m,) degrees of freedom, each worked out once."""
+    some, place = np.unique(freedom, return_inverse=True)
+    return np.array([value(int(k)) for k in some])[place]
 
 
 @dataclass(frozen=True)
@@ -111,7 +126,7 @@ class Innovations:
     system : their linearisation, b minus the residual; spread : (m, k, k) covariance that the map
     adds to the residual; square : (m,) the squared residual in units of its covariance
     C = I + spread; log_det : (m,) of C; log_claim : (m,) of the volume of residuals that a false
-    factor could have.
+    factor could have; freedom : (m,) of the residual.
     """
 
     system: LinearSystem
@@ -119,16 +134,11 @@ class Innovations:
     square: Array
     log_det: Array
     log_claim: Array
+    freedom: Indices
 
-    def log_ratio(self, scale: float = 1.0) -> Array:
-        """
-        Return how much more probable each residual is if its factor is true, (m,) logarithms.
-
-        scale : of C; see `log_likelihood_ratio`
-        """
-        k = self.system.block_size
-        return log_likelihood_ratio(self.square / scale, self.log_det + k * np.log(scale),
-                                    self.log_claim, k)
+    def log_ratio(self) -> Array:
+        """Return how much more probable each residual is if its factor is true, (m,) logarithms."""
+        return log_likelihood_ratio(self.square, self.log_det, self.log_claim, self.freedom)
 
     def joint(self, posterior: Posterior, first: Indices, second: Indices) -> tuple[Array, Array]:
         """
@@ -148,38 +158,33 @@ class Innovations:
         square, log_det = prediction.normalise(
             covariance, np.concatenate((residual[pairs[0]], residual[pairs[1]]), axis=1))
         claim = self.log_claim[first] + self.log_claim[second]
-        return square, log_likelihood_ratio(square, log_det, claim, 2 * k)
+        freedom = self.freedom[first] + self.freedom[second]
+        return square, log_likelihood_ratio(square, log_det, claim, freedom)
 
 
 def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
-                log_widths: Array) -> Innovations:
+                log_volume: Array) -> Innovations:
     """
-    Return the innovations of the between factors of a graph, none of which made the posterior.
+    Return the innovations of the factors of a graph, none of which made the posterior.
 
-    log_widths : of `claimed_widths`
+    log_volume : (k,) of `claimed_volume`
     """
     from l1slam_ros.core.kernels import prediction
 
-    count = len(graph.between)
-    system = _between_part(linearise(graph, poses), count)
+    system, factors = linearise(graph, poses, fixed=posterior.fixed), graph.between
     k = system.block_size
     spread = prediction.spreads(system.keyframe, system.blocks, posterior.samples)
-    square, log_det = prediction.normalise(spread + np.eye(k), -system.b.reshape(count, k))
-    return Innovations(system, spread, square, log_det,
-                       log_claim(graph.between.sqrt_information, log_widths))
+    square, log_det = prediction.normalise(spread + np.eye(k), -system.b.reshape(-1, k))
+    return Innovations(system, spread, square, log_det, log_claims(factors, log_volume),
+                       factors.freedom)
 
 
-def log_claim(roots: Array, log_widths: Array) -> Array:
-    """
-    Return ln of the whitened volume that false factors fill, (m,); roots : (m, k, k) whiten.
-
-    A component without information has the residual 0 whether true or false: no evidence.
-    """
-    diagonal = np.abs(np.diagonal(roots, axis1=1, axis2=2))
-    known = diagonal > 0
-    widths = np.where(known, np.log(np.where(known, diagonal, 1.0)) + log_widths, _UNIT_WIDTH)
-    volume: Array = widths.sum(axis=1)
-    return volume
+def log_claims(factors: BetweenFactors, log_volume: Array) -> Array:
+    """Return the logarithms of the volumes, in sigmas, that false factors fill, (m,)."""
+    roots = np.diagonal(factors.sqrt_information, axis1=1, axis2=2)
+    claims: Array = (factors.speaks * log_volume).sum(axis=1) + np.log(
+        np.where(factors.speaks, roots, 1.0)).sum(axis=1)
+    return claims
 
 
 def exact_squares(graph: FactorGraph, poses: Array, posterior: Posterior) -> Array:
@@ -190,8 +195,7 @@ def exact_squares(graph: FactorGraph, poses: Array, posterior: Posterior) -> Arr
     """
     from l1slam_ros.core.kernels import prediction
 
-    count = len(graph.between)
-    system = _between_part(linearise(graph, poses), count)
+    system, count = linearise(graph, poses, fixed=posterior.fixed), len(graph.between)
     k = system.block_size
     right = np.zeros((system.size + 1, k, count * k))
     rows = np.eye(count * k).reshape(count, k, count * k)
@@ -205,41 +209,37 @@ def exact_squares(graph: FactorGraph, poses: Array, posterior: Posterior) -> Arr
     return square
 
 
-def _between_part(system: LinearSystem, count: int) -> LinearSystem:
-    k = system.block_size
-    return LinearSystem(system.keyframe[:count], system.blocks[:count], system.b[: count * k],
-                        system.size)
-
-
-def claimed_widths(manifold: Manifold, poses: Array, rng: np.random.Generator) -> Array:
+def claimed_volume(manifold: Manifold, poses: Array, rng: np.random.Generator) -> Array:
     """
-    Return the logarithms of how wide the claims of false factors spread, (k,).
+    Return the logarithm of the volume that the claims of false factors fill, (k,) its factors.
 
-    The volume of a Gaussian, (2 pi)^(1/2) sigma in each direction, as wide as the positions of
+    That of a Gaussian, (2 pi)^(k/2) sqrt(det M), as wide in each direction as the positions of
     random pairs lie apart (a false factor need not know of the corridor), with any rotation.
     """
     apart = manifold.local(poses, poses[rng.permutation(len(poses))])
     variance = np.full(manifold.TANGENT_SIZE, np.pi**2 / 3)
     variance[manifold.TRANSLATION] = (apart[:, manifold.TRANSLATION] ** 2).mean()
     with np.errstate(divide='ignore'):
-        widths: Array = np.log(variance) / 2 + _UNIT_WIDTH
-    return widths
+        volume: Array = np.log(2 * np.pi * variance) / 2
+        return volume
 
 
-@cache
-def chi2_quantile(probability: float, freedom: int) -> float:
-    """Return what a sum of `freedom` squared standard normal numbers stays below."""
-    return 2 * gamma_quantile(freedom / 2, probability)
+def chi2_quantile(probability: float, freedom: Indices) -> Array:
+    """Return what sums of so many squared standard normal numbers, (m,), stay below, (m,)."""
+    return by_freedom(lambda k: 2 * _gamma_quantile(k / 2, probability), freedom)
 
 
-@cache
-def sampled_quantile(probability: float, freedom: int) -> float:
+def sampled_quantile(probability: float, freedom: Indices) -> Array:
     """
-    Return what r'C^-1 r of normal numbers r (freedom,) stays below.
+    Return what r'C^-1 r of normal numbers stays below, (m,), by how many they are: freedom (m,).
 
     C is the covariance of `SAMPLES` samples, so that has Hotelling's distribution:
     T^2 (q - k + 1) / (q k) is Fisher's F of k and q - k + 1 degrees of freedom.
     """
-    rest = SAMPLES - freedom + 1
-    x = beta_quantile(freedom / 2, rest / 2, probability)
-    return SAMPLES * x / (1 - x)
+    def quantile(k: int) -> float:
+        x = _beta_quantile(k / 2, (SAMPLES - k + 1) / 2, probability)
+        return SAMPLES * x / (1 - x)
+
+    return by_freedom(quantile, freedom)
+
+

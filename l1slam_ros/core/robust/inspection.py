@@ -14,8 +14,15 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
-from l1slam_ros.core.graph.linear_system import LinearSystem, ends, keyframes_of, step_poses
+from l1slam_ros.core.graph.linear_system import (
+    LinearSystem,
+    anchor,
+    ends,
+    keyframes_of,
+    step_poses,
+)
 from l1slam_ros.core.graph.spanning_tree import odometry_poses, pair_key, tree_poses
+from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
 
 # A step this many times as long as nine in ten of all steps is no step of the same robot.
@@ -112,9 +119,15 @@ class InformationRange:
 
 
 def information_range(graph: FactorGraph, part: slice) -> InformationRange:
-    """Return the range of the diagonal entries of the information in `part` of the tangent."""
+    """
+    Return the range of the diagonal entries of the information in `part` of the tangent.
+
+    Of what keyframes say of each other; absolute factors are measurements of another sort.
+    """
     diagonal = (graph.between.sqrt_information**2).sum(axis=1)[:, part]
-    least, most = diagonal.min(axis=1), diagonal.max(axis=1)
+    silent = ~graph.between.speaks[:, part] | graph.between.is_absolute[:, None]
+    least = np.where(silent, np.inf, diagonal).min(axis=1)
+    most = np.where(silent, 0.0, diagonal).max(axis=1)
     low, high = int(np.argmin(least)), int(np.argmax(most))
     return InformationRange(low, float(least[low]), high, float(most[high]))
 
@@ -153,7 +166,7 @@ def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
         return NoiseScales(np.nan, np.nan, *ends)
     system = _system(part, _l2_poses(part))
     group = np.repeat(is_loop.astype(np.int64), graph.manifold.TANGENT_SIZE)
-    noise = rng.standard_normal(len(group))
+    noise = rng.standard_normal(len(group)) * part.between.speaks.ravel()
     variance, spare = np.ones(2), np.zeros(2)
     for _ in range(_ROUNDS):
         both = np.stack((system.b, np.sqrt(variance)[group] * noise), axis=1)
@@ -199,22 +212,19 @@ def initial_poses(graph: FactorGraph, stored: Array | None, ids: Indices) -> Arr
     if stored is not None:
         return stored
     require_connected(graph, ids)
-    if len(odometry_gaps(graph)):
-        return tree_poses(graph, 0)
-    return odometry_poses(graph)
+    poses = tree_poses(graph, 0) if len(odometry_gaps(graph)) else odometry_poses(graph)
+    return placed(graph, poses)
 
 
 def cost_at(graph: FactorGraph, poses: Array) -> float:
     """Return the L1 cost of a graph at poses (n, p), nothing compiled."""
-    manifold, factors, prior = graph.manifold, graph.between, graph.prior
+    manifold, factors = graph.manifold, graph.between
     B = manifold.between(*ends(graph, poses))
-    e = whiten(factors.sqrt_information, manifold.local(factors.measurement, B))
-    e_prior = whiten(prior.sqrt_information, manifold.local(prior.measurement, poses[prior.i]))
-    return l1_cost(e) + l1_cost(e_prior)
+    return l1_cost(whiten(factors.sqrt_information, manifold.local(factors.measurement, B)))
 
 
 def _l2_poses(graph: FactorGraph) -> Array:
-    """Return the L2 map of a graph without priors, (n, p): rotations, positions, then both."""
+    """Return the L2 map of a graph without absolute factors, (n, p): rotations first."""
     manifold, poses = graph.manifold, tree_poses(graph, 0)
     for part in (manifold.ROTATION, manifold.TRANSLATION):
         system = _system(graph, poses).part(part)
@@ -237,7 +247,7 @@ def _l2_poses(graph: FactorGraph) -> Array:
 
 def _system(graph: FactorGraph, poses: Array) -> LinearSystem:
     """
-    Return the linear system of a graph without priors by its manifold's verbs, nothing compiled.
+    Return the linear system of a graph by its manifold's verbs, nothing compiled.
 
     A look at a graph is over before compiled loops are there. With B = Xi^-1 Xj the residual is
     that of B seen from Z; a step s of i moves B on the right by -Ad(B^-1) s.
@@ -249,7 +259,8 @@ def _system(graph: FactorGraph, poses: Array) -> LinearSystem:
     roots = factors.sqrt_information
     b = -whiten(roots, manifold.local(factors.measurement, B))
     blocks = np.stack((whiten(roots, J_i), whiten(roots, J_j)), axis=1)
-    return LinearSystem(keyframes_of(graph), blocks, b.ravel(), graph.n_poses - 1)
+    fixed = anchor(graph)
+    return LinearSystem(keyframes_of(graph, fixed), blocks, b.ravel(), graph.n_poses - fixed)
 
 
 def _least_squares(system: LinearSystem, b: Array, weights: Array | float = 1.0) -> Array:
@@ -281,7 +292,7 @@ def _densest_part(graph: FactorGraph) -> tuple[FactorGraph, Indices, np.ndarray]
     """
     Return a connected part of some consecutive keyframes, with as many factors as may be.
 
-    Its graph without priors, its keyframes in the whole graph (k,), and which of its between
+    Its graph without absolute factors, its keyframes in the whole graph (k,), and which of its
     factors are loops (m,).
     """
     factors, n = graph.between, graph.n_poses
@@ -299,7 +310,7 @@ def _densest_part(graph: FactorGraph) -> tuple[FactorGraph, Indices, np.ndarray]
 def _restricted(graph: FactorGraph, keyframes: Indices) -> tuple[FactorGraph, Indices]:
     """Return the graph of these keyframes alone, ascending, and which factors it has."""
     factors = graph.between
-    index = np.full(graph.n_poses, -1)
+    index = np.full(graph.n_poses + 1, -1)  # the last one is the world's
     index[keyframes] = np.arange(len(keyframes))
     i, j = index[factors.i], index[factors.j]
     rows = np.flatnonzero((i >= 0) & (j >= 0))

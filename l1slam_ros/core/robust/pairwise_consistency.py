@@ -14,9 +14,9 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import whiten
-from l1slam_ros.core.graph.linear_system import anchor
+from l1slam_ros.core.graph.linear_system import with_world
 from l1slam_ros.core.robust.gating import DOUBT
-from l1slam_ros.core.robust.innovation import claimed_widths, log_claim, log_likelihood_ratio
+from l1slam_ros.core.robust.innovation import claimed_volume, log_claims, log_likelihood_ratio
 from l1slam_ros.core.robust.rounds import Growth
 
 # So many loops are asked.
@@ -63,7 +63,7 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
 def spanned(low: Indices, high: Indices, n: int) -> Indices:
     """Return how many factors span the step from each of n keyframes to the next, (n - 1,)."""
     change = np.zeros(n, np.int64)
-    np.add.at(change, low, 1)
+    np.add.at(change, np.maximum(low, 0), 1)  # the world is before all keyframes
     np.add.at(change, high, -1)
     count: Indices = np.cumsum(change)[:-1]
     return count
@@ -95,8 +95,8 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
     near = np.argsort(np.einsum('mi,ij,mj->m', error, scatter, error), kind='stable')
     near = near[: _NEAREST * len(rows)]
     a, b, error = a[near], b[near], error[near]
-    all_roots = growth.subgraph(rows).between.sqrt_information
-    roots, fixed = all_roots[b], anchor(growth.graph)
+    factors, fixed = growth.subgraph(rows).between, growth.posterior.fixed
+    roots = factors.sqrt_information[b]
     start = manifold.identity(len(a))
     there = manifold.retract(start, error)
     k, steps = manifold.TANGENT_SIZE, growth.posterior.samples[:-1].transpose(2, 0, 1)
@@ -107,9 +107,10 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
         change = whiten(roots, manifold.local(there, here))
         covariance += change[:, :, None] * change[:, None, :] / len(steps)
     square, log_det = normalise(covariance, whiten(roots, error))
-    widths = claimed_widths(manifold, poses, np.random.default_rng(0))
-    log_ratio = log_likelihood_ratio(square, log_det, log_claim(roots, widths), k)
-    good = np.flatnonzero((square < growth.gate()) & (log_ratio > np.log(len(rows))))
+    volume = claimed_volume(manifold, poses, np.random.default_rng(0))
+    freedom = factors.freedom[b]
+    log_ratio = log_likelihood_ratio(square, log_det, log_claims(factors, volume)[b], freedom)
+    good = np.flatnonzero((square < growth.gate(freedom)) & (log_ratio > np.log(len(rows))))
     a, b, log_ratio = a[good], b[good], log_ratio[good]
     return np.concatenate((a, b)), np.concatenate((b, a)), np.tile(log_ratio, 2)
 
@@ -127,6 +128,7 @@ def _difference(
 ) -> Array:
     """Return t2v(Z_b^-1 Z) for pairs of factors, (pairs, k); Z : what follows from a for b."""
     low, high, Z = ends
+    poses = with_world(manifold, poses)
     first = manifold.between(poses[low[b]], poses[low[a]])
     second = manifold.between(poses[high[a]], poses[high[b]])
     return manifold.local(Z[b], manifold.compose(manifold.compose(first, Z[a]), second))

@@ -11,6 +11,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
+from l1slam_ros.core.graph.linear_system import with_world
 
 # [m] Linked are loops whose ends lie within it along the way, in sum, and what they claim, too.
 NEAR = 5.0
@@ -34,9 +35,10 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
     manifold, (low, high, Z) = graph.manifold, ends_in_time(graph)
     positions = manifold.positions(chain)
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    way = np.concatenate(([0.0], np.cumsum(steps)))
+    # The world is where the way begins, as WORLD finds it: last.
+    way = np.concatenate(([0.0], np.cumsum(steps), [0.0]))
     ends = np.stack((way[high] + way[low], way[high] - way[low]), axis=1)
-    claim = manifold.positions(manifold.compose(chain[low], Z)) - positions[high]
+    claim = manifold.positions(manifold.compose(with_world(manifold, chain)[low], Z)) - positions[high]
     cells, cell = np.unique(np.round(np.hstack((ends, claim)) / (_GRAIN * NEAR)), axis=0,
                             return_inverse=True)
     pairs = cKDTree(cells).query_pairs(1 / _GRAIN, p=np.inf, output_type='ndarray')

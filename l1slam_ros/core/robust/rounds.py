@@ -16,12 +16,13 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, ends_in_time
 from l1slam_ros.core.graph.linear_system import anchor, linearise, step_poses, whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.robust.gating import DOUBT, believable, log_odds_of_false, noise_variance
 from l1slam_ros.core.robust.innovation import (
     Innovations,
     Posterior,
     chi2_quantile,
-    claimed_widths,
+    claimed_volume,
     innovations,
     sample_posterior,
     sampled_quantile,
@@ -84,7 +85,7 @@ class Growth:
         self.is_loop: Mask = ~self.factors.is_odometry
         self.cut: Mask = np.arange(len(self.factors)) >= self.size
         self.accepted: Mask = ~self.is_loop | self.trusted
-        self.poses = odometry_poses(self.graph)
+        self.poses = placed(self.graph, odometry_poses(self.graph))
         self.part = np.zeros(graph.n_poses, np.int64)
         self.variance = np.ones(2)
         self._floor, self._at_their_word = np.full(2, _LEAST_VARIANCE), False
@@ -132,7 +133,8 @@ class Growth:
         """Return the graph of some factors, with the noise as it was found."""
         self._check()  # with this, each long step begins
         noise = self.variance_at_their_word() if self._at_their_word else self.variance
-        variance = noise[self.is_loop[rows].astype(np.int64)]
+        variance = np.where(self.factors.is_absolute[rows], 1.0,
+                            noise[self.is_loop[rows].astype(np.int64)])
         cut = self.cut[rows]
         if not cut.any():
             return self.graph.subset(rows, variance)
@@ -169,11 +171,11 @@ class Growth:
     def across(self) -> Mask:
         """Return which factors lead from one part to another, (m,) bool."""
         across: Mask = self.part[self.low] != self.part[self.high]
-        return across
+        return across & ~self.factors.is_absolute
 
-    def gate(self, factors: int = 1) -> float:
-        """Return what the squared innovation of so many true factors stays below."""
-        return sampled_quantile(1 - REFUSED, factors * self.graph.manifold.TANGENT_SIZE)
+    def gate(self, freedom: Indices) -> Array:
+        """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""
+        return sampled_quantile(1 - REFUSED, freedom)
 
     def solve(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
@@ -205,6 +207,7 @@ class Growth:
         stated = np.trace(self.posterior.moment, axis1=1, axis2=2)
         for kind in (0, 1):
             known = (self.is_loop[rows] == kind) & (stated > _CHECKED * k)
+            known &= ~self.factors.is_absolute[rows]
             if np.count_nonzero(known) >= _KNOWN:
                 scale = float(np.median(square[known] / stated[known])) / _MEDIAN
                 if scale > _NOISIER:
@@ -214,31 +217,36 @@ class Growth:
 
     def _misfits(self, rows: Indices) -> Indices:
         """Return the accepted loops that do not fit, or that all others speak against."""
-        k = self.graph.manifold.TANGENT_SIZE
+        freedom = self.factors.freedom[rows]
         may_go = self.is_loop[rows] & ~self.trusted[rows]
-        far = (self.posterior.residual**2).sum(axis=1) > chi2_quantile(1 - _DROPPED, k)
+        far = (self.posterior.residual**2).sum(axis=1) > chi2_quantile(1 - _DROPPED, freedom)
         against = np.where(may_go, self.posterior.left_out(), 0.0)
         # Next to a false loop the true ones look bad too: only the worst go.
-        far |= against > max(self.doubted(), against.max(initial=0.0) / 2)
+        far |= against > np.maximum(self.doubted(freedom), against.max(initial=0.0) / 2)
         misfits: Indices = rows[far & may_go]
         return misfits
 
-    def doubted(self) -> float:
-        """Return what `Posterior.left_out` of no factor exceeds if all accepted ones are true."""
+    def doubted(self, freedom: Indices) -> Array:
+        """Return what `Posterior.left_out` stays below, (m,), if all accepted ones are true."""
         accepted = int(np.count_nonzero(self.accepted))
-        return sampled_quantile(1 - _DOUBTED / accepted, self.graph.manifold.TANGENT_SIZE)
+        return sampled_quantile(1 - _DOUBTED / accepted, freedom)
 
     def _learn_variance(self, rows: Indices) -> None:
-        """Compare the residuals with what the noise makes of them, for odometry and for loops."""
+        """
+        Compare the residuals with what the noise makes of them, for odometry and for loops.
+
+        Absolute factors are as noisy as they say: of theirs a few tell nothing.
+        """
         kind, known = self.is_loop[rows], _KNOWN * self.graph.manifold.TANGENT_SIZE
-        found = np.bincount(kind, (self.posterior.residual**2).sum(axis=1), 2)
-        stated = np.bincount(kind, np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
+        own = np.where(self.factors.is_absolute[rows], 0.0, 1.0)
+        found = np.bincount(kind, own * (self.posterior.residual**2).sum(axis=1), 2)
+        stated = np.bincount(kind, own * np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
         scale = (found + known) / (stated + known)
         self.variance = np.maximum(self.variance * scale, self._floor)
 
     def innovations(self, rows: Indices) -> Innovations:
         """Return how factors that are not accepted fit the map."""
-        widths = claimed_widths(self.graph.manifold, self.poses, self.rng)
+        widths = claimed_volume(self.graph.manifold, self.poses, self.rng)
         return innovations(self.subgraph(rows), self.poses, self.posterior, widths)
 
     def believable(self, rows: Indices) -> Indices:
@@ -246,7 +254,7 @@ class Growth:
         if not len(rows):
             return rows
         found = self.innovations(rows)
-        fits = found.square < self.gate()
+        fits = found.square < self.gate(found.freedom)
         log_ratio = found.log_ratio()
         # Taken at their word all are noisier than they are, so that more fit by chance: then only
         # the rest says how many of the rest are false.
@@ -274,7 +282,7 @@ class Growth:
             return best[:0]
         square, both = found.joint(self.posterior, a, b)
         place, ends = (values[rows] for values in self._places)
-        agree = np.flatnonzero(square < self.gate(2))
+        agree = np.flatnonzero(square < self.gate(found.freedom[a] + found.freedom[b]))
         a, b, both = a[agree], b[agree], both[agree]
         own = place[a] == place[b]
         most = -np.log(neighbours_agree(place[~fits], ends[~fits]))
@@ -303,7 +311,7 @@ def solve(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
     """
     # In units of its noise, chi2 is about as large as there are spare measurements.
     k = graph.manifold.TANGENT_SIZE
-    spare = k * max(len(graph.between) - graph.n_poses + 1, 1)
+    spare = max(int(graph.between.freedom.sum()) - k * (graph.n_poses - anchor(graph)), k)
     chi2 = _chi2(graph, poses)
     if chi2 > _FITS * spare:
         linear = _two_linear_steps(graph, poses, cholesky)

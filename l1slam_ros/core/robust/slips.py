@@ -104,10 +104,15 @@ def _slipped(growth: Growth, cut: Growth, step: int) -> bool:
                       for state in (cut, growth))
     span = np.unique(growth.place[cut.accepted & _spanning(growth, step)])
     won, lost = len(np.setdiff1d(with_, without)), len(np.setdiff1d(without, with_))
-    gain = (_excess(growth, cut.variance) - _excess(cut, cut.variance)
-            + growth.gate() * (won - lost))
-    return (gain > _GAIN * growth.gate() and len(span) >= SPANNING and won >= _WON * lost
+    gate = _gate(growth)
+    gain = _excess(growth, cut.variance) - _excess(cut, cut.variance) + gate * (won - lost)
+    return (gain > _GAIN * gate and len(span) >= SPANNING and won >= _WON * lost
             and _is_gross(cut, step))
+
+
+def _gate(growth: Growth) -> float:
+    """Return the gate of a loop that says all there is to say."""
+    return float(growth.gate(np.array([growth.graph.manifold.TANGENT_SIZE]))[0])
 
 
 def _excess(growth: Growth, variance: Array) -> float:
@@ -116,7 +121,7 @@ def _excess(growth: Growth, variance: Array) -> float:
     state.variance = variance
     rows = np.flatnonzero(state.accepted & ~state.cut)
     residual = whitened_residual(state.subgraph(rows), state.poses)
-    return float((residual**2).sum() - len(residual))
+    return float((residual**2).sum() - state.factors.freedom[rows].sum())
 
 
 def _is_gross(growth: Growth, step: int) -> bool:
@@ -127,15 +132,16 @@ def _is_gross(growth: Growth, step: int) -> bool:
     state.cut[step] = False
     alone = state.subgraph(np.array([step]))
     square = exact_squares(alone, state.poses, state.posterior)
-    steps, k = np.count_nonzero(~growth.is_loop), growth.graph.manifold.TANGENT_SIZE
-    return bool(square[0] > chi2_quantile(1 - DOUBT / steps, k))
+    steps = np.count_nonzero(~growth.is_loop)
+    return bool((square > chi2_quantile(1 - DOUBT / steps, alone.between.freedom)).all())
 
 
 def refused(growth: Growth) -> Indices:
     """Return the undecided loops that do not fit, (k,)."""
     rows = growth.undecided()
     if len(rows):
-        rows = rows[growth.innovations(rows).square > growth.gate()]
+        found = growth.innovations(rows)
+        rows = rows[found.square > growth.gate(found.freedom)]
     return rows
 
 
@@ -144,7 +150,7 @@ def _suspected(growth: Growth) -> list[int]:
     group = strongest_group(growth, refused(growth))
     square = unusual_motion(growth.graph, growth.forward)
     odometry = np.flatnonzero(~growth.is_loop & ~growth.cut)
-    limit = chi2_quantile(1 - DOUBT / len(odometry), growth.graph.manifold.TANGENT_SIZE)
+    limit = chi2_quantile(1 - DOUBT / len(odometry), growth.factors.freedom[odometry])
     jumps = odometry[square[odometry] > limit]
     if len(group.places) < SPANNING:
         group, jumps = NO_GROUP, jumps[:0]
@@ -159,7 +165,7 @@ def _spoken_against(growth: Growth) -> Indices:
     against = np.where((growth.is_loop | growth.cut)[inside], 0.0, growth.posterior.left_out())
     against *= growth.variance[0] / growth.variance_at_their_word()[0]
     # To cut it gains no more than that, unless it wins places; of those the other way tells.
-    if against.max() < _GAIN * growth.gate():
+    if against.max() < _GAIN * _gate(growth):
         return inside[:0]
     # Steps between which no accepted loop ends share what speaks against them.
     suspects = inside[against > against.max() / 2]

@@ -15,12 +15,21 @@ from numpy.typing import NDArray
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, keyframes_of
+from l1slam_ros.core.graph.linear_system import (
+    LinearSystem,
+    anchor,
+    keyframes_of,
+    loose_keyframes,
+)
 
 Places = NDArray[np.int32]
+_NONE = np.zeros(0, np.int64)
 
 # Blocks of SE(2) that one gigabyte holds.
 MOST_BLOCKS = 15_000_000
+# Part of its diagonal by which a loose keyframe is damped: above what factorising leaves of a
+# pivot that is none, and for a heading the same as to know it to within thousands of turns.
+_LOOSE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -80,11 +89,13 @@ class BlockCholesky:
     ----------
     pattern : of `keyframe`, or of more
     keyframe : (m, 2) as in `LinearSystem`
+    loose : (k,) columns that may move though nothing determines how, see `loose_keyframes`: they
+        are damped, by so little that whatever is determined does not feel it
 
     """
 
-    def __init__(self, pattern: Pattern, keyframe: Indices):
-        self.pattern = pattern
+    def __init__(self, pattern: Pattern, keyframe: Indices, loose: Indices = _NONE):
+        self.pattern, self._loose = pattern, loose
         self._keyframe = keyframe
         self._layouts: dict[int, _Layout] = {}
         self._factored: _Layout | None = None
@@ -96,8 +107,8 @@ class BlockCholesky:
         """
         Factor J'WJ + diag(diagonal) + share C; False: it is not positive definite.
 
-        weights : (rows,); diagonal : (columns,) or one number; curvature : (m', 2 k, 2 k) of the
-        first m' factors, C their sum
+        weights : (rows,); diagonal : (columns,) or one number; curvature : (m, 2 k, 2 k) of each
+        factor, C their sum
         """
         from l1slam_ros.core.kernels import cholesky
 
@@ -108,6 +119,9 @@ class BlockCholesky:
         if curvature is None or not share:
             curvature = np.empty((0, 2 * k, 2 * k))
         added = np.full(system.size * k, diagonal, float).reshape(-1, k)
+        if len(self._loose):
+            own = system.diagonal(weights).reshape(-1, k)
+            added[self._loose] += _LOOSE * own[self._loose]
         cholesky.assemble(layout.panels, *layout.places, system.blocks, weights.reshape(-1, k),
                           added, curvature, share, layout.size)
         self._factored = layout
@@ -163,6 +177,7 @@ def cholesky_of(graph: FactorGraph) -> BlockCholesky:
     FillError : the factor would have more than `MOST_BLOCKS`.
 
     """
-    keyframe = keyframes_of(graph)
-    pattern = find_pattern(keyframe, graph.n_poses - anchor(graph), MOST_BLOCKS)
-    return BlockCholesky(pattern, keyframe)
+    fixed = anchor(graph)
+    keyframe = keyframes_of(graph, fixed)
+    pattern = find_pattern(keyframe, graph.n_poses - fixed, MOST_BLOCKS)
+    return BlockCholesky(pattern, keyframe, loose_keyframes(graph))

@@ -5,8 +5,6 @@ Weighted linear least squares by one sparse factorisation, and the start it give
 In: a linear system. Out: the step that minimises a weighted sum of squares.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
@@ -35,7 +33,7 @@ def weighted_least_squares(
     """
     added: Array | float = 0.0
     if damping:
-        added = damping * replace(system, blocks=system.blocks**2).transposed_times(weights)
+        added = damping * system.diagonal(weights)
     if not cholesky.factorise(system, weights, added):
         raise GraphError('the normal matrix is singular: a part of the graph is not tied to '
                          'the anchor, or weights differ beyond double precision')

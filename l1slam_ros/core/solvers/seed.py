@@ -22,6 +22,7 @@ from l1slam_ros.core.graph.linear_system import (
     whitened_residual,
 )
 from l1slam_ros.core.graph.spanning_tree import odometry_poses, tree_poses
+from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.interior_point import interior_point
 from l1slam_ros.core.solvers.optimality import l1_cost
@@ -56,6 +57,7 @@ def seed_poses(
     references = [tree_poses(graph, 0), tree_poses(graph, graph.n_poses // 2)]
     if graph.between.is_odometry.sum() == graph.n_poses - 1:
         references.insert(0, odometry_poses(graph))
+    references = [placed(graph, poses) for poses in references]
     candidates: list[Array] = []
     for k, reference in enumerate(references):
         # Two references that unwrap every factor alike lead to one and the same problem.

@@ -52,12 +52,11 @@ def insert_loops(graph: FactorGraph, loops: Loops) -> FactorGraph:
     The factors that were there keep their order, so in a graph in order of time the loops come
     when a robot would have met them.
     """
-    factors, prior = graph.between, graph.prior
+    factors = graph.between
     ends = np.maximum.accumulate(np.maximum(factors.i, factors.j))
     place = np.searchsorted(ends, loops.j, side='right')
     longer = FactorGraph(graph.manifold)
     longer.add_poses(graph.n_poses)
-    longer.add_prior(prior.i, prior.measurement, _information(prior.sqrt_information))
     longer.add_between(
         np.insert(factors.i, place, loops.i), np.insert(factors.j, place, loops.j),
         np.insert(factors.measurement, place, loops.measurement, axis=0),

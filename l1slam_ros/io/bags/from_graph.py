@@ -5,10 +5,11 @@ A graph as the messages of a bag, such that it can be had back exactly.
     /odom            one nav_msgs/Odometry per keyframe: the odometry factors, chained
     /loop_closures   one geometry_msgs/PoseWithCovarianceStamped per other factor;
                      /trusted_loop_closures for those that are never doubted
+    /absolute_poses  the same per absolute factor
     /ground_truth    geometry_msgs/PoseStamped, where the truth is known
 
 Covariances are those of the factors, in the axes of the measured pose: of an odometry message
-that of the motion since the message before.
+that of the motion since the message before. What is left unsaid has an infinite variance.
 """
 
 import os
@@ -18,10 +19,21 @@ import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.geometry.noise import LEAST_VARIANCE, MOST_OF_ODOMETRY, MOST_VARIANCE
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.geometry.noise import (
+    LEAST_VARIANCE,
+    MOST_OF_ODOMETRY,
+    MOST_VARIANCE,
+    covariance_of,
+)
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.measurements import FASTEST, LONGEST_PAUSE, SHORTEST_STEP
-from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUSTED_LOOP_TOPIC, TRUTH_TOPIC
+from l1slam_ros.io.bags.topics import (
+    ABSOLUTE_TOPIC,
+    LOOP_TOPIC,
+    ODOMETRY_TOPIC,
+    TRUSTED_LOOP_TOPIC,
+    TRUTH_TOPIC,
+)
 from l1slam_ros.io.bags.writer import BagWriter, new_bag
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.graphs.graph_file import GraphRecord
@@ -69,21 +81,25 @@ def write_graph_bag(
             if true is not None:
                 true.write(stamp, k)
             for loop in loops[k]:
-                factors.write_loop(stamp, stamps[graph.between.i[loop]], loop)
+                i = graph.between.i[loop]
+                factors.write_loop(stamp, loop, 'map' if i == WORLD else reference_frame_id(
+                    _BASE_FRAME, stamps[i]))
 
 
 class _FactorWriter:
     """Writes /odom and /loop_closures, filling one message of each anew for every factor."""
 
     def __init__(self, writer: BagWriter, graph: FactorGraph):
-        manifold, roots = graph.manifold, np.linalg.inv(graph.between.sqrt_information)
+        manifold, factors = graph.manifold, graph.between
         self._writer = writer
-        self._measured = manifold.to_pose3(graph.between.measurement).tolist()
-        self._covariances = roots @ roots.transpose(0, 2, 1)
+        self._measured = manifold.to_pose3(factors.measurement).tolist()
+        self._covariances = covariance_of(factors.sqrt_information)
+        diagonal = np.arange(manifold.TANGENT_SIZE)
+        self._covariances[:, diagonal, diagonal] += np.where(factors.speaks, 0.0, np.inf)
         rows = np.array(manifold.COVARIANCE_ROWS)
         self._entries = (6 * rows[:, None] + rows).ravel()
-        self._topics = [TRUSTED_LOOP_TOPIC if trusted else LOOP_TOPIC
-                        for trusted in (graph.between.trusted & ~graph.between.is_odometry)]
+        self._topics = np.where(factors.is_absolute, ABSOLUTE_TOPIC, np.where(
+            factors.trusted & ~factors.is_odometry, TRUSTED_LOOP_TOPIC, LOOP_TOPIC)).tolist()
         self._odometry = _blank_odometry(writer.types)
         self._loop = _blank_loop(writer.types)
         writer.add_topic(ODOMETRY_TOPIC, self._odometry.__msgtype__)
@@ -96,10 +112,10 @@ class _FactorWriter:
         self._odometry.pose.covariance = self._covariance(step)
         self._writer.write(ODOMETRY_TOPIC, stamp, self._odometry)
 
-    def write_loop(self, stamp: int, reference_stamp: int, loop: int) -> None:
-        """Write the factor `loop`, between the keyframes of two stamps [ns]."""
+    def write_loop(self, stamp: int, loop: int, frame: str) -> None:
+        """Write the factor `loop` of the keyframe of a stamp [ns], seen from a frame."""
         _fill(self._loop.header, self._loop.pose.pose, stamp, self._measured[loop])
-        self._loop.header.frame_id = reference_frame_id(_BASE_FRAME, reference_stamp)
+        self._loop.header.frame_id = frame
         self._loop.pose.covariance = self._covariance(loop)
         self._writer.write(self._topics[loop], stamp, self._loop)
 
@@ -175,8 +191,8 @@ def _note(record: GraphRecord, stamps: list[int], steps: Indices) -> dict[str, s
     manifold = record.graph.manifold
     metres, _ = manifold.motion(
         manifold.local(manifold.identity(len(steps)), factors.measurement[steps]))
-    roots = np.linalg.inv(factors.sqrt_information)
-    variances = (roots**2).sum(axis=2)
+    variances = np.where(factors.speaks, np.diagonal(
+        covariance_of(factors.sqrt_information), axis1=1, axis2=2), 1.0)
     meant = (len(np.unique(equal, axis=0)) < len(equal) or (seconds > LONGEST_PAUSE).any()
              or (metres > FASTEST * np.maximum(seconds, SHORTEST_STEP)).any()
              or variances.min(initial=1.0) < LEAST_VARIANCE
@@ -196,18 +212,24 @@ def _steps(record: GraphRecord) -> Indices:
         raise GraphError(f'no edge between the consecutive vertices {ids[k]} and {ids[k + 1]}; '
                          'a bag needs the odometry of every vertex')
     _refuse_backward(record, rows)
+    unsaid = first[~factors.speaks[rows].all(axis=1)]
+    if len(unsaid):
+        raise GraphError(f'the odometry from vertex {ids[unsaid[0]]} leaves a component unsaid; '
+                         'in a bag it says all')
     return rows[np.argsort(first)]
 
 
 def _loops(record: GraphRecord) -> list[list[int]]:
     """Return the loops that end at each keyframe, in the order of the graph."""
-    if len(record.graph.prior):
-        k = record.ids[record.graph.prior.i[0]]
-        raise GraphError(f'a prior on vertex {k}; a bag carries between factors only')
-    rows = np.flatnonzero(~record.graph.between.is_odometry)
+    factors = record.graph.between
+    trusted = factors.j[factors.is_absolute & factors.trusted]
+    if len(trusted):
+        raise GraphError(f'a trusted absolute pose of vertex {record.ids[trusted[0]]}; in a bag '
+                         'it would be doubted')
+    rows = np.flatnonzero(~factors.is_odometry)
     _refuse_backward(record, rows)
     loops: list[list[int]] = [[] for _ in record.ids]
-    for row, j in zip(rows.tolist(), record.graph.between.j[rows].tolist(), strict=True):
+    for row, j in zip(rows.tolist(), factors.j[rows].tolist(), strict=True):
         loops[j].append(row)
     return loops
 

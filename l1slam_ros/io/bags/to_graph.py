@@ -15,7 +15,7 @@ from l1slam_ros.io.bags.reader import BagMessage, bag_summary, read_messages, re
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.messages.base_frame import BaseFrame, Sorted
-from l1slam_ros.io.messages.conversion import loop_closure, odometry_sample
+from l1slam_ros.io.messages.conversion import absolute_pose, loop_closure, odometry_sample
 
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 
@@ -60,7 +60,7 @@ class _Growing:
     def __init__(self, options: GraphBuilderOptions, topics: Topics, verbatim: bool):
         self._builder = GraphBuilder(se2, options, verbatim)
         self._topics, self._types = topics, topics.types()
-        self._base_frame = BaseFrame('')
+        self._base_frame, self._map_frame = BaseFrame(''), ''
         self.seen: set[str] = set()
 
     def take(self, message: BagMessage) -> None:
@@ -74,6 +74,10 @@ class _Growing:
             if topic == self._topics.odometry:
                 self._add_odometry(self._base_frame.take(
                     message.message.child_frame_id, odometry_sample(message.message)))
+            elif topic == self._topics.absolute:
+                # The map is the frame that the first one names.
+                self._builder.add_loop(absolute_pose(message.message, self._map_frame))
+                self._map_frame = message.message.header.frame_id
             else:
                 self._builder.add_loop(loop_closure(
                     message.message, self._base_frame.name, topic == self._topics.trusted))

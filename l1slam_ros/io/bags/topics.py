@@ -7,22 +7,25 @@ BAG_SUFFIXES = ('.mcap', '.db3', '.bag')
 ODOMETRY_TOPIC = '/odom'
 LOOP_TOPIC = '/loop_closures'
 TRUSTED_LOOP_TOPIC = '/trusted_loop_closures'
+ABSOLUTE_TOPIC = '/absolute_poses'
 TRUTH_TOPIC = '/ground_truth'
 
-_LOOP = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+_POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 
 @dataclass(frozen=True)
 class Topics:
-    """Where a bag has its odometry, its loop closures, and those that somebody vouches for."""
+    """Where a bag has its odometry, loop closures, those somebody vouches for, absolute poses."""
 
     odometry: str = ODOMETRY_TOPIC
     loops: str = LOOP_TOPIC
     trusted: str = TRUSTED_LOOP_TOPIC
+    absolute: str = ABSOLUTE_TOPIC
 
     def types(self) -> dict[str, str]:
         """Return the topics with the types of their messages."""
-        return {self.loops: _LOOP, self.trusted: _LOOP, self.odometry: 'nav_msgs/msg/Odometry'}
+        return {self.loops: _POSE, self.trusted: _POSE, self.absolute: _POSE,
+                self.odometry: 'nav_msgs/msg/Odometry'}
 
 
 DEFAULT_TOPICS = Topics()

@@ -6,24 +6,25 @@ A line is a tag, one or two vertex ids, a pose, and the upper triangle of an inf
 
     VERTEX_SE2 id x y theta                                VERTEX2 id x y theta
     EDGE_SE2 i j x y theta xx xy xt yy yt tt               EDGE2 i j x y theta xx xy yy tt xt yt
-    EDGE_PRIOR_SE2 id x y theta xx xy xt yy yt tt
+    EDGE_PRIOR_SE2 id x y theta xx xy xt yy yt tt          EDGE_PRIOR_SE2_XY id x y xx xy yy
 
+Priors are absolute factors; rows and columns of zeros in the information say nothing.
 **TORO orders the information otherwise** (forward, sideways, rotation: `ff fs ss rr fr sr`).
 Stamps and trust in loops, which neither format knows, live beside the graph: see `side_files`.
 """
 
 import os
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
 from l1slam_ros.core.errors import FileError, NoiseError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import square_root_information
-from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import Mask, square_root_information
+from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
 from l1slam_ros.io.files import (
     LARGEST,
     TextLines,
@@ -37,7 +38,7 @@ from l1slam_ros.io.files import (
     settled,
 )
 from l1slam_ros.io.graphs.side_files import read_stamps, read_trusted, write_beside
-from l1slam_ros.io.graphs.tags_left_out import SENSORS, TAGS_3D, TAGS_LEFT_OUT
+from l1slam_ros.io.graphs.tags import FACTORS, SENSORS, TAGS, TAGS_3D, TAGS_LEFT_OUT
 from l1slam_ros.io.wording import counted
 
 
@@ -60,32 +61,8 @@ class GraphRecord:
     damage: str = ''
 
 
-@dataclass(frozen=True)
-class _Tag:
-    """
-    How the lines of one tag are read.
-
-    kind : vertex, between or prior; ids : how many vertex ids lead; information : row and
-    column of each entry of the upper triangle, in the order of the file; none for a vertex.
-    """
-
-    file_format: str
-    kind: str
-    manifold: Manifold
-    ids: int
-    information: tuple[tuple[int, int], ...] = ()
-
-
-_G2O_2D = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-_TORO_2D = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
-
-_TAGS = {
-    'VERTEX_SE2': _Tag('g2o', 'vertex', se2, 1),
-    'EDGE_SE2': _Tag('g2o', 'between', se2, 2, _G2O_2D),
-    'EDGE_PRIOR_SE2': _Tag('g2o', 'prior', se2, 1, _G2O_2D),
-    'VERTEX2': _Tag('toro', 'vertex', se2, 1),
-    'EDGE2': _Tag('toro', 'between', se2, 2, _TORO_2D),
-}
+_NAMES = {'vertex': 'a vertex', 'between': 'an edge', 'absolute': 'an absolute pose',
+          'position': 'an absolute pose'}
 _FORMAT_OF_SUFFIX = {'.graph': 'toro'}
 # So many lines are named in one sentence.
 _NAMED = 3
@@ -94,18 +71,24 @@ _NAMED = 3
 @dataclass(frozen=True)
 class _Rows:
     """
-    The lines of one kind, in the order of the file.
+    The lines of some kinds, in the order of the file.
 
-    lines : (m,) line numbers; ids : (m, 1 or 2); pose : (m, p); information : (m, d, d).
+    lines : (m,) line numbers; ids : (m, 2), the same twice where a line has but one; alone : (m,)
+    bool, where it has; pose : (m, p); information : (m, d, d).
     """
 
     lines: Indices
     ids: Indices
+    alone: Mask
     pose: Array
     information: Array
 
     def __len__(self) -> int:
         return len(self.lines)
+
+    def chosen(self, rows: Indices | Mask) -> '_Rows':
+        """Return some of the lines, in the order of `rows`."""
+        return _Rows(*(getattr(self, column.name)[rows] for column in fields(self)))
 
 
 def read_graph_file(path: str | os.PathLike[str]) -> GraphRecord:
@@ -121,16 +104,14 @@ def read_graph_file(path: str | os.PathLike[str]) -> GraphRecord:
 
     """
     groups = _group(path)
-    edges, priors = _rows(path, groups, 'between'), _rows(path, groups, 'prior')
-    edges, skipped = _without_circles(edges)
-    if not len(edges):
+    edges, skipped = _without_circles(_rows(path, groups, *FACTORS))
+    if edges.alone.all():
         raise FileError(path, f'no edges; expected {_expected("between")} lines')
     vertices = _vertices(path, groups)
     ids = vertices.ids[:, 0] if len(vertices) else np.unique(edges.ids)
     graph = FactorGraph(se2)
     graph.add_poses(len(ids))
     _add_edges(path, graph, ids, edges)
-    _add_priors(path, graph, ids, priors)
     return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
                        read_stamps(path, ids), (*skipped, *_skipped(groups, ids)))
 
@@ -187,75 +168,71 @@ def _group(path: str | os.PathLike[str]) -> dict[str, TextLines]:
 
 
 def _refuse_unknown(path: object, tag: str, line: int) -> None:
-    if tag in _TAGS or tag in TAGS_LEFT_OUT or tag == 'FIX' or tag.startswith('PARAMS_'):
+    if tag in TAGS or tag in TAGS_LEFT_OUT or tag == 'FIX' or tag.startswith('PARAMS_'):
         return
     if tag in TAGS_3D or 'SE3' in tag or 'SIM3' in tag:
         raise FileError(path, f'{quoted(tag)}: 3D graphs are not supported yet; expected a graph '
                         f'in the plane ({_expected("between")} lines)', line)
-    raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(_TAGS)}', line)
+    raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(TAGS)}', line)
 
 
 def _expected(kind: str) -> str:
-    return ' or '.join(name for name, tag in _TAGS.items() if tag.kind == kind)
+    return ' or '.join(name for name, tag in TAGS.items() if tag.kind == kind)
 
 
-def _rows(path: object, groups: dict[str, TextLines], kind: str) -> _Rows:
-    """Return the lines of one kind, whatever their tags."""
+def _rows(path: object, groups: dict[str, TextLines], *kinds: str) -> _Rows:
+    """Return the lines of some kinds, whatever their tags."""
     parts = [_parse(path, name, groups.get(name, TextLines([], [])))
-             for name, tag in _TAGS.items() if tag.kind == kind]
-    lines = np.concatenate([part.lines for part in parts])
-    order = np.argsort(lines)
-    return _Rows(lines[order], np.concatenate([part.ids for part in parts])[order],
-                 np.concatenate([part.pose for part in parts])[order],
-                 np.concatenate([part.information for part in parts])[order])
+             for name, tag in TAGS.items() if tag.kind in kinds]
+    both = _Rows(*(np.concatenate([getattr(part, column.name) for part in parts])
+                   for column in fields(_Rows)))
+    return both.chosen(np.argsort(both.lines))
 
 
 def _parse(path: object, name: str, lines: TextLines) -> _Rows:
-    tag = _TAGS[name]
-    p, d = tag.manifold.POSE_SIZE, tag.manifold.TANGENT_SIZE
+    tag = TAGS[name]
+    p, d = tag.values, tag.manifold.TANGENT_SIZE
     ids, values = parse_rows(path, name, lines, tag.ids, p + len(tag.information))
-    information = np.zeros((len(ids), d, d))
+    m = len(ids)
+    pose, information = tag.manifold.identity(m), np.zeros((m, d, d))
+    pose[:, :p] = values[:, :p]
     for k, (row, column) in enumerate(tag.information):
         information[:, row, column] = information[:, column, row] = values[:, p + k]
-    return _Rows(np.array(lines.numbers, np.int64), ids, values[:, :p], information)
+    return _Rows(np.array(lines.numbers, np.int64), np.repeat(ids, 2 // tag.ids, axis=1),
+                 np.full(m, tag.ids == 1), pose, information)
 
 
 def _vertices(path: object, groups: dict[str, TextLines]) -> _Rows:
     """Return the vertices in ascending order of their ids."""
     rows = _rows(path, groups, 'vertex')
-    order = np.argsort(rows.ids[:, 0], kind='stable')
-    ids, lines = rows.ids[order], rows.lines[order]
+    rows = rows.chosen(np.argsort(rows.ids[:, 0], kind='stable'))
+    ids, lines = rows.ids, rows.lines
     again = np.flatnonzero(ids[1:, 0] == ids[:-1, 0]) + 1
     if len(again):
         k = again[np.argmin(lines[again])]
         raise FileError(path, f'vertex {ids[k, 0]} stands twice, before at line {lines[k - 1]}; '
                         'expected each once', int(lines[k]))
-    return _Rows(lines, ids, rows.pose[order], rows.information[order])
+    return rows
 
 
 def _without_circles(edges: _Rows) -> tuple[_Rows, list[str]]:
     """Return the edges but for those from a vertex to itself, and a sentence on these, if any."""
-    circle = edges.ids[:, 0] == edges.ids[:, 1]
+    circle = (edges.ids[:, 0] == edges.ids[:, 1]) & ~edges.alone
     if not circle.any():
         return edges, []
-    lines, k = edges.lines[circle].tolist(), ~circle
+    lines = edges.lines[circle].tolist()
     names = [str(number) for number in lines[:_NAMED]] + ['...'] * (len(lines) > _NAMED)
     sentence = (f'{counted(len(lines), "edge")} from a vertex to itself not used: '
                 f'{"line" if len(lines) == 1 else "lines"} {", ".join(names)}')
-    return _Rows(edges.lines[k], edges.ids[k], edges.pose[k], edges.information[k]), [sentence]
+    return edges.chosen(~circle), [sentence]
 
 
 def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices,
                edges: _Rows) -> None:
     i, j = _index(path, ids, edges).T
+    i = np.where(edges.alone, WORLD, i)
     doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), np.zeros(len(edges), bool))
     graph.add_between(i, j, edges.pose, edges.information, read_trusted(path, ids, doubted))
-
-
-def _add_priors(path: object, graph: FactorGraph, ids: Indices, priors: _Rows) -> None:
-    index = _index(path, ids, priors)
-    _roots(path, priors)
-    graph.add_prior(index[:, 0], priors.pose, priors.information)
 
 
 def _index(path: object, ids: Indices, rows: _Rows) -> Indices:
@@ -296,7 +273,7 @@ def _skipped(groups: dict[str, TextLines], ids: Indices) -> tuple[str, ...]:
         sentences.append(f'FIX {quoted(" ".join(fixed))} is not used: the first vertex, {ids[0]}, '
                          'is the one held fixed')
     for tag, group in groups.items():
-        if tag not in _TAGS and tag != 'FIX':
+        if tag not in TAGS and tag != 'FIX':
             lines = counted(len(group.texts), f'{quoted(tag)} line is', f'{quoted(tag)} lines are')
             sentences.append(f'{lines} not used: '
                              f'{TAGS_LEFT_OUT.get(tag, SENSORS)}')
@@ -306,32 +283,47 @@ def _skipped(groups: dict[str, TextLines], ids: Indices) -> tuple[str, ...]:
 def _text(path: Path, record: GraphRecord) -> list[str]:
     """Return the lines of the file, many to a string."""
     graph, ids = record.graph, record.ids
-    none = np.empty((0, graph.manifold.TANGENT_SIZE, graph.manifold.TANGENT_SIZE))
-    lines = []
-    if record.poses is not None:
-        lines += _lines(path, graph, 'vertex', ids[:, None], record.poses, none)
-    if len(graph.prior):
-        lines += _lines(path, graph, 'prior', ids[graph.prior.i][:, None],
-                        graph.prior.measurement, graph.prior.sqrt_information)
-    pairs = ids[graph.between.pairs]
-    return lines + _lines(path, graph, 'between', pairs, graph.between.measurement,
-                          graph.between.sqrt_information)
+    d = graph.manifold.TANGENT_SIZE
+    lines = [] if record.poses is None else _lines(
+        path, graph, 'vertex', ids[:, None], record.poses, np.empty((0, d, d)))
+    factors, pairs, kinds = graph.between, ids[graph.between.pairs], _kinds(graph)
+    texts = np.empty(len(factors), object)
+    for kind in np.unique(kinds):
+        rows = np.flatnonzero(kinds == kind)
+        columns = slice(None) if kind == 'between' else slice(1)
+        written = _lines(path, graph, str(kind), pairs[rows, columns], factors.measurement[rows],
+                         factors.sqrt_information[rows])
+        if len(rows) == len(factors):
+            return lines + written
+        texts[rows] = '\n'.join(written).split('\n')
+    return lines + texts.tolist()
+
+
+def _kinds(graph: FactorGraph) -> np.ndarray:
+    """Return how each factor is to be written, (m,) of `FACTORS`."""
+    factors, rest = graph.between, graph.manifold.identity(1)
+    size = graph.manifold.positions(rest).shape[1]
+    is_position = ((factors.measurement[:, size:] == rest[:, size:]).all(axis=1)
+                   & ~factors.speaks[:, graph.manifold.ROTATION].any(axis=1))
+    return np.where(~factors.is_absolute, 'between',
+                    np.where(is_position, 'position', 'absolute'))
 
 
 def _lines(path: Path, graph: FactorGraph, kind: str, ids: Indices, pose: Array,
            roots: Array) -> list[str]:
     """Return the lines of one kind: ids (m, k), pose (m, p), roots (m, d, d) of information."""
     file_format = _FORMAT_OF_SUFFIX.get(path.suffix.lower(), 'g2o')
-    names = [name for name, tag in _TAGS.items() if (tag.file_format, tag.kind, tag.manifold)
+    names = [name for name, tag in TAGS.items() if (tag.file_format, tag.kind, tag.manifold)
              == (file_format, kind, graph.manifold)]
     if not names:
-        raise FileError(path, f'{file_format} has no line for a {kind} of {graph.manifold.NAME}; '
-                        'expected another suffix')
-    values = pose
-    if _TAGS[names[0]].information:
-        rows, columns = np.array(_TAGS[names[0]].information).T
+        raise FileError(path, f'{file_format} has no line for {_NAMES[kind]} of '
+                        f'{graph.manifold.NAME}; expected another suffix')
+    tag = TAGS[names[0]]
+    values = pose[:, :tag.values]
+    if tag.information:
+        rows, columns = np.array(tag.information).T
         information = settled(roots.transpose(0, 2, 1) @ roots)
-        values = np.concatenate((pose, information[:, rows, columns]), axis=1)
+        values = np.concatenate((values, information[:, rows, columns]), axis=1)
     readable = (np.abs(values) <= LARGEST).all(axis=1)
     if not readable.all():
         k = int(np.argmin(readable))

@@ -40,7 +40,4 @@ def load_map(path: Path) -> tuple[FactorGraph, Array, Indices]:
     record = read_graph_file(path)
     if record.poses is None or record.stamps is None:
         raise FileError(path, 'has no poses or no stamps beside it; expected a saved map')
-    if len(record.graph.prior):
-        raise FileError(path, 'has prior factors, which a growing map has no rows for; '
-                        'expected a saved map')
     return record.graph, record.poses, record.stamps

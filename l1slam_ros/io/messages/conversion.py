@@ -8,7 +8,8 @@ A message that cannot be used raises `MessageError` with one of these causes:
     not_finite   NaN or infinity in the pose
     range        so far away that it can only be garbage
     quaternion   its norm is far from 1
-    frame        a loop whose frame is not `<base_frame>@<sec>.<nanosec, 9 digits>`
+    frame        a loop whose frame is not `<base_frame>@<sec>.<nanosec, 9 digits>`, an absolute
+                 pose in another frame than that of the map
     order        a loop whose reference is not earlier than its stamp
 
 Covariances pass as they come: `graph_builder` decides what they are worth.
@@ -16,12 +17,14 @@ Covariances pass as they come: `graph_builder` decides what they are worth.
 
 import math
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import silent_components
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.io.files import NANOSECONDS, quoted, stamp_text
 
@@ -72,6 +75,33 @@ def loop_closure(message: Any, base_frame: str, trusted: bool) -> LoopClosure:
                            f'expected one earlier than its stamp {stamp_text(stamp)}')
     return LoopClosure(reference_stamp, stamp, _pose3(message.pose.pose),
                        _covariance(message.pose.covariance), trusted)
+
+
+def absolute_pose(message: Any, map_frame: str) -> LoopClosure:
+    """
+    Return what a geometry_msgs/PoseWithCovarianceStamped says about the robot in the map frame.
+
+    Where it says nothing of the rotation, the quaternion may be any, also none.
+
+    Parameters
+    ----------
+    message : its `header.frame_id` is the map frame
+    map_frame : as which that is known; empty: any
+
+    Raises
+    ------
+    MessageError : it cannot be used.
+
+    """
+    stamp, frame = stamp_of(message.header), message.header.frame_id
+    if not frame or frame != (map_frame or frame):
+        raise MessageError('frame', f'frame {quoted(frame)} of an absolute pose; expected '
+                           f'{map_frame or "that of the map"}')
+    covariance = _covariance(message.pose.covariance)
+    position, rotation = message.pose.pose.position, message.pose.pose.orientation
+    if silent_components(covariance[None], absolute=True)[0, 3:].all():
+        rotation = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+    return LoopClosure(None, stamp, _checked(position, rotation), covariance)
 
 
 def stamped_pose(message: Any) -> tuple[int, Array]:

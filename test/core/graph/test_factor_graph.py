@@ -4,14 +4,14 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from problems import random_information, random_poses
+from problems import add_absolute, random_information, random_poses
 
 from l1slam_ros.core.errors import GraphError, L1SlamError, NoiseError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import (
+    WORLD,
     BetweenFactors,
     FactorGraph,
-    PriorFactors,
     component_labels,
 )
 
@@ -37,7 +37,7 @@ def pairs_of(graph):
 
 def test_a_new_graph_is_empty():
     graph = FactorGraph(se2)
-    assert graph.n_poses == len(graph.between) == len(graph.prior) == 0
+    assert graph.n_poses == len(graph.between) == 0
     assert graph.between.is_odometry.shape == (0,)
 
 
@@ -83,16 +83,37 @@ def test_trust_of_too_few_factors_is_refused():
     assert {len(column) for column in vars(graph.between).values()} == {0}
 
 
-def test_priors_are_kept_apart(rng):
+def test_the_world_is_an_end_like_any_keyframe(rng):
     graph = graph_with(3, [(0, 1)])
     measurement, information = random_poses(2, rng), random_information(2, rng)
-    graph.add_prior(np.array([2, 0]), measurement, information)
-    assert isinstance(graph.prior, PriorFactors)
-    assert_array_equal(graph.prior.i, [2, 0])
-    assert_array_equal(graph.prior.measurement, measurement)
-    root = graph.prior.sqrt_information
+    add_absolute(graph, np.array([2, 0]), measurement, information)
+    graph.add_between(1, 2, np.zeros((1, 3)), np.eye(3)[None])
+    factors = graph.between
+    assert pairs_of(graph) == [[0, 1], [WORLD, 2], [WORLD, 0], [1, 2]]
+    assert factors.pairs.tolist() == [[0, 1], [2, 2], [0, 0], [1, 2]]
+    # That next to the world is keyframe 0 by its number, and no step of the odometry.
+    assert factors.is_odometry.tolist() == [True, False, False, True]
+    assert_array_equal(factors.measurement[1:3], measurement)
+    root = factors.sqrt_information[1:3]
     assert_allclose(root.transpose(0, 2, 1) @ root, information)
-    assert len(graph.prior) == 2 and len(graph.between) == 1
+
+
+def test_what_only_the_world_ties_together_is_one_part():
+    graph = graph_with(7, [(0, 1), (2, 3), (5, 6)])
+    assert component_labels(graph).tolist() == [0, 0, 1, 1, 2, 3, 3]
+    add_absolute(graph, np.array([3, 6]), np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)))
+    assert component_labels(graph).tolist() == [0, 0, 1, 1, 2, 1, 1]
+
+
+def test_rows_of_zeros_say_nothing():
+    graph = graph_with(2, [(0, 1)])
+    information = np.array([[[4.0, 0, 2], [0, 0, 0], [2, 0, 5]], np.diag([0, 0, 9.0])])
+    graph.add_between(np.array([WORLD, 0]), np.array([0, 1]), np.zeros((2, 3)), information)
+    factors = graph.between
+    assert factors.freedom.tolist() == [3, 2, 1]
+    assert factors.speaks[1:].tolist() == [[True, False, True], [False, False, True]]
+    assert_array_equal(factors.sqrt_information[1:], [
+        [[2, 0, 1], [0, 0, 0], [0, 0, 2]], np.diag([0, 0, 3])])
 
 
 def test_parallel_factors_are_never_merged():
@@ -106,7 +127,6 @@ def test_a_snapshot_stays_as_it_was_while_the_graph_grows():
     for k in range(99):
         snapshots.append(graph.between)
         graph.add_between(k, k + 1, np.full((1, 3), k), np.eye(3)[None])
-        graph.add_prior(k, np.full((1, 3), k), np.eye(3)[None])
     for k, factors in enumerate(snapshots):
         assert len(factors) == k
         assert_array_equal(factors.i, np.arange(k))
@@ -120,13 +140,11 @@ def test_a_copy_and_its_original_grow_apart(size):
     copy.add_poses(5)
     copy.add_between(size + 5, 0, np.ones((1, 3)), np.eye(3)[None])
     original.add_between(0, size + 1, np.zeros((1, 3)), 4 * np.eye(3)[None])
-    original.add_prior(0, np.zeros((1, 3)), np.eye(3)[None])
     assert (original.n_poses, copy.n_poses) == (size + 2, size + 7)
     assert pairs_of(original)[-1] == [0, size + 1] and pairs_of(copy)[-1] == [size + 5, 0]
     assert pairs_of(original)[:-1] == pairs_of(copy)[:-1]
     assert_array_equal(original.between.sqrt_information[-1], 2 * np.eye(3))
     assert_array_equal(copy.between.sqrt_information[-1], np.eye(3))
-    assert (len(original.prior), len(copy.prior)) == (1, 0)
 
 
 def test_a_copy_of_an_empty_graph_grows_too():
@@ -160,12 +178,19 @@ def test_odometry_is_found_wherever_it_stands_in_the_file(rng):
 GOOD = np.eye(3)
 BAD_FACTORS = [
     ([0, 3], [1, 0], 0.0, GOOD, GraphError, 'a factor names keyframe 3, the graph has 0 to 2'),
+    ([0, -2], [1, 0], 0.0, GOOD, GraphError, 'a factor names keyframe -2, the graph has 0 to 2'),
+    ([0, -1], [1, 3], 0.0, GOOD, GraphError, 'a factor names keyframe 3, the graph has 0 to 2'),
+    ([0, -1], [1, -1], 0.0, GOOD, GraphError, 'keyframe -1 has a factor to itself'),
     ([0, 0], [1, -1], 0.0, GOOD, GraphError, 'a factor names keyframe -1, the graph has 0 to 2'),
     ([0, 2], [1, 2], 0.0, GOOD, GraphError, 'keyframe 2 has a factor to itself'),
     ([0, 1], [1, 2], np.nan, GOOD, GraphError, 'measurement 1 is not finite: [ 0. nan  0.]'),
     ([0, 1], [1, 2], np.inf, GOOD, GraphError, 'measurement 1 is not finite: [ 0. inf  0.]'),
     ([0, 1], [1, 2], 0.0, -GOOD, NoiseError, 'matrix 1 is not positive definite: '
      '[-1 -0 -0; -0 -1 -0; -0 -0 -1]'),
+    ([0, -1], [1, 2], 0.0, 0 * GOOD, NoiseError, 'matrix 1 is not positive definite: '
+     '[0 0 0; 0 0 0; 0 0 0]'),
+    ([0, -1], [1, 2], 0.0, np.array([[1.0, 0.1, 0], [0.1, 0, 0], [0, 0, 1]]), NoiseError,
+     'matrix 1 is not positive definite: [1 0.1 0; 0.1 0 0; 0 0 1]'),
 ]
 
 
@@ -182,17 +207,6 @@ def test_a_bad_factor_is_named_and_nothing_is_appended(i, j, value, information,
     assert pairs_of(graph) == [[0, 1], [1, 2]]
     assert_array_equal(graph.between.measurement[1], [0.5] * 3)
     assert len(graph.between.sqrt_information) == 2
-
-
-@pytest.mark.parametrize('i, value, information, error', [
-    (3, 0.0, GOOD, GraphError), (-1, 0.0, GOOD, GraphError), (0, np.nan, GOOD, GraphError),
-    (0, 0.0, 0 * GOOD, NoiseError)])
-def test_a_bad_prior_is_refused_and_nothing_is_appended(i, value, information, error):
-    graph = graph_with(3, [])
-    with pytest.raises(error):
-        graph.add_prior(np.array([1, i]), np.array([[0.0] * 3, [value] * 3]),
-                        np.array([GOOD, information]))
-    assert len(graph.prior) == len(graph.prior.measurement) == 0
 
 
 @pytest.mark.parametrize('shape', [(1, 3), (3, 3), (2, 4)])

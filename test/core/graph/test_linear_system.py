@@ -4,17 +4,23 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from problems import chain_and_loops, graph_of, random_information, random_poses
+from problems import add_absolute, chain_and_loops, graph_of, random_information, random_poses
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.linear_system import anchor, linearise, step_poses, whitened_residual
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
+from l1slam_ros.core.graph.linear_system import (
+    anchor,
+    linearise,
+    loose_keyframes,
+    step_poses,
+    whitened_residual,
+)
 
 N, LOOPS = 12, 9
 M = N - 1 + LOOPS
 
 
-@pytest.fixture(params=[0, 1, 3], ids=lambda priors: f'{priors} priors')
+@pytest.fixture(params=[0, 1, 3], ids=lambda count: f'{count} absolute')
 def case(request, rng):
     """A graph with full information matrices and poses that do not fit it; edges both ways."""
     truth = random_poses(N, rng)
@@ -23,7 +29,7 @@ def case(request, rng):
     graph = graph_of(truth, pairs, 0.4 * rng.uniform(-1, 1, (M, 3)), random_information(M, rng))
     if request.param:
         i = rng.choice(N, request.param, replace=False)
-        graph.add_prior(i, se2.retract(truth[i], 0.2 * rng.standard_normal((len(i), 3))),
+        add_absolute(graph, i, se2.retract(truth[i], 0.2 * rng.standard_normal((len(i), 3))),
                         random_information(len(i), rng))
     return graph, truth
 
@@ -33,17 +39,13 @@ def test_b_is_minus_the_whitened_residual(case):
     assert_array_equal(linearise(graph, poses).b, -whitened_residual(graph, poses))
 
 
-def test_rows_are_the_factors_in_order_then_the_priors(case):
+def test_rows_are_the_factors_in_order(case):
     graph, poses = case
-    expected = []
-    for factors, start in (graph.between, poses[graph.between.i]), (graph.prior, None):
-        for k in range(len(factors)):
-            z = factors.measurement[k : k + 1]
-            if start is None:
-                e = se2.local(z, poses[factors.i[k]][None])[0]
-            else:
-                e = se2.residual(z, start[k : k + 1], poses[factors.j[k]][None])[0]
-            expected.append(factors.sqrt_information[k] @ e)
+    expected, factors = [], graph.between
+    for k, (i, j) in enumerate(zip(factors.i, factors.j, strict=True)):
+        z, end = factors.measurement[k : k + 1], poses[j : j + 1]
+        seen = end if i == WORLD else se2.between(poses[i : i + 1], end)
+        expected.append(factors.sqrt_information[k] @ se2.local(z, seen)[0])
     assert_allclose(whitened_residual(graph, poses), np.concatenate(expected))
 
 
@@ -67,12 +69,12 @@ def test_the_linear_model_errs_by_the_square_of_the_step(case, rng):
     assert errors[0] / errors[1] == pytest.approx(100, rel=0.1)
 
 
-def test_the_gauge_is_fixed_by_keyframe_0_or_by_priors(case, rng):
+def test_the_gauge_is_fixed_by_keyframe_0_or_by_the_world(case, rng):
     graph, poses = case
-    fixed = 0 if len(graph.prior) else 1
+    fixed = 0 if graph.between.is_absolute.any() else 1
     A = linearise(graph, poses).A
     assert anchor(graph) == fixed
-    assert A.shape == (3 * (M + len(graph.prior)), 3 * (N - fixed))
+    assert A.shape == (3 * len(graph.between), 3 * (N - fixed))
     assert np.linalg.matrix_rank(A.toarray()) == A.shape[1]
     moved = step_poses(graph, poses, rng.standard_normal(A.shape[1]))
     assert np.array_equal(moved[0], poses[0]) == bool(fixed)
@@ -83,11 +85,11 @@ def test_each_row_touches_the_keyframes_of_its_factor_alone(case):
     graph, poses = case
     A = linearise(graph, poses).A
     factors, fixed = graph.between, anchor(graph)
-    for row in range(3 * M):
+    for row in range(len(A.indptr) - 1):
         k = row // 3
         touched = set(A.indices[A.indptr[row] : A.indptr[row + 1]] // 3 + fixed)
-        assert touched <= {factors.i[k], factors.j[k]}
-        assert touched | set(range(fixed)) >= {factors.i[k], factors.j[k]} - {0}
+        assert touched <= {factors.i[k], factors.j[k]} - {WORLD}
+        assert touched >= {factors.i[k], factors.j[k]} - {WORLD, *range(fixed)}
     assert (A.data != 0).all()
 
 
@@ -127,3 +129,32 @@ def test_poses_and_graph_are_left_as_they_were(case):
     step_poses(graph, poses, np.ones(system.A.shape[1]))
     assert_array_equal(poses, before)
     assert_array_equal(graph.between.measurement, measurement)
+
+
+# What nothing determines
+
+
+def loosely_tied(rng, absolute, pairs=((0, 1), (1, 2), (3, 4), (4, 5))):
+    """Return a graph whose absolute factors say but x and y, of these keyframes."""
+    truth = random_poses(6, rng)
+    graph = graph_of(truth, list(pairs))
+    k = np.array(absolute, np.int64)
+    add_absolute(graph, k, truth[k] * [1, 1, 0], np.tile(np.diag([1.0, 1, 0]), (len(k), 1, 1)))
+    return graph
+
+
+@pytest.mark.parametrize('absolute, whole, loose', [
+    ([2], None, [0, 3]), ([1, 2, 4, 5], None, [0, 3]), ([1], 2, [3]), ([1], 4, [0]), ([1], 0, [3]),
+])
+def test_a_part_that_no_whole_factor_ties_to_the_world_may_move(rng, absolute, whole, loose):
+    graph = loosely_tied(rng, absolute)
+    if whole is not None:
+        add_absolute(graph, np.array([whole]), np.zeros((1, 3)), np.eye(3)[None])
+    assert loose_keyframes(graph).tolist() == loose
+
+
+def test_without_the_world_the_part_of_the_anchor_is_rigid(rng):
+    graph = loosely_tied(rng, [])
+    assert loose_keyframes(graph).tolist() == []
+    graph.add_between(2, 3, np.zeros((1, 3)), np.diag([1.0, 1, 0])[None])
+    assert loose_keyframes(graph).tolist() == [3 - 1]

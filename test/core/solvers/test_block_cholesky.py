@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from problems import noisy_graph
+from problems import add_absolute, noisy_graph
 from systems import (
     PLENTY,
     SHAPES,
@@ -67,15 +67,15 @@ def test_a_graph_without_free_keyframes():
     assert cholesky.solve(np.zeros(0)).shape == (0,)
 
 
-@pytest.mark.parametrize('prior', [False, True])
-def test_the_systems_of_graphs_are_solved(prior, rng):
-    """The anchor held fixed, or priors in its place: one, and two of one keyframe."""
+@pytest.mark.parametrize('absolute', [False, True])
+def test_the_systems_of_graphs_are_solved(absolute, rng):
+    """The anchor held fixed, or the world in its place: one factor, and two of one keyframe."""
     graph, truth = noisy_graph(40, 40, rng)
-    if prior:
+    if absolute:
         rows = np.array([5, 17, 17])
-        graph.add_prior(rows, truth[rows], np.broadcast_to(np.eye(3), (3, 3, 3)))
+        add_absolute(graph, rows, truth[rows], np.broadcast_to(np.eye(3), (3, 3, 3)))
     system, cholesky = linearise(graph, truth), cholesky_of(graph)
-    assert system.size == (40 if prior else 39)
+    assert system.size == (40 if absolute else 39)
     weights = rng.uniform(0.1, 3, len(system.b))
     assert cholesky.factorise(system, weights)
     check_solution(cholesky, normal(system, weights), rng)

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from problems import linprog_l1
+from problems import add_absolute, linprog_l1
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -119,11 +119,11 @@ def test_one_keyframe_is_solved():
     assert_array_equal(solution.poses, se2.identity(1))
 
 
-def test_a_prior_fixes_the_gauge_instead_of_the_anchor(rng):
+def test_the_world_fixes_the_gauge_instead_of_the_anchor(rng):
     world = simulate_world(60, 90, WorldOptions(), rng)
     moved = se2.compose(np.broadcast_to([3.0, 4.0, 0.5], world.truth.shape), world.truth)
     graph = world.graph.copy()
-    graph.add_prior(np.array([7]), moved[7:8], 1e4 * np.eye(3)[None])
+    add_absolute(graph, np.array([7]), moved[7:8], 1e4 * np.eye(3)[None])
     solution = solve(graph, moved)
     assert solution.status is Status.CONVERGED
     assert_allclose(solution.poses[7], moved[7], atol=1e-6)

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from problems import chain_and_loops, drive, graph_of, linprog_l1, noisy_graph
+from problems import add_absolute, chain_and_loops, drive, graph_of, linprog_l1, noisy_graph
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -269,25 +269,25 @@ def test_far_is_more_than_a_hundredth():
     assert is_far(1.0, 0.0) and not is_far(0.0, 0.0)
 
 
-# Priors
+# Absolute factors
 
 
-def test_priors_meet_at_their_median():
+def test_absolute_factors_meet_at_their_median():
     """All look north, so that x and y of the map are the axes of their residuals."""
     graph = FactorGraph(se2)
     graph.add_poses(1)
     places = np.array([(0.0, 2.0, np.pi / 2), (1.0, 4.0, np.pi / 2), (5.0, 3.0, np.pi / 2)])
-    graph.add_prior(np.zeros(3, int), places, np.broadcast_to(np.eye(3), (3, 3, 3)))
+    add_absolute(graph, np.zeros(3, int), places, np.broadcast_to(np.eye(3), (3, 3, 3)))
     solution = solve(graph, se2.identity(1), DEFAULTS)
     assert_allclose(solution.poses, [[1.0, 3.0, np.pi / 2]], atol=1e-3)
     assert solution.cost == pytest.approx(5.0 + 2.0, abs=1e-2)
 
 
-def test_priors_put_the_map_in_its_place(world, rng):
+def test_an_absolute_factor_puts_the_map_in_its_place(world, rng):
     graph, truth = world
     alone = solve(graph, truth, DEFAULTS)
     there = se2.compose(np.broadcast_to([10.0, 20.0, 0.5], truth.shape), truth)
-    graph.add_prior(np.array([0]), there[:1], np.eye(3)[None])
+    add_absolute(graph, np.array([0]), there[:1], np.eye(3)[None])
     solution = solve(graph, there, DEFAULTS)
     assert solution.cost == pytest.approx(alone.cost, rel=1e-4)
     assert_allclose(solution.poses[0], there[0], atol=1e-3)
@@ -295,8 +295,8 @@ def test_priors_put_the_map_in_its_place(world, rng):
 
 
 @pytest.mark.parametrize('outer', [0, 30])
-def test_the_dual_has_rows_for_priors_even_if_nothing_was_solved(outer):
+def test_the_dual_has_rows_for_the_world_even_if_nothing_was_solved(outer):
     graph = parallel(1.0)
-    graph.add_prior(np.array([0]), np.zeros((1, 3)), np.eye(3)[None])
+    add_absolute(graph, np.array([0]), np.zeros((1, 3)), np.eye(3)[None])
     solution = solve(graph, odometry_poses(graph), OptimiserOptions(outer_iterations=outer))
     assert len(solution.dual) == 6

@@ -18,14 +18,14 @@ from l1slam_ros.core.solvers.restarted_pdhg import halpern_step, minimise_l1_hal
 BLOCK_SIZES = [1, 2, 3, 6]
 
 
-def chain_with_loops(k, rng, size=12, loops=20, priors=2):
-    """Return a system with a keyframe held fixed, loops, and priors; blocks differ in scale."""
+def chain_with_loops(k, rng, size=12, loops=20, absolute=2):
+    """Return a system with a keyframe held fixed, loops, and the world; blocks differ in scale."""
     i = np.concatenate((np.arange(-1, size - 1), rng.integers(0, size, loops)))
     j = np.concatenate((np.arange(size), (i[size:] + rng.integers(1, size, loops)) % size))
     i[0] = size
     keyframe = np.stack((i, j), axis=1)
-    keyframe = np.concatenate((keyframe, np.stack((rng.integers(0, size, priors),
-                                                   np.full(priors, size)), axis=1)))
+    keyframe = np.concatenate((keyframe, np.stack((rng.integers(0, size, absolute),
+                                                   np.full(absolute, size)), axis=1)))
     m = len(keyframe)
     blocks = rng.standard_normal((m, 2, k, k)) * 10 ** rng.uniform(-1, 1, (m, 1, 1, 1))
     blocks[len(i):, 1] = 0

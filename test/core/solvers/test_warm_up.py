@@ -24,7 +24,7 @@ from dataclasses import replace
 
 import numpy as np
 from lies import careful_world, drive_roundabout, roundabout, seen, spoilt
-from problems import play
+from problems import add_absolute, play
 
 from l1slam_ros.io import formats
 from l1slam_ros.core.robust import batch_map
@@ -113,10 +113,10 @@ scattered = 20 * np.random.default_rng(0).standard_normal((150, 3))
 minimise_l2(world.graph, scattered, LeastSquaresOptions(), cholesky)
 look('damped steps')
 connected_parts(world.graph)
-world.graph.add_prior(np.array([7]), world.truth[7:8], np.eye(3)[None])
+add_absolute(world.graph, np.array([7]), world.truth[7:8], np.eye(3)[None])
 for norm in NORMS:
     solved(world.graph, world.odometry, norm=norm)
-look('a prior')
+look('an absolute factor')
 used = [kernel for module in MODULES for kernel in vars(module).values()
         if hasattr(kernel, 'takes') and kernel.stats.cache_hits]
 assert len(used) > 25, 'are the kernels not where this test looks for them?'

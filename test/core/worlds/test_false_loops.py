@@ -3,10 +3,11 @@
 
 import numpy as np
 import pytest
+from problems import add_absolute
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.worlds.false_loops import (
     FALSE_LOOPS,
     Loops,
@@ -141,41 +142,39 @@ def test_a_graph_without_factors_is_refused(kind, rng):
 
 
 def test_inserting_keeps_what_was_there(rng):
-    """Also an order that is not that of time, parallel factors and priors."""
+    """Also an order that is not that of time, parallel factors and an absolute one."""
     graph = FactorGraph(se2)
     graph.add_poses(9)
     i, j = np.array([0, 1, 7, 1, 2]), np.array([1, 2, 8, 2, 0])
     z = rng.normal(size=(5, 3))
     information = np.stack([np.eye(3) * k for k in range(1, 6)])
     graph.add_between(i, j, z, information)
-    graph.add_prior(np.array([4]), np.array([[1.0, 2.0, 3.0]]), 7 * np.eye(3)[None])
+    add_absolute(graph, np.array([4]), np.array([[1.0, 2.0, 3.0]]), 7 * np.eye(3)[None])
     loops = Loops(np.array([0, 0]), np.array([1, 8]), np.ones((2, 3)),
                   np.stack((50 * np.eye(3), 60 * np.eye(3))))
     longer = insert_loops(graph, loops)
     factors = longer.between
-    assert factors.i.tolist() == [0, 0, 1, 7, 1, 2, 0]
-    assert factors.j.tolist() == [1, 1, 2, 8, 2, 0, 8]
+    assert factors.i.tolist() == [0, 0, 1, 7, 1, 2, WORLD, 0]
+    assert factors.j.tolist() == [1, 1, 2, 8, 2, 0, 4, 8]
     np.testing.assert_array_equal(factors.measurement[[0, 2, 3, 4, 5]], z)
-    roots = np.sqrt([1, 50, 2, 3, 4, 5, 60])
+    roots = np.sqrt([1, 50, 2, 3, 4, 5, 7, 60])
     np.testing.assert_allclose(factors.sqrt_information, roots[:, None, None] * np.eye(3))
-    np.testing.assert_allclose(longer.prior.sqrt_information, [np.sqrt(7) * np.eye(3)])
-    assert longer.n_poses == 9 and longer.prior.i.tolist() == [4]
-    assert len(graph.between) == 5
+    assert longer.n_poses == 9 and len(graph.between) == 6
 
 
 def test_what_was_put_in_is_taken_out(world, rng):
     before = world.graph.between
     loops = random_false_loops(world.graph, world.truth, 30, rng)
     longer = insert_loops(world.graph, loops)
-    longer.add_prior(np.array([4]), np.array([[1.0, 2.0, 3.0]]), 7 * np.eye(3)[None])
+    add_absolute(longer, np.array([4]), np.array([[1.0, 2.0, 3.0]]), 7 * np.eye(3)[None])
     pairs = set(zip(loops.i.tolist(), loops.j.tolist(), strict=True))
     after = longer.between
     false = np.array([pair in pairs for pair in zip(after.i, after.j, strict=True)])
     shorter = longer.subset(~false)
-    np.testing.assert_array_equal(shorter.between.i, before.i)
-    np.testing.assert_array_equal(shorter.between.measurement, before.measurement)
-    np.testing.assert_allclose(shorter.between.sqrt_information, before.sqrt_information)
-    assert shorter.n_poses == 1000 and shorter.prior.i.tolist() == [4]
+    np.testing.assert_array_equal(shorter.between.i, [*before.i, WORLD])
+    np.testing.assert_array_equal(shorter.between.measurement[:-1], before.measurement)
+    np.testing.assert_allclose(shorter.between.sqrt_information[:-1], before.sqrt_information)
+    assert shorter.n_poses == 1000
 
 
 def test_more_loops_than_pairs_are_refused_before_memory_is_taken(rng):

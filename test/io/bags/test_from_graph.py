@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
+from problems import add_absolute
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
@@ -224,7 +225,7 @@ def test_what_messages_cannot_express_exactly(tmp_path, rng, pairs, n, message):
 
 def test_a_prior_has_no_place_in_a_bag(tmp_path, rng):
     record = record_of([(0, 1), (1, 2)], rng)
-    record.graph.add_prior(np.array([1]), np.zeros((1, 3)), np.eye(3)[None])
+    add_absolute(record.graph, np.array([1]), np.zeros((1, 3)), np.eye(3)[None])
     with pytest.raises(GraphError, match='a prior on vertex 10; a bag carries'):
         write_graph_bag(tmp_path / 'bag', record)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from problems import add_absolute
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
@@ -93,13 +94,16 @@ def test_ids_beyond_the_floats(write):
     assert record.ids.tolist() == [a, a + 1]
 
 
-def test_priors(write):
-    record = read_graph_file(write(SQUARE + 'EDGE_PRIOR_SE2 7 1 2 0.5 10 1 2 20 3 30\n'))
-    prior = record.graph.prior
-    assert prior.i.tolist() == [1]
-    assert prior.measurement.tolist() == [[1, 2, 0.5]]
-    np.testing.assert_allclose(
-        information_of(prior)[0], [[10, 1, 2], [1, 20, 3], [2, 3, 30]], rtol=1e-15)
+def test_priors_are_seen_from_the_world(write):
+    factors = read_graph_file(write(
+        'EDGE_PRIOR_SE2 7 1 2 0.5 10 1 2 20 3 30\n' + SQUARE + 'EDGE_PRIOR_SE2_XY 9 3 4 5 1 6\n'
+        'EDGE_PRIOR_SE2 3 0 0 1 0 0 0 0 0 9\n')).graph.between
+    assert factors.is_absolute.tolist() == [True, False, False, False, True, True]
+    assert factors.j[factors.is_absolute].tolist() == [1, 2, 0]
+    assert factors.measurement[factors.is_absolute].tolist() == [[1, 2, 0.5], [3, 4, 0], [0, 0, 1]]
+    np.testing.assert_allclose(information_of(factors)[factors.is_absolute], [
+        [[10, 1, 2], [1, 20, 3], [2, 3, 30]], [[5, 1, 0], [1, 6, 0], [0, 0, 0]],
+        np.diag([0, 0, 9])], rtol=1e-15)
 
 
 def test_edges_of_both_formats_keep_the_order_of_the_file(write):
@@ -128,7 +132,7 @@ def test_what_is_not_used_is_said(write):
 
 
 @pytest.mark.parametrize('tag', [
-    'VERTEX_XY', 'EDGE_SE2_XY', 'EDGE_BEARING_SE2_XY', 'EDGE_PRIOR_SE2_XY', 'VERTEX_LINE2D',
+    'VERTEX_XY', 'EDGE_SE2_XY', 'EDGE_BEARING_SE2_XY', 'VERTEX_LINE2D',
     'EDGE_SE2_SEGMENT2D', 'ROBOTLASER1', 'RAWLASER1', 'VERTEX_TAG', 'PARAMS_CAMERAPARAMETERS',
 ])
 def test_known_tags_may_say_anything(write, tag):
@@ -219,6 +223,10 @@ def test_each_malformed_line_is_named(write, square, tags, line, message):
     # Positive definite in one order, not in the other.
     ('EDGE2 3 7 1 0 0 1 0 0 1 0 1', 'information [1 0 0 0 0 1 0 1 1]; expected a positive'),
     ('EDGE_PRIOR_SE2 3 1 0 0 1 0 0 1 0 -1', 'information [1 0 0 0 1 0 0 0 -1]; expected'),
+    ('EDGE_PRIOR_SE2_XY 3 1 0 1 0 -1', 'information [1 0 0 0 -1 0 0 0 0]; expected'),
+    ('EDGE_PRIOR_SE2_XY 3 1 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected'),
+    ('EDGE_SE2 3 7 1 0 0 1 .1 0 0 0 1', 'information [1 0.1 0 0.1 0 0 0 0 1]; expected'),
+    ('EDGE_PRIOR_SE2_XY 3 1 0 0 1 0 1', 'EDGE_PRIOR_SE2_XY: 7 fields; expected 1 whole and 5'),
     ('EDGE_PRIOR_SE2 -1 1 0 0 1 0 0 1 0 1', 'vertex -1 is unknown; expected one of the 3'),
     ('EDGE_PRIOR_SE2 3 7 1 0 0 1 0 0 1 0 1', 'EDGE_PRIOR_SE2: 11 fields; expected 1 whole and 9'),
 ])
@@ -261,7 +269,11 @@ def random_record(rng, n=40, stamps=True):
     A = rng.normal(size=(len(i), 3, 3))
     graph.add_between(i, j, rng.normal(size=(len(i), 3)),
                       A @ A.transpose(0, 2, 1) + 0.1 * np.eye(3))
-    graph.add_prior(np.array([3]), rng.normal(size=(1, 3)), 7.7 * np.eye(3)[None])
+    measured = rng.normal(size=(4, 3))
+    measured[1] *= [1, 1, 0]
+    add_absolute(graph, np.array([3, 3, 9, 7]), measured, np.stack(
+        [7.7 * np.eye(3), np.diag([2.0, 3, 0]), np.diag([2.0, 3, 0]), np.diag([0, 3.0, 7])]))
+    graph.add_between(1, 9, rng.normal(size=(1, 3)), np.diag([0, 0.1, 0])[None])
     ids = np.sort(rng.choice(10**12, n, replace=False))
     return GraphRecord(graph, rng.normal(size=(n, 3)) * 1e3, ids,
                        np.cumsum(rng.integers(1, 10**12, n)) if stamps else None)
@@ -270,10 +282,10 @@ def random_record(rng, n=40, stamps=True):
 def assert_same(a, b):
     assert (a.ids == b.ids).all()
     assert (a.poses == b.poses).all()
-    for x, y in ((a.graph.between, b.graph.between), (a.graph.prior, b.graph.prior)):
-        assert (x.i == y.i).all()
-        assert (x.measurement == y.measurement).all()
-        np.testing.assert_allclose(x.sqrt_information, y.sqrt_information, rtol=0, atol=1e-13)
+    x, y = a.graph.between, b.graph.between
+    assert (x.i == y.i).all() and (x.j == y.j).all()
+    assert (x.measurement == y.measurement).all()
+    np.testing.assert_allclose(x.sqrt_information, y.sqrt_information, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize('suffix, tag, information', [
@@ -302,13 +314,16 @@ def test_round_trip(tmp_path, rng):
     back = read_graph_file(tmp_path / 'a.g2o')
     assert_same(record, back)
     assert (back.stamps == record.stamps).all()
+    tags = [line.split()[0] for line in (tmp_path / 'a.g2o').read_text().splitlines()]
+    prior = 'EDGE_PRIOR_SE2'
+    assert tags[-5:] == [prior, f'{prior}_XY', prior, prior, 'EDGE_SE2']
     assert {p.name for p in tmp_path.iterdir()} == {'a.g2o', 'a.g2o.stamps.txt'}
 
 
 def test_toro_round_trip_and_what_it_cannot_hold(tmp_path, rng):
     record = random_record(rng, stamps=False)
     path = tmp_path / 'a.graph'
-    with pytest.raises(FileError, match='toro has no line for a prior of SE2'):
+    with pytest.raises(FileError, match='toro has no line for an absolute pose of SE2'):
         write_graph_file(path, record)
     assert not path.exists()
     write_graph_file(tmp_path / 'a.g2o', record)
