@@ -1,31 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The false-loop suite: what maps and solvers make of loops that lie.
+The false-loop suite: what maps and solvers make of loops that lie, recorded and made.
 
-    python benchmarks/false_loops.py --datasets DIR [--graphs NAME,...] [--kinds KIND,...]
-        [--shares P,...] [--seeds N] [--solvers WORD,...] [--limit S]
+    python benchmarks/false_loops.py --datasets DIR [--suite NAME,...] [--kinds WORD,...]
+        [--graphs NAME,...] [--shares P,...] [--seeds N | A-B] [--solvers WORD,...] [--limit S]
 
-Runs in the environment of `solvers.py`, on one core. What it measures replaces the same runs in
-results/false_loops.json, the others stay; FALSE_LOOPS.md is written from all of them, after each
-graph and kind, so a run that is stopped leaves what it has.
+        [--output benchmarks]
+
+Prints a line for each run: pass or fail, and why. With --output, what it measures replaces the
+same runs in results/false_loops.json of that folder, the others stay; FALSE_LOOPS.md is written
+from all of them, after each graph and kind, so a run that is stopped leaves what it has. Peers run
+in the environment of `solvers.py`; all runs on one core.
 """
 
 import argparse
 import json
+import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import peer_environment
-from robust_kinds import BATCH, KINDS, ONLINE, SHARES, shares_of
+from robust.kinds import GRAPHS, KINDS, MADE, SUITES
 
 if TYPE_CHECKING:
-    from robust_runs import Run
+    from robust.runs import Run
 
-HERE = Path(__file__).resolve().parent
-GRAPHS = ('intel', 'manhattan3500', 'city10000')
+DEFAULT_SOLVERS = ('ours L', 'DCS from odometry', 'GM from odometry', 'GNC from odometry')
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
@@ -33,64 +36,80 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     lines = (__doc__ or '').strip().splitlines()
     parser = argparse.ArgumentParser(description=lines[0])
     parser.add_argument('--datasets', type=Path, required=True,
-                        help='folder of the public graphs, and of NAME.truth.txt')
+                        help='folder of the public graphs, of NAME.truth.txt, and of real/')
+    parser.add_argument('--suite', type=_words, default=SUITES, metavar='NAME,...',
+                        help=f'of {", ".join(SUITES)}')
+    parser.add_argument('--kinds', type=_words, default=('',), metavar='WORD,...',
+                        help='those whose names begin with one of these')
     parser.add_argument('--graphs', type=_words, default=GRAPHS, metavar='NAME,...',
                         help=f'of {", ".join(GRAPHS)}')
-    parser.add_argument('--kinds', type=_words, metavar='KIND,...',
-                        default=BATCH, help=f'of {", ".join(KINDS)}; all that are not online')
-    parser.add_argument('--shares', type=_shares, default=SHARES, metavar='P,...',
-                        help='of all loops that are false, for the kinds without one of their own')
-    parser.add_argument('--seeds', type=int, default=5, help='each case is drawn so often')
-    parser.add_argument('--solvers', type=_words, default=('',), metavar='WORD,...',
-                        help='those whose names contain one of these, e.g. ours,DCS')
-    parser.add_argument('--limit', type=float, default=60.0,
+    parser.add_argument('--shares', type=_shares, metavar='P,...',
+                        help='of all loops that are false; all that a kind has')
+    parser.add_argument('--seeds', type=_seeds, default=range(3), metavar='N | A-B',
+                        help='each case is drawn so often, or with seeds A to B')
+    parser.add_argument('--solvers', type=_words, default=DEFAULT_SOLVERS, metavar='WORD,...',
+                        help='those whose names contain one of these, e.g. ours L2,live,ISAM2')
+    parser.add_argument('--limit', type=float, default=120.0,
                         help='processor time of one run [s]; who needs more gets no other seed')
-    parser.add_argument('--output', type=Path, default=HERE,
+    parser.add_argument('--output', type=Path,
                         help='folder of results/ and FALSE_LOOPS.md')
     arguments = parser.parse_args(words)
     for name, given, allowed in (('--graphs', arguments.graphs, GRAPHS),
-                                 ('--kinds', arguments.kinds, KINDS)):
+                                 ('--suite', arguments.suite, SUITES)):
         unknown = set(given) - set(allowed)
         if unknown:
             parser.error(f'{name}: {min(unknown)!r} is none of {", ".join(allowed)}')
-    missing = [name for name in arguments.graphs
-               if not (arguments.datasets / f'{name}.g2o').exists()]
-    if missing:
-        parser.error(f'{arguments.datasets} has no {missing[0]}.g2o')
+    if not any(True for _ in selected(arguments)):
+        parser.error('there is no such kind on these graphs with these shares')
+    if not arguments.datasets.is_dir() and set(arguments.graphs) - set(MADE):
+        parser.error(f'{arguments.datasets} is no folder')
     return arguments
+
+
+def selected(arguments: argparse.Namespace) -> Iterable[tuple[str, Any, float]]:
+    """Yield graph, kind and share of what is to be measured."""
+    for graph in arguments.graphs:
+        for kind in KINDS:
+            if (graph in kind.graphs and kind.suite in arguments.suite
+                    and kind.name.startswith(arguments.kinds)):
+                for share in kind.shares:
+                    if arguments.shares is None or share in (0.0, *arguments.shares):
+                        yield graph, kind, share
 
 
 def main() -> None:
     """Measure, merge, write."""
     arguments = parse(sys.argv[1:])
-    peer_environment.enter()
-    # These need what only the environment has.
+    if all(word.startswith('ours') for word in arguments.solvers):
+        os.environ.update(peer_environment.ONE_THREAD)
+    else:
+        peer_environment.enter()
+    # These need what only the environment has, and one thread.
     from measuring import record
-    from robust_cases import public_place
-    from robust_peers import ONLINE_PEERS, PEERS
-    from robust_runs import measure
-    from robust_solvers import ONLINE_OURS, OURS
+    from robust.peers import PEERS
+    from robust.places import place
+    from robust.runs import measure
+    from robust.solvers import OURS
 
     from l1slam_ros.core.solvers.warm_up import warm_up
 
     # Each run is a copy of this process, which has all loops compiled.
     warm_up()
-    batch, online = (
-        [solver for solver in all_ if any(word in solver.name for word in arguments.solvers)]
-        for all_ in ((*OURS, *PEERS), (*ONLINE_OURS, *ONLINE_PEERS)))
-    for name in arguments.graphs:
-        place = public_place(arguments.datasets, name)
-        for kind in arguments.kinds:
-            solvers = online if kind.startswith(ONLINE) else batch
-            for share in shares_of(kind, arguments.shares):
-                write(arguments.output, record('false loops', []), measure(
-                    place, kind, share, arguments.seeds, solvers, arguments.limit))
+    solvers = [solver for solver in (*OURS, *PEERS)
+               if any(word in solver.name for word in arguments.solvers)]
+    places: dict[str, Any] = {}
+    for name, kind, share in selected(arguments):
+        if name not in places:
+            places = {name: place(arguments.datasets, name)}
+        runs = measure(places[name], kind, share, arguments.seeds, solvers, arguments.limit)
+        if arguments.output:
+            write(arguments.output, record('false loops', []), runs)
 
 
 def write(folder: Path, head: dict[str, Any], runs: Sequence['Run']) -> None:
     """Merge runs into the record, and write record and tables; head : of `measuring.record`."""
-    from robust_runs import Run, merged
-    from robust_tables import document
+    from robust.runs import Run, merged
+    from robust.tables import document
 
     from l1slam_ros.io.files import write_lines
 
@@ -112,6 +131,11 @@ def _shares(text: str) -> tuple[float, ...]:
     if not all(0 < share < 1 for share in shares):
         raise argparse.ArgumentTypeError(f'{text!r}, expected shares between 0 and 1')
     return shares
+
+
+def _seeds(text: str) -> range:
+    first, _, last = text.rpartition('-')
+    return range(int(first), int(last) + 1) if first else range(int(last))
 
 
 if __name__ == '__main__':

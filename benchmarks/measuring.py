@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -121,7 +121,7 @@ def record(part: str, rows: list[Row]) -> dict[str, Any]:
         'part': part,
         'machine': {'cpu': _cpu_model(), 'cores': os.cpu_count(), 'used': 1},
         'versions': {'python': platform.python_version()} | {
-            name: version(name) for name in _PACKAGES},
+            name: version(name) for name in _PACKAGES if _is_there(name)},
         'rows': [asdict(r) for r in rows],
     }
 
@@ -129,6 +129,13 @@ def record(part: str, rows: list[Row]) -> dict[str, Any]:
 def rows_of(recorded: Mapping[str, Any]) -> list[Row]:
     """Return the rows of what `record` returned."""
     return [Row(**fields) for fields in recorded['rows']]
+
+
+def _is_there(package: str) -> bool:
+    try:
+        return bool(version(package))
+    except PackageNotFoundError:
+        return False
 
 
 def _cpu_model() -> str:

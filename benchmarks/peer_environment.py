@@ -24,7 +24,7 @@ _MARK = 'L1SLAM_BENCHMARK_ENVIRONMENT'
 # What would lend the libraries of this process, those of a ROS above all, to another Python.
 _LENT = ('PYTHONPATH', 'PYTHONHOME', 'LD_LIBRARY_PATH', 'AMENT_PREFIX_PATH', 'COLCON_PREFIX_PATH',
          'CMAKE_PREFIX_PATH', '_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'VIRTUAL_ENV')
-_ONE_THREAD = {f'{library}_NUM_THREADS': '1' for library in
+ONE_THREAD = {f'{library}_NUM_THREADS': '1' for library in
                ('OMP', 'OPENBLAS', 'MKL', 'NUMBA')}
 
 
@@ -37,7 +37,7 @@ def enter() -> None:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     variables = {name: value for name, value in os.environ.items() if name not in _LENT}
     sys.stdout.flush()
-    os.execve(python, [str(python), *sys.argv], variables | _ONE_THREAD | {_MARK: '1'})
+    os.execve(python, [str(python), *sys.argv], variables | ONE_THREAD | {_MARK: '1'})
 
 
 def requirements() -> list[str]:

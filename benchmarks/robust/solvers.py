@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What solvers of graphs with lies are to the measurements, and our own: the only door to ours."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import incremental
+import numpy as np
+from measuring import clock
+from robust.changes import information_of
+
+from l1slam_ros.core.errors import L1SlamError
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
+from l1slam_ros.core.online.backend import Backend, BackendOptions
+from l1slam_ros.core.online.loop_states import ACCEPTED
+from l1slam_ros.core.robust import batch_map
+from l1slam_ros.core.robust.judgement import Doubt
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+
+# Online: an update after so many keyframes, for so long [s].
+_EVERY, _BUDGET = 10, 0.1
+# Updates after the last keyframe, while the robot stands still.
+_LAST_UPDATES, _LAST_BUDGET = 5, 0.5
+# [m, rad] Two measurements of one pair are the same loop.
+_SAME = 1e-6
+# Live: [s] at rest when no map came for so long, and in any case after so long.
+_REST, _LONGEST_REST = 3.0, 60.0
+DOUBTFUL, REFUSED = 'doubtful', 'refused'
+
+
+@dataclass(frozen=True)
+class Found:
+    """
+    A map and what it took.
+
+    poses : (n, p); seconds : [s]; accepted : (m,) bool, None where the solver does not say;
+    slips : rows of odometry factors it takes for lies; status : its own word on the map; why :
+    it is doubtful, or there is none; maps : (k, p) each, of those on the way.
+    """
+
+    poses: Array
+    seconds: float
+    accepted: Mask | None = None
+    slips: tuple[int, ...] = ()
+    status: str = ''
+    why: str = ''
+    maps: tuple[Array, ...] = ()
+
+
+@dataclass(frozen=True)
+class RobustSolver:
+    """
+    Something that makes a map.
+
+    norm : what it minimises, l1 or l2; start : of `runs.STARTS`; solve : from a graph and poses
+    (n, p) to what it found; online : pose by pose, with maps on the way every `LOOK` keyframes.
+    """
+
+    name: str
+    norm: str
+    start: str
+    solve: Callable[[FactorGraph, Array], Found]
+    online: bool = False
+
+
+# Keyframes between two looks at the map of a running back end.
+LOOK = 50
+
+
+def _batch(norm: str) -> Callable[[FactorGraph, Array], Found]:
+    """Count all from the factor graph on; the poses are not looked at."""
+
+    def solve(graph: FactorGraph, poses: Array) -> Found:
+        began = clock()
+        try:
+            outcome = batch_map.solve(graph, None, batch_map.Wish(norm=norm, robust=True))
+        except L1SlamError as error:
+            return Found(poses, clock() - began, graph.between.is_odometry.copy(),
+                         status=REFUSED, why=str(error))
+        seconds, judgement = clock() - began, outcome.judgement
+        assert judgement is not None
+        return Found(outcome.solution.poses, seconds, judgement.accepted,
+                     tuple(judgement.slips.tolist()),
+                     *_said(judgement.doubt, outcome.solution.status.value))
+
+    return solve
+
+
+def _said(doubt: Doubt | None, status: str) -> tuple[str, str]:
+    """Return its word on the map, and why it is doubtful."""
+    return (DOUBTFUL, str(doubt)) if doubt else (status, '')
+
+
+def _online(rate: float) -> Callable[[FactorGraph, Array], Found]:
+    """
+    Feed the back end as the node does, robust as it is by default.
+
+    rate : keyframes a second, updates in the background; 0: the updates are waited for
+    """
+
+    def solve(graph: FactorGraph, poses: Array) -> Found:
+        maps, seconds, process, began = [], 0.0, clock(), time.monotonic()
+        nothing = dict.fromkeys(('translation', 'rotation', 'period'), 0.0)
+        options = BackendOptions.from_mapping(
+            {'keyframe': nothing, 'odometry': {'covariance_source': 'increment'}})
+        with Backend(options, background=rate > 0) as backend:
+            for k, (sample, loops) in enumerate(incremental.measurements(_in_time(graph)), 1):
+                backend.add_odometry(sample)
+                for loop in loops:
+                    backend.add_loop(loop)
+                if rate:
+                    time.sleep(max(0.0, began + k / rate - time.monotonic()))
+                elif k % _EVERY == 0:
+                    seconds += _updated(backend, _BUDGET)
+                if k % LOOK == 0:
+                    maps.append(backend.poses)
+            if rate:
+                _come_to_rest(backend)
+                seconds = clock() - process
+            else:
+                seconds += sum(_updated(backend, _LAST_BUDGET) for _ in range(_LAST_UPDATES))
+            return _found(backend, graph, seconds, tuple(maps))
+
+    return solve
+
+
+def _come_to_rest(backend: Backend) -> None:
+    """Wait, as a robot that stands still, until no map follows another."""
+    began, maps = time.monotonic(), -1
+    while backend.maps != maps and time.monotonic() - began < _LONGEST_REST:
+        maps = backend.maps
+        time.sleep(_REST)
+
+
+def _found(backend: Backend, graph: FactorGraph, seconds: float,
+           maps: tuple[Array, ...]) -> Found:
+    """Return what the back end believes, by the rows of the graph it was fed."""
+    now, factors = backend.snapshot(), graph.between
+    judgement = now.optimised.judgement
+    steps = np.where(factors.is_odometry, np.minimum(factors.i, factors.j), -1)
+    slips = np.flatnonzero(np.isin(steps, now.graph.between.i[judgement.slips]))
+    return Found(backend.poses, seconds, _accepted(backend, graph), tuple(slips.tolist()),
+                 *_said(judgement.doubt, ''), maps)
+
+
+def _in_time(graph: FactorGraph) -> GraphRecord:
+    """Return the graph with each factor from the earlier keyframe to the later one."""
+    i, j, measurement = ends_in_time(graph)
+    factors, information = graph.between, information_of(graph)
+    turned = factors.i > factors.j
+    adjoint = graph.manifold.adjoint(measurement[turned])
+    information[turned] = adjoint.transpose(0, 2, 1) @ information[turned] @ adjoint
+    forward = FactorGraph(graph.manifold)
+    forward.add_poses(graph.n_poses)
+    forward.add_between(i, j, measurement, information, factors.trusted)
+    return GraphRecord(forward, None, np.arange(graph.n_poses))
+
+
+def _updated(backend: Backend, budget: float) -> float:
+    began = clock()
+    backend.update(budget)
+    return clock() - began
+
+
+def _accepted(backend: Backend, graph: FactorGraph) -> Mask:
+    """Return which factors of the graph the back end uses; it takes a repeated loop once."""
+    states, used = backend.loop_states(), backend.snapshot().graph.between
+    rows = states.rows[states.state[: len(states.rows)] == ACCEPTED]
+    measured: dict[tuple[int, int], list[Array]] = {}
+    for i, j, Z in zip(used.i[rows].tolist(), used.j[rows].tolist(), used.measurement[rows],
+                       strict=True):
+        measured.setdefault((i, j), []).append(Z)
+    accepted = graph.between.is_odometry.copy()
+    for row, (i, j, Z) in enumerate(zip(*ends_in_time(graph), strict=True)):
+        accepted[row] |= any(np.allclose(Z, other, atol=_SAME)
+                             for other in measured.get((int(i), int(j)), []))
+    return accepted
+
+
+OURS = (RobustSolver('ours L1', 'l1', 'odometry', _batch('l1')),
+        RobustSolver('ours L2', 'l2', 'odometry', _batch('l2')),
+        RobustSolver('ours online', 'l1', 'odometry', _online(0.0), online=True),
+        *(RobustSolver(f'ours live {rate}', 'l1', 'odometry', _online(rate), online=True)
+          for rate in (50, 150, 400)))
