@@ -9,17 +9,19 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 
-# Refused loops of several places agree with each other; hardly a loop is believed.
-INCONSISTENT, MOSTLY_REFUSED = 'inconsistent', 'mostly refused'
+# Most loops are refused; all that are accepted are of one place; refused loops of several places
+# agree on another map; an odometry factor may have slipped, and it was not believed.
+MOSTLY_REFUSED, ONE_PLACE, OTHER_MAP, SLIP = (
+    'mostly refused', 'one place', 'another map', 'a slip suspected')
 
 
 @dataclass(frozen=True)
 class Doubt:
     """
-    Why a map is not to be relied on.
+    One reason why a map is not to be relied on.
 
-    kind : one of the two above; loops : how many speak against it; first, last : the keyframes
-    between which they do.
+    kind : one of the above; loops : how many it is about; first, last : the keyframes between
+    which they lie.
     """
 
     kind: str
@@ -38,8 +40,8 @@ class Judgement:
     as stated or larger if it was found so: the length of the residual, and where it is not
     accepted, of that over the uncertainty of the map, NaN before a loop was looked at; variance :
     (2,) of odometry and of loops as it was found, in units of what they state; slips : (k,) the
-    odometry factors that lie, not accepted; doubt : None where all is well; settled : no more is
-    to be found out from the factors that are there.
+    odometry factors that slipped, not accepted; doubts : reasons not to rely on the map; settled :
+    no more is to be found out from the factors that are there.
     """
 
     accepted: Mask
@@ -49,6 +51,11 @@ class Judgement:
     slips: Indices
     doubts: tuple[Doubt, ...] = ()
     settled: bool = True
+
+    @property
+    def doubt(self) -> Doubt | None:
+        """The first reason not to rely on the map; None where all is well."""
+        return self.doubts[0] if self.doubts else None
 
     @staticmethod
     def nothing() -> 'Judgement':

@@ -53,6 +53,9 @@ _KNOWN = 20
 # The noise is learnt to be no less than this part of the variance that was found first: factors
 # that fit exactly, as of a simulator, say of ever less that it is still too much.
 _LEAST_VARIANCE = 1e-3
+# While a map grows the noise that was found first is not known any more; but beyond this ratio of
+# odometry's and loops' weights are soon lost in rounding.
+_LEAST_RATIO = 1e-5
 # Noise that is so many times the variance that was found is measured anew before any loop is
 # dropped for it, by the median of chi2 over its freedom; by factors that others check at all.
 _NOISIER, _MEDIAN, _CHECKED = 3.0, 0.79, 0.01
@@ -73,7 +76,8 @@ class Growth:
     says nothing: a gap or a slip; low, high : (m,) the earlier and the later keyframe of each;
     place : (m,) see `places`; part : (n,) number of the part of each keyframe; poses : (n, p) the
     L2 map of the accepted; posterior : of these; variance : (2,) of odometry and loops in units of
-    what they state; check : called before long steps, raises where the work shall stop.
+    what they state; suspected : the loops across each slip that was suspected and not
+    believed; check : called before long steps, raises where the work shall stop.
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
@@ -90,6 +94,7 @@ class Growth:
         self.variance = np.ones(2)
         self._floor, self._at_their_word = np.full(2, _LEAST_VARIANCE), False
         self.posterior: Posterior
+        self.suspected: list[Indices] = []
         self._drops = np.zeros(len(self.factors), np.int64)
 
     @cached_property
@@ -113,7 +118,7 @@ class Growth:
     def resume(self, poses: Array, accepted: Mask, variance: Array) -> None:
         """Go on from an earlier state: poses (n, p), accepted (m,), variance (2,)."""
         self.poses, self.variance = poses, variance.copy()
-        self._floor = _LEAST_VARIANCE * variance
+        self._floor = np.maximum(_LEAST_RATIO * variance.max(), _LEAST_RATIO**2)
         self.accepted[: self.size] = accepted | self.trusted[: self.size]
         self.cut |= ~self.accepted & ~self.is_loop
         self.accepted |= self.cut

@@ -17,6 +17,7 @@ the odometry factor is off by more than one in all its factors is by chance.
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import Mask, whiten
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.robust.gating import DOUBT
@@ -35,6 +36,8 @@ _JOINING, SPANNING = 2, 3
 _GAIN, _WON = 3.0, 2.0
 # So many steps are tried of those that may have slipped.
 _TRIED = 2
+# A jump like no other is so many times as unusual as what is.
+_UNHEARD = 4.0
 
 
 def join(growth: Growth) -> bool:
@@ -102,12 +105,16 @@ def _slipped(growth: Growth, cut: Growth, step: int) -> bool:
     """Return whether a step slipped rather than that the loops lie that say so."""
     with_, without = (np.unique(growth.place[state.accepted & growth.is_loop])
                       for state in (cut, growth))
-    span = np.unique(growth.place[cut.accepted & _spanning(growth, step)])
+    across = np.flatnonzero(cut.accepted & _spanning(growth, step))
     won, lost = len(np.setdiff1d(with_, without)), len(np.setdiff1d(without, with_))
     gate = _gate(growth)
     gain = _excess(growth, cut.variance) - _excess(cut, cut.variance) + gate * (won - lost)
-    return (gain > _GAIN * gate and len(span) >= SPANNING and won >= _WON * lost
-            and _is_gross(cut, step))
+    sure = unheard_of(growth)[step] or (gain > _GAIN * gate and _is_gross(cut, step))
+    if not sure or len(np.unique(growth.place[across])) < SPANNING:
+        return False
+    if won < _WON * lost:
+        growth.suspected.append(across)
+    return won >= _WON * lost
 
 
 def _gate(growth: Growth) -> float:
@@ -146,36 +153,76 @@ def refused(growth: Growth) -> Indices:
 
 
 def _suspected(growth: Growth) -> list[int]:
-    """Return the odometry factors that may have slipped: the most unusual of each reason."""
-    group = strongest_group(growth, refused(growth))
-    square = unusual_motion(growth.graph, growth.forward)
+    """Return the odometry factors that may have slipped, the most unusual of each reason."""
+    group, against = strongest_group(growth, refused(growth)), _against(growth)
+    square, jumps = unusual_motion(growth.graph, growth.forward), jumping(growth)
+    if len(group.places) < SPANNING:
+        steps = np.count_nonzero(~growth.is_loop)
+        limit = chi2_quantile(1 - DOUBT / steps, growth.factors.freedom[jumps])
+        group, jumps = NO_GROUP, jumps[against[jumps] > limit]
+    runs = (jumps, np.flatnonzero(unheard_of(growth)), _spoken_against(growth, against),
+            weakest_steps(growth, group))
+    suspected = np.unique(np.concatenate(
+        [run[np.argsort(-square[run], kind='stable')[:_TRIED]] for run in runs]))
+    return suspected[np.argsort(-square[suspected], kind='stable')].tolist()
+
+
+def jumping(growth: Growth) -> Indices:
+    """Return the odometry factors that move as the robot hardly ever does, (k,)."""
     odometry = np.flatnonzero(~growth.is_loop & ~growth.cut)
     limit = chi2_quantile(1 - DOUBT / len(odometry), growth.factors.freedom[odometry])
-    jumps = odometry[square[odometry] > limit]
-    if len(group.places) < SPANNING:
-        group, jumps = NO_GROUP, jumps[:0]
-    runs = jumps, _spoken_against(growth), _weakest_steps(growth, group)
-    suspected = [run[np.argsort(-square[run], kind='stable')[:_TRIED]] for run in runs]
-    return np.unique(np.concatenate(suspected)).tolist()
+    jumps: Indices = odometry[
+        unusual_motion(growth.graph, growth.forward[odometry]) > limit]
+    return jumps
 
 
-def _spoken_against(growth: Growth) -> Indices:
-    """Return the odometry factors about the worst that all others speak against, (k,)."""
-    inside = np.flatnonzero(growth.accepted)
-    against = np.where((growth.is_loop | growth.cut)[inside], 0.0, growth.posterior.left_out())
-    against *= growth.variance[0] / growth.variance_at_their_word()[0]
-    # To cut it gains no more than that, unless it wins places; of those the other way tells.
+def unheard_of(growth: Growth) -> Mask:
+    """
+    Return the few jumps like no other, (m,) bool, of which all others say that there was none.
+
+    With the covariance R of the residual r, the innovation of a factor by all others is R^-1 r,
+    and its covariance R^-1: is it likelier that the robot moved as always, or as was measured?
+    """
+    odometry = np.flatnonzero(~growth.is_loop & ~growth.cut)
+    square = unusual_motion(growth.graph, growth.forward[odometry])
+    order, unheard = np.argsort(-square, kind='stable'), np.zeros(len(growth.factors), bool)
+    if len(order) <= _TRIED:
+        return unheard
+    rows = odometry[order[:_TRIED][square[order[:_TRIED]] > _UNHEARD * square[order[_TRIED]]]]
+    manifold, at = growth.graph.manifold, np.searchsorted(np.flatnonzero(growth.accepted), rows)
+    R, r = growth.posterior.moment[at], growth.posterior.residual[at]
+    measured = np.linalg.pinv(R, hermitian=True) @ r[:, :, None]
+    usual = manifold.local(manifold.identity(1), np.median(growth.forward[odometry], axis=0)[None])
+    usual = manifold.retract(manifold.identity(1), usual)
+    moved = measured + whiten(growth.subgraph(rows).between.sqrt_information, manifold.local(
+        np.broadcast_to(usual, growth.forward[rows].shape), growth.forward[rows]))[:, :, None]
+    likelier = [(e.transpose(0, 2, 1) @ R @ e)[:, 0, 0] for e in (moved, measured)]
+    unheard[rows[likelier[0] < likelier[1]]] = True
+    return unheard
+
+
+def _against(growth: Growth) -> Array:
+    """Return by how much all others speak against each odometry factor, (m,), as noisy as said."""
+    rows = np.flatnonzero(growth.accepted)
+    against = np.zeros(len(growth.factors))
+    against[rows] = growth.posterior.left_out()
+    against[growth.is_loop | growth.cut] = 0.0
+    return against * growth.variance[0] / growth.variance_at_their_word()[0]
+
+
+def _spoken_against(growth: Growth, against: Array) -> Indices:
+    """Return the odometry factors about the worst, (k,); none if to cut it could gain nothing."""
     if against.max() < _GAIN * _gate(growth):
-        return inside[:0]
+        return np.zeros(0, np.int64)
     # Steps between which no accepted loop ends share what speaks against them.
-    suspects = inside[against > against.max() / 2]
+    suspects = np.flatnonzero(against > against.max() / 2)
     suspects = suspects[np.argsort(growth.low[suspects])]
     runs = np.cumsum(np.diff(growth.low[suspects], prepend=-1) > 1)
-    run: Indices = suspects[runs == runs[suspects == inside[np.argmax(against)]]]
+    run: Indices = suspects[runs == runs[suspects == np.argmax(against)]]
     return run
 
 
-def _weakest_steps(growth: Growth, group: Group) -> Indices:
+def weakest_steps(growth: Growth, group: Group) -> Indices:
     """Return the odometry that most of a group span, and of it what the fewest accepted do."""
     if not len(group.rows):
         return group.rows
