@@ -84,7 +84,8 @@ def doubt_sentence(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None
     for doubt in doubts:
         where = f'between {ids[doubt.first]} and {ids[doubt.last]}'
         if stamps is not None:
-            where += f' ({stamp_text(stamps[doubt.first])} s to {stamp_text(stamps[doubt.last])} s)'
+            first, last = stamp_text(stamps[doubt.first]), stamp_text(stamps[doubt.last])
+            where += f' ({first} s to {last} s)'
         reasons.append(_REASONS[doubt.kind].format(loops=f'{doubt.loops:,}', where=where))
     return f'{DOUBTFUL}: {"; ".join(reasons)}. {_REMEDY}' if reasons else ''
 

@@ -16,9 +16,9 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.online.snapshot import Optimised, Problem
+from l1slam_ros.core.robust.batch import judge
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.robust.robust_map import minimise_robustly
-from l1slam_ros.core.robust.running import judge
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.nonlinear import (
     OptimiserOptions,

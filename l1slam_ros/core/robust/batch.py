@@ -6,15 +6,14 @@ In: a graph, of which nothing is accepted but the odometry and the trusted loops
 that are accepted, and the L2 map of these.
 """
 
+import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.robust.doubts import doubts
-from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.robust.judgement import Judgement, doubts, judgement_of
 from l1slam_ros.core.robust.rounds import Growth
 from l1slam_ros.core.robust.slips import join, without_slip
 
@@ -68,25 +67,28 @@ def rounds(growth: Growth, repaired: Callable[[Growth], Growth | None]) -> Itera
         yield growth
 
 
-def judgement_of(growth: Growth, doubts: tuple = (), settled: bool = True) -> Judgement:
-    """Return what a state says of the factors that were given."""
-    square, suspect = fits(growth)
-    size, accepted = growth.size, growth.accepted & ~growth.cut
-    return Judgement(accepted[:size], suspect[:size], np.sqrt(square[:size]), growth.variance,
-                     np.flatnonzero(growth.cut[:size]), doubts, settled)
-
-
-def fits(growth: Growth) -> tuple[Array, Mask]:
+def judge(
+    graph: FactorGraph, poses: Array, known: Judgement, deadline: float,
+    check: Callable[[], None] = lambda: None,
+) -> tuple[Judgement, Array]:
     """
-    Return how well each factor fits: a square (m,) of sigmas, and the loops that are suspect.
+    Return what is to be accepted, after looking again at all loops that are not, and its L2 map.
 
-    The square is that of the residual, and of what is not accepted, of the innovation. Suspect,
-    (m,) bool, is a loop that fits and yet was not accepted.
+    A slip of the odometry is not looked for: that takes too long to do while driving.
+
+    Parameters
+    ----------
+    poses : (n, p) the map of what was accepted
+    deadline : `time.monotonic()` [s] after which no second round begins
+    check : called before long steps, raises where the work shall stop
+
     """
-    accepted, square = growth.accepted & ~growth.cut, np.zeros(len(growth.factors))
-    square[growth.accepted] = (growth.posterior.residual**2).sum(axis=1)
-    outside = np.flatnonzero(~accepted)
-    cut, growth.cut = growth.cut, np.zeros_like(growth.cut)
-    square[outside] = growth.innovations(outside).square
-    growth.cut = cut
-    return square, ~accepted & (square < growth.gate(growth.factors.freedom)) & growth.is_loop
+    first, settled = Growth(graph, check), True
+    first.resume(poses, known.accepted, known.variance)
+    growth = first
+    for growth in rounds(first, lambda _: None):
+        # The end is not put off once it is in sight, or short budgets would never get there.
+        if time.monotonic() > deadline and not growth.takes_at_their_word:
+            settled = False
+            break
+    return judgement_of(growth, settled=settled), growth.poses

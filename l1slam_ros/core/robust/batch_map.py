@@ -16,11 +16,11 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.graph.parts import bridged, odometry_gaps
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import Report as OnRound
-from l1slam_ros.core.robust.inspection import initial_poses, odometry_gaps, require_connected
+from l1slam_ros.core.robust.inspection import initial_poses, require_connected
 from l1slam_ros.core.robust.judgement import Judgement
-from l1slam_ros.core.robust.parts import bridged
 from l1slam_ros.core.robust.robust_map import RobustMap, minimise_robustly
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import (

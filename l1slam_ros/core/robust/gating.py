@@ -64,8 +64,8 @@ def noise_variance(found: Innovations) -> Array:
 
     With `scale` of the odometry and `ratio scale` of the loops, true innovations have the
     covariance `scale (spread + ratio I)`; the false ones any. Expectation and maximisation, from
-    several ratios and scales, of which the likeliest wins. Only the best predicted loops are asked:
-    their fit tells most.
+    several ratios and scales, of which the likeliest wins. Only the best predicted loops are
+    asked: their fit tells most.
     """
     from l1slam_ros.core.kernels.prediction import normalise
 

@@ -137,7 +137,7 @@ class Innovations:
     freedom: Indices
 
     def log_ratio(self) -> Array:
-        """Return how much more probable each residual is if its factor is true, (m,) logarithms."""
+        """Return how much likelier each residual is if its factor is true, (m,) logarithms."""
         return log_likelihood_ratio(self.square, self.log_det, self.log_claim, self.freedom)
 
     def joint(self, posterior: Posterior, first: Indices, second: Indices) -> tuple[Array, Array]:

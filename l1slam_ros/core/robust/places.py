@@ -21,7 +21,7 @@ _GRAIN = 0.1
 
 def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
     """
-    Return of each between factor the number of its place, (m,), and where it joins the way, (m, 2).
+    Return of each factor the number of its place, (m,), and where it joins the way, (m, 2).
 
     The latter are the sum and the difference of its ends' distances along the way [m]: so two
     factors are as far apart as the larger difference of the two numbers.
@@ -38,7 +38,8 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
     # The world is where the way begins, as WORLD finds it: last.
     way = np.concatenate(([0.0], np.cumsum(steps), [0.0]))
     ends = np.stack((way[high] + way[low], way[high] - way[low]), axis=1)
-    claim = manifold.positions(manifold.compose(with_world(manifold, chain)[low], Z)) - positions[high]
+    claimed = manifold.compose(with_world(manifold, chain)[low], Z)
+    claim = manifold.positions(claimed) - positions[high]
     cells, cell = np.unique(np.round(np.hstack((ends, claim)) / (_GRAIN * NEAR)), axis=0,
                             return_inverse=True)
     pairs = cKDTree(cells).query_pairs(1 / _GRAIN, p=np.inf, output_type='ndarray')

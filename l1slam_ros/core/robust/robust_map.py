@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.batch import Report, robust_solve
 from l1slam_ros.core.robust.judgement import Judgement
-from l1slam_ros.core.robust.parts import tied
 from l1slam_ros.core.robust.rounds import solve
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.nonlinear import Solution

@@ -15,6 +15,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, ends_in_time
 from l1slam_ros.core.graph.linear_system import anchor, linearise, step_poses, whitened_residual
+from l1slam_ros.core.graph.parts import bridged
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.robust.gating import DOUBT, believable, log_odds_of_false, noise_variance
@@ -27,7 +28,6 @@ from l1slam_ros.core.robust.innovation import (
     sample_posterior,
     sampled_quantile,
 )
-from l1slam_ros.core.robust.parts import bridged
 from l1slam_ros.core.robust.places import neighbours_agree, places
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
@@ -205,20 +205,17 @@ class Growth:
 
     def _is_noisier(self, rows: Indices) -> bool:
         """Raise the variance where half of the factors say that it is far too small."""
-        k, noisier = self.graph.manifold.TANGENT_SIZE, False
-        if self._at_their_word:
+        loops = self.is_loop[rows]
+        if self._at_their_word or np.count_nonzero(loops) < _KNOWN:
             return False
         square = (self.posterior.residual**2).sum(axis=1)
         stated = np.trace(self.posterior.moment, axis1=1, axis2=2)
-        for kind in (0, 1):
-            known = (self.is_loop[rows] == kind) & (stated > _CHECKED * k)
-            known &= ~self.factors.is_absolute[rows]
-            if np.count_nonzero(known) >= _KNOWN:
-                scale = float(np.median(square[known] / stated[known])) / _MEDIAN
-                if scale > _NOISIER:
-                    self.variance[kind] *= scale
-                    noisier = True
-        return noisier
+        known = (stated > _CHECKED) & ~self.factors.is_absolute[rows]
+        scale = np.array([np.median(square[known & kind] / stated[known & kind])
+                          if (known & kind).any() else 0.0 for kind in (~loops, loops)]) / _MEDIAN
+        noisier = scale > _NOISIER
+        self.variance = np.where(noisier, scale, 1.0) * self.variance
+        return bool(noisier.any())
 
     def _misfits(self, rows: Indices) -> Indices:
         """Return the accepted loops that do not fit, or that all others speak against."""
@@ -286,19 +283,20 @@ class Growth:
         if not len(a):
             return best[:0]
         square, both = found.joint(self.posterior, a, b)
-        place, ends = (values[rows] for values in self._places)
+        place, ends = self._places[0][rows], self._places[1][rows]
         agree = np.flatnonzero(square < self.gate(found.freedom[a] + found.freedom[b]))
         a, b, both = a[agree], b[agree], both[agree]
         own = place[a] == place[b]
         most = -np.log(neighbours_agree(place[~fits], ends[~fits]))
         far, near = np.zeros(len(rows)), np.zeros(len(rows))
-        for one, other in ((a, b), (b, a)):
+        for one in (a, b):
             more = both - log_ratio[one]
             np.maximum.at(far, one[~own], more[~own] - max(odds, 0.0))
             np.add.at(near, one[own], np.clip(more[own], 0.0, most))
         evidence = log_ratio + far + near
-        sure = best[evidence[best] > odds + np.log(1 / DOUBT - 1)]
-        return sure[(far + near)[sure] > 0]
+        sure = (evidence > odds + np.log(1 / DOUBT - 1)) & (far + near > 0)
+        together: Indices = best[sure[best]]
+        return together
 
     def some(self, rows: Indices, count: int) -> Indices:
         """Return so many of some factors, at random, or all, (k,)."""

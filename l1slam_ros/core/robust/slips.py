@@ -94,9 +94,9 @@ def _without(growth: Growth, step: int) -> Growth | None:
     return state
 
 
-def _spanning(growth: Growth, step: int) -> Array:
+def _spanning(growth: Growth, step: int) -> Mask:
     """Return which loops span an odometry factor, (m,) bool."""
-    span: Array = growth.is_loop & (growth.low < growth.high[step]) & (
+    span: Mask = growth.is_loop & (growth.low < growth.high[step]) & (
         growth.high > growth.low[step])
     return span
 
@@ -132,7 +132,7 @@ def _excess(growth: Growth, variance: Array) -> float:
 
 
 def _is_gross(growth: Growth, step: int) -> bool:
-    """Return whether a cut odometry factor lies, all others being as noisy as they say at least."""
+    """Return whether a cut factor is off, all others being as noisy as they say at least."""
     state = growth.copy()
     state.take_at_their_word()
     state.solve()
@@ -164,7 +164,7 @@ def _suspected(growth: Growth) -> list[int]:
             weakest_steps(growth, group))
     suspected = np.unique(np.concatenate(
         [run[np.argsort(-square[run], kind='stable')[:_TRIED]] for run in runs]))
-    return suspected[np.argsort(-square[suspected], kind='stable')].tolist()
+    return [int(step) for step in suspected[np.argsort(-square[suspected], kind='stable')]]
 
 
 def jumping(growth: Growth) -> Indices:
@@ -207,7 +207,8 @@ def _against(growth: Growth) -> Array:
     against = np.zeros(len(growth.factors))
     against[rows] = growth.posterior.left_out()
     against[growth.is_loop | growth.cut] = 0.0
-    return against * growth.variance[0] / growth.variance_at_their_word()[0]
+    scale: float = growth.variance[0] / growth.variance_at_their_word()[0]
+    return against * scale
 
 
 def _spoken_against(growth: Growth, against: Array) -> Indices:

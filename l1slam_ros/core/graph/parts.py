@@ -10,7 +10,14 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
-from l1slam_ros.core.robust.inspection import odometry_gaps
+
+
+def odometry_gaps(graph: FactorGraph) -> Indices:
+    """Return the keyframes k without a factor between k and k + 1, (g,)."""
+    factors = graph.between
+    first = np.minimum(factors.i, factors.j)[factors.is_odometry]
+    gaps: Indices = np.setdiff1d(np.arange(graph.n_poses - 1), first)
+    return gaps
 
 
 def bridged(graph: FactorGraph) -> FactorGraph:
