@@ -23,6 +23,8 @@ _SAME = 1e-3
 _RATIOS = (1.0, *(10.0**power for power in range(-6, 7) if power))
 _RATIO_COSTS = 0.25
 _LEAST_START = 1e-9
+# A factor of ten that files are off has to be worth so much, ln: a few lies are no measure.
+_DECADE_COSTS = 5.0
 
 
 def log_odds_of_false(log_ratio: Array, others: int, believed: int = 0) -> float:
@@ -78,7 +80,8 @@ def noise_variance(found: Innovations) -> Array:
         log_det -= (k - freedom) * np.log(ratio)  # what says nothing has no noise
         for start in (1.0, *(np.quantile(square, (0.1, 0.5)) / k).tolist()):
             likelihood, scale = _fitted_scale(square, log_det, log_claim, freedom, start)
-            fits.append((likelihood - _RATIO_COSTS * len(best) * (ratio != 1), scale, ratio))
+            costs = _RATIO_COSTS * len(best) * (ratio != 1) + _DECADE_COSTS * abs(np.log10(scale))
+            fits.append((likelihood - costs, scale, ratio))
     _, scale, ratio = max(fits)
     return np.array([scale, ratio * scale])
 

@@ -15,18 +15,18 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.robust.pairwise_consistency import strongest_group
+from l1slam_ros.core.robust.pairwise_consistency import ASKED, strongest_group
 from l1slam_ros.core.robust.rounds import Growth
-from l1slam_ros.core.robust.slips import SPANNING, jumping, refused, weakest_steps
+from l1slam_ros.core.robust.slips import SPANNING, jumping, refused, spanning, weakest_steps
 
 # Most loops are refused; all that are accepted are of one place; refused loops of several places
 # agree on another map; an odometry factor may have slipped, and it was not believed.
 MOSTLY_REFUSED, ONE_PLACE, OTHER_MAP, SLIP = (
     'mostly refused', 'one place', 'another map', 'a slip suspected')
 
-# Of fewer loops most may well be refused, and be of one place.
-_HANDFUL = 5
-# Refused loops that agree count if their places are so many for each accepted one across.
+# Of fewer loops most may well be refused, and be of one place; most are more than half by some.
+_HANDFUL, _MOST = 5, 0.55
+# Refused loops that agree count if they are so many for each accepted one across.
 _AGAINST = 0.25
 
 
@@ -131,7 +131,7 @@ def doubts(growth: Growth) -> tuple[Doubt, ...]:
     left_out = np.flatnonzero(loops & ~growth.accepted[: growth.size])
     accepted = np.flatnonzero(loops & growth.accepted[: growth.size])
     reasons = []
-    if len(left_out) + len(accepted) >= _HANDFUL and len(left_out) > len(accepted):
+    if np.count_nonzero(loops) >= _HANDFUL and len(left_out) > _MOST * np.count_nonzero(loops):
         reasons.append(_doubt(growth, MOSTLY_REFUSED, left_out))
     if len(accepted) >= _HANDFUL and len(np.unique(growth.place[accepted])) == 1 and not (
             growth.trusted[accepted].any()):
@@ -143,15 +143,15 @@ def doubts(growth: Growth) -> tuple[Doubt, ...]:
 
 def _other_map(growth: Growth) -> list[Doubt]:
     """Return a doubt where refused loops of several places agree: they may be right."""
-    group = strongest_group(growth, refused(growth))
+    outside = refused(growth)
+    group = strongest_group(growth, outside)
     if len(group.places) < SPANNING:
         return []
-    steps = growth.low[weakest_steps(growth, group)]
-    across = (growth.is_loop & growth.accepted & (growth.low <= steps.min(initial=0))
-              & (growth.high > steps.max(initial=0)))
+    step = weakest_steps(growth, group)[0]
+    across = growth.accepted & spanning(growth, step)
+    size = len(group.rows) * max(len(outside) / ASKED, 1.0)
     # What is trusted is right, whatever else speaks against it.
-    places = len(np.unique(growth.place[across]))
-    if (growth.trusted & across).any() or len(group.places) < _AGAINST * places:
+    if (growth.trusted & across).any() or size < _AGAINST * np.count_nonzero(across):
         return []
     return [_doubt(growth, OTHER_MAP, group.rows)]
 

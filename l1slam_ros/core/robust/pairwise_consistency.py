@@ -20,7 +20,7 @@ from l1slam_ros.core.robust.innovation import claimed_volume, log_claims, log_li
 from l1slam_ros.core.robust.rounds import Growth
 
 # So many loops are asked.
-_ASKED = 250
+ASKED = 250
 # Of each one so many pairs are looked at closely, those that differ least.
 _NEAREST = 20
 
@@ -43,7 +43,7 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     Each place has one vote: the best log ratio of its loops, less ln m, for each could have agreed
     by chance with any of the m that were asked.
     """
-    rows = growth.some(rows, _ASKED)
+    rows = growth.some(rows, ASKED)
     if len(rows) < 2:
         return NO_GROUP
     one, other, log_ratio = agreement(growth, rows)

@@ -13,8 +13,9 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
 from l1slam_ros.core.graph.linear_system import with_world
 
-# [m] Linked are loops whose ends lie within it along the way, in sum, and what they claim, too.
-NEAR = 5.0
+# Linked are loops whose ends lie within so many metres along the way, in sum, or within the length
+# of so many ordinary steps, where keyframes are far apart; and what they claim, too.
+_NEAR, _NEAR_STEPS = 5.0, 10
 # Claims are told apart to this part of it, so that a robot that stands has few different ones.
 _GRAIN = 0.1
 
@@ -23,8 +24,8 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
     """
     Return of each factor the number of its place, (m,), and where it joins the way, (m, 2).
 
-    The latter are the sum and the difference of its ends' distances along the way [m]: so two
-    factors are as far apart as the larger difference of the two numbers.
+    The latter are the sum and the difference of its ends' distances along the way, in units of
+    what is near: so two factors are as far apart as the larger difference of the two numbers.
 
     chain : (n, p) poses along the odometry
     """
@@ -37,10 +38,11 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     # The world is where the way begins, as WORLD finds it: last.
     way = np.concatenate(([0.0], np.cumsum(steps), [0.0]))
-    ends = np.stack((way[high] + way[low], way[high] - way[low]), axis=1)
+    near = max(_NEAR, _NEAR_STEPS * float(np.median(steps)) if len(steps) else 0.0)
+    ends = np.stack((way[high] + way[low], way[high] - way[low]), axis=1) / near
     claimed = manifold.compose(with_world(manifold, chain)[low], Z)
     claim = manifold.positions(claimed) - positions[high]
-    cells, cell = np.unique(np.round(np.hstack((ends, claim)) / (_GRAIN * NEAR)), axis=0,
+    cells, cell = np.unique(np.round(np.hstack((ends, claim / near)) / _GRAIN), axis=0,
                             return_inverse=True)
     pairs = cKDTree(cells).query_pairs(1 / _GRAIN, p=np.inf, output_type='ndarray')
     links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells),) * 2)
@@ -60,7 +62,7 @@ def neighbours_agree(place: Indices, ends: Array) -> float:
     if len(place) < 2:
         return 1.0
     distance, index = cKDTree(ends).query(ends, 2, p=np.inf)
-    near = distance[:, 1] < NEAR
+    near = distance[:, 1] < 1
     other = np.where(index[:, 0] == np.arange(len(place)), index[:, 1], index[:, 0])
     agree = np.count_nonzero(near & (place[other] == place))
     return float((agree + 1) / (np.count_nonzero(near) + 1))

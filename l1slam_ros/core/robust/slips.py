@@ -83,7 +83,7 @@ def _without(growth: Growth, step: int) -> Growth | None:
     """Return the state after the rounds that follow if a step is cut; None: it falls apart."""
     state = growth.copy()
     state.cut[step] = True
-    span = _spanning(growth, step)
+    span = spanning(growth, step)
     state.accepted[span] = state.trusted[span]
     state.solve()
     if not join(state) or state.part[state.low[step]] != state.part[state.high[step]]:
@@ -94,7 +94,7 @@ def _without(growth: Growth, step: int) -> Growth | None:
     return state
 
 
-def _spanning(growth: Growth, step: int) -> Mask:
+def spanning(growth: Growth, step: int) -> Mask:
     """Return which loops span an odometry factor, (m,) bool."""
     span: Mask = growth.is_loop & (growth.low < growth.high[step]) & (
         growth.high > growth.low[step])
@@ -105,7 +105,7 @@ def _slipped(growth: Growth, cut: Growth, step: int) -> bool:
     """Return whether a step slipped rather than that the loops lie that say so."""
     with_, without = (np.unique(growth.place[state.accepted & growth.is_loop])
                       for state in (cut, growth))
-    across = np.flatnonzero(cut.accepted & _spanning(growth, step))
+    across = np.flatnonzero(cut.accepted & spanning(growth, step))
     won, lost = len(np.setdiff1d(with_, without)), len(np.setdiff1d(without, with_))
     gate = _gate(growth)
     gain = _excess(growth, cut.variance) - _excess(cut, cut.variance) + gate * (won - lost)
