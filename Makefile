@@ -29,7 +29,7 @@ demo: $(STAMP)
 	$(VENV)/bin/python -m l1slam_ros.ros.demo
 
 test: $(TESTS)
-	$(VENV)/bin/python -m pytest
+	$(VENV)/bin/python -m pytest -n 2 --dist worksteal
 
 clean:
 	rm -rf $(VENV) build demo dist install log *.egg-info

@@ -57,6 +57,7 @@ setup(
         # pip: tests install into other environments, which from 22.3 on it can do.
         'test': [
             'pytest>=7.4',
+            'pytest-xdist>=3.2',
             'hypothesis>=6.98',
             'ruff~=0.17.5',
             'mypy~=2.4.1',

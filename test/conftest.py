@@ -7,9 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from l1slam_ros.core.solvers.warm_up import STEPS
+from l1slam_ros.io.compilation import compile_now
+
 # A domain of its own, seen on this machine only: no robot nearby hears the tests, nor they it.
 os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 100 + 1)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+
+
+def pytest_sessionstart(session):
+    """Compile before the first test: a solve that compiles takes long, and says so."""
+    if not hasattr(session.config, 'workerinput'):
+        capture = session.config.pluginmanager.getplugin('capturemanager')
+        with capture.global_and_fixture_disabled():
+            compile_now(STEPS)
 
 
 @pytest.fixture

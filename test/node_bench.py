@@ -17,7 +17,8 @@ from l1slam_ros.ros.node import BackendNode
 from l1slam_ros.ros.publishing import header
 
 DEADLINE = 60.0
-TYPES = {'/odom': Odometry, '/loop_closures': PoseWithCovarianceStamped}
+TYPES = {'/odom': Odometry, '/loop_closures': PoseWithCovarianceStamped,
+         '/absolute_poses': PoseWithCovarianceStamped}
 
 
 class Bench:

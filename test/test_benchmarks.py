@@ -15,8 +15,9 @@ FOLDER = Path(__file__).parents[1] / 'benchmarks'
 sys.path.append(str(FOLDER))
 cases, measuring, solvers, tables, inner, growth, iteration, linear, ours, whole, environment = (
     importlib.import_module(name) for name in (
-        'cases', 'measuring', 'solvers', 'tables', 'inner', 'growth', 'iteration',
-        'linear_solvers', 'ours', 'whole', 'peer_environment'))
+        'solvers.cases', 'measuring', 'solvers.__main__', 'solvers.tables', 'solvers.inner',
+        'solvers.growth', 'solvers.iteration', 'solvers.linear_solvers', 'solvers.ours',
+        'solvers.whole', 'peer_environment'))
 
 
 @pytest.fixture(scope='module')

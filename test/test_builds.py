@@ -154,11 +154,10 @@ def installed(request, distributions, requirements, tmp_path_factory):
 
 def test_the_installed_command_runs(installed, tmp_path):
     installed.run('l1slam', 'simulate', 'world.g2o', '--poses', 150, '--edges', 250, cwd=tmp_path)
-    report = json.loads(installed.run(
-        'l1slam', 'solve', 'world.g2o', '--output', 'map.g2o', '--plot', 'map.png',
-        '--reference', 'world.g2o.truth.txt', '--json', cwd=tmp_path))
-    assert report['final_cost'] < report['initial_cost'] and report['ate'] < 0.3
-    assert (tmp_path / 'map.g2o').exists() and (tmp_path / 'map.png').exists()
+    # Solving compiles for half a minute; `test_every_python_comes_to_the_same_costs` does it.
+    installed.run('l1slam', 'convert', 'world.g2o', 'bag', cwd=tmp_path)
+    installed.run('l1slam', 'plot', 'bag', '--output', 'map.png', cwd=tmp_path)
+    assert (tmp_path / 'map.png').exists()
     code = 'import l1slam_ros; print(l1slam_ros.__file__)'
     assert Path(installed.run('python', '-c', code, cwd=tmp_path)).is_relative_to(installed.prefix)
 

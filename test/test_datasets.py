@@ -114,12 +114,6 @@ def test_l2_finds_the_known_chi2(dataset):
     assert dataset.cost(solution.poses) == pytest.approx(known.l1_of_l2, rel=1e-5)
 
 
-def test_huber_with_a_huge_delta_is_l2(dataset):
-    options = LeastSquaresOptions(huber_delta=1e9)
-    solution = minimise_huber(dataset.graph, dataset.stored, options, dataset.choice.cholesky)
-    assert solution.cost == pytest.approx(dataset.l2.cost, rel=1e-9)
-
-
 def test_huber_is_below_l2_where_factors_are_far_off(dataset):
     solution = minimise_huber(dataset.graph, dataset.stored, LeastSquaresOptions(),
                               dataset.choice.cholesky)

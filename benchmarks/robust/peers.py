@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-from graph_peers import PRIOR_SIGMA, gtsam_values, information_of
-from graph_solvers import MOST_ITERATIONS, SAME_TOLERANCE
 from measuring import clock
 from robust.solvers import LOOK, Found, RobustSolver
+from solvers.graph_peers import PRIOR_SIGMA, gtsam_values, information_of
+from solvers.graph_solvers import MOST_ITERATIONS, SAME_TOLERANCE
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph

@@ -1,27 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A graph and its poses -> what a map shows; a solution -> the curve of its costs."""
+"""The command of `l1slam` that draws: plot; and the picture of a solve."""
 
+import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from l1slam_ros.core.errors import FileError, GraphError
+from l1slam_ros.cli.commands import Ending, read
+from l1slam_ros.cli.reference import Truth, known_false, read_truth, true_path
+from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.graph.spanning_tree import odometry_poses, pair_key
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.robust.batch_map import Outcome
+from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.io import formats
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.graphs.side_files import false_loops_path, read_false_loops
-from l1slam_ros.io.plot import Curve, MapDrawing
-
-if TYPE_CHECKING:
-    from l1slam_ros.core.robust.batch_map import Outcome
-    from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.io.graphs.side_files import truth_path
+from l1slam_ros.io.plot import Curve, MapDrawing, check_picture, plot_maps, plot_solution
 
 
-def drawing(path: Path, record: GraphRecord, poses: Array, truth: Array | None,
-            name: str, note: str = '', judgement: 'Judgement | None' = None) -> MapDrawing:
+def plot(arguments: argparse.Namespace) -> Ending:
+    """Draw the stored poses of graphs beside each other."""
+    check_picture(arguments.output)
+    drawings, damages = [], []
+    for path in arguments.input:
+        record = read(arguments, path)
+        with formats.named(path):
+            poses = formats.stored_poses(record)
+        known = truth_path(path)
+        truth = read_truth(str(known), record, path) if known.exists() else None
+        drawings.append(_drawing(path, record, poses, truth, 'poses'))
+        damages.append(record.damage)
+    plot_maps(arguments.output, drawings)
+    return Ending('; '.join(filter(None, damages)))
+
+
+def plot_outcome(
+    arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome, truth: Truth | None
+) -> None:
+    """Draw the map of a solve, and beside it its costs."""
+    note = f'{arguments.norm} cost {outcome.solution.cost:.6g}'
+    plot_solution(arguments.plot, _drawing(
+        arguments.input, record, outcome.solution.poses, truth, 'optimised', note,
+        outcome.judgement), _cost_curve(arguments.norm, outcome))
+
+
+def _drawing(path: Path, record: GraphRecord, poses: Array, truth: Truth | None,
+             name: str, note: str = '', judgement: Judgement | None = None) -> MapDrawing:
     """
-    Return the map of poses (n, p), with its odometry, and the path of the truth (l, k) if known.
+    Return the map of poses (n, p), with its odometry, and the path of the truth if known.
 
     name : what the poses are. The odometry sets out from the first of them. Loops that are not
     accepted are drawn as refused or as suspect; of those that are, the ones that the file of false
@@ -41,34 +68,13 @@ def drawing(path: Path, record: GraphRecord, poses: Array, truth: Array | None,
         kept, suspect = judgement.accepted, judgement.suspect
     pairs = factors.pairs
     return MapDrawing(
-        path.name, positions(poses), odometry, truth, pairs[is_loop & kept & ~false],
+        path.name, positions(poses), odometry,
+        true_path(record, poses, truth) if truth else None, pairs[is_loop & kept & ~false],
         suspect=pairs[suspect], rejected=pairs[is_loop & ~kept & ~suspect],
         false=pairs[false & kept], name=name, note=note)
 
 
-def known_false(path: Path, record: GraphRecord) -> np.ndarray:
-    """
-    Return which factors are false loops, (m,) bool, by the file beside the input `path`, if any.
-
-    Raises
-    ------
-    FileError : that file is damaged, or names an edge that the graph does not have.
-
-    """
-    side, factors, n = false_loops_path(path), record.graph.between, record.graph.n_poses
-    ids = read_false_loops(side)
-    index = np.minimum(np.searchsorted(record.ids, ids), n - 1)
-    false = pair_key(index[:, 0], index[:, 1], n)
-    pairs = pair_key(factors.i, factors.j, n)
-    unknown = (record.ids[index] != ids).any(axis=1) | ~np.isin(false, pairs)
-    if unknown.any():
-        i, j = ids[np.argmax(unknown)]
-        raise FileError(side, f'no edge between {i} and {j} in {path}; expected its false loops, '
-                        'or no such file')
-    return ~factors.is_odometry & np.isin(pairs, false)
-
-
-def cost_curve(norm: str, outcome: 'Outcome') -> Curve:
+def _cost_curve(norm: str, outcome: Outcome) -> Curve:
     """Return the costs of a solve, iteration by iteration, its beginning and end named."""
     costs = outcome.solution.history
     iterations = np.arange(len(costs), dtype=float)

@@ -12,15 +12,21 @@ from pathlib import Path
 from typing import Any
 
 from l1slam_ros.core.errors import L1SlamError
-from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS, NORMS, SOLVERS, STARTS
+from l1slam_ros.core.names import (
+    KINDS_OF_FALSE_LOOPS,
+    NORMS,
+    ROTATION_INFORMATION,
+    SOLVERS,
+    STARTS,
+)
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS
 from l1slam_ros.paper import printed as paper
 
 BAD_INPUT, READ_IN_PART, DOUBTFUL, INTERRUPTED, BROKEN_PIPE = 2, 3, 4, 130, 141
 # By command: the module that runs it, imported only then.
 _MODULES = {
-    'solve': 'solving', 'corrupt': 'solving', 'reproduce': 'solving',
-    'convert': 'commands', 'simulate': 'commands', 'info': 'commands', 'plot': 'commands',
+    'solve': 'solving', 'convert': 'commands', 'info': 'commands', 'simulate': 'worlds',
+    'corrupt': 'worlds', 'plot': 'drawing', 'reproduce': 'reproducing',
 }
 
 _INPUT = '.g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1'
@@ -62,8 +68,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return BROKEN_PIPE
     except OSError as error:
         _forget_output()
-        _say(_in_words(error))
-        return BAD_INPUT
+        what = error.strerror or str(error)
+        return _refuse(what if error.filename is None else f'{error.filename}: {what}')
+    except L1SlamError as error:
+        return _refuse(str(error))
+    except MemoryError:
+        return _refuse('not enough memory for a graph of this size')
+    except KeyboardInterrupt:
+        return INTERRUPTED
 
 
 def _answer(arguments: Sequence[str] | None) -> int:
@@ -76,21 +88,7 @@ def _answer(arguments: Sequence[str] | None) -> int:
     if options.command is None:
         parser.print_help(sys.stderr)
         return BAD_INPUT
-    try:
-        ending = _run(options)
-    except BrokenPipeError:
-        raise
-    except L1SlamError as error:
-        _say(str(error))
-        return BAD_INPUT
-    except OSError as error:
-        _say(_in_words(error))
-        return BAD_INPUT
-    except MemoryError:
-        _say('not enough memory for a graph of this size')
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        return INTERRUPTED
+    ending = _run(options)
     for sentence in filter(None, ending):
         _say(sentence)
     if ending.doubt:
@@ -107,14 +105,14 @@ def _run(options: argparse.Namespace) -> Any:
         return getattr(module, options.command)(options)
 
 
-def _in_words(error: OSError) -> str:
-    what = error.strerror or str(error)
-    return what if error.filename is None else f'{error.filename}: {what}'
-
-
 def _say(sentence: str) -> None:
     with suppress(BrokenPipeError):
         print(f'l1slam: {sentence}', file=sys.stderr)
+
+
+def _refuse(sentence: str) -> int:
+    _say(sentence)
+    return BAD_INPUT
 
 
 def _forget_output() -> None:
@@ -172,6 +170,10 @@ def _add_input(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_bag_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        '--rotation-information', choices=ROTATION_INFORMATION, default=ROTATION_INFORMATION[0],
+        help="3D g2o files, in and out: what the information's rotation block is of, the vector "
+        'part of the quaternion, as g2o has it, or the angle (default: %(default)s)')
     add = parser.add_argument_group('how to read a bag').add_argument
     add('--odom-topic', default=DEFAULT_TOPICS.odometry, metavar='TOPIC',
         help='nav_msgs/Odometry (default: %(default)s)')

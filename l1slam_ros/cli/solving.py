@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands of `l1slam` that solve: solve, corrupt and reproduce."""
+"""The command of `l1slam` that solves."""
 
 import argparse
 import json
@@ -8,23 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from l1slam_ros.cli.commands import Ending, check_counts, read, warn, write_spoiled
-from l1slam_ros.cli.reference import Truth, position_error, read_truth, true_path
-from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.cli.commands import Ending, read, warn
+from l1slam_ros.cli.reference import position_error, read_truth
 from l1slam_ros.core.robust.batch_map import Outcome, Wish
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import SENTENCES
 from l1slam_ros.core.solvers.solve import PRIMAL_DUAL
-from l1slam_ros.core.solvers.warm_up import DENSE, JUDGEMENT, SPARSE, STEPS
-from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
+from l1slam_ros.core.solvers.warm_up import DENSE, JUDGEMENT, SPARSE, with_space
 from l1slam_ros.io import formats
-from l1slam_ros.io.compilation import fill_cache
+from l1slam_ros.io.compilation import compile_now
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.node_options import read_params_file
 from l1slam_ros.io.progress import Progress
-from l1slam_ros.io.sentences import DOUBTFUL, doubt_sentence, verdict
+from l1slam_ros.io.sentences import DOUBTFUL, doubt_sentence, judgement_sentences
 from l1slam_ros.io.wording import counted
 
 
@@ -32,18 +30,17 @@ def solve(arguments: argparse.Namespace) -> Ending:
     """Optimise a graph; print, write and draw what came out."""
     _check_outputs(arguments)
     wish = _wish(arguments)
-    record = read(arguments, arguments.input)
-    warn(record.skipped, arguments.quiet)
-    truth = None
+    record = read(arguments, arguments.input, arguments.quiet)
+    truth, warnings = None, list(record.skipped)
     if arguments.reference:
         truth = read_truth(arguments.reference, record, arguments.input)
         warn(truth.skipped, arguments.quiet)
-    _make_ready(_steps(wish), arguments.quiet)
+        warnings += truth.skipped
+    compile_now(with_space(_steps(wish), record.graph.manifold), arguments.quiet)
     outcome = _solved(arguments, record, wish)
-    warnings = [*record.skipped, *(truth.skipped if truth else ())]
     if outcome.unjudged:
         warnings.append(f'no loop was doubted: {outcome.unjudged}')
-        warn((warnings[-1],), arguments.quiet)
+        warn(warnings[-1:], arguments.quiet)
     judgement = outcome.judgement
     ending = Ending(record.damage, doubt_sentence(
         judgement.doubts if judgement else (), record.ids, record.stamps))
@@ -53,7 +50,9 @@ def solve(arguments: argparse.Namespace) -> Ending:
         report['ate'] = position_error(record, outcome.solution.poses, truth)
         report['ate_poses'] = len(truth.rows)
     if arguments.plot:
-        _plot(arguments, record, outcome, truth)
+        from l1slam_ros.cli.drawing import plot_outcome
+
+        plot_outcome(arguments, record, outcome, truth)
     if arguments.output:
         formats.write_output(arguments.output, replace(record, poses=outcome.solution.poses))
     if arguments.json:
@@ -62,7 +61,7 @@ def solve(arguments: argparse.Namespace) -> Ending:
                           else value for name, value in report.items()}))
     elif not arguments.quiet:
         _print_report(report, arguments.norm, outcome)
-        for sentence in verdict(record, judgement) if judgement else ():
+        for sentence in judgement_sentences(record, judgement) if judgement else ():
             print(sentence)
     return ending
 
@@ -85,12 +84,6 @@ def _steps(wish: Wish) -> tuple[str, ...]:
     judgement = () if wish.robust is False else JUDGEMENT
     dense = DENSE if wish.norm == 'l1' and wish.solver == PRIMAL_DUAL else ()
     return (*SPARSE, *judgement, *dense)
-
-
-def _make_ready(steps: tuple[str, ...], quiet: bool = False) -> None:
-    """Compile the solver's loops, which takes long only at the first use on a machine."""
-    with Progress(None, 'part', quiet, 'compiling, once on this machine', delay=1.0) as progress:
-        fill_cache(progress.reach, lambda: False, steps)
 
 
 def _check_outputs(arguments: argparse.Namespace) -> None:
@@ -158,65 +151,3 @@ def _print_report(report: dict[str, object], norm: str, outcome: Outcome) -> Non
     if 'ate' in report:
         print(f'position error {report["ate"]:.4f} m over {report["ate_poses"]:,} of '
               f'{counted(len(solution.poses), "pose")} (RMSE after rigid alignment)')
-
-
-def _plot(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
-          truth: Truth | None) -> None:
-    from l1slam_ros.cli.drawing import cost_curve, drawing
-    from l1slam_ros.io.plot import plot_solution
-
-    poses = outcome.solution.poses
-    path = true_path(record, poses, truth) if truth else None
-    note = f'{arguments.norm} cost {outcome.solution.cost:.6g}'
-    plot_solution(arguments.plot, drawing(
-        arguments.input, record, poses, path, 'optimised', note, outcome.judgement),
-        cost_curve(arguments.norm, outcome))
-
-
-def corrupt(arguments: argparse.Namespace) -> Ending:
-    """
-    Add false loops to a graph.
-
-    What is far apart is judged on the L2 map, solved from the graph alone: a stored start may be
-    raw odometry, whose drift makes places look far apart that are the same, and a 'false' loop
-    between them would be true. False loops that are known already are left out of that map.
-    """
-    from l1slam_ros.cli.drawing import known_false
-
-    check_counts(arguments)
-    record = read(arguments, arguments.input)
-    warn(record.skipped)
-    former = known_false(arguments.input, record)
-    believed = replace(record, graph=record.graph.subset(~former))
-    options = LeastSquaresOptions()
-    _make_ready(SPARSE)
-    with (formats.named(arguments.input),
-          Progress(options.iterations, 'step', label='solving') as progress):
-        solution = solve_graph(
-            believed.graph, believed.poses, Wish(norm='l2', robust=False, least_squares=options),
-            progress.report, ids=believed.ids).solution
-    loops = FALSE_LOOPS[arguments.kind](record.graph, solution.poses, arguments.false_loops,
-                                        np.random.default_rng(arguments.seed))
-    factors = record.graph.between
-    pairs: Indices = np.concatenate((factors.pairs[former],
-                                     np.stack((loops.i, loops.j), axis=1)))
-    spoiled = formats.with_poses(replace(record, graph=insert_loops(record.graph, loops)))
-    # A bag has no vertex ids: read back, it counts its keyframes from 0.
-    ids = record.ids[pairs] if arguments.output.suffix else pairs
-    with formats.named(arguments.input):
-        write_spoiled(arguments.output, ids,
-                      lambda: formats.write_output(arguments.output, spoiled))
-    return Ending(record.damage)
-
-
-def reproduce(arguments: argparse.Namespace) -> Ending:
-    """Run the paper's experiments; write the report and say where it is."""
-    from l1slam_ros.paper import reproduce as paper_experiments
-    from l1slam_ros.paper.experiments import Effort
-    from l1slam_ros.paper.printed import WORLDS
-
-    _make_ready(STEPS)
-    paper_experiments.reproduce(arguments.datasets, WORLDS[arguments.worlds], arguments.output,
-                                Effort())
-    print(arguments.output / paper_experiments.REPORT)
-    return Ending()

@@ -13,16 +13,17 @@ import json
 import os
 import platform
 import queue
-import selectors
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
-from l1slam_ros.core.solvers.warm_up import STEPS, make_ready
+from l1slam_ros.core.solvers.warm_up import STEPS, make_ready, module_of
+from l1slam_ros.io.progress import Progress
 
 _KERNELS = Path(__file__).parents[1] / 'core' / 'kernels'
 # [s] How often the caller is asked whether to stop.
@@ -31,6 +32,12 @@ _LOOK = 0.1
 _NICE = 5
 # What a processor is known by, of all that the kernel of Linux says of it.
 _PROCESSOR = ('model name', 'flags', 'Features', 'CPU implementer', 'CPU part')
+
+
+def compile_now(steps: Sequence[str], quiet: bool = False) -> None:
+    """Compile some of `warm_up.STEPS`, which takes long only at the first use on a machine."""
+    with Progress(None, 'part', quiet, 'compiling, once on this machine', delay=1.0) as progress:
+        fill_cache(progress.reach, lambda: False, steps)
 
 
 def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
@@ -68,31 +75,40 @@ def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
 
 def _compiled(steps: list[str], stopped: Callable[[], bool]) -> Iterator[tuple[str, list[str]]]:
     """Yield each step and the files that keep it, as processes are done with them."""
-    waiting, busy = list(steps), {}
+    done: queue.Queue[tuple[str, list[str]] | None] = queue.Queue()
+    waiting = iter(steps)
     workers = [_start() for _ in range(min(_cores(), len(steps)))]
-    with selectors.DefaultSelector() as selector:
-        try:
-            for worker in workers:
-                assert worker.stdout is not None
-                selector.register(worker.stdout, selectors.EVENT_READ, worker)
-                busy[worker.pid] = _give(worker, waiting)
-            while busy and not stopped():
-                for key, _ in selector.select(_LOOK):
-                    worker = key.data
-                    step, answer = busy.pop(worker.pid), worker.stdout.readline()
-                    # A process that broke says nothing; the others go on.
-                    if not answer:
-                        selector.unregister(worker.stdout)
-                        continue
-                    yield step, json.loads(answer)
-                    if waiting:
-                        busy[worker.pid] = _give(worker, waiting)
-                    else:
-                        selector.unregister(worker.stdout)
-        finally:
-            for worker in workers:
-                worker.kill()
-                worker.communicate()
+    for worker in workers:
+        threading.Thread(target=_drive, args=(worker, waiting, done), daemon=True).start()
+    busy = len(workers)
+    try:
+        while busy and not stopped():
+            with suppress(queue.Empty):
+                answer = done.get(timeout=_LOOK)
+                if answer is None:
+                    busy -= 1
+                else:
+                    yield answer
+    finally:
+        for worker in workers:
+            worker.kill()
+            worker.wait()
+
+
+def _drive(
+    worker: 'subprocess.Popen[str]', waiting: Iterator[str],
+    done: 'queue.Queue[tuple[str, list[str]] | None]',
+) -> None:
+    """Give a process one step after the other, until none waits or it breaks; then say None."""
+    assert worker.stdin is not None and worker.stdout is not None
+    with suppress(OSError, ValueError), worker.stdin, worker.stdout:
+        # The next of a list's iterator is never given to two threads.
+        for step in waiting:
+            worker.stdin.write(f'{step}\n')
+            worker.stdin.flush()
+            # A process that broke says nothing, which is no JSON; the others go on.
+            done.put((step, json.loads(worker.stdout.readline())))
+    done.put(None)
 
 
 def _start() -> 'subprocess.Popen[str]':
@@ -101,18 +117,6 @@ def _start() -> 'subprocess.Popen[str]':
             'from l1slam_ros.io.compilation import work; work()')
     return subprocess.Popen([sys.executable, '-c', code], stdin=subprocess.PIPE,
                             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-
-
-def _give(worker: 'subprocess.Popen[str]', waiting: list[str]) -> str:
-    """Give a process the next step to do; return which it is."""
-    step = waiting.pop(0)
-    assert worker.stdin is not None
-    try:
-        worker.stdin.write(f'{step}\n')
-        worker.stdin.flush()
-    except BrokenPipeError:
-        pass  # it is gone, which reading from it will tell
-    return step
 
 
 def work() -> None:
@@ -130,7 +134,7 @@ def work() -> None:
     while True:
         step = steps.get()
         folder = make_ready(step)
-        files = sorted(map(str, Path(folder).glob(f'{step}.*.nbi'))) if folder else []
+        files = sorted(map(str, Path(folder).glob(f'{module_of(step)}.*.nbi'))) if folder else []
         print(json.dumps(files), flush=True)
 
 

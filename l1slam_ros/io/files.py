@@ -19,11 +19,14 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.io.remarks import Remarks, read_remarks
 from l1slam_ros.io.wording import counted
 
 NANOSECONDS = 10**9
 # No pose or information is beyond this, and with less no square of one leaves the doubles.
 LARGEST = 1e30
+# Two printed digits stay below; an unset or broken quaternion does not.
+QUATERNION_NORM_ERROR = 0.1
 # The longest piece of a damaged file that is quoted in an error.
 _QUOTED = 40
 # So many lines are formatted in one go.
@@ -32,10 +35,11 @@ _AT_ONCE = 500
 
 @dataclass(frozen=True)
 class TextLines:
-    """Lines of a file: their numbers, from 1, and their texts."""
+    """Lines of a file: their numbers, from 1, and their texts; of a saved map, its remarks."""
 
     numbers: list[int]
     texts: list[str]
+    remarks: Remarks = None
 
 
 @contextmanager
@@ -94,8 +98,8 @@ def formatted(line: str, *columns: np.ndarray) -> list[str]:
 
     To format many at once takes a third less time than one by one; more would hold up others.
     """
-    rows = np.concatenate([table.astype(object) for table in columns], axis=1)
-    parts = (rows[k : k + _AT_ONCE] for k in range(0, len(rows), _AT_ONCE))
+    parts = (np.concatenate([table[k : k + _AT_ONCE].astype(object) for table in columns], axis=1)
+             for k in range(0, len(columns[0]), _AT_ONCE))
     return ['\n'.join([line] * len(part)) % tuple(part.ravel().tolist()) for part in parts]
 
 
@@ -118,11 +122,13 @@ def read_lines(path: str | os.PathLike[str]) -> TextLines:
 
     Raises
     ------
-    FileError : the file cannot be read, or is no text.
+    FileError : the file cannot be read, is no text, or is a saved map that is damaged.
 
     """
     try:
-        text = Path(path).read_text(encoding='utf-8-sig')
+        content = Path(path).read_bytes()
+        remarks = read_remarks(path, content)
+        text = content.decode('utf-8-sig').replace('\r\n', '\n').replace('\r', '\n')
     except OSError as error:
         raise FileError(path, f'cannot be read: {error.strerror or error}') from error
     except UnicodeDecodeError as error:
@@ -130,7 +136,7 @@ def read_lines(path: str | os.PathLike[str]) -> TextLines:
         raise FileError(path, f'{found}; expected a text file') from error
     kept = [(number, line) for number, line in enumerate(text.split('\n'), 1)
             if line and not line.isspace() and not line.lstrip().startswith('#')]
-    return TextLines([number for number, _ in kept], [line for _, line in kept])
+    return TextLines([number for number, _ in kept], [line for _, line in kept], remarks)
 
 
 def quoted(text: str) -> str:
@@ -163,6 +169,15 @@ def parse_rows(
         raise FileError(path, f'{name}: {found}; expected {ids} whole{finite} numbers',
                         lines.numbers[k])
     return rows['ids'], rows['values']
+
+
+def refuse_quaternions(path: object, quaternions: Array, numbers: list[int]) -> None:
+    """Refuse the first of the quaternions (m, 4), at lines (m,), whose norm is far from 1."""
+    far = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) > QUATERNION_NORM_ERROR
+    if far.any():
+        k = int(np.argmax(far))
+        raise FileError(path, f'quaternion {quaternions[k].tolist()}; expected one of norm 1',
+                        numbers[k])
 
 
 def first_failure(count: int, works: Callable[[slice], bool]) -> int:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from l1slam_ros.core.errors import FileError, GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.names import QUATERNION
 from l1slam_ros.core.robust.inspection import initial_poses
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES, DEFAULT_TOPICS, Topics
 from l1slam_ros.io.files import require_folder
@@ -22,7 +23,8 @@ GRAPH_SUFFIXES = ('.g2o', '.graph')
 
 
 def read_input(
-    path: Path, options: 'GraphBuilderOptions | None' = None, topics: Topics = DEFAULT_TOPICS
+    path: Path, options: 'GraphBuilderOptions | None' = None, topics: Topics = DEFAULT_TOPICS,
+    rotation_information: str = QUATERNION,
 ) -> GraphRecord:
     """
     Read a graph file or grow a graph from a bag.
@@ -33,6 +35,7 @@ def read_input(
     options : what makes keyframes of a bag's messages; None: what the bag's note says, or the
         node's defaults
     topics : where in a bag to look
+    rotation_information : see `GraphRecord`; written back it is as it was read
 
     Raises
     ------
@@ -44,9 +47,10 @@ def read_input(
     if is_bag(path):
         from l1slam_ros.io.bags.to_graph import graph_from_bag
 
-        return graph_from_bag(path, options, topics)
+        record = graph_from_bag(path, options, topics)
+        return replace(record, rotation_information=rotation_information)
     if path.suffix in GRAPH_SUFFIXES:
-        return read_graph_file(path)
+        return read_graph_file(path, rotation_information)
     raise FileError(path, f'unknown kind of file; expected {", ".join(GRAPH_SUFFIXES)}, '
                     f'{", ".join(BAG_SUFFIXES)} or a rosbag2 directory')
 
@@ -101,9 +105,11 @@ def check_graph_output(path: Path) -> None:
                         f'{", ".join(GRAPH_SUFFIXES)}, or no suffix for a bag directory')
 
 
-def write_output(path: Path, record: GraphRecord) -> None:
+def write_output(path: Path, record: GraphRecord, truth: Array | None = None) -> None:
     """
     Write a graph with its poses, in the format that the suffix names; none: a bag.
+
+    truth : (n, p) poses, which a bag has a topic for
 
     Raises
     ------
@@ -119,4 +125,4 @@ def write_output(path: Path, record: GraphRecord) -> None:
     else:
         from l1slam_ros.io.bags.from_graph import write_graph_bag
 
-        write_graph_bag(path, record)
+        write_graph_bag(path, record, truth)

@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import yaml
+
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.online.backend import BackendOptions
 from l1slam_ros.core.options import Options, Scalar, dotted, option, with_values
@@ -23,16 +25,25 @@ class UpdateOptions(Options):
 class NodeOptions(BackendOptions):
     """Everything the node can be told: the back end's options and its own."""
 
+    autostart: bool = option(
+        True, 'be active from the start, as a node that nobody manages', fixed=True)
+    dimension: int = option(2, 'of the world: SE(2) or SE(3)', '', 2, 3, fixed=True)
     map_frame: str = option('map', 'frame of the optimised poses', fixed=True)
     odom_frame: str = option('odom', 'frame of the odometry', fixed=True)
     base_frame: str = option(
         '', "the robot's frame; empty: the first child_frame_id seen", fixed=True)
     publish_tf: bool = option(
         True, 'publish map -> odom on /tf, where tf2_msgs is installed', fixed=True)
+    transform_period: float = option(
+        0.05, 'how often map -> odom is published', 's', 1e-3, 3600, fixed=True)
+    transform_tolerance: float = option(
+        0.1, 'how far ahead of the newest odometry map -> odom is stamped: until then it holds',
+        's', 0, 3600)
     save_path: str = option('', 'the .g2o file of ~/save and ~/load')
-    on_time_jump: str = option(
-        'ignore', 'what to do when the ROS clock jumps back: go on, or begin a new map', '',
-        choices=('reset', 'ignore'))
+    autosave_period: float = option(
+        60.0, 'with a save_path, how often a map that changed is saved, and at the end; 0: off',
+        's', 0, 1e9)
+    load_on_start: bool = option(False, 'load the map of save_path at start', fixed=True)
     update: UpdateOptions = UpdateOptions()
 
 
@@ -45,8 +56,6 @@ def read_params_file(path: Path) -> NodeOptions:
     FileError : it cannot be read, is no parameter file, or sets something that is refused.
 
     """
-    import yaml
-
     try:
         content = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:

@@ -10,18 +10,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+from matplotlib.transforms import ScaledTranslation
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.io.files import replacing, require_folder
 from l1slam_ros.io.wording import counted
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _SUFFIXES = ('.png', '.svg', '.pdf')
 _BLUE, _GREEN, _ORANGE, _RED, _GREY = '#0072B2', '#009E73', '#E69F00', '#D5370E', '#808080'
@@ -133,24 +133,20 @@ def plot_solution(path: str | Path, drawing: MapDrawing, curve: Curve) -> None:
     _save(figure, path)
 
 
-def _new_figure(path: str | Path, columns: float, rows: float) -> 'Figure':
+def _new_figure(path: str | Path, columns: float, rows: float) -> Figure:
     """Return an empty figure, after a look at the name it will have."""
-    from matplotlib.figure import Figure
-
     check_picture(path)
     return Figure(figsize=(_PANEL * columns, _PANEL * rows), dpi=_DOTS_PER_INCH,
                   layout='constrained')
 
 
-def _save(figure: 'Figure', path: str | Path) -> None:
+def _save(figure: Figure, path: str | Path) -> None:
     with replacing(path) as temporary:
         figure.savefig(temporary, format=Path(path).suffix[1:].lower(), bbox_inches='tight',
                        pad_inches=0.15)
 
 
-def _draw_curves(axes: 'Axes', curves: Sequence[Curve], title: str) -> None:
-    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
-
+def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str) -> None:
     for k, curve in enumerate(curves):
         colour = _CURVE_COLOURS[k % len(_CURVE_COLOURS)]
         axes.plot(curve.iterations, curve.costs, label=curve.label, linewidth=1.6, color=colour)
@@ -177,14 +173,14 @@ def _draw_curves(axes: 'Axes', curves: Sequence[Curve], title: str) -> None:
     _tidy(axes)
 
 
-def _write_title(axes: 'Axes', title: str, small_print: str) -> None:
+def _write_title(axes: Axes, title: str, small_print: str) -> None:
     """Write above a diagram, where nothing is drawn."""
     axes.set_title(title, loc='left', fontweight='bold', pad=24 if small_print else None)
     axes.annotate(small_print, (0, 1), (0, 7), xycoords='axes fraction',
                   textcoords='offset points', color='#555555', fontsize='small')
 
 
-def _draw_map(axes: 'Axes', drawing: MapDrawing) -> None:
+def _draw_map(axes: Axes, drawing: MapDrawing) -> None:
     """Draw from the ground up: what was believed, what is true, what is refused, what came out."""
     if drawing.odometry is not None:
         _draw_path(axes, drawing.odometry, _ODOMETRY, _GREY, 0.7, zorder=1,
@@ -209,10 +205,8 @@ def _draw_map(axes: 'Axes', drawing: MapDrawing) -> None:
     _draw_legend(axes)
 
 
-def _draw_legend(axes: 'Axes') -> None:
+def _draw_legend(axes: Axes) -> None:
     """Draw the legend below a diagram and the name of its x axis, always in the same order."""
-    from matplotlib.transforms import ScaledTranslation
-
     handles, labels = axes.get_legend_handles_labels()
     shown = dict(zip(labels, handles, strict=True))
     order = [*(label for label in _LEGEND if label in shown),
@@ -239,7 +233,7 @@ def _small_print(drawing: MapDrawing) -> str:
 
 
 def _draw_path(
-    axes: 'Axes', positions: Array, label: str, colour: str, width: float, zorder: int,
+    axes: Axes, positions: Array, label: str, colour: str, width: float, zorder: int,
     opacity: float = 1.0,
 ) -> None:
     axes.plot(positions[:, 0], positions[:, 1], color=colour, linewidth=width, label=label,
@@ -247,12 +241,10 @@ def _draw_path(
 
 
 def _draw_pairs(
-    axes: 'Axes', positions: Array, pairs: Indices, label: str, colour: str, zorder: int,
+    axes: Axes, positions: Array, pairs: Indices, label: str, colour: str, zorder: int,
     opacity: float,
 ) -> None:
     """Draw loops as lines between the positions they join, evenly thinned out if too many."""
-    from matplotlib.collections import LineCollection
-
     if not len(pairs):
         return
     count = min(len(pairs), _MOST_LOOPS)
@@ -269,10 +261,8 @@ def _opacity(count: int) -> float:
     return float(np.clip(25 / math.sqrt(max(count, 1)), 0.3, 0.8))
 
 
-def _set_view(axes: 'Axes', drawing: MapDrawing) -> None:
+def _set_view(axes: Axes, drawing: MapDrawing) -> None:
     """Show the map and the truth whole, the odometry as far as it stays in their neighbourhood."""
-    from matplotlib.ticker import MaxNLocator
-
     seen = [drawing.positions] if drawing.truth is None else [drawing.positions, drawing.truth]
     points = np.concatenate([positions[:, :2] for positions in seen])
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
@@ -288,7 +278,7 @@ def _set_view(axes: 'Axes', drawing: MapDrawing) -> None:
     axes.xaxis.set_major_locator(MaxNLocator('auto', steps=[1, 2, 2.5, 5, 10], min_n_ticks=1))
 
 
-def _tidy(axes: 'Axes') -> None:
+def _tidy(axes: Axes) -> None:
     axes.grid(True, color='#DDDDDD', linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[['top', 'right']].set_visible(False)

@@ -27,9 +27,8 @@ class Progress:
     def __init__(self, total: float | None, unit: str, quiet: bool = False, label: str = '',
                  delay: float = 0.0):
         self._total, self._unit, self._label, self._done = total, unit, label, 0.0
-        now = time.monotonic()
-        self._show_from = now + delay
-        self._next_line = now + _PATIENCE if label and not quiet else float('inf')
+        self._delay = delay
+        self._next_line = time.monotonic() + _PATIENCE if label and not quiet else float('inf')
         self._on_terminal = not quiet and sys.stderr is not None and sys.stderr.isatty()
         self._bar: Any = None
 
@@ -44,10 +43,11 @@ class Progress:
     def advance(self, steps: float = 1, note: str = '') -> None:
         """Count some steps; note : what came of them."""
         self._done += steps
-        now = time.monotonic()
         if self._on_terminal:
-            self._advance_bar(now, steps, note)
-        elif now >= self._next_line:
+            self._advance_bar(steps, note)
+            return
+        now = time.monotonic()
+        if now >= self._next_line:
             self._next_line = now + _APART
             # Another solver may go on where one came no further.
             within = self._total is not None and self._done <= self._total
@@ -55,15 +55,12 @@ class Progress:
             print(f'l1slam: {self._label}: {self._unit} {self._done:,.0f}{of_all}'
                   f'{", " if note else ""}{note}', file=sys.stderr, flush=True)
 
-    def _advance_bar(self, now: float, steps: float, note: str) -> None:
+    def _advance_bar(self, steps: float, note: str) -> None:
         if self._bar is None:
-            if now < self._show_from:
-                return
             from tqdm import tqdm
 
-            steps = self._done
             self._bar = tqdm(total=self._total, unit=self._unit, leave=False,
-                             desc=self._label or None)
+                             desc=self._label or None, delay=self._delay)
         self._bar.total = self._total
         self._bar.set_postfix_str(note, refresh=False)
         self._bar.update(steps)

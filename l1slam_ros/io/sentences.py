@@ -49,7 +49,7 @@ _REASONS = {
 _REMEDY = 'Vouch for a loop that is right, strike out one that is false, or state the noise'
 
 
-def verdict(record: GraphRecord, judgement: Judgement) -> Iterator[str]:
+def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[str]:
     """Yield what was refused and why, the worst first; then what is noisier than it says."""
     factors, accepted = record.graph.between, judgement.accepted
     is_loop = ~factors.is_odometry
@@ -91,4 +91,4 @@ def doubt_sentence(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None
 
 
 def _named(pair: np.ndarray) -> str:
-    return f'{pair[0]} - {pair[1]}'
+    return f'{pair[0]} - {pair[1]}' if pair[0] != pair[1] else f'absolute pose of {pair[1]}'

@@ -19,13 +19,12 @@ from l1slam_ros.io.files import (
     parse_rows,
     quoted,
     read_lines,
+    refuse_quaternions,
     stamp_from_text,
     stamp_text,
     write_lines,
 )
 from l1slam_ros.io.graphs.graph_file import read_vertices
-from l1slam_ros.io.graphs.side_files import read_stamps
-from l1slam_ros.io.messages.conversion import QUATERNION_NORM_ERROR
 from l1slam_ros.io.wording import counted
 
 _TUM_COLUMNS = 8
@@ -99,54 +98,41 @@ def read_reference(
     lines = read_lines(path)
     if not lines.texts:
         raise FileError(path, 'the file is empty; expected reference poses')
-    if ',' in lines.texts[0]:
-        return _read_csv(path, lines, manifold)
-    columns = len(lines.texts[0].split())
-    if lines.texts[0].split()[0][0].isalpha():
-        return _read_vertices(path, by_stamps)
+    number, is_csv, in_words = lines.numbers[0], ',' in lines.texts[0], _in_words(lines.texts[0])
+    if is_csv:
+        lines = TextLines(lines.numbers[in_words:],
+                          [text.replace(',', ' ') for text in lines.texts[in_words:]])
+    elif in_words:
+        return _read_vertices(path, manifold, by_stamps)
+    columns = len(lines.texts[0].split()) if lines.texts else 0
     if columns == _TUM_COLUMNS:
-        return _sorted(path, lines, *_read_tum(path, lines, manifold), stamped=True)
+        # Poses in space have as many numbers as TUM's; a stamp has a point there, an id has none.
+        stamped = (is_csv or columns != 1 + manifold.POSE_SIZE
+                   or not lines.texts[0].split()[0].isdecimal())
+        rows = _whole_stamps(path, lines) if stamped else lines
+        keys, pose3 = parse_rows(path, 'TUM pose', rows, 1, _TUM_COLUMNS - 1)
+        refuse_quaternions(path, pose3[:, 3:], lines.numbers)
+        return _sorted(path, lines, keys[:, 0], manifold.from_pose3(pose3), stamped=stamped)
     if columns == 1 + manifold.POSE_SIZE:
-        ids, poses = parse_rows(path, 'pose', lines, 1, manifold.POSE_SIZE)
-        return _sorted(path, lines, ids[:, 0], poses, stamped=False)
-    raise FileError(path, f'{counted(columns, "column")}; expected {_TUM_COLUMNS} (TUM), '
-                    f'{1 + manifold.POSE_SIZE} (id and pose) or a graph file', lines.numbers[0])
+        rows = _whole_stamps(path, lines) if is_csv else lines
+        keys, poses = parse_rows(path, 'pose', rows, 1, manifold.POSE_SIZE)
+        return _sorted(path, lines, keys[:, 0], poses, stamped=is_csv)
+    others = ' or {} (stamp and pose)' if is_csv else ', {} (id and pose) or a graph file'
+    raise FileError(path, f'{counted(columns, "column")}; expected {_TUM_COLUMNS} (TUM)'
+                    f'{others.format(1 + manifold.POSE_SIZE)}', number)
 
 
-def _read_vertices(path: str | os.PathLike[str], by_stamps: bool) -> Reference:
-    ids, poses = read_vertices(path)
-    stamps = read_stamps(path, ids) if by_stamps else None
-    if stamps is None:
+def _in_words(text: str) -> bool:
+    return text.strip()[0].isalpha()
+
+
+def _read_vertices(path: str | os.PathLike[str], manifold: Manifold,
+                   by_stamps: bool) -> Reference:
+    ids, poses, stamps = read_vertices(path, manifold)
+    if stamps is None or not by_stamps:
         return Reference(ids, poses, stamped=False)
     first = np.unique(stamps, return_index=True)[1]
     return Reference(stamps[first], poses[first], stamped=True)
-
-
-def _read_csv(path: object, lines: TextLines, manifold: Manifold) -> Reference:
-    """Read `stamp, x, y, theta` (the columns of the manifold), or TUM with commas."""
-    heading = lines.texts[0].strip()[0].isalpha()
-    rows = TextLines(lines.numbers[heading:],
-                     [text.replace(',', ' ') for text in lines.texts[heading:]])
-    columns = len(rows.texts[0].split()) if rows.texts else 0
-    if columns == _TUM_COLUMNS:
-        return _sorted(path, rows, *_read_tum(path, rows, manifold), stamped=True)
-    if columns != 1 + manifold.POSE_SIZE:
-        raise FileError(path, f'{counted(columns, "column")}; expected {_TUM_COLUMNS} (TUM) or '
-                        f'{1 + manifold.POSE_SIZE} (stamp and pose)', lines.numbers[0])
-    stamps, poses = parse_rows(path, 'pose', _whole_stamps(path, rows), 1, manifold.POSE_SIZE)
-    return _sorted(path, rows, stamps[:, 0], poses, stamped=True)
-
-
-def _read_tum(path: object, lines: TextLines, manifold: Manifold) -> tuple[Indices, Array]:
-    """Return stamps [ns] (n,) and poses (n, p)."""
-    exact = _whole_stamps(path, lines)
-    stamps, pose3 = parse_rows(path, 'TUM pose', exact, 1, _TUM_COLUMNS - 1)
-    far = np.abs(np.linalg.norm(pose3[:, 3:], axis=1) - 1.0) > QUATERNION_NORM_ERROR
-    if far.any():
-        k = int(np.argmax(far))
-        raise FileError(path, f'quaternion {pose3[k, 3:].tolist()}; expected one of norm 1',
-                        lines.numbers[k])
-    return stamps[:, 0], manifold.from_pose3(pose3)
 
 
 def _whole_stamps(path: object, lines: TextLines) -> TextLines:

@@ -8,7 +8,6 @@ weight, and in Algorithm 4 the full step, with a dual that restarts from zero.
 """
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -63,7 +62,7 @@ class Effort:
 
     outer : most linearisations of Algorithm 4 as printed, inner : iterations of each; iterations :
     of the angle and translation problems of Figure 2; timed : what one time is taken of; draws :
-    of each random trial of Figures 4 and 6.
+    of what is random in Figures 4 and 6.
     """
 
     outer: int = 30
@@ -244,8 +243,8 @@ def _cost(graph: FactorGraph, poses: Array) -> float:
 
 
 def _last(iterates: Iterator[tuple[Array, Array]], count: int) -> tuple[Array, Array]:
-    """Return the `count`-th of the iterates from here, keeping none of those before."""
-    return deque(islice(iterates, count), maxlen=1)[0]
+    """Return the `count`-th of the iterates from here."""
+    return next(islice(iterates, count - 1, None))
 
 
 def _median(measure: Callable[[], float]) -> float:

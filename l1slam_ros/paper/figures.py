@@ -2,66 +2,72 @@
 """
 The figures of the report: each draws its pictures into a folder and returns the section's lines.
 
-In: what was measured. Out: .png files, and Markdown that shows them and says what is to be seen.
+In: what was measured. Out: .png files, and Markdown that shows them, their numbers in a table.
 """
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.io.plot import Curve, MapDrawing, plot_curves, plot_maps
 from l1slam_ros.paper import printed as paper
-from l1slam_ros.paper import report
-from l1slam_ros.paper.report import Results, metres
-from l1slam_ros.paper.trials import (
+from l1slam_ros.paper.report import Results, cost, metres, table
+from l1slam_ros.paper.runs import (
     HUBER_OF_G2O,
-    HUBER_WIDTHS,
+    HUBERS,
     JOINT,
+    L1,
     L2,
     NOISES,
     ROBUST,
     SEED,
     START,
-    LoopTrials,
+    LoopRuns,
     Map,
-    StartTrials,
-    huber_name,
+    StartRuns,
 )
 
-_SHAPE = ('A map *keeps its shape* when that is less than a fiftieth of its diagonal: '
-          'more looks bent to the eye.')
-_STARTS = ('Every stored pose is moved at random, in position and heading, by these standard '
-           'deviations; the numbers are medians of several draws. How much noise the paper added '
-           'we do not know. The seed reads no start. *Off our map* is the RMSE of the positions '
-           'from those of the seed, then L1, after rigid alignment. *As printed* are '
-           f'{paper.NOISY_OUTER} linearisations of {paper.NOISY_INNER} iterations, as in the '
-           f'paper. {_SHAPE}')
-_LIES = ('The paper draws its seed (Algorithm 3) alone, beside Huber. False loops say that two '
-         'poses far from each other are the very same, and are as sure of it as a true loop. The '
-         'pairs are drawn at random; the pictures show the first draw. Huber begins at the stored '
-         'poses, the other methods read none; its width is where its cost turns from squares to '
-         f'lengths, in sigmas ({HUBER_OF_G2O:g} by default in g2o). *{ROBUST}* the paper does not '
-         'have. Numbers are the RMSE of the positions, after rigid alignment, from the map that '
-         f'the *same method* makes of the graph without false loops. {_SHAPE}')
+# Within this of the lowest cost of a diagram, a method has arrived.
+_ARRIVED = 0.001
+_SHAPE = 'A map *keeps its shape* that is less than a fiftieth of its diagonal off.'
+_CURVES = ('The paper shows 100,000 iterations of the angle and translation problems, 10,000 '
+           'linearisations of the global one. *Weighted*: with the primal weight; *fused*: the '
+           'compiled, restarted form.')
+_STARTS = ('Every stored pose moved at random by these standard deviations, medians of several '
+           f'draws. *Off*: RMSE of the positions from our map, aligned. {_SHAPE}')
+_LIES = ('False loops at random between far poses, as sure as true ones; the pictures show the '
+         'first draw. *Off*: RMSE of the positions from the map that the same method makes '
+         f'without them, aligned. {_SHAPE}')
 
 
 def figure_2(results: Results, folder: Path) -> list[str]:
     """Draw cost against iterations, one picture for each problem."""
     if not results.convergence:
         return [f'Not run: it is of {paper.MANHATTAN_10K.name}, which `--worlds 10k` makes.']
-    lines = [f'Of our world in the place of {paper.MANHATTAN_10K.name}. The paper shows 100,000 '
-             'iterations of the angle and translation problems and 10,000 outer ones of 400 for '
-             'the global one; how many are shown here is in the table. *Weighted* is with the '
-             'primal weight that this package adds, *least squares* its start from reweighted '
-             'ones, *fused* the compiled and restarted form. An iteration of the global problem '
-             'is one linearisation.', '']
+    lines, rows = [_CURVES, ''], []
     for problem, methods in results.convergence.items():
         name = f'figure_2_{problem}.png'
-        curves = [Curve(method, history[:, 0], history[:, 1])
-                  for method, history in methods.items()]
-        plot_curves(folder / name, curves, f'{problem} problem, L1 cost')
+        plot_curves(folder / name, [Curve(method, history[:, 0], history[:, 1])
+                                    for method, history in methods.items()],
+                    f'{problem} problem, L1 cost')
         lines.append(f'![cost against iterations of the {problem} problem]({name})')
-    return [*lines, '', *report.figure_2(results)]
+        lowest = min(history[:, 1].min() for history in methods.values())
+        rows += [[problem, method, f'{history[-1, 0]:,.0f}', cost(history[0, 1]),
+                  cost(history[-1, 1]), f'{history[-1, 1] / lowest - 1:.2%}',
+                  _arrival(history, (1 + _ARRIVED) * lowest)]
+                 for method, history in methods.items()]
+    return [*lines, '', *table(
+        ['problem', 'method', 'iterations', 'cost at first', 'at last', 'above the lowest',
+         f'within {_ARRIVED:.1%} of it from'], rows, words=2)]
+
+
+def _arrival(history: Array, bound: float) -> str:
+    """Return the iteration from which on a cost stays within a bound."""
+    outside = np.flatnonzero(history[:, 1] > bound)
+    first = outside[-1] + 1 if len(outside) else 0
+    return f'{history[first, 0]:,.0f}' if first < len(history) else 'not reached'
 
 
 def figure_3(results: Results, folder: Path) -> list[str]:
@@ -72,28 +78,47 @@ def figure_3(results: Results, folder: Path) -> list[str]:
 
 def figure_4(results: Results, folder: Path) -> list[str]:
     """Draw the first start that L2 does not recover from, and what came of it."""
-    trials = results.starts
-    if trials is None:
+    runs = results.starts
+    if runs is None:
         return [f'Not run: it is of {paper.NOISY.name}.']
-    noise = drawn_noise(trials)
-    maps = next(trial.maps for trial in trials.trials if trial.noise == noise)
+    noise = drawn_noise(runs)
+    maps = runs.noisy[noise][0]
     panels = {(f'Start: noise of {noise:g} m, {noise:g} rad', 'start'): maps[START],
               ('L2 from that start', 'optimised'): maps[L2],
-              ('Seed (reads no start)', 'seed'): trials.seed,
-              ('Seed, then L1', 'optimised'): trials.solution}
+              ('Seed (reads no start)', 'seed'): runs.from_seed[START],
+              ('Seed, then L1', 'optimised'): runs.from_seed[L1]}
     plot_maps(folder / 'figure_4.png', [
-        MapDrawing(title, shown.positions, loops=trials.loops, name=word,
+        MapDrawing(title, shown.positions, loops=runs.loops, name=word,
                    note=f'L1 cost {shown.cost:.6g}')
         for (title, word), shown in panels.items()])
-    return [_STARTS, '',
-            '![a noisy start, and the maps made of it](figure_4.png)', '',
-            *report.figure_4(trials)]
+    return [_STARTS, '', '![a noisy start, and the maps made of it](figure_4.png)', '',
+            *table_of_starts(runs)]
 
 
-def drawn_noise(trials: StartTrials) -> float:
+def drawn_noise(runs: StartRuns) -> float:
     """Return the least noise that bends the first L2 map of it, the most one if none does."""
-    return next((noise for noise in NOISES
-                 if report.with_noise(trials, noise, L2)[0].error >= trials.bent), NOISES[-1])
+    return next((noise for noise in NOISES if runs.noisy[noise][0][L2].error >= runs.bent),
+                NOISES[-1])
+
+
+def table_of_starts(runs: StartRuns) -> list[str]:
+    """Return what comes of noisy starts, and of the seed in their place."""
+    header = ['start', 'its L1 cost']
+    for method in (L2, L1):
+        header += [f'{method} from it: L1 cost', f'{method}: off our map',
+                   f'{method}: keeps the shape']
+    draws = {f'noise of {noise:g} m, {noise:g} rad': maps for noise, maps in runs.noisy.items()}
+    rows = []
+    for start, found in {**draws, 'the seed (Algorithm 3)': [runs.from_seed]}.items():
+        row = [start, _median_cost(maps[START] for maps in found)]
+        for method in (L2, L1):
+            of_method = [maps[method] for maps in found]
+            row += [_median_cost(of_method), metres(_median_error(of_method)),
+                    _in_shape(of_method, runs.bent)]
+        rows.append(row)
+    rows.append(['the seed, then as printed', cost(runs.printed[0]), '', '', '',
+                 cost(runs.printed[-1]), '', ''])
+    return table(header, rows)
 
 
 def figure_6(results: Results, folder: Path) -> list[str]:
@@ -101,34 +126,74 @@ def figure_6(results: Results, folder: Path) -> list[str]:
     if not results.false_loops:
         return [f'Not run: it is of {" and ".join(graph.name for graph in paper.FALSE_LOOPS)}.']
     lines = [_LIES, '']
-    for name, trials in results.false_loops.items():
+    for name, runs in results.false_loops.items():
         picture = f'figure_6_{name.lower()}.png'
-        plot_maps(folder / picture, _false_loop_panels(name, trials))
+        plot_maps(folder / picture, _false_loop_panels(name, runs))
         lines += [f'![{name} with false loops]({picture})', '']
-    return [*lines, *report.figure_6(results.false_loops)]
+    return [*lines, *table_of_methods(results.false_loops), '',
+            *table_of_refused(results.false_loops)]
 
 
-def _false_loop_panels(name: str, trials: LoopTrials) -> list[MapDrawing]:
+def _false_loop_panels(name: str, runs: LoopRuns) -> list[MapDrawing]:
     """Return the clean map, and what each method made of the first draw."""
-    first, loops = trials.trials[0], trials.loops
-    hubers = dict.fromkeys((best_huber(trials), huber_name(HUBER_OF_G2O)))
-    clean = trials.clean[JOINT].positions
-    drawings = [MapDrawing(f'{name} without false loops: L1', clean, loops=loops)]
-    for method in (SEED, JOINT, *hubers):
-        shown = first.maps[method]
-        drawings.append(MapDrawing(method, shown.positions, loops=loops, false=first.false,
-                                   note=_off(shown)))
-    shown, refused = first.maps[ROBUST], np.concatenate((first.refused, first.lost))
-    lost = (loops[:, None] == first.lost).all(axis=2).any(axis=1)
-    return [*drawings, MapDrawing('l1slam solve', shown.positions, loops=loops[~lost],
-                                  rejected=refused, false=first.kept, note=_off(shown))]
+    first, loops = runs.runs[0], runs.loops
+    false = np.concatenate((first.refused, first.kept))
+    hubers = dict.fromkeys((best_huber(runs), HUBER_OF_G2O))
+    drawings = [MapDrawing(f'{name} without false loops: L1', runs.clean[JOINT].positions,
+                           loops=loops)]
+    drawings += [MapDrawing(method, first.maps[method].positions, loops=loops, false=false,
+                            note=f'{metres(first.maps[method].error)} off')
+                 for method in (SEED, JOINT, *hubers)]
+    shown, lost = first.maps[ROBUST], (loops[:, None] == first.lost).all(axis=2).any(axis=1)
+    return [*drawings, MapDrawing(
+        'l1slam solve', shown.positions, loops=loops[~lost], false=first.kept,
+        rejected=np.concatenate((first.refused, first.lost)),
+        note=f'{metres(shown.error)} off')]
 
 
-def best_huber(trials: LoopTrials) -> str:
+def best_huber(runs: LoopRuns) -> str:
     """Return the name of the Huber of least median error, chosen knowing the result."""
-    return min(map(huber_name, HUBER_WIDTHS),
-               key=lambda name: report.median_error(report.maps_by(trials, name)))
+    return min(HUBERS, key=lambda name: _median_error([run.maps[name] for run in runs.runs]))
 
 
-def _off(shown: Map) -> str:
-    return f'{metres(shown.error)} off'
+def table_of_methods(false_loops: dict[str, LoopRuns]) -> list[str]:
+    """Return what every method makes of loops that lie; by name of the graph."""
+    header = ['off its own clean map']
+    for name in false_loops:
+        header += [f'{name}: median', f'{name}: lowest to highest', f'{name}: keeps the shape']
+    rows = []
+    for method in (SEED, JOINT, *HUBERS, ROBUST):
+        row = [method]
+        for runs in false_loops.values():
+            maps = [run.maps[method] for run in runs.runs]
+            errors = [shown.error for shown in maps]
+            row += [metres(_median_error(maps)), f'{min(errors):.2f} to {metres(max(errors))}',
+                    _in_shape(maps, runs.bent)]
+        rows.append(row)
+    return table(header, rows)
+
+
+def table_of_refused(false_loops: dict[str, LoopRuns]) -> list[str]:
+    """Return which loops were refused; by name of the graph."""
+    header = [ROBUST, 'true loops', 'false loops', 'draws', 'loses its shape at',
+              'false loops refused', 'true factors refused']
+    rows = []
+    for name, of in false_loops.items():
+        refused = sum(len(run.refused) for run in of.runs)
+        false = refused + sum(len(run.kept) for run in of.runs)
+        rows.append([name, f'{len(of.loops):,}', f'{false // len(of.runs)}', f'{len(of.runs)}',
+                     metres(of.bent), f'{refused} of {false}',
+                     f'{sum(len(run.lost) for run in of.runs)}'])
+    return table(header, rows)
+
+
+def _median_error(maps: Sequence[Map]) -> float:
+    return float(np.median([shown.error for shown in maps]))
+
+
+def _median_cost(maps: Iterable[Map]) -> str:
+    return cost(float(np.median([shown.cost for shown in maps])))
+
+
+def _in_shape(maps: Sequence[Map], bent: float) -> str:
+    return f'{sum(shown.error < bent for shown in maps)} of {len(maps)}'

@@ -21,8 +21,10 @@ from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.solvers.warm_up import STEPS
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io import formats
+from l1slam_ros.io.compilation import compile_now
 from l1slam_ros.io.files import put_lines, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.plot import MapDrawing
@@ -38,12 +40,12 @@ from l1slam_ros.paper.experiments import (
 )
 from l1slam_ros.paper.printed import PaperGraph
 from l1slam_ros.paper.report import WORLD_SEED, GraphResult, Results
-from l1slam_ros.paper.trials import (
+from l1slam_ros.paper.runs import (
     NOISES,
-    LoopTrials,
-    StartTrials,
-    try_false_loops,
-    try_noisy_starts,
+    LoopRuns,
+    StartRuns,
+    run_false_loops,
+    run_noisy_starts,
 )
 
 REPORT = 'report.md'
@@ -73,6 +75,7 @@ def reproduce(
                           'or --worlds other than none')
     _check_folder(output)
     records = read_datasets(datasets) if datasets else {}
+    compile_now(STEPS)
     results = run(records, worlds, effort)
     with _filling(output) as folder:
         lines = report.head(results)
@@ -112,11 +115,11 @@ def run(
     simulated = {world.name: world for world in worlds}
     graphs, convergence, missing = [], {}, []
     for graph in paper.GRAPHS:
-        if graph.name in records or graph.name in simulated:
-            print(f'l1slam: {graph.name}', file=sys.stderr)
         if graph.name in records:
+            _say(graph.name)
             graphs.append(_run_record(graph, records[graph.name], effort))
         elif graph.name in simulated:
+            _say(graph.name)
             result, curves = _run_world(simulated[graph.name], effort)
             graphs.append(result)
             convergence.update(curves)
@@ -126,31 +129,33 @@ def run(
                    _run_false_loops(records, effort))
 
 
-def _run_starts(records: dict[str, GraphRecord], effort: Effort) -> StartTrials | None:
+def _say(work: str) -> None:
+    print(f'l1slam: {work}', file=sys.stderr)
+
+
+def _run_starts(records: dict[str, GraphRecord], effort: Effort) -> StartRuns | None:
     record = records.get(paper.NOISY.name)
     if record is None:
         return None
-    print(f'l1slam: {paper.NOISY.name} from noisy starts', file=sys.stderr)
+    _say(f'{paper.NOISY.name} from noisy starts')
     as_in_paper = replace(effort, outer=paper.NOISY_OUTER, inner=paper.NOISY_INNER)
     with Progress(len(NOISES) * effort.draws, 'start') as progress:
-        return try_noisy_starts(record.graph, formats.stored_poses(record), effort, as_in_paper,
+        return run_noisy_starts(record.graph, formats.stored_poses(record), effort, as_in_paper,
                                 np.random.default_rng(WORLD_SEED), progress.advance)
 
 
-def _run_false_loops(
-    records: dict[str, GraphRecord], effort: Effort
-) -> dict[str, LoopTrials]:
-    trials = {}
+def _run_false_loops(records: dict[str, GraphRecord], effort: Effort) -> dict[str, LoopRuns]:
+    runs = {}
     for graph, count in paper.FALSE_LOOPS.items():
         record = records.get(graph.name)
         if record is None:
             continue
-        print(f'l1slam: {graph.name} with false loops', file=sys.stderr)
+        _say(f'{graph.name} with false loops')
         with formats.named(graph.file), Progress(1 + effort.draws, 'draw') as progress:
-            trials[graph.name] = try_false_loops(
+            runs[graph.name] = run_false_loops(
                 record.graph, formats.stored_poses(record), count, effort,
                 np.random.default_rng(WORLD_SEED), progress.advance)
-    return trials
+    return runs
 
 
 def _run_record(graph: PaperGraph, record: GraphRecord, effort: Effort) -> GraphResult:
@@ -220,19 +225,14 @@ def _check_folder(output: Path) -> None:
 @contextmanager
 def _filling(output: Path) -> Iterator[Path]:
     """Yield a new folder, whose files go into the folder `output` when the block succeeds."""
-    target = Path(os.path.abspath(output))
     try:
-        with TemporaryDirectory('.tmp', f'.{target.name}.', target.parent,
+        with TemporaryDirectory('.tmp', f'.{output.name}.', output.absolute().parent,
                                 ignore_cleanup_errors=True) as scratch:
-            # One of our own inside it: what `tempfile` makes is for its owner only.
-            made = Path(scratch, target.name)
-            made.mkdir()
+            made = Path(scratch)
             yield made
-            if target.is_dir():
-                # The report last: it names the others.
-                for file in sorted(made.iterdir(), key=lambda file: file.name == REPORT):
-                    os.replace(file, target / file.name)
-            else:
-                os.rename(made, target)
+            output.mkdir(exist_ok=True)
+            # The report last: it names the others.
+            for file in sorted(made.iterdir(), key=lambda file: file.name == REPORT):
+                os.replace(file, output / file.name)
     except OSError as error:
         raise FileError(output, f'cannot be written: {error.strerror or error}') from error

@@ -32,9 +32,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, aligned_positions
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.io.bags.reader import read_messages
-from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.io.bags.topics import TRUTH_TOPIC
+from l1slam_ros.io.bags.truth_topic import read_truth_topic
 from l1slam_ros.io.files import stamp_from_text
+from l1slam_ros.io.formats import read_input, stamps_of
 from l1slam_ros.io.graphs.side_files import false_loops_path, read_false_loops
 from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.io.plot import MapDrawing, plot_maps
@@ -82,23 +84,13 @@ class Recording:
 
 def read_recording(path: Path) -> Recording:
     """Read the demo bag; loops as rows of `stamps`."""
-    stamps: list[int] = []
-    poses: dict[str, list[tuple[float, float]]] = {ODOMETRY_TOPIC: [], TRUTH_TOPIC: []}
-    loops: list[tuple[int, int]] = []
-    for topic, _, _, message in read_messages(path):
-        if topic == LOOP_TOPIC:
-            seconds, _, nanoseconds = message.header.frame_id.split('@')[1].partition('.')
-            loops.append((int(seconds + nanoseconds), stamp_of(message.header)))
-            continue
-        if topic == ODOMETRY_TOPIC:
-            stamps.append(stamp_of(message.header))
-            message = message.pose
-        poses[topic].append((message.pose.position.x, message.pose.position.y))
-    pairs = np.searchsorted(stamps, loops)
+    record, truth = read_input(path), read_truth_topic(path, TRUTH_TOPIC)
+    graph = record.graph
+    positions, loops = graph.manifold.positions, graph.between.pairs[~graph.between.is_odometry]
     false = read_false_loops(false_loops_path(path))
-    is_false = (pairs[:, None] == false).all(axis=2).any(axis=1)
-    return Recording(np.array(stamps), np.array(poses[ODOMETRY_TOPIC]),
-                     np.array(poses[TRUTH_TOPIC]), pairs, is_false)
+    is_false = (loops[:, None] == false).all(axis=2).any(axis=1)
+    return Recording(stamps_of(record), positions(odometry_poses(graph)), positions(truth.poses),
+                     loops, is_false)
 
 
 @dataclass

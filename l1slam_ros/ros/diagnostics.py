@@ -53,11 +53,12 @@ class Diagnosis:
         metres, radians = manifold.motion(manifold.local(before, after))
         self._jump = {'jump.translation': f'{metres[0]:.4f}', 'jump.rotation': f'{radians[0]:.5f}'}
 
-    def publish(self, counts: Mapping[str, int], refused: Counter[str]) -> None:
+    def publish(self, counts: Mapping[str, int], refused: Counter[str], twins: str) -> None:
         """
         Publish one status.
 
-        counts : sizes of the graph; refused : cause -> how many messages, since the start.
+        counts : sizes of the graph; refused : cause -> how many messages, since the start; twins :
+        what is wrong with the node's name, empty: nothing.
         """
         lately = refused - self._refused[0]
         self._refused.append(Counter(refused))
@@ -74,7 +75,7 @@ class Diagnosis:
         for cause, count in sorted((+refused).items()):
             values |= {f'refused.{cause}': count,
                        f'refused.{cause}.last_minute': lately[cause]}
-        level, sentence = self._judgement(counts, lately)
+        level, sentence = self._judgement(counts, lately, twins)
         name = self._node.get_fully_qualified_name()
         status = DiagnosticStatus(
             level=level, name=f'{name}: map', message=sentence, hardware_id=name,
@@ -83,13 +84,14 @@ class Diagnosis:
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
 
-    def _judgement(self, counts: Mapping[str, int], lately: Counter[str]) -> tuple[bytes, str]:
+    def _judgement(self, counts: Mapping[str, int], lately: Counter[str],
+                   twins: str) -> tuple[bytes, str]:
         """Return the level and all that is wrong now, in one sentence."""
         failures = self._failures.lasting
         if failures:
             return DiagnosticStatus.ERROR, '; '.join(
                 f'{what} failed: {why}' for what, why in failures.items())
-        wrong = []
+        wrong = [twins] if twins else []
         if lately:
             wrong.append('refused in the last minute: ' + ', '.join(
                 f'{count} {cause}' for cause, count in sorted(lately.items())))

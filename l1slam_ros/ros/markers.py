@@ -1,53 +1,133 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The graph as RViz and Foxglove draw it: keyframes as points, factors as lines."""
+"""
+The graph as RViz and Foxglove draw it: keyframes as points, factors as lines.
 
-from geometry_msgs.msg import Point, Vector3
-from std_msgs.msg import ColorRGBA
+Each namespace is drawn in pieces, a marker each, and only the pieces that changed are sent: most
+of a large map stands still. They are made as bytes, of arrays, see `publishing.path_bytes`.
+"""
+
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from visualization_msgs.msg import Marker, MarkerArray
 
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.graph.factor_graph import BetweenFactors
-from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED, SUSPECT, LoopStates
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.core.graph.factor_graph import WORLD
+from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED, SUSPECT
+from l1slam_ros.core.online.snapshot import Snapshot
+from l1slam_ros.ros.publishing import ENCAPSULATION, header_bytes, string_bytes
 
 # Okabe and Ito's colours, as in the pictures.
-_BLUE, _GREY, _GREEN = (0.0, 0.447, 0.698), (0.5, 0.5, 0.5), (0.0, 0.62, 0.451)
-_YELLOW, _RED = (0.902, 0.624, 0.0), (0.835, 0.369, 0.0)
+_BLUE, _GREY = (0.0, 0.447, 0.698), (0.5, 0.5, 0.5)
+# Loops: from green over yellow to red as their residual grows to so many sigmas.
+_SIGMAS, _WORST = (0.0, 2.5, 5.0), 5.0
+_LADDER = np.array([(0.0, 0.62, 0.451), (0.902, 0.624, 0.0), (0.835, 0.369, 0.0)])
+_LOOPS = {'loops': ACCEPTED, 'suspect_loops': SUSPECT, 'rejected_loops': REJECTED}
 _POINT, _LINE = 0.1, 0.03  # [m]
+# Keyframes or factors of one marker; what moves by less [m] is not sent again.
+_PIECE, _STILL = 500, 1e-3
+# Lifetime: for ever; not locked to the frame.
+_FOR_EVER = struct.pack('<iI?', 0, 0, False)
+# No texture, its header and format, coordinates on it, text, mesh, its file; no materials.
+_NOTHING_ELSE = struct.pack('<IBxxxiIIBxxxIBxxxIIIBxxxIBxxxIBxxxI?', 1, 0, 0, 0, 1, 0, 1, 0, 0, 0,
+                            1, 0, 1, 0, 1, 0, 0, False)
 
 
-def graph_markers(frame: str, stamp: int, pose3: Array, factors: BetweenFactors,
-                  loops: LoopStates) -> MarkerArray:
+class GraphMarkers:
     """
-    Return one marker for each namespace.
-
-    They are `keyframes`, `odometry`, `loops`, `suspect_loops` and `rejected_loops`.
+    Publishes the graph on the topic `graph`, for who looks.
 
     Parameters
     ----------
-    frame, stamp : of the markers; stamp [ns]
-    pose3 : (n, 7) optimised keyframes, x y z qx qy qz qw
-    factors : which keyframes are tied to each other
-    loops : what has become of the loops among them
+    node : to publish from
 
     """
-    points = [Point(x=x, y=y, z=z) for x, y, z in pose3[:, :3].tolist()]
-    state = loops.state[: len(loops.rows)]
-    pairs, is_odometry = factors.pairs, factors.is_odometry
 
-    def marker(namespace: str, kind: int, size: float, colour: tuple[float, float, float],
-               rows: list[int]) -> Marker:
-        r, g, b = colour
-        return Marker(header=header(frame, stamp), ns=namespace, type=kind, action=Marker.ADD,
-                      scale=Vector3(x=size, y=size, z=size), color=ColorRGBA(r=r, g=g, b=b, a=1.0),
-                      points=[points[row] for row in rows])
+    def __init__(self, node: Node):
+        self._sent: dict[tuple[str, int], bytes] = {}
+        self.someone_new = False
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._publisher = node.create_publisher(
+            MarkerArray, 'graph', latched,
+            event_callbacks=PublisherEventCallbacks(matched=self._on_match))
 
-    return MarkerArray(markers=[
-        marker('keyframes', Marker.POINTS, _POINT, _BLUE, list(range(len(points)))),
-        marker('odometry', Marker.LINE_LIST, _LINE, _GREY, pairs[is_odometry].ravel().tolist()),
-        *(marker(namespace, Marker.LINE_LIST, _LINE, colour,
-                 pairs[loops.rows[state == kind]].ravel().tolist())
-          for namespace, kind, colour in (('loops', ACCEPTED, _GREEN),
-                                          ('suspect_loops', SUSPECT, _YELLOW),
-                                          ('rejected_loops', REJECTED, _RED))),
-    ])
+    def _on_match(self, change: Any) -> None:
+        self.someone_new |= change.current_count_change > 0
+
+    def publish(self, frame: str, stamp: int, now: Snapshot) -> None:
+        """Publish what has changed since the last call; the solver's thread calls it."""
+        if self.someone_new:
+            self.someone_new, self._sent = False, {}
+        if not self._publisher.get_subscription_count():
+            return
+        seen, news = {}, []
+        for name, kind, size, points, colours in _namespaces(now):
+            per = _PIECE * (2 if kind == Marker.LINE_LIST else 1)
+            for number, first in enumerate(range(0, len(points), per)):
+                piece = points[first : first + per], colours[first : first + per]
+                content = np.rint(piece[0] / _STILL).tobytes() + piece[1].tobytes()
+                seen[name, number] = content
+                if self._sent.get((name, number)) != content:
+                    news.append((name, number, kind, Marker.ADD, size, *piece))
+        gone = [(name, number, 0, Marker.DELETE, 0.0, np.zeros((0, 3)), np.zeros((0, 4), 'f4'))
+                for name, number in self._sent.keys() - seen.keys()]
+        self._sent = seen
+        if news or gone:
+            self._publisher.publish(_array_bytes(header_bytes(frame, stamp), news + gone))
+
+
+def _namespaces(now: Snapshot) -> Iterator[tuple[str, int, float, Array, np.ndarray]]:
+    """Yield name, type and size of what is drawn, its points (k, 3) and their colours (k, 4)."""
+    manifold, factors, loops = now.graph.manifold, now.graph.between, now.loop_states()
+    points = manifold.to_pose3(now.poses)[:, :3]
+    begin, end = points[np.maximum(factors.i, 0)], points[factors.j]
+    world = factors.i == WORLD
+    begin[world] = manifold.to_pose3(factors.measurement[world])[:, :3]
+    lines = np.stack((begin, end), axis=1)
+    odometry = lines[factors.is_odometry].reshape(-1, 3)
+    yield 'keyframes', Marker.POINTS, _POINT, points, _colours(_BLUE, len(points))
+    yield 'odometry', Marker.LINE_LIST, _LINE, odometry, _colours(_GREY, len(odometry))
+    k = len(loops.rows)
+    state, sigmas = loops.state[:k], np.nan_to_num(loops.sigmas[:k], nan=_WORST)
+    ladder = np.stack([np.interp(sigmas, _SIGMAS, part) for part in _LADDER.T], axis=1)
+    for name, kind in _LOOPS.items():
+        chosen = state == kind
+        yield (name, Marker.LINE_LIST, _LINE, lines[loops.rows[chosen]].reshape(-1, 3),
+               _colours(np.repeat(ladder[chosen], 2, axis=0), 2 * int(np.count_nonzero(chosen))))
+
+
+def _colours(rgb: Any, count: int) -> np.ndarray:
+    """Return opaque colours to two digits, (count, 4)."""
+    colours = np.ones((count, 4), np.float32)
+    colours[:, :3] = np.round(rgb, 2)
+    return colours
+
+
+def _array_bytes(header: bytes, markers: list[tuple[Any, ...]]) -> bytes:
+    """Return a serialised visualization_msgs/MarkerArray; all markers have one header."""
+    parts = [struct.pack('<I', len(markers))]
+    length = 4
+
+    def add(data: bytes, alignment: int) -> None:
+        nonlocal length
+        padding = -length % alignment
+        parts.append(b'\0' * padding + data)
+        length += padding + len(data)
+
+    for name, number, kind, action, size, points, colours in markers:
+        add(header, 4)
+        add(string_bytes(name), 4)
+        add(struct.pack('<iii', number, kind, action), 4)
+        add(struct.pack('<10d', 0, 0, 0, 0, 0, 0, 1, size, size, size), 8)
+        add(struct.pack('<4f', 1, 1, 1, 1) + _FOR_EVER, 4)
+        add(struct.pack('<I', len(points)), 4)
+        if len(points):
+            add(points.tobytes(), 8)
+        add(struct.pack('<I', len(colours)) + colours.tobytes(), 4)
+        add(_NOTHING_ELSE, 4)
+    return ENCAPSULATION + b''.join(parts)

@@ -13,48 +13,55 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
-from rclpy.node import Node
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core.errors import L1SlamError, MessageError
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.core.online.marginal import newest_covariance
 from l1slam_ros.core.online.update import Improvement
+from l1slam_ros.io.graphs.map_file import MapFile
 from l1slam_ros.io.messages import cdr
 from l1slam_ros.io.messages.base_frame import BaseFrame
-from l1slam_ros.io.messages.conversion import absolute_pose, loop_closure, odometry_sample
+from l1slam_ros.io.messages.conversion import (
+    absolute_pose,
+    false_loop,
+    loop_closure,
+    odometry_sample,
+)
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.diagnostics import Diagnosis
 from l1slam_ros.ros.loop_status import LoopStatus
-from l1slam_ros.ros.markers import graph_markers
+from l1slam_ros.ros.markers import GraphMarkers
 from l1slam_ros.ros.parameters import NodeParameters
-from l1slam_ros.ros.publishing import path_bytes, pose_bytes, transform_stamped
+from l1slam_ros.ros.publishing import path_bytes, pose_bytes, pose_with_covariance
 from l1slam_ros.ros.services import MapServices
 from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.orders import Orders
 from l1slam_ros.ros.threads.solver_thread import SolverThread
 from l1slam_ros.ros.traffic import Traffic
-
-try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:  # the ROS wheels on PyPI have none
-    TFMessage = None
+from l1slam_ros.ros.transform import MapToOdom
 
 _DEPTH = 1000
 # Messages of one topic at most before other callbacks have their turn.
 _AT_ONCE = 100
 _REPEAT_WARNING = 5.0  # [s]
+# [s] The end of the node waits so much longer for a map that is being saved.
+_SAVING = 4.0
 
 
-class BackendNode(Node):
+class BackendNode(LifecycleNode):
     """
     The ROS face of `core.online.backend.Backend`.
+
+    A managed node: messages are used, and map -> odom is published, while it is active, which it
+    is at once unless `autostart` is off. To clean it up empties the map.
 
     Parameters
     ----------
@@ -74,24 +81,25 @@ class BackendNode(Node):
         super().__init__('backend', **keywords)
         self._declared = NodeParameters(self, NodeOptions(), self._on_options)
         options = self.options
-        self._backend = Backend(options)
+        self._backend = Backend(options, options.dimension)
         self._manifold = self._backend.manifold
         self._base_frame = BaseFrame(options.base_frame)
         self._refused: Counter[str] = Counter()
-        self._last_stamp = 0
-        self._last_pose = self._map_to_odom = self._manifold.identity(1)
+        self._active = False
         self._told_map, self._told_version = 0, self._backend.version
-        self._told_transform = self._map_to_odom
         self.failures = Failures(self.get_logger(), self.context.ok)
         self._solver = SolverThread(self._backend, self.failures, self.get_logger(),
                                     lambda: self.options.update.budget, self._tell)
         self._orders = Orders(self, self.failures, self._solver.hurry)
         self._make_publishers()
+        self._map_file = MapFile(self._backend, lambda: self.options, self.get_logger().warning)
+        if options.load_on_start:
+            self.get_logger().info(self._map_file.load_at_start())
         self._topics: dict[str, Traffic] = {}
         self._make_subscriptions()
         self._diagnosis = Diagnosis(self, self._topics, self._solver, self.failures)
         self._map_services = MapServices(
-            self, self._backend, self._orders, lambda: self.options.save_path,
+            self, self._backend, self._orders, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
@@ -101,8 +109,29 @@ class BackendNode(Node):
         # By a clock that goes on where simulated time stands still, or a bag has ended.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(options.update.period, guarded('timer', self._on_timer), clock=steady)
+        self.create_timer(options.transform_period,
+                          guarded('transform', self._on_transform), clock=steady)
         self.create_timer(1.0, guarded('diagnostics', self._on_second), clock=steady)
+        self._tell(None)  # a map may have been loaded
         self._solver.start()
+        if options.autostart:
+            self.trigger_configure()
+            self.trigger_activate()
+
+    def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Use messages from now on."""
+        self._active = True
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Leave messages alone, and the map as it is."""
+        self._active = False
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Empty the map."""
+        self._orders.place('clean up', self._map_services.reset)
+        return TransitionCallbackReturn.SUCCESS
 
     @property
     def options(self) -> NodeOptions:
@@ -113,21 +142,26 @@ class BackendNode(Node):
         """End the threads and the node; return whether they ended within some seconds."""
         deadline = time.monotonic() + seconds
         self._solver.close(0.0)  # what it works at for an order stops
-        ended = self._orders.close(seconds)
+        self._map_services.autosave(at_end=True)
+        ended = self._orders.close(seconds) or (
+            self._map_file.is_saving and self._orders.close(_SAVING))
         ended &= self._solver.close(max(deadline - time.monotonic(), 0.0))
         if ended:
             self.destroy_node()
         return ended
 
+    def is_saving(self) -> bool:
+        """Return whether the map is being saved."""
+        return self._map_file.is_saving
+
     def _make_publishers(self) -> None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._path = self.create_publisher(Path, 'path', latched)
         self._pose = self.create_publisher(PoseStamped, 'pose', 10)
-        self._transform = self.create_publisher(TransformStamped, 'map_to_odom', 10)
-        self._graph = self.create_publisher(MarkerArray, 'graph', latched)
-        self._tf = None
-        if TFMessage is not None and self.options.publish_tf:
-            self._tf = self.create_publisher(TFMessage, '/tf', 100)
+        self._covariance = self.create_publisher(
+            PoseWithCovarianceStamped, 'pose_with_covariance', 10)
+        self._markers = GraphMarkers(self)
+        self._transform = MapToOdom(self, self._backend, self.options.publish_tf)
         self._loop_status = LoopStatus(self)
 
     def _make_subscriptions(self) -> None:
@@ -135,13 +169,18 @@ class BackendNode(Node):
             (Odometry, 'odom', self._on_odometry),
             (PoseWithCovarianceStamped, 'loop_closures', self._on_loop),
             (PoseWithCovarianceStamped, 'trusted_loop_closures', self._on_trusted_loop),
+            (PoseWithCovarianceStamped, 'false_loop_closures', self._on_false_loop),
             (PoseWithCovarianceStamped, 'absolute_poses', self._on_absolute_pose),
         ):
             self._subscribe(kind, topic, callback)
 
     def _subscribe(self, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
-        use = self.failures.guarded(topic, callback)
+        guarded = self.failures.guarded(topic, callback)
         raw = kind is Odometry
+
+        def use(message: Any) -> None:
+            if self._active:
+                guarded(message)
 
         def received(message: Any, information: Any) -> None:
             traffic.note(information)
@@ -191,9 +230,8 @@ class BackendNode(Node):
             return
         if map_to_odom is None:
             return
-        self._map_to_odom, manifold = map_to_odom, self._manifold
-        self._last_stamp, self._last_pose = sample.stamp, manifold.from_pose3(sample.pose3[None])
-        pose = manifold.compose(self._map_to_odom, self._last_pose)
+        manifold = self._manifold
+        pose = manifold.compose(map_to_odom, manifold.from_pose3(sample.pose3[None]))
         self._pose.publish(pose_bytes(self.options.map_frame, sample.stamp,
                                       manifold.to_pose3(pose)[0]))
 
@@ -202,6 +240,9 @@ class BackendNode(Node):
 
     def _on_trusted_loop(self, message: PoseWithCovarianceStamped) -> None:
         self._add_loop(loop_closure, message, self._base_frame.name, True)
+
+    def _on_false_loop(self, message: PoseWithCovarianceStamped) -> None:
+        self._add_loop(false_loop, message, self._base_frame.name)
 
     def _on_absolute_pose(self, message: PoseWithCovarianceStamped) -> None:
         self._add_loop(absolute_pose, message, self.options.map_frame)
@@ -220,14 +261,27 @@ class BackendNode(Node):
 
     def _on_timer(self) -> None:
         self._solver.wake()
-        if self._last_stamp:
-            self._publish_transform()
+        self._map_services.autosave()
+
+    def _on_transform(self) -> None:
+        if self._active:
+            self._transform.publish(self.options)
 
     def _on_second(self) -> None:
         for sentence in self._backend.news():
             self.get_logger().warning(sentence)
         counts, refused = self._backend.counts()
-        self._diagnosis.publish(counts, self._refused + Counter(refused))
+        self._diagnosis.publish(counts, self._refused + Counter(refused), self._twins())
+
+    def _twins(self) -> str:
+        """Return what is wrong where another node has this one's name; else nothing."""
+        own = self.get_name(), self.get_namespace()
+        count = self.get_node_names_and_namespaces().count(own)
+        if count < 2:
+            return ''
+        wrong = f'{count} nodes are called {self.get_fully_qualified_name()}; expected one'
+        self.get_logger().warning(wrong, throttle_duration_sec=_REPEAT_WARNING)
+        return wrong
 
     def _tell(self, improvement: Improvement | None) -> None:
         """Publish what is new; the solver's thread calls it."""
@@ -240,6 +294,8 @@ class BackendNode(Node):
         elif version != self._told_version:
             # Nothing new in the map, but a loop can have come for later, or expired.
             self._loop_status.publish(self._backend.loop_states())
+        elif self._markers.someone_new:
+            self._markers.publish(self.options.map_frame, self._newest(), self._backend.snapshot())
         self._told_version = version
 
     def _publish_map(self) -> None:
@@ -247,26 +303,27 @@ class BackendNode(Node):
         poses, loops = now.poses, now.loop_states()
         if not np.isfinite(poses).all() or not np.isfinite(now.map_to_odom).all():
             raise ArithmeticError('a pose of the map is not finite: it is not published')
-        self._diagnosis.note_jump(
-            self._manifold, self._manifold.compose(self._told_transform, self._last_pose),
-            self._manifold.compose(now.map_to_odom, self._last_pose))
-        self._map_to_odom = self._told_transform = now.map_to_odom
-        frame, stamp = self.options.map_frame, self._last_stamp
+        robot = self._backend.robot()
+        if robot is not None:
+            before, after = (self._manifold.compose(transform, robot.odometry)
+                             for transform in self._backend.moved)
+            self._diagnosis.note_jump(self._manifold, before, after)
+        frame, stamp = self.options.map_frame, self._newest()
         pose3 = self._manifold.to_pose3(poses)
         self._path.publish(path_bytes(frame, stamp, now.stamps, pose3))
-        self._publish_transform()
         self._loop_status.publish(loops)
-        # Markers are slow to make: not unless somebody looks.
-        if self._graph.get_subscription_count():
-            self._graph.publish(graph_markers(frame, stamp, pose3, now.graph.between, loops))
+        self._markers.publish(frame, stamp, now)
+        # It takes a factorisation: not unless somebody listens.
+        if self._covariance.get_subscription_count() and len(poses):
+            covariance = newest_covariance(now)
+            if covariance is not None:
+                self._covariance.publish(pose_with_covariance(
+                    frame, int(now.stamps[-1]), self._manifold, poses[-1:], covariance))
 
-    def _publish_transform(self) -> None:
-        options = self.options
-        transform = transform_stamped(options.map_frame, options.odom_frame, self._last_stamp,
-                                      self._manifold.to_pose3(self._map_to_odom)[0])
-        self._transform.publish(transform)
-        if self._tf is not None:
-            self._tf.publish(TFMessage(transforms=[transform]))
+    def _newest(self) -> int:
+        """Return the stamp of the newest odometry [ns], 0 where there is none."""
+        robot = self._backend.robot()
+        return robot.stamp if robot is not None else 0
 
     def _report(self, improvement: Improvement) -> None:
         self._diagnosis.note(improvement)

@@ -5,14 +5,14 @@ import struct
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from std_msgs.msg import Header
 
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 
 _SECOND = 1_000_000_000
 # CDR, little endian; what follows is aligned relative to the end of these four bytes.
-_ENCAPSULATION = b'\x00\x01\x00\x00'
+ENCAPSULATION = b'\x00\x01\x00\x00'
 
 
 def path_bytes(frame: str, stamp: int, stamps: Indices, pose3: Array) -> bytes:
@@ -33,13 +33,13 @@ def path_bytes(frame: str, stamp: int, stamps: Indices, pose3: Array) -> bytes:
     pose3 : (n, 7) x y z qx qy qz qw
 
     """
-    start: bytes = _header(frame, stamp)
+    start: bytes = header_bytes(frame, stamp)
     start += b'\0' * (-len(start) % 4) + struct.pack('<I', len(stamps))
     if not len(stamps):
-        return _ENCAPSULATION + start
-    start += _header(frame, int(stamps[0]))
+        return ENCAPSULATION + start
+    start += header_bytes(frame, int(stamps[0]))
     start += b'\0' * (-len(start) % 8)
-    name = _string(frame)
+    name = string_bytes(frame)
     record = np.dtype([('pose', '<f8', 7), ('seconds', '<i4'), ('nanoseconds', '<u4'),
                        ('frame', f'V{len(name) + (-len(name) - 8) % 8}')])
     records = np.zeros(len(stamps), record)
@@ -49,13 +49,13 @@ def path_bytes(frame: str, stamp: int, stamps: Indices, pose3: Array) -> bytes:
     records['nanoseconds'][:-1] = nanoseconds[1:]
     records['frame'] = np.void(name.ljust(record['frame'].itemsize, b'\0'))
     body: bytes = records.tobytes()
-    return _ENCAPSULATION + start + body[: -(record.itemsize - 56)]
+    return ENCAPSULATION + start + body[: -(record.itemsize - 56)]
 
 
 def pose_bytes(frame: str, stamp: int, pose3: Array) -> bytes:
     """Return a serialised geometry_msgs/PoseStamped: one pose (7,) at one time [ns]."""
-    start = _header(frame, stamp)
-    return b''.join((_ENCAPSULATION, start, b'\0' * (-len(start) % 8), pose3.tobytes()))
+    start = header_bytes(frame, stamp)
+    return b''.join((ENCAPSULATION, start, b'\0' * (-len(start) % 8), pose3.tobytes()))
 
 
 def transform_stamped(parent: str, child: str, stamp: int, pose3: Array) -> TransformStamped:
@@ -67,18 +67,39 @@ def transform_stamped(parent: str, child: str, stamp: int, pose3: Array) -> Tran
     return message
 
 
+def pose_with_covariance(frame: str, stamp: int, manifold: Manifold, pose: Array,
+                         covariance: Array) -> PoseWithCovarianceStamped:
+    """
+    Return a pose (1, p) with its covariance in the axes of the frame, as ROS has it.
+
+    covariance : (d, d) in the axes of the pose, what the manifold has no components for is known
+    """
+    pose3 = manifold.to_pose3(pose)
+    message = PoseWithCovarianceStamped(header=header(frame, stamp))
+    position, orientation = message.pose.pose.position, message.pose.pose.orientation
+    position.x, position.y, position.z = pose3[0, :3].tolist()
+    orientation.x, orientation.y, orientation.z, orientation.w = pose3[0, 3:].tolist()
+    pose3[:, :3] = 0.0
+    Ad = manifold.adjoint(manifold.from_pose3(pose3))[0]
+    rows, whole = np.array(manifold.COVARIANCE_ROWS), np.zeros((6, 6))
+    whole[rows[:, None], rows] = Ad @ covariance @ Ad.T
+    message.pose.covariance = whole.ravel()
+    return message
+
+
 def header(frame: str, stamp: int) -> Header:
     """Return a header with its stamp [ns]."""
     seconds, nanoseconds = divmod(int(stamp), _SECOND)
     return Header(frame_id=frame, stamp=Time(sec=seconds, nanosec=nanoseconds))
 
 
-def _string(text: str) -> bytes:
+def string_bytes(text: str) -> bytes:
     """Return a CDR string: its length with the closing zero, its characters."""
     data = text.encode() + b'\0'
     return struct.pack('<I', len(data)) + data
 
 
-def _header(frame: str, stamp: int) -> bytes:
+def header_bytes(frame: str, stamp: int) -> bytes:
+    """Return a std_msgs/Header in CDR; stamp [ns]."""
     seconds, nanoseconds = divmod(stamp, _SECOND)
-    return struct.pack('<iI', seconds, nanoseconds) + _string(frame)
+    return struct.pack('<iI', seconds, nanoseconds) + string_bytes(frame)

@@ -8,7 +8,7 @@ Messages are published as the bytes they are in the bag; nothing is decoded.
 import argparse
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
 
@@ -162,34 +162,13 @@ def _message_class(msgtype: str) -> type | None:
     return kind
 
 
-class _Damage:
-    """Says each damage once, however often the bag is played."""
-
-    def __init__(self) -> None:
-        self.sentences: set[str] = set()
-
-    def tell(self, sentence: str) -> None:
-        """Say a sentence on damage."""
-        if sentence not in self.sentences:
-            print(f'replay: {sentence}', file=sys.stderr)
-        self.sentences.add(sentence)
-
-
-def _rounds(arguments: argparse.Namespace, summary: BagSummary, topics: list[str],
-            damage: _Damage) -> Iterator[Iterator[RawMessage]]:
-    """Yield the messages to play: once, or again and again with --loop."""
+def _play(arguments: argparse.Namespace, tell: Callable[[str], None]) -> None:
+    """Play a bag once, or again and again with --loop; tell : is given what is damaged."""
+    summary = bag_summary(arguments.bag)
     start = summary.start + round(arguments.start * _SECOND)
     stop = None
     if arguments.duration is not None:
         stop = start + round(arguments.duration * _SECOND)
-    while True:
-        yield read_raw(arguments.bag, topics, damage.tell, start=start, stop=stop)
-        if not arguments.loop:
-            return
-
-
-def _play(arguments: argparse.Namespace, damage: _Damage) -> None:
-    summary = bag_summary(arguments.bag)
     # Without /rosout: a line that is logged just when a signal comes would be an error there.
     node = rclpy.create_node('replay', enable_rosout=False)
     try:
@@ -198,9 +177,13 @@ def _play(arguments: argparse.Namespace, damage: _Damage) -> None:
             raise FileError(arguments.bag, 'no topic of this bag can be played')
         player.wait_for_subscribers(arguments.wait)
         seconds = max(summary.duration / _SECOND - arguments.start, 0)
-        for messages in _rounds(arguments, summary, list(player.publishers), damage):
+        again = True
+        while again:
+            messages = read_raw(arguments.bag, list(player.publishers), tell, start=start,
+                                stop=stop)
             with Progress(min(seconds, arguments.duration or seconds), 's') as progress:
                 player.play(messages, arguments.rate, progress)
+            again = arguments.loop
     finally:
         node.destroy_node()
 
@@ -254,10 +237,17 @@ def main() -> int:
     own, ros = _split(sys.argv[1:])
     arguments = _parser().parse_args(own)
     arguments.remap = dict(arguments.remap)
-    damage = _Damage()
+    damages: list[str] = []
+
+    def tell(damage: str) -> None:
+        # Once, however often the bag is played.
+        if damage not in damages:
+            print(f'replay: {damage}', file=sys.stderr)
+            damages.append(damage)
+
     rclpy.init(args=ros)
     try:
-        _play(arguments, damage)
+        _play(arguments, tell)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (L1SlamError, OSError) as error:
@@ -265,4 +255,4 @@ def main() -> int:
         return _BAD_INPUT
     finally:
         rclpy.try_shutdown()
-    return _DAMAGED if damage.sentences else 0
+    return _DAMAGED if damages else 0

@@ -16,6 +16,8 @@ from typing import Any
 
 # [s] A signal leaves that long for an orderly end; the threads of the node get a part of it.
 _PATIENCE, _THREADS = 1.2, 0.9
+# [s] And so much longer for a map that is being saved.
+_SAVING = 4.5
 # [s] What raises each time it is called shall not keep a core busy.
 _BREATH = 0.05
 # [s] How long the interpreter lets the solver's own Python run before a callback may.
@@ -29,12 +31,14 @@ class Ending:
     Attributes
     ----------
     begun : whether there was a signal
+    saving : returns whether a map is being saved
 
     """
 
     def __init__(self) -> None:
         self.begun = False
         self._wake: Callable[[], None] | None = None
+        self.saving: Callable[[], bool] = lambda: False
         self._read, write = os.pipe()
         os.set_blocking(write, False)
         signal.set_wakeup_fd(write, warn_on_full_buffer=False)
@@ -56,6 +60,9 @@ class Ending:
         else:
             self._wake()
             time.sleep(_PATIENCE)
+            deadline = time.monotonic() + _SAVING
+            while self.saving() and time.monotonic() < deadline:
+                time.sleep(_BREATH)
             leave(0)
 
 
@@ -84,6 +91,7 @@ def main() -> int:
     ending.orderly(rclpy.try_shutdown)
     try:
         node = BackendNode()
+        ending.saving = node.is_saving
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.get_logger().info('ready: waiting for odometry')

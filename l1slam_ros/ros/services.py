@@ -2,17 +2,18 @@
 """The services of the node, and what the thread of the orders does for each."""
 
 from collections.abc import Awaitable, Callable
-from pathlib import Path
 
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
+from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from l1slam_ros.core.errors import DoubtfulError, OptionError
+from l1slam_ros.core.errors import DoubtfulError, L1SlamError
 from l1slam_ros.core.online.backend import Backend, Stopped
-from l1slam_ros.io.graphs.saved_map import load_map, save_map
+from l1slam_ros.io.graphs.map_file import MapFile
 from l1slam_ros.io.sentences import doubt_sentence
+from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.orders import Orders
 
 
@@ -25,20 +26,23 @@ class MapServices:
     node : to create them on
     backend : what they act on
     orders : where they place their work
-    save_path : returns the file of `~/save` and `~/load` as it is set now
+    map_file : of `~/save` and `~/load`
+    failures : where to tell what nobody asked for
     pause : called, at once, with whether updates shall pause
     stopped : asked whether the node is ending
 
     """
 
-    def __init__(self, node: Node, backend: Backend, orders: Orders,
-                 save_path: Callable[[], str], pause: Callable[[bool], None], stopped: Stopped):
-        self._backend, self._orders = backend, orders
-        self._save_path, self._pause, self._stopped = save_path, pause, stopped
+    def __init__(self, node: Node, backend: Backend, orders: Orders, map_file: MapFile,
+                 failures: Failures, pause: Callable[[bool], None], stopped: Stopped):
+        self._backend, self._orders, self._map_file = backend, orders, map_file
+        self._failures, self._pause, self._stopped = failures, pause, stopped
+        self._autosaving = Future()
+        self._autosaving.set_result(None)
         # A group of their own: a service that awaits its answer would block its whole group.
         group = ReentrantCallbackGroup()
         for name, work in (('optimize', self._optimise), ('reset', self.reset),
-                           ('save', self._save), ('load', self._load)):
+                           ('save', map_file.save), ('load', map_file.load)):
             node.create_service(Trigger, f'~/{name}', self._trigger(name, work),
                                 callback_group=group)
         node.create_service(SetBool, '~/pause', self._set_pause, callback_group=group)
@@ -75,18 +79,16 @@ class MapServices:
         self._backend.reset()
         return 'the map is empty'
 
-    def _save(self) -> str:
-        path = self._file()
-        return f'{save_map(path, self._backend.snapshot())} keyframes saved to {path}'
+    def autosave(self, at_end: bool = False) -> None:
+        """Let the map be saved if it is time, or the end; it is told if that fails."""
+        if self._autosaving.done() and (at_end or self._map_file.is_due):
+            self._autosaving = self._orders.place('the map file', self._autosave)
 
-    def _load(self) -> str:
-        path = self._file()
-        graph, poses, stamps = load_map(path)
-        self._backend.restore(graph, poses, stamps)
-        return f'{len(poses)} keyframes loaded from {path}'
-
-    def _file(self) -> Path:
-        path = self._save_path()
-        if not path:
-            raise OptionError('the parameter save_path is empty, expected the name of a .g2o file')
-        return Path(path)
+    def _autosave(self) -> str:
+        try:
+            self._map_file.autosave()
+        except (L1SlamError, OSError) as error:
+            self._failures.note('autosave', error)
+        else:
+            self._failures.over('autosave')
+        return 'saved'

@@ -20,6 +20,7 @@ from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.solvers import block_cholesky as cholesky
 from l1slam_ros.core.solvers.optimality import l1_cost
+from l1slam_ros.io import progress
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 
 VERTICES = ['VERTEX_SE2 0 0 0 0', 'VERTEX_SE2 1 1 0 0', 'VERTEX_SE2 2 2 0 0']
@@ -29,6 +30,12 @@ EDGES = ['EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1',
 
 # The costs of the odometry as it stands, every loop counted.
 ODOMETRY = ('--no-robust', '--start', 'odometry', '--outer', 0)
+
+
+@pytest.fixture(autouse=True)
+def no_progress(monkeypatch):
+    """On a machine that is busy a log would have lines on what takes long."""
+    monkeypatch.setattr(progress, '_PATIENCE', float('inf'))
 
 
 def graph_file(folder, lines):
@@ -54,13 +61,6 @@ def run(capsys, *arguments):
 
 def solve_json(capsys, *arguments):
     return json.loads(run(capsys, 'solve', *arguments, '--json')[0])
-
-
-def test_of_a_graph_without_loops_nothing_is_said_of_loops(capsys, tmp_path):
-    chain = tmp_path / 'chain.g2o'
-    chain.write_text('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0 1 0 0 1 0 1\n')
-    lines = run(capsys, 'solve', chain)[0].splitlines()
-    assert all(lines) and 'refused' not in ''.join(lines)
 
 
 def test_solve_reports_what_it_wrote(capsys, world, tmp_path):
@@ -273,23 +273,20 @@ def test_a_map_that_loops_agree_is_wrong_is_given_as_doubtful(capsys, torn, tmp_
     assert picture.exists()
 
 
-def test_a_doubt_is_said_even_quietly_and_with_the_times_of_a_bag(capsys, torn, tmp_path):
-    run(capsys, 'convert', torn[0], tmp_path / 'bag')
-    assert main(['solve', str(tmp_path / 'bag'), '--quiet']) == 4
-    out, err = capsys.readouterr()
-    said = DOUBT.fullmatch(err.removeprefix('l1slam: ').rstrip('\n'))
-    first, last = int(said[2]), int(said[3])
-    assert out == '' and said[4] == (
-        f' ({1000 + first / 10:.9f} s to {1000 + last / 10:.9f} s)')
-
-
-def test_a_damaged_bag_with_a_doubtful_map_says_both(capsys, torn, tmp_path):
-    run(capsys, 'convert', torn[0], tmp_path / 'bag')
-    whole = (tmp_path / 'bag' / 'bag.mcap').read_bytes()
-    (tmp_path / 'cut.mcap').write_bytes(whole[:-20])
-    assert main(['solve', str(tmp_path / 'cut.mcap'), '--quiet']) == 4
-    damage, doubt = capsys.readouterr().err.splitlines()
-    assert 'is damaged' in damage and DOUBT.fullmatch(doubt.removeprefix('l1slam: '))
+def test_a_doubt_is_said_even_quietly_with_the_times_of_a_bag_and_beside_its_damage(
+        capsys, torn, tmp_path):
+    bag, cut = tmp_path / 'bag', tmp_path / 'cut.mcap'
+    run(capsys, 'convert', torn[0], bag)
+    cut.write_bytes((bag / 'bag.mcap').read_bytes()[:-20])
+    for path, damages in (bag, 0), (cut, 1):
+        assert main(['solve', str(path), '--quiet']) == 4
+        out, err = capsys.readouterr()
+        *damage, doubt = err.splitlines()
+        said = DOUBT.fullmatch(doubt.removeprefix('l1slam: '))
+        first, last = int(said[2]), int(said[3])
+        assert out == '' and said[4] == (
+            f' ({1000 + first / 10:.9f} s to {1000 + last / 10:.9f} s)')
+        assert len(damage) == damages and all('is damaged' in sentence for sentence in damage)
 
 
 def test_most_loops_refused_is_a_doubt(capsys, world, tmp_path):
@@ -342,7 +339,8 @@ def test_a_graph_without_loops_is_its_odometry(capsys, tmp_path):
     report = solve_json(capsys, graph_file(tmp_path, EDGES[:2]))
     assert report['status'] == 'converged' and report['final_cost'] < 1e-6
     assert report['warnings'] == report['rejected'] == report['suspect'] == []
-    assert 'refused' not in run(capsys, 'solve', tmp_path / 'graph.g2o')[0]
+    lines = run(capsys, 'solve', tmp_path / 'graph.g2o')[0].splitlines()
+    assert all(lines) and 'refused' not in ''.join(lines)
 
 
 def test_a_parameter_file_may_say_that_all_loops_are_believed(capsys, tmp_path, lies):
@@ -377,14 +375,6 @@ def test_without_json_there_is_a_summary_and_with_quiet_nothing(capsys, world):
     assert run(capsys, 'solve', world, '--quiet') == ('', '')
 
 
-def test_graph_to_bag_to_graph_is_one_graph(capsys, world, tmp_path):
-    run(capsys, 'convert', world, tmp_path / 'bag')
-    run(capsys, 'convert', tmp_path / 'bag', tmp_path / 'back.g2o')
-    costs = [solve_json(capsys, path, *ODOMETRY)['initial_cost']
-             for path in (world, tmp_path / 'bag', tmp_path / 'back.g2o')]
-    assert np.ptp(costs) <= 1e-9 * costs[0]
-
-
 def copied_bag(bag, copy, renamed=None, note=True):
     """Copy a bag into an sqlite one by rosbags' own reader and writer."""
     writer = Writer(copy, version=9, storage_plugin=StoragePlugin.SQLITE3)
@@ -407,30 +397,23 @@ def doors(capsys, world, tmp_path):
     """One graph in every form that a user may have it in."""
     run(capsys, 'convert', world, tmp_path / 'a.graph')
     run(capsys, 'convert', world, tmp_path / 'bag')
+    run(capsys, 'convert', tmp_path / 'bag', tmp_path / 'back.g2o')
     sqlite = copied_bag(tmp_path / 'bag', tmp_path / 'sqlite')
-    return [world, tmp_path / 'a.graph', tmp_path / 'bag', tmp_path / 'bag' / 'bag.mcap', sqlite,
-            sqlite / 'sqlite.db3']
+    return [world, tmp_path / 'a.graph', tmp_path / 'bag', tmp_path / 'bag' / 'bag.mcap',
+            tmp_path / 'back.g2o', sqlite, sqlite / 'sqlite.db3']
 
 
-def test_every_door_leads_to_the_same_costs(capsys, doors):
-    for norm in 'l1', 'l2', 'huber':
-        costs = [solve_json(capsys, door, *ODOMETRY, '--norm', norm)['initial_cost']
-                 for door in doors]
-        np.testing.assert_allclose(costs, costs[0], rtol=1e-9)
-        assert costs[0] > 100
-
-
-@pytest.mark.parametrize('norm', ['l1', 'l2'])
-def test_every_door_leads_to_the_same_poses(capsys, doors, tmp_path, norm):
-    outputs = []
-    for k, door in enumerate(doors):
-        run(capsys, 'solve', door, '--no-robust', '--start', 'odometry', '--norm', norm,
-            '--quiet', '--output', tmp_path / f'{k}.tum')
-        outputs.append(np.loadtxt(tmp_path / f'{k}.tum'))
-    moved = np.linalg.norm(outputs[0][:, 1:3] - np.loadtxt(f'{doors[0]}.truth.txt')[:, 1:3])
-    assert moved > 0.1
-    for output in outputs[1:]:
-        np.testing.assert_allclose(output, outputs[0], atol=1e-6)
+@pytest.mark.parametrize('norm', ['l1', 'l2', 'huber'])
+def test_every_door_leads_to_the_same_costs_and_poses(capsys, doors, tmp_path, norm):
+    costs, poses = [], []
+    for door in doors:
+        report = solve_json(capsys, door, '--no-robust', '--start', 'odometry', '--norm', norm,
+                            '--output', tmp_path / 'out.tum')
+        costs.append(report['initial_cost'])
+        poses.append(np.loadtxt(tmp_path / 'out.tum'))
+    assert np.ptp(costs) <= 1e-9 * costs[0] and costs[0] > 100
+    assert np.linalg.norm(poses[0][:, 1:3] - np.loadtxt(f'{doors[0]}.truth.txt')[:, 1:3]) > 0.1
+    assert np.ptp(poses, axis=0).max() < 1e-6
 
 
 def test_a_bag_without_our_note_goes_by_the_parameters(capsys, world, tmp_path):
@@ -485,29 +468,17 @@ def test_a_cut_bag_is_read_in_part_and_exits_with_3(capsys, world, tmp_path):
     assert out == '' and err.startswith(f'l1slam: {cut}') and err.count('\n') == 1
 
 
-def test_intel_as_a_bag_is_the_same_graph(capsys, datasets, tmp_path):
-    run(capsys, 'convert', datasets / 'intel.g2o', tmp_path / 'bag')
-    costs = [solve_json(capsys, path, *ODOMETRY)['initial_cost']
-             for path in (datasets / 'intel.g2o', tmp_path / 'bag')]
-    assert costs[0] == pytest.approx(16108.59, abs=0.005)
-    assert costs[1] == pytest.approx(costs[0], abs=1e-6)
-
-
-def test_a_trajectory_goes_out_as_tum_and_in_as_reference(capsys, world, tmp_path):
-    output = tmp_path / 'out.tum'
-    report = solve_json(capsys, world, '--output', output, '--reference', f'{world}.truth.txt')
-    assert len(output.read_text().splitlines()) == 150
-    assert report['ate'] > 0
-    assert solve_json(capsys, world, '--reference', output)['ate'] == pytest.approx(0, abs=1e-8)
-
-
-def test_stamps_rounded_to_microseconds_still_match(capsys, world, tmp_path):
+def test_a_trajectory_goes_out_as_tum_and_in_as_reference_with_stamps_that_others_round(
+        capsys, world, tmp_path):
     output = tmp_path / 'out.tum'
     run(capsys, 'solve', world, '--output', output, '--quiet')
     lines = [line.split() for line in output.read_text().splitlines()]
-    output.write_text('\n'.join(' '.join([f'{float(stamp) + 2e-7:.6f}', *rest])
-                                for stamp, *rest in lines))
-    assert solve_json(capsys, world, '--reference', output)['ate'] == pytest.approx(0, abs=1e-5)
+    assert len(lines) == 150
+    for shift in 0, 2e-7:
+        output.write_text('\n'.join(' '.join([f'{float(stamp) + shift:.6f}', *rest])
+                                    for stamp, *rest in lines))
+        ate = solve_json(capsys, world, '--reference', output)['ate']
+        assert ate == pytest.approx(0, abs=1e-5 if shift else 1e-8)
 
 
 def test_simulate_writes_truth_and_false_loops(capsys, tmp_path):
@@ -517,13 +488,6 @@ def test_simulate_writes_truth_and_false_loops(capsys, tmp_path):
     assert pairs.shape == (5, 2) and (pairs[:, 1] > pairs[:, 0] + 1).all()
     assert len(np.loadtxt(f'{output}.truth.txt')) == 200
     assert 'loops       106' in run(capsys, 'info', output)[0]
-
-
-def test_info_counts_components(capsys, tmp_path):
-    lines = [*VERTICES, 'VERTEX_SE2 7 0 0 0', 'VERTEX_SE2 8 0 0 0', *EDGES,
-             'EDGE_SE2 7 8 1 0 0 1 0 0 1 0 1']
-    out, _ = run(capsys, 'info', graph_file(tmp_path, lines))
-    assert 'poses       5' in out and 'components  2' in out and 'odometry    3' in out
 
 
 def test_info_of_a_good_graph_and_of_its_bag(capsys, world, tmp_path):
@@ -632,27 +596,6 @@ def test_corrupt_adds_far_pairs_and_keeps_the_rest(capsys, odd, world, tmp_path,
     claimed = np.linalg.norm(after.graph.between.measurement[false][:, :2], axis=1)
     assert claimed.max() < {'random': 2, 'identity': 1e-9, 'grouped': 40}[kind]
     assert solve_json(capsys, tmp_path / 'bad.g2o')['loops'] == 141
-
-
-def test_grouped_false_loops_run_along_and_agree(capsys, odd, tmp_path):
-    record, false, pairs = corrupted(capsys, odd, tmp_path / 'bad.g2o', '--false-loops', 45,
-                                     '--kind', 'grouped')
-    factors = record.graph.between
-    z = {(i, j): m for i, j, m in zip(factors.i[false], factors.j[false],
-                                      factors.measurement[false], strict=True)}
-    steps = factors.measurement[factors.is_odometry]
-    runs = [(i, j) for i, j in z if (i - 1, j - 1) not in z]
-    lengths = []
-    for i, j in runs:
-        k = 0
-        while (i + k + 1, j + k + 1) in z:
-            around = se2.compose(steps[i + k], z[i + k + 1, j + k + 1])
-            np.testing.assert_allclose(se2.compose(z[i + k, j + k], steps[j + k]), around,
-                                       atol=1e-9)
-            k += 1
-        lengths.append(k + 1)
-    assert sum(lengths) == 45 and len(lengths) <= 5
-    assert sum(10 <= length <= 20 for length in lengths) >= len(lengths) - 2
 
 
 def test_another_seed_draws_other_loops_and_the_same_one_the_same(capsys, world, tmp_path):

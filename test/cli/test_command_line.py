@@ -62,16 +62,16 @@ def test_what_runs_nothing_imports_nothing(tmp_path, arguments):
 
 
 @pytest.mark.parametrize('arguments, used', [
-    (('convert', 'graph.g2o', 'out.graph'), {'numpy', 'scipy'}),
-    (('convert', 'graph.g2o', 'out'), {'numpy', 'scipy', 'mcap', 'rosbags', 'yaml'}),
-    (('plot', 'graph.g2o', '--output', 'map.png'), {'numpy', 'scipy', 'matplotlib'}),
-    (('info', 'graph.g2o'), {'numpy', 'scipy'}),
-    (('solve', 'missing.g2o'), {'numpy', 'scipy'}),
-    (('solve', 'graph.g2o'), {'numpy', 'scipy', 'numba'})], ids=lambda value: ' '.join(value))
+    (('convert', 'graph.g2o', 'out.graph'), ('numpy', 'scipy')),
+    (('convert', 'graph.g2o', 'out'), ('numpy', 'scipy', 'mcap', 'rosbags', 'yaml')),
+    (('plot', 'graph.g2o', '--output', 'map.png'), ('numpy', 'scipy', 'matplotlib')),
+    (('info', 'graph.g2o'), ('numpy', 'scipy')),
+    (('solve', 'missing.g2o'), ('numpy', 'scipy')),
+    (('solve', 'graph.g2o'), ('numpy', 'scipy', 'numba'))], ids=lambda value: ' '.join(value))
 def test_a_command_imports_what_it_uses(graph, arguments, used):
     """Others may be behind these: numba and matplotlib look for YAML."""
     found = imported(*arguments, cwd=graph.parent) & HEAVY
-    assert 'numpy' in found <= used | {'yaml'}
+    assert 'numpy' in found <= {*used, 'yaml'}
 
 
 def test_the_version_is_that_of_the_package(capsys):
@@ -93,7 +93,7 @@ def test_a_reader_that_has_gone_is_no_error(graph, arguments):
                       capture_output=False)
     finally:
         os.close(writing)
-    assert (done.returncode, done.stderr) == (141, '')
+    assert done.returncode == 141 and 'Error' not in done.stderr
 
 
 @pytest.mark.skipif(not Path('/dev/full').exists(), reason='no device that is always full')

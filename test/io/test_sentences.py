@@ -20,7 +20,7 @@ from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.sentences import doubt_sentence, verdict
+from l1slam_ros.io.sentences import doubt_sentence, judgement_sentences
 
 N, LOOPS = 30, 27  # keyframes k with the ids 10 + 3 k; loops (k, k + 2)
 
@@ -51,11 +51,11 @@ def judgement(refused=(), suspect=(), slips=(), variance=(1.0, 1.0)):
 
 
 def test_nothing_refused_is_one_sentence(record):
-    assert list(verdict(record, judgement())) == ['0 of 27 loops refused']
+    assert list(judgement_sentences(record, judgement())) == ['0 of 27 loops refused']
 
 
 def test_refused_loops_are_named_by_their_vertices_the_worst_first(record):
-    assert list(verdict(record, judgement({1: 5.04, 20: 123.45, 7: 9.0}))) == [
+    assert list(judgement_sentences(record, judgement({1: 5.04, 20: 123.45, 7: 9.0}))) == [
         '3 of 27 loops refused',
         '  70 - 76: 123.5 sigmas off the accepted ones',
         '  31 - 37: 9.0 sigmas off the accepted ones',
@@ -64,7 +64,7 @@ def test_refused_loops_are_named_by_their_vertices_the_worst_first(record):
 
 @pytest.mark.parametrize('count, more', [(19, None), (20, None), (21, 1), (27, 7)])
 def test_of_many_the_worst_twenty_are_named(record, count, more):
-    said = list(verdict(record, judgement({k: 10.0 + k for k in range(count)})))
+    said = list(judgement_sentences(record, judgement({k: 10.0 + k for k in range(count)})))
     assert said[0] == f'{count} of 27 loops refused'
     named = [line for line in said if ' sigmas off the accepted ones' in line]
     assert len(named) == min(count, 20)
@@ -79,13 +79,13 @@ def test_of_many_the_worst_twenty_are_named(record, count, more):
     ([5, 6], '2 loops suspect and left out: nothing vouches for them, and they could as well fit '
              'by chance')])
 def test_suspects_are_counted_apart(record, suspect, sentence):
-    said = list(verdict(record, judgement({3: 8.0}, suspect=suspect)))
+    said = list(judgement_sentences(record, judgement({3: 8.0}, suspect=suspect)))
     assert said == ['1 of 27 loops refused', '  19 - 25: 8.0 sigmas off the accepted ones',
                     sentence]
 
 
 def test_odometry_that_lies_is_said_first_and_is_no_loop(record):
-    said = list(verdict(record, judgement({0: 8.0}, slips=[2, 9])))
+    said = list(judgement_sentences(record, judgement({0: 8.0}, slips=[2, 9])))
     assert said == [
         'odometry 16 - 19 lies: 42.0 sigmas off what the loops say; left out',
         'odometry 37 - 40 lies: 49.0 sigmas off what the loops say; left out',
@@ -105,7 +105,7 @@ NOISY_LOOPS = ('the loops are about {} times as noisy as they say: a false one t
     ((1.0, 1e4), [NOISY_LOOPS.format('100.0')]),
     ((6.25, 20.25), [NOISY_ODOMETRY.format('2.5'), NOISY_LOOPS.format('4.5')])])
 def test_what_is_twice_as_noisy_as_it_says_or_more_is_told_last(record, variance, said):
-    assert list(verdict(record, judgement(suspect=[5], variance=variance)))[2:] == said
+    assert list(judgement_sentences(record, judgement(suspect=[5], variance=variance)))[2:] == said
 
 
 @pytest.mark.parametrize('stamps, when', [
@@ -129,7 +129,7 @@ def test_a_lone_loop_is_one_loop(record):
                       np.tile(np.eye(3), (3, 1, 1)))
     believed = replace(judgement(), accepted=np.ones(3, bool), suspect=np.zeros(3, bool),
                        sigmas=np.ones(3))
-    said = list(verdict(GraphRecord(graph, None, np.arange(3)), believed))
+    said = list(judgement_sentences(GraphRecord(graph, None, np.arange(3)), believed))
     assert said == ['0 of 1 loop refused']
 
 
@@ -144,6 +144,6 @@ def test_what_a_solve_finds_of_the_noise_is_told():
     graph.add_between(factors.i, factors.j, factors.measurement, information * boast)
     found = minimise_robustly(graph, lambda part, poses: minimise_l2(
         part, poses, LeastSquaresOptions(), cholesky_of(part)))
-    said = list(verdict(GraphRecord(graph, None, np.arange(200)), found.judgement))[-1]
+    said = list(judgement_sentences(GraphRecord(graph, None, np.arange(200)), found.judgement))[-1]
     times = re.fullmatch(re.escape(NOISY_ODOMETRY).replace(r'\{\}', r'(\d+\.\d)'), said)
     assert 3 < float(times[1]) < 6

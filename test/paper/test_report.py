@@ -9,12 +9,11 @@ import pytest
 from l1slam_ros.core.solvers.nonlinear import Solution
 from l1slam_ros.core.solvers.optimality import Status
 from l1slam_ros.io.plot import MapDrawing
+from l1slam_ros.paper import figures, report
 from l1slam_ros.paper import printed as paper
-from l1slam_ros.paper import report
 from l1slam_ros.paper.experiments import Costs, Seconds
-from l1slam_ros.paper.figures import best_huber, drawn_noise
-from l1slam_ros.paper.trials import (
-    HUBER_WIDTHS,
+from l1slam_ros.paper.runs import (
+    HUBERS,
     JOINT,
     L1,
     L2,
@@ -22,33 +21,28 @@ from l1slam_ros.paper.trials import (
     ROBUST,
     SEED,
     START,
-    LoopTrial,
-    LoopTrials,
+    LoopRun,
+    LoopRuns,
     Map,
-    StartTrial,
-    StartTrials,
-    huber_name,
+    StartRuns,
 )
 
 BENT = 1.0
 NO_PAIRS = np.zeros((0, 2), np.int64)
-NARROWEST, NARROW, USUAL, WIDE = map(huber_name, HUBER_WIDTHS)
+NARROWEST, NARROW, USUAL, WIDE = HUBERS
 
 
 def shown(error, cost=100.0):
     return Map(np.zeros((3, 2)), cost, error)
 
 
-def starts(l2_errors, l1_errors, l2_of_seed=0.1):
-    """Trials of two draws for each noise, with one error for both draws of a noise or a pair."""
-    found = []
-    for noise, l2, l1 in zip(NOISES, l2_errors, l1_errors, strict=True):
-        for k in range(2):
-            found.append(StartTrial(noise, {
-                START: shown(9.0, 5000 * noise), L2: shown(np.ravel([l2, l2])[k], 400.0),
-                L1: shown(np.ravel([l1, l1])[k], 300.0)}))
-    return StartTrials(shown(0.2, 110.0), shown(0.0, 100.0), shown(l2_of_seed, 150.0),
-                       np.array([110.0, 105.0]), found, NO_PAIRS, BENT)
+def starts(l2_errors, l1_errors):
+    """Two draws for each noise, with one error for both draws of a noise or a pair."""
+    noisy = {noise: [{START: shown(9.0, 5000 * noise), L2: shown(np.ravel([l2, l2])[k], 400.0),
+                      L1: shown(np.ravel([l1, l1])[k], 300.0)} for k in range(2)]
+             for noise, l2, l1 in zip(NOISES, l2_errors, l1_errors, strict=True)}
+    from_seed = {START: shown(0.2, 110.0), L2: shown(0.1, 150.0), L1: shown(0.0, 100.0)}
+    return StartRuns(from_seed, noisy, np.array([110.0, 105.0]), NO_PAIRS, BENT)
 
 
 def liars(kept=0, lost=0, **errors):
@@ -57,9 +51,9 @@ def liars(kept=0, lost=0, **errors):
              'narrow': NARROW, 'usual': USUAL, 'wide': WIDE}
     of = {name: errors.get(word, (0.0, 0.0)) for word, name in names.items()}
     pairs = np.arange(8).reshape(4, 2)
-    found = [LoopTrial({name: shown(error[k]) for name, error in of.items()}, pairs[kept:],
+    found = [LoopRun({name: shown(error[k]) for name, error in of.items()}, pairs[kept:],
                        pairs[:kept], pairs[:lost]) for k in range(2)]
-    return LoopTrials({JOINT: shown(0.0)}, NO_PAIRS, found, BENT)
+    return LoopRuns({JOINT: shown(0.0)}, NO_PAIRS, found, BENT)
 
 
 def table(lines):
@@ -107,17 +101,18 @@ def test_table_2_sets_times_beside_those_of_the_paper():
     assert [large['L2: paper (g2o)'], large['L2: ours']] == ['did not finish', '2800']
 
 
-def test_a_curve_has_arrived_where_it_stays():
+def test_a_curve_has_arrived_where_it_stays(tmp_path):
     out_again = np.array([[0, 100.0], [40, 100.1], [80, 150.0], [120, 100.05]])
     never = np.array([[0, 300.0], [40, 250.0], [80, 200.0]])
-    one, other = table(report.figure_2(report.Results([], convergence={
-        'angle': {'one': out_again, 'other': never}})))
+    one, other = table(figures.figure_2(report.Results([], convergence={
+        'angle': {'one': out_again, 'other': never}}), tmp_path))
     assert [*one.values()] == ['angle', 'one', '120', '100', '100.05', '0.05%', '120']
     assert [*other.values()][-2:] == ['100.00%', 'not reached']
 
 
 def test_figure_4_has_every_noise_and_the_seed():
-    rows = table(report.figure_4(starts([0.1, 0.1, (0.1, 3.0), 4.0], [0.0, 0.0, 0.0, 2.0])))
+    runs = starts([0.1, 0.1, (0.1, 3.0), 4.0], [0.0, 0.0, 0.0, 2.0])
+    rows = table(figures.table_of_starts(runs))
     by_start = {row['start']: [*row.values()][1:] for row in rows}
     assert len(rows) == len(NOISES) + 2
     assert by_start['noise of 1 m, 1 rad'] == [
@@ -131,15 +126,15 @@ def test_figure_4_has_every_noise_and_the_seed():
 @pytest.mark.parametrize(('errors', 'noise'), [
     ([0.1, 2.0, 0.1, 3.0], 0.5), ([0.1, 0.1, (0.1, 3.0), 3.0], 2), ([0.1] * 4, 2)])
 def test_the_start_that_is_drawn_is_the_first_that_l2_does_not_survive(errors, noise):
-    assert drawn_noise(starts(errors, [0.0] * 4)) == noise
+    assert figures.drawn_noise(starts(errors, [0.0] * 4)) == noise
 
 
 def test_figure_6_has_every_method_and_what_was_refused():
     good = liars(seed=(0.2, 0.4), narrow=(0.5, 0.5), narrowest=(0.6, 0.6), usual=(2, 2),
                  wide=(3, 3))
     bad = liars(seed=(20, 30), robust=(0.0, 1.5), kept=1, lost=2)
-    lines = report.figure_6({'Good': good, 'Bad': bad})
-    methods, refused = table(lines[:lines.index('')]), table(lines[lines.index(''):])
+    runs = {'Good': good, 'Bad': bad}
+    methods, refused = table(figures.table_of_methods(runs)), table(figures.table_of_refused(runs))
     assert [row['off its own clean map'] for row in methods] == [
         SEED, JOINT, NARROWEST, NARROW, USUAL, WIDE, ROBUST]
     assert [*methods[0].values()] == [SEED, '0.30 m', '0.20 to 0.40 m', '2 of 2',
@@ -149,7 +144,7 @@ def test_figure_6_has_every_method_and_what_was_refused():
     assert [[*row.values()] for row in refused] == [
         ['Good', '0', '4', '2', '1.00 m', '8 of 8', '0'],
         ['Bad', '0', '4', '2', '1.00 m', '6 of 8', '4']]
-    assert best_huber(good) == NARROW
+    assert figures.best_huber(good) == NARROW
 
 
 def test_numbers_are_printed_as_in_the_paper():

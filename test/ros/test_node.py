@@ -11,18 +11,16 @@ pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from node_bench import DEADLINE, TYPES, Bench, call, odometry, poses_of
-from problems import add_absolute
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 from torn import torn_graph
-from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions
-from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED
+from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.options import with_values
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
@@ -34,7 +32,7 @@ from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bags.from_graph import write_graph_bag
 from l1slam_ros.io.bags.reader import read_raw
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
-from l1slam_ros.io.messages.conversion import loop_closure, odometry_sample
+from l1slam_ros.io.messages.conversion import loop_closure, odometry_sample, stamp_of
 from l1slam_ros.io.sentences import doubt_sentence
 from l1slam_ros.ros.publishing import header
 
@@ -141,7 +139,9 @@ def test_pose_and_transform_agree_with_the_path(bench, tmp_path, rng):
     b.received['pose'].clear()
     b.received['map_to_odom'].clear()
     b.until(lambda: b.received['map_to_odom'], 'a transform is repeated')
-    assert last.header.stamp == b.received['map_to_odom'][-1].header.stamp
+    # A look-up at the time of the newest odometry finds it.
+    ahead = [stamp_of(m.header) - stamp_of(last.header) for m in b.received['map_to_odom']]
+    assert ahead[0] == pytest.approx(10**8, abs=1e4) and (np.diff(ahead) > 0).all()
 
 
 def test_default_thresholds_make_a_keyframe_every_half_metre(bench):
@@ -223,9 +223,7 @@ def test_a_loaded_map_trusts_the_loop_that_was_vouched_for(bench, tmp_path):
     assert call(b, 'load').success and states() == [ACCEPTED]
     b.until(lambda: len(b.path().poses) == 6, 'the map is back')
     assert b.backend._backend.snapshot().graph.between.trusted.tolist() == [False] * 5 + [True]
-    (tmp_path / 'map.g2o.trusted.txt').unlink()
-    assert call(b, 'load').success
-    b.until(lambda: states() == [REJECTED], 'without the file the loop is doubted')
+    assert [p.name for p in tmp_path.iterdir()] == ['map.g2o']
 
 
 def test_optimize_answers_with_the_cost_and_a_broken_file_leaves_the_map(bench, tmp_path, rng):
@@ -254,24 +252,12 @@ def test_optimize_takes_a_doubtful_map_and_says_so(bench, tmp_path):
     b.until(lambda: len(b.path().poses) == 400, 'the map is there')
     answer = call(b, 'optimize')
     expected, _ = robust_solve(graph)
-    assert answer.message == doubt_sentence(expected.doubt, np.arange(400), stamps)
+    assert answer.message == doubt_sentence(expected.doubts, np.arange(400), stamps)
     assert not answer.success and answer.message.startswith('doubtful: ')
     taken = b.backend._backend.snapshot()
     assert np.abs(taken.poses - poses).max() > 1
     assert (taken.loop_states().state == ACCEPTED).sum() > 200
     b.until(lambda: np.allclose(poses_of(b.path()), taken.poses, atol=1e-9), 'it is published')
-
-
-def test_a_map_with_priors_is_refused_and_the_node_goes_on(bench, tmp_path, rng):
-    graph = simulate_world(10, 12, WorldOptions(), rng).graph
-    add_absolute(graph, np.array([0]), np.zeros((1, 3)), np.eye(3)[None])
-    record = GraphRecord(graph, np.zeros((10, 3)), np.arange(10), 10**9 + np.arange(10))
-    write_graph_file(tmp_path / 'map.g2o', record)
-    b = bench(save_path=str(tmp_path / 'map.g2o'))
-    answer = call(b, 'load')
-    assert not answer.success and 'prior' in answer.message
-    b.send('/odom', odometry(2 * 10**9, 0.0))
-    b.until(lambda: len(b.path().poses) == 1, 'a new map begins')
 
 
 def test_no_update_while_paused(bench):
@@ -295,27 +281,6 @@ def test_diagnostics_count_what_was_refused(bench):
     b.until(lambda: any(
         {v.key: v.value for v in status.values}.get('refused.old_stamp') == '1'
         for message in heard for status in message.status), 'the refusal is reported')
-
-
-def test_the_graph_is_drawn_for_who_looks(bench, tmp_path, rng):
-    world = simulate_world(40, 60, WorldOptions(), rng)
-    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(40)))
-    b = bench(**EVERY_MESSAGE)
-    heard = []
-    b.peer.create_subscription(MarkerArray, 'graph', heard.append, 1)
-    b.until(lambda: b.backend._graph.get_subscription_count(), 'somebody looks')
-    play(b, tmp_path / 'bag')
-
-    def sizes():
-        return {m.ns: len(m.points) for m in heard[-1].markers} if heard else {}
-
-    def all_are_drawn():
-        points = sizes()
-        loops = [points.pop(name, 0) for name in ('loops', 'suspect_loops', 'rejected_loops')]
-        return points == {'keyframes': 40, 'odometry': 2 * 39} and sum(loops) == 2 * 21
-
-    b.until(all_are_drawn, 'keyframes and both ends of each factor are drawn')
-    assert sizes()['loops'] > 2 * 14
 
 
 def test_the_solver_never_starves_the_callbacks(bench, tmp_path, rng):

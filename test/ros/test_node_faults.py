@@ -110,7 +110,7 @@ def test_an_update_that_always_fails_is_not_tried_all_the_time(bench, monkeypatc
 
 
 @pytest.mark.parametrize('kind, service, module, function', [
-    ('ValueError', 'save', saved_map, 'write_graph_file'),
+    ('ValueError', 'save', saved_map, 'graph_lines'),
     ('MemoryError', 'load', saved_map, 'read_graph_file'),
     ('MemoryError', 'optimize', backend_module, 'optimise'),
     ('nan', 'optimize', backend_module, 'optimise')])

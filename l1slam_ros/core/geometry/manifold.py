@@ -11,13 +11,14 @@ Step
 Residual
     `e = t2v(Z^-1 Xi^-1 Xj)`: the error of the relative pose, in the axes of the measured pose. Xi
     may be the world: the identity, which never moves.
-    t2v reads the coordinates off (as g2o does); it is not the logarithm.
+    t2v reads the coordinates off (as g2o does); it is not the logarithm. Of small errors it is
+    the step that makes them, in SE(2) of all.
 Jacobian
     `J_r_i`: derivative of the residual r with respect to the step of pose i, at step zero.
 Stamp
     Integer nanoseconds.
 
-A manifold is a module of plain functions on stacked arrays: `se2` today. Nothing outside it
+A manifold is a module of plain functions on stacked arrays: `se2`, `se3`. Nothing outside it
 assumes a dimension: sizes, and which part of a step is rotation, are asked of it.
 """
 
@@ -63,7 +64,7 @@ class Manifold(Protocol):
         """Return pose v2t(step), (n, p)."""
 
     def local(self, a: Array, b: Array) -> Array:
-        """Return t2v(a^-1 b), (n, d): the step that retracts a to b."""
+        """Return the step that retracts a to b, (n, d)."""
 
     def adjoint(self, pose: Array) -> Array:
         """Return Ad, (n, d, d): pose v2t(s) = v2t(Ad s) pose to first order in s."""
@@ -76,12 +77,10 @@ class Manifold(Protocol):
     ) -> tuple[Array, Array]:
         """Return J_r_i and J_r_j of `residual`, each (n, d, d)."""
 
-    def residual_curvature(self, pose_i: Array, pose_j: Array, gradient: Array) -> Array:
-        """
-        Return the Hessian of dual'e over (step of i, step of j), (n, 2 d, 2 d).
-
-        gradient : (n, 2, d) J_r_i' dual and J_r_j' dual
-        """
+    def residual_curvature(
+        self, measurement: Array, pose_i: Array, pose_j: Array, dual: Array
+    ) -> Array:
+        """Return the Hessian of dual'e over (step of i, step of j), (n, 2 d, 2 d); dual (n, d)."""
 
     def local_jacobian(self, a: Array, b: Array) -> Array:
         """Return J_l_b of `local`, (n, d, d)."""
@@ -94,6 +93,9 @@ class Manifold(Protocol):
 
     def positions(self, pose: Array) -> Array:
         """Return the coordinates of the body's origin in the map [m], (n, 2 or 3)."""
+
+    def rotation(self, pose: Array) -> Array:
+        """Return the rotation matrices of poses, (n, k, k), k = 2 or 3."""
 
     def from_rotation(self, R: Array, t: Array) -> Array:
         """Return poses from rotation matrices (n, k, k) and positions (n, k), k = 2 or 3."""

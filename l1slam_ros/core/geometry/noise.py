@@ -11,6 +11,8 @@ A measurement may say nothing of some components: their rows and columns are zer
 information, in its root, and in the covariance that stands for it here.
 """
 
+from hashlib import blake2b
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -138,18 +140,19 @@ def bounds(found: Array, used: Array, out: Mask) -> list[tuple[float, float]]:
     return list(zip(*variances, strict=True))
 
 
-def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Array,
-                trusted: bool) -> bytes:
+def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Array) -> bytes:
     """
     Return what equal measurements have in common: stamps, pose and, to six digits, covariance.
 
-    Fewer digits than it has: a covariance that went through a file comes back to rounding.
+    Fewer digits than it has: a covariance that is worked out anew comes back to rounding. Sixteen
+    bytes, of which no two differing measurements have the same.
     """
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1)).ravel()
     sigma = np.where(sigma > 0, sigma, 1.0)
     correlation = covariance.reshape(len(sigma), -1) / np.outer(sigma, sigma)
     digits = np.rint(1e6 * np.concatenate((np.log(sigma), correlation.ravel()))).astype(np.int64)
-    return b'%d %d %d ' % (reference, stamp, trusted) + measurement.tobytes() + digits.tobytes()
+    whole = b'%d %d ' % (reference, stamp) + measurement.tobytes() + digits.tobytes()
+    return blake2b(whole, digest_size=16).digest()
 
 
 def root_of_inverse(covariance: Array) -> Array:

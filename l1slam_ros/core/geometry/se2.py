@@ -104,17 +104,18 @@ def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> tupl
     return J_r_i, J_r_j
 
 
-def residual_curvature(pose_i: Array, pose_j: Array, gradient: Array) -> Array:
+def residual_curvature(measurement: Array, pose_i: Array, pose_j: Array, dual: Array) -> Array:
     """
-    Return the Hessian of dual'e over (step of i, step of j), (n, 6, 6); gradient (n, 2, 3).
+    Return the Hessian of dual'e over (step of i, step of j), (n, 6, 6); dual (n, 3).
 
-    With g = J_r_i' dual, h = J_r_j' dual (the gradients) and t = Ri'(tj - ti), the entries (and
-    their mirrors) are (theta_i, x_i) = -g_y, (theta_i, y_i) = g_x, (theta_i, theta_i) = g.t,
-    (theta_i, x_j) = -h_y, (theta_i, y_j) = h_x. The residual is linear in all else.
+    With m = Rz y_t, h = Rij' m (minus and plus the gradients of the positions) and
+    t = Ri'(tj - ti), the entries (and their mirrors) are (theta_i, x_i) = m_y,
+    (theta_i, y_i) = -m_x, (theta_i, theta_i) = -m.t, (theta_i, x_j) = -h_y,
+    (theta_i, y_j) = h_x. The residual is linear in all else.
     """
     from l1slam_ros.core.kernels import se2
 
-    H: Array = se2.curvature(pose_i, pose_j, gradient)
+    H: Array = se2.curvature(measurement, pose_i, pose_j, dual)
     return H
 
 
@@ -142,6 +143,12 @@ def motion(step: Array) -> tuple[Array, Array]:
 def positions(pose: Array) -> Array:
     """Return x, y [m], (n, 2)."""
     return pose[..., :2]
+
+
+def rotation(pose: Array) -> Array:
+    """Return R(theta), (n, 2, 2)."""
+    R: Array = local_jacobian(identity(len(pose)), pose)[..., :2, :2]
+    return R
 
 
 def from_rotation(R: Array, t: Array) -> Array:

@@ -29,7 +29,8 @@ class BetweenFactors:
 
     i, j : (m,) keyframe indices, i may be `WORLD`: an absolute factor; measurement : (m, p)
     relative poses; sqrt_information : (m, d, d) upper triangular roots, see `noise`, a zero row
-    says nothing; trusted : (m,) bool, a person or a marker vouches for it.
+    says nothing; trusted, struck : (m,) bool, a person or a marker vouches for it, or a person has
+    struck it out.
     """
 
     i: Indices
@@ -37,6 +38,7 @@ class BetweenFactors:
     measurement: Array
     sqrt_information: Array
     trusted: Mask
+    struck: Mask
 
     def __len__(self) -> int:
         return len(self.i)
@@ -86,7 +88,8 @@ class FactorGraph:
         self.n_poses = 0
         p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
         self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
-                         GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_)]
+                         GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_),
+                         GrowingArray((), np.bool_)]
 
     def copy(self) -> 'FactorGraph':
         """Return a graph that shares all factors so far; either may grow without the other."""
@@ -107,10 +110,11 @@ class FactorGraph:
         """
         part = FactorGraph(self.manifold)
         part.n_poses = self.n_poses
-        i, j, measurement, root, trusted = (column.view()[chosen] for column in self._between)
+        i, j, measurement, root, trusted, struck = (
+            column.view()[chosen] for column in self._between)
         if variance is not None:
             root = root / np.sqrt(variance)[:, None, None]
-        part.append_between(i, j, measurement, root, trusted)
+        part.append_between(i, j, measurement, root, trusted, struck)
         return part
 
     @property
@@ -162,12 +166,22 @@ class FactorGraph:
 
     def append_between(
         self, i: Indices, j: Indices, measurement: Array, sqrt_information: Array,
-        trusted: Mask | bool = False,
+        trusted: Mask | bool = False, struck: Mask | bool = False,
     ) -> None:
         """Append between factors that are known to be sound, with the roots (m, d, d) at hand."""
-        values = i, j, measurement, sqrt_information, np.broadcast_to(trusted, len(i))
+        values = (i, j, measurement, sqrt_information, np.broadcast_to(trusted, len(i)),
+                  np.broadcast_to(struck, len(i)))
         for column, value in zip(self._between, values, strict=True):
             column.extend(value)
+
+    def say(self, rows: Indices, trusted: bool) -> None:
+        """Let some between factors be vouched for, or else struck out; the last word counts."""
+        for column, value in ((-2, trusted), (-1, not trusted)):
+            said = self._between[column].view().copy()
+            said[rows] = value
+            # What was seen of the column before stays as it was.
+            self._between[column] = GrowingArray((), np.bool_)
+            self._between[column].extend(said)
 
 
 def component_labels(graph: FactorGraph) -> Indices:
@@ -198,6 +212,15 @@ def lowest_joined(graph: FactorGraph) -> Indices:
         np.minimum.at(lowest, np.maximum(a, b), np.minimum(a, b))
         while (lowest[lowest] != lowest).any():
             lowest = lowest[lowest]
+
+
+def gaps(graph: FactorGraph) -> Indices:
+    """Return the keyframes k > 0 that no odometry joins to k - 1, (g,)."""
+    factors = graph.between
+    rows = factors.is_odometry
+    joined = np.zeros(graph.n_poses, bool)
+    joined[np.maximum(factors.i[rows], factors.j[rows])] = True
+    return 1 + np.flatnonzero(~joined[1:])
 
 
 def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:

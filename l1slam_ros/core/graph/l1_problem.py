@@ -31,7 +31,7 @@ class Problem(Protocol):
     def step(self, poses: Array, x: Array) -> Array:
         """Return the poses moved by x (columns,)."""
 
-    def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> Array | None:
+    def curvature(self, poses: Array, dual: Array) -> Array | None:
         """Return the Hessian of dual'e for each factor, (m, 2 k, 2 k)."""
 
 
@@ -53,10 +53,14 @@ class GraphProblem:
         """See `Problem`."""
         return step_poses(self.graph, poses, x)
 
-    def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> Array:
+    def curvature(self, poses: Array, dual: Array) -> Array:
         """See `Problem`."""
-        pair = ends(self.graph, poses)
-        return self.graph.manifold.residual_curvature(*pair, system.gradients(dual))
+        from l1slam_ros.core.kernels.blocks import unwhiten
+
+        manifold, factors = self.graph.manifold, self.graph.between
+        k = manifold.TANGENT_SIZE
+        dual = unwhiten(factors.sqrt_information, dual.reshape(-1, k), (0,) * k)
+        return manifold.residual_curvature(factors.measurement, *ends(self.graph, poses), dual)
 
 
 @dataclass(frozen=True)
@@ -77,5 +81,5 @@ class LinearProblem:
         """See `Problem`."""
         return poses + x
 
-    def curvature(self, poses: Array, system: LinearSystem, dual: Array) -> None:
+    def curvature(self, poses: Array, dual: Array) -> None:
         """See `Problem`."""

@@ -66,7 +66,7 @@ class LinearSystem:
         padded = np.zeros((self.size + 1, k))
         padded[:-1] = x.reshape(-1, k)
         product = np.empty((len(self.blocks), k))
-        multiply(self.keyframe, self.blocks, padded, product)
+        multiply(self.keyframe, self.blocks, padded, product, size_of_blocks(k))
         return product.ravel()
 
     def transposed_times(self, y: Array) -> Array:
@@ -75,16 +75,9 @@ class LinearSystem:
 
         k = self.block_size
         product = np.zeros((self.size + 1, k))
-        multiply_transposed(self.keyframe, self.blocks, y.reshape(-1, k), product)
+        multiply_transposed(self.keyframe, self.blocks, y.reshape(-1, k), product,
+                            size_of_blocks(k))
         return product[:-1].ravel()
-
-    def gradients(self, y: Array) -> Array:
-        """Return J_i'y and J_j'y of each factor, (m, 2, k): the summands of A'y."""
-        from l1slam_ros.core.kernels.blocks import gradients
-
-        k = self.block_size
-        product: Array = gradients(self.blocks, y.reshape(-1, k), (0,) * k)
-        return product
 
     def diagonal(self, weights: Array) -> Array:
         """Return the diagonal of A'WA, (columns,); weights : (rows,)."""
@@ -95,6 +88,12 @@ class LinearSystem:
         blocks = np.ascontiguousarray(self.blocks[:, :, entries, entries])
         b = self.b.reshape(len(blocks), self.block_size)[:, entries].ravel()
         return LinearSystem(self.keyframe, blocks, b, self.size)
+
+
+def size_of_blocks(k: int) -> tuple[int, ...] | Array:
+    """Return what tells the compiled loops the size of a block, see `kernels.cholesky`."""
+    # Blocks of whole poses are worth loops of their own.
+    return (0,) * k if k in (3, 6) else np.zeros(k)
 
 
 def anchor(graph: FactorGraph) -> int:

@@ -3,6 +3,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from l1slam_ros.core.geometry.manifold import Array
 
 # [m/s] The speed of sound: no vehicle on the ground has been faster (Thrust SSC, 341 m/s). Stamps
@@ -36,7 +38,8 @@ class LoopClosure:
     stamps : [ns]; pose3 : (7,) x y z qx qy qz qw [m]; covariance : (6, 6), rows x y z rx ry rz,
     in the axes of the measured pose, those of the map where an absolute pose has no heading: its
     component says nothing if the variance is 0 or less, infinite or above 1e6; trusted : a person
-    or a marker vouches for it.
+    or a marker vouches for it; struck : it is a person's word that the loop of these stamps is
+    false, whatever it measures.
     """
 
     reference_stamp: int | None
@@ -44,6 +47,7 @@ class LoopClosure:
     pose3: Array
     covariance: Array
     trusted: bool = False
+    struck: bool = False
 
     @property
     def is_absolute(self) -> bool:
@@ -54,3 +58,9 @@ class LoopClosure:
     def stamps(self) -> tuple[int, int]:
         """Reference and end [ns]; of an absolute pose its own stamp twice."""
         return self.stamp if self.reference_stamp is None else self.reference_stamp, self.stamp
+
+
+def require_finite(pose3: Array) -> None:
+    """Raise an ArithmeticError where a pose is not finite: it would spoil all after it."""
+    if not np.isfinite(pose3).all():
+        raise ArithmeticError(f'pose {pose3} is not finite')

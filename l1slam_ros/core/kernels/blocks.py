@@ -7,20 +7,12 @@ Sums over factors of products of their two blocks with vectors.
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import compiled, loop
+from l1slam_ros.core.kernels.compiled import ANY_SIZE, for_sizes
 
 
-@loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, ::1], f8[:, ::1])')
-def multiply(keyframe, blocks, x, product):
+@for_sizes('i8[:, ::1], f8[:, :, :, ::1], f8[:, ::1], f8[:, ::1]', ANY_SIZE)
+def multiply(keyframe, blocks, x, product, size):
     """Write A x, (m, k); x : (n + 1, k), the last row zero; other arrays as in LinearSystem."""
-    if x.shape[1] == 3:
-        _multiply(keyframe, blocks, x, product, (0, 0, 0))
-    else:
-        _multiply(keyframe, blocks, x, product, np.empty(x.shape[1]))
-
-
-@compiled
-def _multiply(keyframe, blocks, x, product, size):
     k = len(size)
     for f in range(len(blocks)):
         i, j = keyframe[f, 0], keyframe[f, 1]
@@ -31,17 +23,9 @@ def _multiply(keyframe, blocks, x, product, size):
             product[f, r] = total
 
 
-@loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, ::1], f8[:, ::1])')
-def multiply_transposed(keyframe, blocks, y, product):
+@for_sizes('i8[:, ::1], f8[:, :, :, ::1], f8[:, ::1], f8[:, ::1]', ANY_SIZE)
+def multiply_transposed(keyframe, blocks, y, product, size):
     """Add A'y to product, (n + 1, k), whose last row gathers what is held fixed; y : (m, k)."""
-    if y.shape[1] == 3:
-        _multiply_transposed(keyframe, blocks, y, product, (0, 0, 0))
-    else:
-        _multiply_transposed(keyframe, blocks, y, product, np.empty(y.shape[1]))
-
-
-@compiled
-def _multiply_transposed(keyframe, blocks, y, product, size):
     k = len(size)
     for f in range(len(blocks)):
         i, j = keyframe[f, 0], keyframe[f, 1]
@@ -54,22 +38,21 @@ def _multiply_transposed(keyframe, blocks, y, product, size):
             product[j, c] += at_j
 
 
-@loop('(f8[:, :, :, ::1], f8[:, ::1], UniTuple(i8, 3))')
-def gradients(blocks, y, size):
-    """Return J_i'y and J_j'y of each factor, (m, 2, k); y : (m, k)."""
+@for_sizes('f8[:, :, ::1], f8[:, ::1]')
+def unwhiten(roots, y, size):
+    """Return the dual of the residual itself, L y for each factor, (m, k); roots : L'."""
     k = len(size)
-    product = np.empty((len(blocks), 2, k))
-    for f in range(len(blocks)):
-        for side in range(2):
-            for c in range(k):
-                total = 0.0
-                for r in range(k):
-                    total += blocks[f, side, r, c] * y[f, r]
-                product[f, side, c] = total
+    product = np.empty((len(roots), k))
+    for f in range(len(roots)):
+        for c in range(k):
+            total = 0.0
+            for r in range(k):
+                total += roots[f, r, c] * y[f, r]
+            product[f, c] = total
     return product
 
 
-@loop('(f8[:, :, ::1], f8[:, ::1], UniTuple(i8, 3))')
+@for_sizes('f8[:, :, ::1], f8[:, ::1]')
 def whiten(roots, vectors, size):
     """Return L' e for each factor, (m, k); roots : (m, k, k)."""
     k = len(size)
@@ -83,7 +66,7 @@ def whiten(roots, vectors, size):
     return product
 
 
-@loop('(f8[:, :, ::1], f8[:, :, ::1], i8, f8[:, :, :, ::1], UniTuple(i8, 3))')
+@for_sizes('f8[:, :, ::1], f8[:, :, ::1], i8, f8[:, :, :, ::1]')
 def whiten_blocks(roots, J, side, blocks, size):
     """Write L'J to blocks[:, side] for each factor; J : (m, k, k), blocks : (m, 2, k, k)."""
     k = len(size)

@@ -16,7 +16,7 @@ Source: Ng and Peyton, "Block sparse Cholesky algorithms on advanced uniprocesso
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import compiled, loop
+from l1slam_ros.core.kernels.compiled import ANY_SIZE, compiled, for_sizes
 
 # A pivot that is left with less than this part of its diagonal entry is rounding.
 _SINGULAR = 1e-13
@@ -27,7 +27,7 @@ _FACTORS = ('f8[::1], i8[:, ::1], i8[:, ::1], b1[::1], i8[::1], i8[::1], f8[:, :
             'f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8')
 
 
-@loop(f'({_FACTORS}, UniTuple(i8, 3))', f'({_FACTORS}, f8[::1])')
+@for_sizes(_FACTORS, ANY_SIZE)
 def assemble(panels, address, width, turned, corner, stride, blocks, weights, diagonal, curvature,
              share, size):
     """
@@ -67,7 +67,7 @@ def assemble(panels, address, width, turned, corner, stride, blocks, weights, di
                     panels[address[f, part] + r * width[f, part] + c] += total
 
 
-@loop(f'({_PANELS}, UniTuple(i8, 3))', f'({_PANELS}, f8[::1])')
+@for_sizes(_PANELS, ANY_SIZE)
 def factorise(panels, first, start, pattern, offset, size):
     """
     Turn the lower triangle in `panels` into its Cholesky factor.

@@ -18,6 +18,8 @@ from numba.core.sigutils import normalize_signature
 from numba.np import linalg
 
 Kernel = Callable[..., Any]
+# Of blocks of whole poses in the plane, and of parts of poses; see `cholesky`.
+ANY_SIZE = ('UniTuple(i8, 3)', 'f8[::1]')
 
 
 def compiled(function: Kernel) -> Kernel:
@@ -36,25 +38,33 @@ def compiled(function: Kernel) -> Kernel:
     return kernel
 
 
-def loop(*takes: str) -> Callable[[Kernel], Kernel]:
+def loop(*takes: str, space: tuple[str, ...] = ()) -> Callable[[Kernel], Kernel]:
     """
     Compile, as `compiled`, a function that the interpreter calls.
 
     takes : the types of its arguments in numba's words, so that it can be compiled without them;
-    f8[:, ::1] is an array of doubles, rows one after the other. Several: one version for each
+    f8[:, ::1] is an array of doubles, rows one after the other. Several: one version for each;
+    space : those of the versions that only graphs in space need
     """
     def decorate(function: Kernel) -> Kernel:
         kernel: Any = compiled(function)
-        kernel.takes = takes
+        kernel.takes, kernel.takes_in_space = takes, space
         ready: Kernel = kernel
         return ready
 
     return decorate
 
 
-def make_ready(kernel: Any) -> str:
+def for_sizes(takes: str, plane: tuple[str, ...] = ('UniTuple(i8, 3)',)) -> Callable[
+        [Kernel], Kernel]:
+    """Return `loop` for functions whose last argument is a tuple as long as a block has rows."""
+    return loop(*(f'({takes}, {size})' for size in plane),
+                space=(f'({takes}, UniTuple(i8, 6))',))
+
+
+def make_ready(kernel: Any, space: bool) -> str:
     """Compile a loop, or read it from the cache; return the cache's folder, empty: none."""
-    for takes in kernel.takes:
+    for takes in kernel.takes_in_space if space else kernel.takes:
         # As the types of a call, for these are what the cache goes by.
         kernel.compile(tuple(normalize_signature(takes)[0]))
     return kernel.stats.cache_path or ''

@@ -16,19 +16,16 @@ overlap. K is a tuple of k zeros; its length is a constant to the compiler, an a
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import compiled, loop
+from l1slam_ros.core.kernels.compiled import compiled, for_sizes
 
 # One cache line of single precision. Below 16 the loop vectoriser takes a loop for a short one,
 # where it does not check that arrays are apart, and gives up.
 LANES = 16
+# Blocks of angles, positions and poses in the plane.
+_SIZES = tuple(f'UniTuple(i8, {k})' for k in (1, 2, 3))
 
 
-def _for_each_size(takes: str) -> list[str]:
-    """Return the types of the arguments with K for blocks of angles, positions and poses."""
-    return [f'({takes}, UniTuple(i8, {k}))' for k in (1, 2, 3)]
-
-
-@loop(*_for_each_size('i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]'))
+@for_sizes('i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]', plane=_SIZES)
 def add_squares(keyframe, blocks, gram, K):
     """Add 2 A_fv'A_fv of every factor to its keyframes' gram (size + 1, k, k)."""
     k = len(K)
@@ -41,7 +38,7 @@ def add_squares(keyframe, blocks, gram, K):
                         total[a, b] += 2 * block[r, a] * block[r, b]
 
 
-@loop(*_for_each_size('i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, :, ::1]'))
+@for_sizes('i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, :, ::1]', plane=_SIZES)
 def scale(keyframe, blocks, inverse, scaled, K):
     """Set each block of `scaled` to that of `blocks` times its keyframe's inverse."""
     k = len(K)
@@ -56,7 +53,7 @@ def scale(keyframe, blocks, inverse, scaled, K):
                     scaled[f, side, r, c] = total
 
 
-@loop(*_for_each_size('f4[:, ::1], u4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f8, i8, i8'))
+@for_sizes('f4[:, ::1], u4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f8, i8, i8', plane=_SIZES)
 def iterate(tiles, keyframes, x, z, g, weight, first, count, K):
     """
     Advance x, the y of the tiles and g = A'y by `count` iterations of `halpern.halpern_step`.
@@ -91,8 +88,8 @@ def iterate(tiles, keyframes, x, z, g, weight, first, count, K):
             _scatter(local, tile, g, keyframes[t], K)
 
 
-@loop(*_for_each_size('f4[:, ::1], u4[:, ::1], f4[:, ::1], f4[:, ::1], f8, f4[:, ::1], '
-                      'f4[:, ::1], f4[:, ::1]'))
+@for_sizes('f4[:, ::1], u4[:, ::1], f4[:, ::1], f4[:, ::1], f8, f4[:, ::1], '
+           'f4[:, ::1], f4[:, ::1]', plane=_SIZES)
 def look(tiles, keyframes, x, g, weight, x_bar, g_bar, y_bar, K):
     """
     Find the next point without the pull to the restart, and what the tests want to know.
@@ -143,7 +140,7 @@ def look(tiles, keyframes, x, g, weight, x_bar, g_bar, y_bar, K):
     return weight * moved + turned / weight + 2 * crossed, cost, value
 
 
-@loop(*_for_each_size('f4[:, ::1], u4[:, ::1], f4[:, ::1]'))
+@for_sizes('f4[:, ::1], u4[:, ::1], f4[:, ::1]', plane=_SIZES)
 def adjoint(tiles, keyframes, g, K):
     """Set g = A'y for the y of the tiles."""
     k = len(K)

@@ -48,15 +48,19 @@ def jacobians(z, x_i, x_j):
     return J_i, J_j
 
 
-@loop('(f8[:, ::1], f8[:, ::1], f8[:, :, ::1])')
-def curvature(x_i, x_j, gradient):
-    """Return the Hessian of dual'e over (step of i, step of j), (m, 6, 6); gradient (m, 2, 3)."""
+@loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])')
+def curvature(z, x_i, x_j, dual):
+    """Return the Hessian of dual'e over (step of i, step of j), (m, 6, 6); dual (m, 3)."""
     H = np.zeros((len(x_i), 6, 6))
     for f in range(len(x_i)):
         t = _seen(x_i[f], x_j[f])
-        H[f, 2, 0], H[f, 2, 1] = -gradient[f, 0, 1], gradient[f, 0, 0]
-        H[f, 2, 2] = gradient[f, 0, 0] * t[0] + gradient[f, 0, 1] * t[1]
-        H[f, 2, 3], H[f, 2, 4] = -gradient[f, 1, 1], gradient[f, 1, 0]
-        for c in (0, 1, 3, 4):
-            H[f, c, 2] = H[f, 2, c]
+        c, s = np.cos(z[f, 2]), np.sin(z[f, 2])
+        mx, my = c * dual[f, 0] - s * dual[f, 1], s * dual[f, 0] + c * dual[f, 1]
+        theta = x_j[f, 2] - x_i[f, 2]
+        c, s = np.cos(theta), np.sin(theta)
+        H[f, 2, 0], H[f, 2, 1] = my, -mx
+        H[f, 2, 2] = -(mx * t[0] + my * t[1])
+        H[f, 2, 3], H[f, 2, 4] = s * mx - c * my, c * mx + s * my
+        for column in (0, 1, 3, 4):
+            H[f, column, 2] = H[f, 2, column]
     return H

@@ -17,24 +17,20 @@ place of an update, is told to stop, and never adopted.
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-
-import numpy as np
+from dataclasses import dataclass
 
 from l1slam_ros.core.errors import Interrupted, OptionError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.geometry.manifold import Array, Manifold
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_finite
 from l1slam_ros.core.online.background import Background
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.loop_states import LoopStates
-from l1slam_ros.core.online.snapshot import Optimised, Snapshot
+from l1slam_ros.core.online.parts import as_one, of_all
+from l1slam_ros.core.online.snapshot import Optimised, Robot, SavedMap, Snapshot
 from l1slam_ros.core.online.update import Improvement, improve, optimise
 from l1slam_ros.core.options import Options, option
-from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
-from l1slam_ros.core.solvers.optimality import Status
 
 # What poses live on, by the dimension of the world.
 _MANIFOLDS: dict[int, Manifold] = {2: se2}
@@ -75,6 +71,7 @@ class Backend:
     ----------
     manifold : what the poses live on
     maps : how many maps there were: one more with each that was adopted or took another's place
+    moved : map -> odom before and after the last map that was adopted, (1, p) each
 
     Raises
     ------
@@ -95,6 +92,8 @@ class Backend:
         self._at_rest: object = None
         self._counted: tuple[object, dict[str, int]] = (None, {})
         self._background: Background | None = None
+        self.moved = self.manifold.identity(1), self.manifold.identity(1)
+        self._optimised: Optimised
         self.reset()
         self.maps = 0
         if background:
@@ -115,25 +114,30 @@ class Backend:
 
     def reset(self) -> None:
         """Forget everything."""
-        self._replace(GraphBuilder(self.manifold, self._options), self.manifold.identity(0))
+        self._replace(GraphBuilder(self.manifold, self._options),
+                      Optimised.nothing(self.manifold.identity(0)))
 
-    def restore(self, graph: FactorGraph, poses: Array, stamps: Indices) -> None:
-        """Replace the map by one of an earlier run; see `GraphBuilder.restore`."""
+    def saved(self) -> SavedMap | None:
+        """Return all that another back end goes on from; None: there are no factors yet."""
+        with self._lock:
+            if self._builder.graph.between.is_absolute.all():
+                return None
+            now, growth = self._snapshot(), self._builder.grown()
+        return SavedMap(growth, now.optimised.of_all(now.problem()), now.robust)
+
+    def restore(self, saved: SavedMap) -> None:
+        """Go on from what another back end has `saved`, in the place of the map there is."""
         builder = GraphBuilder(self.manifold, self._options)
-        builder.restore(graph, stamps, poses)
-        self._replace(builder, poses)
+        builder.restore(saved.growth)
+        self._replace(builder, saved.as_judged(self._options.robust.enabled))
 
-    def _replace(self, builder: GraphBuilder, poses: Array) -> None:
+    def _replace(self, builder: GraphBuilder, optimised: Optimised) -> None:
         """Begin a map with the graph of a builder; what is made for the one before is left."""
         with self._lock:
-            self.maps += 1
-            self._map += 1
-            self._changes += 1
             # Options may have changed since it was made.
             builder.options = self._options
             self._builder = builder
-            self._optimised = Optimised.nothing(poses)
-            self._map_to_odom: tuple[Array, Array] | None = None
+            self._begin_map(optimised)
         self._wake()
 
     @property
@@ -165,9 +169,9 @@ class Backend:
         builder = self._builder
         builder.add_due_loops()
         return Snapshot(
-            self._map, self._version(), builder.graph.copy(), builder.stamps, builder.odometry,
-            self._map_to_odom_now(), builder.loop_rows, builder.loop_stamps, self._optimised,
-            self._options.robust.enabled)
+            self._map, self._version(), builder.graph.copy(), builder.gaps, builder.stamps,
+            builder.odometry, self._map_to_odom_now(), builder.loop_rows, builder.loop_stamps,
+            self._optimised, self._options.robust.enabled)
 
     def counts(self) -> tuple[dict[str, int], dict[str, int]]:
         """Return the sizes of the graph, and how many loops were refused for which cause."""
@@ -192,8 +196,7 @@ class Backend:
         with self._lock:
             self._changes += 1
             if options.robust != self._options.robust:
-                self._optimised = replace(self._optimised, judgement=Judgement.nothing(),
-                                          status=Status.OUT_OF_TIME)
+                self._optimised = self._optimised.unjudged()
             self._options = self._builder.options = options
         self._wake()
 
@@ -203,33 +206,43 @@ class Backend:
 
         None: it is held, not used yet; see `GraphBuilder.add_odometry`.
         """
-        _require_finite(sample.pose3)
+        require_finite(sample.pose3)
         with self._lock:
             self._samples += 1
-            graph = self._builder.graph
             self._builder.add_odometry(sample)
-            if self._builder.graph is not graph:
-                self._forget_stray()
+            self._follow()
             map_to_odom = None if self._builder.held else self._map_to_odom_now()
         self._wake()
         return map_to_odom
+
+    def robot(self) -> Robot | None:
+        """Return where the robot is; None: no odometry has said yet where it is in this map."""
+        with self._lock:
+            last = self._builder.last
+            return Robot(last.stamp, last.pose, self._map_to_odom_now()) if last else None
 
     def begin_anew(self) -> None:
         """Forget the only sample so far; see `GraphBuilder.begin_anew`."""
         with self._lock:
             self._builder.begin_anew()
-            self._forget_stray()
+            self._follow()
 
-    def _forget_stray(self) -> None:
-        """Forget the pose of a first sample that was none: an update may have looked at it."""
-        if self._builder.graph.n_poses < 2:
-            self._optimised = Optimised.nothing(self.manifold.identity(0))
-        self._map_to_odom = None
+    def _follow(self) -> None:
+        """Begin a map where the builder did."""
+        if self._builder.graph is not self._graph:
+            self._begin_map(Optimised.nothing(self.manifold.identity(0)))
+
+    def _begin_map(self, optimised: Optimised) -> None:
+        """Leave what was made of the graph that there was, for what is known of another."""
+        self.maps += 1
+        self._map += 1
         self._changes += 1
+        self._graph, self._optimised = self._builder.graph, optimised
+        self._map_to_odom: tuple[Array, Array] | None = None
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Add one loop closure; see `GraphBuilder.add_loop`."""
-        _require_finite(loop.pose3)
+        require_finite(loop.pose3)
         with self._lock:
             self._changes += 1
             self._builder.add_loop(loop)
@@ -258,7 +271,7 @@ class Backend:
                 if self._make_way or stopped() or problem.map != self._map:
                     raise Interrupted
 
-            improvement = improve(problem, solver, budget, check)
+            improvement = of_all(improve(as_one(problem), solver, budget, check), problem)
             check()
             self.adopt(improvement)
         return improvement
@@ -287,7 +300,7 @@ class Backend:
                 if stopped() or problem.map != self._map:
                     raise Interrupted
 
-            improvement = optimise(problem, solver, check)
+            improvement = of_all(optimise(as_one(problem), solver, check), problem)
             check()
             self.adopt(improvement)
         self._wake()
@@ -309,9 +322,11 @@ class Backend:
             if improvement.map != self._map:
                 raise Interrupted
             if improvement.robust == self._options.robust.enabled:
+                before = self._map_to_odom_now()
                 self._optimised = improvement.taken_over(
                     self._optimised, self._options.solver.outer_tolerance)
                 self._map_to_odom = None
+                self.moved = before, self._map_to_odom_now()
                 self._changes += 1
             self.maps += 1
 
@@ -337,9 +352,3 @@ class Backend:
         """Tell the background that there may be something to do."""
         if self._background is not None:
             self._background.wake()
-
-
-def _require_finite(pose3: Array) -> None:
-    # It would spoil all that comes after it.
-    if not np.isfinite(pose3).all():
-        raise ArithmeticError(f'pose {pose3} is not finite')

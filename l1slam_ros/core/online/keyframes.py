@@ -110,6 +110,16 @@ class Motion:
                 else sample.twist_covariance * ((sample.stamp - self._stamp) * 1e-9) ** 2)
         self._ends[1], self._stamp = pose[0], sample.stamp
 
+    def add_known(self, stamp: int, pose: Array, covariance: Array,
+                  options: OdometryOptions) -> None:
+        """Continue to `pose` (1, p) at a stamp [ns]; the covariance (d, d) is of the way there."""
+        rows = np.array(self._manifold.COVARIANCE_ROWS)
+        stated = np.zeros((6, 6))
+        stated[rows[:, None], rows] = covariance
+        seconds = (stamp - self._stamp) * 1e-9
+        self.add(OdometrySample(stamp, self._manifold.to_pose3(pose)[0], stated,
+                                stated / seconds**2), pose, options)
+
     def add_unseen(self, sample: OdometrySample, metres: float, radians: float) -> None:
         """Continue to a sample at the same place, to which the robot may have gone some way."""
         self._unseen = self._unseen + diagonal_covariance(self._manifold, metres, radians)

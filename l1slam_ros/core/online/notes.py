@@ -3,6 +3,8 @@
 
 from collections import Counter
 
+from l1slam_ros.core.geometry.noise import LEAST_VARIANCE
+
 
 class Notes:
     """
@@ -30,6 +32,13 @@ class Notes:
         """Count a message that is used otherwise than it says; the sentence says how."""
         self.warned[cause] += 1
         self._note(cause, sentence)
+
+    def warn_bounds(self, what: str, stamp: int, bounded: list[tuple[float, float]],
+                    most: float) -> None:
+        """Count variances that are used otherwise than stated: found and used."""
+        for found, used in bounded:
+            self.warn(f'{what}_variance', f'variance {found:g} of {what} at {stamp} ns; expected '
+                      f'{LEAST_VARIANCE:g} to {most:g}; {used:g} is used')
 
     def news(self) -> list[str]:
         """Return the first sentence of each cause that is new since the last call."""

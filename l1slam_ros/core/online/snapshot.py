@@ -6,12 +6,14 @@ In: references to arrays that are never written to again. Out: what is worked ou
 problem of the next update first of all.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.online.loop_states import (
     ACCEPTED,
     EXPIRED,
@@ -35,18 +37,54 @@ class Problem:
     A snapshot to improve: graph, poses (n, p), dual (rows,) and the cost the last update left.
 
     map : number of the map that it is of, other after `Backend.reset` and `Backend.restore`;
-    judgement : of all factors; robust : loops may be doubted; settled : nothing has come since an
-    update that converged.
+    gaps : (g,) keyframes that no odometry joins to the ones before; judgement : of all factors;
+    robust : loops may be doubted; settled : nothing has come since an update that converged.
     """
 
     map: int
     graph: FactorGraph
+    gaps: Indices
     poses: Array
     dual: Array
     judgement: Judgement
     robust: bool
     last_cost: float
     settled: bool
+
+
+@dataclass(frozen=True)
+class Growth:
+    """
+    What a graph builder has made of messages, for another to go on from.
+
+    graph : the factors; stamps (n,) [ns] and odometry (n, p) of the keyframes; offset : see
+    `GraphBuilder`; end : stamp [ns] of the last sample, end_pose (1, p) and end_covariance (d, d)
+    of the motion to it from the last keyframe; loop_rows (k,), loop_stamps (k, 2) and expired
+    (l, 2) [ns] : see `GraphBuilder`; waiting : loops, and how long each has waited [ns]; seen : of
+    each loop that came, by its identity, its factor, -1 for none.
+    """
+
+    graph: FactorGraph
+    stamps: Indices
+    odometry: Array
+    offset: Array
+    end: int
+    end_pose: Array
+    end_covariance: Array
+    loop_rows: Indices
+    loop_stamps: Indices
+    expired: Indices
+    waiting: tuple[tuple[LoopClosure, int], ...]
+    seen: Mapping[bytes, int]
+
+    @staticmethod
+    def of_graph(graph: FactorGraph, poses: Array, stamps: Indices) -> 'Growth':
+        """Return that of a graph alone, whose odometry went from pose to pose (n, p)."""
+        d, none = graph.manifold.TANGENT_SIZE, np.zeros((0, 2), np.int64)
+        loops = np.flatnonzero(~graph.between.is_odometry)
+        ends = np.sort(stamps[graph.between.pairs[loops]], axis=1)
+        return Growth(graph, stamps, poses, graph.manifold.identity(1), int(stamps[-1]),
+                      poses[-1:], np.zeros((d, d)), loops, ends, none, (), {})
 
 
 @dataclass(frozen=True)
@@ -76,20 +114,54 @@ class Optimised:
         return (self.status in (Status.CONVERGED, Status.STALLED)
                 or self.quiet_updates >= _QUIET_UPDATES)
 
+    def unjudged(self) -> 'Optimised':
+        """Return the same where nothing is known of any loop."""
+        return replace(self, judgement=Judgement.nothing(), status=Status.OUT_OF_TIME)
+
+    def of_all(self, problem: Problem) -> 'Optimised':
+        """Return the same of all keyframes and factors that a problem has."""
+        if len(self.poses) == len(problem.poses) and len(self.dual) == len(problem.dual):
+            return self
+        return replace(self, poses=problem.poses, dual=problem.dual, judgement=problem.judgement,
+                       status=Status.OUT_OF_TIME, quiet_updates=0)
+
+
+@dataclass(frozen=True)
+class SavedMap:
+    """All that another back end goes on from; robust : loops were doubted."""
+
+    growth: Growth
+    optimised: Optimised
+    robust: bool
+
+    def as_judged(self, robust: bool) -> Optimised:
+        """Return what updates have made, unjudged where loops were judged otherwise."""
+        return self.optimised if self.robust == robust else self.optimised.unjudged()
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Where the robot is: stamp [ns] and pose (1, p) of its odometry, and map -> odom (1, p)."""
+
+    stamp: int
+    odometry: Array
+    map_to_odom: Array
+
 
 @dataclass(frozen=True)
 class Snapshot:
     """
     What a back end knows.
 
-    map : its number; version : see `Backend.version`; graph : the factors so far; stamps (n,)
-    [ns] and odometry (n, p) of the keyframes; map_to_odom : (1, p); loop_rows, loop_stamps : see
-    `GraphBuilder`; robust : loops may be doubted.
+    map : its number; version : see `Backend.version`; graph : the factors so far; gaps : as in
+    `Problem`; stamps (n,) [ns] and odometry (n, p) of the keyframes; map_to_odom : (1, p);
+    loop_rows, loop_stamps : see `GraphBuilder`; robust : loops may be doubted.
     """
 
     map: int
     version: tuple[int, int, int]
     graph: FactorGraph
+    gaps: Indices
     stamps: Indices
     odometry: Array
     map_to_odom: Array
@@ -117,9 +189,10 @@ class Snapshot:
         dual = np.concatenate((last.dual, np.zeros(rows - len(last.dual))))
         judgement = last.judgement.extended(self.graph, self.robust)
         grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
-        settled = not grown and judgement.settled and last.at_rest
-        return Problem(self.map, self.graph, self.poses, dual, judgement, self.robust, last.cost,
-                       settled)
+        told = grown or not np.array_equal(judgement.accepted, last.judgement.accepted)
+        settled = not told and judgement.settled and last.at_rest
+        return Problem(self.map, self.graph, self.gaps, self.poses, dual, judgement, self.robust,
+                       last.cost, settled)
 
     def loop_states(self) -> LoopStates:
         """Return what has become of each loop, those of the graph first, in its order."""

@@ -15,6 +15,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
+from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.online.snapshot import Optimised, Problem
 from l1slam_ros.core.robust.batch import judge
 from l1slam_ros.core.robust.judgement import Judgement
@@ -97,6 +98,9 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
         starts.append(judged)
     check()
     graph = problem.graph.subset(judgement.accepted)
+    if graph.between.is_absolute.any():
+        # Or the map has not come to the world yet.
+        starts.append(placed(graph, problem.poses))
     size = graph.manifold.TANGENT_SIZE
     dual = problem.dual.reshape(-1, size)[judgement.accepted].ravel()
     costs = [l1_cost(whitened_residual(graph, poses)) for poses in starts]

@@ -174,9 +174,29 @@ def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
     system, factors = linearise(graph, poses, fixed=posterior.fixed), graph.between
     k = system.block_size
     spread = prediction.spreads(system.keyframe, system.blocks, posterior.samples)
+    absolute = np.flatnonzero(factors.is_absolute)
+    spread[absolute] += _sagittas(graph.subset(absolute), posterior)
     square, log_det = prediction.normalise(spread + np.eye(k), -system.b.reshape(-1, k))
     return Innovations(system, spread, square, log_det, log_claims(factors, log_volume),
                        factors.freedom)
+
+
+def _sagittas(graph: FactorGraph, posterior: Posterior) -> Array:
+    """
+    Return what linearising leaves out of the covariance of absolute factors, (m, k, k).
+
+    A long way with a heading not known well ends on an arc. Its sagitta, half the offset times
+    the turn, is taken for noise: between keyframes it is small, since both are carried along.
+    """
+    manifold, factors = graph.manifold, graph.between
+    steps = posterior.samples[factors.j - posterior.fixed]
+    offset, turn = ((steps[:, part]**2).sum(axis=1)
+                    for part in (manifold.TRANSLATION, manifold.ROTATION))
+    variance = np.zeros((len(factors), steps.shape[1]))
+    variance[:, manifold.TRANSLATION] = (offset * turn).mean(axis=1)[:, None] / 4
+    roots = factors.sqrt_information
+    sagittas: Array = roots * variance[:, None, :] @ roots.transpose(0, 2, 1)
+    return sagittas
 
 
 def log_claims(factors: BetweenFactors, log_volume: Array) -> Array:

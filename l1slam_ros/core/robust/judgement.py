@@ -82,22 +82,19 @@ class Judgement:
         """
         Return the judgement of all factors that the graph has by now.
 
-        Of the new ones, odometry and what is trusted is believed; a loop is suspect until it was
-        looked at, or where no loop is to be doubted, believed too.
+        Of the new ones, odometry is believed; a loop is suspect until it was looked at, or where
+        no loop is to be doubted, believed too. Whatever a person said by now counts.
         """
         factors, known = graph.between, len(self.accepted)
-        if known == len(factors):
-            return self
-        sure = (factors.is_odometry | factors.trusted)[known:]
-        new_loops = not sure.all()
-        accepted = np.concatenate((self.accepted, sure | (not robust)))
-        if not robust:
-            accepted = np.ones(len(accepted), bool)
-        suspect = np.concatenate((self.suspect, ~sure)) & ~accepted
+        odometry = factors.is_odometry[known:]
+        accepted = np.concatenate((self.accepted, odometry)) if robust else True
+        accepted = (accepted | factors.trusted) & ~factors.struck
+        suspect = np.concatenate((self.suspect, ~odometry)) & ~accepted & ~factors.struck
         sigmas = np.concatenate((self.sigmas, np.full(len(factors) - known, np.nan)))
+        told = not np.array_equal(accepted[:known], self.accepted)
         return replace(
             self, accepted=accepted, suspect=suspect, sigmas=sigmas,
-            settled=not robust or (self.settled and not new_loops))
+            settled=not robust or (self.settled and not told and not suspect[known:].any()))
 
 
 def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),

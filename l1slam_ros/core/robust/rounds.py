@@ -14,6 +14,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, ends_in_time
+from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.linear_system import anchor, linearise, step_poses, whitened_residual
 from l1slam_ros.core.graph.parts import bridged
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
@@ -59,6 +60,8 @@ _LEAST_RATIO = 1e-5
 # Noise that is so many times the variance that was found is measured anew before any loop is
 # dropped for it, by the median of chi2 over its freedom; by factors that others check at all.
 _NOISIER, _MEDIAN, _CHECKED = 3.0, 0.79, 0.01
+# While driving so many of the last absolute factors are looked at, with their neighbours.
+_LATEST = 50
 # What is stated counts in the end up to so many times the variance that was found.
 _WORD = 100.0
 # The variance of an odometry factor that was cut, in units of its own: loops alone decide.
@@ -89,7 +92,7 @@ class Growth:
         self.is_loop: Mask = ~self.factors.is_odometry
         self.cut: Mask = np.arange(len(self.factors)) >= self.size
         self.accepted: Mask = ~self.is_loop | self.trusted
-        self.poses = placed(self.graph, odometry_poses(self.graph))
+        self.poses = placed(self.graph.subset(self.accepted), odometry_poses(self.graph))
         self.part = np.zeros(graph.n_poses, np.int64)
         self.variance = np.ones(2)
         self._floor, self._at_their_word = np.full(2, _LEAST_VARIANCE), False
@@ -108,8 +111,10 @@ class Growth:
 
     def begin(self) -> None:
         """Solve for what is accepted, and learn from the loops how large the noise is."""
+        self._tie_to_world()
         self.solve()
         rows = self.undecided()
+        rows = rows[~self.factors.is_absolute[rows]]
         if len(rows):
             self.variance = self.variance * noise_variance(self.innovations(rows))
             self._floor = _LEAST_VARIANCE * self.variance
@@ -122,10 +127,41 @@ class Growth:
         self.accepted[: self.size] = accepted | self.trusted[: self.size]
         self.cut |= ~self.accepted & ~self.is_loop
         self.accepted |= self.cut
+        self._tie_to_world(_LATEST)
         if (self.accepted & self.is_loop).any():
             self.solve()
         else:
             self.begin()
+
+    @property
+    def _tied(self) -> bool:
+        """Whether an absolute factor is accepted."""
+        return bool((self.accepted & self.factors.is_absolute).any())
+
+    def _tie_to_world(self, latest: int | None = None) -> None:
+        """
+        Accept the absolute factors that agree with their neighbours, if these are more than are.
+
+        Until some are, the map says nothing of any; and behind a long way, little of the next.
+
+        latest : so many of them are looked at; None: all
+        """
+        absolute = self.factors.is_absolute
+        held = self.accepted & absolute
+        if (held == absolute).all():
+            return
+        # As many may have been accepted for want of others.
+        known = np.count_nonzero(held) > self.graph.manifold.TRANSLATION.stop
+        rows, variance = first_fixes(self.graph, latest, self.variance[0] if known else None)
+        if not (known and held[rows].any()):
+            if len(rows) <= np.count_nonzero(held):
+                return
+            self.accepted &= ~absolute | self.trusted
+            self.variance[0] = max(variance, _LEAST_RATIO)
+        self.accepted[rows] = True
+        # A part that no other factor joins is where most of its own absolute factors say.
+        placing = (self.accepted | absolute) & ~self.cut if self.cut.any() else self.accepted
+        self.poses = placed(self.graph.subset(placing), self.poses)
 
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
@@ -169,9 +205,15 @@ class Growth:
 
     def undecided(self) -> Indices:
         """Return the loops within a part that may yet be accepted, (k,)."""
-        open_ = ~self.accepted & (self._drops < _CHANCES)
-        undecided: Indices = np.flatnonzero(open_ & ~self.across())
+        may = ~self.accepted & ~self.factors.struck & (self._drops < _CHANCES) & ~self.across()
+        undecided: Indices = np.flatnonzero(may & (self._tied | ~self.factors.is_absolute))
         return undecided
+
+    def joining(self) -> Indices:
+        """Return the loops from one part to another that may yet be accepted, (k,)."""
+        may = ~self.accepted & ~self.factors.struck & (self._drops < _CHANCES)
+        joining: Indices = np.flatnonzero(may & self.across())
+        return joining
 
     def across(self) -> Mask:
         """Return which factors lead from one part to another, (m,) bool."""

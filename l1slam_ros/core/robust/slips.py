@@ -43,7 +43,7 @@ _UNHEARD = 4.0
 def join(growth: Growth) -> bool:
     """Move parts to where loops across agree that they are; return whether any was."""
     joined = False
-    while (rows := np.flatnonzero(growth.across() & growth.is_loop & ~growth.accepted)).size:
+    while (rows := growth.joining()).size:
         parts = growth.part[np.stack((growth.low[rows], growth.high[rows]))]
         pair = np.sort(parts, axis=0).T @ np.array([growth.graph.n_poses, 1])
         groups = [strongest_group(growth, rows[pair == one]) for one in np.unique(pair)]

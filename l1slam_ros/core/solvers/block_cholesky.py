@@ -20,6 +20,7 @@ from l1slam_ros.core.graph.linear_system import (
     anchor,
     keyframes_of,
     loose_keyframes,
+    size_of_blocks,
 )
 
 Places = NDArray[np.int32]
@@ -120,8 +121,8 @@ class BlockCholesky:
             curvature = np.empty((0, 2 * k, 2 * k))
         added = np.full(system.size * k, diagonal, float).reshape(-1, k)
         if len(self._loose):
-            own = system.diagonal(weights).reshape(-1, k)
-            added[self._loose] += _LOOSE * own[self._loose]
+            own = system.diagonal(weights).reshape(-1, k)[self._loose]
+            added[self._loose] += np.where(own > 0, _LOOSE * own, 1.0)
         cholesky.assemble(layout.panels, *layout.places, system.blocks, weights.reshape(-1, k),
                           added, curvature, share, layout.size)
         self._factored = layout
@@ -159,8 +160,7 @@ class _Layout:
     def __init__(self, pattern: Pattern, keyframe: Indices, block_size: int):
         from l1slam_ros.core.kernels.symbolic import block_addresses
 
-        # Blocks of whole poses are worth loops of their own.
-        self.size = (0,) * 3 if block_size == 3 else np.zeros(block_size)
+        self.size = size_of_blocks(block_size)
         areas = np.diff(pattern.first) * np.diff(pattern.start) * block_size**2
         offset = np.concatenate(([0], np.cumsum(areas))).astype(np.int64)
         self.panels = np.empty(offset[-1])

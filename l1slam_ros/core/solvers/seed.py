@@ -5,6 +5,15 @@ Algorithm 3: first poses by two convex L1 problems, from the graph alone.
 In: a factor graph. Out: poses from which Algorithm 4 finds the optimum. The whitened residual's
 rotation rows involve the rotations alone (see `noise`), so they are solved first; with the
 rotations fixed, the remaining rows are linear in the translations.
+
+Rotations turn in circles, so the first problem is convex near a reference only, and in space only
+to first order: it is solved again from its solution while the cost falls. The best reference is
+the chordal relaxation in L2, one linear solve: rotation matrices with R_j = R_i Z_ij as well as
+may be, as if they were any matrices, then the nearest rotations.
+
+Source: Martinec and Pajdla, "Robust rotation and translation estimation" (2007) for the
+relaxation; Chatterjee and Govindu, "Efficient and robust large-scale rotation averaging" (2013)
+for the repeated L1 problem.
 """
 
 from collections.abc import Callable
@@ -17,6 +26,7 @@ from l1slam_ros.core.graph.l1_problem import LinearProblem
 from l1slam_ros.core.graph.linear_system import (
     LinearSystem,
     anchor,
+    keyframes_of,
     linearise,
     step_poses,
     whitened_residual,
@@ -32,8 +42,10 @@ from l1slam_ros.core.solvers.reweighting import weighted_least_squares
 
 # The paper takes 1,000 iterations or more of each; by factorisations it is some ten steps.
 SEED_OPTIONS = PrimalDualOptions(iterations=2000, tolerance=1e-3)
-# Rounds of re-wrapping the angles; measured: 1 to 6 until the cost stops falling.
-_MOST_ROUNDS = 10
+# Rounds until the cost stops falling; measured: 1 to 6. A step is halved so often.
+_MOST_ROUNDS, _HALVINGS = 10, 6
+# A reference whose cost is that much above the best one's leads nowhere else.
+_NEAR = 1.5
 # [sigma] A residual that departs that little from its linearisation is not wrapped anew.
 _SAME = 1e-6
 
@@ -45,8 +57,8 @@ def seed_poses(
     """
     Return the poses of Algorithm 3, (n, p).
 
-    Angles wrap, so the first problem needs a reference to unwrap against. Three are tried, none
-    of them a stored pose: the odometry chain and two breadth-first trees; the lowest cost wins.
+    The rotations are solved for from the best of three references, none of them a stored pose, and
+    from every other one that is nearly as good; the lowest cost wins.
 
     Parameters
     ----------
@@ -54,19 +66,60 @@ def seed_poses(
     check : called on the way, raises where the work shall stop
 
     """
-    references = [tree_poses(graph, 0), tree_poses(graph, graph.n_poses // 2)]
-    if graph.between.is_odometry.sum() == graph.n_poses - 1:
-        references.insert(0, odometry_poses(graph))
-    references = [placed(graph, poses) for poses in references]
+    references = [placed(graph, poses) for poses in _references(graph, cholesky)]
+    costs = [_rotation_cost(graph, poses) for poses in references]
+    order = [k for k in np.argsort(costs, kind='stable') if costs[k] <= _NEAR * min(costs)]
     candidates: list[Array] = []
-    for k, reference in enumerate(references):
+    for place, k in enumerate(order):
         # Two references that unwrap every factor alike lead to one and the same problem.
-        if not any(_unwrap_alike(graph, reference, other) for other in references[:k]):
-            candidates.append(_solve_rotations(graph, reference, cholesky, options, check))
+        if not any(_unwrap_alike(graph, references[k], references[other])
+                   for other in order[:place]):
+            candidates.append(_solve_rotations(graph, references[k], cholesky, options, check))
     poses = min(candidates, key=lambda poses: _rotation_cost(graph, poses))
     system = translation_system(graph, poses)
     x = _minimise(system, cholesky, options, check)
     return _moved(graph, poses, x, graph.manifold.TRANSLATION)
+
+
+def _references(graph: FactorGraph, cholesky: BlockCholesky | None) -> list[Array]:
+    """Return poses from which the rotations may be found, (n, p) each, the likeliest first."""
+    chordal = None if cholesky is None else chordal_poses(graph, cholesky)
+    first = tree_poses(graph, graph.n_poses // 2) if chordal is None else chordal
+    references = [first, tree_poses(graph, 0)]
+    if graph.between.is_odometry.sum() == graph.n_poses - 1:
+        references.append(odometry_poses(graph))
+    return references
+
+
+def chordal_poses(graph: FactorGraph, cholesky: BlockCholesky) -> Array | None:
+    """
+    Return the rotations of the chordal relaxation in L2, (n, p), positions zero.
+
+    The rows r of the matrices R are found each by the same system, r_j = Z_ij' r_i of each factor,
+    as sure as it is of its rotation. None: that is singular.
+    """
+    manifold, factors, fixed = graph.manifold, graph.between, anchor(graph)
+    part = manifold.ROTATION
+    Z_t = np.swapaxes(manifold.rotation(factors.measurement), 1, 2)
+    m, k, size = len(factors), Z_t.shape[1], graph.n_poses - fixed
+    blocks = np.empty((m, 2, k, k))
+    blocks[:, 0], blocks[:, 1] = -Z_t, np.eye(k)
+    keyframe = keyframes_of(graph, fixed)
+    system = LinearSystem(keyframe, blocks, np.zeros(m * k), size)
+    weights = (factors.sqrt_information[:, part, part] ** 2).mean(axis=(1, 2))
+    if not cholesky.factorise(system, np.repeat(weights, k)):
+        return None
+    # What is held fixed has R = I.
+    known = -(blocks * (keyframe == size)[:, :, None, None]).sum(axis=1)
+    right = np.zeros((size + 1, k, k))
+    for side in range(2):
+        np.add.at(right, keyframe[:, side], weights[:, None, None]
+                  * (np.swapaxes(blocks[:, side], 1, 2) @ known))
+    rows = np.concatenate((np.broadcast_to(np.eye(k), (fixed, k, k)),
+                           cholesky.solve_many(right[:size])))
+    U, _, Vt = np.linalg.svd(np.swapaxes(rows, 1, 2))
+    U[:, :, -1] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[:, None]
+    return manifold.from_rotation(U @ Vt, np.zeros((graph.n_poses, k)))
 
 
 def rotation_system(graph: FactorGraph, poses: Array) -> LinearSystem:
@@ -81,19 +134,29 @@ def translation_system(graph: FactorGraph, poses: Array) -> LinearSystem:
 
 def _solve_rotations(graph: FactorGraph, poses: Array, cholesky: BlockCholesky | None,
                      options: PrimalDualOptions, check: Callable[[], None]) -> Array:
-    """Solve for the rotations, re-wrapped against the last solution while the cost falls."""
+    """Solve for the rotations, from the last solution anew while the cost falls."""
     cost = _rotation_cost(graph, poses)
     for _ in range(_MOST_ROUNDS):
         system = rotation_system(graph, poses)
         x = _minimise(system, cholesky, options, check)
-        candidate = _moved(graph, poses, x, graph.manifold.ROTATION)
-        candidate_cost = _rotation_cost(graph, candidate)
-        if candidate_cost >= cost:
-            break
-        poses, cost = candidate, candidate_cost
-        if _is_same(system.times(x) - system.b, _rotation_residual(graph, poses)):
+        before = cost
+        poses, cost, length = _lowered(graph, poses, x, cost)
+        # Where rotations wrap and are else linear, a solution may be exact.
+        if not length or before - cost <= options.tolerance * cost or _is_same(
+                length * system.times(x) - system.b, _rotation_residual(graph, poses)):
             break
     return poses
+
+
+def _lowered(graph: FactorGraph, poses: Array, x: Array,
+             cost: float) -> tuple[Array, float, float]:
+    """Return poses, cost and length of the longest of x, x/2, ... that lowers it; 0: none."""
+    for halvings in range(_HALVINGS):
+        candidate = _moved(graph, poses, x / 2**halvings, graph.manifold.ROTATION)
+        candidate_cost = _rotation_cost(graph, candidate)
+        if candidate_cost < cost:
+            return candidate, candidate_cost, 0.5**halvings
+    return poses, cost, 0.0
 
 
 def _minimise(system: LinearSystem, cholesky: BlockCholesky | None,

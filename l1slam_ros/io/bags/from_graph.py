@@ -34,7 +34,7 @@ from l1slam_ros.io.bags.topics import (
     TRUSTED_LOOP_TOPIC,
     TRUTH_TOPIC,
 )
-from l1slam_ros.io.bags.writer import BagWriter, new_bag
+from l1slam_ros.io.bags.writer import new_bag
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.messages.conversion import reference_frame_id
@@ -46,6 +46,8 @@ GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
 VERBATIM_NOTE = {'messages': 'verbatim'}
 
 _BASE_FRAME = 'base_link'
+_ODOMETRY, _TRUTH = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped'
+_LOOP = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 # builtin_interfaces/Time holds its seconds in 32 bits.
 _LAST_STAMP = 2**31 * NANOSECONDS - 1
 
@@ -72,109 +74,77 @@ def write_graph_bag(
     steps, loops = _steps(record), _loops(record)
     if truth is not None and len(truth) != len(stamps):
         raise GraphError(f'{len(truth)} true poses; expected {len(stamps)}, one for each vertex')
+    to_pose3, factors = graph.manifold.to_pose3, graph.between
+    covariances = _covariances(graph)
+    chain, measured = to_pose3(_chain(graph, steps)), to_pose3(factors.measurement)
+    topics = np.where(factors.is_absolute, ABSOLUTE_TOPIC, np.where(
+        factors.trusted & ~factors.is_odometry, TRUSTED_LOOP_TOPIC, LOOP_TOPIC)).tolist()
     with new_bag(path, _note(record, stamps, steps)) as writer:
-        factors = _FactorWriter(writer, graph)
-        chain = graph.manifold.to_pose3(_chain(graph, steps)).tolist()
-        true = None if truth is None else _PoseWriter(writer, graph, truth)
+        messages = _Messages(writer.types)
+        writer.add_topic(ODOMETRY_TOPIC, _ODOMETRY)
+        for topic in sorted({LOOP_TOPIC, *topics}):
+            writer.add_topic(topic, _LOOP)
+        if truth is not None:
+            writer.add_topic(TRUTH_TOPIC, _TRUTH)
+            true = to_pose3(truth)
         for k, stamp in enumerate(stamps):
-            factors.write_odometry(stamp, chain[k], steps[k - 1] if k else None)
-            if true is not None:
-                true.write(stamp, k)
+            covariance = covariances[steps[k - 1]] if k else np.zeros(36)
+            writer.write(ODOMETRY_TOPIC, stamp, messages.odometry(stamp, chain[k], covariance))
+            if truth is not None:
+                writer.write(TRUTH_TOPIC, stamp, messages.pose_stamped('map', stamp, true[k]))
             for loop in loops[k]:
-                i = graph.between.i[loop]
-                factors.write_loop(stamp, loop, 'map' if i == WORLD else reference_frame_id(
-                    _BASE_FRAME, stamps[i]))
+                i = factors.i[loop]
+                frame = 'map' if i == WORLD else reference_frame_id(_BASE_FRAME, stamps[i])
+                writer.write(topics[loop], stamp, messages.loop(
+                    frame, stamp, measured[loop], covariances[loop]))
 
 
-class _FactorWriter:
-    """Writes /odom and /loop_closures, filling one message of each anew for every factor."""
+class _Messages:
+    """Makes messages of stamps [ns], poses x y z qx qy qz qw and covariances (36,)."""
 
-    def __init__(self, writer: BagWriter, graph: FactorGraph):
-        manifold, factors = graph.manifold, graph.between
-        self._writer = writer
-        self._measured = manifold.to_pose3(factors.measurement).tolist()
-        self._covariances = covariance_of(factors.sqrt_information)
-        diagonal = np.arange(manifold.TANGENT_SIZE)
-        self._covariances[:, diagonal, diagonal] += np.where(factors.speaks, 0.0, np.inf)
-        rows = np.array(manifold.COVARIANCE_ROWS)
-        self._entries = (6 * rows[:, None] + rows).ravel()
-        self._topics = np.where(factors.is_absolute, ABSOLUTE_TOPIC, np.where(
-            factors.trusted & ~factors.is_odometry, TRUSTED_LOOP_TOPIC, LOOP_TOPIC)).tolist()
-        self._odometry = _blank_odometry(writer.types)
-        self._loop = _blank_loop(writer.types)
-        writer.add_topic(ODOMETRY_TOPIC, self._odometry.__msgtype__)
-        for topic in sorted({LOOP_TOPIC, *self._topics}):
-            writer.add_topic(topic, self._loop.__msgtype__)
+    def __init__(self, types: dict[str, Any]):
+        self._types = types
+        zero = types['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
+        self._standing = types['geometry_msgs/msg/TwistWithCovariance'](
+            types['geometry_msgs/msg/Twist'](zero, zero), np.zeros(36))
 
-    def write_odometry(self, stamp: int, pose3: list[float], step: int | None) -> None:
-        """Write a pose of the odometry; step : the factor that leads there, None at the start."""
-        _fill(self._odometry.header, self._odometry.pose.pose, stamp, pose3)
-        self._odometry.pose.covariance = self._covariance(step)
-        self._writer.write(ODOMETRY_TOPIC, stamp, self._odometry)
+    def odometry(self, stamp: int, pose3: Array, covariance: Array) -> Any:
+        """Return a message of the odometry topic."""
+        return self._types[_ODOMETRY](self._header('odom', stamp), _BASE_FRAME,
+                                      self._with_covariance(pose3, covariance), self._standing)
 
-    def write_loop(self, stamp: int, loop: int, frame: str) -> None:
-        """Write the factor `loop` of the keyframe of a stamp [ns], seen from a frame."""
-        _fill(self._loop.header, self._loop.pose.pose, stamp, self._measured[loop])
-        self._loop.header.frame_id = frame
-        self._loop.pose.covariance = self._covariance(loop)
-        self._writer.write(self._topics[loop], stamp, self._loop)
+    def loop(self, frame: str, stamp: int, pose3: Array, covariance: Array) -> Any:
+        """Return a loop closure; frame : names the earlier keyframe."""
+        return self._types[_LOOP](self._header(frame, stamp),
+                                  self._with_covariance(pose3, covariance))
 
-    def _covariance(self, factor: int | None) -> Array:
-        """Return the 36 entries of a message; zero without a factor."""
-        entries = np.zeros(36)
-        if factor is not None:
-            entries[self._entries] = self._covariances[factor].ravel()
-        return entries
+    def pose_stamped(self, frame: str, stamp: int, pose3: Array) -> Any:
+        """Return a true pose."""
+        return self._types[_TRUTH](self._header(frame, stamp), self._pose(pose3))
+
+    def _header(self, frame: str, stamp: int) -> Any:
+        time = self._types['builtin_interfaces/msg/Time'](*divmod(stamp, NANOSECONDS))
+        return self._types['std_msgs/msg/Header'](time, frame)
+
+    def _with_covariance(self, pose3: Array, covariance: Array) -> Any:
+        return self._types['geometry_msgs/msg/PoseWithCovariance'](self._pose(pose3), covariance)
+
+    def _pose(self, pose3: Array) -> Any:
+        numbers = pose3.tolist()
+        return self._types['geometry_msgs/msg/Pose'](
+            self._types['geometry_msgs/msg/Point'](*numbers[:3]),
+            self._types['geometry_msgs/msg/Quaternion'](*numbers[3:]))
 
 
-class _PoseWriter:
-    """Writes /ground_truth."""
-
-    def __init__(self, writer: BagWriter, graph: FactorGraph, truth: Array):
-        types = writer.types
-        self._writer = writer
-        self._pose3 = graph.manifold.to_pose3(truth).tolist()
-        self._message = types['geometry_msgs/msg/PoseStamped'](
-            _header(types, 'map'), _blank_pose(types))
-        writer.add_topic(TRUTH_TOPIC, self._message.__msgtype__)
-
-    def write(self, stamp: int, k: int) -> None:
-        """Write the true pose of keyframe k."""
-        _fill(self._message.header, self._message.pose, stamp, self._pose3[k])
-        self._writer.write(TRUTH_TOPIC, stamp, self._message)
-
-
-def _blank_odometry(types: dict[str, Any]) -> Any:
-    twist = types['geometry_msgs/msg/Twist'](
-        *(types['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0) for _ in range(2)))
-    return types['nav_msgs/msg/Odometry'](
-        _header(types, 'odom'), _BASE_FRAME,
-        types['geometry_msgs/msg/PoseWithCovariance'](_blank_pose(types), np.zeros(36)),
-        types['geometry_msgs/msg/TwistWithCovariance'](twist, np.zeros(36)))
-
-
-def _blank_loop(types: dict[str, Any]) -> Any:
-    return types['geometry_msgs/msg/PoseWithCovarianceStamped'](
-        _header(types, ''),
-        types['geometry_msgs/msg/PoseWithCovariance'](_blank_pose(types), np.zeros(36)))
-
-
-def _blank_pose(types: dict[str, Any]) -> Any:
-    return types['geometry_msgs/msg/Pose'](
-        types['geometry_msgs/msg/Point'](0.0, 0.0, 0.0),
-        types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0))
-
-
-def _header(types: dict[str, Any], frame: str) -> Any:
-    return types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](0, 0), frame)
-
-
-def _fill(header: Any, pose: Any, stamp: int, pose3: list[float]) -> None:
-    """Set the stamp [ns] and the pose x y z qx qy qz qw of a message."""
-    position, orientation = pose.position, pose.orientation
-    header.stamp.sec, header.stamp.nanosec = divmod(stamp, NANOSECONDS)
-    position.x, position.y, position.z = pose3[:3]
-    orientation.x, orientation.y, orientation.z, orientation.w = pose3[3:]
+def _covariances(graph: FactorGraph) -> Array:
+    """Return the covariance of each factor as messages have it, (m, 36)."""
+    manifold, factors = graph.manifold, graph.between
+    rows, diagonal = manifold.COVARIANCE_ROWS, np.arange(manifold.TANGENT_SIZE)
+    of_manifold = covariance_of(factors.sqrt_information)
+    of_manifold[:, diagonal, diagonal] += np.where(factors.speaks, 0.0, np.inf)
+    covariances = np.zeros((len(factors), 6, 6))
+    covariances[np.ix_(range(len(factors)), rows, rows)] = of_manifold
+    return covariances.reshape(-1, 36)
 
 
 def _note(record: GraphRecord, stamps: list[int], steps: Indices) -> dict[str, str]:

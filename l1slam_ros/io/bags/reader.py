@@ -2,8 +2,8 @@
 """
 Bags in: rosbag2 directories, bare `.mcap` and `.db3` files, `.bag` files of ROS 1.
 
-The bag library reads them while it can; where it gives up, `salvage` goes on. The bag libraries
-are imported by `reader`, `writer`, `salvage` and the walks alone, and only where needed.
+The bag library reads them while it can; where it gives up, `salvage` goes on. The libraries take
+their time to import, so who may do without a bag imports this module only where it meets one.
 """
 
 import math
@@ -14,6 +14,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import yaml
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.bags.damaged.salvage import (
@@ -171,8 +175,6 @@ def read_note(path: str | os.PathLike[str]) -> dict[str, str]:
 
 def _note_in(file: Path) -> dict[str, str]:
     """Return the note in a file, or in the metadata.yaml of a directory."""
-    import yaml
-
     metadata: dict[str, Any] = {}
     if file.is_dir():
         metadata = directory_metadata(file)
@@ -268,9 +270,6 @@ def _by_library(
 @contextmanager
 def _reader(bag: Path) -> Iterator[Any]:
     """Yield the library's reader of a bag that it can be trusted with."""
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
     for file in storage_files(bag) if bag.is_dir() else [bag]:
         if file.suffix == '.mcap' and not is_indexed(file):
             raise LookupError(f'{file.name} has no sound index')

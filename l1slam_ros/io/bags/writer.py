@@ -16,6 +16,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import yaml
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_typestore
+
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.bags.damaged.salvage import METADATA
 from l1slam_ros.io.files import sync_folder
@@ -113,9 +117,6 @@ def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagW
     FileError : the bag cannot be written, or something that is no bag is in its place.
 
     """
-    from mcap.writer import Writer
-    from rosbags.typesys import Stores, get_typestore
-
     target = Path(os.path.abspath(path))
     with _replacing_directory(target) as made:
         made.mkdir()
@@ -137,8 +138,6 @@ def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagW
 
 def _yaml(document: Any, in_one_line: bool = False) -> str:
     """Return a document as YAML, whatever occurs in it twice written out twice."""
-    import yaml
-
     text = StringIO()
     dumper = yaml.SafeDumper(text, sort_keys=False, width=2**16,
                              default_flow_style=in_one_line)

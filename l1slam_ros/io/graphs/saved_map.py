@@ -1,43 +1,161 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map of a back end as a file, and back."""
+"""
+The map of a back end as one file, and back: a g2o graph, and all else in its remarks.
 
+One rename puts it in its place. The map before stays beside it, as `<path>.1`.
+"""
+
+import glob
+import os
+import shutil
+from dataclasses import asdict, fields, replace
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.online.snapshot import Snapshot
-from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
+from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.online.snapshot import Growth, Optimised, SavedMap
+from l1slam_ros.core.robust.judgement import Doubt, Judgement
+from l1slam_ros.io.files import put_lines, replacing
+from l1slam_ros.io.graphs.graph_file import GraphRecord, graph_lines, read_graph_file
+from l1slam_ros.io.remarks import is_proven, with_remarks
+
+_Record = TypeVar('_Record', Growth, Optimised, Judgement)
 
 
-def save_map(path: Path, now: Snapshot) -> int:
+def save_map(path: Path, saved: SavedMap | None) -> str:
     """
-    Write graph, poses, stamps and trust as g2o and beside it; return how many keyframes.
+    Write a map and return a sentence that says so.
 
     Raises
     ------
-    FileError : there is no graph yet, or the file cannot be written.
+    FileError : there is none, or the file cannot be written; it is then as it was.
 
     """
-    if not len(now.graph.between):
+    if saved is None:
         raise FileError(path, 'there is no graph yet to be saved')
-    poses = now.poses
-    write_graph_file(path, GraphRecord(now.graph, poses, np.arange(len(poses)), now.stamps))
-    return len(poses)
+    record = GraphRecord(saved.growth.graph, saved.optimised.poses, np.arange(_count(saved)))
+    with replacing(path) as temporary:
+        put_lines(temporary, with_remarks(graph_lines(path, record), _remarks(saved)))
+        _keep(path)
+    _remove_leftovers(path)
+    return f'{_count(saved)} keyframes saved to {path}'
 
 
-def load_map(path: Path) -> tuple[FactorGraph, Array, Indices]:
+def load_map(path: Path) -> tuple[SavedMap, str, bool]:
     """
-    Return the graph of a saved map, its poses (n, p) and stamps (n,) [ns].
+    Return the map in a file, or that before it where this one is damaged or missing.
+
+    And a sentence that says which, and whether it is the newer one.
 
     Raises
     ------
-    FileError : the file is none.
+    FileError : neither is a map.
 
     """
+    before = _before(path)
+    try:
+        saved, which, whole = _read(path), f'{path}', True
+    except FileError as error:
+        if not before.exists():
+            raise
+        try:
+            saved, which, whole = _read(before), f'{before}, the map before: {error}', False
+        except FileError as another:
+            raise FileError(path, f'cannot be loaded: {error}; {another}') from another
+    return saved, f'{_count(saved)} keyframes loaded from {which}', whole
+
+
+def keep_as(path: Path, another: Path) -> None:
+    """
+    Let a file have another name, too, in the place of what has that.
+
+    Raises
+    ------
+    FileError : it cannot be.
+
+    """
+    with replacing(another) as temporary:
+        try:
+            os.link(path, temporary)
+        except OSError:  # not every file system has links
+            shutil.copyfile(path, temporary)
+
+
+def is_map(path: Path) -> bool:
+    """Tell whether a file is a saved map, whole, as it was written."""
+    try:
+        return is_proven(path, path.read_bytes())
+    except (FileError, OSError):
+        return False
+
+
+def _before(path: Path) -> Path:
+    return path.with_name(f'{path.name}.1')
+
+
+def _count(saved: SavedMap) -> int:
+    return len(saved.optimised.poses)
+
+
+def _keep(path: Path) -> None:
+    """Let a file be that before it, too, unless it is damaged and that is not."""
+    before = _before(path)
+    if path.exists() and (is_map(path) or not is_map(before)):
+        keep_as(path, before)
+
+
+def _remove_leftovers(path: Path) -> None:
+    """Remove what is left of writers of this file that were killed."""
+    for leftover in path.parent.glob(f'.{glob.escape(path.name)}*.tmp'):
+        leftover.unlink(missing_ok=True)
+
+
+def _remarks(saved: SavedMap) -> dict[str, Any]:
+    """Return by name what g2o has no tag for."""
+    growth, optimised = saved.growth, saved.optimised
+    values = {f.name: getattr(record, f.name)
+              for record in (growth, optimised, optimised.judgement) for f in fields(record)}
+    for name in 'graph', 'poses', 'judgement':
+        del values[name]
+    return values | {
+        'doubts': [asdict(doubt) for doubt in optimised.judgement.doubts], 'robust': saved.robust,
+        'trusted': growth.graph.between.trusted, 'struck': growth.graph.between.struck,
+        'seen': {key.hex(): growth.seen[key] for key in sorted(growth.seen)},
+        'waiting': [[loop.reference_stamp, loop.stamp, loop.trusted, loop.struck, age,
+                     loop.pose3.tolist(), loop.covariance.tolist()]
+                    for loop, age in growth.waiting]}
+
+
+def _read(path: Path) -> SavedMap:
     record = read_graph_file(path)
     if record.poses is None or record.stamps is None:
-        raise FileError(path, 'has no poses or no stamps beside it; expected a saved map')
-    return record.graph, record.poses, record.stamps
+        raise FileError(path, 'has no poses or no stamps; expected a saved map')
+    growth = Growth.of_graph(record.graph, record.poses, record.stamps)
+    optimised, values = Optimised.nothing(record.poses), dict(record.remarks or {})
+    if not values:
+        return SavedMap(growth, optimised, True)
+    waiting = tuple(
+        (LoopClosure(reference, stamp, np.array(pose3), np.array(covariance), trusted, struck),
+         age)
+        for reference, stamp, trusted, struck, age, pose3, covariance in values.pop('waiting'))
+    seen = {bytes.fromhex(key): row for key, row in values.pop('seen').items()}
+    doubts = tuple(Doubt(**doubt) for doubt in values.pop('doubts'))
+    judgement = replace(_restored(optimised.judgement, values), doubts=doubts)
+    return SavedMap(replace(_restored(growth, values), waiting=waiting, seen=seen),
+                    replace(_restored(optimised, values), judgement=judgement),
+                    values['robust'])
+
+
+def _restored(record: _Record, values: dict[str, Any]) -> _Record:
+    """Return a record with the values that were saved, each of the kind that stands in it."""
+    return replace(record, **{f.name: _like(getattr(record, f.name), values[f.name])
+                              for f in fields(record) if f.name in values})
+
+
+def _like(kind: Any, value: Any) -> Any:
+    if isinstance(kind, np.ndarray):
+        return np.array(value, kind.dtype).reshape(-1, *kind.shape[1:])
+    return type(kind)(value)

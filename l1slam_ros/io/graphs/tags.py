@@ -1,10 +1,58 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lines of graph files by their tags: how those are read that are used, and why others not."""
+"""
+The lines of graph files by their tags: how those are read that are used, and why others are not.
 
-from dataclasses import dataclass
+A line is a tag, one or two vertex ids, a pose, and the upper triangle of an information matrix:
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.manifold import Manifold
+    VERTEX_SE2 id x y theta                                VERTEX2 id x y theta
+    EDGE_SE2 i j x y theta xx xy xt yy yt tt               EDGE2 i j x y theta xx xy yy tt xt yt
+    EDGE_PRIOR_SE2 id x y theta xx xy xt yy yt tt          EDGE_PRIOR_SE2_XY id x y xx xy yy
+    VERTEX_SE3:QUAT id x y z qx qy qz qw                   VERTEX3 id x y z roll pitch yaw
+    EDGE_SE3:QUAT i j x y z qx qy qz qw xx xy ...          EDGE3 i j x y z roll pitch yaw xx xy ...
+    EDGE_SE3_PRIOR id 0 x y z qx qy qz qw xx xy ...        EDGE_SE3_XYZPRIOR id 0 x y z xx xy ...
+
+Priors are absolute factors; rows and columns of zeros in the information say nothing. The number
+after the id of one in space is that of a `PARAMS_SE3OFFSET` between the robot and what was
+measured, which must be none.
+
+**TORO orders the information of the plane otherwise** (forward, sideways, rotation: `ff fs ss rr
+fr sr`). **g2o's rotation in space is the quaternion's vector part**, half the angle: the rotation
+block of its information is four times that of the angle, the blocks beside it twice. Not all who
+write its files know; TORO's information is of the angles.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from l1slam_ros.core.geometry import se2, se3
+from l1slam_ros.core.geometry.manifold import Array, Manifold
+from l1slam_ros.core.names import QUATERNION
+
+
+def _same(values: Array) -> Array:
+    return values
+
+
+def _from_angles(values: Array) -> Array:
+    """Return poses (m, 7) of rows x y z roll pitch yaw: turns about z, then y, then x."""
+    turn = np.zeros((3, len(values), 7))
+    turn[..., 6] = np.cos(values[:, 3:].T / 2)
+    for axis in range(3):
+        turn[axis, :, 3 + axis] = np.sin(values[:, 3 + axis] / 2)
+    roll, pitch, yaw = turn
+    yaw[:, :3] = values[:, :3]
+    return se3.compose(se3.compose(yaw, pitch), roll)
+
+
+def _to_angles(poses: Array) -> Array:
+    """Return rows x y z roll pitch yaw (m, 6) of poses."""
+    x, y, z, w = poses[:, 3:].T
+    sine = np.clip(2 * (w * y - z * x), -1, 1)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.column_stack((poses[:, :3], roll, np.arcsin(sine), yaw))
 
 
 @dataclass(frozen=True)
@@ -12,10 +60,11 @@ class Tag:
     """
     How the lines of one tag are read.
 
-    kind : vertex, between, absolute or position (absolute, too); ids : how many vertex ids lead;
-    values : how many numbers of the pose follow, the rest is that of the identity; information :
-    row and column of each entry of the upper triangle, in the order of the file; none for a
-    vertex.
+    kind : vertex, between, absolute or position (absolute, too); ids : how many whole numbers
+    lead, of which `vertices` are vertex ids; values : how many numbers of a pose follow, which
+    read and write turn into the first ones of a pose of the manifold and back, the rest is that of
+    the identity; information : row and column of each entry of the upper triangle, in the order of
+    the file; none for a vertex.
     """
 
     file_format: str
@@ -24,26 +73,60 @@ class Tag:
     ids: int
     values: int
     information: tuple[tuple[int, int], ...] = ()
+    read: Callable[[Array], Array] = field(default=_same)
+    write: Callable[[Array], Array] = field(default=_same)
+
+    @property
+    def vertices(self) -> int:
+        """How many vertices a line names."""
+        return 2 if self.kind == 'between' else 1
+
+    @property
+    def has_quaternion(self) -> bool:
+        """Whether the pose ends in a quaternion."""
+        return self.values == se3.POSE_SIZE
+
+    def units(self, rotation_information: str) -> Array:
+        """
+        Return how many of the file's units a unit of each entry of the residual is, (d,).
+
+        rotation_information : of `names.ROTATION_INFORMATION`
+        """
+        units = np.ones(self.manifold.TANGENT_SIZE)
+        if self.has_quaternion and rotation_information == QUATERNION:
+            units[self.manifold.ROTATION] = 0.5
+        return units
 
 
-_G2O_2D = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-_TORO_2D = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
+def _triangle(size: int) -> tuple[tuple[int, int], ...]:
+    """Return row and column of each entry of an upper triangle, row by row."""
+    return tuple((row, column) for row in range(size) for column in range(row, size))
+
+
+_TORO_PLANE = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
+_QUATERNION = (se3.from_pose3, se3.to_pose3)
+_ANGLES = (_from_angles, _to_angles)
 
 TAGS = {
     'VERTEX_SE2': Tag('g2o', 'vertex', se2, 1, 3),
-    'EDGE_SE2': Tag('g2o', 'between', se2, 2, 3, _G2O_2D),
-    'EDGE_PRIOR_SE2': Tag('g2o', 'absolute', se2, 1, 3, _G2O_2D),
-    'EDGE_PRIOR_SE2_XY': Tag('g2o', 'position', se2, 1, 2, ((0, 0), (0, 1), (1, 1))),
+    'EDGE_SE2': Tag('g2o', 'between', se2, 2, 3, _triangle(3)),
+    'EDGE_PRIOR_SE2': Tag('g2o', 'absolute', se2, 1, 3, _triangle(3)),
+    'EDGE_PRIOR_SE2_XY': Tag('g2o', 'position', se2, 1, 2, _triangle(2)),
     'VERTEX2': Tag('toro', 'vertex', se2, 1, 3),
-    'EDGE2': Tag('toro', 'between', se2, 2, 3, _TORO_2D),
+    'EDGE2': Tag('toro', 'between', se2, 2, 3, _TORO_PLANE),
+    'VERTEX_SE3:QUAT': Tag('g2o', 'vertex', se3, 1, 7, (), *_QUATERNION),
+    'EDGE_SE3:QUAT': Tag('g2o', 'between', se3, 2, 7, _triangle(6), *_QUATERNION),
+    'EDGE_SE3_PRIOR': Tag('g2o', 'absolute', se3, 2, 7, _triangle(6), *_QUATERNION),
+    'EDGE_SE3_XYZPRIOR': Tag('g2o', 'position', se3, 2, 3, _triangle(3)),
+    'VERTEX3': Tag('toro', 'vertex', se3, 1, 6, (), *_ANGLES),
+    'EDGE3': Tag('toro', 'between', se3, 2, 6, _triangle(6), *_ANGLES),
 }
 FACTORS = 'between', 'absolute', 'position'
+# What g2o measures an absolute pose in space by: its line where there is no offset.
+OFFSET = 'PARAMS_SE3OFFSET'
+NO_OFFSET = f'{OFFSET} 0 0 0 0 0 0 0 1'
+FORMAT_OF_SUFFIX = {'.graph': 'toro'}
 
-# Besides all that have SE3 or SIM3 in their names.
-TAGS_3D = frozenset({
-    'VERTEX3', 'EDGE3', 'VERTEX_TRACKXYZ', 'EDGE_POINTXYZ', 'EDGE_XYZPRIOR', 'EDGE_PROJECT_DEPTH',
-    'EDGE_PROJECT_DISPARITY',
-})
 _LANDMARKS = 'landmarks are no part of a pose graph'
 SENSORS = 'sensor data and calibration are no part of a pose graph'
 # Known and left out, with the reason that is told; PARAMS_... and FIX are, too.
@@ -53,6 +136,8 @@ TAGS_LEFT_OUT = {
         'EDGE_SE2_POINTXY_OFFSET', 'EDGE_SE2_TWOPOINTSXY', 'EDGE_SE2_LOTSOFXY',
         'VERTEX_SEGMENT2D', 'VERTEX_LINE2D', 'EDGE_SE2_SEGMENT2D', 'EDGE_SE2_SEGMENT2D_LINE',
         'EDGE_SE2_SEGMENT2D_POINTLINE', 'EDGE_SE2_LINE2D', 'EDGE_LINE2D', 'EDGE_LINE2D_POINTXY',
+        'VERTEX_TRACKXYZ', 'EDGE_SE3_TRACKXYZ', 'EDGE_POINTXYZ', 'EDGE_XYZPRIOR',
+        'EDGE_PROJECT_DEPTH', 'EDGE_PROJECT_DISPARITY',
     ), _LANDMARKS),
     **dict.fromkeys((
         'ROBOTLASER1', 'RAWLASER1', 'FRONTLASER1', 'REARLASER1', 'VERTEX_TAG', 'VERTEX_ELLIPSE',

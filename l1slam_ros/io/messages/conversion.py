@@ -26,13 +26,11 @@ from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import silent_components
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.io.files import NANOSECONDS, quoted, stamp_text
+from l1slam_ros.io.files import NANOSECONDS, QUATERNION_NORM_ERROR, quoted, stamp_text
 
 _REFERENCE_FRAME = re.compile(r'(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
 # builtin_interfaces/Time holds its seconds in 32 bits.
 _MAX_SECONDS = 2**31 - 1
-# Two printed digits stay below; an unset or broken quaternion does not.
-QUATERNION_NORM_ERROR = 0.1
 # [m] No robot's coordinates: beyond, differences of positions lose the millimetre, then overflow.
 _FARTHEST = 1e9
 
@@ -68,13 +66,23 @@ def loop_closure(message: Any, base_frame: str, trusted: bool) -> LoopClosure:
     MessageError : it cannot be used.
 
     """
-    stamp = stamp_of(message.header)
-    reference_stamp = _reference_stamp(message.header.frame_id, base_frame)
-    if reference_stamp >= stamp:
-        raise MessageError('order', f'reference {stamp_text(reference_stamp)} of a loop; '
-                           f'expected one earlier than its stamp {stamp_text(stamp)}')
-    return LoopClosure(reference_stamp, stamp, _pose3(message.pose.pose),
+    return LoopClosure(*_ends(message, base_frame), _pose3(message.pose.pose),
                        _covariance(message.pose.covariance), trusted)
+
+
+def false_loop(message: Any, base_frame: str) -> LoopClosure:
+    """
+    Return the word that the loop of two times is false, named as in `loop_closure`.
+
+    What the message measures says nothing, and may be left empty.
+
+    Raises
+    ------
+    MessageError : it names no two times.
+
+    """
+    return LoopClosure(*_ends(message, base_frame), np.array((0.0, 0, 0, 0, 0, 0, 1)),
+                       np.zeros((6, 6)), struck=True)
 
 
 def absolute_pose(message: Any, map_frame: str) -> LoopClosure:
@@ -142,6 +150,16 @@ def stamp_of(header: Any) -> int:
         raise MessageError('stamp', f'stamp {seconds} s {nanoseconds} ns; '
                            'expected a time after 0 with less than 1000000000 ns')
     return stamp
+
+
+def _ends(message: Any, base_frame: str) -> tuple[int, int]:
+    """Return reference and stamp of a loop [ns]."""
+    stamp = stamp_of(message.header)
+    reference = _reference_stamp(message.header.frame_id, base_frame)
+    if reference >= stamp:
+        raise MessageError('order', f'reference {stamp_text(reference)} of a loop; '
+                           f'expected one earlier than its stamp {stamp_text(stamp)}')
+    return reference, stamp
 
 
 def _reference_stamp(frame_id: str, base_frame: str) -> int:

@@ -20,7 +20,7 @@ def between(i, j):
     """Return factors between the given keyframes that measure nothing in particular."""
     m = len(i)
     return BetweenFactors(np.array(i), np.array(j), np.zeros((m, 3)), np.zeros((m, 3, 3)),
-                          np.zeros(m, bool))
+                          *np.zeros((2, m), bool))
 
 
 def graph_with(n, pairs):

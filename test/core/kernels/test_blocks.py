@@ -47,16 +47,6 @@ def test_products_equal_those_of_the_matrix(system, rng):
     assert_allclose(system.transposed_times(y), system.A.T @ y, atol=1e-12)
 
 
-def test_gradients_are_the_summands_of_the_transposed_product(system, k, rng):
-    y = rng.standard_normal(len(system.b))
-    gradients = system.gradients(y)
-    assert_allclose(gradients, np.einsum('fsrc,fr->fsc', system.blocks, y.reshape(-1, k)),
-                    atol=1e-12)
-    total = np.zeros((system.size + 1, k))
-    np.add.at(total, system.keyframe, gradients)
-    assert_allclose(total[:-1].ravel(), system.transposed_times(y), atol=1e-12)
-
-
 @pytest.mark.parametrize('entries', [slice(0, 2), slice(2, 3)])
 def test_a_part_is_its_rows_and_columns(entries, rng):
     system = random_system(SHAPES[-2](9), 9, 3, rng)
@@ -68,10 +58,12 @@ def test_a_part_is_its_rows_and_columns(entries, rng):
     assert part.block_size == len(range(3)[entries])
 
 
-def test_vectors_and_jacobians_are_whitened(k, rng):
+def test_vectors_duals_and_jacobians_are_whitened(k, rng):
     roots, J = rng.standard_normal((2, 7, k, k))
     e = rng.standard_normal((7, k))
     assert_allclose(kernels.whiten(roots, e, (0,) * k), np.einsum('frc,fc->fr', roots, e),
+                    atol=1e-12)
+    assert_allclose(kernels.unwhiten(roots, e, (0,) * k), np.einsum('frc,fr->fc', roots, e),
                     atol=1e-12)
     blocks = np.full((7, 2, k, k), np.pi)
     for side in range(2):

@@ -22,7 +22,6 @@ from l1slam_ros.core.errors import Interrupted, OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
-from l1slam_ros.core.online.graph_builder import LoopOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loop_states import (
     ACCEPTED,
@@ -32,6 +31,7 @@ from l1slam_ros.core.online.loop_states import (
     SUSPECT,
     WAITING,
 )
+from l1slam_ros.core.online.loops.loop_factors import LoopOptions
 from l1slam_ros.core.online.update import improve, optimise
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, minimise
@@ -501,7 +501,7 @@ def restored(world, n):
     first, second = Backend(EVERY), Backend(EVERY)
     play(first, world, 0, n)
     settled(first)
-    second.restore(first.snapshot().problem().graph, first.poses, first.snapshot().stamps)
+    second.restore(first.saved())
     return first, second
 
 

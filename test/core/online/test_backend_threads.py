@@ -134,7 +134,7 @@ def patient(problem, options, budget, check):
 def test_an_update_is_interrupted_at_once(monkeypatch, interrupt):
     backend, stopped, begun = Backend(OPTIONS), threading.Event(), threading.Event()
     drive(backend, 0, 5)
-    now = backend.snapshot()
+    now = backend.saved()
 
     def update():
         with pytest.raises(Interrupted):
@@ -150,7 +150,7 @@ def test_an_update_is_interrupted_at_once(monkeypatch, interrupt):
     if interrupt == 'settle':
         assert backend.settle(go_on).cost == pytest.approx(0.0, abs=1e-6)
     elif interrupt == 'restore':
-        backend.restore(now.graph, now.poses, now.stamps)
+        backend.restore(now)
     elif interrupt == 'reset':
         backend.reset()
     else:
@@ -212,9 +212,9 @@ def test_in_the_background_what_comes_is_judged_and_the_thread_ends():
         backend.add_loop(loop(1.0, 30.0, (28.9, 0.0, 0.0), 1e-4 * np.eye(6)))
         wait_until(lambda: backend.loop_states().state.tolist() == [ACCEPTED])
         wait_until(lambda: backend.update() is None)
-        now = backend.snapshot()
+        now = backend.saved()
         # A map that takes the place of another is woken for too.
-        backend.restore(now.graph, now.poses, now.stamps)
+        backend.restore(now)
         wait_until(lambda: backend.snapshot().optimised.at_rest)
         assert len(of_threads()) == 1
     assert not of_threads()

@@ -27,8 +27,11 @@ from problems import (
 
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions, LoopOptions
+from l1slam_ros.core.graph.factor_graph import WORLD
+from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.loops.loop_factors import LoopOptions
 
 EVERY = GraphBuilderOptions(keyframe=KeyframeOptions(0.0, 0.0, 0.0))
 DEFAULTS = GraphBuilderOptions()
@@ -100,7 +103,7 @@ def test_a_factor_has_the_covariance_of_the_whole_motion(rng):
     assert_allclose(covariance_of(builder, 0), expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize('time', [0.9, 0.5, 0.0])
+@pytest.mark.parametrize('time', [0.9, 0.5, 0.41])
 def test_an_old_stamp_is_refused_and_nothing_is_added(time):
     poses = curve(12)
     builder = grown(poses[:10], EVERY)
@@ -333,7 +336,7 @@ def test_the_loops_of_an_earlier_run_are_those_of_its_keyframes():
         first.add_loop(true_loop(poses, *pair))
     first.add_due_loops()
     second = GraphBuilder(se2, EVERY)
-    second.restore(first.graph, first.stamps, poses)
+    second.restore(first.grown())
     second.add_loop(loop(0.0, 6.2, (1.0, 0.0, 0.0)))
     for k in range(60, 64):
         second.add_odometry(odometry(k * PERIOD, (k, 0.0, 0.0)))
@@ -366,15 +369,16 @@ def test_a_loop_sent_again_is_used_once(times):
 
 
 def test_other_measurements_of_a_pair_are_other_loops():
-    """Another pose, another covariance, another trust, or the whole a nanosecond later."""
+    """Another pose, another covariance, or the whole a nanosecond later; not another trust."""
     poses = curve(200)
     builder, one = grown(poses, EVERY), true_loop(poses, 7, 151, 0.01 * np.eye(6))
     others = [one, replace(one, pose3=np.nextafter(one.pose3, 9)), replace(one, trusted=True),
               replace(one, covariance=0.0101 * np.eye(6)), replace(one, stamp=one.stamp + 1)]
     for other in others + others:
         builder.add_loop(other)
-    assert builder.add_due_loops() == len(others)
+    assert builder.add_due_loops() == len(others) - 1
     assert +builder.refused == {'repeated': len(others)}
+    assert builder.graph.between.trusted[builder.loop_rows].tolist() == [True] + 3 * [False]
 
 
 def test_a_loop_that_expired_may_be_sent_again():
@@ -397,7 +401,7 @@ def test_a_loop_of_an_earlier_run_is_known_by_the_keyframes_it_named(rng):
         first.add_loop(one)
     first.add_due_loops()
     second = GraphBuilder(se2, EVERY)
-    second.restore(first.graph, first.stamps, poses)
+    second.restore(first.grown())
     for one in loops:
         second.add_loop(one)
     second.add_loop(replace(loops[0], covariance=1.01 * covariance))
@@ -507,3 +511,77 @@ def test_one_strange_covariance_does_not_take_other_loops_with_it(bad):
     builder.add_loop(true_loop(poses, 3, 260, bad))
     with np.errstate(over='ignore', invalid='ignore'):
         assert builder.add_due_loops() == 2
+
+
+# Absolute poses
+
+
+def absolute(time, pose, variances=(0.04, 0.04, 0.01), **more):
+    """Return the robot at `pose` (3,) in the map frame at a time [s]."""
+    return LoopClosure(None, seconds(time), se2.to_pose3(np.array(pose, float)),
+                       covariance6(np.diag(variances)), **more)
+
+
+def test_an_absolute_pose_is_a_factor_from_the_world():
+    """At a keyframe as it is stated, whole or in part."""
+    poses = curve(30)
+    growth = grown(poses, EVERY)
+    growth.add_loop(absolute(1.0, (5, 6, 0.7)))
+    growth.add_loop(absolute(2.0, (8, 9, 0.7), (0.04, 0.09, 0)))
+    growth.add_loop(absolute(2.5, (1, 2, 0.7), (-1, np.inf, 0.01), trusted=True))
+    assert growth.add_due_loops() == 3
+    i, j, measurement = loops_of(growth)
+    assert i == [WORLD] * 3 and j == [10, 20, 25]
+    # Without a heading, that of the message means nothing, and the axes are those of the map.
+    assert_allclose(measurement, [[5, 6, 0.7], [8, 9, 0], [1, 2, 0.7]], atol=1e-9)
+    factors = growth.graph.between
+    assert_allclose(factors.sqrt_information[-3:], [
+        np.diag([5, 5, 10]), np.diag([5, 10 / 3, 0]), np.diag([0, 0, 10])], atol=1e-9)
+    assert factors.trusted[-3:].tolist() == [False, False, True]
+    in_graph, waiting, _ = growth.loop_stamps
+    assert in_graph.tolist() == [[seconds(t)] * 2 for t in (1.0, 2.0, 2.5)] and not len(waiting)
+
+
+def test_between_keyframes_it_is_carried_to_the_nearest(rng):
+    poses = curve(60)
+    growth = grown(poses, GraphBuilderOptions())
+    at = keyframe_samples(growth)[3] + 1
+    way = se2.between(poses[at:at + 1], poses[at - 1:at])
+    growth.add_loop(absolute(at * PERIOD, poses[at], (0.04, 0.09, 0.01)))
+    growth.add_loop(absolute(at * PERIOD, poses[at], (0.04, 0.09, 0)))
+    growth.add_due_loops()
+    _, j, measurement = loops_of(growth)
+    assert j == [3, 3]
+    assert_allclose(measurement[0], poses[at - 1], atol=1e-9)
+    Ad = se2.adjoint(se2.inverse(way))[0]
+    rows = len(growth.graph.between) - 2, len(growth.graph.between) - 1
+    assert_allclose(covariance_of(growth, rows[0]), Ad @ np.diag([0.04, 0.09, 0.01]) @ Ad.T)
+    # Where that is from there, nobody knows without a heading: the way is noise.
+    assert_allclose(measurement[1], [*poses[at, :2], 0], atol=1e-9)
+    lost = (way[0, :2] ** 2).mean()
+    root = growth.graph.between.sqrt_information[rows[1]]
+    assert_allclose(np.diag(root)[:2] ** -2, [0.04 + lost, 0.09 + lost])
+
+
+def test_absolute_poses_wait_expire_and_come_once():
+    poses = curve(30)
+    growth = grown(poses[:10], EVERY)
+    growth.add_loop(absolute(1.5, (5, 6, 0.7)))
+    assert growth.add_due_loops() == 0 and growth.n_waiting == 1
+    drive_on(growth, poses, 10)
+    growth.add_loop(absolute(1.5, (5, 6, 0.7)))
+    growth.add_loop(absolute(-1.0, (5, 6, 0.7)))
+    growth.add_loop(absolute(1.5, (5, 6, 0.7), (0, -1, np.nan)))
+    growth.add_loop(absolute(1.5, (5, 6, 0.7), (2e6, 0, np.inf)))
+    growth.add_loop(absolute(90.0, (5, 6, 0.7)))
+    assert growth.add_due_loops() == 1
+    assert growth.refused == {'repeated': 1, 'before_start': 1, 'covariance': 2}
+    drive_on(growth, np.repeat(poses[-1:], 150, axis=0), 30)
+    assert growth.add_due_loops() == 0 and growth.refused['expired'] == 1
+
+
+def test_a_loop_may_leave_components_unsaid():
+    growth = grown(curve(30), EVERY)
+    growth.add_loop(loop(0.5, 2.0, (1, 2, 0.3), covariance6(np.diag([0.04, np.inf, 0.01]))))
+    growth.add_due_loops()
+    assert_allclose(growth.graph.between.sqrt_information[-1], np.diag([5, 0, 10]))

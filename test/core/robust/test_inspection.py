@@ -173,11 +173,11 @@ def test_a_large_graph_is_looked_at_in_seconds(rng):
     z = np.zeros((len(pairs), 3))
     z[:, 0] = pairs[:, 1] - pairs[:, 0]
     graph = graph_of(n, pairs, z + 0.01 * rng.standard_normal(z.shape), 1e4 * np.eye(3))
-    began = time.perf_counter()
+    began = time.process_time()
     for look in repeated_factors, parallel_factors, connected_parts, odometry_gaps, long_steps:
         look(graph)
     found = noise_scales(graph, rng)
-    assert time.perf_counter() - began < 10
+    assert time.process_time() - began < 10
     assert found.loops == pytest.approx(1, rel=0.05)
 
 

@@ -7,13 +7,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from problems import chain_and_loops, drive, graph_of, linprog_l1, noisy_graph, random_information
 
 from l1slam_ros.core.errors import GraphError
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.geometry import se2, se3
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.optimality import l1_cost
-from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.solvers.seed import chordal_poses, seed_poses
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 
 
@@ -141,3 +141,40 @@ def test_the_order_of_the_factors_does_not_matter_much(rng):
 def test_a_graph_in_two_parts_is_refused(rng):
     with pytest.raises(GraphError, match='keyframe 3 has no path'):
         seed_of(graph_of(drive(5, rng), [(0, 1), (1, 2), (3, 4)]))
+
+
+@pytest.mark.parametrize('manifold', [se2, se3], ids=lambda manifold: manifold.NAME)
+@pytest.mark.parametrize('absolute', [False, True])
+def test_the_chordal_relaxation_is_exact_without_noise(manifold, absolute, rng):
+    """A hundred turns of any size, also where the world is what is held fixed."""
+    truth = manifold.from_pose3(rng.standard_normal((30, 7)))
+    if not absolute:
+        truth = manifold.between(np.broadcast_to(truth[0], truth.shape), truth)
+    i, j = np.array(chain_and_loops(30, 70, rng)).T
+    d = manifold.TANGENT_SIZE
+    graph = FactorGraph(manifold)
+    graph.add_poses(30)
+    graph.add_between(i, j, manifold.between(truth[i], truth[j]),
+                      np.tile(np.eye(d), (len(i), 1, 1)))
+    if absolute:
+        graph.add_between(np.array([WORLD]), np.array([3]), truth[3:4], np.eye(d)[None])
+    poses = chordal_poses(graph, cholesky_of(graph))
+    assert_allclose(manifold.rotation(poses), manifold.rotation(truth), atol=1e-9)
+
+
+def test_in_space_it_finds_what_the_odometry_does_not(rng):
+    """Rotations of half a radian of noise at each step, on a grid of many small circles."""
+    n = 60
+    truth = se3.from_pose3(rng.standard_normal((n, 7)))
+    truth = se3.between(np.broadcast_to(truth[0], truth.shape), truth)
+    i, j = np.array(chain_and_loops(n, 5 * n, rng)).T
+    noise = [0.1, 0.1, 0.1, 0.3, 0.3, 0.3] * rng.standard_normal((len(i), 6))
+    graph = FactorGraph(se3)
+    graph.add_poses(n)
+    graph.add_between(i, j, se3.retract(se3.between(truth[i], truth[j]), noise),
+                      np.tile(np.diag([100.0] * 3 + [10.0] * 3), (len(i), 1, 1)))
+    poses = seed_of(graph)
+    assert np.median(se3.motion(se3.local(odometry_poses(graph), truth))[1]) > 1.0
+    costs = [np.abs(whitened_residual(graph, at).reshape(-1, 6)[:, 3:]).sum()
+             for at in (poses, truth)]
+    assert costs[0] < costs[1]

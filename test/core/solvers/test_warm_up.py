@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Once the cache is full nothing is compiled any more: a robot would stand still meanwhile."""
 
+import importlib
 import pkgutil
 import subprocess
 import sys
@@ -10,7 +11,15 @@ import numpy as np
 import pytest
 
 from l1slam_ros.core import kernels
-from l1slam_ros.core.solvers.warm_up import DENSE, JUDGEMENT, SPARSE, STEPS, warm_up
+from l1slam_ros.core.solvers.warm_up import (
+    DENSE,
+    JUDGEMENT,
+    SPARSE,
+    STEPS,
+    STEPS_IN_SPACE,
+    module_of,
+    warm_up,
+)
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.compilation import fill_cache
 from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
@@ -19,6 +28,7 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
 WORK = """
 import importlib
 import itertools
+import importlib
 import pkgutil
 from dataclasses import replace
 
@@ -185,5 +195,14 @@ def test_each_step_is_reported_once_it_is_done():
 
 def test_every_module_of_loops_is_a_step():
     modules = {module.name for module in pkgutil.iter_modules(kernels.__path__)}
-    assert sorted(STEPS) == sorted(modules - {'compiled'})
+    assert {module_of(step) for step in (*STEPS, *STEPS_IN_SPACE)} == modules - {'compiled'}
     assert set(STEPS) == {*SPARSE, *JUDGEMENT, *DENSE}
+    assert not {'se3', *STEPS_IN_SPACE} & set(STEPS)
+
+
+def test_every_version_for_space_is_in_a_step_for_space():
+    for name in {module_of(step) for step in STEPS}:
+        module = importlib.import_module(f'{kernels.__name__}.{name}')
+        wider = [kernel for kernel in vars(module).values()
+                 if getattr(kernel, 'takes_in_space', ())]
+        assert bool(wider) == (f'{name}:space' in STEPS_IN_SPACE)

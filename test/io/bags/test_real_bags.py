@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags as robots and tools write them: every kind, other topics, odd orders, no note of ours."""
 
-import json
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bags import KINDS, TYPES, mcap_file, recording_of, rosbag2_directory, write_world
-from l1slam_ros.cli.main import main
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
@@ -65,24 +63,6 @@ def test_a_summary_of_every_kind(tmp_path, world, kind):
     assert summary.start == recording[0][2]
 
 
-def test_one_graph_has_one_cost_whatever_it_comes_in(tmp_path, world, capsys):
-    bag, recording, _ = world
-    for name in ('a.g2o', 'a.graph'):
-        assert main(['convert', str(bag), str(tmp_path / name)]) == 0
-    db3 = rosbag2_directory(tmp_path / 'db3', recording, StoragePlugin.SQLITE3)
-    costs, poses = [], []
-    for path in (bag, bag / 'bag.mcap', db3, db3 / 'db3.db3', tmp_path / 'a.g2o',
-                 tmp_path / 'a.graph'):
-        capsys.readouterr()
-        out = tmp_path / 'out.tum'
-        arguments = ['solve', str(path), '--start', 'odometry', '--json', '--output', str(out)]
-        assert main(arguments) == 0
-        costs.append(json.loads(capsys.readouterr().out)['initial_cost'])
-        poses.append(np.loadtxt(out))
-    assert np.ptp(costs) <= 1e-9 * costs[0]
-    assert np.ptp(poses, axis=0).max() < 1e-6
-
-
 def test_a_robot_without_our_note_goes_by_the_defaults_of_the_node(tmp_path, world):
     # 16 messages a metre and 20 a second, straight on; no word on their errors.
     template = TYPES.deserialize_cdr(world[1][0][3], ODOMETRY)
@@ -105,15 +85,6 @@ def test_a_robot_without_our_note_goes_by_the_defaults_of_the_node(tmp_path, wor
 
 def renamed(recording, names):
     return [(names.get(topic, topic), *rest) for topic, *rest in recording]
-
-
-def test_other_topics(tmp_path, world):
-    recording = renamed(world[1], {'/odom': '/wheels', '/loop_closures': '/scan_matcher/loops'})
-    path = mcap_file(tmp_path / 'a.mcap', recording)
-    topics = Topics('/wheels', '/scan_matcher/loops')
-    assert_same_graph(read_input(path, EVERY, topics), world[2])
-    trusted = read_input(path, EVERY, Topics('/wheels', trusted='/scan_matcher/loops'))
-    assert_same_graph(trusted, world[2])
 
 
 def test_without_the_default_topic_all_odometry_is_named(tmp_path, world):

@@ -30,7 +30,7 @@ def factors(*loops, trusted=()):
     pairs = np.array([*CHAIN, *loops])
     m = len(pairs)
     return BetweenFactors(*pairs.T, np.zeros((m, 3)), np.tile(np.eye(3), (m, 1, 1)),
-                          np.isin(np.arange(m), trusted))
+                          np.isin(np.arange(m), trusted), np.zeros(m, bool))
 
 
 def test_names(tmp_path):

@@ -9,6 +9,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.io.messages.conversion import (
+    absolute_pose,
     loop_closure,
     odometry_sample,
     reference_frame_id,
@@ -166,3 +167,34 @@ def test_the_frame_says_the_stamp_exactly(new, stamp):
     message.header = header(new, 2**31 - 1, 0, frame)
     assert loop_closure(message, 'a@b', False).reference_stamp == stamp
     assert reference_frame_id('base', 1000100000000) == 'base@1000.100000000'
+
+
+def fix(new, frame='map', variances=(1.0, 1, 1, 0, 0, 0), **pose):
+    message = new('geometry_msgs/msg/PoseWithCovarianceStamped', header=header(new, frame=frame),
+                  pose=pose_with_covariance(new, **pose))
+    message.pose.covariance = np.diag(np.array(variances, float)).ravel()
+    return message
+
+
+def test_an_absolute_pose_has_no_reference(new):
+    found = absolute_pose(fix(new), 'map')
+    assert found.is_absolute and found.stamps == (12 * NS + 5, 12 * NS + 5)
+    assert found.pose3.tolist() == [1, 2, 0, 0, 0, 0, 1] and not found.trusted
+    assert np.diag(found.covariance).tolist() == [1, 1, 1, 0, 0, 0]
+
+
+@pytest.mark.parametrize('unsaid', [0.0, -1.0, math.inf, 1.1e6])
+def test_without_a_heading_the_quaternion_may_be_none(new, unsaid):
+    message = fix(new, variances=(1, 1, 1, *3 * [unsaid]), quaternion=(0.0, 0.0, 0.0, 0.0))
+    assert absolute_pose(message, 'map').pose3[3:].tolist() == [0, 0, 0, 1]
+
+
+@pytest.mark.parametrize('fields, cause', [
+    ({'frame': 'odom'}, 'frame'), ({'frame': ''}, 'frame'), ({'frame': 'a@1.000000000'}, 'frame'),
+    ({'position': (math.nan, 0.0, 0.0)}, 'not_finite'), ({'position': (1e10, 0.0, 0.0)}, 'range'),
+    ({'variances': (1, 1, 1, 0, 0, 1), 'quaternion': (0.0, 0.0, 0.0, 0.0)}, 'quaternion'),
+])
+def test_an_absolute_pose_that_cannot_be_used(new, fields, cause):
+    with pytest.raises(MessageError) as caught:
+        absolute_pose(fix(new, **fields), 'map')
+    assert caught.value.cause == cause

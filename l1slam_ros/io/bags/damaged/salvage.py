@@ -11,10 +11,12 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+
+import yaml
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from l1slam_ros.io.bags.damaged.walk import BrokenRecordError, RawMessage, zstd_decoder
 from l1slam_ros.io.bags.damaged.walk_mcap import walk_mcap
@@ -31,29 +33,20 @@ _PIECE = 4096  # [bytes] of a compressed file that are decompressed at a time
 _COMPLAINT = 200  # the longest piece of a library's complaint that is passed on
 
 
-@dataclass(frozen=True)
-class Damage:
+class DamageError(Exception):
     """
     What keeps a bag from being read to its end.
 
     path : the file or directory; where : words that follow 'damaged'; used : which messages are
     """
 
-    path: Path
-    where: str
-    used: str = 'before that'
+    def __init__(self, path: Path, where: str, used: str = 'before that'):
+        super().__init__(f'{path} is damaged{where}')
+        self.path, self.where, self.used = path, where, used
 
     def sentence(self, count: int) -> str:
         """Say it all, when `count` messages were used."""
-        return f'{self.path} is damaged{self.where}; {count:,} messages {self.used} were used'
-
-
-class _DamageError(Exception):
-    """The walk ends here."""
-
-    def __init__(self, damage: Damage):
-        super().__init__(damage)
-        self.damage = damage
+        return f'{self}; {count:,} messages {self.used} were used'
 
 
 class Salvage:
@@ -77,13 +70,13 @@ class Salvage:
         self._definitions: dict[str, str] = {}
         self.counts: Counter[tuple[str, str]] = Counter()
         self.times: list[int] = []
-        self.damage: Damage | None = None
+        self.damage: DamageError | None = None
         try:
             for message in self._walk():
                 self.counts[message.topic, message.msgtype] += 1
                 self.times.append(message.time)
-        except _DamageError as error:
-            self.damage = error.damage
+        except DamageError as error:
+            self.damage = error
 
     def messages(
         self, topics: Collection[str] | None, start: int | None, stop: int | None
@@ -114,8 +107,6 @@ class Salvage:
 
     def types(self) -> Any:
         """Return the types to decode by: of Jazzy; what it has not, as the bag defines it."""
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
         types = get_typestore(Stores.ROS2_JAZZY)
         for name, text in self._definitions.items():
             with suppress(Exception):  # a damaged definition makes the library raise anything
@@ -129,15 +120,15 @@ class Salvage:
         files, damage = _files(self._bag)
         for file in files:
             if not file.exists():
-                raise _DamageError(Damage(file, ': the file is missing'))
+                raise DamageError(file, ': the file is missing')
             try:
                 yield from self._messages_of(file)
-            except _DamageError:
+            except DamageError:
                 raise
             except Exception as error:  # damaged files make the libraries raise anything
-                raise _DamageError(Damage(file, f': {complaint(error)}')) from error
+                raise DamageError(file, f': {complaint(error)}') from error
         if damage is not None:
-            raise _DamageError(damage)
+            raise damage
 
     def _messages_of(self, file: Path) -> Iterator[RawMessage]:
         with _decompressed(file) as readable:
@@ -148,7 +139,7 @@ class Salvage:
                 size = readable.stat().st_size
                 where = (f': it breaks off after {size:,} bytes' if error.position == size
                          else f' after {error.position:,} of {size:,} bytes')
-                raise _DamageError(Damage(file, where)) from error
+                raise DamageError(file, where) from error
 
 
 def complaint(error: Exception) -> str:
@@ -158,8 +149,6 @@ def complaint(error: Exception) -> str:
 
 def directory_metadata(bag: Path) -> dict[str, Any]:
     """Return what the metadata.yaml of a bag says, nothing where it cannot be read."""
-    import yaml
-
     with suppress(Exception):  # it may be missing, no text, no YAML or other YAML
         document = yaml.safe_load((bag / METADATA).read_text(encoding='utf-8'))
         return dict(document['rosbag2_bagfile_information'])
@@ -182,7 +171,7 @@ def bag_names(directory: Path) -> set[str]:
     return {match['bag'] for match in matches if match}
 
 
-def _files(bag: Path) -> tuple[list[Path], Damage | None]:
+def _files(bag: Path) -> tuple[list[Path], DamageError | None]:
     """Return the files of a bag in the order of writing, and what is wrong with their list."""
     if not bag.is_dir():
         return [bag], None
@@ -191,7 +180,7 @@ def _files(bag: Path) -> tuple[list[Path], Damage | None]:
         # Older versions name the directory too.
         return [bag / Path(name).name for name in names], None
     wrong = 'cannot be read' if (bag / METADATA).exists() else 'is missing'
-    return storage_files(bag), Damage(bag, f': its {METADATA} {wrong}', 'of its files')
+    return storage_files(bag), DamageError(bag, f': its {METADATA} {wrong}', 'of its files')
 
 
 @contextmanager

@@ -5,6 +5,10 @@ import bz2
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
+import lz4.frame  # type: ignore[import-untyped]  # comes with both bag libraries
+import zstandard  # comes with the mcap library
+from rosbags.typesys import Stores, get_typestore
+
 _BASIC = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
 _PIECE = 4096  # [bytes] a decoder is given at a time
 
@@ -36,8 +40,6 @@ def broken_at(position: int, messages: Iterator[RawMessage]) -> Iterator[RawMess
 
 def ros1_types(fields: Mapping[str, Any]) -> Any:
     """Return the types by which messages of ROS 1 become CDR, and are decoded from that."""
-    from rosbags.typesys import Stores, get_typestore
-
     jazzy = get_typestore(Stores.ROS2_JAZZY).fielddefs
     types = get_typestore(Stores.EMPTY)
     # In ROS 1 a header has one field more, which the library's conversion leaves out.
@@ -47,15 +49,11 @@ def ros1_types(fields: Mapping[str, Any]) -> Any:
 
 def zstd_decoder() -> Any:
     """Return a decoder of zstd for one use."""
-    import zstandard  # comes with the mcap library
-
     return zstandard.ZstdDecompressor().decompressobj()
 
 
 def lz4_decoder() -> Any:
     """Return a decoder of lz4 for one use."""
-    import lz4.frame  # type: ignore[import-untyped]  # comes with both bag libraries
-
     return lz4.frame.LZ4FrameDecompressor()
 
 

@@ -14,6 +14,9 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from mcap import data_stream, records
+from mcap.reader import make_reader
+
 from l1slam_ros.io.bags.damaged.walk import (
     BrokenRecordError,
     RawMessage,
@@ -76,8 +79,6 @@ def mcap_metadata(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
 
 def is_indexed(path: Path) -> bool:
     """Tell whether a file has an index that is unharmed and leads to all its messages."""
-    from mcap.reader import make_reader
-
     with path.open('rb') as file:
         summary = make_reader(file).get_summary()
         if summary is None or summary.statistics is None:
@@ -114,8 +115,6 @@ def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
 
 def _parsed(kind: str, content: bytes) -> Any:
     """Return a record as the mcap library has it, by the name of its kind there."""
-    from mcap import data_stream, records
-
     return getattr(records, kind).read(data_stream.ReadDataStream(BytesIO(content)))
 
 

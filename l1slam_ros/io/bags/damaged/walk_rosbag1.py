@@ -12,6 +12,9 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from rosbags.rosbag1.reader import Header, ReaderError, RecordType, read_uint32
+from rosbags.typesys import get_types_from_msg
+
 from l1slam_ros.io.bags.damaged.walk import (
     BrokenRecordError,
     RawMessage,
@@ -21,9 +24,6 @@ from l1slam_ros.io.bags.damaged.walk import (
 )
 
 _MAGIC = b'#ROSBAG V2.0\n'
-_MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
-_LENGTH = struct.Struct('<I')
-_TIME = struct.Struct('<II')
 
 
 def walk_rosbag1(path: Path, definitions: dict[str, str]) -> Iterator[RawMessage]:
@@ -34,49 +34,30 @@ def walk_rosbag1(path: Path, definitions: dict[str, str]) -> Iterator[RawMessage
         if file.read(len(_MAGIC)) != _MAGIC:
             raise BrokenRecordError(0)
         for start, header, data in _records(file, size):
-            opcode = header['op'][0]
-            if opcode == _BAG:
-                chunks = _LENGTH.unpack(header['chunk_count'])[0]
-            chunks -= opcode == _CHUNK_INFO
-            read = connections.chunk if opcode == _CHUNK else connections.record
+            opcode = header.get_uint8('op')
+            if opcode == RecordType.BAGHEADER:
+                chunks = header.get_uint32('chunk_count')
+            chunks -= opcode == RecordType.CHUNK_INFO
+            read = connections.chunk if opcode == RecordType.CHUNK else connections.record
             yield from broken_at(size if file.tell() == size else start, read(header, data))
     # The chunks are listed at the end, unless the recorder was killed before.
     if chunks:
         raise BrokenRecordError(size)
 
 
-def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, dict[str, bytes], bytes]]:
+def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, Any, bytes]]:
     """Yield start, header and data of each record; the data of a chunk in part where it is cut."""
     while (start := stream.tell()) < size:
         try:
-            header = _fields(_sized(stream, size))
-            length = _LENGTH.unpack(stream.read(_LENGTH.size))[0]
-            chunk = header['op'][0] == _CHUNK
-        except (KeyError, IndexError, ValueError, struct.error) as error:
+            header = Header.read(stream)
+            opcode, length = header.get_uint8('op'), read_uint32(stream)
+        except (ReaderError, ValueError) as error:
             raise BrokenRecordError(size if stream.tell() == size else start) from error
         there = size - stream.tell()
-        if length <= there or chunk:
+        if length <= there or opcode == RecordType.CHUNK:
             yield start, header, stream.read(min(length, there))
         if length > there:
             raise BrokenRecordError(size)
-
-
-def _sized(stream: BinaryIO, size: int) -> bytes:
-    """Return the bytes after a length; where they are not all there, read to the end and raise."""
-    length = _LENGTH.unpack(stream.read(_LENGTH.size))[0]
-    content = stream.read(min(length, size - stream.tell()))
-    if len(content) < length:
-        raise ValueError(length)
-    return content
-
-
-def _fields(header: bytes) -> dict[str, bytes]:
-    """Return the fields of a header."""
-    fields, stream = {}, BytesIO(header)
-    while stream.tell() < len(header):
-        name, _, value = _sized(stream, len(header)).partition(b'=')
-        fields[name.decode()] = value
-    return fields
 
 
 class _Connections:
@@ -88,35 +69,31 @@ class _Connections:
         self._types: Any = None
         self._topics: dict[int, tuple[str, str]] = {}
 
-    def record(self, header: dict[str, bytes], data: bytes) -> Iterator[RawMessage]:
+    def record(self, header: Any, data: bytes) -> Iterator[RawMessage]:
         """Yield the message that a record is; of a connection, learn what it says."""
-        opcode = header['op'][0]
-        if opcode not in (_MESSAGE, _CONNECTION):
-            return
-        number = _LENGTH.unpack(header['conn'])[0]
-        if opcode == _CONNECTION:
-            self._topics[number] = (header['topic'].decode(), self._learned(_fields(data)))
-            return
-        topic, msgtype = self._topics[number]
-        seconds, nanoseconds = _TIME.unpack(header['time'])
-        cdr = bytes(self._types.ros1_to_cdr(data, msgtype))
-        yield RawMessage(topic, msgtype, seconds * 10**9 + nanoseconds, cdr)
+        opcode = header.get_uint8('op')
+        if opcode == RecordType.CONNECTION:
+            # The fields of its data are such as those of a header.
+            connection = Header.read(BytesIO(struct.pack('<I', len(data)) + data))
+            self._topics[header.get_uint32('conn')] = (
+                header.get_string('topic'), self._learned(connection))
+        elif opcode == RecordType.MSGDATA:
+            topic, msgtype = self._topics[header.get_uint32('conn')]
+            cdr = bytes(self._types.ros1_to_cdr(data, msgtype))
+            yield RawMessage(topic, msgtype, header.get_time('time'), cdr)
 
-    def chunk(self, header: dict[str, bytes], data: bytes) -> Iterator[RawMessage]:
+    def chunk(self, header: Any, data: bytes) -> Iterator[RawMessage]:
         """Yield the messages of a chunk, in part where it is damaged."""
-        rows = uncompressed(data, header['compression'].decode())
-        stream = BytesIO(rows)
-        for _, inner, content in _records(stream, len(rows)):
+        rows = uncompressed(data, header.get_string('compression'))
+        for _, inner, content in _records(BytesIO(rows), len(rows)):
             yield from self.record(inner, content)
-        if len(rows) != _LENGTH.unpack(header['size'])[0]:
+        if len(rows) != header.get_uint32('size'):
             raise BrokenRecordError(len(rows))
 
-    def _learned(self, connection: dict[str, bytes]) -> str:
+    def _learned(self, connection: Any) -> str:
         """Return the type of a connection, by its name in ROS 2, once its definition is known."""
-        from rosbags.typesys import get_types_from_msg
-
-        package, name = connection['type'].decode().split('/')
-        msgtype, text = f'{package}/msg/{name}', connection['message_definition'].decode()
+        package, name = connection.get_string('type').split('/')
+        msgtype, text = f'{package}/msg/{name}', connection.get_string('message_definition')
         if msgtype not in self._fields:
             self._fields.update(get_types_from_msg(text, msgtype))
             self._types = ros1_types(self._fields)

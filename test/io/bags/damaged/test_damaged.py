@@ -119,7 +119,7 @@ def test_every_message_before_a_cut_is_used_and_no_other(tmp_path, recording, ki
     name, whole, ends = kind(tmp_path, recording)
     assert len(ends) == len(recording) and sorted(ends) == ends
     path = tmp_path / f'cut_{name}'
-    for cut in rng.integers(0, len(whole), 30):
+    for cut in [*rng.integers(0, len(whole), 20), len(whole) - 10]:
         path.write_bytes(whole[:cut])
         expected = int(np.searchsorted(ends, cut, 'right'))
         try:
@@ -144,7 +144,7 @@ def chunk_ends(whole):
     return ends
 
 
-def test_200_cuts_of_a_bag(tmp_path, rng, capsys):
+def test_80_cuts_of_a_bag(tmp_path, rng, capsys):
     write_world(tmp_path / 'bag', 120, 180)
     recording = recording_of(tmp_path / 'bag')
     name, whole = 'a.mcap', (tmp_path / 'bag' / 'bag.mcap').read_bytes()
@@ -153,13 +153,13 @@ def test_200_cuts_of_a_bag(tmp_path, rng, capsys):
     path, output = tmp_path / name, tmp_path / 'out.g2o'
     odometry = np.cumsum([topic == '/odom' for topic, *_ in recording])
     codes = []
-    for cut in rng.integers(0, len(whole), 200):
+    for cut in rng.integers(0, len(whole), 80):
         path.write_bytes(whole[:cut])
         output.unlink(missing_ok=True)
         expected = int(np.searchsorted(ends, cut, 'right'))
-        began = time.perf_counter()
+        began = time.process_time()
         codes.append(main(['convert', str(path), str(output)]))
-        assert time.perf_counter() - began < LONGEST
+        assert time.process_time() - began < LONGEST
         err = capsys.readouterr().err
         keyframes = int(odometry[expected - 1]) if expected else 0
         if codes[-1] == 2:
@@ -171,22 +171,7 @@ def test_200_cuts_of_a_bag(tmp_path, rng, capsys):
         # A decoder gives more of a chunk that is cut than nothing.
         assert keyframes <= record.graph.n_poses <= keyframes + 30
         assert len(record.graph.between) >= expected - 1
-    assert codes.count(3) > 150
-
-
-def test_a_cut_bag_is_solved_plotted_and_described_with_exit_code_3(tmp_path, bag, capsys):
-    whole = (bag / 'bag.mcap').read_bytes()
-    path = tmp_path / 'a.mcap'
-    path.write_bytes(whole[:len(whole) // 2])
-    picture = str(tmp_path / 'map.png')
-    for arguments in (['solve', str(path), '--outer', '2'], ['info', str(path)],
-                      ['plot', str(path), '--output', picture],
-                      ['plot', str(bag), str(path), '--output', picture]):
-        assert main(arguments) == 3
-        err = capsys.readouterr().err
-        assert len(re.findall('is damaged: it breaks off after [0-9,]+ bytes; [0-9,]+ messages '
-                              'before that were used', err)) == 1
-    assert (tmp_path / 'map.png').exists()
+    assert codes.count(3) > 60
 
 
 def test_what_the_messages_mean_survives_a_cut(tmp_path, bag):
@@ -323,14 +308,6 @@ def test_a_database_with_a_damaged_page(tmp_path, recording):
     assert found == recording[:len(found)] and 240 < len(found) <= 250
     assert said == (f'{path} is damaged: database disk image is malformed; '
                     f'{len(found)} messages before that were used')
-
-
-def test_a_database_that_lacks_its_last_bytes_only(tmp_path, recording):
-    path = rosbag2_directory(tmp_path / 'a', recording, StoragePlugin.SQLITE3) / 'a.db3'
-    path.write_bytes(path.read_bytes()[:-10])
-    found, said = read(path)
-    assert found == recording[:len(found)] and len(found) > len(recording) - 20
-    assert_told(said, path, len(found))
 
 
 def test_a_message_that_cannot_be_decoded_is_left_out(tmp_path, recording):

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands of `l1slam` that make graphs: simulate and corrupt."""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from l1slam_ros.cli.commands import Ending, read
+from l1slam_ros.cli.reference import known_false
+from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.robust.batch_map import Wish
+from l1slam_ros.core.robust.batch_map import solve as solve_graph
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
+from l1slam_ros.core.solvers.warm_up import SPARSE, with_space
+from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
+from l1slam_ros.io import formats
+from l1slam_ros.io.compilation import compile_now
+from l1slam_ros.io.files import put_lines, replacing
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.graphs.side_files import false_loops_path, pair_lines, truth_path
+from l1slam_ros.io.progress import Progress
+from l1slam_ros.io.trajectory import write_truth
+
+
+def simulate(arguments: argparse.Namespace) -> Ending:
+    """Make a world and write its graph, its truth and which of its loops are false."""
+    _check(arguments)
+    output, rng = arguments.output, np.random.default_rng(arguments.seed)
+    world = simulate_world(arguments.poses, arguments.edges, WorldOptions(), rng)
+    if arguments.false_loops:
+        make = FALSE_LOOPS[arguments.kind]
+        world = with_false_loops(
+            world, make(world.graph, world.truth, arguments.false_loops, rng))
+    ids = np.arange(world.graph.n_poses)
+    record = GraphRecord(world.graph, world.odometry, ids)
+    write_truth(truth_path(output), ids, world.truth)
+    _write(output, world.false_loops,
+           lambda: formats.write_output(output, record, world.truth))
+    return Ending()
+
+
+def corrupt(arguments: argparse.Namespace) -> Ending:
+    """
+    Add false loops to a graph.
+
+    What is far apart is judged on the L2 map, solved from the graph alone: a stored start may be
+    raw odometry, whose drift makes places look far apart that are the same, and a 'false' loop
+    between them would be true. False loops that are known already are left out of that map.
+    """
+    _check(arguments)
+    record = read(arguments, arguments.input)
+    former = known_false(arguments.input, record)
+    believed = record.graph.subset(~former)
+    options = LeastSquaresOptions()
+    compile_now(with_space(SPARSE, record.graph.manifold))
+    with (formats.named(arguments.input),
+          Progress(options.iterations, 'step', label='solving') as progress):
+        solution = solve_graph(
+            believed, record.poses, Wish(norm='l2', robust=False, least_squares=options),
+            progress.report, ids=record.ids).solution
+    loops = FALSE_LOOPS[arguments.kind](record.graph, solution.poses, arguments.false_loops,
+                                        np.random.default_rng(arguments.seed))
+    pairs: Indices = np.concatenate((record.graph.between.pairs[former],
+                                     np.stack((loops.i, loops.j), axis=1)))
+    spoiled = formats.with_poses(replace(record, graph=insert_loops(record.graph, loops)))
+    # A bag has no vertex ids: read back, it counts its keyframes from 0.
+    ids = record.ids[pairs] if arguments.output.suffix else pairs
+    with formats.named(arguments.input):
+        _write(arguments.output, ids, lambda: formats.write_output(arguments.output, spoiled))
+    return Ending(record.damage)
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Refuse, before any work is done, an output that holds no graph, and counts below 0."""
+    formats.check_graph_output(arguments.output)
+    for name in ('seed', 'false_loops'):
+        value = getattr(arguments, name)
+        if value < 0:
+            raise OptionError(f'--{name.replace("_", "-")} is {value}, expected 0 or more')
+
+
+def _write(output: Path, pairs: Indices, write_graph: Callable[[], None]) -> None:
+    """Write a graph and its file of false loops, pairs (k, 2) of ids, both or neither."""
+    with replacing(false_loops_path(output)) as temporary:
+        put_lines(temporary, pair_lines(pairs))
+        write_graph()

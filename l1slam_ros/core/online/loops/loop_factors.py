@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Loop closures -> factors.
+
+A loop closure names two times. It waits until odometry has reached both, is then carried to the
+nearest keyframes by the raw odometry in between, and becomes a between factor. An absolute pose
+names one, the other end of its factor is the world.
+
+A person may vouch for a loop or strike it out, before it comes or after: the last word counts.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.noise import (
+    MOST_VARIANCE,
+    Mask,
+    loop_identity,
+    root_of_inverse,
+)
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
+from l1slam_ros.core.graph.growable_array import GrowingArray
+from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.online.keyframes import diagonal_covariance, reduced_covariance
+from l1slam_ros.core.online.loops.waiting_loops import (
+    WaitingLoop,
+    WaitingLoops,
+    carried,
+    loop_covariance,
+    said,
+)
+from l1slam_ros.core.online.notes import Notes
+from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
+from l1slam_ros.core.online.snapshot import Growth
+from l1slam_ros.core.options import Options, option
+
+
+@dataclass(frozen=True)
+class LoopOptions(Options):
+    """How loop closures are read."""
+
+    covariance_source: str = option(
+        'message', 'message: as stated, the model where that is unusable; model: the sigmas below',
+        '', choices=('message', 'model'))
+    sigma_translation: float = option(0.1, 'model: of the position', 'm', 1e-9, 1e6)
+    sigma_rotation: float = option(0.05, 'model: of the heading', 'rad', 1e-9, 1e6)
+    wait: float = option(
+        10.0, 'how long a loop for times not yet seen waits, on the clock of the odometry', 's',
+        0, 1e9)
+
+
+class LoopFactors:
+    """
+    The loops on their way into a graph, and which of its factors they became.
+
+    Parameters
+    ----------
+    manifold : what the poses live on
+    notes : told of all that is not used
+    verbatim : each is a measurement as it is stated, none a loop sent again
+
+    Attributes
+    ----------
+    waiting : those that are not in the graph yet, nor refused
+
+    """
+
+    def __init__(self, manifold: Manifold, notes: Notes, verbatim: bool):
+        self._manifold, self._notes, self._verbatim = manifold, notes, verbatim
+        self.waiting = WaitingLoops()
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin with an empty graph; loops that wait may yet find odometry of their times."""
+        # The clock that they came by was none, or goes otherwise now.
+        self.waiting.begin_anew(lambda stamp: stamp, 0)
+        # Of each loop by its identity, whether it is trusted; and its row once it is a factor.
+        self._seen = {one.key: one.loop.trusted for one in self.waiting.all()}
+        self._row_of: dict[bytes, int] = {}
+        # Keyframes of the loops that are struck out, and the stamps they were named by.
+        self._struck: set[tuple[int, int]] = set()
+        self._expired = GrowingArray((2,), np.int64)
+        self._stamps = GrowingArray((2,), np.int64)
+        self._rows = GrowingArray((), np.int64)
+
+    @property
+    def stamps(self) -> tuple[Indices, Indices, Indices]:
+        """See `GraphBuilder.loop_stamps`."""
+        return self._stamps.view(), self.waiting.stamps(), self._expired.view()
+
+    @property
+    def rows(self) -> Indices:
+        """Which between factors of the graph are loops, (k,)."""
+        return self._rows.view()
+
+    def seen(self) -> dict[bytes, int]:
+        """Return of each loop that came, by its identity, its factor, -1 for none."""
+        return {key: self._row_of.get(key, -1) for key in self._seen}
+
+    def restore(self, growth: Growth, track: OdometryTrack, options: LoopOptions) -> None:
+        """Go on with the loops of an earlier run."""
+        self._note(growth.loop_rows, growth.loop_stamps)
+        self._expired.extend(growth.expired)
+        for loop, age in growth.waiting:
+            self.add(loop, track, options, age)
+        factors = growth.graph.between
+        for key, row in growth.seen.items():
+            if row >= 0:
+                self._row_of[key] = row
+            self._seen[key] = self._seen.get(key, False) or bool(row >= 0 and factors.trusted[row])
+        self._struck.update(map(tuple, factors.pairs[factors.struck].tolist()))
+
+    def add(self, loop: LoopClosure, track: OdometryTrack, options: LoopOptions,
+            age: int = 0) -> None:
+        """Take a loop closure or an absolute pose in, once, that came so long ago [ns]."""
+        covariance = self._covariance(loop, options)
+        if covariance is None:
+            return
+        measurement = said(self._manifold, loop, covariance)
+        key = loop_identity(*loop.stamps, measurement, covariance)
+        if not loop.struck:
+            known = self._seen.get(key)
+            if known is not None and known >= loop.trusted and not self._verbatim:
+                self._refuse('repeated', loop, 'was sent before; expected each loop once')
+                return
+            self._seen[key] = loop.trusted
+        begin, end = map(track.time, loop.stamps)
+        arrival = track.last - age if len(track) else 0
+        self.waiting.add(WaitingLoop(loop, arrival, begin, end, measurement, covariance, key))
+
+    def add_due(self, graph: FactorGraph, track: OdometryTrack, options: LoopOptions) -> int:
+        """Make factors of the loops whose times odometry has reached; return how many."""
+        if not len(self.waiting) or not len(track):
+            return 0
+        now = track.last
+        due = self.waiting.due(now)
+        since = now - int(options.wait * 1e9)
+        for one in self.waiting.expired(since) if track.first < since else ():
+            self._expired.extend(np.array([one.loop.stamps]))
+            self._refuse('expired', one.loop, f'waited for odometry until {track.last_stamp} ns; '
+                         'expected odometry of its times')
+            # Sent again when odometry has come that far, it is welcome.
+            self._seen.pop(one.key, None)
+        return self._add_due(due, graph, track, options) if due else 0
+
+    def _add_due(self, due: list[WaitingLoop], graph: FactorGraph, track: OdometryTrack,
+                 options: LoopOptions) -> int:
+        begin, end = np.array([(one.begin, one.end) for one in due]).T
+        known = track.known_until(np.array([one.arrival for one in due]), end)
+        pairs = np.stack((track.nearest_keyframe(begin, known),
+                          track.nearest_keyframe(end, known)), axis=1)
+        can = np.flatnonzero(self._can_be_factors(due, pairs, track.first)).tolist()
+        new: list[int] = []
+        before = len(graph.between)
+        for k in can:
+            # One that is there is vouched for by now: no second factor.
+            if not due[k].loop.struck and (self._verbatim or due[k].key not in self._row_of):
+                self._row_of[due[k].key] = before + len(new)
+                new.append(k)
+        if new:
+            self._append([due[k] for k in new], pairs[new], graph, track, options)
+        for k in can:
+            self._say(due[k], (int(pairs[k, 0]), int(pairs[k, 1])), graph)
+        return len(new)
+
+    def _append(self, loops: list[WaitingLoop], pairs: Indices, graph: FactorGraph,
+                track: OdometryTrack, options: LoopOptions) -> None:
+        """Carry loops to the keyframes pairs (m, 2), and make factors of them."""
+        manifold, ends = self._manifold, track.keyframe_poses[pairs]
+        begin, end = np.array([(one.begin, one.end) for one in loops]).T
+        to_reference = manifold.between(ends[:, 0], track.at(begin))
+        to_keyframe = manifold.between(track.at(end), ends[:, 1])
+        measurement, covariance, sound = carried(manifold, loops, to_reference, to_keyframe)
+        covariance = np.where(sound[:, None, None], covariance, self._model(options))
+        i = np.where([one.loop.is_absolute for one in loops], WORLD, pairs[:, 0])
+        graph.append_between(i, pairs[:, 1], measurement, root_of_inverse(covariance),
+                             np.array([one.loop.trusted for one in loops]))
+        rows = len(graph.between) + np.arange(-len(loops), 0)
+        self._note(rows, np.array([one.loop.stamps for one in loops]))
+
+    def _say(self, one: WaitingLoop, pair: tuple[int, int], graph: FactorGraph) -> None:
+        """Let what a person says of a loop between two keyframes count, now or before."""
+        loop = one.loop
+        if loop.struck:
+            self._struck.add(pair)
+            factors = graph.between.pairs[self.rows]
+            graph.say(self.rows[
+                (factors == pair).all(axis=1) | (factors == pair[::-1]).all(axis=1)
+                | (self._stamps.view() == loop.stamps).all(axis=1)], trusted=False)
+        elif loop.trusted:
+            self._struck.discard(pair)
+            graph.say(np.array([self._row_of[one.key]]), trusted=True)
+        elif pair in self._struck:
+            graph.say(np.array([self._row_of[one.key]]), trusted=False)
+
+    def _can_be_factors(self, loops: list[WaitingLoop], pairs: Indices, first: int) -> Mask:
+        """Return which loops between keyframes (m, 2) can be factors, and note the rest."""
+        early = np.array([one.begin < first for one in loops])
+        same = (pairs[:, 0] == pairs[:, 1]) & ~early & ~np.array(
+            [one.loop.is_absolute for one in loops])
+        for row in np.flatnonzero(early | same).tolist():
+            if early[row]:
+                self._refuse('before_start', loops[row].loop, 'begins before the odometry; '
+                             f'expected times from {first} ns on')
+            else:
+                self._refuse('same_keyframe', loops[row].loop, 'begins and ends at one keyframe; '
+                             'expected two')
+        can: Mask = ~(early | same)
+        return can
+
+    def _note(self, rows: Indices, stamps: Indices) -> None:
+        self._rows.extend(rows)
+        self._stamps.extend(stamps)
+
+    def _refuse(self, cause: str, loop: LoopClosure, why: str) -> None:
+        what = 'an absolute pose at' if loop.is_absolute else f'a loop from {loop.stamps[0]} ns to'
+        self._notes.refuse(cause, f'{what} {loop.stamp} ns {why}')
+
+    def _covariance(self, loop: LoopClosure, options: LoopOptions) -> Array | None:
+        """
+        Return what a loop states, zeros for what it leaves unsaid, (1, d, d).
+
+        Where that is no covariance, the model; there is none of absolute poses: None, refused.
+        """
+        stated = reduced_covariance(self._manifold, loop.covariance[None])
+        model, absolute = self._model(options), loop.is_absolute
+        if options.covariance_source == 'model' and not absolute:
+            return model[None]
+        used, bounded = loop_covariance(stated, None if absolute else model, self._verbatim)
+        self._notes.warn_bounds('loop', loop.stamp, bounded, MOST_VARIANCE)
+        if used is None:
+            self._refuse('covariance', loop, f'has the variances {np.diagonal(stated[0])}; '
+                         f'expected one above 0, to {MOST_VARIANCE:g}')
+        return used
+
+    def _model(self, options: LoopOptions) -> Array:
+        return diagonal_covariance(
+            self._manifold, options.sigma_translation, options.sigma_rotation)

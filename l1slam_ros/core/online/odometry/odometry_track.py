@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The raw odometry so far: where the robot was at any time, and which samples are keyframes.
+
+Stamps may go back: a clock was set, a bag is played again. The time of a sample is its stamp plus
+a shift, another one from where stamps went back, so that time only grows. A stamp means the
+latest stretch of time that had begun by it: the one the robot is in, if that goes back so far.
+"""
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.graph.growable_array import GrowingArray
+from l1slam_ros.core.graph.measurements import LONGEST_PAUSE
+from l1slam_ros.core.online.odometry.odometry_stream import UNSEEN, is_identity
+
+# So many keyframes tell how fast the robot goes.
+_RECENT = 16
+
+# [ns] Between the last sample before stamps went back, and the first after.
+_BETWEEN = 1_000_000_000
+
+
+class OdometryTrack:
+    """
+    Samples of the odometry in one frame, in order of time.
+
+    From the last sample of a part to the first of the next no motion is known: nothing is
+    interpolated there, and what is near to the one is not carried to the other.
+
+    Parameters
+    ----------
+    manifold : what the poses live on
+
+    """
+
+    def __init__(self, manifold: Manifold):
+        self._manifold = manifold
+        self._times = GrowingArray((), np.int64)
+        self._poses = GrowingArray((manifold.POSE_SIZE,))
+        self._keyframes = GrowingArray((), np.int64)
+        self._keyframe_stamps = GrowingArray((), np.int64)
+        # Of each part the first sample, its time and its keyframe; where shifts begin, and they.
+        self._parts = GrowingArray((3,), np.int64)
+        self._shifts: list[tuple[int, int]] = []
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    @property
+    def first(self) -> int:
+        """Time of the first sample [ns]."""
+        return int(self._times.view()[0])
+
+    @property
+    def last(self) -> int:
+        """Time of the last sample [ns]."""
+        return int(self._times.view()[-1])
+
+    @property
+    def last_stamp(self) -> int:
+        """Stamp of the last sample [ns]."""
+        return self.last - self._shifts[-1][1]
+
+    @property
+    def last_pose(self) -> Array:
+        """Pose of the last sample, (1, p)."""
+        pose: Array = self._poses.view()[-1:]
+        return pose
+
+    @property
+    def keyframe_stamps(self) -> Indices:
+        """Stamps of the keyframes, (n,) [ns]."""
+        return self._keyframe_stamps.view()
+
+    @property
+    def keyframe_poses(self) -> Array:
+        """Poses of the keyframes, (n, p)."""
+        poses: Array = self._poses.view()[self._keyframes.view()]
+        return poses
+
+    @property
+    def gaps(self) -> Indices:
+        """The first keyframe of each part but the first, (g,)."""
+        return self._parts.view()[1:, 2]
+
+    def time(self, stamp: int) -> int:
+        """Return the time that a stamp means [ns]."""
+        for begin, shift in reversed(self._shifts):
+            if stamp + shift >= begin:
+                return stamp + shift
+        return stamp + (self._shifts[0][1] if self._shifts else 0)
+
+    def begin_part(self, stamp: int) -> bool:
+        """Let a part begin with the sample to come; return whether its stamp goes back in time."""
+        back = not self._shifts or stamp <= self.last_stamp
+        if back:
+            begin = self.last + _BETWEEN if self._shifts else stamp
+            self._shifts.append((begin, begin - stamp))
+        self._parts.extend(np.array([
+            (len(self), stamp + self._shifts[-1][1], len(self._keyframes))]))
+        return back
+
+    def append(self, stamp: int, pose: Array) -> None:
+        """Append a sample after the last one, pose (1, p)."""
+        if not len(self):
+            self.begin_part(stamp)
+        self._times.extend(np.array([stamp + self._shifts[-1][1]]))
+        self._poses.extend(pose)
+
+    def mark_keyframe(self) -> None:
+        """Make the last sample a keyframe."""
+        self._keyframes.extend(np.array([len(self) - 1]))
+        self._keyframe_stamps.extend(np.array([self.last_stamp]))
+
+    def extend_by_part(self, stamps: Indices, poses: Array) -> None:
+        """Append a part, samples (n,) [ns], (n, p), a keyframe each."""
+        self.begin_part(int(stamps[0]))
+        self._keyframes.extend(len(self) + np.arange(len(stamps)))
+        self._keyframe_stamps.extend(stamps)
+        self._times.extend(stamps + self._shifts[-1][1])
+        self._poses.extend(poses)
+
+    def goes_on(self, stamp: int, pose: Array, offset: Array) -> bool:
+        """
+        Tell whether odometry after a pause is in the frame that it was in, by a first pose (1, p).
+
+        It does not begin anew, and offset (1, p) takes it to where the robot can have gone: twice
+        as fast as of late, or as fast as one that nobody saw.
+        """
+        if is_identity(self._manifold, pose):
+            return False
+        pose = self._manifold.compose(offset, pose)
+        recent = slice(max(int(self._parts.view()[-1, 2]), len(self._keyframes) - _RECENT), None)
+        times, poses = self.keyframe_stamps[recent], self.keyframe_poses[recent]
+        step = self._manifold.local(np.concatenate((poses[:-1], self.last_pose)),
+                                    np.concatenate((poses[1:], pose)))
+        way, seconds = self._manifold.motion(step)[0], np.diff(times, append=stamp) * 1e-9
+        speed = max(2 * (way[:-1] / seconds[:-1]).max(initial=0.0), UNSEEN)
+        pause = (stamp - self.last_stamp) * 1e-9
+        return bool(pause <= LONGEST_PAUSE and way[-1] <= pause * speed)
+
+    def known_until(self, arrivals: Indices, times: Indices) -> Indices:
+        """
+        Return up to which time odometry had come when each loop could first be used, (m,) [ns].
+
+        Only keyframes of that time are candidates, so a loop becomes the same factor whenever an
+        update happens to look for it.
+        """
+        samples = self._times.view()
+        reached: Indices = np.maximum(arrivals, samples[np.searchsorted(samples, times)])
+        return reached
+
+    def nearest_keyframe(self, times: Indices, known: Indices) -> Indices:
+        """Return the keyframe nearest to each time, of its part and up to `known`, (m,)."""
+        keyframes = self._times.view()[self._keyframes.view()]
+        first, end = self._part(times, 2, len(keyframes))
+        last = np.minimum(np.searchsorted(keyframes, known, side='right'), end) - 1
+        after = np.clip(np.searchsorted(keyframes, times), first, last)
+        before = np.maximum(after - 1, first)
+        nearer_before = times - keyframes[before] <= keyframes[after] - times
+        nearest: Indices = np.where(nearer_before, before, after)
+        return nearest
+
+    def at(self, times: Indices) -> Array:
+        """Return the poses at some times, interpolated between samples of a part, (m, p)."""
+        samples, poses = self._times.view(), self._poses.view()
+        first, end = self._part(times, 0, len(samples))
+        after = np.clip(np.searchsorted(samples, times), np.minimum(first + 1, end - 1), end - 1)
+        before = np.maximum(after - 1, first)
+        span = np.maximum(samples[after] - samples[before], 1)
+        fraction = np.minimum((times - samples[before]) / span, 1.0)
+        return self._manifold.interpolate(poses[before], poses[after], fraction)
+
+    def _part(self, times: Indices, column: int, count: int) -> tuple[Indices, Indices]:
+        """Return the first sample or keyframe, and past the last, of the part of each time."""
+        parts = self._parts.view()
+        part = np.maximum(np.searchsorted(parts[:, 1], times, side='right') - 1, 0)
+        bounds = np.append(parts[:, column], count)
+        return bounds[part], bounds[part + 1]

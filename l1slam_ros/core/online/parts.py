@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A problem as the judge and the solvers want it: of one piece, without what a person struck out.
+
+In: the problem of a back end. Out: the same where parts of the map are tied to each other as they
+stand, so weakly that whatever else joins them decides; and what was made of it, for the factors
+of the back end's graph alone.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.online.snapshot import Problem
+from l1slam_ros.core.online.update import Improvement
+
+# [rad] Of the heading of a part: that it is not known. Its place is, to the extent of the map.
+_HEADING = 1.0
+
+
+def as_one(problem: Problem) -> Problem:
+    """Return the problem whose graph is of one piece."""
+    rows = _rows(problem.graph)
+    g, d = len(problem.gaps), problem.graph.manifold.TANGENT_SIZE
+    if not g and rows is None:
+        return problem
+    rows = np.arange(len(problem.graph.between)) if rows is None else rows
+    judgement = problem.judgement
+    return replace(
+        problem, graph=_tied(problem.graph.subset(rows), problem.poses, problem.gaps),
+        dual=np.append(problem.dual.reshape(-1, d)[rows].ravel(), np.zeros(g * d)),
+        judgement=replace(
+            judgement, accepted=np.append(judgement.accepted[rows], np.ones(g, bool)),
+            suspect=np.append(judgement.suspect[rows], np.zeros(g, bool)),
+            sigmas=np.append(judgement.sigmas[rows], np.zeros(g))))
+
+
+def of_all(improvement: Improvement, problem: Problem) -> Improvement:
+    """Return what was made of `as_one(problem)`, for the factors of the problem."""
+    rows = _rows(problem.graph)
+    if not len(problem.gaps) and rows is None:
+        return improvement
+    m, d = len(problem.graph.between), problem.graph.manifold.TANGENT_SIZE
+    rows, made = np.arange(m) if rows is None else rows, improvement.judgement
+    count = len(rows)
+
+    def spread(values: np.ndarray, rest: float) -> np.ndarray:
+        whole = np.full((m, *values.shape[1:]), rest, values.dtype)
+        whole[rows] = values[:count]
+        return whole
+
+    return replace(
+        improvement, dual=spread(improvement.dual.reshape(-1, d), 0.0).ravel(),
+        judgement=replace(
+            made, accepted=spread(made.accepted, False), suspect=spread(made.suspect, False),
+            sigmas=spread(made.sigmas, np.nan), slips=rows[made.slips[made.slips < count]]))
+
+
+def _rows(graph: FactorGraph) -> Indices | None:
+    """Return the factors that no one struck out; None: all."""
+    struck = graph.between.struck
+    return np.flatnonzero(~struck) if struck.any() else None
+
+
+def _tied(graph: FactorGraph, poses: Array, keyframes: Indices) -> FactorGraph:
+    """Return the graph with keyframes k > 0 tied to k - 1 as they stand in poses (n, p)."""
+    manifold, d = graph.manifold, graph.manifold.TANGENT_SIZE
+    extent = float(np.ptp(manifold.positions(poses), axis=0).max()) if len(poses) else 0.0
+    sigma = np.full(d, 1.0 + extent)
+    sigma[manifold.ROTATION] = _HEADING
+    graph.append_between(
+        keyframes - 1, keyframes, manifold.between(poses[keyframes - 1], poses[keyframes]),
+        np.broadcast_to(np.diag(1 / sigma), (len(keyframes), d, d)))
+    return graph

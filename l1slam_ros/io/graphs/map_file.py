@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a running back end keeps its map: when it is saved, and never over that of another."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from l1slam_ros.core.errors import FileError, OptionError
+from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.io.graphs.saved_map import keep_as, load_map, save_map
+from l1slam_ros.io.node_options import NodeOptions
+
+
+class MapFile:
+    """
+    Saves and loads the map of a back end; one thread at a time may.
+
+    Parameters
+    ----------
+    backend : whose map
+    options : returns `save_path` and `autosave_period` as they are now
+    warn : told what a person should know
+
+    Attributes
+    ----------
+    is_saving : whether a save is under way
+
+    """
+
+    def __init__(self, backend: Backend, options: Callable[[], NodeOptions],
+                 warn: Callable[[str], object]):
+        self._backend, self._options, self._warn = backend, options, warn
+        self.is_saving = False
+        self._began, self._took = time.monotonic(), 0.0
+        # The version that is in the file, and the file, if what it held before was ours.
+        self._version, self._ours = backend.version, Path()
+
+    def save(self) -> str:
+        """Save the map; return a sentence that says where."""
+        path, self._began, self.is_saving = self._path(), time.monotonic(), True
+        try:
+            version = self._backend.version
+            sentence = save_map(path, self._backend.saved())
+            self._version, self._ours = version, path
+        finally:
+            self._took, self.is_saving = time.monotonic() - self._began, False
+        return sentence
+
+    def load(self) -> str:
+        """Load the map; return a sentence that says from where."""
+        path = self._path()
+        saved, sentence, whole = load_map(path)
+        if not whole:
+            self._warn(sentence)
+        self._backend.restore(saved)
+        self._version, self._ours = self._backend.version, path
+        return sentence
+
+    def load_at_start(self) -> str:
+        """Load the map if there is one; return a sentence that says so."""
+        try:
+            return self.load()
+        except FileError as error:
+            return f'the map begins empty: {error}'
+
+    @property
+    def is_due(self) -> bool:
+        """Whether it is time for `autosave`: each ends within a period of the one before."""
+        options = self._options()
+        # Who asks does so once in a period of the updates.
+        wait = options.autosave_period - options.update.period - self._took
+        return time.monotonic() - self._began >= wait and self._is_to_be_saved()
+
+    def autosave(self) -> None:
+        """Save the map if it has changed; what stood in its place, if not its own, is kept."""
+        if not self._is_to_be_saved() or self._backend.saved() is None:
+            return
+        path, self._began = self._path(), time.monotonic()
+        if path != self._ours and path.exists():
+            kept = path.with_name(f'{path.stem}.{_time_of(path)}{path.suffix}')
+            keep_as(path, kept)
+            self._warn(f'{path} held a map that was not loaded: it is kept as {kept}')
+        self.save()
+
+    def _is_to_be_saved(self) -> bool:
+        options = self._options()
+        return (options.save_path != '' and options.autosave_period > 0
+                and self._backend.version != self._version)
+
+    def _path(self) -> Path:
+        path = self._options().save_path
+        if not path:
+            raise OptionError('the parameter save_path is empty, expected the name of a .g2o file')
+        return Path(path).absolute()
+
+
+def _time_of(path: Path) -> str:
+    """Return when a file was written, as a part of a name."""
+    return time.strftime('%Y-%m-%dT%H-%M-%S', time.localtime(path.stat().st_mtime))

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The lines of a graph file as arrays; each line that is malformed is named."""
+
+import os
+from collections import defaultdict
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.names import QUATERNION
+from l1slam_ros.io.files import TextLines, parse_rows, quoted, read_lines, refuse_quaternions
+from l1slam_ros.io.graphs.tags import OFFSET, TAGS, TAGS_LEFT_OUT
+from l1slam_ros.io.remarks import Remarks
+from l1slam_ros.io.wording import counted
+
+# So many lines are named in one sentence.
+_NAMED = 3
+
+
+@dataclass(frozen=True)
+class Rows:
+    """
+    The lines of some kinds, in the order of the file.
+
+    lines : (m,) line numbers; ids : (m, 2), the same twice where a line has but one; alone : (m,)
+    bool, where it has; pose : (m, p); information : (m, d, d) as in the file; units : (m, d) of
+    it, see `Tag.units`.
+    """
+
+    lines: Indices
+    ids: Indices
+    alone: Mask
+    pose: Array
+    information: Array
+    units: Array
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def chosen(self, rows: Indices | Mask) -> 'Rows':
+        """Return some of the lines, in the order of `rows`."""
+        return Rows(*(getattr(self, column.name)[rows] for column in fields(self)))
+
+    @property
+    def scaled(self) -> Array:
+        """The information in the units of the residual, (m, d, d)."""
+        return self.units[:, :, None] * self.information * self.units[:, None, :]
+
+
+def lines_by_tag(path: str | os.PathLike[str]) -> tuple[dict[str, TextLines], Remarks]:
+    """Return the lines of each tag, without the tag, and the remarks; every tag is known."""
+    lines = read_lines(path)
+    groups: dict[str, TextLines] = defaultdict(lambda: TextLines([], []))
+    for number, text in zip(lines.numbers, lines.texts, strict=True):
+        tag, *rest = text.split(None, 1)
+        group = groups[tag]
+        group.numbers.append(number)
+        group.texts.append(rest[0] if rest else '')
+    if not groups:
+        raise FileError(path, f'the file is empty; expected {expected_tags("between")} lines')
+    for tag, group in groups.items():
+        _refuse_unknown(path, tag, group.numbers[0])
+    return groups, lines.remarks
+
+
+def _refuse_unknown(path: object, tag: str, line: int) -> None:
+    if tag in TAGS or tag in TAGS_LEFT_OUT or tag == 'FIX' or tag.startswith('PARAMS_'):
+        return
+    raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(TAGS)}', line)
+
+
+def expected_tags(kind: str) -> str:
+    """Return the tags of one kind in words."""
+    *most, last = (name for name, tag in TAGS.items() if tag.kind == kind)
+    return f'{", ".join(most)} or {last}'
+
+
+def manifold_of(path: object, groups: dict[str, TextLines]) -> Manifold:
+    """Return what the poses of a file are of; there must be but one."""
+    found = sorted((lines.numbers[0], name) for name, lines in groups.items() if name in TAGS)
+    for line, name in found[1:]:
+        if TAGS[name].manifold is not TAGS[found[0][1]].manifold:
+            raise FileError(path, f'{name}: a line of {TAGS[name].manifold.NAME} beside '
+                            f'{found[0][1]} at line {found[0][0]}; expected all poses in the '
+                            'plane, or all in space', line)
+    return TAGS[found[0][1]].manifold if found else se2
+
+
+def rows_of(path: object, groups: dict[str, TextLines], manifold: Manifold, kinds: tuple[str, ...],
+          rotation_information: str = QUATERNION) -> Rows:
+    """Return the lines of some kinds, whatever their tags."""
+    offsets = _offsets(path, groups)
+    parts = [_parse(path, name, groups.get(name, TextLines([], [])), rotation_information, offsets)
+             for name, tag in TAGS.items() if tag.kind in kinds and tag.manifold is manifold]
+    both = Rows(*(np.concatenate([getattr(part, column.name) for part in parts])
+                   for column in fields(Rows)))
+    return both.chosen(np.argsort(both.lines))
+
+
+def _parse(path: object, name: str, lines: TextLines, rotation_information: str,
+           offsets: Indices) -> Rows:
+    tag = TAGS[name]
+    p, d = tag.values, tag.manifold.TANGENT_SIZE
+    ids, values = parse_rows(path, name, lines, tag.ids, p + len(tag.information))
+    m = len(ids)
+    if tag.has_quaternion:
+        refuse_quaternions(path, values[:, 3:p], lines.numbers)
+    moved = np.isin(ids[:, tag.vertices:], offsets).any(axis=1)
+    if moved.any():
+        k = int(np.argmax(moved))
+        raise FileError(path, f'{name}: measured by {OFFSET} {ids[k, 1]}, which is not where the '
+                        'robot is; expected no offset', lines.numbers[k])
+    pose, information = tag.manifold.identity(m), np.zeros((m, d, d))
+    read = tag.read(values[:, :p])
+    pose[:, :read.shape[1]] = read
+    for k, (row, column) in enumerate(tag.information):
+        information[:, row, column] = information[:, column, row] = values[:, p + k]
+    return Rows(np.array(lines.numbers, np.int64),
+                 np.repeat(ids[:, :tag.vertices], 2 // tag.vertices, axis=1),
+                 np.full(m, tag.vertices == 1), pose, information,
+                 np.tile(tag.units(rotation_information), (m, 1)))
+
+
+def _offsets(path: object, groups: dict[str, TextLines]) -> Indices:
+    """Return the numbers of the offsets that are not the identity, (k,)."""
+    ids, values = parse_rows(path, OFFSET, groups.get(OFFSET, TextLines([], [])), 1, 7)
+    moved: Indices = ids[(values[:, :6] != 0).any(axis=1), 0]
+    return moved
+
+
+def vertices_of(path: object, groups: dict[str, TextLines], manifold: Manifold) -> Rows:
+    """Return the vertices in ascending order of their ids."""
+    rows = rows_of(path, groups, manifold, ('vertex',))
+    rows = rows.chosen(np.argsort(rows.ids[:, 0], kind='stable'))
+    ids, lines = rows.ids, rows.lines
+    again = np.flatnonzero(ids[1:, 0] == ids[:-1, 0]) + 1
+    if len(again):
+        k = again[np.argmin(lines[again])]
+        raise FileError(path, f'vertex {ids[k, 0]} stands twice, before at line {lines[k - 1]}; '
+                        'expected each once', int(lines[k]))
+    return rows
+
+
+def without_circles(edges: Rows) -> tuple[Rows, list[str]]:
+    """Return the edges but for those from a vertex to itself, and a sentence on these, if any."""
+    circle = (edges.ids[:, 0] == edges.ids[:, 1]) & ~edges.alone
+    if not circle.any():
+        return edges, []
+    lines = edges.lines[circle].tolist()
+    names = [str(number) for number in lines[:_NAMED]] + ['...'] * (len(lines) > _NAMED)
+    sentence = (f'{counted(len(lines), "edge")} from a vertex to itself not used: '
+                f'{"line" if len(lines) == 1 else "lines"} {", ".join(names)}')
+    return edges.chosen(~circle), [sentence]

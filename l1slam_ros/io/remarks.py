@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a saved map says that no graph format has a tag for, in lines that others take for comments.
+
+    #L1SLAM map 1               the first line: the version of what follows
+    #L1SLAM <name> <JSON>       a value; of one with many rows the first, and more in lines to come
+    #L1SLAM sha256 <digest>     the last line: of all bytes before, the proof that they are whole
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+
+from l1slam_ros.core.errors import FileError
+
+# Name -> value; none where a file is no saved map.
+Remarks = Mapping[str, Any] | None
+
+_KEYWORD = '#L1SLAM '
+_FIRST = f'{_KEYWORD}map 1'
+_PROOF = f'{_KEYWORD}sha256 '
+_LAST = len(_PROOF) + 2 * sha256().digest_size + 1  # bytes of the last line
+# Rows to a line: readers whose lines have an end get through, and other threads their turn.
+_AT_ONCE = 500
+
+
+def with_remarks(lines: Iterable[str], values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the lines of a file that says some values, too: arrays, or what JSON knows."""
+    digest = sha256()
+    for line in _unproven(lines, values):
+        digest.update(f'{line}\n'.encode())
+        yield line
+    yield f'{_PROOF}{digest.hexdigest()}'
+
+
+def _unproven(lines: Iterable[str], values: Mapping[str, Any]) -> Iterator[str]:
+    yield _FIRST
+    yield from lines
+    for name, value in values.items():
+        parts = [value]
+        if isinstance(value, np.ndarray | list):
+            parts = [value[k : k + _AT_ONCE] for k in range(0, max(len(value), 1), _AT_ONCE)]
+        for part in parts:
+            rows = (part + 0).tolist() if isinstance(part, np.ndarray) else part  # 1, not true
+            yield f'{_KEYWORD}{name} ' + json.dumps(rows, separators=(',', ':'))
+
+
+def is_proven(path: object, content: bytes) -> bool:
+    """
+    Tell whether a file is a saved map.
+
+    Raises
+    ------
+    FileError : it was one, and is not as it was written.
+
+    """
+    last = content[-_LAST:]
+    if not content.startswith(_KEYWORD.encode()) and not last.startswith(_PROOF.encode()):
+        return False
+    if last != f'{_PROOF}{sha256(memoryview(content)[:-_LAST]).hexdigest()}\n'.encode():
+        raise FileError(path, 'is damaged: its last line is not the checksum of those before; '
+                        'expected a saved map as it was written')
+    if not content.startswith(f'{_FIRST}\n'.encode()):
+        raise FileError(path, f'is a saved map of another version; expected {_FIRST!r}', 1)
+    return True
+
+
+def read_remarks(path: object, content: bytes) -> Remarks:
+    """
+    Return what a saved map says.
+
+    Raises
+    ------
+    FileError : it was one, and is not as it was written.
+
+    """
+    if not is_proven(path, content):
+        return None
+    values: dict[str, Any] = {}
+    _, *lines, _ = (line.split(' ', 2)[1:] for line in content.decode().split('\n')
+                    if line.startswith(_KEYWORD))
+    for name, text in lines:
+        value = json.loads(text)
+        values[name] = values[name] + value if name in values else value
+    return values

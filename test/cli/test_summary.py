@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`l1slam info` in words: one plain sentence on each thing that looks wrong, by vertex ids."""
+
+import re
+
+import numpy as np
+import pytest
+
+from l1slam_ros.cli.summary import bag_numbers, complaints, numbers
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.solvers.optimality import l1_cost
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.bags.from_graph import write_graph_bag
+from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file
+
+# Vertices 10, 11, 12, 13, 14 in a row, and a loop.
+LINES = [f'EDGE_SE2 {k} {k + 1} 1 0 0 1 0 0 1 0 1' for k in range(10, 14)]
+LOOP = 'EDGE_SE2 10 14 4 0 0 1 0 0 1 0 1'
+
+
+@pytest.fixture
+def record_of(tmp_path):
+    def read(*lines):
+        path = tmp_path / 'a.g2o'
+        path.write_text('\n'.join(lines) + '\n')
+        return read_graph_file(path)
+    return read
+
+
+def test_nothing_is_wrong_with_a_good_graph(record_of):
+    assert complaints(record_of(*LINES, LOOP)) == []
+
+
+@pytest.mark.parametrize('more, sentence', [
+    ([LOOP, 'EDGE_SE2 10 14 4 0 0 2 0 0 2 0 2'],
+     '1 edge (10 to 14): given before with the same measurement, so counted twice'),
+    ([LOOP] * 6, '5 edges (10 to 14, 10 to 14, 10 to 14, ...): given before with the same '
+     'measurement, so counted twice'),
+    (['EDGE_SE2 14 20 1 0 0 1 0 0 1 0 1', 'EDGE_SE2 20 30 1 0 0 1 0 0 1 0 1'],
+     'vertex ids are not consecutive: 2 jumps (14 to 20, 20 to 30)'),
+    (['EDGE_SE2 12 16 3 0 0 1 0 0 1 0 1', 'EDGE_SE2 10 15 3 0 0 1 0 0 1 0 1'],
+     'the odometry has 2 gaps (14 and 15, 15 and 16), consecutive vertices without an edge'),
+    (['EDGE_SE2 15 16 3 0 0 1 0 0 1 0 1'],
+     'the graph is not connected and cannot be solved: 2 parts (5 vertices between ids 10 and '
+     '14, 2 vertices between ids 15 and 16)'),
+    (['EDGE_SE2 14 15 50 0 0 1 0 0 1 0 1', *(f'EDGE_SE2 {k} {k + 1} 1 0 0 1 0 0 1 0 1'
+                                              for k in range(15, 30))],
+     'odometry that jumps: 1 step (50 m from 14 to 15); nine in ten are no longer than 1 m'),
+    (['EDGE_SE2 10 14 4 0 0 2e7 0 0 1 0 1', 'EDGE_SE2 10 13 4 0 0 1 0 0 0.5 0 1'],
+     'the information on position differs by 4e+07 between edges: 0.5 from 10 to 13, 2e+07 from '
+     '10 to 14'),
+    (['EDGE_SE2 10 14 4 0 0 1 0 0 1 0 3e6'],
+     'the information on rotation differs by 3e+06 between edges: 1 from 10 to 11, 3e+06 from 10 '
+     'to 14'),
+])
+def test_each_thing_that_looks_wrong_is_one_sentence(record_of, more, sentence):
+    assert sentence in complaints(record_of(*LINES, *more))
+
+
+def test_ids_of_all_64_bits_are_not_consecutive(record_of):
+    least, most = -2**63, 2**63 - 1
+    assert complaints(record_of(f'EDGE_SE2 {least} {most} 1 0 0 1 0 0 1 0 1')) == [
+        f'vertex ids are not consecutive: 1 jump ({least} to {most})']
+
+
+def test_a_ratio_that_is_none_is_not_named(record_of):
+    """Of as few loops as these nothing is known but that the odometry suffers from them."""
+    world = simulate_world(600, 630, WorldOptions(), np.random.default_rng(0))
+    factors, graph = world.graph.between, FactorGraph(se2)
+    noisy = factors.measurement.copy()
+    noisy[~factors.is_odometry] += 1.0
+    graph.add_poses(600)
+    roots = factors.sqrt_information
+    graph.add_between(factors.i, factors.j, noisy, roots.transpose(0, 2, 1) @ roots)
+    said, = complaints(GraphRecord(graph, None, np.arange(600)))
+    assert re.search(r' are [0-9.]+ \(odometry\) times what the information says; ', said)
+
+
+def test_vertices_without_an_edge(record_of):
+    lonely = [f'VERTEX_SE2 {k} 0 0 0' for k in range(10, 20)]
+    assert complaints(record_of(*lonely, *LINES, LOOP)) == [
+        'no edge leads to 5 vertices (15, 16, 17, ...), so the graph cannot be solved',
+        'the odometry has 5 gaps (14 and 15, 15 and 16, 16 and 17, ...), consecutive vertices '
+        'without an edge']
+
+
+@pytest.mark.parametrize('odometry, loops, reason', [
+    (8, 1, 'too small'), (1, 8, 'too small'), (0.1, 1, 'too large, or some loops are false'),
+    (1, 0.1, 'too large, or some loops are false'), (1, 1, None)])
+def test_information_off_by_scale(rng, odometry, loops, reason):
+    """Of a world whose noise is known, told sigmas that many times as large."""
+    world = simulate_world(600, 1800, WorldOptions(), rng)
+    factors, graph = world.graph.between, FactorGraph(se2)
+    roots = factors.sqrt_information
+    sigma = np.where(factors.is_odometry, odometry, loops)[:, None, None]
+    graph.add_poses(600)
+    graph.add_between(factors.i, factors.j, factors.measurement,
+                      roots.transpose(0, 2, 1) @ roots / sigma**2)
+    found = complaints(GraphRecord(graph, None, 5 + np.arange(600)))
+    if reason is None:
+        assert found == []
+        return
+    sentence, = found
+    ratios = re.fullmatch(
+        r'errors at the L2 map of vertices 5 to 604 are (.*) \(odometry\) and (.*) \(loops\) '
+        r'times what the information says; expected about 1: the information is (.*)', sentence)
+    assert ratios[3] == reason
+    assert float(ratios[1]) * odometry == pytest.approx(1, rel=0.1)
+    assert float(ratios[2]) * loops == pytest.approx(1, rel=0.1)
+
+
+def test_the_repeated_edges_of_intel(datasets):
+    record = read_graph_file(datasets / 'intel.g2o')
+    assert complaints(record)[0].startswith('2 edges (60 to 863, 179 to 864): given before')
+    assert dict(numbers(record)) == {
+        'poses': '943 in SE2, ids 0 to 942', 'odometry': '942, 492.9 m',
+        'loops': '895, 4 of them beside another edge', 'components': '1',
+        'l1 cost': '1513.17 at the stored poses'}
+
+
+def test_the_numbers_of_a_graph_with_everything(record_of, tmp_path):
+    (tmp_path / 'a.g2o.stamps.txt').write_text(''.join(f'{k} {k}.5\n' for k in range(10, 15)))
+    record = record_of(*LINES, LOOP, 'EDGE_PRIOR_SE2 10 0 0 0 1 0 0 1 0 1')
+    assert dict(numbers(record)) == {
+        'poses': '5 in SE2, ids 10 to 14', 'odometry': '4, 4.0 m', 'loops': '1',
+        'absolute poses': '1', 'components': '1', 'time': '4.0 s'}
+
+
+def test_the_cost_is_that_which_is_minimised(record_of, rng):
+    vertices = [f'VERTEX_SE2 {k} {rng.normal()} {rng.normal()} {rng.normal()}'
+                for k in range(10, 15)]
+    record = record_of(*vertices, *LINES, LOOP, 'EDGE_PRIOR_SE2 12 1 2 .5 4 1 1 5 1 6')
+    expected = l1_cost(whitened_residual(record.graph, record.poses))
+    assert dict(numbers(record))['l1 cost'] == f'{expected:.6g} at the stored poses'
+
+
+def test_the_numbers_of_a_bag(rng, tmp_path):
+    world = simulate_world(30, 40, WorldOptions(), rng)
+    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(30)), world.truth)
+    assert bag_numbers(tmp_path / 'bag') == [
+        ('duration', '2.9 s from 1000.000000000'),
+        ('note', 'covariance increment, keyframes every'),
+        ('topic', '/ground_truth: 30 of geometry_msgs/msg/PoseStamped'),
+        ('topic', '/loop_closures: 11 of geometry_msgs/msg/PoseWithCovarianceStamped'),
+        ('topic', '/odom: 30 of nav_msgs/msg/Odometry')]

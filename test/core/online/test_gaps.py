@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where odometry does not go on from where it was, a part of the map begins that loops join."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lies import position_error
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import PERIOD, covariance6, curve, loop, loops_of, odometry, seconds
+
+from l1slam_ros.core.errors import MessageError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import gaps
+from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.online.backend import Backend, BackendOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilder
+from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+
+EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
+N, HALF = 200, 100
+
+
+@pytest.fixture(scope='module')
+def world():
+    return simulate_world(N, 420, WorldOptions(), np.random.default_rng(3))
+
+
+def messages(world):
+    """Return samples and loops of a world, in order: keyframe k is at 1 s + k PERIOD."""
+    factors = world.graph.between
+    covariance = np.linalg.inv(factors.sqrt_information.transpose(0, 2, 1)
+                               @ factors.sqrt_information)
+    found = [(0, odometry(1.0, world.odometry[0]))]
+    for row in range(len(factors)):
+        i, j = factors.i[row], factors.j[row]
+        time, stated = 1.0 + j * PERIOD, covariance6(covariance[row])
+        found.append((j, odometry(time, world.odometry[j], stated) if factors.is_odometry[row]
+                      else loop(1.0 + i * PERIOD, time, factors.measurement[row], stated)))
+    return [message for _, message in sorted(found, key=lambda one: one[0])]
+
+
+def fed(backend, found):
+    for message in found:
+        if isinstance(message, LoopClosure):
+            backend.add_loop(message)
+        else:
+            backend.add_odometry(message)
+    backend.update(0.01)
+    backend.settle()
+    return backend
+
+
+def moved(found, frame, back=0.0):
+    """Let odometry be in another frame from the middle on, its stamps set back by some seconds."""
+    start = se2.from_pose3(found[0].pose3[None])
+    for message in found:
+        late = message.stamp >= seconds(1.0 + HALF * PERIOD)
+        if late and not isinstance(message, LoopClosure):
+            pose = se2.from_pose3(message.pose3[None])
+            start = pose if message.stamp == seconds(1.0 + HALF * PERIOD) else start
+            pose = se2.compose(np.array([frame]), se2.between(start, pose))
+            message = replace(message, pose3=se2.to_pose3(pose)[0])
+        stamp = message.stamp - late * seconds(back)
+        if not isinstance(message, LoopClosure):
+            yield replace(message, stamp=stamp)
+        elif not late or message.reference_stamp < seconds(1.0 + HALF * PERIOD - back):
+            # One of a time that the second part has, too, would be of that.
+            yield replace(message, stamp=stamp)
+
+
+@pytest.fixture(scope='module')
+def undisturbed(world):
+    return fed(Backend(EVERY), messages(world)).poses
+
+
+@pytest.mark.parametrize('frame, back', [((0.0, 0, 0), 0.0), ((5e8, 1e5, 1.0), 0.0),
+                                         ((0.0, 0, 0), 5.0)],
+                         ids=['restart', 'teleport', 'clock'])
+def test_the_map_is_that_of_an_undisturbed_drive(world, undisturbed, frame, back):
+    backend = fed(Backend(EVERY), moved(messages(world), frame, back))
+    now = backend.snapshot()
+    assert now.gaps.tolist() == [HALF] and gaps(now.graph).tolist() == [HALF]
+    assert len(now.poses) == N and (np.diff(now.stamps) < 0).sum() == (back > 0)
+    assert np.bincount(backend.loop_states().state)[ACCEPTED] > 100
+    # What the odometry knew of that step is lost.
+    error, least = (position_error(poses, world.truth) for poses in (now.poses, undisturbed))
+    assert error < 1.3 * least + 0.02
+
+
+def test_played_twice_it_is_one_map_with_twice_the_odometry(world, undisturbed):
+    """The loops are known, and what they say is in the first part; the second is odometry."""
+    twice = messages(world)
+    backend = fed(Backend(EVERY), twice + twice)
+    now, loops = backend.snapshot(), len(world.graph.between) - N + 1
+    assert now.gaps.tolist() == [N] and len(now.graph.between) == 2 * (N - 1) + loops
+    assert backend.counts()[1] == {'repeated': loops}
+    assert_allclose(now.poses[:N], undisturbed, atol=0.05)
+    assert_allclose(now.poses[N], now.poses[N - 1], atol=0.05)
+    steps = se2.between(now.poses[N:-1], now.poses[N + 1:])
+    assert_allclose(steps, now.graph.between.measurement[now.graph.between.is_odometry][N - 1:],
+                    atol=1e-6)
+
+
+def test_until_loops_join_it_a_part_begins_where_the_last_one_ends():
+    poses = curve(60)
+    builder = GraphBuilder(se2, EVERY)
+    for k, pose in enumerate(poses[:40]):
+        builder.add_odometry(odometry(100.0 + k * PERIOD, pose))
+    for k, pose in enumerate(poses[40:]):
+        builder.add_odometry(odometry(101.0 + k * PERIOD, pose))
+    assert builder.notes.warned == {'new_part': 1} and not +builder.refused
+    assert builder.gaps.tolist() == [40] and builder.graph.n_poses == 60
+    assert len(builder.graph.between) == 58
+    expected = se2.compose(poses[39:40], se2.between(np.repeat(poses[40:41], 20, 0), poses[40:]))
+    assert_allclose(builder.odometry[40:], expected, atol=1e-9)
+    assert builder.stamps[40] == seconds(101.0)
+
+
+@pytest.mark.parametrize('reference, stamp, ends', [
+    (101.2, 102.4, (42, 54)), (100.3, 102.4, (3, 54)), (100.3, 100.9, (3, 9))])
+def test_a_stamp_is_of_the_part_that_the_robot_is_in_if_that_goes_back_so_far(
+        reference, stamp, ends):
+    builder = GraphBuilder(se2, EVERY)
+    for first in (100.0, 101.0):
+        for k, pose in enumerate(curve(40)[: 40 if first == 100 else 20]):
+            builder.add_odometry(odometry(first + k * PERIOD, pose))
+    builder.add_loop(loop(reference, stamp, (1.0, 0.0, 0.0)))
+    assert builder.add_due_loops() == 1
+    assert loops_of(builder)[:2] == ([ends[0]], [ends[1]])
+
+
+def test_loops_that_came_before_the_clock_was_set_back_are_of_their_time():
+    """Also one that waits then for a time that never comes, until the second part has it."""
+    builder = GraphBuilder(se2, EVERY)
+    for k, pose in enumerate(curve(20)):
+        builder.add_odometry(odometry(100.0 + k * PERIOD, pose))
+    builder.add_loop(loop(100.1, 101.5, (1.0, 0.0, 0.0)))
+    builder.add_loop(loop(100.1, 102.5, (1.0, 0.0, 0.0)))
+    for k, pose in enumerate(curve(30)):
+        builder.add_odometry(odometry(100.0 + k * PERIOD, pose))
+    builder.add_due_loops()
+    assert loops_of(builder)[:2] == ([1, 21], [15, 45])
+
+
+def test_near_a_gap_nothing_is_carried_across_it():
+    """The time is nearer to the first keyframe of the second part than to its own."""
+    builder = GraphBuilder(se2, replace(EVERY, keyframe=KeyframeOptions(0.5, 0.0, 0.0)))
+    for k in range(14):
+        builder.add_odometry(odometry(1.0 + k * PERIOD, (0.1 * k, 0.0, 0.0)))
+    for k in range(14, 30):
+        builder.add_odometry(odometry(1.0 + k * PERIOD, (1e6 + 0.1 * k, 0.0, 0.0)))
+    builder.add_loop(loop(1.0, 2.3, (1.3, 0.0, 0.0)))
+    builder.add_due_loops()
+    assert builder.stamps[[2, 3]].tolist() == [seconds(2.0), seconds(2.4)]
+    i, j, measurement = loops_of(builder)
+    assert (i, j) == ([0], [2])
+    assert_allclose(measurement, [[1.0, 0, 0]], atol=1e-9)
+
+
+def test_one_old_stamp_is_dropped_and_two_near_ones_too():
+    """Messages that overtook each other are no clock that was set back."""
+    builder = GraphBuilder(se2, EVERY)
+    refused = 0
+    for time in (10.0, 10.1, 10.2, 5.0, 10.3, 9.9, 10.0, 10.4):
+        try:
+            builder.add_odometry(odometry(time, (time, 0.0, 0.0)))
+        except MessageError as error:
+            refused += error.cause == 'old_stamp'
+    assert builder.refused == {'old_stamp': 1} and refused == 2
+    assert_array_equal(builder.stamps, [seconds(10 + k / 10) for k in range(5)])
+    assert not builder.gaps.size
+
+
+@pytest.mark.parametrize('choice, poses, x', [
+    ('new_segment', 60, 39.0), ('reset', 20, 0.0), ('ignore', 40, None)])
+def test_what_becomes_of_the_map_is_the_users_to_say(choice, poses, x):
+    backend = Backend(replace(EVERY, on_time_jump=choice))
+    for first, count in ((100.0, 40), (100.0, 20)):
+        for k in range(count):
+            try:
+                backend.add_odometry(odometry(first + k * PERIOD, (float(k), 0.0, 0.0)))
+            except MessageError:
+                assert choice == 'ignore' and first == 100.0
+        backend.settle()
+    assert len(backend.poses) == poses
+    if x is not None:
+        assert_allclose(backend.poses[-20], [x, 0, 0], atol=1e-9)
+        robot = backend.robot()
+        assert_allclose(se2.compose(robot.map_to_odom, robot.odometry)[0, 0], x + 19, atol=1e-9)
+
+
+def test_a_saved_map_keeps_its_parts(world):
+    first = fed(Backend(EVERY), moved(messages(world), (0.0, 0.0, 0.0), 5.0)).snapshot()
+    second = Backend(EVERY)
+    second.restore(first.graph, first.poses, first.stamps)
+    assert second.snapshot().gaps.tolist() == [HALF]
+    assert_array_equal(second.snapshot().stamps, first.stamps)
+    # Another recording, made earlier, is a part of its own.
+    for k in range(5):
+        second.add_odometry(odometry(0.5 + k * PERIOD, (7.0 + k, 0.0, 0.0)))
+    assert second.snapshot().gaps.tolist() == [HALF, N]
+    assert_allclose(second.poses[N], first.poses[-1], atol=1e-9)
+
+
+# A person's hand
+
+
+def struck(one):
+    return replace(one, struck=True)
+
+
+@pytest.mark.parametrize('when', ['before', 'after'])
+@pytest.mark.parametrize('robust', [True, False])
+def test_a_loop_that_is_struck_out_is_never_used(world, when, robust):
+    found = messages(world)
+    backend = Backend(replace(EVERY, robust=replace(EVERY.robust, enabled=robust)))
+    loops = [one for one in found if isinstance(one, LoopClosure)]
+    victim = loops[40]
+    if when == 'before':
+        backend.add_loop(struck(victim))
+    fed(backend, found)
+    if when == 'after':
+        before = backend.poses
+        backend.add_loop(struck(victim))
+        assert backend.update(1.0) is not None
+    states, ends = backend.loop_states(), [victim.reference_stamp, victim.stamp]
+    row = int(np.flatnonzero((states.stamps == ends).all(axis=1))[0])
+    assert states.state[row] == REJECTED
+    assert (states.state == ACCEPTED).sum() >= len(loops) - 10
+    assert backend.snapshot().graph.between.struck[states.rows[row]]
+    if when == 'after':
+        assert 0 < np.abs(backend.poses - before)[:, :2].max() < 1
+    # The last word counts.
+    backend.add_loop(replace(victim, trusted=True))
+    assert backend.update(1.0) is not None
+    assert backend.loop_states().state[row] == ACCEPTED
+
+
+def test_whoever_vouches_after_the_fact_adds_no_second_factor(world):
+    found = messages(world)
+    absurd = loop(2.0, 9.0, (50.0, 0.0, 0.0), 1e-2 * np.eye(6))
+    backend = fed(Backend(EVERY), [*found[:200], absurd])
+    count = len(backend.snapshot().graph.between)
+    assert backend.loop_states().state[-1] == REJECTED
+    backend.add_loop(replace(absurd, trusted=True))
+    backend.settle()
+    assert backend.loop_states().state[-1] == ACCEPTED
+    assert len(backend.snapshot().graph.between) == count
+    backend.add_loop(replace(absurd, trusted=True))
+    assert backend.counts()[1] == {'repeated': 1}

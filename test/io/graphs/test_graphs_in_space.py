@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Graph files of poses in space: both formats, both readings of the rotation, malformed lines."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.geometry import se3
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
+from l1slam_ros.core.names import ANGLE, QUATERNION
+from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
+
+UNIT = ' '.join('1' if row == column else '0' for row in range(6) for column in range(row, 6))
+SQUARE = f"""\
+VERTEX_SE3:QUAT 7 1.5 0 0.25 0 0 0.6 0.8
+VERTEX_SE3:QUAT 3 0 0 0 0 0 0 1
+EDGE_SE3:QUAT 3 7 1 0.25 2 0.48 0 0.36 -0.8 {UNIT}
+FIX 3
+"""
+TORO_SQUARE = f"""\
+VERTEX3 7 1.5 0 0.25 0 0 0.6
+VERTEX3 3 0 0 0 0 0 0
+EDGE3 3 7 1 0.25 2 0.3 -0.2 0.1 {UNIT}
+# as many lines
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def file(content, name='a.g2o'):
+        path = tmp_path / name
+        path.write_text(content)
+        return path
+    return file
+
+
+def information_of(graph):
+    roots = graph.between.sqrt_information
+    return roots.transpose(0, 2, 1) @ roots
+
+
+def random_record(rng, rotation_information=QUATERNION, n=8):
+    graph = FactorGraph(se3)
+    graph.add_poses(n)
+    A = rng.normal(size=(n - 1, 6, 6))
+
+    def anywhere(count):
+        return se3.from_pose3(rng.normal(size=(count, 7)))
+
+    graph.add_between(np.arange(n - 1), np.arange(1, n), anywhere(n - 1),
+                      A @ A.transpose(0, 2, 1) + 0.1 * np.eye(6))
+    return GraphRecord(graph, anywhere(n), np.arange(10, 10 + n),
+                       rotation_information=rotation_information)
+
+
+def test_a_small_graph(write):
+    record = read_graph_file(write(SQUARE))
+    assert record.graph.manifold is se3
+    assert record.ids.tolist() == [3, 7] and record.skipped == ()
+    assert_allclose(record.poses, [[0, 0, 0, 0, 0, 0, 1], [1.5, 0, 0.25, 0, 0, 0.6, 0.8]])
+    assert_allclose(record.graph.between.measurement, [[1, 0.25, 2, -0.48, 0, -0.36, 0.8]])
+
+
+@pytest.mark.parametrize(('reading', 'diagonal'), [(QUATERNION, 0.25), (ANGLE, 1.0)])
+def test_the_rotation_block_is_of_what_it_is_said_to_be(write, reading, diagonal):
+    """Of the vector part, half the angle: a quarter; of the blocks beside it a half."""
+    beside = SQUARE.replace(UNIT, UNIT.replace('1 0 0 0 0 0', '1 0 0 0.5 0 0', 1))
+    information = information_of(read_graph_file(write(beside), reading).graph)[0]
+    assert_allclose(np.diag(information), [1, 1, 1, *[diagonal] * 3])
+    assert_allclose(information[0, 3], 0.5 * np.sqrt(diagonal))
+    toro = information_of(read_graph_file(write(TORO_SQUARE, 'a.graph'), reading).graph)[0]
+    assert_allclose(toro, np.eye(6), atol=1e-15)
+
+
+def test_angles_of_toro_are_turns_about_z_then_y_then_x(write):
+    measurement = read_graph_file(write(TORO_SQUARE, 'a.graph')).graph.between.measurement[0]
+    expected = Rotation.from_euler('ZYX', [0.1, -0.2, 0.3]).as_quat()
+    assert_allclose(measurement, [1, 0.25, 2, *expected], atol=1e-15)
+
+
+@pytest.mark.parametrize('reading', [QUATERNION, ANGLE])
+@pytest.mark.parametrize('suffix', ['g2o', 'graph'])
+def test_round_trip(tmp_path, rng, suffix, reading):
+    record, path = random_record(rng, reading), tmp_path / f'a.{suffix}'
+    write_graph_file(path, record)
+    back = read_graph_file(path, reading)
+    for a, b in ((record.poses, back.poses),
+                 (record.graph.between.measurement, back.graph.between.measurement)):
+        (assert_array_equal if suffix == 'g2o' else assert_allclose)(a, b)
+    assert_allclose(information_of(record.graph), information_of(back.graph), atol=1e-12)
+
+
+def test_a_file_is_written_back_as_it_was(write, tmp_path):
+    """To the number, whatever its rotation block is taken for."""
+    for reading in (QUATERNION, ANGLE):
+        write_graph_file(tmp_path / 'b.g2o', read_graph_file(write(SQUARE), reading))
+        edge = (tmp_path / 'b.g2o').read_text().splitlines()[-1]
+        assert [float(v) for v in edge.split()[10:]] == [float(v) for v in UNIT.split()]
+
+
+@pytest.mark.parametrize('tags', [('VERTEX_SE3:QUAT', 'EDGE_SE3:QUAT', '0 0 0 1', 7, SQUARE),
+                                  ('VERTEX3', 'EDGE3', '0 0 0', 6, TORO_SQUARE)],
+                         ids=['g2o', 'toro'])
+@pytest.mark.parametrize(('line', 'message'), [
+    ('VERTEX 5 1 2', 'VERTEX: 3 fields; expected 1 whole and {pose} finite numbers'),
+    ('VERTEX 5 1 2 x TURN', "VERTEX: 'x' is not a finite number"),
+    ('VERTEX 7 1 2 3 TURN', 'vertex 7 stands twice, before at line 1'),
+    ('EDGE 3 7 1 2 3 TURN 1 0', 'EDGE: {fields} fields; expected 2 whole and {edge} finite'),
+    ('EDGE 3 7.5 1 2 3 TURN UNIT', "EDGE: '7.5' is not a whole number of 64 bits"),
+    ('EDGE 3 8 1 2 3 TURN UNIT', 'vertex 8 is unknown; expected one of the 2 vertices'),
+    ('EDGE 3 7 1 2 nan TURN UNIT', "EDGE: 'nan' is not a finite number"),
+    ('EDGE 3 7 1 2 3 TURN -UNIT', 'information [-1 0 0 0 0 0 0 1 0'),
+    ('EDGE_SE2 3 7 1 0 0 1 0 0 1 0 1', 'EDGE_SE2: a line of SE2 beside VERTEX at line 1'),
+])
+def test_each_malformed_line_is_named(write, tags, line, message):
+    vertex, edge, turn, pose, square = tags
+    text = line.replace('TURN', turn).replace('UNIT', UNIT)
+    message = message.format(pose=pose, fields=4 + pose, edge=pose + 21)
+    for word, tag in (('VERTEX', vertex), ('EDGE ', f'{edge} '), ('EDGE:', f'{edge}:')):
+        text, message = text.replace(word, tag), message.replace(word, tag)
+    with pytest.raises(FileError) as caught:
+        read_graph_file(write(square + text + '\n' + square.splitlines()[2] + '\n'))
+    assert '\n' not in str(caught.value)
+    assert str(caught.value).split('a.g2o', 1)[1].startswith(f':5: {message}')
+
+
+@pytest.mark.parametrize('turn', ['0 0 0 0', '0 0 0 1.2', '3 0 0 1'])
+def test_a_quaternion_that_is_none_is_named(write, turn):
+    with pytest.raises(FileError, match=r'a\.g2o:5: quaternion \[.*\]; expected one of norm 1'):
+        read_graph_file(write(SQUARE + f'VERTEX_SE3:QUAT 9 0 0 0 {turn}\n'))
+
+
+ABSOLUTE = f"""\
+PARAMS_SE3OFFSET 4 0 0 0 0 0 0 1
+EDGE_SE3_PRIOR 7 4 1 2 3 0 0 0.6 0.8 {UNIT}
+EDGE_SE3_XYZPRIOR 3 4 1 2 3 10 0 0 10 0 30
+"""
+
+
+def test_absolute_poses(write, tmp_path):
+    record = read_graph_file(write(SQUARE + ABSOLUTE))
+    for _ in range(2):
+        factors = record.graph.between
+        assert record.skipped == ()
+        assert factors.i.tolist() == [0, WORLD, WORLD] and factors.j.tolist() == [1, 1, 0]
+        assert_allclose(factors.measurement[1:], [[1, 2, 3, 0, 0, 0.6, 0.8],
+                                                  [1, 2, 3, 0, 0, 0, 1]])
+        assert_allclose([np.diag(one) for one in information_of(record.graph)[1:]],
+                        [[1, 1, 1, 0.25, 0.25, 0.25], [10, 10, 30, 0, 0, 0]])
+        write_graph_file(tmp_path / 'b.g2o', record)
+        record = read_graph_file(tmp_path / 'b.g2o')
+    assert (tmp_path / 'b.g2o').read_text().count('PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1') == 1
+
+
+def test_what_was_measured_elsewhere_than_at_the_robot_is_named(write):
+    beside = ABSOLUTE.replace('4 0 0 0', '4 0 0.5 0')
+    with pytest.raises(FileError, match=r'a\.g2o:6: EDGE_SE3_PRIOR: measured by PARAMS'):
+        read_graph_file(write(SQUARE + beside))

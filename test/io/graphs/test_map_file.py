@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When the map of a running back end is saved, and what is never overwritten."""
+
+import os
+import time
+from dataclasses import replace
+
+import pytest
+from problems import odometry
+
+from l1slam_ros.core.errors import FileError, OptionError
+from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.io.graphs.map_file import MapFile
+from l1slam_ros.io.graphs.saved_map import is_map, load_map
+from l1slam_ros.io.node_options import NodeOptions
+
+HOUR = 3600.0
+
+
+class Robot:
+    """A back end with a map file, its options, and what it warned of."""
+
+    def __init__(self, path, period=1e-9):
+        self.options = NodeOptions(save_path=str(path), autosave_period=period)
+        self.backend, self.warnings, self.seconds = Backend(self.options), [], 0
+        self.map_file = MapFile(self.backend, lambda: self.options, self.warnings.append)
+
+    def drive(self, count):
+        for _ in range(count):
+            self.seconds += 1
+            self.backend.add_odometry(odometry(self.seconds, (self.seconds, 0.0, 0.0)))
+
+    def autosave(self):
+        """Save where it is time, as the node does; return whether it was."""
+        due = self.map_file.is_due
+        if due:
+            self.map_file.autosave()
+        return due
+
+
+def keyframes(path):
+    return len(load_map(path)[0].optimised.poses)
+
+
+def test_a_map_is_saved_when_it_has_changed(tmp_path):
+    robot, path = Robot(tmp_path / 'map.g2o'), tmp_path / 'map.g2o'
+    assert not robot.autosave()
+    robot.drive(1)
+    assert robot.autosave() and not path.exists(), 'there is no graph yet'
+    robot.drive(2)
+    assert robot.autosave() and keyframes(path) == 3
+    written = path.stat().st_ino
+    assert not robot.autosave() and path.stat().st_ino == written
+    robot.drive(1)
+    assert robot.autosave() and keyframes(path) == 4 and not robot.warnings
+    # A new map begins: the old one stays until there is more than that.
+    robot.backend.reset()
+    robot.map_file.autosave()
+    assert keyframes(path) == 4
+
+
+@pytest.mark.parametrize('changes', [{'autosave_period': HOUR}, {'save_path': ''},
+                                     {'autosave_period': 0.0}])
+def test_it_is_saved_no_sooner_and_nowhere_that_nobody_said(tmp_path, changes):
+    robot = Robot(tmp_path / 'map.g2o')
+    robot.options = replace(robot.options, **changes)
+    robot.drive(3)
+    assert not robot.autosave()
+    # At the end it is, if at all.
+    robot.map_file.autosave()
+    assert (tmp_path / 'map.g2o').exists() == (robot.options.autosave_period == HOUR)
+
+
+def test_a_save_that_fails_is_tried_again_in_the_next_period(tmp_path):
+    robot = Robot(tmp_path / 'none' / 'map.g2o', period=0.5)
+    robot.drive(3)
+    while not robot.map_file.is_due:
+        time.sleep(0.01)
+    with pytest.raises(FileError, match='none/map.g2o: cannot be written'):
+        robot.map_file.autosave()
+    assert not robot.map_file.is_due and not robot.map_file.is_saving
+    (tmp_path / 'none').mkdir()
+    while not robot.autosave():
+        time.sleep(0.01)
+    assert is_map(tmp_path / 'none' / 'map.g2o')
+
+
+def test_a_map_that_was_not_loaded_is_kept_for_ever(tmp_path):
+    """Also where the one who starts the node forgets to load it."""
+    path, first = tmp_path / 'map.g2o', Robot(tmp_path / 'map.g2o')
+    first.drive(9)
+    first.map_file.save()
+    os.utime(path, (0, 0))
+    second = Robot(path)
+    for _ in range(4):
+        second.drive(3)
+        assert second.autosave()
+    kept = [p for p in tmp_path.iterdir() if p.name not in ('map.g2o', 'map.g2o.1')]
+    assert len(kept) == 1 and keyframes(kept[0]) == 9 and keyframes(path) == 12
+    assert kept[0].suffix == '.g2o' and second.warnings == [
+        f'{path} held a map that was not loaded: it is kept as {kept[0]}']
+    # Who says ~/save means it; the map before is kept as ever.
+    third = Robot(path)
+    third.drive(2)
+    third.map_file.save()
+    assert keyframes(path) == 2 and keyframes(tmp_path / 'map.g2o.1') == 12
+    assert len(list(tmp_path.iterdir())) == 3 and not third.warnings
+
+
+def test_what_was_loaded_is_its_own(tmp_path):
+    path, first = tmp_path / 'map.g2o', Robot(tmp_path / 'map.g2o')
+    first.drive(9)
+    first.map_file.save()
+    second = Robot(path)
+    assert second.map_file.load_at_start() == f'9 keyframes loaded from {path}'
+    assert not second.autosave()
+    second.seconds = 9
+    second.drive(1)
+    assert second.autosave() and keyframes(path) == 10
+    assert {p.name for p in tmp_path.iterdir()} == {'map.g2o', 'map.g2o.1'}
+    # Elsewhere, it is saved elsewhere; there may be another map.
+    second.options = replace(second.options, save_path=str(tmp_path / 'other.g2o'))
+    assert second.map_file.save() == f'10 keyframes saved to {tmp_path / "other.g2o"}'
+
+
+def test_at_start_a_missing_map_is_no_error_and_a_damaged_one_is_kept(tmp_path):
+    path, robot = tmp_path / 'map.g2o', Robot(tmp_path / 'map.g2o')
+    assert robot.map_file.load_at_start() == (
+        f'the map begins empty: {path}: cannot be read: No such file or directory')
+    assert not robot.warnings
+    for _ in range(2):
+        robot.drive(3)
+        robot.map_file.save()
+    path.write_bytes(path.read_bytes()[:-1])
+    assert robot.map_file.load_at_start() == robot.warnings[0]
+    assert robot.warnings[0].startswith(f'3 keyframes loaded from {path}.1, the map before: ')
+    (tmp_path / 'map.g2o.1').write_bytes(b'x')
+    damaged, robot = path.read_bytes(), Robot(path)
+    assert robot.map_file.load_at_start().startswith(
+        f'the map begins empty: {path}: cannot be loaded: ')
+    robot.drive(3)
+    robot.map_file.autosave()
+    assert keyframes(path) == 3
+    assert damaged in [p.read_bytes() for p in tmp_path.iterdir() if p != path]
+
+
+def test_without_a_name_nothing_is_loaded(tmp_path):
+    with pytest.raises(OptionError, match='save_path is empty, expected the name of a .g2o file'):
+        Robot('').map_file.load_at_start()

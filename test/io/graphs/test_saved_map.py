@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A saved map: one file that says all, proves itself whole, and keeps the one before it."""
+
+import os
+from dataclasses import fields, is_dataclass, replace
+
+import numpy as np
+import pytest
+from disk import Disk
+from problems import covariance6, loop, odometry, play
+
+from l1slam_ros.cli.main import main
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.online import backend as backend_module
+from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
+from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED, WAITING
+from l1slam_ros.core.robust.judgement import Doubt
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
+from l1slam_ros.io.graphs.saved_map import is_map, load_map, save_map
+
+EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
+PLENTY = 60.0
+
+
+@pytest.fixture(scope='module')
+def world():
+    return simulate_world(80, 130, WorldOptions(), np.random.default_rng(1))
+
+
+def settle(backend):
+    while backend.update(PLENTY) is not None:
+        pass
+
+
+def first_half(world):
+    """Return a back end in the middle of its run, with loops that were refused and that wait."""
+    backend = Backend(EVERY)
+    backend.add_loop(loop(20.0, 30.0, (1.0, 0.0, 0.0)))
+    play(backend, world, 0, 50)
+    backend.add_loop(loop(0.5, 4.0, (30.0, 40.0, 0.0), 1e-4 * np.eye(6)))
+    backend.add_loop(replace(loop(0.7, 4.1, (3.0, 1.0, 0.5), 0.5 * np.eye(6)), trusted=True))
+    backend.add_loop(replace(loop(0.0, 2.0, (20.0, 0.0, 0.3), 0.1 * np.eye(6)),
+                             reference_stamp=None))
+    settle(backend)
+    backend.add_loop(replace(loop(0.0, 6.0, (7.0, 8.0, 0.0), np.diag([1, 1, 0, 0, 0, np.inf])),
+                             reference_stamp=None))
+    backend.add_loop(loop(0.5, 7.0, (30.0, 40.0, 0.0), 1e-4 * np.eye(6)))
+    return backend
+
+
+@pytest.fixture(scope='module')
+def halfway(world):
+    return first_half(world)
+
+
+def assert_equal(a, b):
+    """Compare records field by field, number by number; a root is squared in the file."""
+    assert type(a) is type(b)
+    for f in fields(a):
+        x, y = getattr(a, f.name), getattr(b, f.name)
+        if is_dataclass(x):
+            assert_equal(x, y)
+        elif f.name == 'sqrt_information':
+            np.testing.assert_allclose(x, y, rtol=1e-14, atol=1e-14 * np.abs(x).max())
+        elif f.name == 'graph':
+            assert_equal(x.between, y.between)
+        elif f.name == 'waiting':
+            assert [t for _, t in x] == [t for _, t in y]
+            for (one, _), (other, _) in zip(x, y, strict=True):
+                assert_equal(one, other)
+        elif isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype
+            np.testing.assert_array_equal(x, y)
+        else:
+            assert x == y and type(x) is type(y), f.name
+
+
+def test_all_comes_back(halfway, tmp_path):
+    saved, path = halfway.saved(), tmp_path / 'map.g2o'
+    assert {WAITING, ACCEPTED, REJECTED} <= set(halfway.loop_states().state)
+    doubtful = replace(saved.optimised.judgement, doubts=(Doubt('another map', 3, 4, 5),),
+                       variance=np.array([0.1, 2 / 3]), slips=np.array([7, 9]))
+    saved = replace(saved, optimised=replace(saved.optimised, judgement=doubtful))
+    assert save_map(path, saved) == f'50 keyframes saved to {path}'
+    back, said, whole = load_map(path)
+    assert whole and said == f'50 keyframes loaded from {path}'
+    assert_equal(saved, back)
+    assert [p.name for p in tmp_path.iterdir()] == ['map.g2o']
+    assert len(saved.growth.waiting) == 3 and len(saved.growth.seen) == 19
+
+
+def test_what_is_loaded_goes_on_as_if_nothing_had_been(world, halfway, tmp_path, monkeypatch):
+    path = tmp_path / 'map.g2o'
+    save_map(path, halfway.saved())
+    backend, undisturbed = Backend(EVERY), first_half(world)
+    backend.restore(load_map(path)[0])
+    np.testing.assert_array_equal(backend.poses, halfway.poses)
+    np.testing.assert_array_equal(backend.snapshot().map_to_odom, halfway.snapshot().map_to_odom)
+    # Nothing is judged anew, nor improved: there is nothing new.
+    with monkeypatch.context() as patch:
+        patch.setattr(backend_module, 'improve', None)
+        assert backend.update(PLENTY) is None
+    for one in backend, undisturbed:
+        play(one, world, 50)
+        settle(one)
+    a, b = (one.saved().optimised for one in (backend, undisturbed))
+    np.testing.assert_allclose(a.poses, b.poses, atol=1e-3)
+    assert a.cost == pytest.approx(b.cost, rel=1e-6)
+    assert_equal(backend.saved().growth, undisturbed.saved().growth)
+    np.testing.assert_array_equal(backend.loop_states().state, undisturbed.loop_states().state)
+
+
+def test_the_motion_after_the_last_keyframe_is_not_lost(tmp_path):
+    """Nor its covariance, nor the frame of the odometry."""
+    options = BackendOptions(KeyframeOptions(1.0, 0.0, 0.0), OdometryOptions('increment'))
+    backends, path = [Backend(options) for _ in range(2)], tmp_path / 'map.g2o'
+
+    def drive(backend, first, last):
+        for k in range(first, last):
+            backend.add_odometry(odometry(k, (5 + 0.3 * k, 0.1 * k, 0.02 * k), covariance6(
+                np.diag(1 + k + np.arange(3)) * 1e-4)))
+
+    drive(backends[0], 0, 9)
+    save_map(path, backends[0].saved())
+    backends[1].restore(load_map(path)[0])
+    for backend in backends:
+        drive(backend, 9, 20)
+    assert_equal(*(backend.saved().growth for backend in backends))
+    # Begun elsewhere, or anew, odometry goes on from where the robot was.
+    for time, pose in (30, (40.0, 50.0, 1.0)), (20, (0.0, 0.0, 0.0)), (9000, (8.0, 0.8, 0.16)):
+        backends[0].restore(load_map(path)[0])
+        moved = backends[0].add_odometry(odometry(time, pose))
+        np.testing.assert_allclose(se2.compose(moved, np.array([pose])), [[7.4, 0.8, 0.16]],
+                                   atol=1e-9)
+
+
+def test_a_loop_that_was_saved_is_known_when_it_is_sent_again(halfway, world, tmp_path):
+    save_map(tmp_path / 'map.g2o', halfway.saved())
+    backend = Backend(EVERY)
+    backend.restore(load_map(tmp_path / 'map.g2o')[0])
+    for _ in range(2):
+        backend.add_loop(loop(0.5, 7.0, (30.0, 40.0, 0.0), 1e-4 * np.eye(6)))
+        backend.add_loop(replace(loop(0.7, 4.1, (3.0, 1.0, 0.5), 0.5 * np.eye(6)), trusted=True))
+    assert backend.counts()[1] == {'repeated': 4}
+
+
+def test_judged_otherwise_it_is_judged_anew(halfway, tmp_path):
+    save_map(tmp_path / 'map.g2o', halfway.saved())
+    backend = Backend(replace(EVERY, robust=RobustOptions(enabled=False)))
+    backend.restore(load_map(tmp_path / 'map.g2o')[0])
+    assert backend.update(PLENTY) is not None
+    assert REJECTED not in backend.loop_states().state
+
+
+# Damage
+
+
+@pytest.fixture
+def two(halfway, tmp_path):
+    """Return a path where a map of five keyframes has been saved, and then one of six."""
+    backend, path = Backend(EVERY), tmp_path / 'map.g2o'
+    for k in range(6):
+        backend.add_odometry(odometry(k, (k, 0.0, 0.0)))
+        if k > 3:
+            save_map(path, backend.saved())
+    return path
+
+
+def damages(content, rng):
+    """Yield the content cut short, and with a byte changed, 200 times each."""
+    for length in rng.choice(len(content), 200, replace=False).tolist():
+        yield content[:length]
+    for place in rng.choice(len(content), 200, replace=False).tolist():
+        byte = content[place] ^ int(rng.integers(1, 256))
+        yield content[:place] + bytes([byte]) + content[place + 1:]
+
+
+def test_what_is_damaged_is_noticed_and_the_map_before_taken(two, rng):
+    content = two.read_bytes()
+    for damaged in damages(content, rng):
+        two.write_bytes(damaged)
+        assert not is_map(two)
+        saved, said, whole = load_map(two)
+        assert len(saved.optimised.poses) == 5 and not whole
+        assert said.startswith(f'5 keyframes loaded from {two}.1, the map before: {two}: ')
+    two.write_bytes(content)
+    assert load_map(two)[1] == f'6 keyframes loaded from {two}'
+
+
+def test_what_is_missing_is_noticed_and_the_map_before_taken(two):
+    two.unlink()
+    assert '.1, the map before: ' in load_map(two)[1]
+    two.with_name('map.g2o.1').write_text('')
+    with pytest.raises(FileError, match='map.g2o: cannot be loaded: .*map.g2o: cannot be read.*'
+                       'map.g2o.1: the file is empty'):
+        load_map(two)
+    two.with_name('map.g2o.1').unlink()
+    with pytest.raises(FileError, match='map.g2o: cannot be read: No such file'):
+        load_map(two)
+
+
+def test_what_is_damaged_takes_the_place_of_no_map(two, halfway):
+    two.write_bytes(two.read_bytes()[:-1])
+    save_map(two, halfway.saved())
+    two.unlink()
+    assert load_map(two)[1].startswith('5 keyframes')
+
+
+def test_the_commands_notice_damage_too(two, capsys):
+    assert main(['info', str(two)]) == 0
+    content = two.read_bytes()
+    two.write_bytes(content.replace(b'EDGE_SE2 0 1 1.0', b'EDGE_SE2 0 1 2.0'))
+    assert main(['info', str(two)]) == 2
+    assert capsys.readouterr().err.strip().endswith(
+        f'{two}: is damaged: its last line is not the checksum of those before; expected a saved '
+        'map as it was written')
+    two.write_bytes(content.replace(b'map 1', b'map 2'))
+    assert not is_map(two)
+
+
+# The disk
+
+
+def content_of(path):
+    return path.read_bytes() if path.exists() else None
+
+
+def test_a_disk_that_fails_at_any_call_leaves_the_old_map_or_the_new_one(
+        two, halfway, monkeypatch):
+    old, before = two.read_bytes(), content_of(two.with_name('map.g2o.1'))
+    for failing in range(20):
+        with monkeypatch.context() as patch:
+            disk = Disk(patch, two.parent, failing)
+            try:
+                save_map(two, halfway.saved())
+                done = len(disk.calls) <= failing
+            except FileError:
+                done = False
+        assert load_map(two)[1].split()[0] in ('6', '50')
+        assert content_of(two.with_name('map.g2o.1')) in (old, before)
+        assert {p.name for p in two.parent.iterdir()} == {'map.g2o', 'map.g2o.1'}
+        if done:
+            break
+        two.write_bytes(old)
+    assert done and failing > 4 and load_map(two)[1].startswith('50')
+
+
+@pytest.mark.parametrize('early', [True, False])
+def test_a_power_cut_leaves_a_map_at_any_moment(two, halfway, monkeypatch, early):
+    before, found, kept = two.with_name('map.g2o.1'), [], []
+    old = two.read_bytes(), before.read_bytes()
+
+    def look():
+        found.append(disk.after_a_power_cut(two, two.parent, early))
+        kept.append(disk.after_a_power_cut(before, two.parent, early))
+
+    disk = Disk(monkeypatch, two.parent, seen=look)
+    save_map(two, halfway.saved())
+    assert set(found) == {old[0], two.read_bytes()} and found[-1] == two.read_bytes()
+    assert set(kept) == {old[1], old[0]} and kept[-1] == old[0]
+
+
+def test_without_links_the_map_before_is_a_copy(two, halfway, monkeypatch):
+    def refuse(*_):
+        raise PermissionError
+
+    old = two.read_bytes()
+    monkeypatch.setattr(os, 'link', refuse)
+    save_map(two, halfway.saved())
+    assert two.with_name('map.g2o.1').read_bytes() == old
+
+
+def test_what_killed_writers_left_is_removed(two, halfway):
+    for name in '.map.g2o.0123abcd.tmp', '.map.g2o.1.0123abcd.tmp', '.other.g2o.0123abcd.tmp':
+        two.with_name(name).write_text('half')
+    save_map(two, halfway.saved())
+    assert {p.name for p in two.parent.iterdir()} == {
+        'map.g2o', 'map.g2o.1', '.other.g2o.0123abcd.tmp'}
+
+
+# Others
+
+
+def test_to_others_it_is_a_graph_with_comments(halfway, tmp_path):
+    saved, path, plain = halfway.saved(), tmp_path / 'map.g2o', tmp_path / 'plain.g2o'
+    save_map(path, saved)
+    write_graph_file(plain, GraphRecord(saved.growth.graph, saved.optimised.poses, np.arange(50)))
+    lines = path.read_text().splitlines()
+    assert [line for line in lines if not line.startswith('#')] == plain.read_text().splitlines()
+    # As long as the shortest of buffers that others read a line into.
+    assert max(map(len, lines)) < 81920
+
+
+def test_converted_it_keeps_stamps_and_trust(halfway, tmp_path):
+    path, other = tmp_path / 'map.g2o', tmp_path / 'other.g2o'
+    save_map(path, halfway.saved())
+    assert main(['convert', str(path), str(other)]) == 0
+    a, b = read_graph_file(path), read_graph_file(other)
+    np.testing.assert_array_equal(a.stamps, b.stamps)
+    np.testing.assert_array_equal(a.graph.between.trusted, b.graph.between.trusted)
+    assert a.graph.between.trusted.sum() == 1 and not is_map(other)
+    # A graph with the files beside it, as maps once were saved, is loaded, too.
+    backend = Backend(EVERY)
+    backend.restore(load_map(other)[0])
+    np.testing.assert_array_equal(backend.poses, halfway.poses)
+    np.testing.assert_array_equal(backend.snapshot().stamps, a.stamps)
+    assert backend.update(PLENTY) is not None
+
+
+def test_what_is_no_map_is_refused(halfway, tmp_path):
+    path = tmp_path / 'map.g2o'
+    backend = Backend(EVERY)
+    backend.add_loop(replace(loop(0.0, 2.0, (20.0, 0.0, 0.3)), reference_stamp=None))
+    backend.add_odometry(odometry(2.0, (0.0, 0.0, 0.0)))
+    with pytest.raises(FileError, match='there is no graph yet to be saved'):
+        save_map(path, backend.saved())
+    saved = halfway.saved()
+    write_graph_file(path, GraphRecord(saved.growth.graph, saved.optimised.poses, np.arange(50)))
+    with pytest.raises(FileError, match='has no poses or no stamps; expected a saved map'):
+        load_map(path)

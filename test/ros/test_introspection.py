@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `ros2 node info`, `ros2 param describe` and `ros2 lifecycle` show: the node's interface."""
+
+import gc
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from node_bench import odometry
+from rcl_interfaces.srv import DescribeParameters, ListParameters
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+CONFIG = Path(__file__).parents[2] / 'config'
+INPUTS = {
+    '/odom': 'nav_msgs/msg/Odometry',
+    '/loop_closures': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    '/trusted_loop_closures': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    '/false_loop_closures': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    '/absolute_poses': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+}
+OUTPUTS = {
+    '/path': 'nav_msgs/msg/Path',
+    '/pose': 'geometry_msgs/msg/PoseStamped',
+    '/pose_with_covariance': 'geometry_msgs/msg/PoseWithCovarianceStamped',
+    '/map_to_odom': 'geometry_msgs/msg/TransformStamped',
+    '/graph': 'visualization_msgs/msg/MarkerArray',
+    '/loop_status': 'diagnostic_msgs/msg/DiagnosticArray',
+    '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
+}
+SERVICES = {
+    **{f'/backend/{name}': 'std_srvs/srv/Trigger' for name in ('optimize', 'reset', 'save',
+                                                               'load')},
+    '/backend/pause': 'std_srvs/srv/SetBool',
+    '/backend/change_state': 'lifecycle_msgs/srv/ChangeState',
+    '/backend/get_state': 'lifecycle_msgs/srv/GetState',
+}
+LATCHED = {'/path', '/graph', '/loop_status'}
+# name -> default, unit; those that only the start can set are marked.
+PARAMETERS = {
+    'map_frame': ('map', '', True), 'odom_frame': ('odom', '', True), 'base_frame': ('', '', True),
+    'update.period': (0.2, 's', True), 'update.budget': (0.1, 's', False),
+    'keyframe.translation': (0.5, 'm', False), 'keyframe.rotation': (0.2, 'rad', False),
+    'keyframe.period': (0.0, 's', False), 'odometry.covariance_source': ('model', '', False),
+    'odometry.sigma_translation': (0.05, 'm/m', False),
+    'odometry.sigma_rotation': (0.05, 'rad/rad', False),
+    'loop.covariance_source': ('message', '', False), 'loop.wait': (10.0, 's', False),
+    'robust.enabled': (True, '', False), 'dimension': (2, '', True),
+    'publish_tf': (True, '', True), 'transform_period': (0.05, 's', True),
+    'transform_tolerance': (0.1, 's', False), 'save_path': ('', '', False),
+    'on_time_jump': ('new_segment', '', False), 'autostart': (True, '', True),
+}
+
+
+def asked(b, kind, name, request):
+    client = b.peer.create_client(kind, f'/backend/{name}')
+    b.until(client.service_is_ready, f'{name} is offered')
+    future = client.call_async(request)
+    b.until(future.done, f'{name} answers')
+    return future.result()
+
+
+def test_topics_and_services_are_those_of_the_interface(bench):
+    b = bench()
+
+    def known():
+        named = (dict(call('backend', '/')) for call in (
+            b.peer.get_subscriber_names_and_types_by_node,
+            b.peer.get_publisher_names_and_types_by_node,
+            b.peer.get_service_names_and_types_by_node))
+        return all(expected.keys() <= found.keys() and all(
+            found[name] == [kind] for name, kind in expected.items())
+            for expected, found in zip((INPUTS, OUTPUTS, SERVICES), named, strict=True))
+
+    b.until(known, 'all is found, with its type')
+    for topic in INPUTS:
+        (end,) = b.peer.get_subscriptions_info_by_topic(topic)
+        assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+        assert b.backend.has_parameter(f'qos_overrides.{topic}.subscription.reliability')
+        assert b.backend.has_parameter(f'qos_overrides.{topic}.subscription.depth')
+        assert b.backend.get_parameter(f'qos_overrides.{topic}.subscription.depth').value == 1000
+    for topic in OUTPUTS:
+        (end,) = b.peer.get_publishers_info_by_topic(topic)
+        latched = end.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        assert latched == (topic in LATCHED), topic
+        assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+
+
+def test_parameters_are_described_with_unit_and_range(bench):
+    b = bench()
+    listed = set(asked(b, ListParameters, 'list_parameters',
+                       ListParameters.Request()).result.names)
+    assert listed >= PARAMETERS.keys()
+    names = [name for name in sorted(listed)
+             if not name.startswith('qos_overrides.') and name not in (
+                 'use_sim_time', 'start_type_description_service')]
+    answer = asked(b, DescribeParameters, 'describe_parameters',
+                   DescribeParameters.Request(names=names))
+    for name, described in zip(names, answer.descriptors, strict=True):
+        value = b.backend.get_parameter(name).value
+        assert described.description, name
+        if isinstance(value, float):
+            assert len(described.floating_point_range) == 1, name
+        elif isinstance(value, int) and not isinstance(value, bool):
+            assert len(described.integer_range) == 1, name
+        if name in PARAMETERS:
+            default, unit, fixed = PARAMETERS[name]
+            assert (value, described.read_only) == (default, fixed), name
+            assert unit in described.description and (f'[{unit}]' in described.description
+                                                      or not unit), name
+
+
+@pytest.mark.parametrize('name', ['l1slam.rviz', 'foxglove.json'])
+def test_layouts_show_what_the_node_publishes(name):
+    text = (CONFIG / name).read_text()
+    layout = yaml.safe_load(text)  # JSON is YAML, too
+    topics = set(re.findall(r'["\s](/[a-z_]+)', text))
+    assert layout and {'/path', '/graph', '/pose', '/pose_with_covariance'} <= topics
+    assert topics <= OUTPUTS.keys() | INPUTS.keys()
+
+
+def change(b, transition):
+    request = ChangeState.Request(transition=Transition(id=transition))
+    return asked(b, ChangeState, 'change_state', request).success
+
+
+def state(b):
+    return asked(b, GetState, 'get_state', GetState.Request()).current_state.label
+
+
+def test_a_node_that_is_managed_waits_to_be_told(bench):
+    b = bench(autostart=False)
+    assert state(b) == 'unconfigured'
+    b.send('/odom', odometry(10**9, 0.0))
+    b.until(lambda: b.status()[2].get('odom.received') == '1', 'it has come')
+    assert not b.received['pose'] and not b.received['map_to_odom']
+    assert change(b, Transition.TRANSITION_CONFIGURE) and state(b) == 'inactive'
+    assert change(b, Transition.TRANSITION_ACTIVATE) and state(b) == 'active'
+    b.send('/odom', odometry(2 * 10**9, 0.0))
+    b.until(lambda: len(b.path().poses) == 1 and b.received['map_to_odom'], 'a map')
+    assert len(b.received['pose']) == 1
+    assert change(b, Transition.TRANSITION_DEACTIVATE)
+    b.send('/odom', odometry(3 * 10**9, 0.0))
+    b.until(lambda: b.status()[2].get('odom.received') == '3', 'it has come')
+    assert len(b.received['pose']) == 1 and len(b.path().poses) == 1
+    assert change(b, Transition.TRANSITION_CLEANUP) and state(b) == 'unconfigured'
+    b.until(lambda: not b.path().poses, 'the map is empty')
+
+
+def test_unless_it_is_managed_it_is_active_at_once(bench):
+    assert state(bench()) == 'active'
+
+
+def test_two_nodes_of_one_name_are_noticed(bench):
+    gc.collect()  # a managed node is there until nobody holds it: one of an earlier test may be
+    b = bench()
+    b.until(lambda: b.status()[1] == 'ok', 'one is fine')
+    other = bench()
+    b.until(lambda: '2 nodes are called /backend; expected one' in b.status()[1], 'it is said')
+    assert b.status()[0] == DiagnosticStatus.WARN
+    other.close()

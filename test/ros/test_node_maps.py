@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node never loses a map: it saves on its own, at its end too, and goes on where it was."""
+
+import os
+import signal
+import subprocess
+import time
+
+import numpy as np
+import pytest
+
+rclpy = pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
+from node_bench import call, odometry, poses_of
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from l1slam_ros.core.online import backend as backend_module
+from l1slam_ros.io.graphs.saved_map import is_map, load_map
+from l1slam_ros.ros.demo import executable
+
+DEADLINE = 60.0
+
+
+def drive(b, first, last):
+    for k in range(first, last):
+        b.send('/odom', odometry((k + 1) * 10**9, 1.0 * k))
+
+
+def keyframes(path):
+    return len(load_map(path)[0].optimised.poses) if path.exists() else 0
+
+
+def test_the_map_is_saved_while_it_grows_and_at_the_end(bench, tmp_path, monkeypatch):
+    path = tmp_path / 'map.g2o'
+    b = bench(save_path=str(path), autosave_period=0.2)
+    drive(b, 0, 3)
+    b.until(lambda: keyframes(path) == 3, 'the map is saved')
+    drive(b, 3, 5)
+    b.until(lambda: keyframes(path) == 5, 'it is saved again')
+    other = tmp_path / 'other.g2o'
+    assert b.backend.set_parameters([Parameter('save_path', value=str(other))])[0].successful
+    assert call(b, 'save').message == f'5 keyframes saved to {other}'
+    b.until(lambda: len(b.path().poses) == 5, 'the map')
+    now = b.path()
+    assert b.backend.set_parameters([Parameter('autosave_period', value=1e6)])[0].successful
+    drive(b, 5, 6)
+    b.until(lambda: len(b.path().poses) == 6, 'a keyframe more')
+    assert b.backend.close(DEADLINE) and keyframes(other) == 6 and len(now.poses) == 5
+    b.peer.destroy_node()
+
+
+def test_a_settled_map_is_loaded_at_start_and_published_at_once(bench, tmp_path, monkeypatch):
+    path = tmp_path / 'map.g2o'
+    first = bench(save_path=str(path))
+    drive(first, 0, 4)
+    first.until(lambda: len(first.path().poses) == 4, 'a map')
+    first.until(lambda: first.backend._backend.snapshot().problem().settled, 'it settles')
+    assert call(first, 'save').success
+    improved = []
+    monkeypatch.setattr(backend_module, 'improve', lambda *_: improved.append(1))
+    second = bench(save_path=str(path), load_on_start=True)
+    second.until(lambda: len(second.path().poses) == 4, 'the map is there without odometry')
+    np.testing.assert_array_equal(poses_of(second.path()), poses_of(first.path()))
+    second.received['/diagnostics'].clear()
+    second.until(lambda: len(second.received['/diagnostics']) == 2, 'a second later')
+    assert not improved
+
+
+def test_a_damaged_map_is_said_and_the_one_before_taken(bench, tmp_path, capfd):
+    path = tmp_path / 'map.g2o'
+    b = bench(save_path=str(path), autosave_period=0.0, load_on_start=True)
+    assert 'the map begins empty: ' in capfd.readouterr().err
+    for count in 3, 5:
+        drive(b, 0 if count == 3 else 3, count)
+        b.until(lambda count=count: len(b.path().poses) == count, 'a map')
+        assert call(b, 'save').success
+    path.write_bytes(path.read_bytes()[:-100])
+    answer = call(b, 'load')
+    assert answer.success
+    assert answer.message.startswith(f'3 keyframes loaded from {path}.1, the map before: {path}: ')
+    assert answer.message in capfd.readouterr().err
+    b.until(lambda: len(b.path().poses) == 3, 'the map before')
+
+
+def test_a_map_that_cannot_be_saved_is_an_error_until_it_can(bench, tmp_path):
+    path = tmp_path / 'none' / 'map.g2o'
+    b = bench(save_path=str(path), autosave_period=0.2)
+    drive(b, 0, 3)
+    b.until(lambda: b.status()[0] == DiagnosticStatus.ERROR
+            and f'autosave failed: {path}: cannot be written: ' in b.status()[1], 'it says so')
+    path.parent.mkdir()
+    b.until(lambda: b.status()[0] == DiagnosticStatus.OK, 'it is over')
+    assert keyframes(path) == 3
+
+
+class Robot:
+    """The node as a process, and a peer that drives and listens."""
+
+    def __init__(self, ros, path):
+        self.process = subprocess.Popen(
+            [executable('backend'), '--ros-args', '-p', f'save_path:={path}', '-p',
+             'autosave_period:=0.2', '-p', 'load_on_start:=true'], stderr=subprocess.PIPE,
+            text=True)
+        self.node, self.heard = ros.create_node('robot'), []
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(PathMessage, 'path', self.heard.append, latched)
+        self.publisher = self.node.create_publisher(Odometry, 'odom', QoSProfile(depth=1000))
+
+    def until(self, condition, what):
+        deadline = time.monotonic() + DEADLINE
+        while not condition():
+            assert time.monotonic() < deadline, f'waited {DEADLINE} s in vain until {what}'
+            rclpy.spin_once(self.node, timeout_sec=0.05)
+
+    def drive(self, first, last):
+        self.until(self.publisher.get_subscription_count, 'the node listens')
+        for k in range(first, last):
+            self.publisher.publish(odometry((k + 1) * 10**9, 5.0 + k))
+
+    def end(self, number):
+        self.process.send_signal(number)
+        said = self.process.communicate(timeout=DEADLINE)[1]
+        self.node.destroy_node()
+        return said
+
+
+def test_a_killed_node_goes_on_where_it_was_and_a_signal_loses_nothing(ros, tmp_path):
+    path = tmp_path / 'map.g2o'
+    first = Robot(ros, path)
+    first.drive(0, 10)
+    first.until(lambda: keyframes(path) == 10, 'all is saved')
+    first.end(signal.SIGKILL)
+    second = Robot(ros, path)
+    second.until(lambda: second.heard, 'the map is back')
+    assert len(second.heard[-1].poses) == 10
+    second.drive(10, 20)
+    second.until(lambda: len(second.heard[-1].poses) == 20, 'the robot goes on')
+    np.testing.assert_allclose(poses_of(second.heard[-1])[:, 0], 5 + np.arange(20), atol=1e-6)
+    said = second.end(signal.SIGTERM)
+    assert second.process.returncode == 0 and '10 keyframes loaded from' in said, said
+    assert is_map(path) and keyframes(path) == 20
+    assert set(os.listdir(tmp_path)) == {'map.g2o', 'map.g2o.1'}

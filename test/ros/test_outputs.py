@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the node publishes besides the Path: the drawn graph, how well it knows where it is."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from node_bench import odometry
+from rclpy.serialization import deserialize_message
+from test_node import EVERY_MESSAGE, play
+from visualization_msgs.msg import Marker, MarkerArray
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.linear_system import linearise
+from l1slam_ros.core.online.backend import Backend, BackendOptions
+from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED
+from l1slam_ros.core.online.marginal import newest_covariance
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.bags.from_graph import write_graph_bag
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.messages.conversion import reference_frame_id
+from l1slam_ros.ros.markers import _array_bytes
+from l1slam_ros.ros.publishing import header, header_bytes, pose_with_covariance
+
+
+class Drawing:
+    """What RViz would draw of the markers so far."""
+
+    def __init__(self, b):
+        self.drawn, self.heard = {}, 0
+        b.peer.create_subscription(MarkerArray, 'graph', self.take, 10)
+
+    def take(self, message):
+        self.heard += 1
+        for marker in message.markers:
+            self.drawn.pop((marker.ns, marker.id), None)
+            if marker.action == Marker.ADD:
+                self.drawn[marker.ns, marker.id] = marker
+
+    def sizes(self):
+        sizes = {}
+        for (name, _), marker in self.drawn.items():
+            assert len(marker.colors) == len(marker.points)
+            sizes[name] = sizes.get(name, 0) + len(marker.points)
+        return sizes
+
+
+def test_the_graph_is_drawn_for_who_looks_also_for_who_comes_late(bench, tmp_path, rng):
+    world = simulate_world(40, 60, WorldOptions(), rng)
+    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(40)))
+    b = bench(**EVERY_MESSAGE)
+    early = Drawing(b)
+    play(b, tmp_path / 'bag')
+
+    def all_are_drawn(drawing):
+        points = drawing.sizes()
+        loops = [points.pop(name, 0) for name in ('loops', 'suspect_loops', 'rejected_loops')]
+        return points == {'keyframes': 40, 'odometry': 2 * 39} and sum(loops) == 2 * 21
+
+    b.until(lambda: all_are_drawn(early), 'keyframes and both ends of each factor are drawn')
+    assert early.sizes()['loops'] > 2 * 14
+    late = Drawing(b)
+    b.until(lambda: all_are_drawn(late), 'who comes late sees all of it')
+    assert late.heard == 1
+    path = np.array([(p.pose.position.x, p.pose.position.y) for p in b.path().poses])
+    drawn = np.array([(p.x, p.y) for p in late.drawn['keyframes', 0].points])
+    np.testing.assert_allclose(drawn, path, atol=2e-3)
+    loops = b.backend._backend.loop_states()
+    worst = late.drawn['loops', 0].colors[2 * int(np.nanargmax(
+        loops.sigmas[loops.state == ACCEPTED]))]
+    assert worst.r > 0.1 and worst.a == 1.0
+
+
+@pytest.mark.parametrize('frame', ['map', 'm', 'world'])
+def test_markers_are_what_their_bytes_say(frame, rng):
+    made = [('keyframes', 3, Marker.POINTS, Marker.ADD, 0.1, rng.normal(size=(5, 3)),
+             rng.random((5, 4), dtype=np.float32)),
+            ('odd', 1, Marker.LINE_LIST, Marker.DELETE, 0.3, np.zeros((0, 3)),
+             np.zeros((0, 4), np.float32)),
+            ('loops', 7, Marker.LINE_LIST, Marker.ADD, 0.5, rng.normal(size=(2, 3)),
+             rng.random((2, 4), dtype=np.float32))]
+    read = deserialize_message(_array_bytes(header_bytes(frame, 10**9 + 5), made), MarkerArray)
+    for marker, (name, number, kind, action, size, points, colours) in zip(
+            read.markers, made, strict=True):
+        assert (marker.ns, marker.id, marker.type, marker.action) == (name, number, kind, action)
+        assert marker.scale.x == size and marker.pose.orientation.w == 1.0
+        assert (marker.header.frame_id, marker.header.stamp.nanosec) == (frame, 5)
+        assert [(p.x, p.y, p.z) for p in marker.points] == [tuple(p) for p in points]
+        assert [(c.r, c.g, c.b, c.a) for c in marker.colors] == [tuple(c) for c in colours]
+        assert not marker.text and not marker.mesh_resource and not marker.texture.data
+
+
+def dense(now):
+    """Return the covariance of the newest keyframe by a dense inverse."""
+    graph = now.graph.subset(now.optimised.judgement.accepted)
+    A = linearise(graph, now.poses).A.toarray()
+    return np.linalg.inv(A.T @ A)[-3:, -3:]
+
+
+def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path, rng):
+    world = simulate_world(60, 130, WorldOptions(), rng)
+    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(60)))
+    b = bench(**EVERY_MESSAGE)
+    heard = []
+    b.peer.create_subscription(PoseWithCovarianceStamped, 'pose_with_covariance', heard.append, 10)
+    b.until(lambda: b.backend._covariance.get_subscription_count(), 'somebody listens')
+    play(b, tmp_path / 'bag')
+    b.until(lambda: heard and heard[-1].header.stamp == b.path().poses[-1].header.stamp
+            and b.backend._backend.update(0.0) is None, 'the map is done')
+    now = b.backend._backend.snapshot()
+    expected = pose_with_covariance('map', int(now.stamps[-1]), se2, now.poses[-1:], dense(now))
+
+    def agrees():
+        return np.allclose(heard[-1].pose.covariance, expected.pose.covariance, rtol=1e-6)
+
+    b.until(agrees, 'the covariance of the newest keyframe')
+    whole = np.reshape(heard[-1].pose.covariance, (6, 6))
+    R = se2.adjoint(now.poses[-1:])[0, :2, :2]
+    np.testing.assert_allclose(whole[:2, :2], R @ dense(now)[:2, :2] @ R.T, rtol=1e-6)
+    assert whole[5, 5] == pytest.approx(dense(now)[2, 2], rel=1e-6) and not whole[2:5].any()
+    assert heard[-1].header.frame_id == 'map'
+
+
+def test_of_a_part_that_nothing_joins_hardly_anything_is_known():
+    backend = Backend(BackendOptions())
+    assert newest_covariance(backend.snapshot()) is not None
+    from problems import odometry as sample
+    for k in range(10):
+        backend.add_odometry(sample(100.0 + k, (float(k), 0.0, 0.0)))
+    known = newest_covariance(backend.snapshot())
+    for k in range(3):
+        backend.add_odometry(sample(50.0 + k, (float(k), 0.0, 0.0)))
+    unknown = newest_covariance(backend.snapshot())
+    assert 0 < known[0, 0] < 0.1 and unknown[0, 0] > 50 and unknown[2, 2] > 0.9
+
+
+def test_a_person_strikes_a_loop_out_and_vouches_for_it_after_all(bench):
+    b = bench(**{'robust.enabled': False})
+    hand = {topic: b.peer.create_publisher(PoseWithCovarianceStamped, topic, 10)
+            for topic in ('false_loop_closures', 'trusted_loop_closures')}
+    b.until(lambda: all(p.get_subscription_count() for p in hand.values()), 'the node listens')
+    for k in range(6):
+        b.send('/odom', odometry((k + 1) * 10**9, 1.0 * k))
+    frame = reference_frame_id('base_link', 10**9)
+    loop = PoseWithCovarianceStamped(header=header(frame, 6 * 10**9))
+    loop.pose.pose.position.x, loop.pose.pose.orientation.w = 3.0, 1.0
+    loop.pose.covariance = (1e-6 * np.eye(6)).ravel()
+    b.send('/loop_closures', loop)
+
+    def states():
+        return b.backend._backend.loop_states().state.tolist()
+
+    def end():
+        return b.path().poses[-1].pose.position.x if len(b.path().poses) == 6 else None
+
+    b.until(lambda: states() == [ACCEPTED] and end() and end() < 4.9, 'the loop is believed')
+    # Only the stamps count; what else is in the message may be nothing.
+    hand['false_loop_closures'].publish(PoseWithCovarianceStamped(header=header(frame, 6 * 10**9)))
+    b.until(lambda: states() == [REJECTED] and end() and abs(end() - 5) < 1e-6, 'struck out')
+    hand['trusted_loop_closures'].publish(loop)
+    b.until(lambda: states() == [ACCEPTED] and end() and end() < 4.9, 'vouched for')
