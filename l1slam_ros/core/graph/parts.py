@@ -9,7 +9,11 @@ factor in each gap that no other factor speaks against.
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
+
+# A gap: the odometry is so many times vaguer, by the volume of one sigma; and no number is less.
+_VAGUE, _TINY = 1e4, 1e-300
 
 
 def odometry_gaps(graph: FactorGraph) -> Indices:
@@ -18,6 +22,17 @@ def odometry_gaps(graph: FactorGraph) -> Indices:
     first = np.minimum(factors.i, factors.j)[factors.is_odometry]
     gaps: Indices = np.setdiff1d(np.arange(graph.n_poses - 1), first)
     return gaps
+
+
+def vague_odometry(graph: FactorGraph) -> Mask:
+    """Return which factors are odometry so vague, beside all other, that it says nothing, (m,)."""
+    factors = graph.between
+    diagonal = np.abs(np.diagonal(factors.sqrt_information, axis1=1, axis2=2))
+    size = np.where(factors.speaks, np.log(np.maximum(diagonal, _TINY)), 0.0).sum(axis=1)
+    odometry = factors.is_odometry
+    vague: Mask = odometry & (size < np.median(size[odometry]) - np.log(_VAGUE)
+                              if odometry.any() else False)
+    return vague
 
 
 def bridged(graph: FactorGraph) -> FactorGraph:

@@ -101,9 +101,10 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
                  settled: bool = True) -> Judgement:
     """Return what a state says of the factors that were given."""
     square, suspect = fits(growth)
-    size, accepted = growth.size, growth.accepted & ~growth.cut
+    size, slip = growth.size, growth.cut & ~growth.gap
+    accepted = growth.accepted & ~slip
     return Judgement(accepted[:size], suspect[:size], np.sqrt(square[:size]), growth.variance,
-                     np.flatnonzero(growth.cut[:size]), reasons, settled)
+                     np.flatnonzero(slip[:size]), reasons, settled)
 
 
 def fits(growth: Growth) -> tuple[Array, Mask]:
@@ -158,7 +159,7 @@ def _ambiguous(growth: Growth) -> Iterator[Indices]:
     loops = np.flatnonzero(growth.is_loop & growth.accepted)
     ends = np.unique((growth.low[loops], growth.high[loops]))
     jumps = growth.low[jumping(growth)]
-    for slip in growth.low[np.flatnonzero(growth.cut[: growth.size])]:
+    for slip in growth.low[np.flatnonzero(growth.cut & ~growth.gap)]:
         place = np.searchsorted(ends, slip, side='right')
         if (np.searchsorted(ends, jumps, side='right') == place).any():
             yield loops[(growth.low[loops] <= slip) & (growth.high[loops] > slip)]

@@ -15,8 +15,8 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.batch import Report, robust_solve
 from l1slam_ros.core.robust.judgement import Judgement
-from l1slam_ros.core.robust.rounds import solve
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import l2_map
 from l1slam_ros.core.solvers.nonlinear import Solution
 
 
@@ -41,7 +41,7 @@ def minimise_robustly(
     judgement, poses = robust_solve(graph, report, check)
     accepted = graph.subset(judgement.accepted)
     whole = tied(accepted, poses)
-    seed = solve(whole, poses, cholesky_of(whole), lambda *_: check())
+    seed = l2_map(whole, poses, cholesky_of(whole), lambda *_: check())
     solution = minimise(whole, seed)
     rows = len(accepted.between) * graph.manifold.TANGENT_SIZE
     return RobustMap(replace(solution, dual=solution.dual[:rows]), seed, judgement)

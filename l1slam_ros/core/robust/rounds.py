@@ -15,8 +15,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, ends_in_time
 from l1slam_ros.core.graph.first_fixes import first_fixes
-from l1slam_ros.core.graph.linear_system import anchor, linearise, step_poses, whitened_residual
-from l1slam_ros.core.graph.parts import bridged
+from l1slam_ros.core.graph.parts import bridged, vague_odometry
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.robust.gating import DOUBT, believable, log_odds_of_false, noise_variance
@@ -30,11 +29,8 @@ from l1slam_ros.core.robust.innovation import (
     sampled_quantile,
 )
 from l1slam_ros.core.robust.places import neighbours_agree, places
-from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, cholesky_of
-from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.solvers.nonlinear import Report
-from l1slam_ros.core.solvers.optimality import l2_cost
-from l1slam_ros.core.solvers.reweighting import weighted_least_squares
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import l2_map
 
 # The same samples each time: the answer is that of the graph, not of chance.
 _SEED = 2014
@@ -43,10 +39,6 @@ REFUSED = 1e-3
 _DROPPED = 2e-5
 # Probability that any true factor of a round is doubted for what the others say.
 _DOUBTED = 0.01
-# Gauss-Newton begins where chi2 is at most so many times what the noise makes of it.
-_FITS = 3
-# Steps of Gauss-Newton at most in one round.
-_STEPS = 60
 # A loop that was dropped that often is not tried again.
 _CHANCES = 2
 # What is measured of the noise counts against as many factors on which it was measured before.
@@ -75,8 +67,9 @@ class Growth:
     The state of a robust solve.
 
     graph : the one given, and an odometry factor for each gap, which is cut; size : factors given;
-    accepted, is_loop, trusted : (m,) bool of the between factors; cut : (m,) bool, odometry that
-    says nothing: a gap or a slip; low, high : (m,) the earlier and the later keyframe of each;
+    accepted, is_loop, trusted : (m,) bool of the between factors; gap, cut : (m,) bool, odometry
+    that says nothing: where there is none, and there or where it slipped; low, high : (m,) the
+    earlier and the later keyframe of each;
     place : (m,) see `places`; part : (n,) number of the part of each keyframe; poses : (n, p) the
     L2 map of the accepted; posterior : of these; variance : (2,) of odometry and loops in units of
     what they state; suspected : the loops across each slip that was suspected and not
@@ -90,7 +83,8 @@ class Growth:
         self.rng = np.random.default_rng(_SEED)
         self.low, self.high, self.forward = ends_in_time(self.graph)
         self.is_loop: Mask = ~self.factors.is_odometry
-        self.cut: Mask = np.arange(len(self.factors)) >= self.size
+        self.gap: Mask = vague_odometry(self.graph) | (np.arange(len(self.factors)) >= self.size)
+        self.cut: Mask = self.gap.copy()
         self.accepted: Mask = ~self.is_loop | self.trusted
         self.poses = placed(self.graph.subset(self.accepted), odometry_poses(self.graph))
         self.part = np.zeros(graph.n_poses, np.int64)
@@ -234,7 +228,7 @@ class Growth:
             subgraph = self.subgraph(rows)
             cholesky = cholesky_of(subgraph)
             self._check()
-            self.poses = solve(subgraph, self.poses, cholesky, lambda *_: self._check())
+            self.poses = l2_map(subgraph, self.poses, cholesky, lambda *_: self._check())
             self._check()
             self.posterior = sample_posterior(subgraph, self.poses, cholesky, self.rng)
             if self._is_noisier(rows):
@@ -344,37 +338,3 @@ class Growth:
         """Return so many of some factors, at random, or all, (k,)."""
         chosen: Indices = self.rng.permutation(rows)[:count]
         return chosen
-
-
-def solve(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
-          report: Report = lambda iteration, cost: None) -> Array:
-    """
-    Return the L2 map of a graph to within its noise: chi2 one above the optimum or less.
-
-    From poses (n, p) that may be far off: where they do not fit to within the noise, first
-    rotations alone, then translations, each of which is linear; then Gauss-Newton.
-    """
-    # In units of its noise, chi2 is about as large as there are spare measurements.
-    k = graph.manifold.TANGENT_SIZE
-    spare = max(int(graph.between.freedom.sum()) - k * (graph.n_poses - anchor(graph)), k)
-    chi2 = _chi2(graph, poses)
-    if chi2 > _FITS * spare:
-        linear = _two_linear_steps(graph, poses, cholesky)
-        poses = linear if _chi2(graph, linear) < chi2 else poses
-    return minimise_l2(graph, poses, LeastSquaresOptions(_STEPS, 1 / spare), cholesky,
-                       report).poses
-
-
-def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:
-    manifold = graph.manifold
-    for part in (manifold.ROTATION, manifold.TRANSLATION):
-        system = linearise(graph, poses).part(part)
-        x = weighted_least_squares(system, cholesky, np.ones_like(system.b))
-        step = np.zeros((graph.n_poses - anchor(graph), manifold.TANGENT_SIZE))
-        step[:, part] = x.reshape(len(step), -1)
-        poses = step_poses(graph, poses, step)
-    return poses
-
-
-def _chi2(graph: FactorGraph, poses: Array) -> float:
-    return l2_cost(whitened_residual(graph, poses))

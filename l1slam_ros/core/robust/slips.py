@@ -203,12 +203,16 @@ def unheard_of(growth: Growth) -> Mask:
 
 def _against(growth: Growth) -> Array:
     """Return by how much all others speak against each odometry factor, (m,), as noisy as said."""
-    rows = np.flatnonzero(growth.accepted)
-    against = np.zeros(len(growth.factors))
-    against[rows] = growth.posterior.left_out()
+    against, noise = np.zeros(len(growth.factors)), growth.variance_at_their_word()[0]
+    against[growth.accepted] = growth.posterior.left_out()
     against[growth.is_loop | growth.cut] = 0.0
-    scale: float = growth.variance[0] / growth.variance_at_their_word()[0]
-    return against * scale
+    if growth.takes_at_their_word or against.max() < _GAIN * _gate(growth) * (
+            noise / growth.variance[0]):
+        return np.asarray(against * (growth.variance[0] / noise))
+    state = growth.copy()
+    state.take_at_their_word()
+    state.solve()
+    return _against(state)
 
 
 def _spoken_against(growth: Growth, against: Array) -> Indices:
