@@ -91,7 +91,7 @@ def main() -> None:
     from robust.runs import measure
     from robust.solvers import OURS
 
-    from l1slam_ros.core.solvers.warm_up import warm_up
+    from l1slam_ros.io.warm_up import warm_up
 
     # Each run is a copy of this process, which has all loops compiled.
     warm_up()

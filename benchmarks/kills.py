@@ -42,9 +42,9 @@ from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.ros.demo import executable
 
 KILLS, POSES, EDGES = 60, 3000, 4800
-_PERIOD = 0.5  # [s] from autosave to autosave
-_RATE = 60.0  # [Hz] of the odometry
-_LONGEST = 1.5  # [s] from the first message to the kill
+_PERIOD = 1.0  # [s] from autosave to autosave
+_RATE = 30.0  # [Hz] of the odometry
+_LONGEST = 3.0  # [s] from the first message to the kill
 _PATIENCE = 300.0  # [s]
 _SAVE = 2e-5  # [s] it takes to save a keyframe
 _AGAIN = 2 * 10**9  # [ns] before the last keyframe: loops since then are sent again
@@ -57,7 +57,7 @@ class Player:
     def __init__(self, bag: Path, path: Path, rng: np.random.Generator):
         self.messages = [(m.topic, m.time, m.data) for m in read_raw(bag, _KINDS)]
         self.path, self.rng = path, rng
-        self.sent: dict[int, float] = {}  # stamp [ns] of odometry -> when it was sent last [s]
+        self.sent: dict[int, float] = {}  # stamp [ns] of odometry -> when it was sent [s]
         self.last = 0  # stamp of the last keyframe of the map that was loaded [ns]
         self.lost: list[float] = []
         self.inside = 0
@@ -115,7 +115,8 @@ class Player:
             deadline = time.monotonic() + 2 * _PERIOD
             while not self._being_written() - before and time.monotonic() < deadline:
                 pass  # a small map is written in two milliseconds
-            time.sleep(self.rng.uniform(0, _SAVE * len(self.sent)))
+            size = len(self.maps[-1].poses) if self.maps else 0
+            time.sleep(self.rng.uniform(0, _SAVE * size))
         self.process.send_signal(signal.SIGKILL)
         self.process.wait()
         killed = time.monotonic()
@@ -124,6 +125,7 @@ class Player:
         self.start()
         self.lost.append(max((killed - when for stamp, when in self.sent.items()
                               if stamp > self.last), default=0.0))
+        self.sent.clear()
 
     def _being_written(self) -> set[str]:
         return {name for name in os.listdir(self.path.parent) if name.endswith('.tmp')}

@@ -78,7 +78,11 @@ def _half_aliased(place: Place, rng: np.random.Generator, count: int) -> Changed
 
 
 def _slip(place: Place, rng: np.random.Generator, what: str, count: int) -> Changed:
-    """Move odometry factors by 5 m in some direction, or by 90 degrees about some axis."""
+    """
+    Move odometry factors by 5 m in some direction, or by 90 degrees about some axis.
+
+    What they measured is gone, so the map to be found is that of all the others.
+    """
     graph, manifold, factors = place.graph, place.graph.manifold, place.graph.between
     rows = np.flatnonzero(factors.is_odometry)
     edge = int(len(rows) * _EDGE)
@@ -86,7 +90,8 @@ def _slip(place: Place, rng: np.random.Generator, what: str, count: int) -> Chan
     slips = np.stack([_wrong_step(manifold, what == 'translation', rng) for _ in rows])
     moved = factors.measurement.copy()
     moved[rows] = manifold.retract(moved[rows], slips)
-    return Changed(_with(graph, measurement=moved), graph,
+    others = graph.subset(np.delete(np.arange(len(factors)), rows))
+    return Changed(_with(graph, measurement=moved), others,
                    steps=np.minimum(factors.i[rows], factors.j[rows]))
 
 

@@ -21,8 +21,8 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
-from l1slam_ros.core.solvers.warm_up import warm_up
 from l1slam_ros.core.worlds.simulate import World, WorldOptions, simulate_world
+from l1slam_ros.io.warm_up import warm_up
 
 
 def solve(world: World) -> dict[str, float]:

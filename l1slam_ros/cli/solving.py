@@ -16,13 +16,13 @@ from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import SENTENCES
 from l1slam_ros.core.solvers.solve import PRIMAL_DUAL
-from l1slam_ros.core.solvers.warm_up import DENSE, JUDGEMENT, SPARSE, with_space
 from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import compile_now
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.node_options import read_params_file
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.sentences import DOUBTFUL, doubt_sentence, judgement_sentences
+from l1slam_ros.io.warm_up import DENSE, JUDGEMENT, SPARSE, with_space
 from l1slam_ros.io.wording import counted
 
 
@@ -108,8 +108,8 @@ def _wish(arguments: argparse.Namespace) -> Wish:
         least_squares = replace(least_squares, iterations=arguments.outer)
     if arguments.inner is not None:
         solver = replace(solver, inner=replace(solver.inner, iterations=arguments.inner))
-    return Wish(arguments.start, arguments.norm, arguments.solver, robust, solver,
-                        least_squares)
+    arguments.norm = arguments.norm or solver.norm
+    return Wish(arguments.start, arguments.norm, arguments.solver, robust, solver, least_squares)
 
 
 def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:

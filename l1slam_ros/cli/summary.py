@@ -61,7 +61,7 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
         ('components', f'{len(connected_parts(graph)):,}'),
     ]
     if absolute:
-        rows.insert(3, ('absolute poses', f'{absolute:,}'))
+        rows.insert(3, ('absolute', f'{absolute:,}'))
     if record.stamps is not None:
         rows.append(('time', f'{(record.stamps[-1] - record.stamps[0]) / NANOSECONDS:,.1f} s'))
     if record.poses is not None:

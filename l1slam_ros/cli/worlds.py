@@ -15,7 +15,6 @@ from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.robust.batch_map import Wish
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
-from l1slam_ros.core.solvers.warm_up import SPARSE, with_space
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
 from l1slam_ros.io import formats
@@ -25,13 +24,14 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import false_loops_path, pair_lines, truth_path
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.trajectory import write_truth
+from l1slam_ros.io.warm_up import SPARSE, with_space
 
 
 def simulate(arguments: argparse.Namespace) -> Ending:
     """Make a world and write its graph, its truth and which of its loops are false."""
     _check(arguments)
     output, rng = arguments.output, np.random.default_rng(arguments.seed)
-    world = simulate_world(arguments.poses, arguments.edges, WorldOptions(), rng)
+    world = simulate_world(arguments.poses, arguments.edges, WorldOptions(), rng, arguments.world)
     if arguments.false_loops:
         make = FALSE_LOOPS[arguments.kind]
         world = with_false_loops(

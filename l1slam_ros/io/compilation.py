@@ -22,8 +22,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from l1slam_ros.core.solvers.warm_up import STEPS, make_ready, module_of
 from l1slam_ros.io.progress import Progress
+from l1slam_ros.io.warm_up import STEPS, make_ready, module_of
 
 _KERNELS = Path(__file__).parents[1] / 'core' / 'kernels'
 # [s] How often the caller is asked whether to stop.

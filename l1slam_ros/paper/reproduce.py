@@ -21,7 +21,6 @@ from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.seed import seed_poses
-from l1slam_ros.core.solvers.warm_up import STEPS
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import compile_now
@@ -29,6 +28,7 @@ from l1slam_ros.io.files import put_lines, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.plot import MapDrawing
 from l1slam_ros.io.progress import Progress
+from l1slam_ros.io.warm_up import STEPS
 from l1slam_ros.paper import figures, report
 from l1slam_ros.paper import printed as paper
 from l1slam_ros.paper.experiments import (

@@ -7,6 +7,7 @@ of a large map stands still. They are made as bytes, of arrays, see `publishing.
 """
 
 import struct
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -30,7 +31,8 @@ _LADDER = np.array([(0.0, 0.62, 0.451), (0.902, 0.624, 0.0), (0.835, 0.369, 0.0)
 _LOOPS = {'loops': ACCEPTED, 'suspect_loops': SUSPECT, 'rejected_loops': REJECTED}
 _POINT, _LINE = 0.1, 0.03  # [m]
 # Keyframes or factors of one marker; what moves by less [m] is not sent again.
-_PIECE, _STILL = 500, 1e-3
+_PIECE, _STILL = 500, 0.01
+_EVERY = 1.0  # [s] people look no faster
 # Lifetime: for ever; not locked to the frame.
 _FOR_EVER = struct.pack('<iI?', 0, 0, False)
 # No texture, its header and format, coordinates on it, text, mesh, its file; no materials.
@@ -50,21 +52,31 @@ class GraphMarkers:
 
     def __init__(self, node: Node):
         self._sent: dict[tuple[str, int], bytes] = {}
-        self.someone_new = False
+        self._someone_new = self._waits = False
+        self._last = 0.0
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._publisher = node.create_publisher(
             MarkerArray, 'graph', latched,
             event_callbacks=PublisherEventCallbacks(matched=self._on_match))
 
     def _on_match(self, change: Any) -> None:
-        self.someone_new |= change.current_count_change > 0
+        self._someone_new |= change.current_count_change > 0
+
+    @property
+    def behind(self) -> bool:
+        """Whether somebody looks who has not seen the last map."""
+        return self._someone_new or (self._waits and time.monotonic() - self._last >= _EVERY)
 
     def publish(self, frame: str, stamp: int, now: Snapshot) -> None:
         """Publish what has changed since the last call; the solver's thread calls it."""
-        if self.someone_new:
-            self.someone_new, self._sent = False, {}
         if not self._publisher.get_subscription_count():
             return
+        if not self._someone_new and time.monotonic() - self._last < _EVERY:
+            self._waits = True
+            return
+        if self._someone_new:
+            self._someone_new, self._sent = False, {}
+        self._waits, self._last = False, time.monotonic()
         seen, news = {}, []
         for name, kind, size, points, colours in _namespaces(now):
             per = _PIECE * (2 if kind == Marker.LINE_LIST else 1)

@@ -148,6 +148,8 @@ class BackendNode(LifecycleNode):
         ended &= self._solver.close(max(deadline - time.monotonic(), 0.0))
         if ended:
             self.destroy_node()
+            # It holds the node in the graph of ROS, and rclpy forgets it.
+            self._state_machine = None
         return ended
 
     def is_saving(self) -> bool:
@@ -204,6 +206,7 @@ class BackendNode(LifecycleNode):
         self._backend.set_options(options)
 
     def _on_time_jump(self, _: TimeJump) -> None:
+        self._transform.forget()
         if self.options.on_time_jump == 'reset':
             self.get_logger().warning('the clock jumped back: the map begins anew')
             self._orders.place('time jump', self._map_services.reset)
@@ -294,7 +297,7 @@ class BackendNode(LifecycleNode):
         elif version != self._told_version:
             # Nothing new in the map, but a loop can have come for later, or expired.
             self._loop_status.publish(self._backend.loop_states())
-        elif self._markers.someone_new:
+        elif self._markers.behind:
             self._markers.publish(self.options.map_frame, self._newest(), self._backend.snapshot())
         self._told_version = version
 

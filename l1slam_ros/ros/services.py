@@ -81,7 +81,7 @@ class MapServices:
 
     def autosave(self, at_end: bool = False) -> None:
         """Let the map be saved if it is time, or the end; it is told if that fails."""
-        if self._autosaving.done() and (at_end or self._map_file.is_due):
+        if at_end or (self._autosaving.done() and self._map_file.is_due):
             self._autosaving = self._orders.place('the map file', self._autosave)
 
     def _autosave(self) -> str:

@@ -37,13 +37,18 @@ class MapToOdom:
         self._tf = None
         if on_tf and TFMessage is not None:
             self._tf = node.create_publisher(TFMessage, '/tf', 100)
-        self._newest = self._stamp = 0
+        self._newest = self._stamp = self._before = 0
+
+    def forget(self) -> None:
+        """Be silent until there is other odometry: its stamps so far are of another time."""
+        self._before = self._newest
 
     def publish(self, options: NodeOptions) -> None:
         """Publish the transform as it is now, if any odometry has come."""
         robot = self._backend.robot()
-        if robot is None:
+        if robot is None or robot.stamp == self._before:
             return
+        self._before = 0
         if robot.stamp < self._newest:
             self._stamp = 0  # time itself went back
         self._newest = robot.stamp

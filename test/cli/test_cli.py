@@ -663,7 +663,7 @@ def test_a_parameter_file_speaks_to_both_growth_and_solver(capsys, world, tmp_pa
     (VERTICES, None, 'edge'),
     ([*VERTICES, 'EDGE_SE2 0 1 1 0 0 1 0 0 1 0'], 4, 'expected'),
     (['once upon a time'], 1, 'once'),
-    (['VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1'], 1, '3D'),
+    (['VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1'], None, 'no edges'),
     ([*VERTICES, 'VERTEX_SE2 9 0 0 0', *EDGES], None, 'not connected'),
 ])
 def test_bad_input_is_one_line_exit_code_2_and_no_output(capsys, tmp_path, lines, line, words):

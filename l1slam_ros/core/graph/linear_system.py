@@ -83,6 +83,18 @@ class LinearSystem:
         """Return the diagonal of A'WA, (columns,); weights : (rows,)."""
         return replace(self, blocks=self.blocks**2).transposed_times(weights)
 
+    def weighted(self, roots: Array) -> 'LinearSystem':
+        """Return the system with the rows of each factor multiplied by its root (m, k, k)."""
+        from l1slam_ros.core.kernels.blocks import whiten, whiten_blocks
+
+        k, blocks = self.block_size, np.empty_like(self.blocks)
+        roots = np.ascontiguousarray(roots)
+        for side in range(2):
+            whiten_blocks(roots, np.ascontiguousarray(self.blocks[:, side]), side, blocks,
+                          (0,) * k)
+        b: Array = whiten(roots, self.b.reshape(-1, k), (0,) * k).ravel()
+        return replace(self, blocks=blocks, b=b)
+
     def part(self, entries: slice) -> 'LinearSystem':
         """Return the system of only these rows of each factor and columns of each keyframe."""
         blocks = np.ascontiguousarray(self.blocks[:, :, entries, entries])

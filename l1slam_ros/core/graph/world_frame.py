@@ -13,6 +13,8 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.factor_graph import FactorGraph, lowest_joined
 
+# What is in its place stays there: else the cost falls to less than this part.
+_BETTER = 0.8
 # So many of the absolute factors, and of tuples of them, say where a part may be.
 _ASKED = 200
 
@@ -22,7 +24,7 @@ def placed(graph: FactorGraph, poses: Array) -> Array:
     Return poses (n, p), each part moved as one to where its absolute factors say it is.
 
     A part is what other factors join. Of the motions that single absolute factors or a few
-    positions ask for, and of none at all, it is that of the lowest L1 cost.
+    positions ask for, it is that of the lowest L1 cost; none where that is hardly lower.
     """
     is_absolute = graph.between.is_absolute
     if not is_absolute.any():
@@ -50,7 +52,9 @@ def _best_motion(graph: FactorGraph, poses: Array) -> Array:
     moved = manifold.compose(np.repeat(motions, m, axis=0), np.tile(here, (count, 1)))
     e = manifold.local(np.tile(factors.measurement, (count, 1)), moved)
     cost = np.abs(whiten(np.tile(factors.sqrt_information, (count, 1, 1)), e))
-    best = int(np.argmin(cost.reshape(count, -1).sum(axis=1)))
+    costs = cost.reshape(count, -1).sum(axis=1)
+    best = int(np.argmin(costs))
+    best = best if costs[best] < _BETTER * costs[0] else 0
     return motions[best:best + 1]
 
 

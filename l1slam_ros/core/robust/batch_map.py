@@ -22,15 +22,9 @@ from l1slam_ros.core.robust.batch import Report as OnRound
 from l1slam_ros.core.robust.inspection import initial_poses, require_connected
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.robust.robust_map import RobustMap, minimise_robustly
-from l1slam_ros.core.solvers.block_cholesky import cholesky_of
-from l1slam_ros.core.solvers.gauss_newton import (
-    LeastSquaresOptions,
-    huber_cost,
-    minimise_huber,
-    minimise_l2,
-)
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
-from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
+from l1slam_ros.core.solvers.optimality import norm_of
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.solvers.solve import AUTO, Choice, choose, minimise_by
 
@@ -146,9 +140,7 @@ class _Minimiser:
 
     def choose(self, graph: FactorGraph) -> Choice:
         """Return what the graph is solved by."""
-        if self._wish.norm == 'l1':
-            return choose(self._wish.solver, graph)
-        return Choice(cholesky_of(graph), 'gauss-newton', f'the norm is {self._wish.norm}')
+        return choose(self._wish.solver, graph, self._wish.norm)
 
     def minimise(self, graph: FactorGraph, poses: Array) -> Solution:
         """Return the solution from poses (n, p)."""
@@ -157,25 +149,17 @@ class _Minimiser:
     def minimise_by(self, choice: Choice, graph: FactorGraph, poses: Array) -> Solution:
         """Return the solution by what was chosen."""
         wish, self.solver, self.reason = self._wish, choice.solver, choice.reason
-        if wish.norm == 'l1':
-            solution, self.solver = minimise_by(choice, graph, poses, wish.options, self._report)
-            if self.solver != choice.solver:
-                self.reason = f'it went on where {choice.solver} came no further'
-            return solution
-        assert choice.cholesky is not None
-        minimise_norm = minimise_l2 if wish.norm == 'l2' else minimise_huber
-        return minimise_norm(graph, poses, wish.least_squares, choice.cholesky, self._report)
+        solution, self.solver = minimise_by(choice, graph, poses, wish.options, self._report,
+                                            wish.least_squares)
+        if self.solver != choice.solver:
+            self.reason = f'it went on where {choice.solver} came no further'
+        return solution
 
 
 def cost_function(graph: FactorGraph, wish: Wish) -> Callable[[Array], float]:
     """Return what is to be minimised, as a function of the poses."""
-    size, delta = graph.manifold.TANGENT_SIZE, wish.least_squares.huber_delta
-    of_residual: dict[str, Callable[[Array], float]] = {
-        'l1': l1_cost,
-        'l2': l2_cost,
-        'huber': lambda r: huber_cost(r, size, delta),
-    }
-    return lambda poses: of_residual[wish.norm](whitened_residual(graph, poses))
+    norm = norm_of(wish.norm, graph.manifold.TANGENT_SIZE, wish.least_squares.huber_delta)
+    return lambda poses: norm.cost(whitened_residual(graph, poses))
 
 
 def _require_start(graph: FactorGraph, stored: Array | None, wish: Wish, ids: Indices) -> None:

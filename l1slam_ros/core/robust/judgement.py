@@ -116,11 +116,14 @@ def fits(growth: Growth) -> tuple[Array, Mask]:
     """
     accepted, square = growth.accepted & ~growth.cut, np.zeros(len(growth.factors))
     square[growth.accepted] = (growth.posterior.residual**2).sum(axis=1)
-    outside = np.flatnonzero(~accepted)
+    # While nothing ties the map to the world, nothing is known of what names it.
+    square[~accepted] = np.nan
+    outside = np.flatnonzero(~accepted & growth.may_be_predicted)
     cut, growth.cut = growth.cut, np.zeros_like(growth.cut)
     square[outside] = growth.innovations(outside).square
     growth.cut = cut
-    return square, ~accepted & (square < growth.gate(growth.factors.freedom)) & growth.is_loop
+    far = square >= growth.gate(growth.factors.freedom)
+    return square, ~accepted & ~far & growth.is_loop
 
 
 def doubts(growth: Growth) -> tuple[Doubt, ...]:

@@ -128,9 +128,10 @@ class Growth:
             self.begin()
 
     @property
-    def _tied(self) -> bool:
-        """Whether an absolute factor is accepted."""
-        return bool((self.accepted & self.factors.is_absolute).any())
+    def may_be_predicted(self) -> Mask:
+        """(m,) bool: not absolute factors while none of these is accepted."""
+        absolute = self.factors.is_absolute
+        return ~absolute | (self.accepted & absolute).any()
 
     def _tie_to_world(self, latest: int | None = None) -> None:
         """
@@ -142,17 +143,17 @@ class Growth:
         """
         absolute = self.factors.is_absolute
         held = self.accepted & absolute
-        if (held == absolute).all():
-            return
-        # As many may have been accepted for want of others.
-        known = np.count_nonzero(held) > self.graph.manifold.TRANSLATION.stop
-        rows, variance = first_fixes(self.graph, latest, self.variance[0] if known else None)
-        if not (known and held[rows].any()):
-            if len(rows) <= np.count_nonzero(held):
-                return
-            self.accepted &= ~absolute | self.trusted
-            self.variance[0] = max(variance, _LEAST_RATIO)
-        self.accepted[rows] = True
+        if (held != absolute).any():
+            # As many may have been accepted for want of others.
+            count = np.count_nonzero(held)
+            known = count > self.graph.manifold.TRANSLATION.stop
+            rows, variance = first_fixes(self.graph, latest, self.variance[0] if known else None)
+            if known and held[rows].any():
+                self.accepted[rows] = True
+            elif len(rows) > count:
+                self.accepted &= ~absolute | self.trusted
+                self.accepted[rows] = True
+                self.variance[0] = max(variance, _LEAST_RATIO)
         # A part that no other factor joins is where most of its own absolute factors say.
         placing = (self.accepted | absolute) & ~self.cut if self.cut.any() else self.accepted
         self.poses = placed(self.graph.subset(placing), self.poses)
@@ -200,7 +201,7 @@ class Growth:
     def undecided(self) -> Indices:
         """Return the loops within a part that may yet be accepted, (k,)."""
         may = ~self.accepted & ~self.factors.struck & (self._drops < _CHANCES) & ~self.across()
-        undecided: Indices = np.flatnonzero(may & (self._tied | ~self.factors.is_absolute))
+        undecided: Indices = np.flatnonzero(may & self.may_be_predicted)
         return undecided
 
     def joining(self) -> Indices:

@@ -6,7 +6,6 @@ In: a graph and poses. Out: poses of lower cost. Both solve sparse normal equati
 Marquardt's damping only when a plain Gauss-Newton step fails.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +16,7 @@ from l1slam_ros.core.graph.linear_system import anchor, linearise, step_poses, w
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.nonlinear import Report, Solution
-from l1slam_ros.core.solvers.optimality import Status, fits_exactly, l1_cost, l2_cost
+from l1slam_ros.core.solvers.optimality import Huber, Norm, Status, fits_exactly, l1_cost, l2_cost
 from l1slam_ros.core.solvers.reweighting import weighted_least_squares
 
 _FIRST_DAMPING = 1e-6
@@ -39,11 +38,6 @@ class LeastSquaresOptions(Options):
         1e-9, 1e9)
 
 
-# From the whitened residual (rows,) to the cost, and to the weight of each row.
-_Cost = Callable[[Array], float]
-_Weights = Callable[[Array], Array]
-
-
 def minimise_l2(
     graph: FactorGraph,
     poses: Array,
@@ -52,7 +46,7 @@ def minimise_l2(
     report: Report = lambda iteration, cost: None,
 ) -> Solution:
     """Minimise chi2, the sum of squared whitened residuals; arguments as `optimiser.minimise`."""
-    return _gauss_newton(graph, poses, l2_cost, np.ones_like, options, cholesky, report)
+    return gauss_newton(graph, poses, Huber(), options, cholesky, report)
 
 
 def minimise_huber(
@@ -62,31 +56,49 @@ def minimise_huber(
     cholesky: BlockCholesky,
     report: Report = lambda iteration, cost: None,
 ) -> Solution:
-    """
-    Minimise sum rho(|e_k|) over the factors k, odometry included; arguments as above.
-
-    rho(s) = s^2 up to delta, 2 delta s - delta^2 beyond (g2o's Huber), e_k the whitened residual
-    of one factor.
-    """
-    delta, d = options.huber_delta, graph.manifold.TANGENT_SIZE
-
-    def weights(residual: Array) -> Array:
-        length = _lengths(residual, d)
-        return np.repeat(delta / np.maximum(length, delta), d)
-
-    return _gauss_newton(graph, poses, lambda r: huber_cost(r, d, delta), weights, options,
-                         cholesky, report)
+    """Minimise Huber's norm of each factor, odometry included; arguments as above."""
+    norm = Huber(graph.manifold.TANGENT_SIZE, options.huber_delta)
+    return gauss_newton(graph, poses, norm, options, cholesky, report)
 
 
-def huber_cost(residual: Array, d: int, delta: float) -> float:
-    """Return sum rho(|e_k|) for the whitened residual (rows,) of factors with d rows each."""
-    length = _lengths(residual, d)
-    return float(np.where(length <= delta, length**2, 2 * delta * length - delta**2).sum())
-
-
-def _lengths(residual: Array, d: int) -> Array:
-    lengths: Array = np.linalg.norm(residual.reshape(-1, d), axis=1)
-    return lengths
+def gauss_newton(
+    graph: FactorGraph,
+    poses: Array,
+    norm: Norm,
+    options: LeastSquaresOptions,
+    cholesky: BlockCholesky,
+    report: Report = lambda iteration, cost: None,
+) -> Solution:
+    """Minimise a norm, reweighted at each step; arguments as `optimiser.minimise`."""
+    residual = whitened_residual(graph, poses)
+    history = [norm.cost(residual)]
+    status, damping = Status.ITERATION_LIMIT, 0.0
+    while len(history) <= options.iterations:
+        if fits_exactly(l1_cost(residual), len(residual)):
+            status = Status.CONVERGED
+            break
+        system = linearise(graph, poses, residual)
+        step = weighted_least_squares(system, cholesky, norm.weights(residual), damping)
+        candidate = step_poses(graph, poses, step)
+        moved = whitened_residual(graph, candidate)
+        cost = norm.cost(moved)
+        decrease, full = history[-1] - cost, damping <= _FIRST_DAMPING
+        if decrease >= 0:
+            poses, residual = candidate, moved
+            damping = damping / 10 if damping > _FIRST_DAMPING else 0.0
+        else:
+            damping, cost = max(10 * damping, _FIRST_DAMPING), history[-1]
+        history.append(cost)
+        report(len(history) - 1, cost)
+        # By a step as good as undamped; at the optimum rounding may let the cost rise a little.
+        if full and abs(decrease) <= options.tolerance * cost:
+            status = Status.CONVERGED
+            break
+        if damping > _MOST_DAMPING:
+            status = Status.STALLED
+            break
+    return Solution(poses, history[-1], status, len(history) - 1, 0, np.array(history),
+                    np.zeros(len(residual)))
 
 
 def l2_map(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
@@ -121,43 +133,3 @@ def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky)
 
 def _chi2(graph: FactorGraph, poses: Array) -> float:
     return l2_cost(whitened_residual(graph, poses))
-
-
-def _gauss_newton(
-    graph: FactorGraph,
-    poses: Array,
-    cost_of: _Cost,
-    weights_of: _Weights,
-    options: LeastSquaresOptions,
-    cholesky: BlockCholesky,
-    report: Report,
-) -> Solution:
-    residual = whitened_residual(graph, poses)
-    history = [cost_of(residual)]
-    status, damping = Status.ITERATION_LIMIT, 0.0
-    while len(history) <= options.iterations:
-        if fits_exactly(l1_cost(residual), len(residual)):
-            status = Status.CONVERGED
-            break
-        system = linearise(graph, poses, residual)
-        step = weighted_least_squares(system, cholesky, weights_of(residual), damping)
-        candidate = step_poses(graph, poses, step)
-        moved = whitened_residual(graph, candidate)
-        cost = cost_of(moved)
-        decrease, full = history[-1] - cost, damping <= _FIRST_DAMPING
-        if decrease >= 0:
-            poses, residual = candidate, moved
-            damping = damping / 10 if damping > _FIRST_DAMPING else 0.0
-        else:
-            damping, cost = max(10 * damping, _FIRST_DAMPING), history[-1]
-        history.append(cost)
-        report(len(history) - 1, cost)
-        # By a step as good as undamped; at the optimum rounding may let the cost rise a little.
-        if full and abs(decrease) <= options.tolerance * cost:
-            status = Status.CONVERGED
-            break
-        if damping > _MOST_DAMPING:
-            status = Status.STALLED
-            break
-    return Solution(poses, history[-1], status, len(history) - 1, 0, np.array(history),
-                    np.zeros(0))

@@ -29,7 +29,7 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.l1_problem import Problem
 from l1slam_ros.core.graph.linear_system import LinearSystem
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
-from l1slam_ros.core.solvers.optimality import Status, fits_exactly, l1_cost, smoothing
+from l1slam_ros.core.solvers.optimality import L1, Norm, Status, fits_exactly, l1_cost, smoothing
 
 # How far to go towards the nearest bound.
 _FRACTION = 0.9995
@@ -134,19 +134,18 @@ class _Direction:
     gap: float
 
 
-class _Regularisation:
+class Regularisation:
     """How much curvature kappa and damping D the next factorisation gets."""
 
     def __init__(self) -> None:
         self._kappa, self._damping = _CURVATURE, 0.0
 
-    def factorise(self, problem: Problem, at: _Iterate, weights: Array,
+    def factorise(self, system: LinearSystem, weights: Array, C: Array | None,
                   cholesky: BlockCholesky) -> bool:
         """Factor J'QJ + kappa C + D I; take less curvature while that is not definite."""
-        C = problem.curvature(at.poses, at.y)
         kappa, damping = self._kappa, self._damping
         for share in (0.5, 0.5, 0.0, None):
-            definite = cholesky.factorise(at.system, weights, damping, C, kappa)
+            definite = cholesky.factorise(system, weights, damping, C, kappa)
             if definite or share is None:
                 break
             kappa, damping = share * kappa, max(damping, _DAMPING_PIVOT)
@@ -179,7 +178,7 @@ def interior_point(
 
     """
     at = _start(problem, poses)
-    costs, best, regularisation = [l1_cost(at.residual)], at, _Regularisation()
+    costs, best, regularisation = [l1_cost(at.residual)], at, Regularisation()
     status, worst = Status.ITERATION_LIMIT, 1 + tolerance
     for iteration in range(iterations + 1):
         cost = l1_cost(at.residual)
@@ -207,29 +206,35 @@ def prove(optimum: Optimum, cholesky: BlockCholesky) -> tuple[Array, float, Stat
     |b|_1 + b'y. A run that came to rest where one might lower it by a percent has not converged.
     """
     cost = optimum.costs[-1]
-    y, gap = min((_feasible_dual(end, cost, cholesky) for end in optimum.ends),
-                 key=lambda proof: proof[1])
+    proofs = (feasible_dual(end.system, end.y, np.minimum(end.s, end.t), L1, cholesky)
+              for end in optimum.ends)
+    y, gap = min(proofs, key=lambda proof: proof[1])
     unproven = gap > _PROVEN * cost and not fits_exactly(cost, len(y))
     stalls = unproven and optimum.status is Status.CONVERGED
     return y, gap, Status.STALLED if stalls else optimum.status
 
 
-def _feasible_dual(at: _Iterate, cost: float, cholesky: BlockCholesky) -> tuple[Array, float]:
+def feasible_dual(system: LinearSystem, y: Array, slack: Array, norm: Norm,
+                  cholesky: BlockCholesky) -> tuple[Array, float]:
     """
     Return a dual near y with A'y = 0, |y| <= 1, and by how much the cost exceeds its value.
 
-    By turns projected on the one, along the slack each row has left, and clipped to the other; at
+    By turns projected on the one, along the slack (rows,) that it has left, and to the other; at
     the end shrunk by what is missing.
+
+    norm : L1 or group L1
     """
-    slack = np.maximum(np.minimum(at.s, at.t), _LEAST_WEIGHT)
-    if not cholesky.factorise(at.system, slack):
-        return np.zeros_like(at.y), cost
-    y = at.y
+    residual, slack = -system.b, np.maximum(slack, _LEAST_WEIGHT)
+    cost = norm.cost(residual)
+    if not cholesky.factorise(system, slack):
+        return np.zeros_like(y), cost
     for _ in range(_PROJECTIONS):
-        x = cholesky.solve(at.system.transposed_times(np.clip(y, -1, 1)))
-        y = np.clip(y, -1, 1) - slack * at.system.times(x)
-        feasible = y / max(1.0, float(np.abs(y).max(initial=0.0)))
-        gap = max(cost - float((feasible * at.residual).sum()), 0.0)
+        y = norm.resolvent(y, 0.0)
+        y = y - slack * system.times(cholesky.solve(system.transposed_times(y)))
+        longest = float((np.abs(y) / np.maximum(np.abs(norm.resolvent(y, 0.0)), 1e-300)).max(
+            initial=1.0))
+        feasible = y / longest
+        gap = max(norm.gap(residual, feasible), 0.0)
         if gap <= _CLOSE * cost:
             break
     return feasible, gap
@@ -248,10 +253,10 @@ def _start(problem: Problem, poses: Array) -> _Iterate:
 
 
 def _step(problem: Problem, at: _Iterate, cholesky: BlockCholesky,
-          regularisation: _Regularisation) -> bool:
+          regularisation: Regularisation) -> bool:
     """Move `at` by one predictor and corrector step; False: there was no direction."""
     n, Q = len(at.y), at.weights
-    if not regularisation.factorise(problem, at, Q, cholesky):
+    if not regularisation.factorise(at.system, Q, problem.curvature(at.poses, at.y), cholesky):
         return False
     predictor = _direction(at, cholesky, Q, np.zeros(n), np.zeros(n))
     gap = at.gap

@@ -5,8 +5,9 @@ How good an answer is, recomputed from the problem itself: objectives, duality g
 Nothing here trusts what a solver says of its own result.
 """
 
+from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -44,6 +45,117 @@ def l2_cost(residual: Array) -> float:
     return float((residual * residual).sum())
 
 
+class Norm(Protocol):
+    """
+    What is minimised of a whitened residual r (rows,), F(r), and what goes with it.
+
+    It is a sum over groups of `size` consecutive rows, convex, and does not change when a group
+    turns.
+    """
+
+    @property
+    def size(self) -> int:
+        """Rows of a group."""
+
+    def cost(self, residual: Array) -> float:
+        """Return F(r)."""
+
+    def weights(self, residual: Array) -> Array:
+        """Return the weights w (rows,) by which w r^2 is like F near r, but for a factor."""
+
+    def resolvent(self, dual: Array, sigma: Array | float) -> Array:
+        """Return (I + sigma dF*)^-1 of a dual (rows,); with sigma 0 the nearest that may be."""
+
+    def gap(self, residual: Array, dual: Array) -> float:
+        """Return F(r) + F*(y) - y'r, 0 or more; with A'y = 0 what a linear problem can lose."""
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """
+    Sum of the lengths of the groups: L1 where each is one row, else group L1.
+
+    L1 depends on the axes that a residual is written in. Where a group is a factor, its length is
+    Mahalanobis' distance, which does not: turn the body's frame, and the map stays.
+    """
+
+    size: int = 1
+
+    def cost(self, residual: Array) -> float:
+        """See `Norm`."""
+        return float(_lengths(residual, self.size).sum())
+
+    def weights(self, residual: Array) -> Array:
+        """See `Norm`; smoothed, where a group is shorter than usual."""
+        length = _lengths(residual, self.size)
+        return np.repeat(1 / np.hypot(length, smoothing(length)), self.size)
+
+    def resolvent(self, dual: Array, sigma: Array | float) -> Array:
+        """See `Norm`: y / max(1, |y|)."""
+        nearest: Array = dual / np.repeat(np.maximum(_lengths(dual, self.size), 1.0), self.size)
+        return nearest
+
+    def gap(self, residual: Array, dual: Array) -> float:
+        """See `Norm`; F* is 0 for a dual no longer than 1."""
+        return self.cost(residual) - float((dual * residual).sum())
+
+
+@dataclass(frozen=True)
+class Huber:
+    """
+    Sum of rho(s) over the lengths s of the groups, s^2 up to delta, 2 delta s - delta^2 beyond.
+
+    That is g2o's. With delta infinite it is chi2, L2 without a half.
+    """
+
+    size: int = 1
+    delta: float = np.inf
+
+    def cost(self, residual: Array) -> float:
+        """See `Norm`."""
+        length = _lengths(residual, self.size)
+        if self.delta == np.inf:
+            return float((length * length).sum())
+        return float(np.where(length <= self.delta, length**2,
+                              2 * self.delta * length - self.delta**2).sum())
+
+    def weights(self, residual: Array) -> Array:
+        """See `Norm`."""
+        if self.delta == np.inf:
+            return np.ones_like(residual)
+        length = np.maximum(_lengths(residual, self.size), self.delta)
+        return np.repeat(self.delta / length, self.size)
+
+    def resolvent(self, dual: Array, sigma: Array | float) -> Array:
+        """See `Norm`: y / (1 + sigma / 2), no longer than 2 delta."""
+        dual = dual / (1 + np.asarray(sigma) / 2)
+        excess = _lengths(dual, self.size) / (2 * self.delta)
+        nearest: Array = dual / np.repeat(np.maximum(excess, 1.0), self.size)
+        return nearest
+
+    def gap(self, residual: Array, dual: Array) -> float:
+        """See `Norm`; F* is |y|^2 / 4."""
+        return self.cost(residual) + l2_cost(dual) / 4 - float((dual * residual).sum())
+
+
+L1 = Lengths()
+
+
+def norm_of(name: str, size: int, delta: float = np.inf) -> Norm:
+    """Return one of `names.NORMS` for factors of so many rows; delta : of Huber."""
+    norms: dict[str, Norm] = {'l1': L1, 'group-l1': Lengths(size), 'l2': Huber(),
+                              'huber': Huber(size, delta)}
+    return norms[name]
+
+
+def _lengths(rows: Array, size: int) -> Array:
+    if size == 1:
+        return np.abs(rows)
+    groups = rows.reshape(-1, size)
+    length: Array = np.sqrt((groups * groups).sum(axis=1))
+    return length
+
+
 def smoothing(residual: Array) -> float:
     """Return the mean of |r|, or where all fits exactly a millionth of a sigma."""
     # Weights of rows that fit to rounding must stay comparable with those of exact zeros.
@@ -55,14 +167,17 @@ def fits_exactly(cost: float, rows: int) -> bool:
     return cost <= 1e-9 * rows
 
 
-def duality_gap(A: 'csr_array', b: Array, x: Array, y: Array, box: Array) -> float:
+def duality_gap(A: 'csr_array', b: Array, x: Array, y: Array, box: Array,
+                norm: Norm = L1) -> float:
     """
     Bound how far x is from the best step inside a box: |x_j| <= box_j.
 
     For every such x' and every |y|_inf <= 1,
     `|A x' - b|_1 >= y'(A x' - b) >= -b'y - box'|A'y|`, so
 
-        gap = |A x - b|_1 + b'y + box'|A'y|.
+        gap = |A x - b|_1 + b'y + box'|A'y|,
+
+    and of another norm F(A x - b) + F*(y) + b'y + box'|A'y|.
 
     Parameters
     ----------
@@ -71,4 +186,5 @@ def duality_gap(A: 'csr_array', b: Array, x: Array, y: Array, box: Array) -> flo
     box : (columns,) half widths; without a box the gap is infinite unless A'y = 0
 
     """
-    return l1_cost(A @ x - b) + float(b @ y) + float(box @ np.abs(A.T @ y))
+    Ax = A @ x
+    return norm.gap(Ax - b, y) + float(y @ Ax) + float(box @ np.abs(A.T @ y))

@@ -25,7 +25,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.options import Options, option
-from l1slam_ros.core.solvers.optimality import Status, duality_gap, l1_cost
+from l1slam_ros.core.solvers.optimality import L1, Norm, Status, duality_gap
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -128,9 +128,10 @@ def minimise_l1(
     options: PrimalDualOptions,
     deadline: float = np.inf,
     theta: float = 1.0,
+    norm: Norm = L1,
 ) -> PrimalDualSolution:
     """
-    Minimise |A x - b|_1 by Algorithm 2, from (x, y).
+    Minimise |A x - b|_1, or another norm of it, by Algorithm 2, from (x, y).
 
     Algorithm 1 with K = A, F(z) = |z - b|_1 and G = 0: the resolvent of F* subtracts sigma b and
     clips to the unit box, that of G does nothing.
@@ -142,22 +143,24 @@ def minimise_l1(
     options : see `PrimalDualOptions`
     deadline : `time.monotonic()` [s] after which to stop at the next look
     theta : over-relaxation of the primal in [0, 1]; convergence is proved for 1
+    norm : rows of one group share the smallest step size of them
 
     """
     tau, sigma = diagonal_step_sizes(A)
     omega = primal_weight(A, b, x)
     tau, sigma = tau / omega, sigma * omega
+    sigma = np.repeat(sigma.reshape(-1, norm.size).min(axis=1), norm.size)
     sigma_b = sigma * b
-    iterates = primal_dual(A, lambda v: np.clip(v - sigma_b, -1, 1), lambda v: v,
+    iterates = primal_dual(A, lambda v: norm.resolvent(v - sigma_b, sigma), lambda v: v,
                            x, y, tau, sigma, theta)
-    history = [(0.0, l1_cost(A @ x - b))]
+    history = [(0.0, norm.cost(A @ x - b))]
     gap, status = np.inf, Status.ITERATION_LIMIT
     for k in range(1, options.iterations + 1):
         x, y = next(iterates)
         if k % CHECK_EVERY and k < options.iterations:
             continue
-        history.append((k, l1_cost(A @ x - b)))
-        gap = duality_gap(A, b, x, y, box=np.abs(x))
+        history.append((k, norm.cost(A @ x - b)))
+        gap = duality_gap(A, b, x, y, np.abs(x), norm)
         if gap <= options.tolerance * history[-1][1]:
             status = Status.CONVERGED
             break

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The L1 solvers by name, and which one a graph gets where nobody chose.
+The solvers by name, and which one a graph gets where nobody chose.
 
 In: a graph and poses. Out: the solution, the name of the solver that found it, and why it was it.
 """
@@ -10,13 +10,18 @@ from dataclasses import dataclass
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.names import SOLVERS
+from l1slam_ros.core.names import NORMS, SOLVERS
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, cholesky_of
 from l1slam_ros.core.solvers.exact import minimise_interior_point
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, gauss_newton
+from l1slam_ros.core.solvers.group_l1 import minimise_group_l1
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution, minimise
-from l1slam_ros.core.solvers.optimality import Status
+from l1slam_ros.core.solvers.optimality import Status, norm_of
 
 AUTO, PRIMAL_DUAL, INTERIOR_POINT = SOLVERS
+L1_NORM, GROUP_L1_NORM, *_ = NORMS
+# What other norms are minimised by.
+GAUSS_NEWTON, PRIMAL_DUAL_NEWTON = 'gauss-newton', 'primal-dual-newton'
 # Multiplications of blocks in one factorisation that a factor of the graph may cost before the
 # primal-dual method is the quicker one: measured, some 25 factorisations against some 6,000
 # iterations, each of which passes once over the factors.
@@ -33,24 +38,31 @@ class Choice:
     What a graph is solved by.
 
     cholesky : of the graph, None where it fills in too much; solver : of `SOLVERS`, not `auto`;
-    reason : a clause that says why; falls_back : another solver may go on where it fails.
+    reason : a clause that says why; falls_back : another solver may go on where it fails; norm :
+    what is minimised.
     """
 
     cholesky: BlockCholesky | None
     solver: str
     reason: str
     falls_back: bool = False
+    norm: str = L1_NORM
 
 
-def choose(solver: str, graph: FactorGraph) -> Choice:
+def choose(solver: str, graph: FactorGraph, norm: str = L1_NORM) -> Choice:
     """
     Resolve one of `SOLVERS`: `auto` goes by the predicted work of a factorisation.
 
+    Norms other than L1 have one solver each.
+
     Raises
     ------
-    FillError : the interior point was asked for, and the graph fills in.
+    FillError : what was asked for needs a factorisation, and the graph fills in.
 
     """
+    if norm != L1_NORM:
+        found_by = PRIMAL_DUAL_NEWTON if norm == GROUP_L1_NORM else GAUSS_NEWTON
+        return Choice(cholesky_of(graph), found_by, f'the norm is {norm}', norm=norm)
     try:
         cholesky = cholesky_of(graph)
     except FillError:
@@ -67,15 +79,22 @@ def choose(solver: str, graph: FactorGraph) -> Choice:
 
 def minimise_by(
     choice: Choice, graph: FactorGraph, poses: Array, options: OptimiserOptions,
-    report: Report = lambda iteration, cost: None
+    report: Report = lambda iteration, cost: None,
+    least_squares: LeastSquaresOptions | None = None,
 ) -> tuple[Solution, str]:
     """
-    Minimise the L1 norm of the whitened residuals; return the solution and what found it.
+    Minimise the norm of the whitened residuals; return the solution and what found it.
 
     Where nobody asked for the interior point and it does not converge, Algorithm 4 goes on from
     its best poses.
     """
     cholesky = choice.cholesky
+    if cholesky and choice.solver == PRIMAL_DUAL_NEWTON:
+        return minimise_group_l1(graph, poses, options, cholesky, report), choice.solver
+    if cholesky and choice.solver == GAUSS_NEWTON:
+        least_squares = least_squares or LeastSquaresOptions()
+        norm = norm_of(choice.norm, graph.manifold.TANGENT_SIZE, least_squares.huber_delta)
+        return gauss_newton(graph, poses, norm, least_squares, cholesky, report), choice.solver
     if choice.solver == PRIMAL_DUAL or cholesky is None:
         return minimise(graph, poses, options, cholesky, report=report), PRIMAL_DUAL
     solution = minimise_interior_point(graph, poses, options, cholesky, report)

@@ -203,8 +203,8 @@ def _typical_information(graph: FactorGraph) -> Array:
     factors = graph.between
     if not len(factors):
         raise GraphError('the graph has no factor, expected some whose information to take')
-    odometry = factors.is_odometry
-    roots = factors.sqrt_information[odometry if odometry.all() else ~odometry]
+    loops = ~factors.is_odometry & ~factors.is_absolute & factors.speaks.all(axis=1)
+    roots = factors.sqrt_information[loops if loops.any() else factors.is_odometry]
     size = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
     median = np.argsort(size, kind='stable')[(len(size) - 1) // 2]
     information: Array = _information(roots[median : median + 1])[0]

@@ -123,7 +123,7 @@ def _remarks(saved: SavedMap) -> dict[str, Any]:
     return values | {
         'doubts': [asdict(doubt) for doubt in optimised.judgement.doubts], 'robust': saved.robust,
         'trusted': growth.graph.between.trusted, 'struck': growth.graph.between.struck,
-        'seen': {key.hex(): growth.seen[key] for key in sorted(growth.seen)},
+        'seen': [[key.hex(), growth.seen[key]] for key in sorted(growth.seen)],
         'waiting': [[loop.reference_stamp, loop.stamp, loop.trusted, loop.struck, age,
                      loop.pose3.tolist(), loop.covariance.tolist()]
                     for loop, age in growth.waiting]}
@@ -141,7 +141,7 @@ def _read(path: Path) -> SavedMap:
         (LoopClosure(reference, stamp, np.array(pose3), np.array(covariance), trusted, struck),
          age)
         for reference, stamp, trusted, struck, age, pose3, covariance in values.pop('waiting'))
-    seen = {bytes.fromhex(key): row for key, row in values.pop('seen').items()}
+    seen = {bytes.fromhex(key): row for key, row in values.pop('seen')}
     doubts = tuple(Doubt(**doubt) for doubt in values.pop('doubts'))
     judgement = replace(_restored(optimised.judgement, values), doubts=doubts)
     return SavedMap(replace(_restored(growth, values), waiting=waiting, seen=seen),

@@ -193,9 +193,9 @@ def test_what_becomes_of_the_map_is_the_users_to_say(choice, poses, x):
 
 
 def test_a_saved_map_keeps_its_parts(world):
-    first = fed(Backend(EVERY), moved(messages(world), (0.0, 0.0, 0.0), 5.0)).snapshot()
-    second = Backend(EVERY)
-    second.restore(first.graph, first.poses, first.stamps)
+    one, second = fed(Backend(EVERY), moved(messages(world), (0.0, 0.0, 0.0), 5.0)), Backend(EVERY)
+    first = one.snapshot()
+    second.restore(one.saved())
     assert second.snapshot().gaps.tolist() == [HALF]
     assert_array_equal(second.snapshot().stamps, first.stamps)
     # Another recording, made earlier, is a part of its own.

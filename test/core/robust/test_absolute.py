@@ -3,12 +3,15 @@
 
 import numpy as np
 import pytest
-from gps import seen
+from gps import FRAME, seen
 from numpy.testing import assert_allclose
-from problems import add_absolute, drive, graph_of
+from problems import PERIOD, add_absolute, covariance6, drive, graph_of, odometry, seconds
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.first_fixes import first_fixes
+from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.online.backend import Backend, BackendOptions
+from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.batch_map import Wish, solve
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
@@ -104,3 +107,19 @@ def test_a_trusted_pose_stays_whatever_the_others_say(world):
     graph.add_between(-1, 200, wrong, np.eye(3)[None], True)
     found, _ = robust_solve(graph)
     assert found.accepted[-1]
+
+
+@pytest.mark.parametrize('robust', [True, False])
+@pytest.mark.parametrize('trusted', [True, False])
+def test_a_running_map_comes_to_the_world_with_the_first_absolute_pose(robust, trusted):
+    backend = Backend(BackendOptions.from_mapping({'robust': {'enabled': robust}}))
+    for k in range(20):
+        backend.add_odometry(odometry(k * PERIOD, (k, 0.0, 0.0)))
+    backend.update()
+    there = se2.compose(np.array([FRAME]), np.array([[10.0, 0.0, 0.0]]))
+    backend.add_loop(LoopClosure(None, seconds(10 * PERIOD), se2.to_pose3(there)[0],
+                                 covariance6(0.01 * np.eye(3)), trusted))
+    backend.update()
+    assert backend.loop_states().state.tolist() == [ACCEPTED]
+    ends = se2.compose(np.array(2 * [FRAME]), np.array([[0.0, 0, 0], [19, 0, 0]]))
+    assert_allclose(se2.local(backend.poses[[0, -1]], ends), 0, atol=0.05)

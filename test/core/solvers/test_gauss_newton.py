@@ -15,11 +15,10 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import (
     LeastSquaresOptions,
-    huber_cost,
     minimise_huber,
     minimise_l2,
 )
-from l1slam_ros.core.solvers.optimality import Status, l2_cost
+from l1slam_ros.core.solvers.optimality import Huber, Status, l2_cost
 
 DEFAULTS = LeastSquaresOptions()
 BOTH = pytest.mark.parametrize('minimise', [minimise_l2, minimise_huber])
@@ -79,14 +78,15 @@ def test_the_cost_has_no_half(world):
 def test_huber_cost_by_hand():
     """Lengths 5 (beyond 2: 2 2 5 - 2^2 = 16), 1 (1^2) and 2 (2^2, either way)."""
     residual = np.array([3.0, 4.0, 0.0, 0.6, 0.0, -0.8, 0.0, 2.0, 0.0])
-    assert huber_cost(residual, 3, 2.0) == pytest.approx(16 + 1 + 4)
-    assert huber_cost(residual, 3, 1e9) == pytest.approx(l2_cost(residual))
-    assert huber_cost(np.zeros(0), 3, 1.0) == 0.0
+    assert Huber(3, 2.0).cost(residual) == pytest.approx(16 + 1 + 4)
+    assert Huber(3, 1e9).cost(residual) == pytest.approx(l2_cost(residual))
+    assert Huber(3, 1.0).cost(np.zeros(0)) == 0.0
 
 
 def test_huber_cost_is_smooth_where_it_turns_linear():
     delta, h = 1.345, 1e-6
-    costs = [huber_cost(np.array([s, 0.0, 0.0]), 3, delta) for s in (delta - h, delta, delta + h)]
+    costs = [Huber(3, delta).cost(np.array([s, 0.0, 0.0]))
+             for s in (delta - h, delta, delta + h)]
     assert (costs[2] - costs[1]) / h == pytest.approx((costs[1] - costs[0]) / h, rel=1e-4)
     assert costs[1] == delta**2
 
@@ -98,7 +98,8 @@ def test_huber_ends_where_its_gradient_is_zero(delta, world):
     solution = solve(minimise_huber, graph, odometry_poses(graph), options)
 
     def cost(x):
-        return huber_cost(whitened_residual(graph, step_poses(graph, solution.poses, x)), 3, delta)
+        moved = step_poses(graph, solution.poses, x)
+        return Huber(3, delta).cost(whitened_residual(graph, moved))
 
     n = 3 * (graph.n_poses - 1)
     gradient = approx_fprime(np.zeros(n), cost, 1e-7)

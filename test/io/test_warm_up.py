@@ -11,18 +11,19 @@ import numpy as np
 import pytest
 
 from l1slam_ros.core import kernels
-from l1slam_ros.core.solvers.warm_up import (
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.compilation import fill_cache
+from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
+from l1slam_ros.io.warm_up import (
     DENSE,
     JUDGEMENT,
+    ONLINE,
     SPARSE,
     STEPS,
     STEPS_IN_SPACE,
     module_of,
     warm_up,
 )
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.compilation import fill_cache
-from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
 
 # Prints what a process compiles.
 WORK = """
@@ -196,7 +197,7 @@ def test_each_step_is_reported_once_it_is_done():
 def test_every_module_of_loops_is_a_step():
     modules = {module.name for module in pkgutil.iter_modules(kernels.__path__)}
     assert {module_of(step) for step in (*STEPS, *STEPS_IN_SPACE)} == modules - {'compiled'}
-    assert set(STEPS) == {*SPARSE, *JUDGEMENT, *DENSE}
+    assert set(STEPS) == {*SPARSE, *JUDGEMENT, *DENSE, *ONLINE}
     assert not {'se3', *STEPS_IN_SPACE} & set(STEPS)
 
 
