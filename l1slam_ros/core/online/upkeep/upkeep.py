@@ -33,7 +33,7 @@ from l1slam_ros.core.online.snapshot import Optimised, Snapshot
 from l1slam_ros.core.online.update import Improvement, front_of, improve, optimise
 from l1slam_ros.core.online.upkeep.live_map import LiveMap
 from l1slam_ros.core.online.upkeep.threads import Worker
-from l1slam_ros.core.robust.running import judge
+from l1slam_ros.core.robust.batch import judge
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
 # Asked on the way, often: whether to stop.
