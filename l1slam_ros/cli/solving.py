@@ -108,8 +108,8 @@ def _wish(arguments: argparse.Namespace) -> Wish:
         least_squares = replace(least_squares, iterations=arguments.outer)
     if arguments.inner is not None:
         solver = replace(solver, inner=replace(solver.inner, iterations=arguments.inner))
-    return Wish(arguments.start, arguments.norm, arguments.solver, robust, solver,
-                        least_squares)
+    arguments.norm = arguments.norm or solver.norm
+    return Wish(arguments.start, arguments.norm, arguments.solver, robust, solver, least_squares)
 
 
 def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:

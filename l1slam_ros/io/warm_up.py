@@ -16,9 +16,9 @@ from l1slam_ros.core.geometry.manifold import Manifold
 # compile.
 SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interior_point', 'se2')
 JUDGEMENT = ('prediction',)
-DENSE = ('halpern', 'tiles')
+DENSE = ('halpern',)
 ONLINE = ('border',)
-STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:], 'tiles')
+STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
 # What poses in space need besides; after the colon: the versions for them of that module's loops.
 _SPACE = ':space'
 _IN_SPACE = {'halpern': f'halpern{_SPACE}', 'cholesky': f'cholesky{_SPACE}',

@@ -31,7 +31,7 @@ def compiling(monkeypatch):
     """Let compiling last until the event that is returned is set, or the node ends."""
     finish = threading.Event()
 
-    def fill_cache(report, stopped):
+    def fill_cache(report, stopped, steps):
         report(1, 2)
         while not stopped() and not finish.wait(0.01):
             pass

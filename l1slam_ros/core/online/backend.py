@@ -8,7 +8,7 @@ It owns the growing graph; how its map is kept is told in `upkeep`.
 from dataclasses import dataclass
 
 from l1slam_ros.core.errors import OptionError
-from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_finite
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
@@ -21,7 +21,7 @@ from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
 # What poses live on, by the dimension of the world.
-_MANIFOLDS: dict[int, Manifold] = {2: se2}
+_MANIFOLDS: dict[int, Manifold] = {2: se2, 3: se3}
 # [s] In the background nothing has come for a while when it has not for so long.
 _PAUSE = 0.2
 
@@ -50,7 +50,7 @@ class Backend(Upkeep):
     Parameters
     ----------
     options : see `BackendOptions`
-    dimension : of the world: 2
+    dimension : of the world, 2 or 3
     background : update in a thread of its own whenever there is something new, until `close` or
         the end of the `with` block
 
@@ -60,16 +60,15 @@ class Backend(Upkeep):
 
     Raises
     ------
-    OptionError : the dimension is not supported.
+    OptionError : there is no such dimension.
 
     """
 
     def __init__(self, options: BackendOptions = BackendOptions(),  # noqa: B008
                  dimension: int = 2, background: bool = False):
         if dimension not in _MANIFOLDS:
-            raise OptionError(f'dimension {dimension!r} is not supported yet, expected 2')
-        self.manifold = _MANIFOLDS[dimension]
-        self._options = options
+            raise OptionError(f'dimension is {dimension!r}, expected 2 or 3')
+        self.manifold, self._options = _MANIFOLDS[dimension], options
         super().__init__(options.solver, options.robust.enabled)
         self._counted: tuple[object, dict[str, int]] = (None, {})
         self._background: Background | None = None
@@ -114,6 +113,7 @@ class Backend(Upkeep):
 
     def restore(self, saved: SavedMap) -> None:
         """Go on from what another back end has `saved`, in the place of the map there is."""
+        saved.require(self.manifold)
         builder = GraphBuilder(self.manifold, self._options)
         builder.restore(saved.growth)
         self._replace(builder, saved.as_judged(self._robust))

@@ -192,7 +192,8 @@ def optimise(problem: Problem, options: OptimiserOptions,
 def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
             check: Check) -> Solution:
     check()
-    return minimise_by(choose(AUTO, graph), graph, poses, options, lambda *_: check())[0]
+    choice = choose(AUTO, graph, options.norm)
+    return minimise_by(choice, graph, poses, options, lambda *_: check())[0]
 
 
 def _improvement(solution: Solution, problem: Problem, judgement: Judgement, before: float,

@@ -95,4 +95,4 @@ def gauss_newton(
             status = Status.STALLED
             break
     return Solution(poses, history[-1], status, len(history) - 1, 0, np.array(history),
-                    np.zeros(0))
+                    np.zeros(len(residual)))

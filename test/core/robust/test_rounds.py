@@ -19,7 +19,8 @@ def test_one_true_loop_in_a_thousand_is_beyond_the_gate():
         growth.accepted[np.random.default_rng(seed).choice(loops, 5, replace=False)] = True
         growth.settle()
         rows = growth.undecided()
-        refused += np.count_nonzero(growth.innovations(rows).square >= growth.gate())
+        found = growth.innovations(rows)
+        refused += np.count_nonzero(found.square >= growth.gate(found.freedom))
         asked += len(rows)
     # Loops of one world share its errors, so a binomial bound (3 sigma: 23 in 60) is doubled.
     assert asked > 50_000

@@ -137,6 +137,19 @@ def test_the_motion_after_the_last_keyframe_is_not_lost(tmp_path):
                                    atol=1e-9)
 
 
+def test_what_came_after_the_last_update_is_looked_at(world, tmp_path):
+    backend, loaded = first_half(world), Backend(EVERY)
+    settle(backend)
+    backend.add_loop(replace(loop(0.9, 4.5, (3.0, 1.0, 0.5), 0.5 * np.eye(6)), trusted=True))
+    save_map(tmp_path / 'map.g2o', backend.saved())
+    loaded.restore(load_map(tmp_path / 'map.g2o')[0])
+    for one in backend, loaded:
+        assert one.update(PLENTY) is not None
+        settle(one)
+    np.testing.assert_allclose(loaded.poses, backend.poses, atol=2e-3)
+    assert not np.allclose(loaded.poses, load_map(tmp_path / 'map.g2o')[0].optimised.poses)
+
+
 def test_a_loop_that_was_saved_is_known_when_it_is_sent_again(halfway, world, tmp_path):
     save_map(tmp_path / 'map.g2o', halfway.saved())
     backend = Backend(EVERY)
@@ -209,8 +222,8 @@ def test_what_is_damaged_takes_the_place_of_no_map(two, halfway):
     assert load_map(two)[1].startswith('5 keyframes')
 
 
-def test_the_commands_notice_damage_too(two, capsys):
-    assert main(['info', str(two)]) == 0
+def test_the_commands_read_both_and_notice_damage_too(two, capsys):
+    assert main(['info', str(two)]) == main(['info', f'{two}.1']) == 0
     content = two.read_bytes()
     two.write_bytes(content.replace(b'EDGE_SE2 0 1 1.0', b'EDGE_SE2 0 1 2.0'))
     assert main(['info', str(two)]) == 2
