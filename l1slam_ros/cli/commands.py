@@ -60,7 +60,8 @@ def read(arguments: argparse.Namespace, path: Path, quiet: bool = False) -> Grap
         options = read_params_file(arguments.params_file)
     topics = Topics(arguments.odom_topic, arguments.loop_topic, arguments.trusted_topic,
                     arguments.absolute_topic)
-    record = formats.read_input(path, options, topics, arguments.rotation_information)
+    record = formats.read_input(path, options, topics, arguments.rotation_information,
+                                options.dimension if options else 2)
     warn(record.skipped, quiet)
     return record
 

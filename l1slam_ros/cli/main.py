@@ -18,6 +18,7 @@ from l1slam_ros.core.names import (
     ROTATION_INFORMATION,
     SOLVERS,
     STARTS,
+    WORLDS,
 )
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS
 from l1slam_ros.paper import printed as paper
@@ -194,8 +195,9 @@ def _add_solve(parser: argparse.ArgumentParser) -> None:
     add('--start', choices=STARTS, default=STARTS[0],
         help='where from: first poses from the graph alone, the stored poses, or the odometry; '
         'where loops are doubted, always from the graph alone (default: %(default)s)')
-    add('--norm', choices=NORMS, default=NORMS[0],
-        help='what is minimised (default: %(default)s)')
+    add('--norm', choices=NORMS,
+        help='what is minimised: l1, of each component; group-l1, of the length of each factor, '
+        'whatever axes it is written in; l2; huber (default: as of solver.norm, l1)')
     add('--solver', choices=SOLVERS, default=SOLVERS[0],
         help='for l1; auto: interior-point on sparse graphs (default: %(default)s)')
     add('--robust', action=argparse.BooleanOptionalAction,
@@ -221,6 +223,9 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('output', type=Path, metavar='OUTPUT',
         help=f'{_GRAPH_OUTPUT}; beside it OUTPUT.truth.txt and OUTPUT.false.txt')
+    add('--world', choices=WORLDS, default=WORLDS[0],
+        help='streets in the plane; in space a building of several floors, with ramps, or a drive '
+        'on a sphere or a torus (default: %(default)s)')
     add('--poses', type=int, required=True, metavar='N')
     add('--edges', type=int, required=True, metavar='M', help='true ones, odometry included')
     add('--false-loops', type=int, default=0, metavar='K',

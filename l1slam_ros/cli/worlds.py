@@ -31,7 +31,7 @@ def simulate(arguments: argparse.Namespace) -> Ending:
     """Make a world and write its graph, its truth and which of its loops are false."""
     _check(arguments)
     output, rng = arguments.output, np.random.default_rng(arguments.seed)
-    world = simulate_world(arguments.poses, arguments.edges, WorldOptions(), rng)
+    world = simulate_world(arguments.poses, arguments.edges, WorldOptions(), rng, arguments.world)
     if arguments.false_loops:
         make = FALSE_LOOPS[arguments.kind]
         world = with_false_loops(

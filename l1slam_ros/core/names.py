@@ -5,6 +5,7 @@
 STARTS = ('seed', 'file', 'odometry')
 NORMS = ('l1', 'group-l1', 'l2', 'huber')
 SOLVERS = ('auto', 'primal-dual', 'interior-point')
+WORLDS = ('streets', 'building', 'sphere', 'torus')
 KINDS_OF_FALSE_LOOPS = ('random', 'identity', 'grouped')
 # What the rotation block of the information in a g2o file of poses in space is of.
 ROTATION_INFORMATION = QUATERNION, ANGLE = ('quaternion', 'angle')

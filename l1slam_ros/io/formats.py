@@ -24,7 +24,7 @@ GRAPH_SUFFIXES = ('.g2o', '.graph')
 
 def read_input(
     path: Path, options: 'GraphBuilderOptions | None' = None, topics: Topics = DEFAULT_TOPICS,
-    rotation_information: str = QUATERNION,
+    rotation_information: str = QUATERNION, dimension: int = 2,
 ) -> GraphRecord:
     """
     Read a graph file or grow a graph from a bag.
@@ -36,6 +36,7 @@ def read_input(
         node's defaults
     topics : where in a bag to look
     rotation_information : see `GraphRecord`; written back it is as it was read
+    dimension : of the world of a bag that does not note it
 
     Raises
     ------
@@ -47,9 +48,10 @@ def read_input(
     if is_bag(path):
         from l1slam_ros.io.bags.to_graph import graph_from_bag
 
-        record = graph_from_bag(path, options, topics)
+        record = graph_from_bag(path, options, topics, dimension)
         return replace(record, rotation_information=rotation_information)
-    if path.suffix in GRAPH_SUFFIXES:
+    # The map before the one of that name, too.
+    if path.name.removesuffix('.1').endswith(GRAPH_SUFFIXES):
         return read_graph_file(path, rotation_information)
     raise FileError(path, f'unknown kind of file; expected {", ".join(GRAPH_SUFFIXES)}, '
                     f'{", ".join(BAG_SUFFIXES)} or a rosbag2 directory')

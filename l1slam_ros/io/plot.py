@@ -8,7 +8,7 @@ Okabe and Ito, which people who see red and green alike can tell apart.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -53,12 +53,12 @@ def _no_pairs() -> Indices:
 @dataclass(frozen=True)
 class MapDrawing:
     """
-    What one map shows, seen from above.
+    What one map shows, seen from above where it is not said otherwise.
 
     positions, odometry : (n, 2 or 3) [m]; truth : (l, 2 or 3) [m] a path, rows of NaN part it;
     loops, suspect, rejected, false : (m, 2) pairs of rows of `positions`, each loop in one of
     them: `false` those known to be which were not rejected; name : what the positions are; note :
-    more for the line under the title, e.g. costs.
+    more for the line under the title, e.g. costs; upwards : the axis that is.
     """
 
     title: str
@@ -71,6 +71,19 @@ class MapDrawing:
     false: Indices = field(default_factory=_no_pairs)
     name: str = 'optimised'
     note: str = ''
+    upwards: str = 'y'
+
+    def views(self) -> 'list[MapDrawing]':
+        """Return what is drawn: the map from above, and where it has heights, from the side."""
+        if self.positions.shape[1] == 2:
+            return [self]
+
+        def aside(path: Array | None) -> Array | None:
+            return None if path is None else path[:, [0, 2]]
+
+        return [self, replace(
+            self, title=f'{self.title}, from the side', positions=self.positions[:, [0, 2]],
+            odometry=aside(self.odometry), truth=aside(self.truth), upwards='z')]
 
 
 @dataclass(frozen=True)
@@ -103,10 +116,11 @@ def plot_maps(path: str | Path, maps: Sequence[MapDrawing]) -> None:
     FileError : a suffix other than .png, .svg and .pdf, or a file that cannot be written.
 
     """
-    columns = len(maps) if len(maps) <= 3 else math.ceil(math.sqrt(len(maps)))
-    rows = math.ceil(len(maps) / columns)
+    views = [view for drawing in maps for view in drawing.views()]
+    columns = len(views) if len(views) <= 3 else math.ceil(math.sqrt(len(views)))
+    rows = math.ceil(len(views) / columns)
     figure = _new_figure(path, columns, rows)
-    for k, drawing in enumerate(maps, 1):
+    for k, drawing in enumerate(views, 1):
         _draw_map(figure.add_subplot(rows, columns, k), drawing)
     _save(figure, path)
 
@@ -122,10 +136,13 @@ def plot_curves(path: str | Path, curves: Sequence[Curve], title: str = '') -> N
 
 def plot_solution(path: str | Path, drawing: MapDrawing, curve: Curve) -> None:
     """Draw a map, and beside it the costs on the way there; errors as for `plot_maps`."""
-    figure = _new_figure(path, 2, 1)
-    beside = figure.add_subplot(1, 2, 1)
-    _draw_map(beside, drawing)
-    axes = figure.add_subplot(1, 2, 2)
+    views = drawing.views()
+    columns = len(views) + 1
+    figure = _new_figure(path, columns, 1)
+    for k, view in enumerate(views, 1):
+        beside = figure.add_subplot(1, columns, k)
+        _draw_map(beside, view)
+    axes = figure.add_subplot(1, columns, columns)
     _draw_curves(axes, [curve], curve.label)
     # As high as the map, unless that is a long corridor.
     (left, right), (low, high) = beside.get_xlim(), beside.get_ylim()
@@ -200,7 +217,7 @@ def _draw_map(axes: Axes, drawing: MapDrawing) -> None:
     _write_title(axes, drawing.title, _small_print(drawing))
     _set_view(axes, drawing)
     axes.set_xlabel('x [m]')
-    axes.set_ylabel('y [m]')
+    axes.set_ylabel(f'{drawing.upwards} [m]')
     _tidy(axes)
     _draw_legend(axes)
 

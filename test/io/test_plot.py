@@ -189,11 +189,12 @@ def test_the_loops_of_a_large_graph_are_thinned_out_and_one_image(tmp_path, rng)
     assert elements.count('path') < 500
 
 
-def test_positions_in_space_are_seen_from_above(tmp_path):
+def test_positions_in_space_are_seen_from_above_and_from_the_side(tmp_path):
     flat, tall = tmp_path / 'flat.png', tmp_path / 'tall.png'
     heights = np.array([[0.0], [5.0], [9.0], [-3.0], [1.0]])
-    loops = np.array([[0, 2]])
-    plot_maps(flat, [MapDrawing('', SQUARE, loops=loops)])
+    aside, loops = np.hstack((SQUARE[:, :1], heights)), np.array([[0, 2]])
+    plot_maps(flat, [MapDrawing('', SQUARE, loops=loops),
+                     MapDrawing(', from the side', aside, loops=loops, upwards='z')])
     plot_maps(tall, [MapDrawing('', np.hstack((SQUARE, heights)), loops=loops)])
     np.testing.assert_array_equal(pixels(flat), pixels(tall))
 

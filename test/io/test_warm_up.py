@@ -17,6 +17,7 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
 from l1slam_ros.io.warm_up import (
     DENSE,
     JUDGEMENT,
+    ONLINE,
     SPARSE,
     STEPS,
     STEPS_IN_SPACE,
@@ -28,7 +29,6 @@ from l1slam_ros.io.warm_up import (
 WORK = """
 import importlib
 import itertools
-import importlib
 import pkgutil
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ from problems import add_absolute, play
 from l1slam_ros.io import formats
 from l1slam_ros.core.robust import batch_map
 from l1slam_ros.io.compilation import fill_cache
-from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core import kernels
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
@@ -49,7 +49,9 @@ from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l
 from l1slam_ros.core.solvers.reweighting import weighted_least_squares
 from l1slam_ros.core.graph.linear_system import linearise
 from l1slam_ros.core.names import NORMS, STARTS
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.warm_up import STEPS, with_space
 
 MODULES = [importlib.import_module(f'{kernels.__name__}.{module.name}')
            for module in pkgutil.iter_modules(kernels.__path__)]
@@ -82,7 +84,7 @@ for enabled in (True, False):
     backend.settle()
     look(f'optimise, robust {enabled}')
     after = Backend(options)
-    after.restore(backend.snapshot().graph, backend.poses, backend.snapshot().stamps)
+    after.restore(backend.saved())
     after.update(60.0)
     look(f'restored, robust {enabled}')
 
@@ -127,6 +129,12 @@ add_absolute(world.graph, np.array([7]), world.truth[7:8], np.eye(3)[None])
 for norm in NORMS:
     solved(world.graph, world.odometry, norm=norm)
 look('an absolute factor')
+assert fill_cache(lambda done, total: None, lambda: False, with_space(STEPS, se3))
+building = simulate_world(120, 300, WorldOptions(), np.random.default_rng(0), 'building')
+for norm in NORMS:
+    solved(building.graph, building.odometry, norm=norm)
+solved(building.graph, building.odometry, solver='primal-dual', robust=False)
+look('in space')
 used = [kernel for module in MODULES for kernel in vars(module).values()
         if hasattr(kernel, 'takes') and kernel.stats.cache_hits]
 assert len(used) > 25, 'are the kernels not where this test looks for them?'
@@ -156,7 +164,7 @@ print(*sys.modules)
 
 def test_nothing_is_compiled_once_the_cache_is_full():
     done = subprocess.run([sys.executable, '-c', WORK], capture_output=True, text=True,
-                          timeout=240, cwd=Path(__file__).parents[2])
+                          timeout=240, cwd=Path(__file__).parents[1])
     assert done.returncode == 0, done.stderr
     assert done.stdout == ''
 
@@ -196,7 +204,7 @@ def test_each_step_is_reported_once_it_is_done():
 def test_every_module_of_loops_is_a_step():
     modules = {module.name for module in pkgutil.iter_modules(kernels.__path__)}
     assert {module_of(step) for step in (*STEPS, *STEPS_IN_SPACE)} == modules - {'compiled'}
-    assert set(STEPS) == {*SPARSE, *JUDGEMENT, *DENSE}
+    assert set(STEPS) == {*SPARSE, *JUDGEMENT, *DENSE, *ONLINE}
     assert not {'se3', *STEPS_IN_SPACE} & set(STEPS)
 
 

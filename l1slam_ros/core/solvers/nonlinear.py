@@ -16,6 +16,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise, step_poses, whitened_residual
+from l1slam_ros.core.names import NORMS
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.optimality import Status, fits_exactly, l1_cost
@@ -37,6 +38,9 @@ _HALVINGS = 5
 class OptimiserOptions(Options):
     """How long Algorithm 4 runs and when it is content."""
 
+    norm: str = option(
+        NORMS[0], 'what `l1slam` and `~/optimize` minimise; updates on the way minimise l1', '',
+        choices=NORMS)
     outer_iterations: int = option(60, 'most linearisations of one solve', '', 0, 10**6)
     outer_tolerance: float = option(
         1e-6, 'converged when the cost fell by less than this part of itself twice in a row',
@@ -51,7 +55,7 @@ class Solution:
 
     poses : (n, p); cost : of the norm it minimises; history : (outer_iterations + 1,) costs,
     the start first; dual : (rows,) and gap : of the last linear problem, see `duality_gap`; L2 and
-    Huber have neither (empty, infinite).
+    Huber have neither (zeros, infinite).
     """
 
     poses: Array

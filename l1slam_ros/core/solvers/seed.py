@@ -115,9 +115,10 @@ def chordal_poses(graph: FactorGraph, cholesky: BlockCholesky) -> Array | None:
     for side in range(2):
         np.add.at(right, keyframe[:, side], weights[:, None, None]
                   * (np.swapaxes(blocks[:, side], 1, 2) @ known))
-    rows = np.concatenate((np.broadcast_to(np.eye(k), (fixed, k, k)),
-                           cholesky.solve_many(right[:size])))
-    U, _, Vt = np.linalg.svd(np.swapaxes(rows, 1, 2))
+    R = np.tile(np.eye(k), (graph.n_poses, 1, 1))
+    for row in range(k):
+        R[fixed:, row] = cholesky.solve(right[:size, :, row].ravel()).reshape(size, k)
+    U, _, Vt = np.linalg.svd(R)
     U[:, :, -1] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[:, None]
     return manifold.from_rotation(U @ Vt, np.zeros((graph.n_poses, k)))
 

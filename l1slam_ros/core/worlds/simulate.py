@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Synthetic worlds: a robot in the streets of a Manhattan.
+Synthetic worlds: a robot in the streets of a Manhattan, or in space.
 
 In: sizes, noise, a random generator. Out: a graph and the truth it was measured in. A street grid
-lies in the plane, so the world is SE(2); `false_loops` spoils it, or any other graph.
+lies in the plane, so that world is SE(2); for the others see `in_space`. `false_loops` spoils
+them, or any other graph.
 """
 
 import math
@@ -13,12 +14,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from l1slam_ros.core.errors import GraphError
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry import se2, se3
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.names import WORLDS
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.worlds.false_loops import Loops, insert_loops
+from l1slam_ros.core.worlds.in_space import DRIVES
 
 _EAST_NORTH_WEST_SOUTH = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 # A place is driven through this often or more, or there would be little to recognise.
@@ -64,14 +67,15 @@ class World:
 
 
 def simulate_world(
-    n_poses: int, n_edges: int, options: WorldOptions, rng: np.random.Generator
+    n_poses: int, n_edges: int, options: WorldOptions, rng: np.random.Generator,
+    world: str = WORLDS[0],
 ) -> World:
     """
-    Return a Manhattan world without false loops.
+    Return a world without false loops, of `names.WORLDS`.
 
-    The robot drives straight, left or right at random at every crossing of a square of streets,
-    as large as lets it come by the places often enough for `n_edges`. Loops join poses near each
-    other in truth. Measurements are the true relative poses, then a step of Gaussian noise on
+    In streets the robot drives straight, left or right at random at every crossing of a square of
+    them, as large as lets it come by the places often enough for `n_edges`. Loops join poses near
+    each other in truth. Measurements are the true relative poses, then a step of Gaussian noise on
     the right. Factors come in the order of a drive: by j, at each j the odometry, then loops by i.
 
     Raises
@@ -86,15 +90,20 @@ def simulate_world(
     if not 0 <= n_loops <= most - (n_poses - 1):
         raise GraphError(f'{n_edges} edges between {n_poses} poses, '
                          f'expected {n_poses - 1} to {most}')
-    visits = max(_LEAST_VISITS, n_loops / n_poses / 2)
-    side = max(2, round(math.sqrt(n_poses / (2 * options.block * visits))))
-    truth = _drive(n_poses, side, options, rng)
-    loops = _near_pairs(se2.positions(truth), n_loops, options.step, rng)
+    if world in DRIVES:
+        manifold: Manifold = se3
+        truth = DRIVES[world](n_poses, options.step, options.block, rng)
+    else:
+        visits = max(_LEAST_VISITS, n_loops / n_poses / 2)
+        side = max(2, round(math.sqrt(n_poses / (2 * options.block * visits))))
+        manifold, truth = se2, _drive(n_poses, side, options, rng)
+    loops = _near_pairs(manifold.positions(truth), n_loops, options.step, rng)
     chain = np.arange(n_poses - 1)
     i, j = np.concatenate((np.stack((chain, chain + 1), axis=1), loops)).T
     is_loop = np.arange(len(i)) >= n_poses - 1
     order = np.lexsort((i, is_loop, j))
-    graph = _measured(truth, i[order], j[order], is_loop[order].astype(np.int64), options, rng)
+    graph = _measured(manifold, truth, i[order], j[order], is_loop[order].astype(np.int64),
+                      options, rng)
     return World(graph, truth, odometry_poses(graph), np.zeros((0, 2), np.int64))
 
 
@@ -140,18 +149,18 @@ def _near_pairs(positions: Array, count: int, step: float, rng: np.random.Genera
 
 
 def _measured(
-    truth: Array, i: Indices, j: Indices, is_loop: Indices, options: WorldOptions,
-    rng: np.random.Generator,
+    manifold: Manifold, truth: Array, i: Indices, j: Indices, is_loop: Indices,
+    options: WorldOptions, rng: np.random.Generator,
 ) -> FactorGraph:
     """Return the graph of noisy measurements; is_loop : (m,) 0 for odometry, 1 for a loop."""
-    sigma = np.empty((2, se2.TANGENT_SIZE))
-    sigma[:, se2.TRANSLATION] = np.array([[options.odometry_sigma_translation],
-                                          [options.loop_sigma_translation]])
-    sigma[:, se2.ROTATION] = np.array([[options.odometry_sigma_rotation],
-                                       [options.loop_sigma_rotation]])
-    noise = sigma[is_loop] * rng.standard_normal((len(i), se2.TANGENT_SIZE))
-    graph = FactorGraph(se2)
+    sigma = np.empty((2, manifold.TANGENT_SIZE))
+    sigma[:, manifold.TRANSLATION] = [[options.odometry_sigma_translation],
+                                      [options.loop_sigma_translation]]
+    sigma[:, manifold.ROTATION] = [[options.odometry_sigma_rotation],
+                                   [options.loop_sigma_rotation]]
+    noise = sigma[is_loop] * rng.standard_normal((len(i), manifold.TANGENT_SIZE))
+    graph = FactorGraph(manifold)
     graph.add_poses(len(truth))
-    graph.add_between(i, j, se2.retract(se2.between(truth[i], truth[j]), noise),
-                      (sigma[:, :, None] ** -2 * np.eye(se2.TANGENT_SIZE))[is_loop])
+    graph.add_between(i, j, manifold.retract(manifold.between(truth[i], truth[j]), noise),
+                      (sigma[:, :, None] ** -2 * np.eye(manifold.TANGENT_SIZE))[is_loop])
     return graph

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import (
     LEAST_VARIANCE,
@@ -44,6 +45,8 @@ from l1slam_ros.io.trajectory import invented_stamps
 GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
 # And besides, where a reader of messages would take some for faults: see `_note`.
 VERBATIM_NOTE = {'messages': 'verbatim'}
+# Of a graph whose poses are in space.
+SPACE_NOTE = {'dimension': '3'}
 
 _BASE_FRAME = 'base_link'
 _ODOMETRY, _TRUTH = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped'
@@ -168,7 +171,8 @@ def _note(record: GraphRecord, stamps: list[int], steps: Indices) -> dict[str, s
              or variances.min(initial=1.0) < LEAST_VARIANCE
              or variances[steps].max(initial=1.0) > MOST_OF_ODOMETRY
              or variances.max(initial=1.0) > MOST_VARIANCE)
-    return GRAPH_NOTE | VERBATIM_NOTE if meant else GRAPH_NOTE
+    return (GRAPH_NOTE | (VERBATIM_NOTE if meant else {})
+            | (SPACE_NOTE if manifold is se3 else {}))
 
 
 def _steps(record: GraphRecord) -> Indices:

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from l1slam_ros.core.errors import FileError, MessageError
-from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry import se2, se3
+from l1slam_ros.core.geometry.manifold import Manifold
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.io.bags.from_graph import GRAPH_NOTE, VERBATIM_NOTE
+from l1slam_ros.io.bags.from_graph import GRAPH_NOTE, SPACE_NOTE, VERBATIM_NOTE
 from l1slam_ros.io.bags.reader import BagMessage, bag_summary, read_messages, read_note
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
 from l1slam_ros.io.graphs.graph_file import GraphRecord
@@ -20,7 +21,8 @@ from l1slam_ros.io.messages.conversion import absolute_pose, loop_closure, odome
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 
 
-def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topics) -> GraphRecord:
+def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topics,
+                   dimension: int = 2) -> GraphRecord:
     """
     Grow a graph from the messages of a bag, damaged or not.
 
@@ -30,6 +32,7 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
     options : what makes keyframes of messages; None: what the bag's note says, or the node's
         defaults
     topics : where to look
+    dimension : of the world; a bag that notes 3 is in space anyway
 
     Raises
     ------
@@ -37,7 +40,8 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
 
     """
     note = read_note(path)
-    growing = _Growing(options or _noted_options(note), topics,
+    in_space = dimension == 3 or note.get('dimension') == SPACE_NOTE['dimension']
+    growing = _Growing(se3 if in_space else se2, options or _noted_options(note), topics,
                        note.get('messages') == VERBATIM_NOTE['messages'])
     damage: list[str] = []
     for message in read_messages(path, topics.types(), damage.append):
@@ -57,8 +61,9 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
 class _Growing:
     """A graph that grows message by message."""
 
-    def __init__(self, options: GraphBuilderOptions, topics: Topics, verbatim: bool):
-        self._builder = GraphBuilder(se2, options, verbatim)
+    def __init__(self, manifold: Manifold, options: GraphBuilderOptions, topics: Topics,
+                 verbatim: bool):
+        self._builder = GraphBuilder(manifold, options, verbatim)
         self._topics, self._types = topics, topics.types()
         self._base_frame, self._map_frame = BaseFrame(''), ''
         self.seen: set[str] = set()

@@ -10,6 +10,7 @@ from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.compilation import fill_cache
+from l1slam_ros.io.warm_up import STEPS, with_space
 from l1slam_ros.ros.threads.failures import Failures
 
 # [s] After a failed update the next one waits; twice as long after each more, up to this.
@@ -120,7 +121,8 @@ class SolverThread:
                 self._logger.info(f'compiling the solver, once on a machine: {self.compiling}')
 
         try:
-            if not self._backend.alone(lambda: fill_cache(report, self.is_closing)):
+            steps = with_space(STEPS, self._backend.manifold)
+            if not self._backend.alone(lambda: fill_cache(report, self.is_closing, steps)):
                 self._logger.debug('not all is compiled yet: the rest is when it is first called')
         except Exception as error:
             # Not the end: what is missing is compiled when it is first called.

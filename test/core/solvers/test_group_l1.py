@@ -86,7 +86,7 @@ def test_turned_frames_in_space(rng):
 @pytest.mark.parametrize('name', NORMS)
 def test_each_norm_ends_where_another_solver_does(name, manifold, rng):
     """SciPy's BFGS on the smoothed cost of a step from there finds nothing lower."""
-    graph, truth = noisy_graph(12, 10, rng) if manifold == 'plane' else space_graph(8, rng)
+    graph, truth = noisy_graph(12, 10, rng) if manifold == 'plane' else space_graph(6, rng)
     norm = norm_of(name, graph.manifold.TANGENT_SIZE, DELTA)
     found, _ = minimise_by(choose('auto', graph, name), graph, truth, OPTIONS)
     assert found.status is Status.CONVERGED

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drives in space: their shapes, and that what was measured along them is solved and recorded."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import PERIOD, seconds
+
+from l1slam_ros.core.errors import GraphError, OptionError
+from l1slam_ros.core.geometry import se3
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.names import WORLDS
+from l1slam_ros.core.online.backend import Backend, BackendOptions
+from l1slam_ros.core.robust.door import solve
+from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS
+from l1slam_ros.core.worlds.in_space import DRIVES
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
+from l1slam_ros.io.bags.from_graph import write_graph_bag
+from l1slam_ros.io.formats import read_input
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+
+EVERY = BackendOptions.from_mapping({'keyframe': {'translation': 0.0, 'rotation': 0.0},
+                                     'odometry': {'covariance_source': 'increment'}})
+
+
+@pytest.fixture
+def world(rng):
+    """A building with true loops, and with random lies."""
+    made = simulate_world(150, 330, WorldOptions(), rng, 'building')
+    return made, with_false_loops(made, FALSE_LOOPS['random'](made.graph, made.truth, 40, rng))
+
+
+def covariances(factors):
+    return np.linalg.inv(factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information)
+
+
+@pytest.mark.parametrize('name', sorted(DRIVES))
+@pytest.mark.parametrize('n', [1, 2, 500])
+def test_a_drive_goes_where_it_looks_in_even_steps(name, n, rng):
+    truth = DRIVES[name](n, 0.5, 5, rng)
+    assert_allclose(truth[:1], se3.identity(1), atol=1e-12)
+    assert len(truth) == n
+    step = np.diff(truth[:, :3], axis=0)
+    length = np.linalg.norm(step, axis=1)
+    assert_allclose(length, 0.5, rtol=0.15 if n > 2 else 0.3)
+    assert_allclose(se3.rotation(truth[:-1])[:, :, 0], step / length[:, None], atol=1e-9)
+
+
+def test_a_building_has_floors_with_ramps_between_them(rng):
+    z = DRIVES['building'](1500, 1.0, 5, rng)[:, 2]
+    on_floor = np.isclose(z % 3, 0) | np.isclose(z % 3, 3)
+    assert set(np.round(z[on_floor] / 3)) <= {0, 1, 2, 3, 4} and z.max() >= 6
+    assert 0.05 < 1 - on_floor.mean() < 0.3
+
+
+def test_a_sphere_and_a_torus_are_round(rng):
+    sphere, torus = (DRIVES[name](2000, 1.0, 5, rng)[:, :3] for name in ('sphere', 'torus'))
+    extent = np.ptp(sphere, axis=0)
+    assert_allclose(extent, 2 * np.sqrt(2000) / np.pi, rtol=0.1)
+    # From the first pose, in its axes; so compare with all distances from the middle.
+    radius = np.linalg.norm(torus - torus.mean(axis=0), axis=1)
+    assert radius.max() / radius.min() == pytest.approx(3, rel=0.05)
+
+
+def test_a_world_in_space_is_measured_as_it_says(rng):
+    for name in WORLDS[1:]:
+        made = simulate_world(200, 500, WorldOptions(), rng, name)
+        factors = made.graph.between
+        e = se3.local(factors.measurement, se3.between(made.truth[factors.i],
+                                                       made.truth[factors.j]))
+        assert (len(factors), made.graph.n_poses) == (500, 200)
+        assert_allclose(e.std(axis=0), [0.05] * 3 + [0.01] * 3, rtol=0.15)
+        distance = np.linalg.norm(made.truth[factors.i, :3] - made.truth[factors.j, :3], axis=1)
+        assert distance.max() < 4
+
+
+def test_lies_in_space_are_refused(world):
+    clean, spoiled = (solve(made.graph) for made in world)
+    pairs = {tuple(pair) for pair in world[1].false_loops.tolist()}
+    is_false = np.array([pair in pairs for pair in map(tuple, world[1].graph.between.pairs)])
+    assert clean.inliers.all() and is_false.sum() == 40
+    assert_array_equal(spoiled.inliers, ~is_false)
+    assert_allclose(spoiled.poses, clean.poses, atol=1e-4)
+
+
+def test_a_back_end_in_space_ends_at_the_map_of_the_batch(world):
+    made, factors = world[0], world[0].graph.between
+    covariance, unknown = covariances(factors), np.zeros((6, 6))
+    with Backend(EVERY, dimension=3) as backend:
+        for k in range(150):
+            rows = np.flatnonzero(factors.j == k)
+            step = rows[factors.is_odometry[rows]]
+            backend.add_odometry(OdometrySample(
+                seconds(k * PERIOD), made.odometry[k],
+                covariance[step[0]] if k else unknown, unknown))
+            for row in rows[~factors.is_odometry[rows]]:
+                backend.add_loop(LoopClosure(
+                    seconds(factors.i[row] * PERIOD), seconds(k * PERIOD),
+                    factors.measurement[row], covariance[row]))
+            if k % 30 == 29:
+                backend.update(budget=0.05)
+        backend.settle()
+        error = absolute_trajectory_error(backend.poses[:, :3], solve(made.graph).poses[:, :3])
+        assert error < 1e-3
+        saved = backend.saved()
+    with Backend(EVERY, dimension=2) as flat, pytest.raises(
+            GraphError, match='a map of SE3, expected one of SE2'):
+        flat.restore(saved)
+
+
+def test_a_bag_of_a_world_in_space_is_the_same_graph(world, tmp_path):
+    made = world[0]
+    write_graph_bag(tmp_path / 'bag', GraphRecord(made.graph, made.odometry, np.arange(150)))
+    graph = read_input(tmp_path / 'bag').graph
+    assert graph.manifold is se3
+    order = [np.lexsort((factors.i, factors.j)) for factors in (made.graph.between, graph.between)]
+    for name in 'i', 'j', 'measurement', 'sqrt_information':
+        theirs, ours = (getattr(one.between, name)[rows]
+                        for one, rows in zip((made.graph, graph), order, strict=True))
+        assert_allclose(ours, theirs, rtol=1e-8, atol=1e-8)
+
+
+def test_there_is_no_other_dimension():
+    with pytest.raises(OptionError, match='dimension is 4, expected 2 or 3'):
+        Backend(EVERY, 4)
