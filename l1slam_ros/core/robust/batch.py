@@ -122,4 +122,5 @@ def judge(
         if time.monotonic() > deadline and not growth.takes_at_their_word:
             settled = False
             break
-    return judgement_of(growth, settled=settled), growth.poses
+    reasons = doubts(growth) if settled else ()
+    return judgement_of(growth, reasons, settled), growth.poses
