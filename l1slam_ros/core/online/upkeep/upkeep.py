@@ -58,8 +58,9 @@ class Upkeep:
 
     Attributes
     ----------
-    maps : how many maps there were: one more with each that was adopted or took another's place
-    moved : map -> odom before and after the last map that was adopted, (1, p) each
+    maps : how many maps there were: one more whenever factors were taken into it, and with each
+        that was adopted or took another's place
+    moved : map -> odom before and after the last of them, (1, p) each
 
     """
 
@@ -184,14 +185,16 @@ class Upkeep:
         with self._lock:
             self._builder.add_due_loops()
             self._live.hear()
+            before, taken = self._map_to_odom_now(), False
         while time.monotonic() < deadline:
             with self._lock:
                 if not self._live.take_one():
                     break
-                self._changes += 1
-        with self._lock:
-            self._live.note_newest()
-            self._map_to_odom = None
+                taken = True
+        if taken:
+            with self._lock:
+                self._live.note_newest()
+                self._note_map(before)
 
     def _begin_due(self, idle: bool, budget: float, check: Callable[[], None]) -> bool:
         """Let the workers begin what is due; return whether any is at work."""
@@ -299,6 +302,10 @@ class Upkeep:
     def _adopt(self, improvement: Improvement, front: Front | None) -> None:
         before = self._map_to_odom_now()
         self._live.adopt(improvement, front, self._solver.outer_tolerance)
+        self._note_map(before)
+
+    def _note_map(self, before: Array) -> None:
+        """Note that the map is another now; before : map -> odom until then."""
         self._map_to_odom = None
         self.moved = before, self._map_to_odom_now()
         self._changes += 1
