@@ -42,8 +42,8 @@ def solve(arguments: argparse.Namespace) -> Ending:
         warnings.append(f'no loop was doubted: {outcome.unjudged}')
         warn(warnings[-1:], arguments.quiet)
     judgement = outcome.judgement
-    ending = Ending(record.damage, doubt_sentence(judgement.doubt, record.ids, record.stamps)
-                    if judgement and judgement.doubt else '')
+    ending = Ending(record.damage, doubt_sentence(
+        judgement.doubts if judgement else (), record.ids, record.stamps))
     report = _report(record, outcome)
     report['warnings'] = [*warnings, *filter(None, ending)]
     if truth:
@@ -117,7 +117,7 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
     suspect = judgement.suspect if judgement else np.zeros(len(factors), bool)
     refused = ~judgement.accepted & ~suspect if judgement else suspect
     slips = judgement.slips if judgement else np.zeros(0, np.int64)
-    doubtful = judgement is not None and judgement.doubt is not None
+    doubtful = judgement is not None and judgement.doubts
     return {
         'poses': record.graph.n_poses,
         'factors': len(factors),

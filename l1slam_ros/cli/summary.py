@@ -9,13 +9,13 @@ import numpy as np
 
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.robust.inspection import (
     connected_parts,
     cost_at,
     information_range,
     long_steps,
     noise_scales,
-    odometry_gaps,
     parallel_factors,
     repeated_factors,
     step_lengths,

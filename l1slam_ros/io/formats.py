@@ -50,7 +50,8 @@ def read_input(
 
         record = graph_from_bag(path, options, topics, dimension)
         return replace(record, rotation_information=rotation_information)
-    if path.suffix in GRAPH_SUFFIXES:
+    # The map before the one of that name, too.
+    if path.name.removesuffix('.1').endswith(GRAPH_SUFFIXES):
         return read_graph_file(path, rotation_information)
     raise FileError(path, f'unknown kind of file; expected {", ".join(GRAPH_SUFFIXES)}, '
                     f'{", ".join(BAG_SUFFIXES)} or a rosbag2 directory')

@@ -1,12 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a robust solve refused, and what it found of the noise, in sentences for people."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Indices
-from l1slam_ros.core.robust.judgement import INCONSISTENT, Doubt, Judgement
+from l1slam_ros.core.robust.judgement import (
+    MOSTLY_REFUSED,
+    ONE_PLACE,
+    OTHER_MAP,
+    SLIP,
+    Doubt,
+    Judgement,
+)
 from l1slam_ros.io.files import stamp_text
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.wording import counted
@@ -28,6 +35,18 @@ _NOISE = (
     'the loops are about {times:.1f} times as noisy as they say: a false one that is little off '
     'passes for noise',
 )
+
+# By the kind of a doubt.
+_REASONS = {
+    MOSTLY_REFUSED: '{loops} loops, most of all, are refused or suspect, {where}: either they are '
+                    'false, or the odometry is worse than it says',
+    ONE_PLACE: 'all {loops} loops that are used are of one place, {where}, and may be one mistake',
+    OTHER_MAP: '{loops} refused loops of several places agree with each other on another map, '
+               '{where}',
+    SLIP: 'the odometry may have slipped, as {loops} loops say {where}, but as many speak '
+          'against it',
+}
+_REMEDY = 'Vouch for a loop that is right, strike out one that is false, or state the noise'
 
 
 def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[str]:
@@ -55,17 +74,20 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
             yield sentence.format(times=times)
 
 
-def doubt_sentence(doubt: Doubt, ids: Indices, stamps: Indices | None) -> str:
-    """Return why and where a map is not to be relied on; ids, stamps : (n,) of the keyframes."""
-    where = f'between {ids[doubt.first]} and {ids[doubt.last]}'
-    if stamps is not None:
-        where += f' ({stamp_text(stamps[doubt.first])} s to {stamp_text(stamps[doubt.last])} s)'
-    if doubt.kind == INCONSISTENT:
-        return (f'{DOUBTFUL}: {doubt.loops:,} refused loops agree with each other, but not with '
-                f'the odometry {where}, and to leave out one step of it does not reconcile them; '
-                'the map may be bent there')
-    return (f'{DOUBTFUL}: {doubt.loops:,} loops, most of all, are refused or suspect, {where}; '
-            'either they are false, or the odometry is worse than it says')
+def doubt_sentence(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None) -> str:
+    """
+    Return why and where a map is not to be relied on, and what can be done; empty: it may be.
+
+    ids, stamps : (n,) of the keyframes
+    """
+    reasons = []
+    for doubt in doubts:
+        where = f'between {ids[doubt.first]} and {ids[doubt.last]}'
+        if stamps is not None:
+            first, last = stamp_text(stamps[doubt.first]), stamp_text(stamps[doubt.last])
+            where += f' ({first} s to {last} s)'
+        reasons.append(_REASONS[doubt.kind].format(loops=f'{doubt.loops:,}', where=where))
+    return f'{DOUBTFUL}: {"; ".join(reasons)}. {_REMEDY}' if reasons else ''
 
 
 def _named(pair: np.ndarray) -> str:

@@ -11,12 +11,14 @@ from collections.abc import Callable, Sequence
 
 from l1slam_ros.core.geometry.manifold import Manifold
 
-# What a sparse graph is solved by, what false loops are told by, what a dense graph is solved by:
-# modules of `kernels`, those first that take long to compile.
+# What a sparse graph is solved by, what false loops are told by, what a dense graph is solved by,
+# what keeps up with a graph that grows: modules of `kernels`, those first that take long to
+# compile.
 SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interior_point', 'se2')
 JUDGEMENT = ('prediction',)
-DENSE = ('halpern', 'tiles')
-STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *SPARSE[2:], 'tiles')
+DENSE = ('halpern',)
+ONLINE = ('border',)
+STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
 # What poses in space need besides; after the colon: the versions for them of that module's loops.
 _SPACE = ':space'
 _IN_SPACE = {'halpern': f'halpern{_SPACE}', 'cholesky': f'cholesky{_SPACE}',

@@ -19,6 +19,8 @@ _MINUTE = 60
 _BEHIND = 10.0
 # Of so many judged loops most may be refused without a warning: a few say little.
 _FEW = 5
+# [m], [rad] What moves the robot by less is no jump: the last of a solve.
+_STILL = 1e-3
 
 
 class Diagnosis:
@@ -50,8 +52,9 @@ class Diagnosis:
 
     def note_jump(self, manifold: Manifold, before: Array, after: Array) -> None:
         """Remember how far a new map moved the robot: its pose (1, p) before [m] and after."""
-        metres, radians = manifold.motion(manifold.local(before, after))
-        self._jump = {'jump.translation': f'{metres[0]:.4f}', 'jump.rotation': f'{radians[0]:.5f}'}
+        metres, radians = (float(way[0]) for way in manifold.motion(manifold.local(before, after)))
+        if max(metres, radians) > _STILL:
+            self._jump = {'jump.translation': f'{metres:.4f}', 'jump.rotation': f'{radians:.5f}'}
 
     def publish(self, counts: Mapping[str, int], refused: Counter[str], twins: str) -> None:
         """

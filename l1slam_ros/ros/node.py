@@ -148,6 +148,8 @@ class BackendNode(LifecycleNode):
         ended &= self._solver.close(max(deadline - time.monotonic(), 0.0))
         if ended:
             self.destroy_node()
+            # It holds the node in the graph of ROS, and rclpy forgets it.
+            self._state_machine = None
         return ended
 
     def is_saving(self) -> bool:

@@ -67,10 +67,10 @@ class MapServices:
         improvement = self._backend.settle(self._stopped)
         if improvement is None:
             return 'there are no factors yet'
-        doubt = improvement.judgement.doubt
-        if doubt:
+        doubts = improvement.judgement.doubts
+        if doubts:
             stamps = self._backend.snapshot().stamps
-            raise DoubtfulError(doubt_sentence(doubt, np.arange(len(stamps)), stamps))
+            raise DoubtfulError(doubt_sentence(doubts, np.arange(len(stamps)), stamps))
         return (f'L1 cost {improvement.cost_before:.6g} -> {improvement.cost:.6g}, '
                 f'{improvement.status.value}, {improvement.seconds:.2f} s')
 

@@ -10,8 +10,8 @@ import pytest
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust.judgement import (
-    INCONSISTENT,
     MOSTLY_REFUSED,
+    OTHER_MAP,
     Doubt,
     Judgement,
 )
@@ -112,14 +112,14 @@ def test_what_is_twice_as_noisy_as_it_says_or_more_is_told_last(record, variance
     (None, ''), (10**9 * np.arange(N), ' (2.000000000 s to 7.000000000 s)')])
 def test_a_doubt_says_why_and_where(stamps, when):
     ids, where = 10 + 3 * np.arange(N), f'between 16 and 31{when}'
-    said = [doubt_sentence(Doubt(kind, 1234, 2, 7), ids, stamps)
-            for kind in (INCONSISTENT, MOSTLY_REFUSED)]
-    assert said == [
-        'doubtful: 1,234 refused loops agree with each other, but not with the odometry '
-        f'{where}, and to leave out one step of it does not reconcile them; the map may be bent '
-        'there',
-        f'doubtful: 1,234 loops, most of all, are refused or suspect, {where}; either they are '
-        'false, or the odometry is worse than it says']
+    said = doubt_sentence([Doubt(kind, 1234, 2, 7) for kind in (MOSTLY_REFUSED, OTHER_MAP)],
+                          ids, stamps)
+    assert said == (
+        f'doubtful: 1,234 loops, most of all, are refused or suspect, {where}: either they are '
+        'false, or the odometry is worse than it says; 1,234 refused loops of several places '
+        f'agree with each other on another map, {where}. Vouch for a loop that is right, strike '
+        'out one that is false, or state the noise')
+    assert doubt_sentence((), ids, stamps) == ''
 
 
 def test_a_lone_loop_is_one_loop(record):

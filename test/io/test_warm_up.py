@@ -17,6 +17,7 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
 from l1slam_ros.io.warm_up import (
     DENSE,
     JUDGEMENT,
+    ONLINE,
     SPARSE,
     STEPS,
     STEPS_IN_SPACE,
@@ -203,7 +204,7 @@ def test_each_step_is_reported_once_it_is_done():
 def test_every_module_of_loops_is_a_step():
     modules = {module.name for module in pkgutil.iter_modules(kernels.__path__)}
     assert {module_of(step) for step in (*STEPS, *STEPS_IN_SPACE)} == modules - {'compiled'}
-    assert set(STEPS) == {*SPARSE, *JUDGEMENT, *DENSE}
+    assert set(STEPS) == {*SPARSE, *JUDGEMENT, *DENSE, *ONLINE}
     assert not {'se3', *STEPS_IN_SPACE} & set(STEPS)
 
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `ros2 node info`, `ros2 param describe` and `ros2 lifecycle` show: the node's interface."""
 
-import gc
 import re
 from pathlib import Path
 
@@ -158,7 +157,6 @@ def test_unless_it_is_managed_it_is_active_at_once(bench):
 
 
 def test_two_nodes_of_one_name_are_noticed(bench):
-    gc.collect()  # a managed node is there until nobody holds it: one of an earlier test may be
     b = bench()
     b.until(lambda: b.status()[1] == 'ok', 'one is fine')
     other = bench()

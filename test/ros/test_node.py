@@ -252,7 +252,7 @@ def test_optimize_takes_a_doubtful_map_and_says_so(bench, tmp_path):
     b.until(lambda: len(b.path().poses) == 400, 'the map is there')
     answer = call(b, 'optimize')
     expected, _ = robust_solve(graph)
-    assert answer.message == doubt_sentence(expected.doubt, np.arange(400), stamps)
+    assert answer.message == doubt_sentence(expected.doubts, np.arange(400), stamps)
     assert not answer.success and answer.message.startswith('doubtful: ')
     taken = b.backend._backend.snapshot()
     assert np.abs(taken.poses - poses).max() > 1

@@ -15,7 +15,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from node_bench import call, odometry
 
 from l1slam_ros.core.graph.measurements import OdometrySample
-from l1slam_ros.core.online import backend as backend_module
+from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs import saved_map
 from l1slam_ros.ros import node
 from l1slam_ros.ros.publishing import header
@@ -77,7 +77,7 @@ def assert_all_finite(b):
 
 @pytest.mark.parametrize('kind', FAULTS)
 def test_an_update_that_fails(bench, monkeypatch, tmp_path, kind):
-    fault = Fault(monkeypatch, backend_module, 'improve', kind)
+    fault = Fault(monkeypatch, upkeep, 'improve', kind)
     b = bench(save_path=str(tmp_path / 'map.g2o'))
     drive(b, 0, 3)
     b.until(lambda: len(b.path().poses) == 3 and is_ok(b), 'a map')
@@ -94,7 +94,7 @@ def test_an_update_that_fails(bench, monkeypatch, tmp_path, kind):
 
 
 def test_an_update_that_always_fails_is_not_tried_all_the_time(bench, monkeypatch):
-    fault = Fault(monkeypatch, backend_module, 'improve', 'ValueError')
+    fault = Fault(monkeypatch, upkeep, 'improve', 'ValueError')
     fault.on = True
     b = bench(**{'update.period': 0.001})
     drive(b, 0, 3)
@@ -112,8 +112,8 @@ def test_an_update_that_always_fails_is_not_tried_all_the_time(bench, monkeypatc
 @pytest.mark.parametrize('kind, service, module, function', [
     ('ValueError', 'save', saved_map, 'graph_lines'),
     ('MemoryError', 'load', saved_map, 'read_graph_file'),
-    ('MemoryError', 'optimize', backend_module, 'optimise'),
-    ('nan', 'optimize', backend_module, 'optimise')])
+    ('MemoryError', 'optimize', upkeep, 'optimise'),
+    ('nan', 'optimize', upkeep, 'optimise')])
 def test_a_service_that_fails(bench, monkeypatch, tmp_path, kind, service, module, function):
     fault = Fault(monkeypatch, module, function, kind)
     b = bench(save_path=str(tmp_path / 'map.g2o'))
@@ -158,7 +158,7 @@ def test_a_publisher_that_fails(bench, monkeypatch):
 
 
 def test_each_kind_of_failure_is_logged_once_in_full(bench, monkeypatch, capfd):
-    fault = Fault(monkeypatch, backend_module, 'improve', 'ValueError')
+    fault = Fault(monkeypatch, upkeep, 'improve', 'ValueError')
     fault.on = True
     b = bench()
     drive(b, 0, 3)

@@ -15,7 +15,7 @@ from node_bench import call, odometry, poses_of
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
-from l1slam_ros.core.online import backend as backend_module
+from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.ros.threads import solver_thread
 
 DEADLINE = 60.0
@@ -112,8 +112,8 @@ def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
     b = bench(save_path=str(tmp_path / 'map.g2o'))
     drive(b, 0, 3)
     b.until(lambda: len(b.path().poses) == 3, 'a map')
-    began, improve = threading.Event(), backend_module.improve
-    monkeypatch.setattr(backend_module, 'improve', lambda *a: began.set() or patient(*a))
+    began, improve = threading.Event(), upkeep.improve
+    monkeypatch.setattr(upkeep, 'improve', lambda *a: began.set() or patient(*a))
     drive(b, 3, 5)
     b.until(began.is_set, 'an update that takes for ever')
     assert call(b, 'save').message.startswith('5 keyframes')
@@ -124,8 +124,8 @@ def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
     assert call(b, 'load').success
     b.until(lambda: len(b.path().poses) == 5, 'the map is back')
     assert call(b, 'pause', SetBool.Request(data=True)).success
-    b.until(lambda: not b.backend._backend._solving.locked(), 'the update stops')
-    monkeypatch.setattr(backend_module, 'improve', improve)
+    b.until(lambda: not b.backend._backend._updating.locked(), 'the update stops')
+    monkeypatch.setattr(upkeep, 'improve', improve)
     assert call(b, 'pause', SetBool.Request(data=False)).success
     drive(b, 5, 8)
     b.until(lambda: len(b.path().poses) == 8, 'updates go on')

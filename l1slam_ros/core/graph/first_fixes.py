@@ -56,7 +56,8 @@ def first_fixes(graph: FactorGraph, latest: int | None = None,
     if size <= leading:
         return rows, variance or 1.0
     samples = _Samples(graph, rows)
-    near = [stride * np.arange(leading) for stride in range(1, (size - 1) // (leading - 1))]
+    strides = np.arange(1, max((size - 1) // (leading - 1), 2))
+    near = list(strides[:, None] * np.arange(leading))
     if variance is None:
         variance = _likeliest_variance(samples, _windows(len(rows), size, _FOR_NOISE), near)
     leads, windows = [*near, *(size - 1 - lead for lead in near)], _windows(

@@ -32,16 +32,16 @@ class Tiles:
 
     def pack(self, values: Array) -> Single:
         """Return the values of all factors, (m, c), as tiles (t, c, lanes)."""
-        from l1slam_ros.core.kernels import tiles as kernels
+        from l1slam_ros.core.kernels import halpern
 
         tiles = np.zeros((self._count, values.shape[1], self._lanes), np.float32)
-        kernels.pack(values, self._order, tiles)
+        halpern.pack(values, self._order, tiles)
         return tiles
 
     def unpack(self, tiles: Single) -> Array:
         """Return the values of all factors, (m, c), from tiles (t, c, lanes)."""
-        from l1slam_ros.core.kernels import tiles as kernels
+        from l1slam_ros.core.kernels import halpern
 
         values = np.empty((len(self._order), tiles.shape[1]))
-        kernels.unpack(tiles, self._order, values)
+        halpern.unpack(tiles, self._order, values)
         return values

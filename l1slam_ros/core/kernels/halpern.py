@@ -16,7 +16,7 @@ overlap. K is a tuple of k zeros; its length is a constant to the compiler, an a
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import compiled, for_sizes
+from l1slam_ros.core.kernels.compiled import compiled, for_sizes, loop
 
 # One cache line of single precision. Below 16 the loop vectoriser takes a loop for a short one,
 # where it does not check that arrays are apart, and gives up.
@@ -193,3 +193,21 @@ def _scatter(local, tile, g, keyframes, K):
             v = keyframes[side * LANES + lane]
             for c in range(k):
                 g[v, c] += local[(side * k + c) * LANES + lane]
+
+
+@loop('(f8[:, ::1], i8[::1], f4[:, :, ::1])')
+def pack(values, order, tiles):
+    """Write values (m, c), taken in `order` (m,), to tiles (t, c, lanes)."""
+    lanes = tiles.shape[2]
+    for place in range(len(order)):
+        for c in range(values.shape[1]):
+            tiles[place // lanes, c, place % lanes] = values[order[place], c]
+
+
+@loop('(f4[:, :, ::1], i8[::1], f8[:, ::1])')
+def unpack(tiles, order, values):
+    """Undo `pack`: write the tiles to values (m, c)."""
+    lanes = tiles.shape[2]
+    for place in range(len(order)):
+        for c in range(values.shape[1]):
+            values[order[place], c] = tiles[place // lanes, c, place % lanes]

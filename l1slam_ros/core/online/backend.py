@@ -1,42 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The incremental back end: samples and loops in, optimised poses out, from as many threads as like.
+The incremental back end: samples and loops in, optimised poses out, from many threads.
 
-It owns the growing graph, the poses and the dual. An update is three steps:
-
-    problem = backend.snapshot().problem()
-    improvement = improve(problem, options, budget)     # the work; touches nothing of the backend
-    backend.adopt(improvement)                          # poses and dual for the next warm start
-
-One lock is held to append, to take a snapshot and to adopt, never while solving, reading or
-writing a file. A second one lets one thread at a time solve.
-
-What is being solved for a map that is replaced meanwhile, or that `settle` is to solve in the
-place of an update, is told to stop, and never adopted.
+It owns the growing graph; how its map is kept is told in `upkeep`.
 """
 
-import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 
-from l1slam_ros.core.errors import Interrupted, OptionError
+from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_finite
-from l1slam_ros.core.online.background import Background
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.loop_states import LoopStates
-from l1slam_ros.core.online.parts import as_one, of_all
-from l1slam_ros.core.online.snapshot import Optimised, Problem, Robot, SavedMap, Snapshot
-from l1slam_ros.core.online.update import Improvement, improve, optimise
+from l1slam_ros.core.online.snapshot import Optimised, Robot, SavedMap
+from l1slam_ros.core.online.upkeep.threads import Background
+from l1slam_ros.core.online.upkeep.upkeep import Stopped as Stopped
+from l1slam_ros.core.online.upkeep.upkeep import Upkeep
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
 # What poses live on, by the dimension of the world.
 _MANIFOLDS: dict[int, Manifold] = {2: se2, 3: se3}
-
-# Asked on the way, often: whether to stop.
-Stopped = Callable[[], bool]
+# [s] In the background nothing has come for a while when it has not for so long.
+_PAUSE = 0.2
 
 
 @dataclass(frozen=True)
@@ -56,7 +43,7 @@ class BackendOptions(GraphBuilderOptions):
     robust: RobustOptions = RobustOptions()
 
 
-class Backend:
+class Backend(Upkeep):
     """
     Keeps a map while it grows.
 
@@ -70,8 +57,6 @@ class Backend:
     Attributes
     ----------
     manifold : what the poses live on
-    maps : how many maps there were: one more with each that was adopted or took another's place
-    moved : map -> odom before and after the last map that was adopted, (1, p) each
 
     Raises
     ------
@@ -84,18 +69,16 @@ class Backend:
         if dimension not in _MANIFOLDS:
             raise OptionError(f'dimension is {dimension!r}, expected 2 or 3')
         self.manifold, self._options = _MANIFOLDS[dimension], options
-        self._lock, self._solving = threading.Lock(), threading.Lock()
-        self._make_way = False
-        self.maps = self._map = self._changes = self._samples = 0
-        self._at_rest: object = None  # the version at which an update found nothing to do
-        self._graph: object = None
+        super().__init__(options.solver, options.robust.enabled)
         self._counted: tuple[object, dict[str, int]] = (None, {})
         self._background: Background | None = None
+        self._graph: object = None
         self.moved = self.manifold.identity(1), self.manifold.identity(1)
         self.reset()
         self.maps = 0
         if background:
-            self._background = Background(lambda stopped: self.update(stopped=stopped))
+            self._background = Background(
+                lambda idle, stopped: self._update(0.0, stopped, idle), _PAUSE)
 
     def __enter__(self) -> 'Backend':
         """Return the back end; the end of the block closes it."""
@@ -106,9 +89,14 @@ class Backend:
         self.close()
 
     def close(self) -> None:
-        """End updates in the background; raise what one of them raised, if any did."""
-        if self._background is not None:
-            self._background.close()
+        """End what is at work behind; raise what went wrong there, if anything did."""
+        try:
+            if self._background is not None:
+                self._background.close()
+        finally:
+            with self._alone():
+                pass
+        self._check_workers()
 
     def reset(self) -> None:
         """Forget everything."""
@@ -121,14 +109,14 @@ class Backend:
             if self._builder.graph.between.is_absolute.all():
                 return None
             now, growth = self._snapshot(), self._builder.grown()
-        return SavedMap(growth, now.optimised.of_all(now.problem()), now.robust)
+        return SavedMap(growth, now.known(), now.robust)
 
     def restore(self, saved: SavedMap) -> None:
         """Go on from what another back end has `saved`, in the place of the map there is."""
         saved.require(self.manifold)
         builder = GraphBuilder(self.manifold, self._options)
         builder.restore(saved.growth)
-        self._replace(builder, saved.as_judged(self._options.robust.enabled))
+        self._replace(builder, saved.as_judged(self._robust))
 
     def _replace(self, builder: GraphBuilder, optimised: Optimised) -> None:
         """Begin a map with the graph of a builder; what is made for the one before is left."""
@@ -139,28 +127,6 @@ class Backend:
             self._begin_map(optimised)
         self._wake()
 
-    def _begin_map(self, optimised: Optimised | None = None) -> None:
-        """Begin with what is known of another map; None: with nothing, if the builder did."""
-        if optimised is None and self._builder.graph is self._graph:
-            return
-        optimised = optimised or Optimised.nothing(self.manifold.identity(0))
-        self.maps += 1
-        self._map += 1
-        self._changes += 1
-        self._graph, self._optimised = self._builder.graph, optimised
-        self._map_to_odom: tuple[Array, Array] | None = None
-
-    @property
-    def version(self) -> tuple[int, int, int]:
-        """Other than an earlier one where there may be something new to do or to tell."""
-        with self._lock:
-            return self._version()
-
-    def _version(self) -> tuple[int, int, int]:
-        builder = self._builder
-        # While loops wait, any sample may be the one that they wait for, or one too many.
-        return (self._changes, builder.graph.n_poses, self._samples if builder.n_waiting else 0)
-
     @property
     def poses(self) -> Array:
         """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
@@ -169,19 +135,6 @@ class Backend:
     def loop_states(self) -> LoopStates:
         """Return what has become of each loop, those of the graph first, in its order."""
         return self.snapshot().loop_states()
-
-    def snapshot(self) -> Snapshot:
-        """Return the back end as it is now, the due loops in its graph, to be read at leisure."""
-        with self._lock:
-            return self._snapshot()
-
-    def _snapshot(self) -> Snapshot:
-        builder = self._builder
-        builder.add_due_loops()
-        return Snapshot(
-            self._map, self._version(), builder.graph.copy(), builder.gaps, builder.stamps,
-            builder.odometry, self._map_to_odom_now(), builder.loop_rows, builder.loop_stamps,
-            self._optimised, self._options.robust.enabled)
 
     def counts(self) -> tuple[dict[str, int], dict[str, int]]:
         """Return the sizes of the graph, and how many loops were refused for which cause."""
@@ -205,9 +158,11 @@ class Backend:
         """
         with self._lock:
             self._changes += 1
-            if options.robust != self._options.robust:
-                self._optimised = self._optimised.unjudged()
+            doubted, self._robust = self._robust, options.robust.enabled
             self._options = self._builder.options = options
+            self._solver = options.solver
+            if doubted != self._robust:
+                self._begin(self._builder, self._snapshot().known().unjudged())
         self._wake()
 
     def add_odometry(self, sample: OdometrySample) -> Array | None:
@@ -237,6 +192,14 @@ class Backend:
             self._builder.begin_anew()
             self._begin_map()
 
+    def _begin_map(self, optimised: Optimised | None = None) -> None:
+        """Begin with what is known of another map; None: with nothing, if the builder did."""
+        if optimised is None and self._builder.graph is self._graph:
+            return
+        self.maps += 1
+        self._graph = self._builder.graph
+        self._begin(self._builder, optimised or Optimised.nothing(self.manifold.identity(0)))
+
     def add_loop(self, loop: LoopClosure) -> None:
         """Add one loop closure; see `GraphBuilder.add_loop`."""
         require_finite(loop.pose3)
@@ -245,104 +208,9 @@ class Backend:
             self._builder.add_loop(loop)
         self._wake()
 
-    def update(self, budget: float = 0.1, stopped: Stopped = lambda: False) -> Improvement | None:
-        """
-        Improve the map for about `budget` seconds; None: there was nothing to do.
-
-        Raises
-        ------
-        Interrupted : told to stop, or to make way for `settle`, or the map was replaced.
-
-        """
-        with self._solving:
-            with self._lock:
-                if self._at_rest == self._version():
-                    return None
-                now, solver = self._snapshot(), self._options.solver
-            problem = now.problem()
-            if problem.settled or not problem.graph.n_poses:
-                self._at_rest = now.version
-                return None
-            check = self._asker(problem, lambda: self._make_way or stopped())
-            improvement = of_all(improve(as_one(problem), solver, budget, check), problem)
-            check()
-            self.adopt(improvement)
-        return improvement
-
-    def settle(self, stopped: Stopped = lambda: False) -> Improvement | None:
-        """
-        Judge all loops and solve to the end; None: there are no factors yet.
-
-        An update that is under way makes way.
-
-        Raises
-        ------
-        Interrupted : told to stop, or the map was replaced.
-
-        """
-        self._make_way = True
-        with self._solving:
-            self._make_way = False
-            with self._lock:
-                now, solver = self._snapshot(), self._options.solver
-            problem = now.problem()
-            if not len(problem.graph.between):
-                return None
-            check = self._asker(problem, stopped)
-            improvement = of_all(optimise(as_one(problem), solver, check), problem)
-            check()
-            self.adopt(improvement)
+    def _on_end(self) -> None:
+        super()._on_end()
         self._wake()
-        return improvement
-
-    def _asker(self, problem: Problem, stopped: Stopped) -> Callable[[], None]:
-        def check() -> None:
-            if stopped() or problem.map != self._map:
-                raise Interrupted
-
-        return check
-
-    def adopt(self, improvement: Improvement) -> None:
-        """
-        Take over what was made of a snapshot; keyframes since then follow along.
-
-        What was made when loops were judged otherwise is left.
-
-        Raises
-        ------
-        Interrupted : it was made for a map that is there no more.
-        ArithmeticError : it is not finite; nothing is taken over.
-
-        """
-        with self._lock:
-            if improvement.map != self._map:
-                raise Interrupted
-            if improvement.robust == self._options.robust.enabled:
-                before = self._map_to_odom_now()
-                self._optimised = improvement.taken_over(
-                    self._optimised, self._options.solver.outer_tolerance)
-                self._map_to_odom = None
-                self.moved = before, self._map_to_odom_now()
-                self._changes += 1
-            self.maps += 1
-
-    def alone(self, work: Callable[[], bool]) -> bool:
-        """Do some work while nothing is being solved, nor begins to be; return what it returns."""
-        with self._solving:
-            return work()
-
-    def _map_to_odom_now(self) -> Array:
-        """Return the odometry frame seen from the map: what the last optimised keyframe says."""
-        poses, manifold, offset = self._optimised.poses, self.manifold, self._builder.offset
-        last = len(poses) - 1
-        if last < 0:
-            return manifold.identity(1)
-        # Asked for with every sample: worked out when an update or a new offset changes it.
-        if self._map_to_odom is None or self._map_to_odom[0] is not offset:
-            odometry = self._builder.odometry[last : last + 1]
-            to_kept = manifold.compose(poses[last:], manifold.inverse(odometry))
-            self._map_to_odom = offset, manifold.compose(to_kept, offset)
-        return self._map_to_odom[1]
 
     def _wake(self) -> None:
         """Tell the background that there may be something to do."""

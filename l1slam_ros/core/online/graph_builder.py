@@ -163,6 +163,7 @@ class GraphBuilder:
         if not self._glued and point.stamp <= self._track.last_stamp:
             gap = f'odometry stamp {point.stamp} ns is before the end of the map'
         if gap:
+            self.add_due_loops()  # what came before is of that time
             cause, said = _SAID[on_gap]
             self.notes.warn(cause, f'{gap}; {said}')
         if point.anew or (gap and on_gap == 'reset'):
@@ -179,7 +180,6 @@ class GraphBuilder:
         if self._moved:
             pose = manifold.compose(self.offset, pose)
         if gap and on_gap == 'new_segment':
-            self.add_due_loops()
             if self._track.begin_part(point.stamp):
                 self._loops.waiting.begin_anew(self._track.time)
             self._track.append(point.stamp, pose)

@@ -15,6 +15,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.online.snapshot import Problem
 from l1slam_ros.core.online.update import Improvement
+from l1slam_ros.core.robust.judgement import Judgement
 
 # [rad] Of the heading of a part: that it is not known. Its place is, to the extent of the map.
 _HEADING = 1.0
@@ -39,23 +40,31 @@ def as_one(problem: Problem) -> Problem:
 
 def of_all(improvement: Improvement, problem: Problem) -> Improvement:
     """Return what was made of `as_one(problem)`, for the factors of the problem."""
+    d = problem.graph.manifold.TANGENT_SIZE
+    dual = _spread(improvement.dual.reshape(-1, d), problem, 0.0).ravel()
+    return replace(improvement, dual=dual,
+                   judgement=judgement_of_all(improvement.judgement, problem))
+
+
+def judgement_of_all(judgement: Judgement, problem: Problem) -> Judgement:
+    """Return a judgement of the factors of `as_one(problem)`, for those of the problem."""
     rows = _rows(problem.graph)
-    if not len(problem.gaps) and rows is None:
-        return improvement
-    m, d = len(problem.graph.between), problem.graph.manifold.TANGENT_SIZE
-    rows, made = np.arange(m) if rows is None else rows, improvement.judgement
-    count = len(rows)
-
-    def spread(values: np.ndarray, rest: float) -> np.ndarray:
-        whole = np.full((m, *values.shape[1:]), rest, values.dtype)
-        whole[rows] = values[:count]
-        return whole
-
+    slips = judgement.slips[judgement.slips < len(problem.graph.between)]
     return replace(
-        improvement, dual=spread(improvement.dual.reshape(-1, d), 0.0).ravel(),
-        judgement=replace(
-            made, accepted=spread(made.accepted, False), suspect=spread(made.suspect, False),
-            sigmas=spread(made.sigmas, np.nan), slips=rows[made.slips[made.slips < count]]))
+        judgement, accepted=_spread(judgement.accepted, problem, False),
+        suspect=_spread(judgement.suspect, problem, False),
+        sigmas=_spread(judgement.sigmas, problem, np.nan),
+        slips=slips if rows is None else rows[slips[slips < len(rows)]])
+
+
+def _spread(values: np.ndarray, problem: Problem, rest: float) -> np.ndarray:
+    """Return values of the factors of `as_one(problem)` as those of the problem's."""
+    rows, m = _rows(problem.graph), len(problem.graph.between)
+    if rows is None:
+        return values[:m]
+    whole = np.full((m, *values.shape[1:]), rest, values.dtype)
+    whole[rows] = values[:len(rows)]
+    return whole
 
 
 def _rows(graph: FactorGraph) -> Indices | None:

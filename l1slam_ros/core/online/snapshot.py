@@ -8,6 +8,7 @@ problem of the next update first of all.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.incremental.growing_map import View
 from l1slam_ros.core.online.loop_states import (
     ACCEPTED,
     EXPIRED,
@@ -26,6 +28,7 @@ from l1slam_ros.core.online.loop_states import (
 )
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.optimality import Status
+from l1slam_ros.core.solvers.solve import AUTO, PRIMAL_DUAL, Choice, choose
 
 # A large map gets but one linearisation into an update, and never meets a test that takes two of
 # them. It is at rest when so many updates in a row lowered the cost by less than is looked for.
@@ -38,19 +41,41 @@ class Problem:
     A snapshot to improve: graph, poses (n, p), dual (rows,) and the cost the last update left.
 
     map : number of the map that it is of, other after `Backend.reset` and `Backend.restore`;
-    gaps : (g,) keyframes that no odometry joins to the ones before; judgement : of all factors;
-    robust : loops may be doubted; settled : nothing has come since an update that converged.
+    gaps : (g,) keyframes that no odometry joins to the ones before; starts : poses to start from,
+    `poses` the first; judgement : of all factors; robust : loops may be doubted; settled : nothing
+    has come since an update that converged; may_be_far : there is news that no front knows.
     """
 
     map: int
     graph: FactorGraph
     gaps: Indices
-    poses: Array
+    starts: list[Array]
     dual: Array
     judgement: Judgement
     robust: bool
     last_cost: float
     settled: bool
+    may_be_far: bool
+
+    @property
+    def poses(self) -> Array:
+        """Where the keyframes are, (n, p)."""
+        return self.starts[0]
+
+    @cached_property
+    def part(self) -> FactorGraph:
+        """The factors that are believed."""
+        return self.graph.subset(self.judgement.accepted)
+
+    @cached_property
+    def choice(self) -> Choice:
+        """What to solve them by."""
+        return choose(AUTO, self.part)
+
+    @property
+    def is_sparse(self) -> bool:
+        """Whether they are solved by factorisations."""
+        return self.choice.solver != PRIMAL_DUAL
 
 
 @dataclass(frozen=True)
@@ -91,10 +116,10 @@ class Growth:
 @dataclass(frozen=True)
 class Optimised:
     """
-    What updates have made so far, of the first keyframes and factors.
+    What has been made so far, of the first keyframes and factors.
 
-    poses : (k, p); dual : (rows,); judgement, cost and status : as the last update left them;
-    quiet_updates : how many in a row hardly lowered the cost.
+    poses : (k, p); dual : (rows,); cost, status : as the last map left them; judgement : of the
+    first factors, made beside the map; quiet_updates : how many in a row hardly lowered the cost.
     """
 
     poses: Array
@@ -118,13 +143,6 @@ class Optimised:
     def unjudged(self) -> 'Optimised':
         """Return the same where nothing is known of any loop."""
         return replace(self, judgement=Judgement.nothing(), status=Status.OUT_OF_TIME)
-
-    def of_all(self, problem: Problem) -> 'Optimised':
-        """Return the same of all keyframes and factors that a problem has."""
-        if len(self.poses) == len(problem.poses) and len(self.dual) == len(problem.dual):
-            return self
-        return replace(self, poses=problem.poses, dual=problem.dual, judgement=problem.judgement,
-                       status=Status.OUT_OF_TIME, quiet_updates=0)
 
 
 @dataclass(frozen=True)
@@ -162,7 +180,11 @@ class Snapshot:
 
     map : its number; version : see `Backend.version`; graph : the factors so far; gaps : as in
     `Problem`; stamps (n,) [ns] and odometry (n, p) of the keyframes; map_to_odom : (1, p);
-    loop_rows, loop_stamps : see `GraphBuilder`; robust : loops may be doubted.
+    loop_rows, loop_stamps : see `GraphBuilder`; robust : loops may be doubted; looks : (k, 3) what
+    the front says of the factors after those that are judged: accepted, suspect, sigmas;
+    all_judged : no loop is among them; judged : (k, p) the L2 map of the judgement, None: there is
+    none; stale : the map is not of the factors that are accepted; views : the L1 and L2 map of the
+    front, where there is one.
     """
 
     map: int
@@ -176,36 +198,67 @@ class Snapshot:
     loop_stamps: tuple[Indices, Indices, Indices]
     optimised: Optimised
     robust: bool
+    looks: Array
+    all_judged: bool
+    judged: Array | None
+    stale: bool
+    views: tuple[View, ...]
 
-    @property
+    @cached_property
     def poses(self) -> Array:
         """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
-        optimised, manifold = self.optimised.poses, self.graph.manifold
-        known = len(optimised)
-        new = self.odometry[known:]
+        return self._followed(self.views[0].poses if self.views else self.optimised.poses,
+                              self.odometry)
+
+    def _followed(self, poses: Array, others: Array) -> Array:
+        """Return poses (k, p) and all keyframes after them, as they follow in others (n, p)."""
+        manifold, known = self.graph.manifold, len(poses)
+        new = others[known:]
         if known and len(new):
-            start = np.broadcast_to(self.odometry[known - 1], new.shape)
-            last = np.broadcast_to(optimised[-1], new.shape)
+            start = np.broadcast_to(others[known - 1], new.shape)
+            last = np.broadcast_to(poses[-1], new.shape)
             new = manifold.compose(last, manifold.between(start, new))
-        return np.concatenate((optimised, new))
+        return np.concatenate((poses, new))
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """What is believed of all factors."""
+        last = self.optimised.judgement
+        accepted, suspect, sigmas = self.looks.T
+        looked = replace(
+            last, accepted=np.concatenate((last.accepted, accepted > 0)),
+            suspect=np.concatenate((last.suspect, suspect > 0)),
+            sigmas=np.concatenate((last.sigmas, sigmas)),
+            settled=not self.robust or (last.settled and self.all_judged))
+        return looked.extended(self.graph, self.robust)
 
     def problem(self) -> Problem:
         """Return what an update begins with: the graph, and the warm start for all of it."""
         last, rows = self.optimised, len(self.graph.between) * self.graph.manifold.TANGENT_SIZE
         # Rows are only ever appended, so the dual of the old ones stays; new ones start at zero.
         dual = np.concatenate((last.dual, np.zeros(rows - len(last.dual))))
-        judgement = last.judgement.extended(self.graph, self.robust)
+        starts = [self.poses]
+        starts += [self._followed(view.poses, self.poses) for view in self.views[1:]]
+        if self.judged is not None and self.stale:
+            # After a loop has closed, the L2 map of the judgement is nearer.
+            starts.append(self._followed(self.judged, self.poses))
         grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
-        told = grown or not np.array_equal(judgement.accepted, last.judgement.accepted)
-        settled = not told and judgement.settled and last.at_rest
-        return Problem(self.map, self.graph, self.gaps, self.poses, dual, judgement, self.robust,
-                       last.cost, settled)
+        settled = not (grown or self.stale) and self.judgement.settled and last.at_rest
+        return Problem(self.map, self.graph, self.gaps, starts, dual, self.judgement, self.robust,
+                       last.cost, settled, self.stale or not self.views)
+
+    def known(self) -> Optimised:
+        """Return what was made, of all keyframes and factors that there are."""
+        problem, last = self.problem(), self.optimised
+        same = len(last.poses) == len(problem.poses) and len(last.dual) == len(problem.dual)
+        return replace(last, poses=problem.poses, dual=problem.dual, judgement=problem.judgement,
+                       status=last.status if same else Status.OUT_OF_TIME,
+                       quiet_updates=last.quiet_updates if same else 0)
 
     def loop_states(self) -> LoopStates:
         """Return what has become of each loop, those of the graph first, in its order."""
         in_graph, waiting, expired = self.loop_stamps
-        judgement = self.optimised.judgement.extended(self.graph, self.robust)
-        rows = self.loop_rows
+        judgement, rows = self.judgement, self.loop_rows
         state = np.where(judgement.accepted[rows], ACCEPTED,
                          np.where(judgement.suspect[rows], SUSPECT, REJECTED))
         others = np.repeat([WAITING, EXPIRED], [len(waiting), len(expired)])

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What an update computes: a better map, of a snapshot of the back end.
+What is computed behind an update: a better map, of a snapshot of the back end.
 
 In: a `Problem`. Out: an `Improvement`, to be adopted. Nothing here knows of threads or locks; who
 may have to stop the work hands in a check.
@@ -12,15 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.world_frame import placed
+from l1slam_ros.core.incremental.front import Front, Gate
 from l1slam_ros.core.online.snapshot import Optimised, Problem
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.robust.robust_map import minimise_robustly
-from l1slam_ros.core.robust.running import judge
-from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.solvers.nonlinear import (
     OptimiserOptions,
     Solution,
@@ -28,10 +29,15 @@ from l1slam_ros.core.solvers.nonlinear import (
     is_far,
     minimise,
 )
-from l1slam_ros.core.solvers.optimality import Status, l1_cost, smoothing
+from l1slam_ros.core.solvers.optimality import Status, l1_cost, l2_cost, smoothing
 from l1slam_ros.core.solvers.reweighting import reweighted_step
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
+
+# Steps of Gauss-Newton that the gate's map gets each time it is made.
+_L2_STEPS = 4
+# A map whose cost fell by more than this part is worth another round at once.
+_FALLS = 1e-3
 
 # Called on the way, often; raises where the work shall stop.
 Check = Callable[[], None]
@@ -42,7 +48,7 @@ class Improvement:
     """
     What one update did: new poses (n, p), dual (rows,) and judgement, and the account of it.
 
-    map, robust : of the `Problem`; cost_before, cost : L1 cost of the accepted factors;
+    map : of the `Problem`; cost_before, cost : L1 cost of the accepted factors;
     reweighted_steps : factorisations for the long-range part; outer, inner : iterations of
     Algorithm 4; gap : of its last linear problem; seconds : all of it.
     """
@@ -51,7 +57,6 @@ class Improvement:
     poses: Array
     dual: Array
     judgement: Judgement
-    robust: bool
     cost_before: float
     cost: float
     status: Status
@@ -73,41 +78,47 @@ class Improvement:
         for name in ('poses', 'dual', 'cost'):
             if not np.isfinite(getattr(self, name)).all():
                 raise ArithmeticError(f'the {name} of a new map is not finite; the map stays')
-        quiet = (self.judgement.settled and len(self.dual) == len(before.dual)
-                 and self.cost_before - self.cost <= tolerance * self.cost)
-        return Optimised(self.poses, self.dual, self.judgement, self.cost, self.status,
+        same = len(self.dual) == len(before.dual)
+        quiet = same and self.cost_before - self.cost <= tolerance * self.cost
+        return Optimised(self.poses, self.dual, before.judgement, self.cost, self.status,
                          before.quiet_updates + 1 if quiet else 0)
+
+    @property
+    def falls(self) -> bool:
+        """Whether another round at once is worth it."""
+        return (self.status not in (Status.CONVERGED, Status.STALLED)
+                and self.cost_before - self.cost > _FALLS * self.cost)
 
 
 def improve(problem: Problem, options: OptimiserOptions, budget: float,
             check: Check = lambda: None) -> Improvement:
     """
-    Judge the loops that have come and lower the L1 cost of a snapshot, for about `budget` seconds.
+    Lower the L1 cost of what is believed of a snapshot, for about `budget` seconds.
 
-    While the cost is far above what the last update left (a loop has closed), reweighted least
-    squares steps carry the long-range part: one factorisation bends the whole chain, where a
-    first-order method moves it a few keyframes per iteration. Then, always, Algorithm 4 from the
-    kept dual.
+    With an infinite budget to the optimum that the poses lead to, where there is a factor for it.
+    Where no front has, and the cost is far above what the last map left (a loop has closed),
+    reweighted least squares steps carry the long-range part: one factorisation bends the whole
+    chain, where a first-order method moves it a few keyframes per iteration. Then, always,
+    Algorithm 4 from the kept dual.
     """
     start = time.monotonic()
     deadline = start + budget
-    judgement, starts = problem.judgement, [problem.poses]
-    if not judgement.settled:
-        judgement, judged = judge(problem.graph, problem.poses, judgement, deadline, check)
-        # After a loop has closed, the L2 map of the judgement is nearer.
-        starts.append(judged)
-    check()
-    graph = problem.graph.subset(judgement.accepted)
+    graph = problem.part
+    if budget == np.inf and problem.is_sparse:
+        before = l1_cost(whitened_residual(graph, problem.poses))
+        solution = minimise_by(problem.choice, graph, problem.poses, options,
+                               lambda *_: check())[0]
+        return _improvement(solution, problem, problem.judgement, before, 0, start)
+    starts = problem.starts
     if graph.between.is_absolute.any():
-        # Or the map has not come to the world yet.
-        starts.append(placed(graph, problem.poses))
-    size = graph.manifold.TANGENT_SIZE
-    dual = problem.dual.reshape(-1, size)[judgement.accepted].ravel()
+        # The map may not have come to the world yet.
+        starts = [*starts, placed(graph, problem.poses)]
     costs = [l1_cost(whitened_residual(graph, poses)) for poses in starts]
     before, cost = costs[0], min(costs)
     poses = starts[costs.index(cost)]
-    steps, far = 0, is_far(cost, problem.last_cost)
-    cholesky = cholesky_of(graph) if far else None
+    dual = _dual_of(problem, poses)
+    steps, far = 0, problem.may_be_far and is_far(cost, problem.last_cost)
+    cholesky = problem.choice.cholesky if far else None
     while cholesky and far and (not steps or time.monotonic() < deadline):
         check()
         system = linearise(graph, poses)
@@ -117,7 +128,43 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
         steps += 1
         far = is_far(previous, cost)
     solution = minimise(graph, poses, options, cholesky, dual, deadline, lambda *_: check())
-    return _improvement(solution, problem, judgement, before, steps, start)
+    return _improvement(solution, problem, problem.judgement, before, steps, start)
+
+
+def _dual_of(problem: Problem, poses: Array) -> Array:
+    """Return the dual to start from, (rows,): what is kept, else what the residual asks for."""
+    e = whitened_residual(problem.part, poses)
+    dual = problem.dual.reshape(-1, problem.graph.manifold.TANGENT_SIZE)
+    kept = dual[problem.judgement.accepted]
+    asked = (e / np.hypot(e, smoothing(e))).reshape(kept.shape)
+    known = kept.any(axis=1, keepdims=True)
+    return np.where(known, kept, asked).ravel()
+
+
+def front_of(problem: Problem, poses: Array, rows: int,
+             check: Check = lambda: None) -> Front | None:
+    """
+    Return the map of a snapshot, poses (n, p), for the factors from `rows` on to move.
+
+    None: its factor would take longer than what it is for, or some keyframe is not tied to others.
+    """
+    judgement, choice, part = problem.judgement, problem.choice, problem.part
+    if not problem.is_sparse or choice.cholesky is None:
+        return None
+    loops = ~problem.graph.between.is_odometry
+    believed, kinds = loops & judgement.accepted, loops[judgement.accepted].astype(np.int64)
+    gate = Gate.of(part.manifold, poses, judgement.variance, int(believed.sum()),
+                   int((loops & ~believed).sum()))
+    found = part.subset(np.arange(len(kinds)), judgement.variance[kinds])
+    starts = [poses, *problem.starts[1:]]
+    nearest = min(starts, key=lambda start: l2_cost(whitened_residual(found, start)))
+    # Until chi2 is within one of its minimum: far from it the gate would see ghosts.
+    enough = LeastSquaresOptions(_L2_STEPS, 1 / max(len(part.between), 1))
+    try:
+        l2_poses = minimise_l2(found, nearest, enough, choice.cholesky, lambda *_: check()).poses
+        return Front(part, poses, l2_poses, choice.cholesky, kinds, gate, rows)
+    except GraphError:
+        return None
 
 
 def optimise(problem: Problem, options: OptimiserOptions,
@@ -155,6 +202,6 @@ def _improvement(solution: Solution, problem: Problem, judgement: Judgement, bef
     # The rows of what is not believed have no dual yet.
     dual = np.zeros((len(accepted), problem.graph.manifold.TANGENT_SIZE))
     dual[accepted] = solution.dual.reshape(-1, dual.shape[1])
-    return Improvement(problem.map, solution.poses, dual.ravel(), judgement, problem.robust,
+    return Improvement(problem.map, solution.poses, dual.ravel(), judgement,
                        before, solution.cost, solution.status, steps, solution.outer_iterations,
                        solution.inner_iterations, solution.gap, time.monotonic() - start)

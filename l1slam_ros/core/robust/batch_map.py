@@ -16,9 +16,10 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.graph.parts import bridged, odometry_gaps
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import Report as OnRound
-from l1slam_ros.core.robust.inspection import initial_poses, odometry_gaps, require_connected
+from l1slam_ros.core.robust.inspection import initial_poses, require_connected
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.robust.robust_map import RobustMap, minimise_robustly
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
@@ -26,6 +27,9 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
 from l1slam_ros.core.solvers.optimality import norm_of
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.solvers.solve import AUTO, Choice, choose, minimise_by
+
+# A graph with more gaps than this part of its steps is none of a robot that kept its odometry.
+_MOST_GAPS = 0.1
 
 
 @dataclass(frozen=True)
@@ -84,15 +88,15 @@ def solve(
 
     Raises
     ------
-    GraphError : the graph is not connected, has no such start, or numbers beyond all measure; or
-        its loops cannot be judged and `wish.robust` is True.
+    GraphError : the graph has no such start, or numbers beyond all measure; or it is not connected
+        and loops are not to be judged.
 
     """
     ids = np.arange(graph.n_poses) if ids is None else ids
     _require_start(graph, stored, wish, ids)
     seed = None
     initial = (odometry_poses(graph) if wish.start == 'odometry'
-               else initial_poses(graph, stored, ids))
+               else initial_poses(graph if wish.robust is False else bridged(graph), stored, ids))
     minimiser = _Minimiser(wish, report)
     began = time.perf_counter()
     robust, unjudged = _robust_map(graph, wish, minimiser, on_round, ids)
@@ -118,15 +122,13 @@ def _robust_map(
     graph: FactorGraph, wish: Wish, minimiser: '_Minimiser', on_round: OnRound, ids: Indices
 ) -> tuple[RobustMap | None, str]:
     """Return the robust map; where nobody insists on one and there is none, None and why."""
+    gaps, steps = odometry_gaps(graph), graph.n_poses - 1
+    if wish.robust is None and len(gaps) > _MOST_GAPS * steps:
+        return None, (f'{len(gaps):,} of {steps:,} steps have no odometry, the first one from '
+                      f'{ids[gaps[0]]} to {ids[gaps[0] + 1]}, so there is no chain to judge by')
     if wish.robust is False:
         return None, ''
-    try:
-        _require_chain(graph, ids, 'so no chain of odometry to judge loops by')
-        return minimise_robustly(graph, minimiser.minimise, on_round), ''
-    except GraphError as error:
-        if wish.robust:
-            raise
-        return None, str(error)
+    return minimise_robustly(graph, minimiser.minimise, on_round), ''
 
 
 class _Minimiser:
@@ -162,7 +164,8 @@ def cost_function(graph: FactorGraph, wish: Wish) -> Callable[[Array], float]:
 
 def _require_start(graph: FactorGraph, stored: Array | None, wish: Wish, ids: Indices) -> None:
     """Refuse, before any work is done, a graph that is not connected or has no such start."""
-    require_connected(graph, ids)
+    if wish.robust is False:
+        require_connected(graph, ids)
     if wish.start == 'file' and stored is None:
         raise GraphError('the input stores no poses to start from; expected --start seed or '
                          'odometry')

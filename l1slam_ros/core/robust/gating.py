@@ -10,7 +10,7 @@ false ones is assumed.
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.robust.innovation import Innovations
+from l1slam_ros.core.robust.innovation import Innovations, log_likelihood_ratio
 
 # Of factors that are believed at one time, any is false with at most this probability.
 DOUBT = 0.01
@@ -18,6 +18,13 @@ DOUBT = 0.01
 _BEST_PREDICTED = 1000
 _ROUNDS = 100
 _SAME = 1e-3
+# How much more the loops' variance may be off than the odometry's, as said or else; another ratio
+# has to make each loop likelier by so much, ln. And the least scale to start from.
+_RATIOS = (1.0, *(10.0**power for power in range(-6, 7) if power))
+_RATIO_COSTS = 0.25
+_LEAST_START = 1e-9
+# A factor of ten that files are off has to be worth so much, ln: a few lies are no measure.
+_DECADE_COSTS = 5.0
 
 
 def log_odds_of_false(log_ratio: Array, others: int, believed: int = 0) -> float:
@@ -53,35 +60,44 @@ def believable(log_ratio: Array, log_odds: float) -> Indices:
     return believed
 
 
-def common_scale(found: Innovations) -> float:
+def noise_variance(found: Innovations) -> Array:
     """
-    Return by what the variances that factors state are to be multiplied, as one number.
+    Return by what the variances that odometry and loops state are to be multiplied, (2,).
 
-    The true ones have innovations of covariance `scale C`, the false ones any: expectation and
-    maximisation over the best predicted, whose fit tells most.
+    With `scale` of the odometry and `ratio scale` of the loops, true innovations have the
+    covariance `scale (spread + ratio I)`; the false ones any. Expectation and maximisation, from
+    several ratios and scales, of which the likeliest wins. Only the best predicted loops are
+    asked: their fit tells most.
     """
+    from l1slam_ros.core.kernels.prediction import normalise
+
     best = np.argsort(found.log_det, kind='stable')[:_BEST_PREDICTED]
-    k, square, scale = found.system.block_size, found.square[best], 1.0
-    share = found.freedom[best] / k
+    k, log_claim, freedom = found.system.block_size, found.log_claim[best], found.freedom[best]
+    residual, spread = -found.system.b.reshape(-1, k)[best], found.spread[best]
+    fits: list[tuple[float, float, float]] = []
+    for ratio in _RATIOS:
+        square, log_det = normalise(spread + ratio * np.eye(k), residual)
+        log_det -= (k - freedom) * np.log(ratio)  # what says nothing has no noise
+        for start in (1.0, *(np.quantile(square, (0.1, 0.5)) / k).tolist()):
+            likelihood, scale = _fitted_scale(square, log_det, log_claim, freedom, start)
+            costs = _RATIO_COSTS * len(best) * (ratio != 1) + _DECADE_COSTS * abs(np.log10(scale))
+            fits.append((likelihood - costs, scale, ratio))
+    _, scale, ratio = max(fits)
+    return np.array([scale, ratio * scale])
+
+
+def _fitted_scale(square: Array, log_det: Array, log_claim: Array, freedom: Indices, start: float
+                  ) -> tuple[float, float]:
+    """Return the log likelihood of the best scale of C near a start, and that scale."""
+    scale = start = max(start, _LEAST_START)
     for _ in range(_ROUNDS):
-        log_ratio = found.log_ratio(scale)[best]
-        true = probability(log_ratio - log_odds_of_false(log_ratio, 0))
-        # The one pseudo-factor of scale 1 is for crowds without a true one.
-        before, scale = scale, float((true @ square + k) / (k * ((true * share).sum() + 1)))
+        log_ratio = log_likelihood_ratio(square / scale, log_det + freedom * np.log(scale),
+                                         log_claim, freedom)
+        odds = log_odds_of_false(log_ratio, 0)
+        true = probability(log_ratio - odds)
+        # The one pseudo-factor at the start is for crowds without a true one.
+        before, scale = scale, float((true @ square + start) / (true @ freedom + 1))
         if abs(scale / before - 1) < _SAME:
             break
-    return scale
-
-
-def one_of_each_group(i: Indices, j: Indices, apart: int) -> Indices:
-    """
-    Return factors (i, j) so that no two join nearly the same places; earlier ones first, (k,).
-
-    apart : least sum of the distances, in keyframes, between their two ends
-    """
-    rest, chosen = np.arange(len(i)), []
-    while len(rest):
-        head = rest[0]
-        chosen.append(head)
-        rest = rest[np.abs(i[rest] - i[head]) + np.abs(j[rest] - j[head]) > apart]
-    return np.array(chosen, np.int64)
+    likelihood = np.logaddexp(log_ratio - odds, 0.0).sum() - len(square) * np.logaddexp(0, -odds)
+    return float(likelihood), scale

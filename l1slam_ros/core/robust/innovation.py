@@ -123,26 +123,22 @@ class Innovations:
     """
     Factors against a posterior that does not know them.
 
-    system : their linearisation, b minus the residual; square : (m,) the squared residual in units
-    of its covariance C; log_det : (m,) of C; log_claim : (m,) of the volume of residuals that a
-    false factor could have; freedom : (m,) of the residual.
+    system : their linearisation, b minus the residual; spread : (m, k, k) covariance that the map
+    adds to the residual; square : (m,) the squared residual in units of its covariance
+    C = I + spread; log_det : (m,) of C; log_claim : (m,) of the volume of residuals that a false
+    factor could have; freedom : (m,) of the residual.
     """
 
     system: LinearSystem
+    spread: Array
     square: Array
     log_det: Array
     log_claim: Array
     freedom: Indices
 
-    def log_ratio(self, scale: float = 1.0) -> Array:
-        """
-        Return how much more probable each residual is if its factor is true, (m,) logarithms.
-
-        scale : of C; see `log_likelihood_ratio`
-        """
-        return log_likelihood_ratio(
-            self.square / scale, self.log_det + self.freedom * np.log(scale), self.log_claim,
-            self.freedom)
+    def log_ratio(self) -> Array:
+        """Return how much likelier each residual is if its factor is true, (m,) logarithms."""
+        return log_likelihood_ratio(self.square, self.log_det, self.log_claim, self.freedom)
 
     def joint(self, posterior: Posterior, first: Indices, second: Indices) -> tuple[Array, Array]:
         """
@@ -177,12 +173,12 @@ def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
 
     system, factors = linearise(graph, poses, fixed=posterior.fixed), graph.between
     k = system.block_size
-    covariance = prediction.spreads(system.keyframe, system.blocks, posterior.samples)
-    covariance += np.eye(k)
+    spread = prediction.spreads(system.keyframe, system.blocks, posterior.samples)
     absolute = np.flatnonzero(factors.is_absolute)
-    covariance[absolute] += _sagittas(graph.subset(absolute), posterior)
-    square, log_det = prediction.normalise(covariance, -system.b.reshape(-1, k))
-    return Innovations(system, square, log_det, log_claims(factors, log_volume), factors.freedom)
+    spread[absolute] += _sagittas(graph.subset(absolute), posterior)
+    square, log_det = prediction.normalise(spread + np.eye(k), -system.b.reshape(-1, k))
+    return Innovations(system, spread, square, log_det, log_claims(factors, log_volume),
+                       factors.freedom)
 
 
 def _sagittas(graph: FactorGraph, posterior: Posterior) -> Array:

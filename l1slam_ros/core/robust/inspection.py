@@ -21,6 +21,7 @@ from l1slam_ros.core.graph.linear_system import (
     keyframes_of,
     step_poses,
 )
+from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.graph.spanning_tree import odometry_poses, pair_key, tree_poses
 from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.solvers.optimality import l1_cost, l2_cost
@@ -66,14 +67,6 @@ def connected_parts(graph: FactorGraph) -> list[Indices]:
     labels = component_labels(graph)
     ends = np.cumsum(np.bincount(labels))[:-1]
     return np.split(np.argsort(labels, kind='stable'), ends)
-
-
-def odometry_gaps(graph: FactorGraph) -> Indices:
-    """Return the keyframes k without a factor between k and k + 1, (g,)."""
-    factors = graph.between
-    first = np.minimum(factors.i, factors.j)[factors.is_odometry]
-    gaps: Indices = np.setdiff1d(np.arange(graph.n_poses - 1), first)
-    return gaps
 
 
 @dataclass(frozen=True)

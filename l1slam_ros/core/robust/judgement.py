@@ -1,6 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is believed of the factors of a graph, by the batch solve and by a running back end."""
+"""
+What was found of the factors of a graph, and why its map is not to be relied on.
 
+In: the end of a robust solve, of all at once or while the map grows. Out: the judgement, with the
+reasons to doubt it, each with the keyframes where a person may look. What a person can do: vouch
+for a loop, strike one out, or state the noise as it is.
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,18 +15,28 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.robust.pairwise_consistency import ASKED, strongest_group
+from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.slips import SPANNING, jumping, refused, spanning, weakest_steps
 
-# Refused loops of several places agree with each other; hardly a loop is believed.
-INCONSISTENT, MOSTLY_REFUSED = 'inconsistent', 'mostly refused'
+# Most loops are refused; all that are accepted are of one place; refused loops of several places
+# agree on another map; an odometry factor may have slipped, and it was not believed.
+MOSTLY_REFUSED, ONE_PLACE, OTHER_MAP, SLIP = (
+    'mostly refused', 'one place', 'another map', 'a slip suspected')
+
+# Of fewer loops most may well be refused, and be of one place; most are more than half by some.
+_HANDFUL, _MOST = 5, 0.55
+# Refused loops that agree count if they are so many for each accepted one across.
+_AGAINST = 0.25
 
 
 @dataclass(frozen=True)
 class Doubt:
     """
-    Why a map is not to be relied on.
+    One reason why a map is not to be relied on.
 
-    kind : one of the two above; loops : how many speak against it; first, last : the keyframes
-    between which they do.
+    kind : one of the above; loops : how many it is about; first, last : the keyframes between
+    which they lie.
     """
 
     kind: str
@@ -38,8 +55,8 @@ class Judgement:
     as stated or larger if it was found so: the length of the residual, and where it is not
     accepted, of that over the uncertainty of the map, NaN before a loop was looked at; variance :
     (2,) of odometry and of loops as it was found, in units of what they state; slips : (k,) the
-    odometry factors that lie, not accepted; doubt : None where all is well; settled : no more is
-    to be found out from the factors that are there.
+    odometry factors that slipped, not accepted; doubts : reasons not to rely on the map; settled :
+    no more is to be found out from the factors that are there.
     """
 
     accepted: Mask
@@ -47,8 +64,13 @@ class Judgement:
     sigmas: Array
     variance: Array
     slips: Indices
-    doubt: Doubt | None = None
+    doubts: tuple[Doubt, ...] = ()
     settled: bool = True
+
+    @property
+    def doubt(self) -> Doubt | None:
+        """The first reason not to rely on the map; None where all is well."""
+        return self.doubts[0] if self.doubts else None
 
     @staticmethod
     def nothing() -> 'Judgement':
@@ -73,3 +95,79 @@ class Judgement:
         return replace(
             self, accepted=accepted, suspect=suspect, sigmas=sigmas,
             settled=not robust or (self.settled and not told and not suspect[known:].any()))
+
+
+def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
+                 settled: bool = True) -> Judgement:
+    """Return what a state says of the factors that were given."""
+    square, suspect = fits(growth)
+    size, slip = growth.size, growth.cut & ~growth.gap
+    accepted = growth.accepted & ~slip
+    return Judgement(accepted[:size], suspect[:size], np.sqrt(square[:size]), growth.variance,
+                     np.flatnonzero(slip[:size]), reasons, settled)
+
+
+def fits(growth: Growth) -> tuple[Array, Mask]:
+    """
+    Return how well each factor fits: a square (m,) of sigmas, and the loops that are suspect.
+
+    The square is that of the residual, and of what is not accepted, of the innovation. Suspect,
+    (m,) bool, is a loop that fits and yet was not accepted.
+    """
+    accepted, square = growth.accepted & ~growth.cut, np.zeros(len(growth.factors))
+    square[growth.accepted] = (growth.posterior.residual**2).sum(axis=1)
+    # While nothing ties the map to the world, nothing is known of what names it.
+    square[~accepted] = np.nan
+    outside = np.flatnonzero(~accepted & growth.may_be_predicted)
+    cut, growth.cut = growth.cut, np.zeros_like(growth.cut)
+    square[outside] = growth.innovations(outside).square
+    growth.cut = cut
+    far = square >= growth.gate(growth.factors.freedom)
+    return square, ~accepted & ~far & growth.is_loop
+
+
+def doubts(growth: Growth) -> tuple[Doubt, ...]:
+    """Return the reasons to doubt a map in which nothing more can be accepted; none: ()."""
+    loops = growth.is_loop[: growth.size]
+    left_out = np.flatnonzero(loops & ~growth.accepted[: growth.size])
+    accepted = np.flatnonzero(loops & growth.accepted[: growth.size])
+    reasons = []
+    if np.count_nonzero(loops) >= _HANDFUL and len(left_out) > _MOST * np.count_nonzero(loops):
+        reasons.append(_doubt(growth, MOSTLY_REFUSED, left_out))
+    if len(accepted) >= _HANDFUL and len(np.unique(growth.place[accepted])) == 1 and not (
+            growth.trusted[accepted].any()):
+        reasons.append(_doubt(growth, ONE_PLACE, accepted))
+    reasons += _other_map(growth)
+    reasons += [_doubt(growth, SLIP, rows) for rows in (*growth.suspected, *_ambiguous(growth))]
+    return tuple(reasons)
+
+
+def _other_map(growth: Growth) -> list[Doubt]:
+    """Return a doubt where refused loops of several places agree: they may be right."""
+    outside = refused(growth)
+    group = strongest_group(growth, outside)
+    if len(group.places) < SPANNING:
+        return []
+    step = weakest_steps(growth, group)[0]
+    across = growth.accepted & spanning(growth, step)
+    size = len(group.rows) * max(len(outside) / ASKED, 1.0)
+    # What is trusted is right, whatever else speaks against it.
+    if (growth.trusted & across).any() or size < _AGAINST * np.count_nonzero(across):
+        return []
+    return [_doubt(growth, OTHER_MAP, group.rows)]
+
+
+def _ambiguous(growth: Growth) -> Iterator[Indices]:
+    """Yield the loops across each slip that has a rival: a jump, and no loop ends in between."""
+    loops = np.flatnonzero(growth.is_loop & growth.accepted)
+    ends = np.unique((growth.low[loops], growth.high[loops]))
+    jumps = growth.low[jumping(growth)]
+    for slip in growth.low[np.flatnonzero(growth.cut & ~growth.gap)]:
+        place = np.searchsorted(ends, slip, side='right')
+        if (np.searchsorted(ends, jumps, side='right') == place).any():
+            yield loops[(growth.low[loops] <= slip) & (growth.high[loops] > slip)]
+
+
+def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
+    low, high = np.maximum(growth.low[rows], 0), growth.high[rows]
+    return Doubt(kind, len(rows), int(low.min()), int(high.max()))

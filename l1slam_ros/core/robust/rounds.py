@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The rounds of a robust solve: predict, believe, solve, doubt.
+The rounds of a robust solve: predict, gate, accept, solve.
 
-In: a graph and what is believed of it. Out: the same with more loops believed. See `batch`.
+In: a graph and what is accepted of it. Out: the same with more loops accepted. See `batch`.
 """
 
 import copy
@@ -15,16 +15,10 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, ends_in_time
 from l1slam_ros.core.graph.first_fixes import first_fixes
-from l1slam_ros.core.graph.linear_system import anchor, linearise, step_poses, whitened_residual
+from l1slam_ros.core.graph.parts import bridged, vague_odometry
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.robust.gating import (
-    DOUBT,
-    believable,
-    common_scale,
-    log_odds_of_false,
-    one_of_each_group,
-)
+from l1slam_ros.core.robust.gating import DOUBT, believable, log_odds_of_false, noise_variance
 from l1slam_ros.core.robust.innovation import (
     Innovations,
     Posterior,
@@ -34,11 +28,9 @@ from l1slam_ros.core.robust.innovation import (
     sample_posterior,
     sampled_quantile,
 )
-from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, cholesky_of
-from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.solvers.nonlinear import Report
-from l1slam_ros.core.solvers.optimality import l2_cost
-from l1slam_ros.core.solvers.reweighting import weighted_least_squares
+from l1slam_ros.core.robust.places import neighbours_agree, places
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import l2_map
 
 # The same samples each time: the answer is that of the graph, not of chance.
 _SEED = 2014
@@ -47,75 +39,91 @@ REFUSED = 1e-3
 _DROPPED = 2e-5
 # Probability that any true factor of a round is doubted for what the others say.
 _DOUBTED = 0.01
-# Gauss-Newton begins where chi2 is at most so many times what the noise makes of it.
-_FITS = 3
-# Steps of Gauss-Newton at most in one round.
-_STEPS = 60
 # A loop that was dropped that often is not tried again.
 _CHANCES = 2
 # What is measured of the noise counts against as many factors on which it was measured before.
 _KNOWN = 20
-# The noise is learnt to be no less than this part of the variance that is stated: factors that
-# fit exactly, as of a simulator, say of ever less that it is still too much. At a thirtieth of
-# the stated deviations the map has long stopped to change.
+# The noise is learnt to be no less than this part of the variance that was found first: factors
+# that fit exactly, as of a simulator, say of ever less that it is still too much.
 _LEAST_VARIANCE = 1e-3
+# While a map grows the noise that was found first is not known any more; but beyond this ratio of
+# odometry's and loops' weights are soon lost in rounding.
+_LEAST_RATIO = 1e-5
+# Noise that is so many times the variance that was found is measured anew before any loop is
+# dropped for it, by the median of chi2 over its freedom; by factors that others check at all.
+_NOISIER, _MEDIAN, _CHECKED = 3.0, 0.79, 0.01
 # While driving so many of the last absolute factors are looked at, with their neighbours.
 _LATEST = 50
+# What is stated counts in the end up to so many times the variance that was found.
+_WORD = 100.0
+# The variance of an odometry factor that was cut, in units of its own: loops alone decide.
+_CUT = 1e4
 # Pairs are formed of so many loops that fit best.
 _CANDIDATES = 200
-# [keyframes] Loops whose ends are nearer to each other, in sum, may be one and the same mistake.
-_APART = 40
 
 
 class Growth:
     """
     The state of a robust solve.
 
-    accepted, is_loop, trusted : (m,) bool of the between factors; low, high : (m,) the earlier and
-    the later keyframe of each; poses : (n, p) the L2 map of the accepted; posterior : of these;
-    variance : (2,) of odometry and loops in units of what they state; check : called before long
-    steps, raises where the work shall stop.
+    graph : the one given, and an odometry factor for each gap, which is cut; size : factors given;
+    accepted, is_loop, trusted : (m,) bool of the between factors; gap, cut : (m,) bool, odometry
+    that says nothing: where there is none, and there or where it slipped; low, high : (m,) the
+    earlier and the later keyframe of each;
+    place : (m,) see `places`; part : (n,) number of the part of each keyframe; poses : (n, p) the
+    L2 map of the accepted; posterior : of these; variance : (2,) of odometry and loops in units of
+    what they state; suspected : the loops across each slip that was suspected and not
+    believed; check : called before long steps, raises where the work shall stop.
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
         self._check = check
-        self.graph, self.factors, self.trusted = graph, graph.between, graph.between.trusted
+        self.graph, self.size = bridged(graph), len(graph.between)
+        self.factors, self.trusted = self.graph.between, self.graph.between.trusted
         self.rng = np.random.default_rng(_SEED)
-        self.low = np.minimum(self.factors.i, self.factors.j)
-        self.high = np.maximum(self.factors.i, self.factors.j)
+        self.low, self.high, self.forward = ends_in_time(self.graph)
         self.is_loop: Mask = ~self.factors.is_odometry
+        self.gap: Mask = vague_odometry(self.graph) | (np.arange(len(self.factors)) >= self.size)
+        self.cut: Mask = self.gap.copy()
         self.accepted: Mask = ~self.is_loop | self.trusted
-        self.poses = placed(self.graph.subset(self.accepted), odometry_poses(graph))
+        self.poses = placed(self.graph.subset(self.accepted), odometry_poses(self.graph))
+        self.part = np.zeros(graph.n_poses, np.int64)
         self.variance = np.ones(2)
-        self._least_variance = _LEAST_VARIANCE
+        self._floor, self._at_their_word = np.full(2, _LEAST_VARIANCE), False
         self.posterior: Posterior
+        self.suspected: list[Indices] = []
         self._drops = np.zeros(len(self.factors), np.int64)
 
     @cached_property
-    def forward(self) -> Array:
-        """The measurement of the later keyframe from the earlier one, (m, p)."""
-        return ends_in_time(self.graph)[2]
+    def _places(self) -> tuple[Indices, Array]:
+        return places(self.graph, odometry_poses(self.graph))
 
-    def slips(self) -> Indices:
-        """Return the odometry factors that lie, (k,)."""
-        return np.flatnonzero(~self.accepted & ~self.is_loop)
+    @property
+    def place(self) -> Indices:
+        """The number of the place of each factor, (m,)."""
+        return self._places[0]
 
     def begin(self) -> None:
-        """Solve for what is accepted, and learn from the loops how large their noise is."""
+        """Solve for what is accepted, and learn from the loops how large the noise is."""
         self._tie_to_world()
-        self.settle()
-        rows = self.undecided_loops()
+        self.solve()
+        rows = self.undecided()
+        rows = rows[~self.factors.is_absolute[rows]]
         if len(rows):
-            self._scale_variance(common_scale(self.innovations(rows)))
-            self.settle()
+            self.variance = self.variance * noise_variance(self.innovations(rows))
+            self._floor = _LEAST_VARIANCE * self.variance
+            self.solve()
 
     def resume(self, poses: Array, accepted: Mask, variance: Array) -> None:
         """Go on from an earlier state: poses (n, p), accepted (m,), variance (2,)."""
         self.poses, self.variance = poses, variance.copy()
-        self.accepted = accepted | self.trusted
+        self._floor = np.maximum(_LEAST_RATIO * variance.max(), _LEAST_RATIO**2)
+        self.accepted[: self.size] = accepted | self.trusted[: self.size]
+        self.cut |= ~self.accepted & ~self.is_loop
+        self.accepted |= self.cut
         self._tie_to_world(_LATEST)
         if (self.accepted & self.is_loop).any():
-            self.settle()
+            self.solve()
         else:
             self.begin()
 
@@ -145,69 +153,106 @@ class Growth:
             elif len(rows) > count:
                 self.accepted &= ~absolute | self.trusted
                 self.accepted[rows] = True
-                self.variance[0] = max(variance, _LEAST_VARIANCE)
-        self.poses = placed(self.graph.subset(self.accepted), self.poses)
+                self.variance[0] = max(variance, _LEAST_RATIO)
+        # A part that no other factor joins is where most of its own absolute factors say.
+        placing = (self.accepted | absolute) & ~self.cut if self.cut.any() else self.accepted
+        self.poses = placed(self.graph.subset(placing), self.poses)
 
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
         clone = copy.copy(self)
         clone.accepted, clone._drops = self.accepted.copy(), self._drops.copy()
+        clone.cut, clone.variance = self.cut.copy(), self.variance.copy()
         return clone
 
-    def part(self, rows: Indices) -> FactorGraph:
+    def subgraph(self, rows: Indices) -> FactorGraph:
         """Return the graph of some factors, with the noise as it was found."""
         self._check()  # with this, each long step begins
-        variance = np.maximum(self.variance, self._least_variance)
-        return self.graph.subset(rows, np.where(
-            self.factors.is_absolute[rows], 1.0, variance[self.is_loop[rows].astype(np.int64)]))
+        noise = self.variance_at_their_word() if self._at_their_word else self.variance
+        variance = np.where(self.factors.is_absolute[rows], 1.0,
+                            noise[self.is_loop[rows].astype(np.int64)])
+        cut = self.cut[rows]
+        if not cut.any():
+            return self.graph.subset(rows, variance)
+        # Where loops hold both sides, the odometry between them hardly matters; where nothing
+        # does, it is all there is. Either way it says that the keyframes are where they are.
+        low, high = self.factors.i[rows[cut]], self.factors.j[rows[cut]]
+        variance[cut] *= np.where(self.part[low] == self.part[high], _CUT, 1.0)
+        subgraph = self.graph.subset(rows, variance)
+        subgraph.between.measurement[cut] = self.graph.manifold.between(
+            self.poses[low], self.poses[high])
+        return subgraph
+
+    def variance_at_their_word(self) -> Array:
+        """Return the variance, (2,), where factors are as noisy as they say, or as was found."""
+        noise: Array = np.maximum(self.variance, np.minimum(_WORD * self.variance, 1.0))
+        return noise
 
     def take_at_their_word(self) -> None:
         """From now on let factors be as noisy as they say, if they are not noisier."""
-        self._least_variance = 1.0
+        self._at_their_word = True
         self._drops[:] = 0
 
     @property
     def takes_at_their_word(self) -> bool:
         """Whether `take_at_their_word` was called."""
-        return self._least_variance == 1.0
+        return self._at_their_word
 
     def undecided(self) -> Indices:
-        """Return the factors that may yet be accepted, (k,)."""
-        may = ~self.accepted & (self._drops < _CHANCES)
+        """Return the loops within a part that may yet be accepted, (k,)."""
+        may = ~self.accepted & ~self.factors.struck & (self._drops < _CHANCES) & ~self.across()
         undecided: Indices = np.flatnonzero(may & self.may_be_predicted)
         return undecided
 
-    def undecided_loops(self) -> Indices:
-        """Return the loops between keyframes among them, (k,)."""
-        rows = self.undecided()
-        return rows[(self.is_loop & ~self.factors.is_absolute)[rows]]
+    def joining(self) -> Indices:
+        """Return the loops from one part to another that may yet be accepted, (k,)."""
+        may = ~self.accepted & ~self.factors.struck & (self._drops < _CHANCES)
+        joining: Indices = np.flatnonzero(may & self.across())
+        return joining
+
+    def across(self) -> Mask:
+        """Return which factors lead from one part to another, (m,) bool."""
+        across: Mask = self.part[self.low] != self.part[self.high]
+        return across & ~self.factors.is_absolute
 
     def gate(self, freedom: Indices) -> Array:
         """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""
         return sampled_quantile(1 - REFUSED, freedom)
 
-    def settle(self) -> None:
+    def solve(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
         drop = np.zeros(1, np.int64)
         while len(drop):
-            self._keep_connected()
+            if self.cut.any():
+                self.part = component_labels(self.graph.subset(self.accepted & ~self.cut))
             rows = np.flatnonzero(self.accepted)
-            part = self.part(rows)
-            cholesky = cholesky_of(part)
+            subgraph = self.subgraph(rows)
+            cholesky = cholesky_of(subgraph)
             self._check()
-            self.poses = solve(part, self.poses, cholesky, lambda *_: self._check())
+            self.poses = l2_map(subgraph, self.poses, cholesky, lambda *_: self._check())
             self._check()
-            self.posterior = sample_posterior(part, self.poses, cholesky, self.rng)
+            self.posterior = sample_posterior(subgraph, self.poses, cholesky, self.rng)
+            if self._is_noisier(rows):
+                continue
             drop = self._misfits(rows)
             self.accepted[drop] = False
             self._drops[drop] += 1
-        if not self.takes_at_their_word:
+        if not self._at_their_word:
             self._learn_variance(rows)
 
-    def _keep_connected(self) -> None:
-        """Take all odometry back where the graph would fall apart without it."""
-        if component_labels(self.part(np.flatnonzero(self.accepted))).any():
-            self.accepted |= ~self.is_loop
+    def _is_noisier(self, rows: Indices) -> bool:
+        """Raise the variance where half of the factors say that it is far too small."""
+        loops = self.is_loop[rows]
+        if self._at_their_word or np.count_nonzero(loops) < _KNOWN:
+            return False
+        square = (self.posterior.residual**2).sum(axis=1)
+        stated = np.trace(self.posterior.moment, axis1=1, axis2=2)
+        known = (stated > _CHECKED) & ~self.factors.is_absolute[rows]
+        scale = np.array([np.median(square[known & kind] / stated[known & kind])
+                          if (known & kind).any() else 0.0 for kind in (~loops, loops)]) / _MEDIAN
+        noisier = scale > _NOISIER
+        self.variance = np.where(noisier, scale, 1.0) * self.variance
+        return bool(noisier.any())
 
     def _misfits(self, rows: Indices) -> Indices:
         """Return the accepted loops that do not fit, or that all others speak against."""
@@ -235,88 +280,62 @@ class Growth:
         own = np.where(self.factors.is_absolute[rows], 0.0, 1.0)
         found = np.bincount(kind, own * (self.posterior.residual**2).sum(axis=1), 2)
         stated = np.bincount(kind, own * np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
-        self._scale_variance((found + known) / (stated + known))
-
-    def _scale_variance(self, scale: Array | float) -> None:
-        self.variance = np.maximum(self.variance * scale, _LEAST_VARIANCE)
+        scale = (found + known) / (stated + known)
+        self.variance = np.maximum(self.variance * scale, self._floor)
 
     def innovations(self, rows: Indices) -> Innovations:
         """Return how factors that are not accepted fit the map."""
-        volume = claimed_volume(self.graph.manifold, self.poses, self.rng)
-        return innovations(self.part(rows), self.poses, self.posterior, volume)
+        widths = claimed_volume(self.graph.manifold, self.poses, self.rng)
+        return innovations(self.subgraph(rows), self.poses, self.posterior, widths)
 
     def believable(self, rows: Indices) -> Indices:
-        """Return which factors that are not accepted may be believed: each, or as pairs, (k,)."""
+        """Return which of some loops may be accepted: each by itself, or else together, (k,)."""
         if not len(rows):
             return rows
         found = self.innovations(rows)
-        fits = np.flatnonzero(found.square < self.gate(found.freedom))
-        log_ratio = found.log_ratio()[fits]
+        fits = found.square < self.gate(found.freedom)
+        log_ratio = found.log_ratio()
         # Taken at their word all are noisier than they are, so that more fit by chance: then only
         # the rest says how many of the rest are false.
-        true = 0 if self.takes_at_their_word else np.count_nonzero(self.accepted & self.is_loop)
-        odds = log_odds_of_false(log_ratio, len(rows) - len(fits), int(true))
-        good = believable(log_ratio, odds)
+        true = 0 if self._at_their_word else np.count_nonzero(self.accepted & self.is_loop)
+        odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)), int(true))
+        good = np.flatnonzero(fits)[believable(log_ratio[fits], odds)]
         if not len(good):
-            best = fits[np.argsort(-log_ratio, kind='stable')[:_CANDIDATES]]
-            return self._pairs(found, rows, best, odds)
-        believed: Indices = rows[fits[good]]
+            good = self._together(found, rows, fits, log_ratio, odds)
+        believed: Indices = rows[good]
         return believed
 
-    def _pairs(self, found: Innovations, rows: Indices, best: Indices, odds: float) -> Indices:
-        """Return those of the best that vouch for each other, far from each other, (k,)."""
+    def _together(self, found: Innovations, rows: Indices, fits: Mask, log_ratio: Array,
+                  odds: float) -> Indices:
+        """
+        Return which loops may be accepted for what others say that fit, (k,).
+
+        To the log ratio of a loop a come that of the best loop b of another place, given a, less
+        the odds that b is false by chance too; and of each loop b of its own place, but no more
+        than -ln q: q is how often neighbours agree that are refused.
+        """
+        best = np.flatnonzero(fits)
+        best = best[np.argsort(-log_ratio[best], kind='stable')[:_CANDIDATES]]
         a, b = (best[side] for side in np.triu_indices(len(best), 1))
-        low, high = self.low[rows], self.high[rows]
-        apart = np.abs(low[a] - low[b]) + np.abs(high[a] - high[b]) > _APART
-        a, b = a[apart], b[apart]
         if not len(a):
-            return rows[:0]
-        square, log_ratio = found.joint(self.posterior, a, b)
-        # To both being false by chance, the second one being so is as likely as the first.
-        sure = log_ratio > np.log(1 / DOUBT - 1) + odds + max(odds, 0.0)
-        good = sure & (square < self.gate(found.freedom[a] + found.freedom[b]))
-        believed: Indices = rows[np.unique(np.concatenate((a[good], b[good])))]
-        return believed
-
-    def heads(self, rows: Indices) -> Indices:
-        """Return which of some factors have a vote: the first of each group of them, (k,)."""
-        return one_of_each_group(self.low[rows], self.high[rows], _APART)
+            return best[:0]
+        square, both = found.joint(self.posterior, a, b)
+        place, ends = self._places[0][rows], self._places[1][rows]
+        agree = np.flatnonzero(square < self.gate(found.freedom[a] + found.freedom[b]))
+        a, b, both = a[agree], b[agree], both[agree]
+        own = place[a] == place[b]
+        most = -np.log(neighbours_agree(place[~fits], ends[~fits]))
+        far, near = np.zeros(len(rows)), np.zeros(len(rows))
+        for one in (a, b):
+            more = both - log_ratio[one]
+            np.maximum.at(far, one[~own], more[~own] - max(odds, 0.0))
+            np.add.at(near, one[own], np.clip(more[own], 0.0, most))
+        evidence = log_ratio + far + near
+        sure = (evidence > odds + np.log(1 / DOUBT - 1)) & (far + near > 0)
+        together: Indices = best[sure[best]]
+        return together
 
     def some(self, rows: Indices, count: int) -> Indices:
         """Return so many of some factors, at random, or all, (k,)."""
         chosen: Indices = self.rng.permutation(rows)[:count]
         return chosen
-
-
-def solve(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
-          report: Report = lambda iteration, cost: None) -> Array:
-    """
-    Return the L2 map of a graph to within its noise: chi2 one above the optimum or less.
-
-    From poses (n, p) that may be far off: where they do not fit to within the noise, first
-    rotations alone, then translations, each of which is linear; then Gauss-Newton.
-    """
-    # In units of its noise, chi2 is about as large as there are spare measurements.
-    k = graph.manifold.TANGENT_SIZE
-    spare = max(int(graph.between.freedom.sum()) - k * (graph.n_poses - anchor(graph)), k)
-    chi2 = _chi2(graph, poses)
-    if chi2 > _FITS * spare:
-        linear = _two_linear_steps(graph, poses, cholesky)
-        poses = linear if _chi2(graph, linear) < chi2 else poses
-    return minimise_l2(graph, poses, LeastSquaresOptions(_STEPS, 1 / spare), cholesky,
-                       report).poses
-
-
-def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:
-    manifold = graph.manifold
-    for part in (manifold.ROTATION, manifold.TRANSLATION):
-        system = linearise(graph, poses).part(part)
-        x = weighted_least_squares(system, cholesky, np.ones_like(system.b))
-        step = np.zeros((graph.n_poses - anchor(graph), manifold.TANGENT_SIZE))
-        step[:, part] = x.reshape(len(step), -1)
-        poses = step_poses(graph, poses, step)
-    return poses
-
-
-def _chi2(graph: FactorGraph, poses: Array) -> float:
-    return l2_cost(whitened_residual(graph, poses))

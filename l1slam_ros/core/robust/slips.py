@@ -1,94 +1,243 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Odometry that lies: found by what the loops across a slip have in common.
+Gaps and slips of the odometry: steps of which only the loops across can tell.
 
-In: a robust solve in which nothing more can be believed. Out: one in which an odometry factor is
-left out, and the loops that were refused because of it are accepted.
+A gap is a slip whose place is known. Where both sides of a step are parts of their own, each right
+in itself, the true loops across agree with each other (`pairwise_consistency`): parts are joined
+where loops of two places or more do. A slip is suspected where an accepted factor of the odometry
+is far off by what all others say, or where refused loops agree. Then slip and lies are compared:
 
-Three ways lead to a factor that may lie: it moves as the robot never did; believed loops across
-speak against it; or refused loops across agree with each other (`pairwise_consistency`). Each is
-tried, and counts when leaving it out brings more loops in than it costs, of several places.
+    gain = excess(without) - excess(with) + gate (places won - places lost)
+
+with the excess of chi2 over its freedom: the step is cut, the loops across are asked anew, and the
+rounds go on from there. The slip is believed if it gains three gates, three places span it, and
+the odometry factor is off by more than one in all its factors is by chance.
 """
-
-from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import Mask, whiten
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
-from l1slam_ros.core.graph.linear_system import with_world
-from l1slam_ros.core.robust.gating import DOUBT, log_odds_of_false
-from l1slam_ros.core.robust.innovation import (
-    chi2_quantile,
-    claimed_volume,
-    exact_squares,
-    innovations,
+from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.robust.gating import DOUBT
+from l1slam_ros.core.robust.innovation import chi2_quantile, exact_squares
+from l1slam_ros.core.robust.pairwise_consistency import (
+    NO_GROUP,
+    Group,
+    spanned,
+    strongest_group,
 )
-from l1slam_ros.core.robust.pairwise_consistency import accord, weakest_steps
 from l1slam_ros.core.robust.rounds import Growth
 
-# So many loops more have to come in without the factor, and loops of that many groups to span it.
-VOTES = 3
-# So many steps of unusual motion are tried.
+# Places that join two parts, and that span a slip, at least.
+_JOINING, SPANNING = 2, 3
+# Gates to be gained at least; and places won for each that is lost.
+_GAIN, _WON = 3.0, 2.0
+# So many steps are tried of those that may have slipped.
 _TRIED = 2
-# So many loops judge where a slip is, and of those that agree so many say how it is mended.
-_JURY, _PROPOSALS = 500, 20
-# A long way is searched by so many places at a time.
-_AT_A_TIME = 20
+# A jump like no other is so many times as unusual as what is.
+_UNHEARD = 4.0
+
+
+def join(growth: Growth) -> bool:
+    """Move parts to where loops across agree that they are; return whether any was."""
+    joined = False
+    while (rows := growth.joining()).size:
+        parts = growth.part[np.stack((growth.low[rows], growth.high[rows]))]
+        pair = np.sort(parts, axis=0).T @ np.array([growth.graph.n_poses, 1])
+        groups = [strongest_group(growth, rows[pair == one]) for one in np.unique(pair)]
+        group = max(groups, key=lambda group: len(group.places))
+        if len(group.places) < _JOINING:
+            return joined
+        _join_by(growth, group)
+        joined = True
+    return joined
+
+
+def _join_by(growth: Growth, group: Group) -> None:
+    """Move the later one of two parts to where the first loop of a group says, accept all."""
+    manifold, loop = growth.graph.manifold, group.rows[0]
+    fixed, moving = growth.low[loop], growth.high[loop]
+    Z = growth.forward[loop, None]
+    if growth.part[fixed] > growth.part[moving]:
+        fixed, moving, Z = moving, fixed, manifold.inverse(Z)
+    wanted = manifold.compose(growth.poses[fixed, None], Z)
+    motion = manifold.compose(wanted, manifold.inverse(growth.poses[moving, None]))
+    part = growth.part == growth.part[moving]
+    growth.poses = growth.poses.copy()
+    growth.poses[part] = manifold.compose(
+        np.broadcast_to(motion, growth.poses[part].shape), growth.poses[part])
+    growth.accepted[group.rows] = True
+    growth.solve()
 
 
 def without_slip(growth: Growth) -> Growth | None:
-    """Return a state without an odometry factor that loops agree is wrong; None: there is none."""
-    if len(growth.undecided_loops()) < VOTES:
+    """Return a state in which an odometry factor is cut that slipped; None: there is none."""
+    states = [cut for step in _suspected(growth) if (cut := _without(growth, step))
+              and _slipped(growth, cut, step)]
+    return max(states, key=lambda cut: np.count_nonzero(cut.accepted), default=None)
+
+
+def _without(growth: Growth, step: int) -> Growth | None:
+    """Return the state after the rounds that follow if a step is cut; None: it falls apart."""
+    state = growth.copy()
+    state.cut[step] = True
+    span = spanning(growth, step)
+    state.accepted[span] = state.trusted[span]
+    state.solve()
+    if not join(state) or state.part[state.low[step]] != state.part[state.high[step]]:
         return None
-    before = np.count_nonzero(growth.accepted)
-    for attempt in (_without_unusual, _without_worst, _mended):
-        for trial in attempt(growth):
-            _believe(trial)
-            gained = np.count_nonzero(trial.accepted) - before
-            left_out = np.flatnonzero(growth.accepted & ~trial.accepted & ~growth.is_loop)
-            voters = trial.heads(_across(trial, left_out))
-            if gained >= VOTES and len(voters) >= VOTES and _is_gross(trial, left_out):
-                return trial
-    return None
+    while len(news := state.believable(state.undecided())):
+        state.accepted[news] = True
+        state.solve()
+    return state
 
 
-def _is_gross(growth: Growth, left_out: Indices) -> bool:
-    """Return whether odometry factors lie, all others being as noisy as they say at least."""
-    trial = growth.copy()
-    trial.take_at_their_word()
-    trial.settle()
-    square = exact_squares(trial.part(left_out), trial.poses, trial.posterior)
-    steps, freedom = np.count_nonzero(~growth.is_loop), growth.factors.freedom[left_out]
-    return bool((square > chi2_quantile(1 - DOUBT / steps, freedom)).all())
+def spanning(growth: Growth, step: int) -> Mask:
+    """Return which loops span an odometry factor, (m,) bool."""
+    span: Mask = growth.is_loop & (growth.low < growth.high[step]) & (
+        growth.high > growth.low[step])
+    return span
 
 
-def _believe(growth: Growth) -> None:
-    """Accept the loops that can be believed, round by round."""
-    while len(news := growth.believable(growth.undecided_loops())):
-        growth.accepted[news] = True
-        growth.settle()
+def _slipped(growth: Growth, cut: Growth, step: int) -> bool:
+    """Return whether a step slipped rather than that the loops lie that say so."""
+    with_, without = (np.unique(growth.place[state.accepted & growth.is_loop])
+                      for state in (cut, growth))
+    across = np.flatnonzero(cut.accepted & spanning(growth, step))
+    won, lost = len(np.setdiff1d(with_, without)), len(np.setdiff1d(without, with_))
+    gate = _gate(growth)
+    gain = _excess(growth, cut.variance) - _excess(cut, cut.variance) + gate * (won - lost)
+    sure = unheard_of(growth)[step] or (gain > _GAIN * gate and _is_gross(cut, step))
+    if not sure or len(np.unique(growth.place[across])) < SPANNING:
+        return False
+    if won < _WON * lost:
+        growth.suspected.append(across)
+    return won >= _WON * lost
 
 
-def _across(growth: Growth, left_out: Indices) -> Indices:
-    """Return the accepted loops across any of the odometry factors left out, (k,)."""
-    steps = np.sort(growth.low[left_out])
-    spans = np.searchsorted(steps, growth.low) < np.searchsorted(steps, growth.high)
-    across: Indices = np.flatnonzero(growth.accepted & growth.is_loop & spans)
-    return across
+def _gate(growth: Growth) -> float:
+    """Return the gate of a loop that says all there is to say."""
+    return float(growth.gate(np.array([growth.graph.manifold.TANGENT_SIZE]))[0])
 
 
-def _without_unusual(growth: Growth) -> Iterator[Growth]:
-    """Leave out an odometry factor that moves as the robot never did."""
-    rows = np.flatnonzero(growth.accepted & ~growth.is_loop)
-    square = unusual_motion(growth.graph, growth.forward[rows])
-    most = np.argsort(-square, kind='stable')[:_TRIED]
-    limit = chi2_quantile(1 - DOUBT / len(rows), growth.factors.freedom[rows[most]])
-    for row in rows[most[square[most] > limit]].tolist():
-        trial = growth.copy()
-        trial.accepted[row] = False
-        trial.settle()
-        yield trial
+def _excess(growth: Growth, variance: Array) -> float:
+    """Return chi2 less its freedom of the accepted factors that say anything, the noise given."""
+    state = growth.copy()
+    state.variance = variance
+    rows = np.flatnonzero(state.accepted & ~state.cut)
+    residual = whitened_residual(state.subgraph(rows), state.poses)
+    return float((residual**2).sum() - state.factors.freedom[rows].sum())
+
+
+def _is_gross(growth: Growth, step: int) -> bool:
+    """Return whether a cut factor is off, all others being as noisy as they say at least."""
+    state = growth.copy()
+    state.take_at_their_word()
+    state.solve()
+    state.cut[step] = False
+    alone = state.subgraph(np.array([step]))
+    square = exact_squares(alone, state.poses, state.posterior)
+    steps = np.count_nonzero(~growth.is_loop)
+    return bool((square > chi2_quantile(1 - DOUBT / steps, alone.between.freedom)).all())
+
+
+def refused(growth: Growth) -> Indices:
+    """Return the undecided loops that do not fit, (k,)."""
+    rows = growth.undecided()
+    if len(rows):
+        found = growth.innovations(rows)
+        rows = rows[found.square > growth.gate(found.freedom)]
+    return rows
+
+
+def _suspected(growth: Growth) -> list[int]:
+    """Return the odometry factors that may have slipped, the most unusual of each reason."""
+    group, against = strongest_group(growth, refused(growth)), _against(growth)
+    square, jumps = unusual_motion(growth.graph, growth.forward), jumping(growth)
+    if len(group.places) < SPANNING:
+        steps = np.count_nonzero(~growth.is_loop)
+        limit = chi2_quantile(1 - DOUBT / steps, growth.factors.freedom[jumps])
+        group, jumps = NO_GROUP, jumps[against[jumps] > limit]
+    runs = (jumps, np.flatnonzero(unheard_of(growth)), _spoken_against(growth, against),
+            weakest_steps(growth, group))
+    suspected = np.unique(np.concatenate(
+        [run[np.argsort(-square[run], kind='stable')[:_TRIED]] for run in runs]))
+    return [int(step) for step in suspected[np.argsort(-square[suspected], kind='stable')]]
+
+
+def jumping(growth: Growth) -> Indices:
+    """Return the odometry factors that move as the robot hardly ever does, (k,)."""
+    odometry = np.flatnonzero(~growth.is_loop & ~growth.cut)
+    limit = chi2_quantile(1 - DOUBT / len(odometry), growth.factors.freedom[odometry])
+    jumps: Indices = odometry[
+        unusual_motion(growth.graph, growth.forward[odometry]) > limit]
+    return jumps
+
+
+def unheard_of(growth: Growth) -> Mask:
+    """
+    Return the few jumps like no other, (m,) bool, of which all others say that there was none.
+
+    With the covariance R of the residual r, the innovation of a factor by all others is R^-1 r,
+    and its covariance R^-1: is it likelier that the robot moved as always, or as was measured?
+    """
+    odometry = np.flatnonzero(~growth.is_loop & ~growth.cut)
+    square = unusual_motion(growth.graph, growth.forward[odometry])
+    order, unheard = np.argsort(-square, kind='stable'), np.zeros(len(growth.factors), bool)
+    if len(order) <= _TRIED:
+        return unheard
+    rows = odometry[order[:_TRIED][square[order[:_TRIED]] > _UNHEARD * square[order[_TRIED]]]]
+    manifold, at = growth.graph.manifold, np.searchsorted(np.flatnonzero(growth.accepted), rows)
+    R, r = growth.posterior.moment[at], growth.posterior.residual[at]
+    measured = np.linalg.pinv(R, hermitian=True) @ r[:, :, None]
+    usual = manifold.local(manifold.identity(1), np.median(growth.forward[odometry], axis=0)[None])
+    usual = manifold.retract(manifold.identity(1), usual)
+    moved = measured + whiten(growth.subgraph(rows).between.sqrt_information, manifold.local(
+        np.broadcast_to(usual, growth.forward[rows].shape), growth.forward[rows]))[:, :, None]
+    likelier = [(e.transpose(0, 2, 1) @ R @ e)[:, 0, 0] for e in (moved, measured)]
+    unheard[rows[likelier[0] < likelier[1]]] = True
+    return unheard
+
+
+def _against(growth: Growth) -> Array:
+    """Return by how much all others speak against each odometry factor, (m,), as noisy as said."""
+    against, noise = np.zeros(len(growth.factors)), growth.variance_at_their_word()[0]
+    against[growth.accepted] = growth.posterior.left_out()
+    against[growth.is_loop | growth.cut] = 0.0
+    if growth.takes_at_their_word or against.max() < _GAIN * _gate(growth) * (
+            noise / growth.variance[0]):
+        return np.asarray(against * (growth.variance[0] / noise))
+    state = growth.copy()
+    state.take_at_their_word()
+    state.solve()
+    return _against(state)
+
+
+def _spoken_against(growth: Growth, against: Array) -> Indices:
+    """Return the odometry factors about the worst, (k,); none if to cut it could gain nothing."""
+    if against.max() < _GAIN * _gate(growth):
+        return np.zeros(0, np.int64)
+    # Steps between which no accepted loop ends share what speaks against them.
+    suspects = np.flatnonzero(against > against.max() / 2)
+    suspects = suspects[np.argsort(growth.low[suspects])]
+    runs = np.cumsum(np.diff(growth.low[suspects], prepend=-1) > 1)
+    run: Indices = suspects[runs == runs[suspects == np.argmax(against)]]
+    return run
+
+
+def weakest_steps(growth: Growth, group: Group) -> Indices:
+    """Return the odometry that most of a group span, and of it what the fewest accepted do."""
+    if not len(group.rows):
+        return group.rows
+    low, high, n = growth.low, growth.high, growth.graph.n_poses
+    against = spanned(low[group.rows], high[group.rows], n)
+    common = np.flatnonzero(against == against.max())
+    accepted = growth.accepted & growth.is_loop
+    across = spanned(low[accepted], high[accepted], n)[common]
+    weakest = common[across == across.min()]
+    return np.flatnonzero(~growth.is_loop & ~growth.cut & np.isin(low, weakest))
 
 
 def unusual_motion(graph: FactorGraph, Z: Array) -> Array:
@@ -104,155 +253,3 @@ def unusual_motion(graph: FactorGraph, Z: Array) -> Array:
     off = manifold.local(manifold.identity(len(Z)), Z) - mean
     square: Array = np.einsum('mi,ij,mj->m', off, precision, off)
     return square
-
-
-def _without_worst(growth: Growth) -> Iterator[Growth]:
-    """Leave out the odometry factor that all others speak against."""
-    inside = np.flatnonzero(growth.accepted)
-    against = np.where(growth.is_loop[inside], 0.0, growth.posterior.left_out())
-    limit = chi2_quantile(1 - DOUBT / len(inside), growth.factors.freedom[inside])
-    if (against < limit).all():
-        return
-    trial, worst = growth.copy(), int(inside[np.argmax(against)])
-    # Steps between which no believed loop ends share what speaks against them.
-    run = _run_about(worst, trial.low, inside[against > against.max() / 2])
-    within = _ending_within(trial, run)
-    trial.accepted[worst] = False
-    trial.accepted[within] = trial.trusted[within]
-    trial.settle()
-    jury = trial.some(within[~trial.accepted[within]], _JURY)
-    slipped = _likeliest(trial, jury, run, lambda step: _slipped_elsewhere(trial, worst, step))
-    trial.accepted[worst], trial.accepted[slipped] = True, False
-    trial.poses = _slipped_elsewhere(trial, worst, int(trial.low[slipped]))
-    trial.settle()
-    yield trial
-
-
-def _ending_within(growth: Growth, run: Indices) -> Indices:
-    """Return the loops that end between the steps of a run of odometry factors, (k,)."""
-    first, last = growth.low[run[0]], growth.low[run[-1]]
-    within = [(end > first) & (end <= last) for end in (growth.low, growth.high)]
-    ending: Indices = np.flatnonzero(growth.is_loop & np.any(within, axis=0))
-    return ending
-
-
-def _likeliest(
-    growth: Growth, jury: Indices, run: Indices, slipped_at: Callable[[int], Array]
-) -> int:
-    """
-    Return which of a run of odometry factors slipped.
-
-    That with whose poses, `slipped_at(step)` (n, p), a jury of loops fits best; of those between
-    which none of these loops ends, the one whose motion is more usual so than as measured.
-    """
-    steps = growth.low[run]
-    first = np.unique(_places(growth, jury, steps), return_index=True)[1]
-    while len(first) > 1:
-        stride = -(-len(first) // _AT_A_TIME)
-        support = [_support(growth, jury, slipped_at(step)).sum()
-                   for step in steps[first[::stride]].tolist()]
-        best = stride * int(np.argmax(support))
-        first = first[max(best - stride + 1, 0):best + stride]
-    fits = _support(growth, jury, slipped_at(int(steps[first[0]]))) > 0
-    place = _places(growth, jury[fits], steps)
-    alike = np.flatnonzero(place == place[first[0]])
-    moved = np.concatenate([_step_of(growth, slipped_at(step), step)
-                            for step in steps[alike].tolist()])
-    motions = np.concatenate((growth.forward[run[alike]], moved))
-    measured, mended = unusual_motion(growth.graph, motions).reshape(2, -1)
-    return int(run[alike[np.argmax(measured - mended)]])
-
-
-def _places(growth: Growth, loops: Indices, steps: Indices) -> Indices:
-    """Return of steps (k,) a number each, the same where no loop ends between them, (k,)."""
-    ends = np.unique(np.concatenate((growth.low[loops], growth.high[loops])))
-    return np.searchsorted(ends, steps, side='right')
-
-
-def _step_of(growth: Growth, poses: Array, step: int) -> Array:
-    return growth.graph.manifold.between(poses[step, None], poses[step + 1, None])
-
-
-def _run_about(worst: int, low: Indices, suspects: Indices) -> Indices:
-    """Return those of some odometry factors that follow one another up to the worst and on."""
-    suspects = suspects[np.argsort(low[suspects])]
-    runs = np.cumsum(np.diff(low[suspects], prepend=-1) > 1)
-    run: Indices = suspects[runs == runs[suspects == worst]]
-    return run
-
-
-def _slipped_elsewhere(growth: Growth, worst: int, step: int) -> Array:
-    """Return the poses if the odometry did not slip at the factor `worst` but at another step."""
-    manifold, poses = growth.graph.manifold, growth.poses
-    motion = _motion_to_fit(growth, poses, worst)
-    part = slice(growth.high[worst], step + 1)
-    if step < growth.low[worst]:
-        motion, part = manifold.inverse(motion), slice(step + 1, growth.high[worst])
-    moved = poses.copy()
-    moved[part] = manifold.compose(np.broadcast_to(motion, poses[part].shape), poses[part])
-    return moved
-
-
-def _mended(growth: Growth) -> Iterator[Growth]:
-    """Leave out an odometry factor that most refused loops span in accord."""
-    agreed, _ = accord(growth)
-    if len(growth.heads(agreed)) < VOTES:
-        return
-    low, weakest = growth.low, weakest_steps(growth, agreed)
-    odometry = np.flatnonzero(~growth.is_loop & np.isin(low, weakest))
-    odometry = odometry[np.argsort(low[odometry], kind='stable')]
-    runs = np.split(odometry, np.flatnonzero(np.diff(low[odometry]) > 1) + 1)
-    square = unusual_motion(growth.graph, growth.forward)
-    for run in sorted(runs, key=lambda run: -square[run].max())[:_TRIED]:
-        yield _mended_within(growth, agreed, run)
-
-
-def _mended_within(growth: Growth, agreed: Indices, run: Indices) -> Growth:
-    """Leave out one of a run of odometry factors, so that most loops across agree."""
-    trial, low, high = growth.copy(), growth.low, growth.high
-    first, last = int(low[run[0]]), int(low[run[-1]])
-    affected = growth.is_loop & (low <= last) & (high > first)
-    trial.accepted &= ~affected | growth.trusted
-    trial.settle()
-    affected &= ~trial.accepted
-    jury, poses = trial.some(np.flatnonzero(affected), _JURY), trial.poses
-    loop = max(trial.some(agreed, _PROPOSALS).tolist(), key=lambda loop: _support(
-        trial, jury, _mended_poses(trial, poses, loop, first)).sum())
-    # Where exactly it is, only those tell that span some of the steps.
-    jury = trial.some(np.flatnonzero(affected & ((low > first) | (high <= last))), _JURY)
-    slipped = _likeliest(trial, jury, run, lambda step: _mended_poses(trial, poses, loop, step))
-    trial.poses = _mended_poses(trial, poses, loop, int(low[slipped]))
-    trial.accepted[slipped] = False
-    rows = np.flatnonzero(affected)
-    trial.accepted[rows[_support(trial, rows, trial.poses) > 0]] = True
-    trial.settle()
-    return trial
-
-
-def _support(growth: Growth, rows: Indices, poses: Array) -> Array:
-    """Return the log odds of factors to be true at mended poses, 0 where not believed, (k,)."""
-    if not len(rows):
-        return np.zeros(0)
-    graph = growth.part(rows)
-    volume = claimed_volume(graph.manifold, poses, np.random.default_rng(0))
-    found = innovations(graph, poses, growth.posterior, volume)
-    # The loop that mended the poses is as uncertain as the one that is judged by it.
-    fits = found.square < 2 * growth.gate(found.freedom)
-    log_ratio = found.log_ratio(2.0)
-    odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)))
-    return np.where(fits & (log_ratio > odds + np.log(1 / DOUBT - 1)), log_ratio - odds, 0.0)
-
-
-def _mended_poses(growth: Growth, poses: Array, loop: int, step: int) -> Array:
-    """Return the poses, those behind a step of the odometry moved as one so that a loop fits."""
-    motion, behind = _motion_to_fit(growth, poses, loop), poses[step + 1:]
-    moved = growth.graph.manifold.compose(np.broadcast_to(motion, behind.shape), behind)
-    return np.concatenate((poses[: step + 1], moved))
-
-
-def _motion_to_fit(growth: Growth, poses: Array, factor: int) -> Array:
-    """Return how the later end of a factor is to be moved for the factor to fit, (1, p)."""
-    manifold, low, high = growth.graph.manifold, growth.low[factor], growth.high[factor]
-    start = with_world(manifold, poses)[low, None]
-    wanted = manifold.compose(start, growth.forward[factor, None])
-    return manifold.compose(wanted, manifold.inverse(poses[high, None]))

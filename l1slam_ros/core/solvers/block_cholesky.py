@@ -8,6 +8,7 @@ every size: of the rotations alone, of the translations, of whole poses.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +49,11 @@ class Pattern:
     start: Indices
     rows: Indices
     work: float
+
+    @cached_property
+    def owner(self) -> Places:
+        """The panel of each position, (n,)."""
+        return np.repeat(np.arange(len(self.first) - 1, dtype=np.int32), np.diff(self.first))
 
 
 def find_pattern(keyframe: Indices, size: int, most_blocks: int) -> Pattern:
@@ -146,6 +152,22 @@ class BlockCholesky:
         assert layout is not None, 'solve before factorise'
         x: Array = solve_many(layout.panels, *layout.shape, self.pattern.position, right)
         return x
+
+
+    def climb(self, keyframe: int) -> tuple[Places, Array]:
+        """
+        Return L^-1 e for the k columns of a free keyframe, by the last factorisation.
+
+        Positions (p,), ascending, where it is not zero, and the columns, (k, p k).
+        """
+        from l1slam_ros.core.kernels.border import climb
+
+        layout = self._factored
+        assert layout is not None, 'climb before factorise'
+        found: tuple[Places, Array] = climb(
+            layout.panels, *layout.shape, self.pattern.owner, self.pattern.position[keyframe],
+            len(layout.size))
+        return found
 
 
 class _Layout:

@@ -12,15 +12,18 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.linear_system import linearise, step_poses, whitened_residual
+from l1slam_ros.core.graph.linear_system import anchor, linearise, step_poses, whitened_residual
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.nonlinear import Report, Solution
-from l1slam_ros.core.solvers.optimality import Huber, Norm, Status, fits_exactly, l1_cost
+from l1slam_ros.core.solvers.optimality import Huber, Norm, Status, fits_exactly, l1_cost, l2_cost
 from l1slam_ros.core.solvers.reweighting import weighted_least_squares
 
 _FIRST_DAMPING = 1e-6
 _MOST_DAMPING = 1e6
+# A map to within its noise: Gauss-Newton begins where chi2 is at most so many times what the noise
+# makes of it, and takes so many steps at most.
+_FITS, _NOISE_STEPS = 3, 60
 
 
 @dataclass(frozen=True)
@@ -96,3 +99,37 @@ def gauss_newton(
             break
     return Solution(poses, history[-1], status, len(history) - 1, 0, np.array(history),
                     np.zeros(len(residual)))
+
+
+def l2_map(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
+           report: Report = lambda iteration, cost: None) -> Array:
+    """
+    Return the L2 map of a graph to within its noise: chi2 one above the optimum or less.
+
+    From poses (n, p) that may be far off: where they do not fit to within the noise, first
+    rotations alone, then translations, each of which is linear; then Gauss-Newton.
+    """
+    # In units of its noise, chi2 is about as large as there are spare measurements.
+    k = graph.manifold.TANGENT_SIZE
+    spare = max(int(graph.between.freedom.sum()) - k * (graph.n_poses - anchor(graph)), k)
+    chi2 = _chi2(graph, poses)
+    if chi2 > _FITS * spare:
+        linear = _two_linear_steps(graph, poses, cholesky)
+        poses = linear if _chi2(graph, linear) < chi2 else poses
+    return minimise_l2(graph, poses, LeastSquaresOptions(_NOISE_STEPS, 1 / spare), cholesky,
+                       report).poses
+
+
+def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:
+    manifold = graph.manifold
+    for part in (manifold.ROTATION, manifold.TRANSLATION):
+        system = linearise(graph, poses).part(part)
+        x = weighted_least_squares(system, cholesky, np.ones_like(system.b))
+        step = np.zeros((graph.n_poses - anchor(graph), manifold.TANGENT_SIZE))
+        step[:, part] = x.reshape(len(step), -1)
+        poses = step_poses(graph, poses, step)
+    return poses
+
+
+def _chi2(graph: FactorGraph, poses: Array) -> float:
+    return l2_cost(whitened_residual(graph, poses))

@@ -50,6 +50,9 @@ class MapFile:
         """Load the map; return a sentence that says from where."""
         path = self._path()
         saved, sentence, whole = load_map(path)
+        found, expected = saved.growth.graph.manifold, self._backend.manifold
+        if found is not expected:
+            raise FileError(path, f'is a map of {found.NAME}; expected one of {expected.NAME}')
         if not whole:
             self._warn(sentence)
         self._backend.restore(saved)

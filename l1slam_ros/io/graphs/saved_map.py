@@ -120,9 +120,8 @@ def _remarks(saved: SavedMap) -> dict[str, Any]:
               for record in (growth, optimised, optimised.judgement) for f in fields(record)}
     for name in 'graph', 'poses', 'judgement':
         del values[name]
-    doubt = optimised.judgement.doubt
     return values | {
-        'doubt': doubt and asdict(doubt), 'robust': saved.robust,
+        'doubts': [asdict(doubt) for doubt in optimised.judgement.doubts], 'robust': saved.robust,
         'trusted': growth.graph.between.trusted, 'struck': growth.graph.between.struck,
         'seen': [[key.hex(), growth.seen[key]] for key in sorted(growth.seen)],
         'waiting': [[loop.reference_stamp, loop.stamp, loop.trusted, loop.struck, age,
@@ -143,8 +142,8 @@ def _read(path: Path) -> SavedMap:
          age)
         for reference, stamp, trusted, struck, age, pose3, covariance in values.pop('waiting'))
     seen = {bytes.fromhex(key): row for key, row in values.pop('seen')}
-    doubt = values.pop('doubt')
-    judgement = replace(_restored(optimised.judgement, values), doubt=doubt and Doubt(**doubt))
+    doubts = tuple(Doubt(**doubt) for doubt in values.pop('doubts'))
+    judgement = replace(_restored(optimised.judgement, values), doubts=doubts)
     return SavedMap(replace(_restored(growth, values), waiting=waiting, seen=seen),
                     replace(_restored(optimised, values), judgement=judgement),
                     values['robust'])

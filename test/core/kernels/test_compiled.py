@@ -83,7 +83,7 @@ assert compilation.__file__.startswith({folder!r}), compilation.__file__
 {before}
 reports = []
 answer = compilation.fill_cache(lambda *done: reports.append(done), lambda: False,
-                                ('tiles', 'se2'))
+                                ('interior_point', 'se2'))
 print(answer, reports, 'numba' in sys.modules)
 """
 # Nobody can start a process with this.

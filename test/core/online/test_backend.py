@@ -169,7 +169,7 @@ def test_the_budget_is_kept(budget):
     world = simulate_world(800, 1800, WorldOptions(), np.random.default_rng(0))
     options = BackendOptions(EVERY.keyframe, EVERY.odometry, solver=OptimiserOptions(
         outer_iterations=10**6, inner=PrimalDualOptions(iterations=10**7, tolerance=0.0)))
-    backend = Backend(options)
+    backend = Backend(replace(options, robust=RobustOptions(enabled=False)))
     play(backend, world)
     problem = backend.snapshot().problem()
     start = time.monotonic()
@@ -183,26 +183,24 @@ def test_the_budget_is_kept(budget):
 
 def test_small_budgets_add_up(world):
     """The costs of one set of loops: those that are yet to be believed would add theirs."""
-    backend = Backend(CREDULOUS)
+    backend, end = Backend(CREDULOUS), time.monotonic() + PLENTY
     play(backend, world)
     costs = []
-    for _ in range(400):
-        improvement = backend.update(0.01)
-        if improvement is None:
-            break
-        costs.append(improvement.cost)
-    assert improvement is None
+    while (improvement := backend.update(0.01)) is not None:
+        assert time.monotonic() < end
+        # None yet, while the first one is at work.
+        costs += [improvement.cost] if improvement.cost else []
     assert (np.diff(costs) <= 1e-9).all()
     batch = batch_of(world.graph)
     assert costs[-1] == pytest.approx(batch.cost, rel=1e-3)
 
 
 def test_small_budgets_judge_to_the_end(world):
-    """A budget too short for one look at the loops still gets on with every update."""
-    backend = Backend(EVERY)
+    """A budget too short for one look at the loops leaves it behind, and it is done."""
+    backend, end = Backend(EVERY), time.monotonic() + PLENTY
     play(backend, world)
-    for _ in range(20):
-        backend.update(0.0)
+    while backend.update(0.0) is not None:
+        assert time.monotonic() < end
     assert (backend.loop_states().state == ACCEPTED).all()
     assert backend.snapshot().problem().judgement.settled
 
@@ -290,8 +288,9 @@ def test_several_loops_at_once_bring_a_drifted_drive_back():
     for i, j in loops:
         seen = se2.between(truth[i : i + 1], truth[j : j + 1])[0]
         backend.add_loop(loop(i * PERIOD, j * PERIOD, seen, 1e-4 * np.eye(6)))
-    improvement = backend.update(PLENTY)
-    assert improvement.reweighted_steps > 0
+    problem = backend.snapshot().problem()
+    assert improve(problem, CREDULOUS.solver, PLENTY).reweighted_steps > 0
+    backend.update(PLENTY)
     i, j = np.array(loops).T
     error = se2.local(se2.between(truth[i], truth[j]), se2.between(backend.poses[i],
                                                                    backend.poses[j]))
@@ -540,7 +539,7 @@ def test_after_a_restore_odometry_may_begin_anywhere(world):
 
 
 def test_the_dual_of_old_rows_is_kept_and_new_rows_start_at_zero(world):
-    backend = Backend(EVERY)
+    backend = Backend(CREDULOUS)
     play(backend, world, 0, 100)
     improvement = improve(backend.snapshot().problem(), EVERY.solver, PLENTY)
     backend.adopt(improvement)
@@ -555,7 +554,7 @@ def test_the_dual_of_old_rows_is_kept_and_new_rows_start_at_zero(world):
 
 
 def test_a_warm_update_does_more_with_little_work_than_a_cold_one(world):
-    warm, cold = Backend(EVERY), Backend(EVERY)
+    warm, cold = Backend(CREDULOUS), Backend(CREDULOUS)
     play(warm, world, 0, 149)
     settled(warm)
     play(warm, world, 149)
@@ -570,7 +569,7 @@ def test_a_warm_update_does_more_with_little_work_than_a_cold_one(world):
 
 
 def test_the_account_of_an_update_is_true(world):
-    backend = Backend(EVERY)
+    backend = Backend(CREDULOUS)
     play(backend, world, 0, 80)
     problem = backend.snapshot().problem()
     improvement = improve(problem, EVERY.solver, PLENTY)
@@ -592,7 +591,8 @@ def test_what_was_judged_by_other_options_is_not_adopted(careful):
     assert not doubting.judgement.accepted.all()
     backend.set_options(CREDULOUS)
     before = backend.poses
-    backend.adopt(doubting)
+    with pytest.raises(Interrupted):
+        backend.adopt(doubting)
     assert_array_equal(backend.poses, before)
     assert backend.snapshot().problem().judgement.accepted.all()
 
@@ -617,7 +617,7 @@ def test_what_is_not_finite_is_not_adopted(world, name):
 @pytest.mark.parametrize('work', ['improve', 'optimise', 'optimise all'])
 def test_work_can_be_stopped_at_many_moments(careful, work):
     world = spoilt(careful, 'random', 130)
-    backend = Backend(CREDULOUS if work == 'optimise all' else EVERY)
+    backend = Backend(EVERY if work == 'optimise' else CREDULOUS)
     play(backend, world)
     problem = backend.snapshot().problem()
     kept = problem.poses.copy(), problem.judgement.accepted.copy()
@@ -638,7 +638,7 @@ def test_work_can_be_stopped_at_many_moments(careful, work):
             optimise(problem, EVERY.solver, check)
 
     run()
-    assert count > 20
+    assert count > 10
     for limit in np.linspace(0, count - 1, 8).astype(int):
         with pytest.raises(Interrupted):
             run()
@@ -652,8 +652,9 @@ def test_a_large_map_comes_to_rest_though_no_update_ends_by_its_tests(world):
     options = replace(EVERY, solver=OptimiserOptions(outer_iterations=1))
     backend = Backend(options)
     play(backend, world)
-    updates = settled(backend)
-    assert backend.snapshot().problem().settled and updates > 5
+    settled(backend)
+    assert backend.snapshot().problem().settled
+    assert backend.snapshot().optimised.quiet_updates >= 5
     assert cost(world.graph, backend.poses) == pytest.approx(batch_of(world.graph).cost, rel=1e-3)
     play(backend, careful_world(151, 320), 150, 151)
     assert not backend.snapshot().problem().settled

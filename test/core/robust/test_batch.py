@@ -9,15 +9,8 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.spanning_tree import pair_key
-from l1slam_ros.core.robust.batch import (
-    INCONSISTENT,
-    MOSTLY_REFUSED,
-    Doubt,
-    minimise_accepted,
-    mostly_refused,
-    reconsidered,
-    robust_solve,
-)
+from l1slam_ros.core.robust.batch import robust_solve
+from l1slam_ros.core.robust.judgement import OTHER_MAP, SLIP
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
 
@@ -65,11 +58,10 @@ def test_false_loops_are_refused_and_true_ones_kept(world, kind, count):
 
 
 def test_a_clean_graph_keeps_all_its_loops(world):
-    solution, poses = robust_solve(world.graph)
-    keep = reconsidered(world.graph, poses, solution.accepted)
-    assert np.count_nonzero(~keep) <= 2  # one true loop in a thousand is beyond the gate
-    best = minimise_accepted(world.graph, poses, np.ones(len(keep), bool))
-    assert error(minimise_accepted(world.graph, poses, keep), best) < 0.02
+    solution, _ = robust_solve(world.graph)
+    # One true loop in a thousand is beyond the gate.
+    assert np.count_nonzero(~solution.accepted) <= 2
+    assert not solution.doubts
 
 
 def test_a_graph_of_odometry_alone_is_its_chain(world):
@@ -109,23 +101,11 @@ def test_a_map_that_loops_agree_is_wrong_is_doubtful(world):
         return measurement
 
     steps = graph.between.i[np.sort(slipped)]
-    doubt = robust_solve(with_measurements(graph, change))[0].doubt
-    assert doubt.kind == INCONSISTENT and doubt.loops > 10
-    assert steps[0] - 20 < doubt.first < doubt.last < steps[1] + 20
-
-
-@pytest.mark.parametrize('refused, doubtful', [(0, False), (2, False), (3, True), (5, True)])
-def test_most_loops_refused_is_a_doubt(refused, doubtful):
-    graph, n = FactorGraph(se2), 10
-    graph.add_poses(n)
-    i = np.concatenate((np.arange(n - 1), np.arange(5)))
-    j = np.concatenate((np.arange(1, n), np.arange(5) + 4))
-    graph.add_between(i, j, np.zeros((len(i), 3)), np.tile(np.eye(3), (len(i), 1, 1)))
-    accepted = np.arange(len(i)) < len(i) - refused
-    expected = Doubt(MOSTLY_REFUSED, refused, 5 - refused, 8) if doubtful else None
-    assert mostly_refused(graph, accepted) == expected
-    # Of less than a handful most may be refused.
-    assert mostly_refused(graph.subset(np.arange(n + 3)), accepted[:n + 3]) is None
+    solution, poses = robust_solve(with_measurements(graph, change))
+    right = error(poses, world.truth) < 0.5
+    assert right or {doubt.kind for doubt in solution.doubts} & {OTHER_MAP, SLIP}
+    for doubt in solution.doubts:
+        assert doubt.loops > 10 and doubt.first < steps[0] < doubt.last
 
 
 def test_a_trusted_loop_is_never_refused(world):
@@ -139,7 +119,6 @@ def test_a_trusted_loop_is_never_refused(world):
                          trusted=np.arange(len(true)) == lie)
     solution, poses = robust_solve(trusting)
     assert solution.accepted[lie]
-    assert reconsidered(trusting, poses, solution.accepted)[lie]
 
 
 def test_the_same_graph_gives_the_same_answer(world):

@@ -10,6 +10,7 @@ from problems import add_absolute
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
+from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.robust.inspection import (
     _system,
     connected_parts,
@@ -17,7 +18,6 @@ from l1slam_ros.core.robust.inspection import (
     information_range,
     long_steps,
     noise_scales,
-    odometry_gaps,
     parallel_factors,
     repeated_factors,
     step_lengths,

@@ -19,9 +19,8 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.robust.batch import minimise_accepted, robust_solve
+from l1slam_ros.core.robust.batch import judge, robust_solve
 from l1slam_ros.core.robust.judgement import Judgement
-from l1slam_ros.core.robust.running import judge
 
 EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 
@@ -137,8 +136,8 @@ def test_it_ends_where_the_batch_solve_does(bad):
 
 
 def test_judging_again_changes_nothing(bad):
-    once = judged(bad)
-    poses = minimise_accepted(bad.graph, bad.odometry, once.accepted)
+    once, poses = judge(bad.graph, bad.odometry,
+                        Judgement.nothing().extended(bad.graph, True), np.inf)
     twice, _ = judge(bad.graph, poses, once, np.inf)
     assert_array_equal(twice.accepted, once.accepted)
     assert twice.settled
@@ -176,8 +175,7 @@ def test_a_lie_that_was_believed_is_dropped_when_the_truth_comes(bad):
     believed = Judgement.nothing().extended(bad.graph, True)
     lie = int(np.flatnonzero(is_false(bad, bad.graph.between))[30])
     believed.accepted[lie], believed.suspect[lie] = True, False
-    judgement = judged(bad, believed)
+    judgement, poses = judge(bad.graph, bad.odometry, believed, np.inf)
     assert not judgement.accepted[is_false(bad, bad.graph.between)].any()
     assert not judgement.suspect[lie] and judgement.sigmas[lie] > 4
-    poses = minimise_accepted(bad.graph, bad.odometry, judgement.accepted)
     assert position_error(poses, bad.truth) < 0.2

@@ -7,9 +7,10 @@ from lies import careful_world, is_false, spoilt
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
-from l1slam_ros.core.robust.gating import DOUBT
-from l1slam_ros.core.robust.pairwise_consistency import accord, spanned, weakest_steps
+from l1slam_ros.core.robust.judgement import doubts
+from l1slam_ros.core.robust.pairwise_consistency import spanned, strongest_group
 from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.slips import SPANNING, refused, weakest_steps
 
 STEP = 200
 
@@ -32,37 +33,34 @@ def slipped(graph, step):
 
 
 def grown(graph):
-    """Return the state in which nothing more can be believed."""
+    """Return the state in which nothing more can be accepted."""
     growth = Growth(graph)
     growth.begin()
     while len(news := growth.believable(growth.undecided())):
         growth.accepted[news] = True
-        growth.settle()
+        growth.solve()
     return growth
 
 
 def test_loops_across_a_slip_agree(bad):
     growth = grown(slipped(bad.graph, STEP))
-    camp, chance = accord(growth)
-    assert len(growth.heads(camp)) >= 3 and chance < DOUBT
-    assert not is_false(bad, growth.factors)[camp].any()
-    assert ((growth.low[camp] <= STEP) & (growth.high[camp] > STEP)).all()
-    steps = weakest_steps(growth, camp)
-    assert steps[0] <= STEP <= steps[-1] and len(steps) < 20
+    group = strongest_group(growth, refused(growth))
+    assert len(group.places) >= SPANNING
+    assert not is_false(bad, growth.factors)[group.rows].any()
+    assert ((growth.low[group.rows] <= STEP) & (growth.high[group.rows] > STEP)).all()
+    steps = growth.low[weakest_steps(growth, group)]
+    assert steps.min() <= STEP <= steps.max() and len(steps) < 20
 
 
 @pytest.mark.parametrize('kind', ['random', 'identity', 'grouped'])
 def test_false_loops_agree_by_chance_at_most(kind):
-    growth = grown(spoilt(careful_world(400, 800), kind, 400).graph)
-    camp, chance = accord(growth)
-    assert not len(camp) or chance > DOUBT
-    assert not len(weakest_steps(growth, camp[:0]))
+    assert not doubts(grown(spoilt(careful_world(400, 800), kind, 400).graph))
 
 
 def test_where_nothing_is_refused_nobody_agrees():
     growth = grown(careful_world(60, 100).graph)
     growth.accepted[:] = True
-    assert accord(growth)[0].shape == (0,)
+    assert not len(strongest_group(growth, refused(growth)).rows)
 
 
 def test_spanned_counts_the_factors_across_each_step():

@@ -17,9 +17,10 @@ def test_one_true_loop_in_a_thousand_is_beyond_the_gate():
         growth = Growth(careful_world(200, 1200, seed).graph)
         loops = np.flatnonzero(growth.is_loop)
         growth.accepted[np.random.default_rng(seed).choice(loops, 5, replace=False)] = True
-        growth.settle()
+        growth.solve()
         rows = growth.undecided()
-        refused += np.count_nonzero(growth.innovations(rows).square >= growth.gate())
+        found = growth.innovations(rows)
+        refused += np.count_nonzero(found.square >= growth.gate(found.freedom))
         asked += len(rows)
     # Loops of one world share its errors, so a binomial bound (3 sigma: 23 in 60) is doubled.
     assert asked > 50_000
@@ -54,7 +55,7 @@ def test_two_loops_vouch_for_each_other_only_within_the_gate_of_both(apart, beli
     But 3.6 m are more, over the 42 steps between them, than one true pair in a thousand shows.
     """
     growth = Growth(two_loops(apart))
-    growth.settle()
+    growth.solve()
     rows = growth.undecided()
     assert (growth.innovations(rows).square < 1).all()
     assert len(growth.believable(rows)) == believed

@@ -12,10 +12,10 @@ from problems import covariance6, loop, odometry, play
 from l1slam_ros.cli.main import main
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.online import backend as backend_module
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED, WAITING
+from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.core.robust.judgement import Doubt
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
@@ -81,7 +81,7 @@ def assert_equal(a, b):
 def test_all_comes_back(halfway, tmp_path):
     saved, path = halfway.saved(), tmp_path / 'map.g2o'
     assert {WAITING, ACCEPTED, REJECTED} <= set(halfway.loop_states().state)
-    doubtful = replace(saved.optimised.judgement, doubt=Doubt('inconsistent', 3, 4, 5),
+    doubtful = replace(saved.optimised.judgement, doubts=(Doubt('another map', 3, 4, 5),),
                        variance=np.array([0.1, 2 / 3]), slips=np.array([7, 9]))
     saved = replace(saved, optimised=replace(saved.optimised, judgement=doubtful))
     assert save_map(path, saved) == f'50 keyframes saved to {path}'
@@ -101,13 +101,13 @@ def test_what_is_loaded_goes_on_as_if_nothing_had_been(world, halfway, tmp_path,
     np.testing.assert_array_equal(backend.snapshot().map_to_odom, halfway.snapshot().map_to_odom)
     # Nothing is judged anew, nor improved: there is nothing new.
     with monkeypatch.context() as patch:
-        patch.setattr(backend_module, 'improve', None)
+        patch.setattr(upkeep, 'improve', None)
         assert backend.update(PLENTY) is None
     for one in backend, undisturbed:
         play(one, world, 50)
         settle(one)
     a, b = (one.saved().optimised for one in (backend, undisturbed))
-    np.testing.assert_allclose(a.poses, b.poses, atol=1e-6)
+    np.testing.assert_allclose(a.poses, b.poses, atol=1e-3)
     assert a.cost == pytest.approx(b.cost, rel=1e-6)
     assert_equal(backend.saved().growth, undisturbed.saved().growth)
     np.testing.assert_array_equal(backend.loop_states().state, undisturbed.loop_states().state)
@@ -135,6 +135,19 @@ def test_the_motion_after_the_last_keyframe_is_not_lost(tmp_path):
         moved = backends[0].add_odometry(odometry(time, pose))
         np.testing.assert_allclose(se2.compose(moved, np.array([pose])), [[7.4, 0.8, 0.16]],
                                    atol=1e-9)
+
+
+def test_what_came_after_the_last_update_is_looked_at(world, tmp_path):
+    backend, loaded = first_half(world), Backend(EVERY)
+    settle(backend)
+    backend.add_loop(replace(loop(0.9, 4.5, (3.0, 1.0, 0.5), 0.5 * np.eye(6)), trusted=True))
+    save_map(tmp_path / 'map.g2o', backend.saved())
+    loaded.restore(load_map(tmp_path / 'map.g2o')[0])
+    for one in backend, loaded:
+        assert one.update(PLENTY) is not None
+        settle(one)
+    np.testing.assert_allclose(loaded.poses, backend.poses, atol=2e-3)
+    assert not np.allclose(loaded.poses, load_map(tmp_path / 'map.g2o')[0].optimised.poses)
 
 
 def test_a_loop_that_was_saved_is_known_when_it_is_sent_again(halfway, world, tmp_path):
@@ -209,8 +222,8 @@ def test_what_is_damaged_takes_the_place_of_no_map(two, halfway):
     assert load_map(two)[1].startswith('5 keyframes')
 
 
-def test_the_commands_notice_damage_too(two, capsys):
-    assert main(['info', str(two)]) == 0
+def test_the_commands_read_both_and_notice_damage_too(two, capsys):
+    assert main(['info', str(two)]) == main(['info', f'{two}.1']) == 0
     content = two.read_bytes()
     two.write_bytes(content.replace(b'EDGE_SE2 0 1 1.0', b'EDGE_SE2 0 1 2.0'))
     assert main(['info', str(two)]) == 2

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Graphs in several parts, made whole for a solver, at no cost to what they say.
+
+In: a graph whose odometry has gaps, or that nothing accepted ties together. Out: the same with a
+factor in each gap that no other factor speaks against.
+"""
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
+
+# A gap: the odometry is so many times vaguer, by the volume of one sigma; and no number is less.
+_VAGUE, _TINY = 1e4, 1e-300
+
+
+def odometry_gaps(graph: FactorGraph) -> Indices:
+    """Return the keyframes k without a factor between k and k + 1, (g,)."""
+    factors = graph.between
+    first = np.minimum(factors.i, factors.j)[factors.is_odometry]
+    gaps: Indices = np.setdiff1d(np.arange(graph.n_poses - 1), first)
+    return gaps
+
+
+def vague_odometry(graph: FactorGraph) -> Mask:
+    """Return which factors are odometry so vague, beside all other, that it says nothing, (m,)."""
+    factors = graph.between
+    diagonal = np.abs(np.diagonal(factors.sqrt_information, axis1=1, axis2=2))
+    size = np.where(factors.speaks, np.log(np.maximum(diagonal, _TINY)), 0.0).sum(axis=1)
+    odometry = factors.is_odometry
+    vague: Mask = odometry & (size < np.median(size[odometry]) - np.log(_VAGUE)
+                              if odometry.any() else False)
+    return vague
+
+
+def bridged(graph: FactorGraph) -> FactorGraph:
+    """Return the graph with a factor for each gap of its odometry, behind all others."""
+    gaps = odometry_gaps(graph)
+    return _with_steps(graph, gaps, graph.manifold.identity(len(gaps)))
+
+
+def tied(graph: FactorGraph, poses: Array) -> FactorGraph:
+    """
+    Return the graph with its parts tied together where they are, poses (n, p).
+
+    Each but the first gets one more factor, behind all others, from its first keyframe to the one
+    before, which is of an earlier part. They form a tree, so the optimum leaves no residual.
+    """
+    first = np.unique(component_labels(graph), return_index=True)[1][1:]
+    return _with_steps(graph, first - 1, graph.manifold.between(poses[first - 1], poses[first]))
+
+
+def _with_steps(graph: FactorGraph, at: Indices, Z: Array) -> FactorGraph:
+    """Return the graph with steps Z (k, p) from keyframes `at` (k,), as sure as its odometry."""
+    if not len(at):
+        return graph
+    whole, roots = graph.copy(), graph.between.sqrt_information
+    usual = (np.median(roots[graph.between.is_odometry], axis=0) if graph.between.is_odometry.any()
+             else np.eye(graph.manifold.TANGENT_SIZE))
+    whole.append_between(at, at + 1, Z, np.broadcast_to(usual, (len(at), *usual.shape)))
+    return whole

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The state of the map of a back end: what was made of its graph, and what is due.
+
+In: the graph as it grows, and what workers have made of snapshots of it. Out: where the newest
+keyframe is, what is accepted, and whether map or judgement are due. Its owner holds the lock.
+"""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.growable_array import GrowingArray
+from l1slam_ros.core.incremental.front import Front
+from l1slam_ros.core.online.graph_builder import GraphBuilder
+from l1slam_ros.core.online.snapshot import Optimised
+from l1slam_ros.core.online.update import Improvement
+from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.solvers.optimality import Status
+
+# A map is factored anew from so many rows on that came since: those of ten keyframes.
+_MANY_ROWS = 90
+# [s] While loops come none of which fits, they are judged so often.
+_JUDGE_EVERY = 2.0
+# [s] What the exact map of a sparse graph takes a keyframe, before that was measured.
+_OPTIMUM = 6e-5
+
+
+class LiveMap:
+    """
+    The map of a graph.
+
+    Parameters
+    ----------
+    number : of the map, another for each graph
+    builder : of the graph
+    optimised : what there is of it
+    robust : loops may be doubted
+
+    Attributes
+    ----------
+    front : takes what has come, None: there is none
+    looks : (k, 3) what fronts said of the factors after those that are judged: accepted, suspect,
+        sigmas
+    judged : (n, p) the L2 map of the judgement, None: there is none
+    stale : the map is not of the factors that are accepted
+    last : the last improvement, None: there was none
+    newest : the last keyframe of the map, and its pose (1, p)
+    round_took, judge_took : processor time [s] of the last exact map, time of the last judgement
+
+    """
+
+    def __init__(self, number: int, builder: GraphBuilder, optimised: Optimised, robust: bool):
+        self.number, self.robust, self._builder = number, robust, builder
+        self.optimised, self.looks = optimised, GrowingArray((3,))
+        self.front: Front | None = None
+        self.judged: Array | None = None
+        self.stale = False
+        self.last: Improvement | None = None
+        self.newest: tuple[int, Array]
+        self.judge_took = self._judge_at = 0.0
+        self.round_took = _OPTIMUM * builder.graph.n_poses
+        # The factors that the map is of, the loops that were judged, and whether one that the
+        # front left may be true.
+        self._used, self._fits = np.zeros(0, bool), False
+        known = len(optimised.judgement.accepted)
+        self._judged_loops = int(np.count_nonzero(builder.loop_rows < known))
+        self.note_newest()
+
+    @property
+    def all_judged(self) -> bool:
+        """Whether no loop waits to be judged."""
+        return not self.robust or (self.optimised.judgement.settled
+                                   and self._judged_loops == len(self._builder.loop_rows))
+
+    @property
+    def accepted(self) -> Mask:
+        """Which of the factors that were looked at are accepted, (m,) bool."""
+        return np.concatenate((self.optimised.judgement.accepted, self.looks.view()[:, 0] > 0))
+
+    def hear(self) -> None:
+        """Take over what a person said of factors that were looked at before."""
+        factors, before = self._builder.graph.between, self.accepted
+        count, judgement = len(before), self.optimised.judgement
+        after = (before | factors.trusted[:count]) & ~factors.struck[:count]
+        if (after == before).all():
+            return
+        known = len(judgement.accepted)
+        self.optimised = replace(self.optimised, judgement=replace(
+            judgement, accepted=after[:known], suspect=judgement.suspect & ~after[:known]))
+        looks, self.looks = self.looks.view().copy(), GrowingArray((3,))
+        looks[:, 0] = after[known:]
+        self.looks.extend(looks)
+        self._judged_loops, self.stale = -1, True
+
+    def take_one(self) -> bool:
+        """Let the front take one factor; return whether it did."""
+        front, factors = self.front, self._builder.graph.between
+        if front is None or front.closed or front.rows >= len(factors):
+            return False
+        row, judged = front.rows, self.optimised.judgement.accepted
+        accept: bool | None = None
+        if factors.struck[row]:
+            accept = False
+        elif row < len(judged):
+            accept = bool(judged[row])
+        elif row < len(judged) + len(self.looks):
+            accept = bool(self.looks.view()[row - len(judged), 0])
+        elif factors.trusted[row] or not self.robust:
+            accept = True
+        look = front.add(factors, accept)
+        if look is None:
+            return False
+        if row == len(judged) + len(self.looks):
+            self.looks.extend(np.array([(look.accepted, look.suspect, look.sigmas)], float))
+            self._fits |= look.suspect
+        return True
+
+    def is_map_due(self, idle: bool) -> bool:
+        """Return whether to make the map anew; idle : nothing has come for a while."""
+        graph, optimised, front = self._builder.graph, self.optimised, self.front
+        rows = len(graph.between) * graph.manifold.TANGENT_SIZE
+        behind = (len(optimised.poses) < graph.n_poses or len(optimised.dual) < rows
+                  or not optimised.at_rest)
+        late = idle or front is None or front.closed or front.border >= _MANY_ROWS
+        falls = self.last is not None and self.last.falls
+        return bool(graph.n_poses) and (self.stale or falls or (behind and late))
+
+    def is_judge_due(self, idle: bool, budget: float) -> bool:
+        """Return whether to judge all loops; budget : there is so much time for it now [s]."""
+        soon = self._fits or self.front is None
+        wait = self.judge_took if soon else max(_JUDGE_EVERY, 2 * self.judge_took)
+        in_time = idle or budget > self.judge_took
+        return not self.all_judged and (in_time or time.monotonic() > self._judge_at + wait)
+
+    def begin_judgement(self) -> int:
+        """Expect a judgement of all loops there are; return how many."""
+        self._fits = False
+        return len(self._builder.loop_rows)
+
+    def take_judgement(self, judgement: Judgement, poses: Array, loops: int) -> None:
+        """Take over what is accepted of the first factors, so many loops, and its L2 map."""
+        looks, before = self.looks.view(), len(self.optimised.judgement.accepted)
+        self.looks = GrowingArray((3,))
+        self.looks.extend(looks[len(judgement.accepted) - before:])
+        self.optimised = replace(self.optimised, judgement=judgement)
+        self._judged_loops, self.judged = loops, poses
+        self._judge_at = time.monotonic()
+        self._compare()
+
+    def adopt(self, improvement: Improvement, front: Front | None, tolerance: float) -> None:
+        """
+        Take over a map; see `Improvement.taken_over`.
+
+        Raises
+        ------
+        ArithmeticError : it is not finite; nothing is taken over.
+
+        """
+        self.optimised = improvement.taken_over(self.optimised, tolerance)
+        judgement = improvement.judgement
+        self.front, self.last, self._used = front, improvement, judgement.accepted
+        # What the front begins with, no other may have looked at.
+        first = len(self.optimised.judgement.accepted) + len(self.looks)
+        self.looks.extend(np.column_stack(
+            (judgement.accepted, judgement.suspect, judgement.sigmas))[first:])
+        self._compare()
+        self.note_newest()
+
+    def note_newest(self) -> None:
+        """Remember the last keyframe of the map, which keyframes to come follow."""
+        poses = self.optimised.poses
+        self.newest = ((self.front.keyframes - 1, self.front.newest) if self.front
+                       else (len(poses) - 1, poses[-1:]))
+
+    def account(self, seconds: float) -> Improvement:
+        """Return what the last map says of itself, after an update that took so long."""
+        now, last = self.optimised, self.last
+        judgement = replace(now.judgement, settled=self.all_judged)
+        if last is None:
+            return Improvement(self.number, now.poses, now.dual, judgement, 0.0, 0.0,
+                               Status.OUT_OF_TIME, 0, 0, 0, np.inf, seconds)
+        return replace(last, judgement=judgement, seconds=seconds)
+
+    def growth(self) -> tuple[FactorGraph, int, int]:
+        """Return what changes when something comes."""
+        graph = self._builder.graph
+        return graph, graph.n_poses, len(graph.between)
+
+    def _compare(self) -> None:
+        """Find out whether the map is of the factors that are accepted."""
+        used, accepted = self._used, self.accepted
+        both = min(len(used), len(accepted))
+        self.stale = bool((used[:both] != accepted[:both]).any())

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Threads of the back end: one piece of work behind an update, and updates without a timer."""
+
+import threading
+from collections.abc import Callable
+
+from l1slam_ros.core.errors import Interrupted
+
+
+class Worker:
+    """
+    Does one piece of work at a time, in a thread that ends with it.
+
+    Parameters
+    ----------
+    name : of its threads
+    done : called when some work has ended, however it did
+
+    """
+
+    def __init__(self, name: str, done: Callable[[], None]):
+        self._name, self._done = name, done
+        self._thread: threading.Thread | None = None
+        self._error: Exception | None = None
+        self.busy = False
+
+    def start(self, work: Callable[[], None]) -> None:
+        """Begin some work, unless some is under way."""
+        if self.busy:
+            return
+        self.busy = True
+        # Not a daemon: those are torn down within a compiled loop when the process ends.
+        self._thread = threading.Thread(target=self._run, args=(work,), name=self._name)
+        self._thread.start()
+
+    def join(self) -> None:
+        """Wait for the end of what is under way."""
+        if self._thread is not None:
+            self._thread.join()
+
+    def check(self) -> None:
+        """Raise what the last work raised, once."""
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def _run(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except Interrupted:
+            # By what wants no more of it.
+            pass
+        except Exception as error:
+            self._error = error
+        self.busy = False
+        self._done()
+
+
+class Background:
+    """
+    Calls an update each time it is woken, and once more when it has not been for a while.
+
+    Parameters
+    ----------
+    update : called with whether nothing has come for a while, and a function that tells it to stop
+    pause : [s] that is a while
+
+    """
+
+    def __init__(self, update: Callable[[bool, Callable[[], bool]], object], pause: float):
+        self._update, self._pause = update, pause
+        self._woken = threading.Event()
+        self._closing = False
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._work, name='updates', daemon=True)
+        self._thread.start()
+
+    def wake(self) -> None:
+        """Look whether there is something to do."""
+        self._woken.set()
+
+    def close(self) -> None:
+        """Stop what is at work and end; raise what an update raised: it was the last one then."""
+        self._closing = True
+        self._woken.set()
+        self._thread.join()
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
+
+    def _work(self) -> None:
+        pause: float | None = None
+        try:
+            while not self._closing:
+                idle = not self._woken.wait(pause)
+                # In this order, or the call to close is lost.
+                self._woken.clear()
+                if not self._closing:
+                    pause = self._pause if self._updated(idle) else None
+        except Exception as error:
+            self._error = error
+
+    def _updated(self, idle: bool) -> bool:
+        """Tell whether more may be to do later."""
+        try:
+            return self._update(idle, lambda: self._closing) is not None
+        except Interrupted:
+            # By what wakes this thread when it is done.
+            return False

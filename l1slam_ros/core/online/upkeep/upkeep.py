@@ -1,0 +1,344 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Keeping a map up to date while it grows: the front in an update, map and judge behind it.
+
+An update takes what has come into a map that was factored before (`front`), in a time that does
+not grow with the map. Two workers go on behind it, each in a thread of its own, from one snapshot
+to the next:
+
+    map     lowers the L1 cost of what is accepted, and factors it for the next front
+    judge   looks at all loops anew, and moves nothing
+
+One lock is held to append, to take a snapshot, to look at one factor and to adopt, never while
+solving, reading or writing a file. A second one lets one thread at a time update.
+
+What is being worked out for a map that is replaced meanwhile, or that `settle` is to solve in the
+place of the workers, is told to stop, and never adopted.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+
+from l1slam_ros.core.errors import Interrupted
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.incremental.front import Front
+from l1slam_ros.core.online.graph_builder import GraphBuilder
+from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
+from l1slam_ros.core.online.snapshot import Optimised, Snapshot
+from l1slam_ros.core.online.update import Improvement, front_of, improve, optimise
+from l1slam_ros.core.online.upkeep.live_map import LiveMap
+from l1slam_ros.core.online.upkeep.threads import Worker
+from l1slam_ros.core.robust.batch import judge
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
+
+# Asked on the way, often: whether to stop.
+Stopped = Callable[[], bool]
+# [s] So long an update may take what has come, and a map is improved, whatever the budget.
+_LEAST_TIME, _LEAST_ROUND = 0.02, 0.1
+# Linearisations of one round: more and it is late. Of the clock it may take some times as long.
+_OUTER, _PATIENCE = 2, 4
+# So often a new front takes what came meanwhile, before it is one.
+_PASSES = 3
+# [s] How often who waits looks whether to stop.
+_LOOK = 0.05
+
+
+class Upkeep:
+    """
+    The part of a back end that keeps its map.
+
+    Parameters
+    ----------
+    solver, robust : the options of these names
+
+    Attributes
+    ----------
+    maps : how many maps there were: one more whenever factors were taken into it, and with each
+        that was adopted or took another's place
+    moved : map -> odom before and after the last of them, (1, p) each
+
+    """
+
+    def __init__(self, solver: OptimiserOptions, robust: bool):
+        self._solver, self._robust = solver, robust
+        self._lock, self._updating = threading.Lock(), threading.Lock()
+        self._ended = threading.Event()
+        self._workers = self._mapper, self._judge = (
+            Worker('map', self._on_end), Worker('judge', self._on_end))
+        self._make_way = False
+        self.maps = self._changes = self._samples = 0
+        self._builder: GraphBuilder
+        self._live: LiveMap
+        # The version at which an update found nothing to do, and what there was at the last one.
+        self._at_rest: object = None
+        self._grown: object = None
+        self._map_to_odom: tuple[Array, Array] | None = None
+        self.moved: tuple[Array, Array]
+
+    def _begin(self, builder: GraphBuilder, optimised: Optimised) -> None:
+        """Begin a map with the graph of a builder; the lock is held."""
+        number = self._live.number + 1 if hasattr(self, '_live') else 1
+        self._builder = builder
+        self._live = LiveMap(number, builder, optimised, self._robust)
+        self._map_to_odom, self._grown = None, self._live.growth()
+        self._changes += 1
+
+    @property
+    def version(self) -> tuple[int, int, int]:
+        """Other than an earlier one where there may be something new to do or to tell."""
+        with self._lock:
+            return self._version()
+
+    def _version(self) -> tuple[int, int, int]:
+        builder = self._builder
+        # While loops wait, any sample may be the one that they wait for, or one too many.
+        return (self._changes, builder.graph.n_poses, self._samples if builder.n_waiting else 0)
+
+    def snapshot(self) -> Snapshot:
+        """Return the back end as it is now, the due loops in its graph, to be read at leisure."""
+        with self._lock:
+            return self._snapshot()
+
+    def _snapshot(self) -> Snapshot:
+        builder, live = self._builder, self._live
+        builder.add_due_loops()
+        return Snapshot(
+            live.number, self._version(), builder.graph.copy(), builder.gaps, builder.stamps,
+            builder.odometry, self._map_to_odom_now(), builder.loop_rows, builder.loop_stamps,
+            live.optimised, live.robust, live.looks.view(), live.all_judged, live.judged,
+            live.stale, live.front.views if live.front else ())
+
+    def _map_to_odom_now(self) -> Array:
+        """Return the odometry frame seen from the map: what its last keyframe says."""
+        offset, manifold = self._builder.offset, self._builder.graph.manifold
+        last, pose = self._live.newest
+        if last < 0:
+            return manifold.identity(1)
+        # Asked for with every sample: worked out when an update or a new offset changes it.
+        if self._map_to_odom is None or self._map_to_odom[0] is not offset:
+            odometry = self._builder.odometry[last : last + 1]
+            to_kept = manifold.compose(pose, manifold.inverse(odometry))
+            self._map_to_odom = offset, manifold.compose(to_kept, offset)
+        return self._map_to_odom[1]
+
+    def update(self, budget: float = 0.1, stopped: Stopped = lambda: False) -> Improvement | None:
+        """
+        Take what has come into the map, and let it be improved; None: there was nothing to do.
+
+        What has come, up to some twenty milliseconds of work, is in the map when this returns. It
+        waits up to `budget` seconds for what goes on behind, and leaves the rest there.
+
+        Raises
+        ------
+        Interrupted : told to stop, or to make way for `settle`, or the map was replaced.
+
+        """
+        return self._update(budget, stopped)
+
+    def _update(self, budget: float, stopped: Stopped, idle: bool | None = None
+                ) -> Improvement | None:
+        """See `update`; idle : nothing has come for a while, None: find out."""
+        start = time.monotonic()
+        with self._updating:
+            self._check_workers()
+            if self._at_rest == self.version:
+                return None
+            live, last = self._live, self._live.last
+            self._take(start + max(budget, _LEAST_TIME))
+            with self._lock:
+                grown = live.growth()
+                came, self._grown = grown != self._grown, grown
+            idle = not came if idle is None else idle
+            check = self._check_of(live, stopped)
+            while self._begin_due(idle, budget, check):
+                self._ended.wait(max(min(_LOOK, start + budget - time.monotonic()), 0.0))
+                self._ended.clear()
+                self._check_workers()
+                check()
+                if time.monotonic() >= start + budget:
+                    return live.account(time.monotonic() - start)
+            if came or live.last is not last:
+                return live.account(time.monotonic() - start)
+            if idle:
+                self._at_rest = self.version
+        return None
+
+    def _check_of(self, live: LiveMap, stopped: Stopped) -> Callable[[], None]:
+        """Return what raises `Interrupted` where work for a map is not wanted any more."""
+        def check() -> None:
+            if self._make_way or stopped() or live is not self._live:
+                raise Interrupted
+
+        return check
+
+    def _check_workers(self) -> None:
+        for worker in self._workers:
+            worker.check()
+
+    def _take(self, deadline: float) -> None:
+        """Let the front take what has come, until a time [s]."""
+        with self._lock:
+            self._builder.add_due_loops()
+            self._live.hear()
+            before, taken = self._map_to_odom_now(), False
+        while time.monotonic() < deadline:
+            with self._lock:
+                if not self._live.take_one():
+                    break
+                taken = True
+        if taken:
+            with self._lock:
+                self._live.note_newest()
+                self._note_map(before)
+
+    def _begin_due(self, idle: bool, budget: float, check: Callable[[], None]) -> bool:
+        """Let the workers begin what is due; return whether any is at work."""
+        with self._lock:
+            if self._live.is_map_due(idle):
+                self._mapper.start(lambda: self._map_anew(idle, budget, check))
+            if self._live.is_judge_due(idle, budget):
+                self._judge.start(lambda: self._judge_anew(check))
+            return self._mapper.busy or self._judge.busy
+
+    def _map_anew(self, idle: bool, budget: float, check: Callable[[], None]) -> None:
+        """Lower the cost of the map, when idle to the end, and factor it."""
+        start = time.thread_time()
+        with self._lock:
+            live, now, solver = self._live, self._snapshot(), self._solver
+        whole = now.problem()
+        problem = as_one(whole)
+        check()
+        round_ = max(budget, _LEAST_ROUND)
+        # For the first front of a map that was loaded nobody shall wait long.
+        thorough = idle and live.front is not None
+        if problem.is_sparse and (thorough or live.round_took < round_):
+            improvement = improve(problem, solver, np.inf, check)
+            live.round_took = time.thread_time() - start
+        else:
+            outer = min(solver.outer_iterations, _OUTER)
+            improvement = improve(problem, replace(solver, outer_iterations=outer),
+                                  _PATIENCE * round_, check)
+        check()
+        front = front_of(problem, improvement.poses, len(whole.graph.between), check)
+        for _ in range(_PASSES):
+            with self._lock:
+                factors, accepted = self._builder.graph.between, live.accepted
+            while front is not None and front.rows < len(accepted):
+                check()
+                if not front.add(factors, bool(accepted[front.rows])):
+                    break
+        check()
+        self.adopt(of_all(improvement, whole), front)
+
+    def _judge_anew(self, check: Callable[[], None]) -> None:
+        """Look at all loops anew; no keyframe is moved."""
+        start = time.monotonic()
+        with self._lock:
+            live, now, loops = self._live, self._snapshot(), self._live.begin_judgement()
+        whole = now.problem()
+        problem = as_one(whole)
+        judgement, poses = judge(problem.graph, problem.poses, problem.judgement, np.inf, check)
+        check()
+        judgement = judgement_of_all(judgement, whole)
+        with self._lock:
+            live.take_judgement(judgement, poses, loops)
+            live.judge_took = time.monotonic() - start
+            self._changes += 1
+
+    def settle(self, stopped: Stopped = lambda: False) -> Improvement | None:
+        """
+        Judge all loops and solve to the end; None: there are no factors yet.
+
+        What is under way makes way.
+
+        Raises
+        ------
+        Interrupted : told to stop, or the map was replaced.
+
+        """
+        with self._alone():
+            with self._lock:
+                live, now, loops = self._live, self._snapshot(), self._live.begin_judgement()
+                self._grown = live.growth()
+            whole = now.problem()
+            if not len(whole.graph.between):
+                return None
+            problem, check = as_one(whole), self._check_of(live, stopped)
+            improvement = optimise(problem, self._solver, check)
+            check()
+            front = front_of(replace(problem, judgement=improvement.judgement), improvement.poses,
+                             len(whole.graph.between), check)
+            improvement = of_all(improvement, whole)
+            with self._lock:
+                if live is not self._live:
+                    raise Interrupted
+                live.take_judgement(improvement.judgement, improvement.poses, loops)
+                self._adopt(improvement, front)
+        self._on_end()
+        return improvement
+
+    def adopt(self, improvement: Improvement, front: Front | None = None) -> None:
+        """
+        Take over a map that was made of a snapshot; keyframes since then follow along.
+
+        front : made of it, None: it cannot be factored
+
+        Raises
+        ------
+        Interrupted : it was made for a map that is there no more.
+        ArithmeticError : it is not finite; nothing is taken over.
+
+        """
+        with self._lock:
+            if improvement.map != self._live.number:
+                raise Interrupted
+            self._adopt(improvement, front)
+
+    def _adopt(self, improvement: Improvement, front: Front | None) -> None:
+        before = self._map_to_odom_now()
+        self._live.adopt(improvement, front, self._solver.outer_tolerance)
+        self._note_map(before)
+
+    def _note_map(self, before: Array) -> None:
+        """Note that the map is another now; before : map -> odom until then."""
+        self._map_to_odom = None
+        self.moved = before, self._map_to_odom_now()
+        self._changes += 1
+        self.maps += 1
+
+    def marginal_covariance(self, keyframe: int) -> Array | None:
+        """
+        Return the covariance of a keyframe's step, (k, k), relative to what is held fixed.
+
+        Exact for the least squares map of what is accepted, with the noise as it was found. None:
+        the keyframe is not in a factored map yet.
+        """
+        with self._lock:
+            front = self._live.front
+            if front is None or not 0 <= keyframe < front.keyframes:
+                return None
+            return front.covariance(keyframe)
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Let nothing be at work."""
+        self._make_way = True
+        with self._updating:
+            for worker in self._workers:
+                worker.join()
+            self._make_way = False
+            yield
+
+    def alone(self, work: Callable[[], bool]) -> bool:
+        """Do some work while nothing is being solved, nor begins to be; return what it returns."""
+        with self._alone():
+            return work()
+
+    def _on_end(self) -> None:
+        """Hear that a worker is done."""
+        self._ended.set()
