@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A place is measured in metres along the way, and has one vote."""
+
+import numpy as np
+import pytest
+from lies import careful_world
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.robust.places import neighbours_agree, places
+
+
+def straight(step, pairs, off):
+    """Return a drive along a line with loops that are wrong by so much [m], and its chain."""
+    n = 1 + max(max(pair) for pair in pairs)
+    chain = np.column_stack((step * np.arange(n), np.zeros(n), np.zeros(n)))
+    graph, (i, j) = FactorGraph(se2), np.array(pairs).T
+    i, j = np.concatenate((np.arange(n - 1), i)), np.concatenate((np.arange(1, n), j))
+    Z = se2.between(chain[i], chain[j])
+    Z[n - 1:, 1] += off
+    graph.add_poses(n)
+    graph.add_between(i, j, Z, np.tile(np.eye(3), (len(i), 1, 1)))
+    return graph, chain
+
+
+@pytest.mark.parametrize('step, apart, same', [(0.1, 20, True), (0.1, 30, False), (2.0, 5, True),
+                                               (2.0, 6, False)])
+def test_near_is_within_metres_or_within_ordinary_steps(step, apart, same):
+    """5 m in sum where keyframes are dense, ten steps where they are far apart."""
+    pairs = [(0, 300), (apart, 300 + apart)]
+    graph, chain = straight(step, pairs, np.zeros(2))
+    place, _ = places(graph, chain)
+    assert (place[-1] == place[-2]) == same
+
+
+def test_a_run_is_one_place_and_what_claims_something_else_is_another():
+    pairs = [(k, 200 + k) for k in range(50)] + [(25, 226)]
+    off = np.concatenate((np.full(50, 3.0), [30.0]))
+    graph, chain = straight(1.0, pairs, off)
+    place = places(graph, chain)[0][-51:]
+    assert len(set(place[:50].tolist())) == 1 and place[50] not in place[:50]
+
+
+def test_few_neighbours_tell_nothing_and_many_that_differ_tell_much():
+    ends = np.column_stack((np.arange(100) * 0.1, np.zeros(100)))
+    assert neighbours_agree(np.zeros(1, int), ends[:1]) == 1.0
+    assert neighbours_agree(np.arange(2), 10 * ends[:2] * 100) == 1.0
+    assert neighbours_agree(np.zeros(100, int), ends) == 1.0
+    assert neighbours_agree(np.arange(100), ends) == pytest.approx(1 / 101)
+
+
+def test_every_loop_of_a_world_has_a_place():
+    world = careful_world(200, 400)
+    place, ends = places(world.graph, world.odometry)
+    assert place.shape == (len(world.graph.between),) and np.isfinite(ends).all()

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lies as place recognition makes them, misstated noise, sessions, and what is doubtful."""
+
+import numpy as np
+import pytest
+from lies import careful_world, is_false, position_error, spoilt
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.parts import odometry_gaps
+from l1slam_ros.core.robust.batch import robust_solve
+from l1slam_ros.core.robust.batch_map import Wish
+from l1slam_ros.core.robust.batch_map import solve as solve_graph
+from l1slam_ros.core.robust.judgement import ONE_PLACE, OTHER_MAP
+
+
+@pytest.fixture(scope='module')
+def world():
+    return careful_world(400, 800)
+
+
+def information(factors):
+    return factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information
+
+
+def shifted_runs(world, starts, length=30):
+    """Return the graph with runs of loops (i + k, j + k) that say with one voice that j is off."""
+    graph, k, shift = world.graph.copy(), np.arange(length), np.array([[8.0, -6.0, 0.4]])
+    for i, j in starts:
+        far = se2.compose(np.broadcast_to(shift, (length, 3)), world.truth[j + k])
+        graph.add_between(i + k, j + k, se2.between(world.truth[i + k], far),
+                          np.tile(np.diag([400.0, 400.0, 1e4]), (length, 1, 1)))
+    return graph
+
+
+@pytest.mark.parametrize('runs', [1, 3])
+def test_a_corridor_taken_for_another_does_not_pass_for_a_slip(world, runs):
+    graph = shifted_runs(world, [(20, 220), (70, 300), (120, 260)][:runs])
+    found, poses = robust_solve(graph)
+    assert not found.accepted[len(world.graph.between):].any() and not len(found.slips)
+    assert position_error(poses, world.truth) < 0.3
+
+
+@pytest.mark.parametrize('odometry, loops', [(1e-4, 1), (1e4, 1), (1, 1e-4), (1, 1e4),
+                                             (1e-6, 1e-6), (1e6, 1e6)])
+def test_misstated_information_changes_no_decision(world, odometry, loops):
+    bad = spoilt(world, 'random', 401)
+    factors, graph = bad.graph.between, FactorGraph(se2)
+    graph.add_poses(bad.graph.n_poses)
+    times = np.where(factors.is_odometry, odometry, loops)[:, None, None]
+    graph.add_between(factors.i, factors.j, factors.measurement, times * information(factors))
+    found, _ = robust_solve(graph)
+    false = is_false(bad, factors)
+    assert not found.accepted[false].any()
+    assert np.count_nonzero(~found.accepted[~false]) <= 8
+    # In hundreds: how noisy the odometry is shows only where loops check it.
+    np.testing.assert_allclose(np.log10(found.variance / [odometry, loops]), 0, atol=1.0)
+
+
+@pytest.mark.parametrize('joined', [True, False])
+def test_two_sessions_are_joined_by_loops_or_stay_two_parts(world, joined):
+    bad = spoilt(world, 'random', 170)
+    factors, seam, n = bad.graph.between, 199, 400
+    low, high = np.minimum(factors.i, factors.j), np.maximum(factors.i, factors.j)
+    across = (low <= seam) & (high > seam)
+    keep = ~across if not joined else ~(across & (high - low == 1))
+    graph = bad.graph.subset(keep)
+    assert odometry_gaps(graph).tolist() == [seam]
+    outcome = solve_graph(graph, None, Wish(norm='l2'))
+    assert outcome.parts == (1 if joined else 2)
+    assert not outcome.judgement.accepted[is_false(bad, graph.between)].any()
+    halves = (slice(0, n),) if joined else (slice(0, 200), slice(200, n))
+    for half in halves:
+        assert position_error(outcome.solution.poses[half], world.truth[half]) < 0.5
+
+
+def test_one_place_that_carries_all_is_doubtful_and_a_few_loops_are_not():
+    n, loops = 600, 20
+    angle = 2 * np.pi * np.arange(n + loops) / n
+    truth = np.column_stack((95 * np.cos(angle), 95 * np.sin(angle), angle))
+    k, back = np.arange(n + loops - 1), np.arange(loops)
+    i, j = np.concatenate((k, back)), np.concatenate((k + 1, back + n))
+    noise = np.random.default_rng(0).standard_normal((len(i), 3)) * [0.05, 0.05, 0.005]
+    graph = FactorGraph(se2)
+    graph.add_poses(len(truth))
+    graph.add_between(i, j, se2.retract(se2.between(truth[i], truth[j]), noise),
+                      np.tile(np.diag([400.0, 400.0, 4e4]), (len(i), 1, 1)))
+    found, _ = robust_solve(graph)
+    assert ONE_PLACE in [doubt.kind for doubt in found.doubts]
+    few, _ = robust_solve(graph.subset(np.arange(len(k) + 3)))
+    assert not few.doubts
+
+
+def test_half_a_map_that_says_it_is_elsewhere_is_doubtful():
+    """109 true loops against 54, of nine places, that agree with each other."""
+    world = careful_world(500, 499 + 109)
+    starts = [(i, 260 + 20 * run) for run, i in enumerate(range(5, 185, 20))]
+    found, _ = robust_solve(shifted_runs(world, starts, length=6))
+    assert OTHER_MAP in [doubt.kind for doubt in found.doubts]
+    assert not robust_solve(world.graph)[0].doubts
