@@ -22,7 +22,7 @@ from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.optimality import smoothing
 
 # Where the weights of the L1 map turn over, in mean |e|.
-_SMOOTHING = 0.03
+_SMOOTHING = 0.1
 # One in so many true loops may be left to the judgement for its noise alone.
 _REFUSED = 1e-3
 # Of the loops admitted, one in so many may be false.
@@ -145,10 +145,18 @@ class Front:
         # What is silent of some component is for the judgement, too.
         if accept is False or other_gauge or (accept is None and not np.diag(factor.root).all()):
             return Look(False, accept is None, np.nan)
-        new = count in pair
+        try:
+            return self._take(factor, count in pair, bool(accept))
+        except np.linalg.LinAlgError:
+            # Beyond double precision: the next map may be able to.
+            self.closed = True
+            return None
+
+    def _take(self, factor: Factor, new: bool, sure: bool) -> Look:
+        """Look at a factor, and make it part of the map where it is accepted."""
         variance = np.full(len(factor.root), self._gate.variance[0 if new else 1])
         predicted = self._l2.predict(factor)
-        look, left = self._look(predicted, variance, bool(accept) or new)
+        look, left = self._look(predicted, variance, sure or new)
         if look.accepted:
             self._l2.add(predicted, variance)
             self._l1.add(self._l1.predict(factor), np.hypot(left, self._mu))

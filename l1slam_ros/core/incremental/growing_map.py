@@ -54,19 +54,22 @@ class Predicted:
 
 @dataclass(frozen=True)
 class View:
-    """The map at one moment, to be worked out at leisure: first (n, p), and steps from there."""
+    """
+    The map at one moment, to be worked out at leisure.
+
+    first : (n, p) where the keyframes began; fixed : so many are held fixed; steps : of the others
+    """
 
     manifold: Manifold
     first: Array
+    fixed: int
     steps: Steps
 
     @cached_property
     def poses(self) -> Array:
         """All keyframes, (n, p)."""
-        steps = self.steps.all()
-        fixed = len(self.first) - len(steps)
-        moved = self.manifold.retract(self.first[fixed:], steps)
-        return np.concatenate((self.first[:fixed], moved))
+        moved = self.manifold.retract(self.first[self.fixed:], self.steps.all())
+        return np.concatenate((self.first[:self.fixed], moved))
 
 
 class GrowingMap:
@@ -89,7 +92,8 @@ class GrowingMap:
         self._first.extend(poses)
 
     def __len__(self) -> int:
-        return len(self._first)
+        # What a factor that failed wanted to see does not count.
+        return self.fixed + self._border.keyframes
 
     @property
     def rows(self) -> int:
@@ -104,7 +108,8 @@ class GrowingMap:
     @property
     def view(self) -> View:
         """The map as it is now."""
-        return View(self._manifold, self._first.view(), self._border.steps())
+        return View(self._manifold, self._first.view()[:len(self)], self.fixed,
+                    self._border.steps())
 
     def pose(self, keyframe: int) -> Array:
         """Return where a keyframe is, (1, p)."""

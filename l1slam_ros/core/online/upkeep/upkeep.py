@@ -10,10 +10,8 @@ to the next:
     judge   looks at all loops anew, and moves nothing
 
 One lock is held to append, to take a snapshot, to look at one factor and to adopt, never while
-solving, reading or writing a file. A second one lets one thread at a time update.
-
-What is being worked out for a map that is replaced meanwhile, or that `settle` is to solve in the
-place of the workers, is told to stop, and never adopted.
+solving, reading or writing a file. A second one lets one thread at a time update. What is worked
+out for a map that is replaced, or that `settle` is to solve, is told to stop, and never adopted.
 """
 
 import threading
@@ -70,7 +68,7 @@ class Upkeep:
         self._workers = self._mapper, self._judge = (
             Worker('map', self._on_end), Worker('judge', self._on_end))
         self._make_way = False
-        self.maps = self._changes = self._samples = 0
+        self.maps = self._number = self._changes = self._samples = 0
         self._builder: GraphBuilder
         self._live: LiveMap
         # The version at which an update found nothing to do, and what there was at the last one.
@@ -82,9 +80,8 @@ class Upkeep:
 
     def _begin(self, builder: GraphBuilder, optimised: Optimised) -> None:
         """Begin a map with the graph of a builder; the lock is held."""
-        number = self._live.number + 1 if hasattr(self, '_live') else 1
-        self._builder = builder
-        self._live = LiveMap(number, builder, optimised, self._robust)
+        self._builder, self._number = builder, self._number + 1
+        self._live = LiveMap(self._number, builder, optimised, self._robust)
         self._map_to_odom, self._grown = None, self._live.growth()
         self._changes += 1
 
