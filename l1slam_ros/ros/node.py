@@ -309,7 +309,7 @@ class BackendNode(LifecycleNode):
         robot = self._backend.robot()
         if robot is not None:
             before, after = (self._manifold.compose(transform, robot.odometry)
-                             for transform in self._backend.moved)
+                             for transform in self._backend.moved())
             self._diagnosis.note_jump(self._manifold, before, after)
         frame, stamp = self.options.map_frame, self._newest()
         pose3 = self._manifold.to_pose3(poses)

@@ -323,7 +323,7 @@ def test_where_the_odometry_is_full_of_gaps_nothing_is_there_to_judge_by(capsys,
 def test_a_graph_too_dense_to_judge_is_solved_all_the_same(capsys, world, monkeypatch):
     """With memory for few blocks: the odometry alone can be factored, all loops cannot."""
     expected = solve_json(capsys, world, '--no-robust')['final_cost']
-    monkeypatch.setattr(cholesky, 'MOST_BLOCKS', 400)
+    monkeypatch.setattr(cholesky, 'MOST_ENTRIES', 9 * 400)
     report = solve_json(capsys, world)
     assert report['solver'] == 'primal-dual'
     assert report['final_cost'] == pytest.approx(expected, rel=1e-3)

@@ -18,7 +18,7 @@ from node_bench import call, odometry, poses_of
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from l1slam_ros.core.online import backend as backend_module
+from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs.saved_map import is_map, load_map
 from l1slam_ros.ros.demo import executable
 
@@ -61,7 +61,7 @@ def test_a_settled_map_is_loaded_at_start_and_published_at_once(bench, tmp_path,
     first.until(lambda: first.backend._backend.snapshot().problem().settled, 'it settles')
     assert call(first, 'save').success
     improved = []
-    monkeypatch.setattr(backend_module, 'improve', lambda *_: improved.append(1))
+    monkeypatch.setattr(upkeep, 'improve', lambda *_: improved.append(1))
     second = bench(save_path=str(path), load_on_start=True)
     second.until(lambda: len(second.path().poses) == 4, 'the map is there without odometry')
     np.testing.assert_array_equal(poses_of(second.path()), poses_of(first.path()))

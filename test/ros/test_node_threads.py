@@ -199,7 +199,10 @@ def test_what_a_full_queue_has_dropped_is_said_to_be_lost(bench):
 
 
 def test_the_jump_of_the_transform_is_said(bench):
-    """A trusted loop says that the robot came but 4 m in what odometry says were 5."""
+    """A trusted loop says that the robot came but 4 m in what odometry says were 5.
+
+    The front takes the most of that step at once, the map behind it the rest.
+    """
     from geometry_msgs.msg import PoseWithCovarianceStamped
 
     from l1slam_ros.ros.publishing import header
@@ -213,5 +216,6 @@ def test_the_jump_of_the_transform_is_said(bench):
     loop.pose.pose.position.x, loop.pose.pose.orientation.w = 4.0, 1.0
     loop.pose.covariance = (1e-8 * np.eye(6)).ravel()
     vouch.publish(loop)
-    b.until(lambda: float(b.status()[2].get('jump.translation', 0)) == pytest.approx(1.0, abs=.01),
-            'a jump of a metre')
+    b.until(lambda: 0.05 < float(b.status()[2].get('jump.translation', 0)) < 1.01, 'a jump')
+    b.until(lambda: b.path().poses[-1].pose.position.x == pytest.approx(4.0, abs=0.01),
+            'a metre in all')

@@ -4,8 +4,9 @@ Supernodal Cholesky of a sparse matrix of k x k blocks: assembly and factorisati
 
 Panels are dense, row after row: entry (r, c) of panel s is panels[offset[s] + r width + c].
 Left-looking: each supernode gathers what all earlier ones subtract from it, then is factored; all
-the work is done in tiles of 3 x 3 inner products, which reuse what they load and suit blocks of
-three and of six.
+the work is done in tiles of 2 x 3 inner products, which reuse what they load and suit blocks of
+three and of six. (Of 3 x 3, the compiler makes code that is half as fast, or worse where rows are
+short.)
 
 `size` is k zeros. As a tuple its length is known when a loop is compiled, so that loops over the
 rows of a block are unrolled; as an array it serves blocks of every other size.
@@ -151,19 +152,15 @@ def _subtract(panels, top, inner, height, columns, place, target, size):
         c1, c2 = min(c + 1, columns - 1), min(c + 2, columns - 1)
         right = (source[c * inner:(c + 1) * inner], source[c1 * inner:(c1 + 1) * inner],
                  source[c2 * inner:(c2 + 1) * inner])
-        for r in range(c, height, 3):
-            r1, r2 = min(r + 1, height - 1), min(r + 2, height - 1)
-            left = (source[r * inner:(r + 1) * inner], source[r1 * inner:(r1 + 1) * inner],
-                    source[r2 * inner:(r2 + 1) * inner])
+        for r in range(c, height, 2):
+            r1 = min(r + 1, height - 1)
+            left = source[r * inner:(r + 1) * inner], source[r1 * inner:(r1 + 1) * inner]
             # Most panels of sparse graphs are as wide as a block.
             tile = _tile(left, right, size) if inner == len(size) else _tile(left, right, left[0])
             _write(panels[place[r]:], target[c], target[c1], target[c2], c1 > c, c2 > c1, tile[0])
             if r1 > r:
                 _write(panels[place[r1]:], target[c], target[c1], target[c2], c1 > c, c2 > c1,
                        tile[1])
-            if r2 > r1:
-                _write(panels[place[r2]:], target[c], target[c1], target[c2], c1 > c, c2 > c1,
-                       tile[2])
 
 
 @compiled
@@ -179,15 +176,15 @@ def _write(row, t0, t1, t2, has_second, has_third, values):
 @compiled
 def _tile(left, right, along):
     """
-    Return the nine inner products of three rows with three rows, each as long as `along`.
+    Return the six inner products of two rows with three rows, each as long as `along`.
 
     A row, or a tuple, whose length the compiler knows: then the loop is unrolled.
     """
-    left0, left1, left2 = left
+    left0, left1 = left
     right0, right1, right2 = right
-    s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = 0.0
+    s00 = s01 = s02 = s10 = s11 = s12 = 0.0
     for q in range(len(along)):
-        x0, x1, x2 = left0[q], left1[q], left2[q]
+        x0, x1 = left0[q], left1[q]
         y0, y1, y2 = right0[q], right1[q], right2[q]
         s00 += x0 * y0
         s01 += x0 * y1
@@ -195,10 +192,7 @@ def _tile(left, right, along):
         s10 += x1 * y0
         s11 += x1 * y1
         s12 += x1 * y2
-        s20 += x2 * y0
-        s21 += x2 * y1
-        s22 += x2 * y2
-    return (s00, s01, s02), (s10, s11, s12), (s20, s21, s22)
+    return (s00, s01, s02), (s10, s11, s12)
 
 
 @compiled
@@ -235,16 +229,13 @@ def _update_strip(panel, height, width, c, strip):
     c1, c2 = min(c + 1, width - 1), min(c + 2, width - 1)
     right = (panel[c * width:c * width + c], panel[c1 * width:c1 * width + c],
              panel[c2 * width:c2 * width + c])
-    for r in range(c, height, 3):
-        r1, r2 = min(r + 1, height - 1), min(r + 2, height - 1)
-        left = (panel[r * width:r * width + c], panel[r1 * width:r1 * width + c],
-                panel[r2 * width:r2 * width + c])
+    for r in range(c, height, 2):
+        r1 = min(r + 1, height - 1)
+        left = panel[r * width:r * width + c], panel[r1 * width:r1 * width + c]
         tile = _tile(left, right, left[0])
         _write(panel[r * width:], c, c1, c2, strip > 1, strip > 2, tile[0])
         if r1 > r:
             _write(panel[r1 * width:], c, c1, c2, strip > 1, strip > 2, tile[1])
-        if r2 > r1:
-            _write(panel[r2 * width:], c, c1, c2, strip > 1, strip > 2, tile[2])
 
 
 @compiled

@@ -73,7 +73,6 @@ class Backend(Upkeep):
         self._counted: tuple[object, dict[str, int]] = (None, {})
         self._background: Background | None = None
         self._graph: object = None
-        self.moved = self.manifold.identity(1), self.manifold.identity(1)
         self.reset()
         self.maps = 0
         if background:

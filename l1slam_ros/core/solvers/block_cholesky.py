@@ -27,8 +27,8 @@ from l1slam_ros.core.graph.linear_system import (
 Places = NDArray[np.int32]
 _NONE = np.zeros(0, np.int64)
 
-# Blocks of SE(2) that one gigabyte holds.
-MOST_BLOCKS = 15_000_000
+# Numbers that one gigabyte holds.
+MOST_ENTRIES = 135_000_000
 # Part of its diagonal by which a loose keyframe is damped: above what factorising leaves of a
 # pivot that is none, and for a heading the same as to know it to within thousands of turns.
 _LOOSE = 1e-9
@@ -196,10 +196,11 @@ def cholesky_of(graph: FactorGraph) -> BlockCholesky:
 
     Raises
     ------
-    FillError : the factor would have more than `MOST_BLOCKS`.
+    FillError : the factor would have more than `MOST_ENTRIES`.
 
     """
     fixed = anchor(graph)
     keyframe = keyframes_of(graph, fixed)
-    pattern = find_pattern(keyframe, graph.n_poses - fixed, MOST_BLOCKS)
+    most_blocks = MOST_ENTRIES // graph.manifold.TANGENT_SIZE**2
+    pattern = find_pattern(keyframe, graph.n_poses - fixed, most_blocks)
     return BlockCholesky(pattern, keyframe, loose_keyframes(graph))

@@ -73,7 +73,7 @@ def test_a_graph_that_fills_in_gets_algorithm_4(world, monkeypatch):
     """With memory for a few blocks only: nothing is factored, and it is solved all the same."""
     graph = world.graph
     expected = minimise_by(choose(AUTO, graph), graph, world.truth, DEFAULTS)[0].cost
-    monkeypatch.setattr(cholesky, 'MOST_BLOCKS', 30)
+    monkeypatch.setattr(cholesky, 'MOST_ENTRIES', 9 * 30)
     for solver in AUTO, PRIMAL_DUAL:
         choice = choose(solver, graph)
         assert (choice.cholesky, choice.solver) == (None, PRIMAL_DUAL)
@@ -84,7 +84,7 @@ def test_a_graph_that_fills_in_gets_algorithm_4(world, monkeypatch):
 
 
 def test_the_interior_point_of_a_graph_that_fills_in_is_refused(world, monkeypatch):
-    monkeypatch.setattr(cholesky, 'MOST_BLOCKS', 30)
+    monkeypatch.setattr(cholesky, 'MOST_ENTRIES', 9 * 30)
     with pytest.raises(FillError, match='60|59 keyframes') as refusal:
         choose(INTERIOR_POINT, world.graph)
     assert isinstance(refusal.value, L1SlamError) and '\n' not in str(refusal.value)

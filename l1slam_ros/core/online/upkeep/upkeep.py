@@ -60,7 +60,6 @@ class Upkeep:
     ----------
     maps : how many maps there were: one more whenever factors were taken into it, and with each
         that was adopted or took another's place
-    moved : map -> odom before and after the last of them, (1, p) each
 
     """
 
@@ -78,7 +77,8 @@ class Upkeep:
         self._at_rest: object = None
         self._grown: object = None
         self._map_to_odom: tuple[Array, Array] | None = None
-        self.moved: tuple[Array, Array]
+        # Map -> odom before the first map and after the last that nobody asked for yet.
+        self._moved: tuple[Array, Array] | None = None
 
     def _begin(self, builder: GraphBuilder, optimised: Optimised) -> None:
         """Begin a map with the graph of a builder; the lock is held."""
@@ -307,9 +307,16 @@ class Upkeep:
     def _note_map(self, before: Array) -> None:
         """Note that the map is another now; before : map -> odom until then."""
         self._map_to_odom = None
-        self.moved = before, self._map_to_odom_now()
+        first = before if self._moved is None else self._moved[0]
+        self._moved = first, self._map_to_odom_now()
         self._changes += 1
         self.maps += 1
+
+    def moved(self) -> tuple[Array, Array]:
+        """Return map -> odom as it was when this was asked before, and as it is, (1, p) each."""
+        with self._lock:
+            (before, after), self._moved = self._moved or 2 * (self._map_to_odom_now(),), None
+            return before, after
 
     def marginal_covariance(self, keyframe: int) -> Array | None:
         """
