@@ -78,7 +78,7 @@ def place(datasets: Path, name: str) -> Place:
         return _bicocca(datasets / 'real', found)
     if name == BOVISA:
         unknown = np.zeros(len(record.graph.between), bool)
-        track = read_vertices(datasets / 'real' / 'bovisa06.gps.g2o')[1][:, :2]
+        track = read_vertices(datasets / 'real' / 'bovisa06.gps.g2o', se2)[1][:, :2]
         return Place(name, record.graph, record.poses, unknown, unknown, nearest_error(track),
                      timed=False)
     truth = datasets / f'{name}.truth.txt'

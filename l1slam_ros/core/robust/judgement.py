@@ -140,7 +140,7 @@ def doubts(growth: Growth) -> tuple[Doubt, ...]:
         reasons.append(_doubt(growth, ONE_PLACE, accepted))
     reasons += _other_map(growth)
     reasons += [_doubt(growth, SLIP, rows) for rows in (*growth.suspected, *_ambiguous(growth))]
-    return tuple(reasons)
+    return tuple(dict.fromkeys(reasons))
 
 
 def _carries_all(growth: Growth, accepted: Indices) -> bool:

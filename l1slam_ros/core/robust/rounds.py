@@ -28,7 +28,7 @@ from l1slam_ros.core.robust.innovation import (
     sample_posterior,
     sampled_quantile,
 )
-from l1slam_ros.core.robust.places import neighbours_agree, places
+from l1slam_ros.core.robust.places import neighbours_agree, of_one_street, places
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 
@@ -102,6 +102,12 @@ class Growth:
     def place(self) -> Indices:
         """The number of the place of each factor, (m,)."""
         return self._places[0]
+
+    def of_one_street(self, rows: Indices, step: int) -> bool:
+        """Return whether factors across an odometry factor are so; see `of_one_street`."""
+        ends = self._places[1]
+        late = ends.sum(axis=1) / 2
+        return of_one_street(ends[rows], float(late[step]), float(late.max()))
 
     def begin(self) -> None:
         """Solve for what is accepted, and learn from the loops how large the noise is."""

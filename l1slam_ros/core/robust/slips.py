@@ -11,7 +11,8 @@ is far off by what all others say, or where refused loops agree. Then slip and l
 
 with the excess of chi2 over its freedom: the step is cut, the loops across are asked anew, and the
 rounds go on from there. The slip is believed if it gains three gates, three places span it, and
-the odometry factor is off by more than one in all its factors is by chance.
+the odometry factor is off by more than one in all its factors is by chance; and where its motion
+is no jump, if the loops across are not of one street.
 """
 
 import numpy as np
@@ -112,9 +113,12 @@ def _slipped(growth: Growth, cut: Growth, step: int) -> bool:
     sure = unheard_of(growth)[step] or (gain > _GAIN * gate and _is_gross(cut, step))
     if not sure or len(np.unique(growth.place[across])) < SPANNING:
         return False
-    if won < _WON * lost:
+    # A robot that moved as ever slipped only if it is not one street that says so.
+    believed = won >= _WON * lost and (
+        step in jumping(growth) or not growth.of_one_street(across, step))
+    if not believed:
         growth.suspected.append(across)
-    return won >= _WON * lost
+    return bool(believed)
 
 
 def _gate(growth: Growth) -> float:
