@@ -72,7 +72,8 @@ def test_odometry_factors_slip(place, what, metres, radians, count):
                       after.measurement[after.is_odometry])
     changed = np.abs(moved).max(axis=1) > 1e-9
     assert np.array_equal(np.flatnonzero(after.is_odometry)[changed], case.slips)
-    assert len(case.slips) == count
+    assert len(case.slips) == count == len(after) - case.is_false.sum() - len(case.clean.between)
+    assert not component_labels(case.clean).any()
     assert np.hypot(*moved[changed, :2].T) == pytest.approx(metres, abs=1e-9)
     assert np.abs(moved[changed, 2]) == pytest.approx(radians, abs=1e-9)
 

@@ -63,7 +63,7 @@ def test_the_refused_are_the_false_and_a_start_is_begun_from(world):
 
 def test_what_cannot_be_solved_is_said(world):
     graph, poses = l1.read_graph(world)
-    with pytest.raises(l1.L1SlamError, match="norm is 'l3', expected one of l1, l2, huber"):
+    with pytest.raises(l1.L1SlamError, match="norm is 'l3', expected one of l1, group-l1, l2, huber"):
         l1.solve(graph, norm='l3')
     with pytest.raises(l1.L1SlamError, match=r'start has the shape \(3, 3\), expected \(200, 3\)'):
         l1.solve(graph, start=poses[:3])

@@ -15,7 +15,7 @@ from robust.aliasing import aliased_loops, outnumbers
 from robust.places import Place
 
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 
 _SLIP_TRANSLATION, _SLIP_ROTATION = 5.0, math.pi / 2
 _HEADING_SIGMA = math.radians(1)
@@ -81,16 +81,19 @@ def _slip(place: Place, rng: np.random.Generator, what: str, count: int) -> Chan
     """
     Move odometry factors by 5 m in some direction, or by 90 degrees about some axis.
 
-    What they measured is gone, so the map to be found is that of all the others.
+    What they measured is gone, so the map to be found is that of all the others, which leave no
+    part on its own.
     """
     graph, manifold, factors = place.graph, place.graph.manifold, place.graph.between
-    rows = np.flatnonzero(factors.is_odometry)
-    edge = int(len(rows) * _EDGE)
-    rows = rng.choice(rows[edge:-edge], count, replace=False)
+    steps = np.flatnonzero(factors.is_odometry)
+    edge = int(len(steps) * _EDGE)
+    others = FactorGraph(manifold)
+    while others.n_poses == 0 or component_labels(others).any():
+        rows = rng.choice(steps[edge:-edge], count, replace=False)
+        others = graph.subset(np.delete(np.arange(len(factors)), rows))
     slips = np.stack([_wrong_step(manifold, what == 'translation', rng) for _ in rows])
     moved = factors.measurement.copy()
     moved[rows] = manifold.retract(moved[rows], slips)
-    others = graph.subset(np.delete(np.arange(len(factors)), rows))
     return Changed(_with(graph, measurement=moved), others,
                    steps=np.minimum(factors.i[rows], factors.j[rows]))
 

@@ -106,7 +106,7 @@ def test_a_full_disk_is_one_line(graph, arguments):
 
 
 @pytest.mark.parametrize('typed, offered', [
-    ('l1slam so', ['solve ']), ('l1slam solve a.g2o --norm ', ['l1', 'l2', 'huber']),
+    ('l1slam so', ['solve ']), ('l1slam solve a.g2o --norm ', ['l1', 'group-l1', 'l2', 'huber']),
     ('l1slam solve a.g2o --no-r', ['--no-robust ']),
     ('l1slam corrupt a.g2o b.g2o --kind g', ['grouped '])])
 def test_the_tab_key_completes(tmp_path, typed, offered):

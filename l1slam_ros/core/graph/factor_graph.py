@@ -194,15 +194,18 @@ def component_labels(graph: FactorGraph) -> Indices:
 
 
 def lowest_joined(graph: FactorGraph) -> Indices:
-    """
-    Return the first keyframe of the component of each keyframe, and of the world, (n + 1,).
+    """Return the first keyframe of the component of each keyframe, and of the world, (n + 1,)."""
+    return lowest_of_components(graph.between.i, graph.between.j, graph.n_poses + 1)
 
-    Every vertex points to a lower one of its component, or to itself, the world being the highest;
-    factors pull what both ends point to down to the lower one, and pointers are doubled, until
-    nothing moves.
+
+def lowest_of_components(i: Indices, j: Indices, n: int) -> Indices:
     """
-    i, j = graph.between.i, graph.between.j
-    lowest = np.arange(graph.n_poses + 1)
+    Return the lowest vertex of the component of each of n vertices, joined by edges (i, j), (n,).
+
+    Every vertex points to a lower one of its component, or to itself; edges pull what both ends
+    point to down to the lower one, and pointers are doubled, until nothing moves.
+    """
+    lowest = np.arange(n)
     while True:
         a, b = lowest[i], lowest[j]
         apart = a != b

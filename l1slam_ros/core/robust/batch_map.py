@@ -122,13 +122,19 @@ def _robust_map(
     graph: FactorGraph, wish: Wish, minimiser: '_Minimiser', on_round: OnRound, ids: Indices
 ) -> tuple[RobustMap | None, str]:
     """Return the robust map; where nobody insists on one and there is none, None and why."""
-    gaps, steps = odometry_gaps(graph), graph.n_poses - 1
-    if wish.robust is None and len(gaps) > _MOST_GAPS * steps:
-        return None, (f'{len(gaps):,} of {steps:,} steps have no odometry, the first one from '
-                      f'{ids[gaps[0]]} to {ids[gaps[0] + 1]}, so there is no chain to judge by')
-    if wish.robust is False:
-        return None, ''
-    return minimise_robustly(graph, minimiser.minimise, on_round), ''
+    unjudged, gaps = '', odometry_gaps(graph)
+    if wish.robust is None and len(gaps) > _MOST_GAPS * (graph.n_poses - 1):
+        unjudged = (f'no edge between the consecutive vertices {ids[gaps[0]]} and '
+                    f'{ids[gaps[0] + 1]}, so no chain of odometry to judge loops by')
+    elif wish.robust is not False:
+        try:
+            return minimise_robustly(graph, minimiser.minimise, on_round), ''
+        except GraphError as error:
+            if wish.robust:
+                raise
+            unjudged = str(error)
+    require_connected(graph, ids)
+    return None, unjudged
 
 
 class _Minimiser:

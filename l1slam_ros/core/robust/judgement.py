@@ -26,6 +26,8 @@ MOSTLY_REFUSED, ONE_PLACE, OTHER_MAP, SLIP = (
 
 # Of fewer loops most may well be refused, and be of one place; most are more than half by some.
 _HANDFUL, _MOST = 5, 0.55
+# A place that joins more than this part of the keyframes is no one mistake.
+_SMALL = 0.5
 # Refused loops that agree count if they are so many for each accepted one across.
 _AGAINST = 0.25
 
@@ -134,12 +136,20 @@ def doubts(growth: Growth) -> tuple[Doubt, ...]:
     reasons = []
     if np.count_nonzero(loops) >= _HANDFUL and len(left_out) > _MOST * np.count_nonzero(loops):
         reasons.append(_doubt(growth, MOSTLY_REFUSED, left_out))
-    if len(accepted) >= _HANDFUL and len(np.unique(growth.place[accepted])) == 1 and not (
-            growth.trusted[accepted].any()):
+    if _carries_all(growth, accepted):
         reasons.append(_doubt(growth, ONE_PLACE, accepted))
     reasons += _other_map(growth)
     reasons += [_doubt(growth, SLIP, rows) for rows in (*growth.suspected, *_ambiguous(growth))]
     return tuple(reasons)
+
+
+def _carries_all(growth: Growth, accepted: Indices) -> bool:
+    """Return whether all accepted loops are of one place, and join but a small part of the way."""
+    if len(accepted) < _HANDFUL or growth.trusted[accepted].any():
+        return False
+    joined = np.ptp(growth.low[accepted]) + np.ptp(growth.high[accepted])
+    return len(np.unique(growth.place[accepted])) == 1 and bool(
+        joined < _SMALL * growth.graph.n_poses)
 
 
 def _other_map(growth: Growth) -> list[Doubt]:

@@ -10,7 +10,7 @@ linkage). Near is measured along the way in metres, never in keyframes.
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
+from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, lowest_of_components
 from l1slam_ros.core.graph.linear_system import with_world
 
 # Linked are loops whose ends lie within so many metres along the way, in sum, or within the length
@@ -29,10 +29,6 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
 
     chain : (n, p) poses along the odometry
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     manifold, (low, high, Z) = graph.manifold, ends_in_time(graph)
     positions = manifold.positions(chain)
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
@@ -44,9 +40,8 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
     claim = manifold.positions(claimed) - positions[high]
     cells, cell = np.unique(np.round(np.hstack((ends, claim / near)) / _GRAIN), axis=0,
                             return_inverse=True)
-    pairs = cKDTree(cells).query_pairs(1 / _GRAIN, p=np.inf, output_type='ndarray')
-    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells),) * 2)
-    place: Indices = connected_components(links, directed=False)[1].astype(np.int64)
+    lowest = lowest_of_components(*_near(cells, 1 / _GRAIN), len(cells))
+    place = np.unique(lowest, return_inverse=True)[1]
     return place[cell.ravel()], ends
 
 
@@ -57,12 +52,29 @@ def neighbours_agree(place: Indices, ends: Array) -> float:
     place, ends : of the loops that are asked, see `places`. Where few have neighbours the answer
     is near 1: nothing is known of how lies come here.
     """
-    from scipy.spatial import cKDTree
+    a, b = _near(ends, 1.0)
+    a, b = np.concatenate((a, b)), np.concatenate((b, a))
+    nearest_first = np.lexsort((np.abs(ends[a] - ends[b]).max(axis=1), a))
+    with_neighbour, first = np.unique(a[nearest_first], return_index=True)
+    agree = np.count_nonzero(place[with_neighbour] == place[b[nearest_first[first]]])
+    return float((agree + 1) / (len(with_neighbour) + 1))
 
-    if len(place) < 2:
-        return 1.0
-    distance, index = cKDTree(ends).query(ends, 2, p=np.inf)
-    near = distance[:, 1] < 1
-    other = np.where(index[:, 0] == np.arange(len(place)), index[:, 1], index[:, 0])
-    agree = np.count_nonzero(near & (place[other] == place))
-    return float((agree + 1) / (np.count_nonzero(near) + 1))
+
+def _near(points: Array, reach: float) -> tuple[Indices, Indices]:
+    """
+    Return the pairs of points (n, k) that no component tells further apart than `reach`, (pairs,).
+
+    A sweep along the first component. SciPy's trees do the same, but to import them takes longer
+    than to solve most graphs.
+    """
+    order = np.argsort(points[:, 0], kind='stable')
+    points = points[order]
+    last = np.searchsorted(points[:, 0], points[:, 0] + reach, side='right')
+    within = last - np.arange(len(points))
+    first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for shift in range(1, within.max(initial=0)):
+        rows = np.flatnonzero(within > shift)
+        rows = rows[(np.abs(points[rows] - points[rows + shift]) <= reach).all(axis=1)]
+        first.append(order[rows])
+        second.append(order[rows + shift])
+    return np.concatenate(first), np.concatenate(second)

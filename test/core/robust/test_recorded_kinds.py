@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 from lies import careful_world, is_false, position_error, spoilt
+from torn import shifted_runs
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -23,19 +24,9 @@ def information(factors):
     return factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information
 
 
-def shifted_runs(world, starts, length=30):
-    """Return the graph with runs of loops (i + k, j + k) that say with one voice that j is off."""
-    graph, k, shift = world.graph.copy(), np.arange(length), np.array([[8.0, -6.0, 0.4]])
-    for i, j in starts:
-        far = se2.compose(np.broadcast_to(shift, (length, 3)), world.truth[j + k])
-        graph.add_between(i + k, j + k, se2.between(world.truth[i + k], far),
-                          np.tile(np.diag([400.0, 400.0, 1e4]), (length, 1, 1)))
-    return graph
-
-
 @pytest.mark.parametrize('runs', [1, 3])
 def test_a_corridor_taken_for_another_does_not_pass_for_a_slip(world, runs):
-    graph = shifted_runs(world, [(20, 220), (70, 300), (120, 260)][:runs])
+    graph = shifted_runs(world, [(20, 220), (70, 300), (120, 260)][:runs], 30)
     found, poses = robust_solve(graph)
     assert not found.accepted[len(world.graph.between):].any() and not len(found.slips)
     assert position_error(poses, world.truth) < 0.3
@@ -95,6 +86,6 @@ def test_half_a_map_that_says_it_is_elsewhere_is_doubtful():
     """109 true loops against 54, of nine places, that agree with each other."""
     world = careful_world(500, 499 + 109)
     starts = [(i, 260 + 20 * run) for run, i in enumerate(range(5, 185, 20))]
-    found, _ = robust_solve(shifted_runs(world, starts, length=6))
+    found, _ = robust_solve(shifted_runs(world, starts, 6))
     assert OTHER_MAP in [doubt.kind for doubt in found.doubts]
     assert not robust_solve(world.graph)[0].doubts
