@@ -155,7 +155,8 @@ def excess(now: Snapshot) -> float:
 
 def held(now: Snapshot, lies: Any) -> tuple[int, int, int]:
     """Return how many false loops are believed, how many true ones are not, and of how many."""
-    factors, n = now.graph.between, now.graph.n_poses
+    factors = now.graph.between
+    n = max(now.graph.n_poses, lies.max(initial=0) + 1)
     ends = np.sort(factors.pairs, axis=1).T
     false = np.isin(pair_key(*ends, n), pair_key(*np.sort(lies, axis=1).T, n))
     loop, accepted = ~factors.is_odometry, now.judgement.accepted

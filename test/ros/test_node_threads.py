@@ -216,6 +216,6 @@ def test_the_jump_of_the_transform_is_said(bench):
     loop.pose.pose.position.x, loop.pose.pose.orientation.w = 4.0, 1.0
     loop.pose.covariance = (1e-8 * np.eye(6)).ravel()
     vouch.publish(loop)
-    b.until(lambda: 0.05 < float(b.status()[2].get('jump.translation', 0)) < 1.01, 'a jump')
+    b.until(lambda: 0.01 < float(b.status()[2].get('jump.translation', 0)) < 1.01, 'a jump')
     b.until(lambda: b.path().poses[-1].pose.position.x == pytest.approx(4.0, abs=0.01),
             'a metre in all')
