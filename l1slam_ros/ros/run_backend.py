@@ -75,8 +75,8 @@ def leave(code: int) -> None:
     os._exit(code)
 
 
-def main() -> int:
-    """Run the node until SIGINT or SIGTERM; return the exit code."""
+def main() -> None:
+    """Run the node until SIGINT or SIGTERM, and leave the process."""
     ending = Ending()
     sys.setswitchinterval(_TURN)
     import rclpy
@@ -103,10 +103,10 @@ def main() -> int:
         # A signal can shut ROS down under any call; what that call then raises is no failure.
         if rclpy.ok():
             raise
-    if node is not None and not node.close(_THREADS):
-        leave(code)
-    rclpy.try_shutdown()
-    return code
+    if node is None or node.close(_THREADS):
+        rclpy.try_shutdown()
+    # Not by returning: a thread that is within ROS when the interpreter is torn down aborts.
+    leave(code)
 
 
 def _spin(executor: Any, node: Any) -> None:
