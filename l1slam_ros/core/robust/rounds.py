@@ -58,6 +58,8 @@ _LATEST = 50
 _WORD = 100.0
 # The variance of an odometry factor that was cut, in units of its own: loops alone decide.
 _CUT = 1e4
+# The noise is learnt before anything is accepted from loops of so many places at least.
+_FEWEST_PLACES = 3
 # Pairs are formed of so many loops that fit best.
 _CANDIDATES = 200
 
@@ -115,7 +117,8 @@ class Growth:
         self.solve()
         rows = self.undecided()
         rows = rows[~self.factors.is_absolute[rows]]
-        if len(rows):
+        # Loops of fewer places may be one mistake: they would fit the noise that is learnt of them.
+        if len(np.unique(self.place[rows])) >= _FEWEST_PLACES:
             self.variance = self.variance * noise_variance(self.innovations(rows))
             self._floor = _LEAST_VARIANCE * self.variance
             self.solve()

@@ -59,3 +59,20 @@ def test_two_loops_vouch_for_each_other_only_within_the_gate_of_both(apart, beli
     rows = growth.undecided()
     assert (growth.innovations(rows).square < 1).all()
     assert len(growth.believable(rows)) == believed
+
+
+def test_lies_of_one_place_do_not_teach_their_noise():
+    """Ten loops, all off by the same 8 m, where the odometry is sure of a decimetre."""
+    n = 60
+    graph, i = FactorGraph(se2), np.arange(n - 1)
+    truth = np.column_stack((np.arange(n), np.zeros((n, 2)))).astype(float)
+    graph.add_poses(n)
+    graph.add_between(i, i + 1, se2.between(truth[:-1], truth[1:]),
+                      np.tile(np.diag([1e4, 1e4, 1e6]), (n - 1, 1, 1)))
+    start = np.arange(10)
+    seen = se2.between(truth[start], truth[start + 50]) - [8.0, 0.0, 0.0]
+    graph.add_between(start, start + 50, seen, np.tile(np.diag([1e4, 1e4, 1e6]), (10, 1, 1)))
+    growth = Growth(graph)
+    growth.begin()
+    assert growth.variance[1] <= 1
+    assert not len(growth.believable(growth.undecided()))
