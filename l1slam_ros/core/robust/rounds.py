@@ -117,7 +117,7 @@ class Growth:
         self.solve()
         rows = self.undecided()
         rows = rows[~self.factors.is_absolute[rows]]
-        # Loops of fewer places may be one mistake: they would fit the noise that is learnt of them.
+        # Loops of fewer places may be one mistake, which the noise learnt of them would fit.
         if len(np.unique(self.place[rows])) >= _FEWEST_PLACES:
             self.variance = self.variance * noise_variance(self.innovations(rows))
             self._floor = _LEAST_VARIANCE * self.variance
