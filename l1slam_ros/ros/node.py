@@ -109,8 +109,8 @@ class BackendNode(LifecycleNode):
         # By a clock that goes on where simulated time stands still, or a bag has ended.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(options.update.period, guarded('timer', self._on_timer), clock=steady)
-        self.create_timer(options.transform_period,
-                          guarded('transform', self._on_transform), clock=steady)
+        self._transform_timer = self.create_timer(
+            options.transform_period, guarded('transform', self._on_transform), clock=steady)
         self.create_timer(1.0, guarded('diagnostics', self._on_second), clock=steady)
         self._tell(None)  # a map may have been loaded
         self._solver.start()
@@ -226,6 +226,8 @@ class BackendNode(LifecycleNode):
             self._add_odometry(sample)
 
     def _add_odometry(self, sample: OdometrySample) -> None:
+        if self._transform_timer.is_canceled():
+            self._transform_timer.reset()
         try:
             map_to_odom = self._backend.add_odometry(sample)
         except L1SlamError as error:
@@ -267,8 +269,9 @@ class BackendNode(LifecycleNode):
         self._map_services.autosave()
 
     def _on_transform(self) -> None:
-        if self._active:
-            self._transform.publish(self.options)
+        # Until odometry comes there is nothing to say, and a timer at rest costs processor time.
+        if self._active and not self._transform.publish(self.options):
+            self._transform_timer.cancel()
 
     def _on_second(self) -> None:
         for sentence in self._backend.news():

@@ -43,11 +43,11 @@ class MapToOdom:
         """Be silent until there is other odometry: its stamps so far are of another time."""
         self._before = self._newest
 
-    def publish(self, options: NodeOptions) -> None:
-        """Publish the transform as it is now, if any odometry has come."""
+    def publish(self, options: NodeOptions) -> bool:
+        """Publish the transform as it is now; return whether any odometry has come."""
         robot = self._backend.robot()
         if robot is None or robot.stamp == self._before:
-            return
+            return False
         self._before = 0
         if robot.stamp < self._newest:
             self._stamp = 0  # time itself went back
@@ -61,3 +61,4 @@ class MapToOdom:
         self._publisher.publish(transform)
         if self._tf is not None:
             self._tf.publish(TFMessage(transforms=[transform]))
+        return True
