@@ -36,11 +36,12 @@ def minimise_interior_point(
     end above the poses' own cost (false loops bend it), from the poses themselves. The result is
     the best poses met, never worse than the start. The L2 map counts as one step.
     """
-    start = l1_cost(whitened_residual(graph, poses))
+    residual = whitened_residual(graph, poses)
+    start = l1_cost(residual)
     steps = options.outer_iterations - 1
     if steps < 0:
         return Solution(poses, start, Status.ITERATION_LIMIT, 0, 0, np.array([start]),
-                        np.zeros(len(whitened_residual(graph, poses))))
+                        np.zeros(len(residual)))
     problem = GraphProblem(graph)
     rough = minimise_l2(graph, poses, _ROUGH_L2, cholesky).poses
     optimum = interior_point(problem, rough, cholesky, steps, _TOLERANCE, report)

@@ -74,8 +74,9 @@ def minimise_group_l1(
     That is where all who start in the same valley start; it counts as one step.
     """
     norm = Lengths(graph.manifold.TANGENT_SIZE)
-    start = norm.cost(whitened_residual(graph, poses))
-    history, rows = [start], len(whitened_residual(graph, poses))
+    residual = whitened_residual(graph, poses)
+    start, rows = norm.cost(residual), len(residual)
+    history = [start]
     if options.outer_iterations < 1:
         return Solution(poses, start, Status.ITERATION_LIMIT, 0, 0, np.array(history),
                         np.zeros(rows))
