@@ -62,24 +62,36 @@ def _climb_panel(panel, rows, columns, skip, where, values, own):
     """Solve for a supernode's own rows, the first `skip` of which are zero, and go below."""
     k = len(values)
     width, none = columns * k, skip * k
-    for r in range(none, width):
-        line = panel[r * width:(r + 1) * width]
-        for q in range(k):
-            x = values[q, own:]
-            total = x[r - none]
-            for c in range(none, r):
-                total -= line[c] * x[c - none]
-            x[r - none] = total / line[r]
-    for b in range(columns, len(rows)):
-        target = where[rows[b]] * k
-        for a in range(k):
-            line = panel[(b * k + a) * width + none:(b * k + a + 1) * width]
-            for q in range(k):
-                x = values[q, own:own + width - none]
-                total = 0.0
-                for c in range(len(line)):
-                    total += line[c] * x[c]
-                values[q, target + a] -= total
+    # Three columns at a time (k is 3 or 6): what takes the time is reading the panel.
+    for q in range(0, k, 3):
+        x, y, z = values[q, own:], values[q + 1, own:], values[q + 2, own:]
+        for r in range(none, width):
+            line = panel[r * width + none:(r + 1) * width]
+            of_x, of_y, of_z = _dot_three(line, r - none, x, y, z)
+            pivot = line[r - none]
+            x[r - none] = (x[r - none] - of_x) / pivot
+            y[r - none] = (y[r - none] - of_y) / pivot
+            z[r - none] = (z[r - none] - of_z) / pivot
+        for b in range(columns, len(rows)):
+            target = where[rows[b]] * k
+            for a in range(k):
+                line = panel[(b * k + a) * width + none:(b * k + a + 1) * width]
+                of_x, of_y, of_z = _dot_three(line, width - none, x, y, z)
+                values[q, target + a] -= of_x
+                values[q + 1, target + a] -= of_y
+                values[q + 2, target + a] -= of_z
+
+
+@compiled
+def _dot_three(line, length, x, y, z):
+    """Return the products of a line with x, y and z."""
+    of_x = of_y = of_z = 0.0
+    for c in range(length):
+        value = line[c]
+        of_x += value * x[c]
+        of_y += value * y[c]
+        of_z += value * z[c]
+    return of_x, of_y, of_z
 
 
 @loop('(i8[::1], i4[::1], f8[::1], f8[:, :, ::1])')
@@ -108,12 +120,8 @@ def meet(begin, places, values, product):
                 x = values[stop - common * k:stop]
                 y = values[stop + own_length - common * k:stop + own_length]
                 z = values[stop + 2 * own_length - common * k:stop + 2 * own_length]
-                of_x = of_y = of_z = 0.0
-                for r in range(len(left)):
-                    of_x += left[r] * x[r]
-                    of_y += left[r] * y[r]
-                    of_z += left[r] * z[r]
-                product[s, a, b], product[s, a, b + 1], product[s, a, b + 2] = of_x, of_y, of_z
+                product[s, a, b], product[s, a, b + 1], product[s, a, b + 2] = _dot_three(
+                    left, len(left), x, y, z)
 
 
 @loop('(f8[:, :, ::1], i8[:, ::1], f8[:, :, :, ::1], f8[::1], f8[::1], f8[::1], i8[::1], '
