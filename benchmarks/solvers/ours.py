@@ -76,9 +76,8 @@ class _Halpern:
 
     name: str = 'ours, primal-dual'
 
-    def reach(
-        self, problem: InnerProblem, costs: Sequence[float], limit: float
-    ) -> list[Setting | None]:
+    def reach(self, problem: InnerProblem, costs: Sequence[float],
+              limit: float) -> list[Setting | None]:
         """Look up in the history of a run that is long enough where each cost is reached."""
         deadline, count = time.monotonic() + limit, _FEWEST
         while True:
@@ -96,9 +95,8 @@ class _Halpern:
         return timed(lambda: _halpern(problem, PrimalDualOptions(setting, 0.0), limit).x)
 
 
-def _halpern(
-    problem: InnerProblem, options: PrimalDualOptions, limit: float
-) -> PrimalDualSolution:
+def _halpern(problem: InnerProblem, options: PrimalDualOptions,
+             limit: float) -> PrimalDualSolution:
     deadline, system = time.monotonic() + limit, problem.system
     x = weighted_least_squares(system, cholesky_of(problem.graph), np.ones(len(system.b)))
     r = system.times(x) - system.b
@@ -216,7 +214,5 @@ def _fused_bytes(problem: InnerProblem) -> float:
     return float(each_edge + each_keyframe * problem.system.size / edges)
 
 
-ITERATIONS = (
-    Iteration('SciPy, Algorithm 2', _two_products),
-    Iteration('ours, fused', _fused, _fused_bytes),
-)
+ITERATIONS = (Iteration('SciPy, Algorithm 2', _two_products),
+              Iteration('ours, fused', _fused, _fused_bytes))

@@ -85,9 +85,8 @@ def _read(source: str, record: GraphRecord, input_path: Path) -> Reference:
     return read_reference(source, record.graph.manifold, by_stamps=record.stamps is not None)
 
 
-def _at_stamps(
-    record: GraphRecord, reference: Reference, stamps: Indices
-) -> tuple[Indices, Array, Indices]:
+def _at_stamps(record: GraphRecord, reference: Reference,
+               stamps: Indices) -> tuple[Indices, Array, Indices]:
     """Return the keyframes that have truth, it, and before which true poses there is a gap."""
     if len(reference.keys) < 2:
         return np.zeros(0, np.int64), reference.poses[:0], np.zeros(0, np.int64)

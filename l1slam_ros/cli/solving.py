@@ -67,8 +67,7 @@ def solve(arguments: argparse.Namespace) -> Ending:
 
 
 def _solved(arguments: argparse.Namespace, record: GraphRecord, wish: Wish) -> Outcome:
-    steps = (wish.options.outer_iterations if wish.norm == 'l1'
-             else wish.least_squares.iterations)
+    steps = (wish.options.outer_iterations if wish.norm == 'l1' else wish.least_squares.iterations)
     quiet = arguments.quiet
     with (formats.named(arguments.input),
           Progress(None, 'round', quiet, 'judging loops') as judging,

@@ -34,13 +34,11 @@ def simulate(arguments: argparse.Namespace) -> Ending:
     world = simulate_world(arguments.poses, arguments.edges, WorldOptions(), rng, arguments.world)
     if arguments.false_loops:
         make = FALSE_LOOPS[arguments.kind]
-        world = with_false_loops(
-            world, make(world.graph, world.truth, arguments.false_loops, rng))
+        world = with_false_loops(world, make(world.graph, world.truth, arguments.false_loops, rng))
     ids = np.arange(world.graph.n_poses)
     record = GraphRecord(world.graph, world.odometry, ids)
     write_truth(truth_path(output), ids, world.truth)
-    _write(output, world.false_loops,
-           lambda: formats.write_output(output, record, world.truth))
+    _write(output, world.false_loops, lambda: formats.write_output(output, record, world.truth))
     return Ending()
 
 

@@ -95,10 +95,8 @@ def _compiled(steps: list[str], stopped: Callable[[], bool]) -> Iterator[tuple[s
             worker.wait()
 
 
-def _drive(
-    worker: 'subprocess.Popen[str]', waiting: Iterator[str],
-    done: 'queue.Queue[tuple[str, list[str]] | None]',
-) -> None:
+def _drive(worker: 'subprocess.Popen[str]', waiting: Iterator[str],
+           done: 'queue.Queue[tuple[str, list[str]] | None]') -> None:
     """Give a process one step after the other, until none waits or it breaks; then say None."""
     assert worker.stdin is not None and worker.stdout is not None
     with suppress(OSError, ValueError), worker.stdin, worker.stdout:

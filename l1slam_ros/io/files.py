@@ -144,9 +144,8 @@ def quoted(text: str) -> str:
     return repr(text if len(text) <= _QUOTED else text[:_QUOTED] + '...')
 
 
-def parse_rows(
-    path: object, name: str, lines: TextLines, ids: int, values: int
-) -> tuple[Indices, Array]:
+def parse_rows(path: object, name: str, lines: TextLines, ids: int,
+               values: int) -> tuple[Indices, Array]:
     """
     Convert lines of `ids` whole numbers followed by `values` finite numbers, none beyond 1e30.
 

@@ -22,10 +22,9 @@ if TYPE_CHECKING:
 GRAPH_SUFFIXES = ('.g2o', '.graph')
 
 
-def read_input(
-    path: Path, options: 'GraphBuilderOptions | None' = None, topics: Topics = DEFAULT_TOPICS,
-    rotation_information: str = QUATERNION, dimension: int = 2,
-) -> GraphRecord:
+def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
+               topics: Topics = DEFAULT_TOPICS, rotation_information: str = QUATERNION,
+               dimension: int = 2) -> GraphRecord:
     """
     Read a graph file or grow a graph from a bag.
 

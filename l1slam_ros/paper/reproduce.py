@@ -51,9 +51,8 @@ from l1slam_ros.paper.runs import (
 REPORT = 'report.md'
 
 
-def reproduce(
-    datasets: Path | None, worlds: Sequence[PaperGraph], output: Path, effort: Effort
-) -> None:
+def reproduce(datasets: Path | None, worlds: Sequence[PaperGraph], output: Path,
+              effort: Effort) -> None:
     """
     Run the experiments and write the report into the folder `output`, whole or not at all.
 
@@ -108,9 +107,7 @@ def _read(path: Path) -> GraphRecord:
     return record
 
 
-def run(
-    records: dict[str, GraphRecord], worlds: Sequence[PaperGraph], effort: Effort
-) -> Results:
+def run(records: dict[str, GraphRecord], worlds: Sequence[PaperGraph], effort: Effort) -> Results:
     """Measure every graph, in the order of the paper; records as of `read_datasets`."""
     simulated = {world.name: world for world in worlds}
     graphs, convergence, missing = [], {}, []
@@ -163,9 +160,8 @@ def _run_record(graph: PaperGraph, record: GraphRecord, effort: Effort) -> Graph
     return _measured(graph, record.graph, formats.stored_poses(record), seed, effort)
 
 
-def _run_world(
-    graph: PaperGraph, effort: Effort
-) -> tuple[GraphResult, dict[str, dict[str, Array]]]:
+def _run_world(graph: PaperGraph,
+               effort: Effort) -> tuple[GraphResult, dict[str, dict[str, Array]]]:
     """Return what a world of the graph's size gives, with the curves if they are shown of it."""
     world = simulate_world(graph.poses, graph.edges, WorldOptions(),
                            np.random.default_rng(WORLD_SEED))
@@ -178,12 +174,9 @@ def _run_world(
     return result, {**curves, 'global': _global_curves(result.costs)}
 
 
-def _measured(
-    paper_graph: PaperGraph, graph: FactorGraph, start: Array, seed: Array, effort: Effort,
-    truth_cost: float | None = None,
-) -> GraphResult:
-    steps = (OptimiserOptions().outer_iterations + effort.outer
-             + LeastSquaresOptions().iterations)
+def _measured(paper_graph: PaperGraph, graph: FactorGraph, start: Array, seed: Array,
+              effort: Effort, truth_cost: float | None = None) -> GraphResult:
+    steps = (OptimiserOptions().outer_iterations + effort.outer + LeastSquaresOptions().iterations)
     with Progress(steps, 'step') as progress:
         costs = measure_costs(graph, start, seed, effort, progress.report)
     seconds = measure_seconds(graph, seed, effort)
@@ -208,11 +201,9 @@ def _global_curves(costs: Costs) -> dict[str, Array]:
 SECTIONS: dict[str, Callable[[Results, Path], list[str]]] = {
     'Table I: the cost': lambda results, _: report.table_1(results),
     'Table II: the time per iteration': lambda results, _: report.table_2(results),
-    'Figure 2: cost against iterations': figures.figure_2,
-    'Figure 3: the maps': figures.figure_3,
+    'Figure 2: cost against iterations': figures.figure_2, 'Figure 3: the maps': figures.figure_3,
     'Figure 4: a start that is mostly noise': figures.figure_4,
-    'Figure 6: loops that lie': figures.figure_6,
-}
+    'Figure 6: loops that lie': figures.figure_6}
 
 
 def _check_folder(output: Path) -> None:

@@ -138,8 +138,7 @@ def test_a_topic_is_a_truth(tmp_path, kind):
     truth = read_truth(f'{tmp_path}/mocap:/robot/truth', record, Path('graph.g2o'))
     assert truth.rows.tolist() == np.flatnonzero(SCORED).tolist()
     assert position_error(record, poses, truth) < 5e-4
-    assert truth.skipped == (
-        f'1 message on /robot/truth of {tmp_path}/mocap refused: not_finite',)
+    assert truth.skipped == (f'1 message on /robot/truth of {tmp_path}/mocap refused: not_finite',)
 
 
 @pytest.mark.parametrize('source, said', [

@@ -97,10 +97,9 @@ def test_comments_and_blank_lines_are_left_out_and_still_counted(tmp_path):
     assert [text.split() for text in lines.texts] == [['a', '1'], ['c', '3']]
 
 
-@pytest.mark.parametrize(('content', 'message'), [
-    (b'good\n\xff\xfe', 'byte 0xff at offset 5; expected a text file'),
-    (None, 'cannot be read: No such file or directory'),
-])
+@pytest.mark.parametrize(('content', 'message'),
+                         [(b'good\n\xff\xfe', 'byte 0xff at offset 5; expected a text file'),
+                          (None, 'cannot be read: No such file or directory')])
 def test_what_is_no_text_is_named(tmp_path, content, message):
     path = tmp_path / 'a.txt'
     if content is not None:
@@ -189,10 +188,9 @@ def test_stamps_keep_their_last_nanosecond(stamp):
     assert stamp_text(np.int64(stamp)) == stamp_text(stamp)
 
 
-@pytest.mark.parametrize(('text', 'stamp'), [
-    ('12', 12 * 10**9), ('12.5', 12500000000), ('1.305031102175300121e+09', 1305031102175300121),
-    ('0.0000000004', 0),
-])
+@pytest.mark.parametrize(('text', 'stamp'),
+                         [('12', 12 * 10**9), ('12.5', 12500000000),
+                          ('1.305031102175300121e+09', 1305031102175300121), ('0.0000000004', 0)])
 def test_stamps_of_other_tools(text, stamp):
     assert stamp_from_text(text) == stamp
 

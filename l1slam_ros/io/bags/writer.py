@@ -33,11 +33,9 @@ _DISTRIBUTION = 'jazzy'
 # As rosbag2 writes them: no deadline is 2^63 - 1 ns, and so is the start of an empty bag.
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 _NEVER = 2**63 - 1
-_QOS = {
-    'history': 'keep_last', 'depth': 1000, 'reliability': 'reliable', 'durability': 'volatile',
-    'deadline': _FOREVER, 'lifespan': _FOREVER, 'liveliness': 'automatic',
-    'liveliness_lease_duration': _FOREVER, 'avoid_ros_namespace_conventions': False,
-}
+_QOS = {'history': 'keep_last', 'depth': 1000, 'reliability': 'reliable', 'durability': 'volatile',
+        'deadline': _FOREVER, 'lifespan': _FOREVER, 'liveliness': 'automatic',
+        'liveliness_lease_duration': _FOREVER, 'avoid_ros_namespace_conventions': False}
 
 
 class BagWriter:
@@ -139,8 +137,7 @@ def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagW
 def _yaml(document: Any, in_one_line: bool = False) -> str:
     """Return a document as YAML, whatever occurs in it twice written out twice."""
     text = StringIO()
-    dumper = yaml.SafeDumper(text, sort_keys=False, width=2**16,
-                             default_flow_style=in_one_line)
+    dumper = yaml.SafeDumper(text, sort_keys=False, width=2**16, default_flow_style=in_one_line)
     dumper.ignore_aliases = lambda _: True
     dumper.open()
     dumper.represent(document)
