@@ -126,7 +126,7 @@ INNER: tuple[LinearSolver, ...] = (
 
 
 def _l1(solver: str) -> GraphSolver:
-    """Solve by one of `choice.SOLVERS`, from given poses."""
+    """Solve by one of `names.SOLVERS`, from given poses."""
 
     def solve(graph: FactorGraph, poses: Array) -> Array:
         return minimise_by(choose(solver, graph), graph, poses, OptimiserOptions())[0].poses
@@ -150,9 +150,9 @@ def _seed_and_l1(graph: FactorGraph, poses: Array) -> Array:
 
 def seed_and_l1(graph: FactorGraph) -> tuple[Array, Array]:
     """Return the seed and the map, (n, p) each, by the default solver; one ordering for both."""
-    choice = choose(AUTO, graph)
-    seed = seed_poses(graph, choice.cholesky)
-    return seed, minimise_by(choice, graph, seed, OptimiserOptions())[0].poses
+    method = choose(AUTO, graph)
+    seed = seed_poses(graph, method.cholesky)
+    return seed, minimise_by(method, graph, seed, OptimiserOptions())[0].poses
 
 
 def _from_poses(name: str, solve: Callable[[FactorGraph, Array], Array]) -> GraphSolver:

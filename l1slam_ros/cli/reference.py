@@ -74,7 +74,7 @@ def read_truth(source: str, record: GraphRecord, input_path: Path) -> Truth:
 def _read(source: str, record: GraphRecord, input_path: Path) -> Reference:
     bag, colon, topic = source.rpartition(':/')
     if colon and not Path(source).exists():
-        from l1slam_ros.io.bags.truth_topic import read_truth_topic
+        from l1slam_ros.io.bags.to_graph import read_truth_topic
 
         path = Path(bag)
         if bag == 'bag' and not path.exists() and is_bag(input_path):

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -23,12 +22,11 @@ from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io import formats
-from l1slam_ros.io.compilation import compile_now
-from l1slam_ros.io.files import put_lines, require_folder
+from l1slam_ros.io.compilation import STEPS, compile_now
+from l1slam_ros.io.files import new_folder_beside, put_lines, reported, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.plot import MapDrawing
 from l1slam_ros.io.progress import Progress
-from l1slam_ros.io.warm_up import STEPS
 from l1slam_ros.paper import figures, report
 from l1slam_ros.paper import printed as paper
 from l1slam_ros.paper.experiments import (
@@ -216,14 +214,9 @@ def _check_folder(output: Path) -> None:
 @contextmanager
 def _filling(output: Path) -> Iterator[Path]:
     """Yield a new folder, whose files go into the folder `output` when the block succeeds."""
-    try:
-        with TemporaryDirectory('.tmp', f'.{output.name}.', output.absolute().parent,
-                                ignore_cleanup_errors=True) as scratch:
-            made = Path(scratch)
-            yield made
-            output.mkdir(exist_ok=True)
-            # The report last: it names the others.
-            for file in sorted(made.iterdir(), key=lambda file: file.name == REPORT):
-                os.replace(file, output / file.name)
-    except OSError as error:
-        raise FileError(output, f'cannot be written: {error.strerror or error}') from error
+    with reported(output), new_folder_beside(output) as made:
+        yield made
+        output.mkdir(exist_ok=True)
+        # The report last: it names the others.
+        for file in sorted(made.iterdir(), key=lambda file: file.name == REPORT):
+            os.replace(file, output / file.name)

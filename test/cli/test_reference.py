@@ -142,7 +142,8 @@ def test_a_topic_is_a_truth(tmp_path, kind):
 
 
 @pytest.mark.parametrize('source, said', [
-    ('bag:/nothing', 'no poses on /nothing; expected true poses; there are poses on /pose'),
+    ('bag:/nothing', 'no poses on /nothing; expected true poses; geometry_msgs/msg/PoseStamped '
+     'is on /pose'),
     ('bag:/time', '/time is of builtin_interfaces/msg/Time; expected one of geometry_'),
     ('missing:/pose', 'missing: no such file or directory'),
     ('bag:/pose', 'shares 0 poses with the graph, expected 2 or more$'),

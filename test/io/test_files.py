@@ -15,7 +15,7 @@ from l1slam_ros.io.files import (
     read_lines,
     replacing,
     require_folder,
-    settled,
+    rounded,
     stamp_from_text,
     stamp_text,
     write_lines,
@@ -170,7 +170,7 @@ def test_a_folder_that_is_not_there_is_named(tmp_path, monkeypatch):
     (50.00000000000001, 50.0), (0.30000000000000004, 0.3), (1e-8 + 1e-24, 1e-8), (0.0, 0.0),
     (-3000.0000000000005, -3e3), (1 / 3, 1 / 3), (0.1234567890123456, 0.1234567890123456)])
 def test_rounding_is_undone_where_it_can_be(value, decimal):
-    assert settled(np.array([value])).tolist() == [decimal]
+    assert rounded(np.array([value])).tolist() == [decimal]
 
 
 @pytest.mark.parametrize('bad', [{0}, {9}, {3, 4, 9}, {8, 9}])

@@ -25,7 +25,7 @@ from l1slam_ros.io.files import (
     put_lines,
     quoted,
     replacing,
-    settled,
+    rounded,
 )
 from l1slam_ros.io.graphs.rows import (
     Rows,
@@ -254,7 +254,7 @@ def _lines(path: Path, record: GraphRecord, kind: str, ids: Indices, pose: Array
     if tag.information:
         rows, columns = np.array(tag.information).T
         roots = roots / tag.units(record.rotation_information)
-        information = settled(roots.transpose(0, 2, 1) @ roots)
+        information = rounded(roots.transpose(0, 2, 1) @ roots)
         values = np.concatenate((values, information[:, rows, columns]), axis=1)
     readable = (np.abs(values) <= LARGEST).all(axis=1)
     if not readable.all():
