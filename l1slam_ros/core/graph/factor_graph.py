@@ -126,6 +126,12 @@ class FactorGraph:
         """Let `count` more keyframes exist; the next index is `n_poses` before the call."""
         self.n_poses += count
 
+    def append_step(self, measurement: Array, sqrt_information: Array) -> None:
+        """Append a keyframe and the factor to it from the one before: (1, p), (1, d, d)."""
+        self.add_poses(1)
+        k = np.array([self.n_poses - 1])
+        self.append_between(k - 1, k, measurement, sqrt_information)
+
     def add_between(self, i: Indices, j: Indices, measurement: Array, information: Array,
                     trusted: Mask | bool = False) -> None:
         """
