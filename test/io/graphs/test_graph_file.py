@@ -269,8 +269,9 @@ def random_record(rng, n=40, stamps=True):
         [7.7 * np.eye(3), np.diag([2.0, 3, 0]), np.diag([2.0, 3, 0]), np.diag([0, 3.0, 7])]))
     graph.add_between(1, 9, rng.normal(size=(1, 3)), np.diag([0, 0.1, 0])[None])
     ids = np.sort(rng.choice(10**12, n, replace=False))
+    ids[-2:] = 2**63 - 2, 2**63 - 1  # as floats they would be one
     return GraphRecord(graph, rng.normal(size=(n, 3)) * 1e3, ids,
-                       np.cumsum(rng.integers(1, 10**12, n)) if stamps else None)
+                       2**62 + np.cumsum(rng.integers(1, 10**12, n)) if stamps else None)
 
 
 def assert_same(a, b):
@@ -389,7 +390,7 @@ def test_trust_comes_back_with_the_graph(tmp_path, rng, name):
     rows = [row for row in range(len(factors) - 1, 39, -7)  # loops that nothing runs along
             if (pairs == pairs[row]).all(axis=1).sum() == 1]
     assert len(rows) > 3
-    write_graph_file(path, with_trust(record, rows))
+    write_graph_file(path, with_trust(record, [0, *rows]))  # row 0 is odometry
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         name, f'{name}.stamps.txt', f'{name}.trusted.txt']
     assert sorted(tuple(map(int, line.split()))
@@ -407,11 +408,15 @@ def test_trust_joins_loops_either_way_round_and_leaves_odometry(write):
     trusted_path(path).write_text('3 9\n')
     assert read_graph_file(path).graph.between.trusted.tolist() == [
         False, False, True, False, True]
+    trusted_path(path).write_text('# nobody vouched\n\n')
+    assert not read_graph_file(path).graph.between.trusted.any()
 
 
 @pytest.mark.parametrize(('text', 'message'), [
     ('3 9\n\n3 x\n', ":3: trusted loop: 'x' is not a whole number of 64 bits; expected 2 whole"),
     ('3 9 1\n', ':1: trusted loop: 3 fields; expected 2 whole numbers'),
+    ('3 2.5\n', ":1: trusted loop: '2.5' is not a whole number of 64 bits; expected 2"),
+    ('3 3\n', ':1: no edge between 3 and 3 in '),
     ('9 3\n3 8\n', ':2: no edge between 3 and 8 in '),
     ('9 3\n0 1\n', ':2: no edge between 0 and 1 in '),
 ])
@@ -460,6 +465,8 @@ def test_the_graph_survives_a_failing_replacement(tmp_path, rng):
     ('3 1\n7 2\n7 2\n9 3\n', ': 4 stamps that are not those of the 3 vertices'),
     ('3 1\n# x\n7 two\n9 3\n', ":3: '7 two'; expected a vertex id and seconds"),
     ('3 1\n7\n9 3\n', ":2: '7'; expected a vertex id and seconds"),
+    ('1\n2\n', ': 2 stamps that are not those'), ('1\n' * 4, ': 4 stamps that are not those'),
+    ('1\n2 3\n', ":2: '2 3'; expected seconds"), ('x\n', ":1: 'x'; expected seconds"),
 ])
 def test_damaged_stamps_are_named(write, text, message):
     path = write(SQUARE)
@@ -473,6 +480,8 @@ def test_stamps_of_any_order(write):
     path = write(SQUARE)
     stamps_path(path).write_text('9 3\n# c\n3 1.25\n7 2.000000001\n')
     assert read_graph_file(path).stamps.tolist() == [1250000000, 2000000001, 3000000000]
+    stamps_path(path).write_text('# seconds\n 3.25\n1 \n2.5\n')
+    assert read_graph_file(path).stamps.tolist() == [3250000000, 1000000000, 2500000000]
 
 
 def test_vertices_alone(write):
