@@ -219,15 +219,6 @@ def lowest_of_components(i: Indices, j: Indices, n: int) -> Indices:
             lowest = lowest[lowest]
 
 
-def gaps(graph: FactorGraph) -> Indices:
-    """Return the keyframes k > 0 that no odometry joins to k - 1, (g,)."""
-    factors = graph.between
-    rows = factors.is_odometry
-    joined = np.zeros(graph.n_poses, bool)
-    joined[np.maximum(factors.i[rows], factors.j[rows])] = True
-    return 1 + np.flatnonzero(~joined[1:])
-
-
 def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:
     """
     Return of all between factors the earlier and later keyframe (m,), and that from this.

@@ -15,8 +15,9 @@ import numpy as np
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import MOST_OF_ODOMETRY, root_of_inverse
-from l1slam_ros.core.graph.factor_graph import FactorGraph, gaps
+from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.online.keyframes import KeyframeOptions, Motion, OdometryOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
 from l1slam_ros.core.online.notes import Notes
@@ -225,7 +226,7 @@ class GraphBuilder:
         """Go on where a run ended; odometry that begins elsewhere is taken to begin there."""
         self._begin(growth.graph)
         track, stamps = self._track, growth.stamps
-        for part in np.split(np.arange(len(stamps)), gaps(self.graph)):
+        for part in np.split(np.arange(len(stamps)), odometry_gaps(self.graph) + 1):
             track.extend_by_part(stamps[part], growth.odometry[part])
         self.offset = growth.offset
         self._motion = Motion(self.graph.manifold, track.last_stamp, track.last_pose)
