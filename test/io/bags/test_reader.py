@@ -26,9 +26,9 @@ def test_messages_come_in_order_of_time(bag):
     messages = list(read_messages(bag))
     assert [m.topic for m in messages] == ['/a', '/b', '/a', '/a', '/a', '/a']
     assert [m.time // 10**9 for m in messages] == [10, 11, 12, 14, 16, 18]
-    assert messages[1].message.data == 'b'
+    assert messages[1].data.data == 'b'
     assert messages[1].msgtype == STRING
-    assert [m.message.data for m in read_messages(bag, ['/b', '/not_there'])] == ['b']
+    assert [m.data.data for m in read_messages(bag, ['/b', '/not_there'])] == ['b']
 
 
 def test_raw_messages_are_what_was_sent(bag):
