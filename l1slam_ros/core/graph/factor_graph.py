@@ -126,10 +126,8 @@ class FactorGraph:
         """Let `count` more keyframes exist; the next index is `n_poses` before the call."""
         self.n_poses += count
 
-    def add_between(
-        self, i: Indices, j: Indices, measurement: Array, information: Array,
-        trusted: Mask | bool = False,
-    ) -> None:
+    def add_between(self, i: Indices, j: Indices, measurement: Array, information: Array,
+                    trusted: Mask | bool = False) -> None:
         """
         Append between factors: i, j (m,), measurement (m, p), information (m, d, d), trusted (m,).
 
@@ -164,10 +162,8 @@ class FactorGraph:
             raise GraphError(f'measurement {row} is not finite: {measurement[row]}')
         self.append_between(i, j, measurement, square_root_information(information), trusted)
 
-    def append_between(
-        self, i: Indices, j: Indices, measurement: Array, sqrt_information: Array,
-        trusted: Mask | bool = False, struck: Mask | bool = False,
-    ) -> None:
+    def append_between(self, i: Indices, j: Indices, measurement: Array, sqrt_information: Array,
+                       trusted: Mask | bool = False, struck: Mask | bool = False) -> None:
         """Append between factors that are known to be sound, with the roots (m, d, d) at hand."""
         values = (i, j, measurement, sqrt_information, np.broadcast_to(trusted, len(i)),
                   np.broadcast_to(struck, len(i)))

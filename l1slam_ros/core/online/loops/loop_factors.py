@@ -186,9 +186,8 @@ class LoopFactors:
         if loop.struck:
             self._struck.add(pair)
             factors = graph.between.pairs[self.rows]
-            graph.say(self.rows[
-                (factors == pair).all(axis=1) | (factors == pair[::-1]).all(axis=1)
-                | (self._stamps.view() == loop.stamps).all(axis=1)], trusted=False)
+            graph.say(self.rows[(factors == pair).all(axis=1) | (factors == pair[::-1]).all(axis=1)
+                                | (self._stamps.view() == loop.stamps).all(axis=1)], trusted=False)
         elif loop.trusted:
             self._struck.discard(pair)
             graph.say(np.array([self._row_of[one.key]]), trusted=True)

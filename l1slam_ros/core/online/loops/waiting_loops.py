@@ -118,9 +118,8 @@ class WaitingLoops:
         return self._loops.pop(number)
 
 
-def carried(
-    manifold: Manifold, used: list[WaitingLoop], to_reference: Array, to_keyframe: Array
-) -> tuple[Array, Array, Mask]:
+def carried(manifold: Manifold, used: list[WaitingLoop], to_reference: Array,
+            to_keyframe: Array) -> tuple[Array, Array, Mask]:
     """
     Return what loops say between keyframes near their times.
 
@@ -158,9 +157,8 @@ def carried(
     return measurement, covariance, usable(filled(covariance, silent))
 
 
-def loop_covariance(
-    stated: Array, model: Array | None, verbatim: bool
-) -> tuple[Array | None, list[tuple[float, float]]]:
+def loop_covariance(stated: Array, model: Array | None,
+                    verbatim: bool) -> tuple[Array | None, list[tuple[float, float]]]:
     """
     Return a covariance by what a loop states, (1, d, d), and variances found and used instead.
 
