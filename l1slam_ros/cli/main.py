@@ -174,9 +174,11 @@ def _add_bag_options(parser: argparse.ArgumentParser) -> None:
         'part of the quaternion, as g2o has it, or the angle (default: %(default)s)')
     add = parser.add_argument_group('how to read a bag').add_argument
     add('--odom-topic', default=DEFAULT_TOPICS.odometry, metavar='TOPIC',
-        help='nav_msgs/Odometry (default: %(default)s)')
+        help='nav_msgs/Odometry; or, as a whole, the pose graph of an rtabmap_msgs/MapGraph or '
+        'pose_graph_tools_msgs/PoseGraph (default: %(default)s)')
     add('--loop-topic', default=DEFAULT_TOPICS.loops, metavar='TOPIC',
-        help='geometry_msgs/PoseWithCovarianceStamped (default: %(default)s)')
+        help='geometry_msgs/PoseWithCovarianceStamped, or the loops of such a pose graph '
+        '(default: %(default)s)')
     add('--trusted-topic', default=DEFAULT_TOPICS.trusted, metavar='TOPIC',
         help='the same, loops somebody vouches for (default: %(default)s)')
     add('--absolute-topic', default=DEFAULT_TOPICS.absolute, metavar='TOPIC',
