@@ -174,8 +174,10 @@ def _add_bag_options(parser: argparse.ArgumentParser) -> None:
         'part of the quaternion, as g2o has it, or the angle (default: %(default)s)')
     add = parser.add_argument_group('how to read a bag').add_argument
     for name, default, what in (
-        ('odom', DEFAULT_TOPICS.odometry, 'nav_msgs/Odometry'),
-        ('loop', DEFAULT_TOPICS.loops, 'geometry_msgs/PoseWithCovarianceStamped'),
+        ('odom', DEFAULT_TOPICS.odometry, 'nav_msgs/Odometry; or, as a whole, the pose graph of '
+         'an rtabmap_msgs/MapGraph or pose_graph_tools_msgs/PoseGraph'),
+        ('loop', DEFAULT_TOPICS.loops, 'geometry_msgs/PoseWithCovarianceStamped, or the loops of '
+         'such a pose graph'),
         ('trusted', DEFAULT_TOPICS.trusted, 'the same, loops somebody vouches for'),
         ('absolute', DEFAULT_TOPICS.absolute, 'the same, poses in the map frame'),
     ):

@@ -36,8 +36,10 @@ def simulate(arguments: argparse.Namespace) -> Ending:
         world = with_false_loops(world, make(world.graph, world.truth, arguments.false_loops, rng))
     ids = np.arange(world.graph.n_poses)
     record = GraphRecord(world.graph, world.odometry, ids)
-    write_truth(truth_path(output), ids, world.truth)
-    _write(output, world.false_loops, lambda: formats.write_output(output, record, world.truth))
+    with replacing(truth_path(output)) as temporary:
+        write_truth(temporary, ids, world.truth)
+        _write(output, world.false_loops,
+               lambda: formats.write_output(output, record, world.truth))
     return Ending()
 
 

@@ -97,13 +97,17 @@ def stamps_of(record: GraphRecord) -> Indices:
 
 
 def check_output(path: Path) -> None:
-    """Refuse, before any work is done, an output whose suffix names no format."""
+    """Refuse, before any work is done, an output that could not be written in the end."""
     if path.suffix not in (*GRAPH_SUFFIXES, '.tum', ''):
         raise FileError(path, f'unknown suffix; expected {", ".join(GRAPH_SUFFIXES)}, .tum, or '
                         'none for a bag directory')
     require_folder(path)
     if path.suffix and path.is_dir():
         raise FileError(path, 'cannot be written: it is a directory')
+    if not path.suffix:
+        from l1slam_ros.io.bags.writer import refuse_other_than_bag
+
+        refuse_other_than_bag(path)
 
 
 def check_graph_output(path: Path) -> None:

@@ -667,6 +667,8 @@ def test_bad_input_is_one_line_exit_code_2_and_no_output(capsys, tmp_path, lines
     (['solve', 'graph.g2o', '--output', 'taken.g2o', '--plot', 'a.png'], 'it is a directory'),
     (['solve', 'graph.g2o', '--plot', 'missing/out.png'], 'missing is no folder'),
     (['solve', 'gap.g2o', '--start', 'odometry'], 'consecutive vertices 1 and 2'),
+    (['solve', 'graph.g2o', '--output', 'other'], 'other: exists and is no bag'),
+    (['simulate', 'other', '--poses', '10', '--edges', '12'], 'other: exists and is no bag'),
     (['convert', 'graph.g2o', 'out.doc'], 'suffix'),
     (['corrupt', 'graph.g2o', 'out.tum', '--false-loops', '1'], 'trajectory'),
     (['corrupt', 'graph.g2o', 'out.g2o', '--false-loops', '-1'], '--false-loops is -1'),
@@ -687,13 +689,14 @@ def test_bad_arguments_are_one_line_and_exit_code_2(
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'graph.g2o').write_text('\n'.join(EDGES))
     (tmp_path / 'graph.txt').write_text('{}')
-    (tmp_path / 'taken.g2o').mkdir()
+    for name in ('other', 'taken.g2o'):
+        (tmp_path / name).mkdir()
     (tmp_path / 'gap.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 0 5 1 '))
     assert main([*arguments]) == 2
     _, err = capsys.readouterr()
     assert err.count('\n') == 1 and words in err, err
     assert sorted(p.name for p in tmp_path.iterdir()) == [
-        'gap.g2o', 'graph.g2o', 'graph.txt', 'taken.g2o']
+        'gap.g2o', 'graph.g2o', 'graph.txt', 'other', 'taken.g2o']
 
 
 def test_a_graph_with_gaps_and_without_poses_is_solved_from_its_tree(capsys, tmp_path):

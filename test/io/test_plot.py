@@ -65,6 +65,13 @@ def test_what_is_not_given_is_not_named(tmp_path):
     assert not {'odometry', 'truth', 'refused', 'suspect'} & set(words(path).split())
 
 
+@pytest.mark.parametrize('name, title', [
+    ('$\\frac$.g2o', '$\\frac$.g2o'), ('a\udce9.g2o', 'a?.g2o')])
+def test_a_name_is_written_as_it_is(tmp_path, name, title):
+    plot_maps(tmp_path / 'map.svg', [MapDrawing(name, SQUARE)])
+    assert title in words(tmp_path / 'map.svg')
+
+
 def test_refused_loops_are_red(tmp_path):
     for name, rejected in ('none', np.zeros((0, 2), int)), ('one', np.array([[0, 2]])):
         plot_maps(tmp_path / f'{name}.png', [MapDrawing('', SQUARE, rejected=rejected)])

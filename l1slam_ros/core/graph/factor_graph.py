@@ -90,12 +90,14 @@ class FactorGraph:
         self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
                          GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_),
                          GrowingArray((), np.bool_)]
+        self._factors: BetweenFactors | None = None
 
     def copy(self) -> 'FactorGraph':
         """Return a graph that shares all factors so far; either may grow without the other."""
         clone = FactorGraph(self.manifold)
         clone.n_poses = self.n_poses
         clone._between = [column.copy() for column in self._between]
+        clone._factors = self._factors
         return clone
 
     def subset(self, chosen: Indices | Mask, variance: Array | None = None) -> 'FactorGraph':
@@ -120,7 +122,9 @@ class FactorGraph:
     @property
     def between(self) -> BetweenFactors:
         """All factors so far: a snapshot that later appends do not change."""
-        return BetweenFactors(*(column.view() for column in self._between))
+        if self._factors is None:
+            self._factors = BetweenFactors(*(column.view() for column in self._between))
+        return self._factors
 
     def add_poses(self, count: int = 1) -> None:
         """Let `count` more keyframes exist; the next index is `n_poses` before the call."""
@@ -175,6 +179,7 @@ class FactorGraph:
                   np.broadcast_to(struck, len(i)))
         for column, value in zip(self._between, values, strict=True):
             column.extend(value)
+        self._factors = None
 
     def say(self, rows: Indices, trusted: bool) -> None:
         """Let some between factors be vouched for, or else struck out; the last word counts."""
@@ -184,6 +189,7 @@ class FactorGraph:
             # What was seen of the column before stays as it was.
             self._between[column] = GrowingArray((), np.bool_)
             self._between[column].extend(said)
+        self._factors = None
 
 
 def component_labels(graph: FactorGraph) -> Indices:

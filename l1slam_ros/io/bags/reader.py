@@ -241,10 +241,15 @@ def _by_library(bag: Path, topics: Collection[str] | None, start: int | None,
     with _reader(bag) as reader:
         types = reader.typestore if reader.is2 else ros1_types(reader.typestore.fielddefs)
         connections = [c for c in reader.connections if topics is None or c.topic in topics]
+        missing = sum(c.msgcount for c in connections)
         # No connection would mean all of them to the library.
         for c, time, data in reader.messages(connections, start, stop) if connections else ():
+            missing -= 1
             cdr = bytes(data if reader.is2 else types.ros1_to_cdr(data, c.msgtype))
             yield BagMessage(c.topic, c.msgtype, time, cdr), types
+        # Within a chunk the library stops at a damaged record without a word.
+        if missing > 0 and start is None and stop is None:
+            raise LookupError(f'{missing:,} messages are missing')
 
 
 @contextmanager

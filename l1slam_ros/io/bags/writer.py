@@ -131,7 +131,7 @@ def _yaml(document: Any, in_one_line: bool = False) -> str:
                          default_flow_style=in_one_line)).strip()
 
 
-def _refuse_other_than_bag(target: Path) -> None:
+def refuse_other_than_bag(target: Path) -> None:
     """Refuse to replace what is there, unless it is a bag and nothing else."""
     if not os.path.lexists(target):
         return
@@ -148,7 +148,7 @@ def _refuse_other_than_bag(target: Path) -> None:
 def _replacing_directory(target: Path) -> Iterator[Path]:
     """Yield the name of a directory to make, which takes the place of `target` in the end."""
     with reported(target):
-        _refuse_other_than_bag(target)
+        refuse_other_than_bag(target)
         with new_folder_beside(target) as scratch:
             # The bag is made under its own name: that of the file inside repeats it.
             made = scratch / target.name

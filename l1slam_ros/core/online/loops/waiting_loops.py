@@ -149,6 +149,8 @@ def carried(manifold: Manifold, used: list[WaitingLoop], to_reference: Array,
     # The error lives in the axes of the measured pose; see it from the keyframe instead.
     Ad = manifold.adjoint(manifold.inverse(to_keyframe))
     turned = Ad @ covariance @ Ad.transpose(0, 2, 1)
+    if not silent.any():
+        return measurement, turned, usable(turned)
     way = manifold.local(manifold.identity(len(used)), to_keyframe)
     lost = np.zeros(silent.shape)
     lost[:, manifold.TRANSLATION] = (way[:, manifold.TRANSLATION] ** 2).mean(axis=1)[:, None]
