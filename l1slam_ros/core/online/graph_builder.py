@@ -150,6 +150,10 @@ class GraphBuilder:
                                f'last one, {track.last_stamp} ns')
         points = self._stream.take(sample, self._verbatim, not ignore)
         keyframes = [self._add(point) for point in points]
+        track = self._track  # a new one, maybe
+        # Loops that are due become factors by the samples as they came.
+        if track.may_be_thinned and not self._loops.waiting.is_due(track.last):
+            track.thin()
         return any(keyframes)
 
     def finish(self) -> None:
