@@ -25,10 +25,8 @@ from l1slam_ros.paper import printed as paper
 
 BAD_INPUT, READ_IN_PART, DOUBTFUL, INTERRUPTED, BROKEN_PIPE = 2, 3, 4, 130, 141
 # By command: the module that runs it, imported only then.
-_MODULES = {
-    'solve': 'solving', 'convert': 'commands', 'info': 'commands', 'simulate': 'worlds',
-    'corrupt': 'worlds', 'plot': 'drawing', 'reproduce': 'reproducing',
-}
+_MODULES = {'solve': 'solving', 'convert': 'commands', 'info': 'commands', 'simulate': 'worlds',
+            'corrupt': 'worlds', 'plot': 'drawing', 'reproduce': 'reproducing'}
 
 _INPUT = '.g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1'
 _OUTPUT = '.g2o, .graph, .tum, or a name without a suffix for a bag directory'
@@ -143,10 +141,9 @@ def _parser() -> argparse.ArgumentParser:
     commands_of = parser.add_subparsers(metavar='COMMAND', dest='command')
 
     def add(name: str, text: str, example: str) -> argparse.ArgumentParser:
-        return commands_of.add_parser(
-            name, help=text, description=f'{text[0].upper()}{text[1:]}.',
-            epilog=f'example:\n  l1slam {name} {example}',
-            formatter_class=argparse.RawDescriptionHelpFormatter)
+        return commands_of.add_parser(name, help=text, description=f'{text[0].upper()}{text[1:]}.',
+                                      epilog=f'example:\n  l1slam {name} {example}',
+                                      formatter_class=argparse.RawDescriptionHelpFormatter)
 
     _add_solve(add('solve', 'optimise a graph or a bag',
                    'graph.g2o --output solved.g2o --plot map.png'))

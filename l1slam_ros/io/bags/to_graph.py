@@ -4,8 +4,11 @@ A bag -> a graph, grown by the code that the node grows with: live and offline s
 
 Where the topic of the loops has pose graphs of another front end, their loops are taken; where
 that of the odometry has, the graph as a whole.
+
+And the true poses that it has on a topic, stamped by their headers.
 """
 
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +17,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError, MessageError
 from l1slam_ros.core.geometry import se2, se3
-from l1slam_ros.core.geometry.manifold import Manifold
+from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import (
@@ -26,11 +29,16 @@ from l1slam_ros.io.bags.from_graph import GRAPH_NOTE, SPACE_NOTE, VERBATIM_NOTE
 from l1slam_ros.io.bags.reader import BagMessage, bag_summary, read_messages, read_note
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
 from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.messages import conversion
 from l1slam_ros.io.messages.base_frame import BaseFrame, Sorted
-from l1slam_ros.io.messages.conversion import absolute_pose, loop_closure, odometry_sample
 from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
+from l1slam_ros.io.trajectory import Reference
+from l1slam_ros.io.wording import counted
 
 _ODOMETRY = 'nav_msgs/msg/Odometry'
+# What a topic of true poses may be of.
+_POSES = ('geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PoseWithCovarianceStamped',
+          'geometry_msgs/msg/TransformStamped', 'nav_msgs/msg/Odometry')
 
 
 def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topics,
@@ -95,13 +103,13 @@ class _Growing:
                 raise MessageError('type', f'{message.msgtype} on {topic}; expected {expected}')
             elif topic == self._topics.odometry:
                 self._add_odometry(self._base_frame.take(
-                    message.message.child_frame_id, odometry_sample(message.message)))
+                    message.message.child_frame_id, conversion.odometry_sample(message.message)))
             elif topic == self._topics.absolute:
                 # The map is the frame that the first one names.
-                self._builder.add_loop(absolute_pose(message.message, self._map_frame))
+                self._builder.add_loop(conversion.absolute_pose(message.message, self._map_frame))
                 self._map_frame = message.message.header.frame_id
             else:
-                self._builder.add_loop(loop_closure(
+                self._builder.add_loop(conversion.loop_closure(
                     message.message, self._base_frame.name, topic == self._topics.trusted))
         except MessageError as error:
             notes.refuse(error.cause, str(error))
@@ -150,6 +158,37 @@ class _Growing:
             skipped.append(f'{builder.n_waiting} loops name times after the last odometry')
         return GraphRecord(builder.graph, None, np.arange(builder.graph.n_poses), builder.stamps,
                            tuple(skipped), damage)
+
+
+def read_truth_topic(path: Path, topic: str, manifold: Manifold = se2) -> Reference:
+    """
+    Return the true poses on a topic of a bag, in order of their stamps; of one stamp the first.
+
+    Raises
+    ------
+    FileError : the bag cannot be read, or has no poses on the topic.
+
+    """
+    damage: list[str] = []
+    refused: Counter[str] = Counter()
+    pose_at: dict[int, Array] = {}
+    for message in read_messages(path, [topic], damage.append):
+        if message.msgtype not in _POSES:
+            raise FileError(path, f'{topic} is of {message.msgtype}; expected one of '
+                            f'{", ".join(_POSES)}')
+        try:
+            stamp, pose3 = conversion.stamped_pose(message.message)
+            pose_at.setdefault(stamp, pose3)
+        except MessageError as error:
+            refused[error.cause] += 1
+    skipped = [f'{counted(count, "message")} on {topic} of {path} refused: {cause}'
+               for cause, count in refused.items()]
+    if not pose_at:
+        raise FileError(path, '; '.join([f'no poses on {topic}; expected true poses',
+                                         *_alternatives(path, topic, *_POSES), *skipped, *damage]))
+    stamps = np.array(sorted(pose_at), np.int64)
+    poses = manifold.from_pose3(np.array([pose_at[stamp] for stamp in stamps.tolist()]))
+    return Reference(stamps, poses, stamped=True, skipped=(*skipped, *damage))
 
 
 def _noted_options(note: dict[str, str]) -> GraphBuilderOptions:

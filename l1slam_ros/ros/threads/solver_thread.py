@@ -9,9 +9,8 @@ from typing import Any
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.update import Improvement
-from l1slam_ros.io.compilation import fill_cache
+from l1slam_ros.io.compilation import STEPS, fill_cache, with_space
 from l1slam_ros.io.node_options import UpdateOptions
-from l1slam_ros.io.warm_up import STEPS, with_space
 from l1slam_ros.ros.threads.failures import Failures
 
 # [s] After a failed update the next one waits; twice as long after each more, up to this.
