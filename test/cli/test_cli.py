@@ -87,18 +87,16 @@ def test_a_chosen_solver_is_the_one_that_solves(capsys, world, solver):
     assert (report['inner_iterations'] > 0) == (solver == 'primal-dual')
 
 
-REPORTED = [
-    'poses', 'factors', 'loops', 'initial_cost', 'seed_cost', 'final_cost', 'status', 'seconds',
-    'solver', 'outer_iterations', 'inner_iterations', 'rejected', 'suspect', 'slips', 'parts',
-    'warnings']
+REPORTED = ['poses', 'factors', 'loops', 'initial_cost', 'seed_cost', 'final_cost', 'status',
+            'seconds', 'solver', 'outer_iterations', 'inner_iterations', 'rejected', 'suspect',
+            'slips', 'parts', 'warnings']
 
 
 @pytest.mark.parametrize('more', [(), ('--no-robust',), ('--robust', '--norm', 'l2')])
 def test_the_names_of_a_report_stay(capsys, world, more):
     assert list(solve_json(capsys, world, *more)) == REPORTED
     truth = ('--reference', f'{world}.truth.txt')
-    assert list(solve_json(capsys, world, *more, *truth)) == [
-        *REPORTED, 'ate', 'ate_poses']
+    assert list(solve_json(capsys, world, *more, *truth)) == [*REPORTED, 'ate', 'ate_poses']
 
 
 # Robust
@@ -529,8 +527,7 @@ def test_plot_shows_false_loops_where_they_are_known(capsys, world, tmp_path):
 
 @pytest.mark.parametrize('line, words', [
     ('3 5', 'no edge between 3 and 5'), ('3 999', 'no edge between 3 and 999'),
-    ('3', '1 field; expected 2 whole numbers'), ('3 x', "'x' is not a whole number"),
-])
+    ('3', '1 field; expected 2 whole numbers'), ('3 x', "'x' is not a whole number")])
 def test_a_file_of_other_false_loops_is_refused(capsys, tmp_path, line, words):
     path = graph_file(tmp_path, [*VERTICES, *EDGES])
     (tmp_path / 'graph.g2o.false.txt').write_text(f'0 2\n{line}\n')
@@ -686,6 +683,8 @@ def test_bad_input_is_one_line_exit_code_2_and_no_output(capsys, tmp_path, lines
     (['solve', 'graph.g2o', '--output', 'taken.g2o', '--plot', 'a.png'], 'it is a directory'),
     (['solve', 'graph.g2o', '--plot', 'missing/out.png'], 'missing is no folder'),
     (['solve', 'gap.g2o', '--start', 'odometry'], 'consecutive vertices 1 and 2'),
+    (['solve', 'graph.g2o', '--output', 'other'], 'other: exists and is no bag'),
+    (['simulate', 'other', '--poses', '10', '--edges', '12'], 'other: exists and is no bag'),
     (['convert', 'graph.g2o', 'out.doc'], 'suffix'),
     (['corrupt', 'graph.g2o', 'out.tum', '--false-loops', '1'], 'trajectory'),
     (['corrupt', 'graph.g2o', 'out.g2o', '--false-loops', '-1'], '--false-loops is -1'),
@@ -706,13 +705,14 @@ def test_bad_arguments_are_one_line_and_exit_code_2(
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'graph.g2o').write_text('\n'.join(EDGES))
     (tmp_path / 'graph.txt').write_text('{}')
-    (tmp_path / 'taken.g2o').mkdir()
+    for name in ('other', 'taken.g2o'):
+        (tmp_path / name).mkdir()
     (tmp_path / 'gap.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 0 5 1 '))
     assert main([*arguments]) == 2
     _, err = capsys.readouterr()
     assert err.count('\n') == 1 and words in err, err
     assert sorted(p.name for p in tmp_path.iterdir()) == [
-        'gap.g2o', 'graph.g2o', 'graph.txt', 'taken.g2o']
+        'gap.g2o', 'graph.g2o', 'graph.txt', 'other', 'taken.g2o']
 
 
 def test_a_graph_with_gaps_and_without_poses_is_solved_from_its_tree(capsys, tmp_path):

@@ -43,7 +43,7 @@ def test_strays_do_not_stop_the_map(bench, capfd):
 
     def refused():
         node = bench.backend
-        return dict(node._refused + Counter(node._backend.counts()[1]))
+        return dict(node._inputs.refused + Counter(node._backend.counts()[1]))
 
     bench.until(lambda: refused() == expected, f'{expected} are counted')
     bench.until(lambda: len(bench.path().poses) == 10, 'the Path has all poses')

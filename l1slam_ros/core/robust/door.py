@@ -54,8 +54,8 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
     expected = (graph.n_poses, graph.manifold.POSE_SIZE)
     if start is not None and np.shape(start) != expected:
         raise GraphError(f'start has the shape {np.shape(start)}, expected {expected}')
-    wish = batch_map.Wish('seed' if start is None else 'file', norm, robust=robust)
-    outcome = batch_map.solve(graph, None if start is None else np.asarray(start, float), wish)
+    asked = batch_map.SolveOptions('seed' if start is None else 'file', norm, robust=robust)
+    outcome = batch_map.solve(graph, None if start is None else np.asarray(start, float), asked)
     judgement, status = outcome.judgement, outcome.solution.status.value
     if judgement is None:
         inliers = np.ones(len(graph.between), bool)
