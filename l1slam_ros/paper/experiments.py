@@ -3,9 +3,9 @@
 The paper's experiments: its algorithms as printed, beside those this package uses.
 
 In: a graph, where to start, and its seed. Out: the costs of Table I, the seconds per iteration of
-Table II and the curves of Figure 2, as numbers; and L-infinity, which the paper left for later. *As
-printed* means Algorithm 2 without a primal weight, and in Algorithm 4 the full step, with a dual
-that restarts from zero.
+Table II and the curves of Figure 2, as numbers; and L-infinity, which the paper left for later.
+*As printed* means Algorithm 2 without a primal weight, and in Algorithm 4 the full step, with a
+dual that restarts from zero.
 """
 
 import time

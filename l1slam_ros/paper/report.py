@@ -28,8 +28,8 @@ _COSTS = ("A graph is the paper's own where the costs of both starts agree. (*) 
           f"the paper's size (seed {WORLD_SEED}). (+) ended before it had settled: too large.")
 _SECONDS = ('Of the processor; the paper ran C++ on an Intel i7 at 2.9 GHz. *Plain* is Algorithm '
             '2 as printed, in SciPy; *fused* the compiled form that this package uses.')
-_LARGEST = ('Algorithm 2 with the projection onto the L1 ball as the resolvent of the dual, from the '
-            'L2 map. The worst factor is all that this norm sees.')
+_LARGEST = ('Algorithm 2 with the projection onto the L1 ball as the resolvent of the dual, from '
+            'the L2 map. The worst factor is all that this norm sees.')
 
 
 @dataclass(frozen=True)
