@@ -2,6 +2,7 @@
 """`l1slam_ros.read_graph` and `write_graph`: any file of a graph -> the graph, and back."""
 
 import os
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,8 @@ def read_graph(path: str | os.PathLike[str], *,
 
     Poses are x y theta [m, rad] in the plane, x y z qx qy qz qw in space.
 
-    Keyframes are numbered from 0, in the order of the file's vertex ids.
+    Keyframes are numbered from 0, in the order of the file's vertex ids. What was skipped, or lost
+    where a bag is damaged, is warned of.
 
     Parameters
     ----------
@@ -36,6 +38,8 @@ def read_graph(path: str | os.PathLike[str], *,
     """
     _check_reading(rotation_information)
     record = formats.read_input(Path(path), rotation_information=rotation_information)
+    for sentence in filter(None, (*record.skipped, record.damage)):
+        warnings.warn(sentence, stacklevel=2)
     return record.graph, record.poses
 
 
