@@ -254,11 +254,9 @@ class BackendNode(LifecycleNode):
 
     def _add_loop(self, read: Callable[..., LoopClosure], *message: Any) -> None:
         try:
-            loop = read(*message)
+            self._backend.add_loop(read(*message))
         except L1SlamError as error:
             self._refuse(error)
-            return
-        self._backend.add_loop(loop)
 
     def _refuse(self, error: L1SlamError) -> None:
         self._refused[error.cause if isinstance(error, MessageError) else 'unusable'] += 1
