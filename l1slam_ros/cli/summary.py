@@ -42,8 +42,7 @@ def bag_numbers(path: Path) -> list[tuple[str, str]]:
         ('duration', f'{summary.duration / NANOSECONDS:,.1f} s from {stamp_text(summary.start)}'),
         ('note', note or 'none of l1slam: keyframes and covariances by the options of the node'),
         *(('topic', f'{topic.name}: {topic.count:,} of {topic.msgtype}')
-          for topic in summary.topics),
-    ]
+          for topic in summary.topics)]
 
 
 def numbers(record: GraphRecord) -> list[tuple[str, str]]:
@@ -58,8 +57,7 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
         ('poses', f'{graph.n_poses:,} in {graph.manifold.NAME}, ids {ids[0]} to {ids[-1]}'),
         ('odometry', f'{int(factors.is_odometry.sum()):,}, {step_lengths(graph).sum():,.1f} m'),
         ('loops', f'{int(is_loop.sum()):,}{beside}'),
-        ('components', f'{len(connected_parts(graph)):,}'),
-    ]
+        ('components', f'{len(connected_parts(graph)):,}')]
     if absolute:
         rows.insert(3, ('absolute', f'{absolute:,}'))
     if record.stamps is not None:

@@ -50,9 +50,8 @@ def invented_stamps(n: int) -> Indices:
     return 1000 * NANOSECONDS + np.arange(n, dtype=np.int64) * (NANOSECONDS // 10)
 
 
-def write_tum(
-    path: str | os.PathLike[str], stamps: Indices, poses: Array, manifold: Manifold
-) -> None:
+def write_tum(path: str | os.PathLike[str], stamps: Indices, poses: Array,
+              manifold: Manifold) -> None:
     """
     Write a TUM file: stamps (n,) [ns], poses (n, p).
 
@@ -79,9 +78,8 @@ def write_truth(path: str | os.PathLike[str], ids: Indices, poses: Array) -> Non
                        for k, row in zip(ids.tolist(), poses.tolist(), strict=True)))
 
 
-def read_reference(
-    path: str | os.PathLike[str], manifold: Manifold = se2, by_stamps: bool = False
-) -> Reference:
+def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2,
+                   by_stamps: bool = False) -> Reference:
     """
     Read reference poses: TUM, a graph file's vertices, `id x y theta`, or `stamp, x, y, theta`.
 
@@ -126,8 +124,7 @@ def _in_words(text: str) -> bool:
     return text.strip()[0].isalpha()
 
 
-def _read_vertices(path: str | os.PathLike[str], manifold: Manifold,
-                   by_stamps: bool) -> Reference:
+def _read_vertices(path: str | os.PathLike[str], manifold: Manifold, by_stamps: bool) -> Reference:
     ids, poses, stamps = read_vertices(path, manifold)
     if stamps is None or not by_stamps:
         return Reference(ids, poses, stamped=False)

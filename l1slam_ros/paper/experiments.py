@@ -103,12 +103,10 @@ class Seconds:
     l2: float
 
 
-def measure_costs(
-    graph: FactorGraph, start: Array, seed: Array, effort: Effort, report: Report
-) -> Costs:
+def measure_costs(graph: FactorGraph, start: Array, seed: Array, effort: Effort,
+                  report: Report) -> Costs:
     """Return what the solvers make of a graph from its seed; start, seed : (n, p) poses."""
-    solution, solver = minimise_by(choose(AUTO, graph), graph, seed, OptimiserOptions(),
-                                   report)
+    solution, solver = minimise_by(choose(AUTO, graph), graph, seed, OptimiserOptions(), report)
     most = max(1, int(_MOST_PASSES / (effort.inner * max(len(graph.between), 1))))
     bearable = replace(effort, outer=min(effort.outer, most))
     printed = printed_costs(graph, seed, bearable, report)
@@ -118,10 +116,8 @@ def measure_costs(
                  cut_short, solution, solver)
 
 
-def printed_costs(
-    graph: FactorGraph, poses: Array, effort: Effort,
-    report: Report = lambda outer, cost: None,
-) -> Array:
+def printed_costs(graph: FactorGraph, poses: Array, effort: Effort,
+                  report: Report = lambda outer, cost: None) -> Array:
     """Return the cost of the poses, then after each step of Algorithm 4 as printed, (k,)."""
     costs = np.array([_cost(graph, poses)])
     for outer in range(effort.outer):
@@ -153,8 +149,7 @@ def measure_seconds(graph: FactorGraph, seed: Array, effort: Effort) -> Seconds:
     systems = (rotation_system(graph, seed), translation_system(graph, seed),
                linearise(graph, seed))
     methods = {name: [_median(partial(timed, system, effort.timed)) / effort.timed
-                      for system in systems]
-               for name, timed in TIMED.items()}
+                      for system in systems] for name, timed in TIMED.items()}
     return Seconds(methods, _median(partial(_l2_seconds, graph, seed, cholesky_of(graph))))
 
 
@@ -188,15 +183,12 @@ def _l2_seconds(graph: FactorGraph, seed: Array, cholesky: BlockCholesky) -> flo
 
 
 # From a system and a number of iterations to the seconds they take, set-up not counted.
-TIMED: dict[str, Callable[[LinearSystem, int], float]] = {
-    'plain': _plain_seconds,
-    'fused': _fused_seconds,
-}
+TIMED: dict[str, Callable[[LinearSystem, int], float]] = {'plain': _plain_seconds,
+                                                          'fused': _fused_seconds}
 
 
-def measure_convergence(
-    graph: FactorGraph, start: Array, seed: Array, iterations: int
-) -> dict[str, dict[str, Array]]:
+def measure_convergence(graph: FactorGraph, start: Array, seed: Array,
+                        iterations: int) -> dict[str, dict[str, Array]]:
     """
     Return how the cost falls on the two problems of Algorithm 3, by every method.
 
@@ -214,9 +206,8 @@ def measure_convergence(
             'translation': _histories(translation, moved, cholesky, iterations)}
 
 
-def _histories(
-    system: LinearSystem, x: Array, cholesky: BlockCholesky, iterations: int
-) -> dict[str, Array]:
+def _histories(system: LinearSystem, x: Array, cholesky: BlockCholesky,
+               iterations: int) -> dict[str, Array]:
     """Return what becomes of x (columns,) by every method; one of them starts elsewhere."""
     A, b = system.A, system.b
     options = PrimalDualOptions(iterations=iterations, tolerance=0.0)

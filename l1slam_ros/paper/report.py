@@ -99,8 +99,7 @@ def table_1(results: Results) -> list[str]:
              cost(r.costs.seed), cost(r.paper.final),
              cost(r.costs.printed[-1]) + (' (+)' if r.costs.cut_short else ''),
              f'**{cost(r.costs.solution.cost)}**', r.costs.solver, cost(r.costs.l2),
-             '' if r.truth_cost is None else cost(r.truth_cost)]
-            for r in results.graphs]
+             '' if r.truth_cost is None else cost(r.truth_cost)] for r in results.graphs]
     return [*table(header, rows), '', _COSTS]
 
 

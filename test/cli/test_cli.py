@@ -87,18 +87,16 @@ def test_a_chosen_solver_is_the_one_that_solves(capsys, world, solver):
     assert (report['inner_iterations'] > 0) == (solver == 'primal-dual')
 
 
-REPORTED = [
-    'poses', 'factors', 'loops', 'initial_cost', 'seed_cost', 'final_cost', 'status', 'seconds',
-    'solver', 'outer_iterations', 'inner_iterations', 'rejected', 'suspect', 'slips', 'parts',
-    'warnings']
+REPORTED = ['poses', 'factors', 'loops', 'initial_cost', 'seed_cost', 'final_cost', 'status',
+            'seconds', 'solver', 'outer_iterations', 'inner_iterations', 'rejected', 'suspect',
+            'slips', 'parts', 'warnings']
 
 
 @pytest.mark.parametrize('more', [(), ('--no-robust',), ('--robust', '--norm', 'l2')])
 def test_the_names_of_a_report_stay(capsys, world, more):
     assert list(solve_json(capsys, world, *more)) == REPORTED
     truth = ('--reference', f'{world}.truth.txt')
-    assert list(solve_json(capsys, world, *more, *truth)) == [
-        *REPORTED, 'ate', 'ate_poses']
+    assert list(solve_json(capsys, world, *more, *truth)) == [*REPORTED, 'ate', 'ate_poses']
 
 
 # Robust
@@ -533,8 +531,7 @@ def test_plot_shows_false_loops_where_they_are_known(capsys, world, tmp_path):
 
 @pytest.mark.parametrize('line, words', [
     ('3 5', 'no edge between 3 and 5'), ('3 999', 'no edge between 3 and 999'),
-    ('3', '1 field; expected 2 whole numbers'), ('3 x', "'x' is not a whole number"),
-])
+    ('3', '1 field; expected 2 whole numbers'), ('3 x', "'x' is not a whole number")])
 def test_a_file_of_other_false_loops_is_refused(capsys, tmp_path, line, words):
     path = graph_file(tmp_path, [*VERTICES, *EDGES])
     (tmp_path / 'graph.g2o.false.txt').write_text(f'0 2\n{line}\n')

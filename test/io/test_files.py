@@ -15,7 +15,7 @@ from l1slam_ros.io.files import (
     read_lines,
     replacing,
     require_folder,
-    settled,
+    rounded,
     stamp_from_text,
     stamp_text,
     write_lines,
@@ -97,10 +97,9 @@ def test_comments_and_blank_lines_are_left_out_and_still_counted(tmp_path):
     assert [text.split() for text in lines.texts] == [['a', '1'], ['c', '3']]
 
 
-@pytest.mark.parametrize(('content', 'message'), [
-    (b'good\n\xff\xfe', 'byte 0xff at offset 5; expected a text file'),
-    (None, 'cannot be read: No such file or directory'),
-])
+@pytest.mark.parametrize(('content', 'message'),
+                         [(b'good\n\xff\xfe', 'byte 0xff at offset 5; expected a text file'),
+                          (None, 'cannot be read: No such file or directory')])
 def test_what_is_no_text_is_named(tmp_path, content, message):
     path = tmp_path / 'a.txt'
     if content is not None:
@@ -171,7 +170,7 @@ def test_a_folder_that_is_not_there_is_named(tmp_path, monkeypatch):
     (50.00000000000001, 50.0), (0.30000000000000004, 0.3), (1e-8 + 1e-24, 1e-8), (0.0, 0.0),
     (-3000.0000000000005, -3e3), (1 / 3, 1 / 3), (0.1234567890123456, 0.1234567890123456)])
 def test_rounding_is_undone_where_it_can_be(value, decimal):
-    assert settled(np.array([value])).tolist() == [decimal]
+    assert rounded(np.array([value])).tolist() == [decimal]
 
 
 @pytest.mark.parametrize('bad', [{0}, {9}, {3, 4, 9}, {8, 9}])
@@ -189,10 +188,9 @@ def test_stamps_keep_their_last_nanosecond(stamp):
     assert stamp_text(np.int64(stamp)) == stamp_text(stamp)
 
 
-@pytest.mark.parametrize(('text', 'stamp'), [
-    ('12', 12 * 10**9), ('12.5', 12500000000), ('1.305031102175300121e+09', 1305031102175300121),
-    ('0.0000000004', 0),
-])
+@pytest.mark.parametrize(('text', 'stamp'),
+                         [('12', 12 * 10**9), ('12.5', 12500000000),
+                          ('1.305031102175300121e+09', 1305031102175300121), ('0.0000000004', 0)])
 def test_stamps_of_other_tools(text, stamp):
     assert stamp_from_text(text) == stamp
 

@@ -86,10 +86,9 @@ def test_suspects_are_counted_apart(record, suspect, sentence):
 
 def test_odometry_that_lies_is_said_first_and_is_no_loop(record):
     said = list(judgement_sentences(record, judgement({0: 8.0}, slips=[2, 9])))
-    assert said == [
-        'odometry 16 - 19 lies: 42.0 sigmas off what the loops say; left out',
-        'odometry 37 - 40 lies: 49.0 sigmas off what the loops say; left out',
-        '1 of 27 loops refused', '  10 - 16: 8.0 sigmas off the accepted ones']
+    assert said == ['odometry 16 - 19 lies: 42.0 sigmas off what the loops say; left out',
+                    'odometry 37 - 40 lies: 49.0 sigmas off what the loops say; left out',
+                    '1 of 27 loops refused', '  10 - 16: 8.0 sigmas off the accepted ones']
 
 
 NOISY_ODOMETRY = ('the odometry is about {} times as noisy as it says: loops far apart in time '
@@ -99,10 +98,8 @@ NOISY_LOOPS = ('the loops are about {} times as noisy as they say: a false one t
 
 
 @pytest.mark.parametrize('variance, said', [
-    ((3.99, 3.99), []), ((1e-4, 0.0), []),
-    ((4.0, 3.0), [NOISY_ODOMETRY.format('2.0')]),
-    ((9.61, 0.01), [NOISY_ODOMETRY.format('3.1')]),
-    ((1.0, 1e4), [NOISY_LOOPS.format('100.0')]),
+    ((3.99, 3.99), []), ((1e-4, 0.0), []), ((4.0, 3.0), [NOISY_ODOMETRY.format('2.0')]),
+    ((9.61, 0.01), [NOISY_ODOMETRY.format('3.1')]), ((1.0, 1e4), [NOISY_LOOPS.format('100.0')]),
     ((6.25, 20.25), [NOISY_ODOMETRY.format('2.5'), NOISY_LOOPS.format('4.5')])])
 def test_what_is_twice_as_noisy_as_it_says_or_more_is_told_last(record, variance, said):
     assert list(judgement_sentences(record, judgement(suspect=[5], variance=variance)))[2:] == said

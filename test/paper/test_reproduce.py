@@ -259,8 +259,7 @@ def test_what_cannot_be_is_refused_at_once_in_one_line(capsys, tmp_path, changes
 @pytest.mark.parametrize(('text', 'says'), [
     ('EDGE_SE2 0 1 1 0 nonsense 1 0 0 1 0 1\n', 'intel.g2o:1: '),
     ('VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nVERTEX_SE2 2 1 0 0\n'
-     'EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n', 'intel.g2o: the graph is not connected: vertex 2'),
-])
+     'EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n', 'intel.g2o: the graph is not connected: vertex 2')])
 def test_a_graph_that_cannot_be_used_is_named(capsys, tmp_path, text, says):
     (tmp_path / 'intel.g2o').write_text(text)
     assert main(['reproduce', *arguments(tmp_path)]) == 2

@@ -90,12 +90,14 @@ class FactorGraph:
         self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
                          GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_),
                          GrowingArray((), np.bool_)]
+        self._factors: BetweenFactors | None = None
 
     def copy(self) -> 'FactorGraph':
         """Return a graph that shares all factors so far; either may grow without the other."""
         clone = FactorGraph(self.manifold)
         clone.n_poses = self.n_poses
         clone._between = [column.copy() for column in self._between]
+        clone._factors = self._factors
         return clone
 
     def subset(self, chosen: Indices | Mask, variance: Array | None = None) -> 'FactorGraph':
@@ -120,16 +122,16 @@ class FactorGraph:
     @property
     def between(self) -> BetweenFactors:
         """All factors so far: a snapshot that later appends do not change."""
-        return BetweenFactors(*(column.view() for column in self._between))
+        if self._factors is None:
+            self._factors = BetweenFactors(*(column.view() for column in self._between))
+        return self._factors
 
     def add_poses(self, count: int = 1) -> None:
         """Let `count` more keyframes exist; the next index is `n_poses` before the call."""
         self.n_poses += count
 
-    def add_between(
-        self, i: Indices, j: Indices, measurement: Array, information: Array,
-        trusted: Mask | bool = False,
-    ) -> None:
+    def add_between(self, i: Indices, j: Indices, measurement: Array, information: Array,
+                    trusted: Mask | bool = False) -> None:
         """
         Append between factors: i, j (m,), measurement (m, p), information (m, d, d), trusted (m,).
 
@@ -164,15 +166,14 @@ class FactorGraph:
             raise GraphError(f'measurement {row} is not finite: {measurement[row]}')
         self.append_between(i, j, measurement, square_root_information(information), trusted)
 
-    def append_between(
-        self, i: Indices, j: Indices, measurement: Array, sqrt_information: Array,
-        trusted: Mask | bool = False, struck: Mask | bool = False,
-    ) -> None:
+    def append_between(self, i: Indices, j: Indices, measurement: Array, sqrt_information: Array,
+                       trusted: Mask | bool = False, struck: Mask | bool = False) -> None:
         """Append between factors that are known to be sound, with the roots (m, d, d) at hand."""
         values = (i, j, measurement, sqrt_information, np.broadcast_to(trusted, len(i)),
                   np.broadcast_to(struck, len(i)))
         for column, value in zip(self._between, values, strict=True):
             column.extend(value)
+        self._factors = None
 
     def say(self, rows: Indices, trusted: bool) -> None:
         """Let some between factors be vouched for, or else struck out; the last word counts."""
@@ -182,6 +183,7 @@ class FactorGraph:
             # What was seen of the column before stays as it was.
             self._between[column] = GrowingArray((), np.bool_)
             self._between[column].extend(said)
+        self._factors = None
 
 
 def component_labels(graph: FactorGraph) -> Indices:

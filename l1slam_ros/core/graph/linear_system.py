@@ -151,9 +151,8 @@ def whitened_residual(graph: FactorGraph, poses: Array) -> Array:
     return whitened.ravel()
 
 
-def linearise(
-    graph: FactorGraph, poses: Array, residual: Array | None = None, fixed: int | None = None
-) -> LinearSystem:
+def linearise(graph: FactorGraph, poses: Array, residual: Array | None = None,
+              fixed: int | None = None) -> LinearSystem:
     """
     Return the system at `poses` (n, p); Jacobians with respect to right steps.
 

@@ -63,8 +63,8 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
         if not (finite := np.isfinite(start).all(axis=1)).all():
             raise GraphError(f'start of keyframe {int(np.argmin(finite))} is no pose; expected '
                              'finite numbers')
-    wish = batch_map.Wish('seed' if start is None else 'file', norm, robust=robust)
-    outcome = batch_map.solve(graph, start, wish)
+    asked = batch_map.SolveOptions('seed' if start is None else 'file', norm, robust=robust)
+    outcome = batch_map.solve(graph, start, asked)
     judgement, status = outcome.judgement, outcome.solution.status.value
     if judgement is None:
         inliers = np.ones(len(graph.between), bool)

@@ -55,9 +55,8 @@ _LOOP = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 _LAST_STAMP = 2**31 * NANOSECONDS - 1
 
 
-def write_graph_bag(
-    path: str | os.PathLike[str], record: GraphRecord, truth: Array | None = None
-) -> None:
+def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
+                    truth: Array | None = None) -> None:
     """
     Write a graph as the messages a robot would have sent.
 

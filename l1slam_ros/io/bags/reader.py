@@ -72,11 +72,8 @@ class BagSummary:
     note: dict[str, str]
 
 
-def read_messages(
-    path: str | os.PathLike[str],
-    topics: Collection[str] | None = None,
-    on_damage: OnDamage | None = None,
-) -> Iterator[BagMessage]:
+def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None = None,
+                  on_damage: OnDamage | None = None) -> Iterator[BagMessage]:
     """
     Yield the messages of a bag in order of time.
 
@@ -108,14 +105,9 @@ def read_messages(
                   f'{count:,} others were used')
 
 
-def read_raw(
-    path: str | os.PathLike[str],
-    topics: Collection[str] | None = None,
-    on_damage: OnDamage | None = None,
-    *,
-    start: int | None = None,
-    stop: int | None = None,
-) -> Iterator[RawMessage]:
+def read_raw(path: str | os.PathLike[str], topics: Collection[str] | None = None,
+             on_damage: OnDamage | None = None, *, start: int | None = None,
+             stop: int | None = None) -> Iterator[RawMessage]:
     """
     Yield the messages of a bag in order of time, as serialised; arguments as `read_messages`.
 
@@ -231,10 +223,8 @@ class _Place:
                 yield message
 
 
-def _messages(
-    path: str | os.PathLike[str], topics: Collection[str] | None, start: int | None,
-    stop: int | None, on_damage: OnDamage | None
-) -> Iterator[tuple[RawMessage, Any]]:
+def _messages(path: str | os.PathLike[str], topics: Collection[str] | None, start: int | None,
+              stop: int | None, on_damage: OnDamage | None) -> Iterator[tuple[RawMessage, Any]]:
     """Yield the messages of a bag, each with the types to decode it by."""
     bag, place = _bag_path(path), _Place()
     try:
@@ -255,9 +245,8 @@ def _messages(
         on_damage(damage.sentence(place.count))
 
 
-def _by_library(
-    bag: Path, topics: Collection[str] | None, start: int | None, stop: int | None
-) -> Iterator[tuple[RawMessage, Any]]:
+def _by_library(bag: Path, topics: Collection[str] | None, start: int | None,
+                stop: int | None) -> Iterator[tuple[RawMessage, Any]]:
     with _reader(bag) as reader:
         types = reader.typestore if reader.is2 else ros1_types(reader.typestore.fielddefs)
         connections = [c for c in reader.connections if topics is None or c.topic in topics]

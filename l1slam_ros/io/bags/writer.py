@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import StringIO
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import yaml
@@ -22,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.bags.damaged.salvage import METADATA
-from l1slam_ros.io.files import sync_folder
+from l1slam_ros.io.files import new_folder_beside, reported, sync_folder
 
 NOTE_KEY = 'l1slam'
 # What recorders leave in a bag's directory besides metadata.yaml.
@@ -33,11 +32,9 @@ _DISTRIBUTION = 'jazzy'
 # As rosbag2 writes them: no deadline is 2^63 - 1 ns, and so is the start of an empty bag.
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 _NEVER = 2**63 - 1
-_QOS = {
-    'history': 'keep_last', 'depth': 1000, 'reliability': 'reliable', 'durability': 'volatile',
-    'deadline': _FOREVER, 'lifespan': _FOREVER, 'liveliness': 'automatic',
-    'liveliness_lease_duration': _FOREVER, 'avoid_ros_namespace_conventions': False,
-}
+_QOS = {'history': 'keep_last', 'depth': 1000, 'reliability': 'reliable', 'durability': 'volatile',
+        'deadline': _FOREVER, 'lifespan': _FOREVER, 'liveliness': 'automatic',
+        'liveliness_lease_duration': _FOREVER, 'avoid_ros_namespace_conventions': False}
 
 
 class BagWriter:
@@ -139,8 +136,7 @@ def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagW
 def _yaml(document: Any, in_one_line: bool = False) -> str:
     """Return a document as YAML, whatever occurs in it twice written out twice."""
     text = StringIO()
-    dumper = yaml.SafeDumper(text, sort_keys=False, width=2**16,
-                             default_flow_style=in_one_line)
+    dumper = yaml.SafeDumper(text, sort_keys=False, width=2**16, default_flow_style=in_one_line)
     dumper.ignore_aliases = lambda _: True
     dumper.open()
     dumper.represent(document)
@@ -164,21 +160,18 @@ def refuse_other_than_bag(target: Path) -> None:
 @contextmanager
 def _replacing_directory(target: Path) -> Iterator[Path]:
     """Yield the name of a directory to make, which takes the place of `target` in the end."""
-    try:
+    with reported(target):
         refuse_other_than_bag(target)
-        with TemporaryDirectory('.tmp', f'.{target.name}.', target.parent,
-                                ignore_cleanup_errors=True) as scratch:
+        with new_folder_beside(target) as scratch:
             # The bag is made under its own name: that of the file inside repeats it.
-            made = Path(scratch, target.name)
+            made = scratch / target.name
             yield made
             for file in made.iterdir():
                 with file.open('rb') as written:
                     os.fsync(written.fileno())
             sync_folder(made)
-            _swap(made, target, Path(scratch, f'{target.name}.former'))
+            _swap(made, target, scratch / f'{target.name}.former')
             sync_folder(target.parent)
-    except OSError as error:
-        raise FileError(target, f'cannot be written: {error.strerror or error}') from error
 
 
 def _swap(made: Path, target: Path, former: Path) -> None:

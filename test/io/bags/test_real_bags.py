@@ -93,9 +93,8 @@ def test_without_the_default_topic_all_odometry_is_named(tmp_path, world):
     path = mcap_file(tmp_path / 'a.mcap', both)
     with pytest.raises(FileError) as caught:
         read_input(path)
-    assert str(caught.value) == (
-        f'{path}: 0 keyframes from /odom; expected 2 or more; '
-        'nav_msgs/msg/Odometry is on /visual, /wheels')
+    assert str(caught.value) == (f'{path}: 0 keyframes from /odom; expected 2 or more; '
+                                 'nav_msgs/msg/Odometry is on /visual, /wheels')
 
 
 def test_a_topic_asked_for_that_is_not_there_is_an_error(tmp_path, world):

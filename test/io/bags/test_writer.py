@@ -86,9 +86,8 @@ def test_a_stream_of_the_file_is_enough(bag):
 
 
 def test_every_topic_has_its_type_and_all_qos_keys(bag):
-    qos_keys = {
-        'history', 'depth', 'reliability', 'durability', 'deadline', 'lifespan', 'liveliness',
-        'liveliness_lease_duration', 'avoid_ros_namespace_conventions'}
+    qos_keys = {'history', 'depth', 'reliability', 'durability', 'deadline', 'lifespan',
+                'liveliness', 'liveliness_lease_duration', 'avoid_ros_namespace_conventions'}
     data = yaml.safe_load((bag / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
     with (bag / 'bag.mcap').open('rb') as file:
         channels = {c.topic: c for c in make_reader(file).get_summary().channels.values()}

@@ -65,9 +65,8 @@ def test_a_small_graph(write):
     assert factors.i.tolist() == [0, 1, 2]
     assert factors.j.tolist() == [1, 2, 0]
     assert factors.measurement[0].tolist() == [1, 0.25, 1.5]
-    np.testing.assert_allclose(
-        information_of(factors)[0], [[4, 0.5, 0.25], [0.5, 5, 0.125], [0.25, 0.125, 6]],
-        rtol=1e-15)
+    np.testing.assert_allclose(information_of(factors)[0],
+                               [[4, 0.5, 0.25], [0.5, 5, 0.125], [0.25, 0.125, 6]], rtol=1e-15)
     assert record.stamps is None
     assert record.skipped == ()
 
@@ -107,9 +106,8 @@ def test_priors_are_seen_from_the_world(write):
 
 
 def test_edges_of_both_formats_keep_the_order_of_the_file(write):
-    record = read_graph_file(write(
-        'EDGE2 0 1 1 0 0 1 0 1 1 0 0\nEDGE_SE2 0 1 2 0 0 1 0 0 1 0 1\n'
-        'EDGE2 0 1 3 0 0 1 0 1 1 0 0\n'))
+    record = read_graph_file(write('EDGE2 0 1 1 0 0 1 0 1 1 0 0\nEDGE_SE2 0 1 2 0 0 1 0 0 1 0 1\n'
+                                   'EDGE2 0 1 3 0 0 1 0 1 1 0 0\n'))
     assert record.graph.between.measurement[:, 0].tolist() == [1, 2, 3]
 
 
@@ -131,11 +129,9 @@ def test_what_is_not_used_is_said(write):
         "1 'EDGE_SE2_XY' line is not used: landmarks are no part of a pose graph")
 
 
-@pytest.mark.parametrize('tag', [
-    'VERTEX_XY', 'EDGE_SE2_XY', 'EDGE_BEARING_SE2_XY', 'VERTEX_LINE2D',
-    'EDGE_SE2_SEGMENT2D', 'ROBOTLASER1', 'RAWLASER1', 'VERTEX_TAG', 'PARAMS_CAMERAPARAMETERS',
-    'VERTEX_TRACKXYZ',
-])
+@pytest.mark.parametrize('tag', ['VERTEX_XY', 'EDGE_SE2_XY', 'EDGE_BEARING_SE2_XY',
+                                 'VERTEX_LINE2D', 'EDGE_SE2_SEGMENT2D', 'ROBOTLASER1', 'RAWLASER1',
+                                 'VERTEX_TAG', 'PARAMS_CAMERAPARAMETERS', 'VERTEX_TRACKXYZ'])
 def test_known_tags_may_say_anything(write, tag):
     record = read_graph_file(write(SQUARE + f'{tag}\n{tag} 3 x nan 1 2 3 4 5 6 7 8 9\n'))
     sentence, = record.skipped
@@ -205,8 +201,7 @@ def with_tags(text, tags):
 
 @pytest.mark.parametrize(('square', 'tags'), [
     (SQUARE, {'VERTEX': 'VERTEX_SE2', 'EDGE': 'EDGE_SE2'}),
-    (TORO_SQUARE, {'VERTEX': 'VERTEX2', 'EDGE': 'EDGE2'}),
-], ids=['g2o', 'toro'])
+    (TORO_SQUARE, {'VERTEX': 'VERTEX2', 'EDGE': 'EDGE2'})], ids=['g2o', 'toro'])
 @pytest.mark.parametrize(('line', 'message'), MALFORMED)
 def test_each_malformed_line_is_named(write, square, tags, line, message):
     # A good line follows: it is not the last one that is named, nor the first of its tag.

@@ -29,7 +29,7 @@ from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
 from l1slam_ros.core.online.update import Improvement, front_of, improve, optimise
-from l1slam_ros.core.online.upkeep.live_map import LiveMap
+from l1slam_ros.core.online.upkeep.live_map import AT_ONCE, LiveMap
 from l1slam_ros.core.online.upkeep.threads import Worker
 from l1slam_ros.core.robust.batch import judge
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
@@ -185,7 +185,7 @@ class Upkeep:
             before, taken = self._map_to_odom_now(), False
         while time.monotonic() < deadline:
             with self._lock:
-                if not self._live.take_one():
+                if not self._live.take_some():
                     break
                 taken = True
         if taken:
@@ -225,10 +225,9 @@ class Upkeep:
         for _ in range(_PASSES):
             with self._lock:
                 factors, accepted = self._builder.graph.between, live.accepted
-            while front is not None and front.rows < len(accepted):
+            while front is not None and not front.closed and front.rows < len(accepted):
                 check()
-                if not front.add(factors, bool(accepted[front.rows])):
-                    break
+                front.take(factors, accepted[front.rows:front.rows + AT_ONCE].astype(int))
         check()
         self.adopt(of_all(improvement, whole), front)
 

@@ -78,9 +78,8 @@ class Salvage:
         except DamageError as error:
             self.damage = error
 
-    def messages(
-        self, topics: Collection[str] | None, start: int | None, stop: int | None
-    ) -> Iterator[RawMessage]:
+    def messages(self, topics: Collection[str] | None, start: int | None,
+                 stop: int | None) -> Iterator[RawMessage]:
         """
         Yield the messages in order of time, those of one time in the order of the files.
 

@@ -141,9 +141,8 @@ class _Channels:
                 self._definitions[schema.name] = schema.data.decode()
         elif opcode == _CHANNEL:
             channel = _parsed('Channel', content)
-            self._topics[channel.id] = (
-                (channel.topic, self._schemas[channel.schema_id])
-                if channel.message_encoding == 'cdr' else None)
+            self._topics[channel.id] = ((channel.topic, self._schemas[channel.schema_id])
+                                        if channel.message_encoding == 'cdr' else None)
 
     def chunk(self, content: bytes) -> Iterator[RawMessage]:
         """Yield the messages of a chunk, in part where it is damaged."""
