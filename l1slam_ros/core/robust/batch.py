@@ -39,14 +39,19 @@ No loop is factored before it is accepted, so none bends what it is judged by. R
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.judgement import Judgement, doubts, judgement_of
 from l1slam_ros.core.robust.rounds import Growth
 from l1slam_ros.core.robust.slips import join, without_slip
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import l2_map
+from l1slam_ros.core.solvers.nonlinear import Solution
 
 # Every round accepts a loop, hence there is an end; this one is for the patience of people.
 _MOST_ROUNDS = 200
@@ -73,6 +78,36 @@ def robust_solve(
     for number, growth in enumerate(rounds(first, without_slip), 1):
         report(number, int(np.count_nonzero(growth.accepted & growth.is_loop)))
     return judgement_of(growth, doubts(growth)), growth.poses
+
+
+@dataclass(frozen=True)
+class RobustMap:
+    """The map of the accepted factors, the L2 map (n, p) it began with, the judgement on all."""
+
+    solution: Solution
+    seed: Array
+    judgement: Judgement
+
+
+def minimise_robustly(
+    graph: FactorGraph, minimise: Callable[[FactorGraph, Array], Solution],
+    report: Report = lambda round_, accepted: None, check: Callable[[], None] = lambda: None,
+) -> RobustMap:
+    """
+    Return the map that `minimise` makes of the factors that are accepted.
+
+    They are judged in L2, which spreads a doubt over all factors near it, where L1 leaves it on a
+    few.
+
+    minimise : from a graph and poses (n, p) to its solution; report, check : see `robust_solve`
+    """
+    judgement, poses = robust_solve(graph, report, check)
+    accepted = graph.subset(judgement.accepted)
+    whole = tied(accepted, poses)
+    seed = l2_map(whole, poses, cholesky_of(whole), lambda *_: check())
+    solution = minimise(whole, seed)
+    rows = len(accepted.between) * graph.manifold.TANGENT_SIZE
+    return RobustMap(replace(solution, dual=solution.dual[:rows]), seed, judgement)
 
 
 def rounds(growth: Growth, repaired: Callable[[Growth], Growth | None]) -> Iterator[Growth]:
