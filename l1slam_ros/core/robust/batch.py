@@ -43,7 +43,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.judgement import Judgement, doubts, judgement_of
@@ -110,26 +110,32 @@ def minimise_robustly(
     return RobustMap(replace(solution, dual=solution.dual[:rows]), seed, judgement)
 
 
-def rounds(growth: Growth, repaired: Callable[[Growth], Growth | None]) -> Iterator[Growth]:
+def rounds(
+    growth: Growth, repaired: Callable[[Growth, Indices], Growth | None]
+) -> Iterator[Growth]:
     """
     Yield the state after each round, until there is nothing more to accept.
 
-    repaired : asked for another state where nothing more can be accepted; None: there is none.
+    repaired : asked in the end for another state, from the one with the noise as it was found and
+    the loops that are left out though all may be as noisy as they say; None: there is none.
     """
+    found = None
     for _ in range(_MOST_ROUNDS):
         news = growth.believable(growth.undecided())
         growth.accepted[news] = True
         if len(news):
             growth.solve()
         elif not join(growth):
-            if growth.takes_at_their_word:
-                break
-            other = repaired(growth)
-            if other is None:
+            if not found:
+                found = growth.copy()
                 growth.take_at_their_word()
                 growth.solve()
             else:
-                growth = other
+                other = repaired(found, growth.undecided())
+                growth.slip_odds = found.slip_odds
+                if not other:
+                    break
+                growth, found = other, None
         yield growth
 
 
@@ -152,7 +158,7 @@ def judge(
     first, settled = Growth(graph, check), True
     first.resume(poses, known.accepted, known.variance)
     growth = first
-    for growth in rounds(first, lambda _: None):
+    for growth in rounds(first, lambda *_: None):
         # The end is not put off once it is in sight, or short budgets would never get there.
         if time.monotonic() > deadline and not growth.takes_at_their_word:
             settled = False

@@ -71,15 +71,19 @@ def _join_by(growth: Growth, group: Group) -> None:
     growth.solve()
 
 
-def without_slip(growth: Growth) -> Growth | None:
-    """Return a state in which an odometry factor is cut that slipped; None: there is none."""
+def without_slip(growth: Growth, left_out: Indices) -> Growth | None:
+    """
+    Return a state in which an odometry factor is cut that slipped; None: there is none.
+
+    left_out : (k,) loops that nothing else explains
+    """
     growth.slip_odds = {step: odds for step, odds in growth.slip_odds.items() if growth.cut[step]}
     if np.count_nonzero(~growth.is_loop & ~growth.cut) < _FEWEST_STEPS:
         return None
     motion = usual_motion(growth)
     odds = log_odds_of_slips(growth, motion)
     found, most = None, 0.0
-    for step in _suspected(growth, odds):
+    for step in _suspected(growth, odds, left_out):
         state = _without(growth, step)
         if state and (likeliest := _likeliest(state, step, motion)) != step:
             state, step = _without(growth, likeliest), likeliest
@@ -94,18 +98,17 @@ def without_slip(growth: Growth) -> Growth | None:
     return found
 
 
-def _suspected(growth: Growth, odds: Array) -> list[int]:
+def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:
     """Return the odometry factors that may have slipped."""
     order = np.argsort(-odds, kind='stable')[:_TRIED]
     suspects = order[odds[order] > -SURE].tolist()
-    rows = growth.undecided()
     for _ in range(_TRIED):
-        group = strongest_group(growth, rows)
+        group = strongest_group(growth, left_out)
         if len(group.places) < SPANNING:
             break
         common = common_steps(growth, group)
         suspects.append(int(common[np.argmax(odds[common])]))
-        rows = np.setdiff1d(rows, group.rows)
+        left_out = np.setdiff1d(left_out, group.rows)
     return list(dict.fromkeys(suspects))
 
 
