@@ -105,6 +105,10 @@ class GraphBuilder:
         points = self.stream.take(sample, self._verbatim, not ignore)
         for point in points:
             self._add(point)
+        track = self._track  # a new one, maybe
+        # Loops that are due become factors by the samples as they came.
+        if track.may_be_thinned and not self._loops.waiting.is_due(track.last):
+            track.thin()
         return bool(points)
 
     def finish(self) -> None:
