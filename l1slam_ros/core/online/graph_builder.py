@@ -105,9 +105,9 @@ class GraphBuilder:
         points = self.stream.take(sample, self._verbatim, not ignore)
         for point in points:
             self._add(point)
-        track = self._track  # a new one, maybe
+        track = self.track  # a new one, maybe
         # Loops that are due become factors by the samples as they came.
-        if track.may_be_thinned and not self._loops.waiting.is_due(track.last):
+        if track.may_be_thinned and not self.loops.waiting.is_due(track.last):
             track.thin()
         return bool(points)
 
