@@ -140,6 +140,9 @@ class Front:
         one cannot be, and it takes no more.
         """
         looks: list[Look] = []
+        self.closed = self._is_beyond(factors, int(accept[0]))
+        if self.closed:
+            return looks
         linearised = self._map.linearise(factors, slice(self.rows, self.rows + len(accept)))
         for at, known in enumerate(accept.tolist()):
             look = None if self._is_beyond(factors, known) else self._look(

@@ -84,17 +84,45 @@ class Motion:
     """
 
     def __init__(self, manifold: Manifold, stamp: int, pose: Array):
-        d = manifold.TANGENT_SIZE
         self._manifold = manifold
+        self.bounded: list[tuple[float, float]] = []
+        self.begin(stamp, pose)
+
+    def begin(self, stamp: int, pose: Array) -> None:
+        """Begin at a keyframe: stamp [ns], pose (1, p)."""
+        d = self._manifold.TANGENT_SIZE
         self._start = self._stamp = stamp
         # The keyframe and the last sample.
         self._ends = np.concatenate((pose, pose))
         self._metres = self._radians = 0.0
         self._distance = self._turn = 0.0
-        self.bounded: list[tuple[float, float]] = []
         self._poses: list[Array] = []
         self._stated: list[Array] | None = []
         self._unseen = np.zeros((d, d))
+
+    def step(self, sample: OdometrySample, pose: Array, keyframe: KeyframeOptions,
+             odometry: OdometryOptions, verbatim: bool = False,
+             unseen: tuple[float, float] | None = None) -> tuple[Array, Array] | None:
+        """
+        Continue to a sample; where it makes a keyframe, return the motion, and begin there.
+
+        unseen : how far and by which angle the robot may have gone instead; that is a keyframe:
+        what is published goes by the last one
+
+        Returns
+        -------
+        relative pose (1, p) and covariance (d, d); None: no keyframe
+
+        """
+        if unseen is not None:
+            self._add_unseen(sample, *unseen)
+        else:
+            self.add(sample, pose, odometry)
+            if not self.is_keyframe(keyframe):
+                return None
+        motion = self.pose, self.covariance(odometry, verbatim)
+        self.begin(sample.stamp, pose)
+        return motion
 
     def add(self, sample: OdometrySample, pose: Array, options: OdometryOptions) -> None:
         """Continue to `pose` (1, p) in the odometry frame, that of a sample."""
@@ -129,7 +157,7 @@ class Motion:
         self.add(OdometrySample(stamp, self._manifold.to_pose3(pose)[0], stated,
                                 stated / seconds**2), pose, options)
 
-    def add_unseen(self, sample: OdometrySample, metres: float, radians: float) -> None:
+    def _add_unseen(self, sample: OdometrySample, metres: float, radians: float) -> None:
         """Continue to a sample at the same place, to which the robot may have gone some way."""
         self._unseen = self._unseen + diagonal_covariance(self._manifold, metres, radians)
         self._stamp = sample.stamp
@@ -152,6 +180,7 @@ class Motion:
 
         verbatim : as stated, though it be more, or less, than any odometry can know
         """
+        self.bounded = []
         model = diagonal_covariance(
             self._manifold,
             float(np.hypot(options.sigma_translation * self._metres, options.floor_translation)),

@@ -113,12 +113,15 @@ class OdometryTrack:
             (len(self), stamp + self._shifts[-1][1], len(self._keyframes))]))
         return back
 
-    def append(self, stamp: int, pose: Array) -> None:
+    def append(self, stamp: int, pose: Array, is_keyframe: bool) -> None:
         """Append a sample after the last one, pose (1, p)."""
         if not len(self):
             self.begin_part(stamp)
         self._times.extend(np.array([stamp + self._shifts[-1][1]]))
         self._poses.extend(pose)
+        if is_keyframe:
+            self._keyframes.extend(np.array([len(self) - 1]))
+            self._keyframe_stamps.extend(np.array([stamp]))
 
     @property
     def may_be_thinned(self) -> bool:
@@ -174,11 +177,6 @@ class OdometryTrack:
             idle = 0 if len(spared) > _WORTH * len(kept) else idle + 1
             first = 3 - first  # those between had no turn
         return needed
-
-    def mark_keyframe(self) -> None:
-        """Make the last sample a keyframe."""
-        self._keyframes.extend(np.array([len(self) - 1]))
-        self._keyframe_stamps.extend(np.array([self.last_stamp]))
 
     def extend_by_part(self, stamps: Indices, poses: Array) -> None:
         """Append a part, samples (n,) [ns], (n, p), a keyframe each."""
