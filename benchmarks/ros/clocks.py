@@ -7,8 +7,10 @@ The demo bag through the real node, with clocks as they are.
 Played once, by the machine's clock: that map is the yardstick. Then with `use_sim_time` and
 `/clock` as a bag player sends it, with a clock that pauses for some seconds halfway, messages too
 or only the clock, twice in a row, with and without `/clock`, and with a clock, and the messages
-with it, that jump back by 20 s halfway. Said is how far each keyframe is from where it is in the
-undisturbed map, at its stamp: at worst, and the odometry's own worst beside it.
+with it, that jump back by 20 s halfway. Said is of each part of the map, one for each time that
+stamps go back, how far its keyframes are at worst from where they are in the undisturbed map, and
+its error to the truth, aligned, beside those of the undisturbed map and of the odometry. Loops
+that are sent again are known: what was played twice is odometry the second time.
 """
 
 import os
@@ -35,8 +37,9 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.io.bags.reader import read_raw
-from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.io.bags.reader import read_messages, read_raw
+from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
 from l1slam_ros.io.messages import cdr
 from l1slam_ros.io.messages.conversion import stamp_of, stamped_pose
 from l1slam_ros.ros.demo import executable
@@ -161,6 +164,12 @@ def main() -> None:
             e for _ in range(2) for e in with_clock(messages))),
         'back by 20 s': (True, lambda: jumping(messages)),
     }
+    truth = dict(stamped_pose(m.data) for m in read_messages(bag, [TRUTH_TOPIC]))
+    measured = {}
+    for _, topic, data in messages:
+        if topic == ODOMETRY_TOPIC:
+            stamp, pose3 = stamped_pose(cdr.odometry(data))
+            measured[stamp] = pose3[:2], truth[stamp][:2]
     known: dict[int, np.ndarray] = {}
     for name, (sim_time, events) in plays.items():
         found = list(events())
@@ -168,26 +177,28 @@ def main() -> None:
         robot.play(iter(found) if 'pause' not in name else events(), rate)
         stamps, poses = robot.finish(sum(topic == ODOMETRY_TOPIC for _, topic, _ in found))
         known = known or dict(zip(stamps.tolist(), poses, strict=True))
-        _tell(name, stamps, poses, known, messages, robot.said)
+        _tell(name, stamps, poses, known, measured, robot.said)
 
 
 def _tell(name: str, stamps: np.ndarray, poses: np.ndarray, known: dict[int, np.ndarray],
-          messages: list[Event], said: dict[str, Any]) -> None:
-    there = np.array([stamp in known for stamp in stamps.tolist()])
-    apart = np.array([np.hypot(*(pose - known[stamp])[:2]) for stamp, pose in zip(
-        stamps[there].tolist(), poses[there], strict=True)])
-    odometry = {}
-    for _, topic, data in messages:
-        if topic == ODOMETRY_TOPIC:
-            stamp, pose3 = stamped_pose(cdr.odometry(data))
-            odometry[stamp] = pose3[:2]
-    worst = max(np.hypot(*(odometry[stamp] - pose[:2])) for stamp, pose in known.items())
-    new = np.flatnonzero(np.diff(stamps) < 0) + 1
-    parts = ', '.join(f'{part.max():.3f}' for part in np.split(apart, new))
-    print(f'{name:22}{len(stamps):6} keyframes, off by at most {parts} m (odometry {worst:.2f}); '
-          f'{said["accepted_loops"]} loops accepted, {said["rejected_loops"]} rejected, refused '
-          f'{ {k: v for k, v in said.items() if k.startswith("refused.") and k.count(".") == 1} }',
-          flush=True)
+          measured: dict[int, tuple[np.ndarray, ...]], said: dict[str, Any]) -> None:
+    # A stamp that comes twice is in two parts; each is told of on its own.
+    parts = np.split(np.arange(len(stamps)), np.flatnonzero(np.diff(stamps) < 0) + 1)
+    print(f'{name}: {len(stamps)} keyframes, {said["accepted_loops"]} loops accepted, '
+          f'{said["rejected_loops"]} rejected', flush=True)
+    for part in parts:
+        both = [k for k in part if stamps[k] in known]
+        map_, undisturbed, odometry, true = (np.array(rows) for rows in zip(*(
+            (poses[k, :2], known[stamps[k]][:2], *measured[stamps[k]]) for k in both),
+            strict=True))
+        print(f'    of {len(both)}, off by at most {_worst(map_, undisturbed):.3f} m; to the '
+              f'truth {absolute_trajectory_error(map_, true):.3f} m, undisturbed '
+              f'{absolute_trajectory_error(undisturbed, true):.3f}, '
+              f'odometry {absolute_trajectory_error(odometry, true):.3f}', flush=True)
+
+
+def _worst(positions: np.ndarray, others: np.ndarray) -> float:
+    return float(np.linalg.norm(positions - others, axis=1).max())
 
 
 if __name__ == '__main__':
