@@ -69,14 +69,15 @@ def main() -> int:
                 process.send_signal(signal.SIGINT)
             counted, heard = (process.communicate()[0] for process in (bare, ear))
             backend.wait()
-    for topic, received in zip(('odom', 'loop_closures'), map(int, counted.split()), strict=True):
+    counts, bare_late = counted.splitlines()
+    for topic, received in zip(('odom', 'loop_closures'), map(int, counts.split()), strict=True):
         if sent[topic]:
             node = int(said[f'{topic}.received'])
             print(f'{topic}: {sent[topic]} sent; bare subscriber lost '
                   f'{1 - received / sent[topic]:.3%}, node {1 - node / sent[topic]:.3%}; it says '
                   f'{said[f"{topic}.lost"]} lost')
-    print(f'{heard.strip()}; {said["keyframes"]} keyframes in the end, {said["factors"]} factors, '
-          f'{cpu:.0f} % of a core')
+    print(f'{bare_late}\n{heard.strip()}\n{said["keyframes"]} keyframes and {said["factors"]} '
+          f'factors in the end, {cpu:.0f} % of a core')
     return 0
 
 
@@ -160,35 +161,41 @@ def cpu_seconds(process: int) -> float:
 
 
 def _count() -> int:
-    """Count messages until SIGINT; print how many."""
+    """Take messages until SIGINT; print how many, and how old they were."""
     rclpy.init()
-    node, received = rclpy.create_node('bare'), [0, 0]
-
-    def count(which: int) -> None:
-        received[which] += 1
-
-    for which, (kind, topic) in enumerate((
-            (Odometry, 'odom'), (PoseWithCovarianceStamped, 'loop_closures'))):
+    node = rclpy.create_node('bare')
+    ages: list[list[float]] = [[], []]
+    for one, (kind, topic) in zip(ages, (
+            (Odometry, 'odom'), (PoseWithCovarianceStamped, 'loop_closures')), strict=True):
         node.create_subscription(
-            kind, topic, lambda _, which=which: count(which), QoSProfile(depth=1000))
+            kind, topic, lambda m, one=one: one.append(_age(m)), QoSProfile(depth=1000))
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
-    print(*received)
+    print(*map(len, ages))
+    print(f'bare subscriber: {_late(ages[0])}')
     return 0
+
+
+def _age(message: Any) -> float:
+    """Return how long ago a message was sent, or what it answers [ms]."""
+    return (time.monotonic_ns() - stamp_of(message.header)) * 1e-6
+
+
+def _late(ages: list[float]) -> str:
+    p50, p99 = np.percentile(ages, (50, 99))
+    return f'{len(ages)} messages, {p50:.1f} ms late in the median, p99 {p99:.1f}'
 
 
 def _listen() -> int:
     """Note until SIGINT how old poses are when they come; print it."""
     rclpy.init()
-    node, late = rclpy.create_node('ear'), []
+    node = rclpy.create_node('ear')
+    ages: list[float] = []
     node.create_subscription(
-        PoseStamped, 'pose',
-        lambda m: late.append((time.monotonic_ns() - stamp_of(m.header)) * 1e-6),
-        QoSProfile(depth=1000))
+        PoseStamped, 'pose', lambda m: ages.append(_age(m)), QoSProfile(depth=1000))
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
-    p50, p99, p999 = np.percentile(late, (50, 99, 99.9))
-    print(f'{len(late)} poses, after {p50:.1f} ms in the median, p99 {p99:.1f}, p99.9 {p999:.1f}')
+    print(f'pose: {_late(ages)}')
     return 0
 
 
