@@ -292,7 +292,11 @@ def test_where_the_odometry_is_full_of_gaps_nothing_is_there_to_judge_by(capsys,
     output = str(tmp_path / 'out.g2o')
     asked = ['solve', str(path), '--start', start, '--json', '--output', output]
     assert main([*asked, '--robust']) == 0
-    assert json.loads(capsys.readouterr().out)['parts'] == 2
+    out, err = capsys.readouterr()
+    report, warning = json.loads(out), ('2 parts that nothing accepted joins: where one lies from '
+                                        'another is a guess')
+    assert report['parts'] == 2 and report['warnings'] == [warning] and warning in err
+    assert report['suspect'] == [[0, 2]] and not report['rejected']
     assert main(asked) == 0
     out, err = capsys.readouterr()
     warning = f'no loop was doubted: {GAP} to judge loops by'

@@ -8,13 +8,13 @@ import pytest
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.robust.judgement import (
     MOSTLY_REFUSED,
     OTHER_MAP,
     Doubt,
     Judgement,
 )
-from l1slam_ros.core.robust.robust_map import minimise_robustly
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world

@@ -99,7 +99,7 @@ class MapFile:
         path = self._options().save_path
         if not path:
             raise OptionError('the parameter save_path is empty, expected the name of a .g2o file')
-        return Path(path).absolute()
+        return Path(path).expanduser().absolute()
 
 
 def _time_of(path: Path) -> str:
