@@ -190,6 +190,7 @@ class Upkeep:
                 if not self._live.take_some():
                     break
                 taken = True
+            time.sleep(0)  # who waits for the lock would else wait for the deadline
         if taken:
             with self._lock:
                 self._live.note_newest()
