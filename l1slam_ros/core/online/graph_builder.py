@@ -17,7 +17,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import MOST_OF_ODOMETRY, root_of_inverse
 from l1slam_ros.core.graph.factor_graph import FactorGraph, gaps
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.online.keyframes import KeyframeOptions, Motion, OdometryOptions
+from l1slam_ros.core.online.keyframes import KeyframeOptions, Level, Motion, OdometryOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
 from l1slam_ros.core.online.notes import Notes
 from l1slam_ros.core.online.odometry.odometry_stream import UNSEEN_TURN, OdometryStream, Point
@@ -80,7 +80,7 @@ class GraphBuilder:
         """Begin with a graph, of which no keyframe is known yet."""
         self.graph = graph
         self._track = OdometryTrack(graph.manifold)
-        self.offset = graph.manifold.identity(1)
+        self.offset, self._level = graph.manifold.identity(1), Level(graph.manifold)
         self._moved, self._glued = False, True
 
     @property
@@ -166,6 +166,7 @@ class GraphBuilder:
             self.add_due_loops()  # what came before is of that time
             cause, said = _SAID[on_gap]
             self.notes.warn(cause, f'{gap}; {said}')
+            self._level = Level(self.graph.manifold)
         if point.anew or (gap and on_gap == 'reset'):
             self._forget()
         if not len(self._track):
@@ -200,6 +201,11 @@ class GraphBuilder:
         motion = self._motion
         covariance = motion.covariance(self.options.odometry, self._verbatim)
         self.notes.warn_bounds('odometry', point.stamp, motion.bounded, MOST_OF_ODOMETRY)
+        length, angle = self._level.dropped(point.sample, self.options.keyframe)
+        if length or angle:
+            self.notes.warn('slope', f'odometry at {point.stamp} ns has left the plane by '
+                            f'{length:.3g} m and {angle:.2g} rad, which are dropped; expected '
+                            'dimension 3 for a robot on slopes')
         self._begin_keyframe(point.stamp, pose)
         k = self.graph.n_poses - 1
         self.graph.append_between(np.array([k - 1]), np.array([k]), motion.pose,
