@@ -37,9 +37,12 @@ def solve(arguments: argparse.Namespace) -> Ending:
         warnings += truth.skipped
     compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
     outcome = _solved(arguments, record, asked)
-    if outcome.unjudged:
-        warnings.append(f'no loop was doubted: {outcome.unjudged}')
-        warn(warnings[-1:], arguments.quiet)
+    remarks = [f'no loop was doubted: {outcome.unjudged}'] if outcome.unjudged else []
+    if outcome.parts > 1:
+        remarks.append(f'{outcome.parts:,} parts that nothing accepted joins: where one lies from '
+                       'another is a guess')
+    warn(remarks, arguments.quiet)
+    warnings += remarks
     judgement = outcome.judgement
     ending = Ending(record.damage, doubt_sentence(
         judgement.doubts if judgement else (), record.ids, record.stamps))

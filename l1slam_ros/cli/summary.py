@@ -95,14 +95,14 @@ def _on_parts(record: GraphRecord) -> Iterator[str]:
     joined = [part for part in parts if len(part) > 1]
     if lonely:
         names = [str(record.ids[k]) for k in lonely[:_NAMED]]
-        yield (f'no edge leads to {_listed("vertex", names, len(lonely), "vertices")}, so the '
-               'graph cannot be solved')
+        yield (f'no edge leads to {_listed("vertex", names, len(lonely), "vertices")}: place '
+               'unknown')
     if len(joined) > 1:
         joined.sort(key=len, reverse=True)
         names = [f'{len(part):,} vertices between ids {record.ids[part[0]]} and '
                  f'{record.ids[part[-1]]}' for part in joined[:_NAMED]]
-        yield ('the graph is not connected and cannot be solved: '
-               f'{_listed("part", names, len(joined))}')
+        yield (f'the graph is not connected: {_listed("part", names, len(joined))}; nothing says '
+               'where one lies from another')
 
 
 def _on_gaps(record: GraphRecord) -> Iterator[str]:

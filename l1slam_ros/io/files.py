@@ -20,14 +20,13 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.measurements import QUATERNION_NORM_ERROR
 from l1slam_ros.io.remarks import Remarks, read_remarks
 from l1slam_ros.io.wording import counted
 
 NANOSECONDS = 10**9
 # No pose or information is beyond this, and with less no square of one leaves the doubles.
 LARGEST = 1e30
-# Two printed digits stay below; an unset or broken quaternion does not.
-QUATERNION_NORM_ERROR = 0.1
 # The longest piece of a damaged file that is quoted in an error.
 _QUOTED = 40
 # So many lines are formatted in one go.

@@ -6,6 +6,7 @@ In the end `l1slam_ros.read_graph` and `write_graph`.
 """
 
 import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -148,7 +149,8 @@ def read_graph(path: str | os.PathLike[str], *,
 
     Poses are x y theta [m, rad] in the plane, x y z qx qy qz qw in space.
 
-    Keyframes are numbered from 0, in the order of the file's vertex ids.
+    Keyframes are numbered from 0, in the order of the file's vertex ids. What was skipped, or lost
+    where a bag is damaged, is warned of.
 
     Parameters
     ----------
@@ -163,6 +165,8 @@ def read_graph(path: str | os.PathLike[str], *,
     """
     _check_reading(rotation_information)
     record = read_input(Path(path), rotation_information=rotation_information)
+    for sentence in filter(None, (*record.skipped, record.damage)):
+        warnings.warn(sentence, stacklevel=2)
     return record.graph, record.poses
 
 

@@ -25,8 +25,12 @@ import numpy as np
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import silent_components
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.io.files import NANOSECONDS, QUATERNION_NORM_ERROR, quoted, stamp_text
+from l1slam_ros.core.graph.measurements import (
+    QUATERNION_NORM_ERROR,
+    LoopClosure,
+    OdometrySample,
+)
+from l1slam_ros.io.files import NANOSECONDS, quoted, stamp_text
 
 _REFERENCE_FRAME = re.compile(r'(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
 # builtin_interfaces/Time holds its seconds in 32 bits.

@@ -80,7 +80,7 @@ class Inputs:
         def read(message: Any) -> None:
             for found in graphs.take(message):
                 if isinstance(found, LoopClosure):
-                    self._backend.add_loop(found)
+                    self._add_loop(lambda loop: loop, found)
                 else:
                     self._refuse(found)
 
@@ -116,11 +116,9 @@ class Inputs:
 
     def _add_loop(self, read: Callable[[Any], LoopClosure], message: Any) -> None:
         try:
-            loop = read(message)
+            self._backend.add_loop(read(message))
         except L1SlamError as error:
             self._refuse(error)
-            return
-        self._backend.add_loop(loop)
 
     def _refuse(self, error: L1SlamError) -> None:
         self.refused[error.cause if isinstance(error, MessageError) else 'unusable'] += 1
