@@ -164,7 +164,7 @@ def _save(figure: Figure, path: str | Path) -> None:
         figure.savefig(temporary, format=kind, bbox_inches='tight', pad_inches=0.15)
         if kind == 'png':
             # Of few colours anyway; with a palette it takes a third of the room.
-            Image.open(temporary).convert('RGB').quantize(dither=Image.Dither.NONE).save(
+            Image.open(temporary).convert('RGB').quantize(64, dither=Image.Dither.NONE).save(
                 temporary, kind, optimize=True)
 
 
