@@ -106,7 +106,7 @@ def _online(rate: float) -> Callable[[FactorGraph, Array], Found]:
         nothing = dict.fromkeys(('translation', 'rotation', 'period'), 0.0)
         options = BackendOptions.from_mapping(
             {'keyframe': nothing, 'odometry': {'covariance_source': 'increment'}})
-        with Backend(options, background=rate > 0) as backend:
+        with Backend(options, incremental.dimension_of(graph), rate > 0) as backend:
             for k, (sample, loops) in enumerate(incremental.measurements(_in_time(graph)), 1):
                 backend.add_odometry(sample)
                 for loop in loops:

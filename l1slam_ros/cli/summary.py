@@ -10,6 +10,7 @@ import numpy as np
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.graph.parts import odometry_gaps
+from l1slam_ros.core.names import ANGLE, QUATERNION
 from l1slam_ros.core.robust.inspection import (
     connected_parts,
     cost_at,
@@ -28,6 +29,9 @@ from l1slam_ros.io.wording import counted
 _OFF_SCALE = 3.0
 # So is information that differs that much from edge to edge.
 _WIDE_RANGE = 1e6
+# A reading of the rotations' information fits where their errors are as large as it says, to this
+# logarithm: half of what it is to the other reading.
+_FITS = math.log(2) / 2
 # So many examples are named in one sentence.
 _NAMED = 3
 
@@ -143,6 +147,7 @@ def _on_noise(record: GraphRecord) -> Iterator[str]:
     except L1SlamError as error:
         yield f'the noise cannot be judged: {error}'
         return
+    yield from _on_rotations(record, scales.turns)
     # Of too few factors nothing can be said.
     both = {'odometry': scales.odometry, 'loops': scales.loops}
     found = {name: scale for name, scale in both.items() if not math.isnan(scale)}
@@ -154,6 +159,16 @@ def _on_noise(record: GraphRecord) -> Iterator[str]:
     yield (f'errors at the L2 map of vertices {record.ids[scales.first]} to '
            f'{record.ids[scales.last]} are {times} times what the information says; expected '
            f'about 1: the information is {reason}')
+
+
+def _on_rotations(record: GraphRecord, turns: float) -> Iterator[str]:
+    """Say that rotation information is of what it was not read as: twice as large, or half."""
+    as_read = record.rotation_information
+    other, times = (ANGLE, 2.0) if as_read == QUATERNION else (QUATERNION, 0.5)
+    if record.graph.manifold.TANGENT_SIZE == 6 and abs(math.log(times * turns)) < _FITS:
+        yield (f'errors of rotations are {turns:.2g} times as large, beside those of '
+               f'translations, as information of the {as_read} says: it looks like one of the '
+               f'{other}; expected --rotation-information {other}')
 
 
 def _edges(record: GraphRecord, factors: Indices) -> list[str]:

@@ -17,7 +17,7 @@ from l1slam_ros.core.geometry.noise import MOST_OF_ODOMETRY, root_of_inverse
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.graph.parts import odometry_gaps
-from l1slam_ros.core.online.keyframes import KeyframeOptions, Motion, OdometryOptions
+from l1slam_ros.core.online.keyframes import KeyframeOptions, Level, Motion, OdometryOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
 from l1slam_ros.core.online.notes import Notes
 from l1slam_ros.core.online.odometry.odometry_stream import UNSEEN_TURN, OdometryStream, Point
@@ -83,7 +83,7 @@ class GraphBuilder:
         """Begin with a graph, of which no keyframe is known yet."""
         self.graph = graph
         self.track = OdometryTrack(graph.manifold)
-        self.offset = graph.manifold.identity(1)
+        self.offset, self._level = graph.manifold.identity(1), Level(graph.manifold)
         self._moved, self._glued = False, True
 
     def add_odometry(self, sample: OdometrySample) -> bool:
@@ -125,6 +125,7 @@ class GraphBuilder:
             self.add_due_loops()  # what came before is of that time
             cause, said = _SAID[on_gap]
             self.notes.warn(cause, f'{gap}; {said}')
+            self._level = Level(self.graph.manifold)
         if point.anew or (gap and on_gap == 'reset'):
             self._forget()
         if not self.graph.n_poses:
@@ -148,7 +149,15 @@ class GraphBuilder:
         self.track.append(point.stamp, pose, is_keyframe=motion is not None)
         if motion is not None:
             self.notes.warn_bounds('odometry', point.stamp, self._motion.bounded, MOST_OF_ODOMETRY)
+            self._note_slope(point.sample)
             self.graph.append_step(motion[0], root_of_inverse(motion[1][None]))
+
+    def _note_slope(self, sample: OdometrySample) -> None:
+        length, angle = self._level.dropped(sample, self.options.keyframe)
+        if length or angle:
+            self.notes.warn('slope', f'odometry at {sample.stamp} ns has left the plane by '
+                            f'{length:.3g} m and {angle:.2g} rad, which are dropped; expected '
+                            'dimension 3 for a robot on slopes')
 
     def _begin_part(self, stamp: int, pose: Array) -> None:
         """Begin a part of the map with a keyframe."""

@@ -24,11 +24,12 @@ from problems import (
     seconds,
     true_loop,
 )
+from scipy.spatial.transform import Rotation
 
 from l1slam_ros.core.errors import MessageError
-from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.graph.factor_graph import WORLD
-from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopOptions
@@ -586,3 +587,19 @@ def test_a_loop_may_leave_components_unsaid():
     growth.add_loop(loop(0.5, 2.0, (1, 2, 0.3), covariance6(np.diag([0.04, np.inf, 0.01]))))
     growth.add_due_loops()
     assert_allclose(growth.graph.between.sqrt_information[-1], np.diag([5, 0, 10]))
+
+
+@pytest.mark.parametrize(('manifold', 'slope', 'mounted', 'says'), [
+    (se2, 0.1, 0.0, 'has left the plane by 0.5'), (se2, 0.0, 0.3, ''), (se2, 0.01, 0.3, ''),
+    (se3, 0.1, 0.3, '')])
+def test_a_slope_is_said_where_it_is_dropped(manifold, slope, mounted, says):
+    """Of a sensor that is mounted high and tilted, what changes is; by then it is half a metre."""
+    builder = GraphBuilder(manifold, GraphBuilderOptions())
+    turn = Rotation.from_euler('ZY', [[0.1 * k, mounted - slope] for k in range(20)]).as_quat()
+    for k in range(20):
+        pose3 = np.array([k * np.cos(slope), 0.0, mounted + k * np.sin(slope), *turn[k]])
+        builder.add_odometry(OdometrySample(seconds(k), pose3, np.eye(6), np.eye(6)))
+    sentences = builder.notes.sentences()
+    assert len(sentences) == bool(says)
+    if says:
+        assert says in sentences[0] and 'dimension 3' in sentences[0]
