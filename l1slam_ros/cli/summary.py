@@ -28,8 +28,8 @@ from l1slam_ros.io.wording import counted
 _OFF_SCALE = 3.0
 # So is information that differs that much from edge to edge.
 _WIDE_RANGE = 1e6
-# So many examples are named in one sentence.
-_NAMED = 3
+# So many examples are named in one sentence, and so many characters of a note.
+_NAMED, _LONGEST = 3, 20
 
 
 def bag_numbers(path: Path) -> list[tuple[str, str]]:
@@ -37,7 +37,9 @@ def bag_numbers(path: Path) -> list[tuple[str, str]]:
     from l1slam_ros.io.bags.reader import bag_summary
 
     summary = bag_summary(path)
-    note = ', '.join(f'{key} {value}' for key, value in sorted(summary.note.items()))
+    # A list of numbers may be as long as the bag.
+    note = ', '.join(f'{key} {value if len(value) <= _LONGEST else value[:_LONGEST] + " ..."}'
+                     for key, value in sorted(summary.note.items()))
     return [
         ('duration', f'{summary.duration / NANOSECONDS:,.1f} s from {stamp_text(summary.start)}'),
         ('note', note or 'none of l1slam: keyframes and covariances by the options of the node'),
