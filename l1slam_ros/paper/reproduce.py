@@ -34,6 +34,7 @@ from l1slam_ros.paper.experiments import (
     Effort,
     measure_convergence,
     measure_costs,
+    measure_largest,
     measure_seconds,
 )
 from l1slam_ros.paper.printed import PaperGraph
@@ -121,7 +122,7 @@ def run(records: dict[str, GraphRecord], worlds: Sequence[PaperGraph], effort: E
         else:
             missing.append(graph)
     return Results(graphs, missing, convergence, _run_starts(records, effort),
-                   _run_false_loops(records, effort))
+                   _run_false_loops(records, effort), _run_largest(records, effort))
 
 
 def _say(work: str) -> None:
@@ -151,6 +152,14 @@ def _run_false_loops(records: dict[str, GraphRecord], effort: Effort) -> dict[st
                 record.graph, formats.stored_poses(record), count, effort,
                 np.random.default_rng(WORLD_SEED), progress.advance)
     return runs
+
+
+def _run_largest(records: dict[str, GraphRecord], effort: Effort) -> dict[str, Array]:
+    record = records.get(paper.NOISY.name)
+    if record is None:
+        return {}
+    _say(f'{paper.NOISY.name} in L-infinity')
+    return measure_largest(record.graph, formats.stored_poses(record), effort)
 
 
 def _run_record(graph: PaperGraph, record: GraphRecord, effort: Effort) -> GraphResult:

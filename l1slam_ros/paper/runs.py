@@ -17,7 +17,7 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import pair_key
-from l1slam_ros.core.robust.robust_map import minimise_robustly
+from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_huber, minimise_l2
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Solution

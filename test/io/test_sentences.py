@@ -2,20 +2,19 @@
 """What people are told of the loops that were refused, and of the noise."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.robust.judgement import (
     MOSTLY_REFUSED,
     OTHER_MAP,
     Doubt,
     Judgement,
 )
-from l1slam_ros.core.robust.robust_map import minimise_robustly
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
@@ -48,18 +47,6 @@ def judgement(refused=(), suspect=(), slips=(), variance=(1.0, 1.0)):
     for step in slips:
         sigmas[step], accepted[step] = 40.0 + step, False
     return Judgement(accepted, doubtful, sigmas, np.array(variance), np.array(slips, np.int64))
-
-
-def test_nothing_refused_is_one_sentence(record):
-    assert list(judgement_sentences(record, judgement())) == ['0 of 27 loops refused']
-
-
-def test_refused_loops_are_named_by_their_vertices_the_worst_first(record):
-    assert list(judgement_sentences(record, judgement({1: 5.04, 20: 123.45, 7: 9.0}))) == [
-        '3 of 27 loops refused',
-        '  70 - 76: 123.5 sigmas off the accepted ones',
-        '  31 - 37: 9.0 sigmas off the accepted ones',
-        '  13 - 19: 5.0 sigmas off the accepted ones']
 
 
 @pytest.mark.parametrize('count, more', [(19, None), (20, None), (21, 1), (27, 7)])
@@ -117,17 +104,6 @@ def test_a_doubt_says_why_and_where(stamps, when):
         f'agree with each other on another map, {where}. Vouch for a loop that is right, strike '
         'out one that is false, or state the noise')
     assert doubt_sentence((), ids, stamps) == ''
-
-
-def test_a_lone_loop_is_one_loop(record):
-    graph = FactorGraph(se2)
-    graph.add_poses(3)
-    graph.add_between(np.array([0, 1, 0]), np.array([1, 2, 2]), np.zeros((3, 3)),
-                      np.tile(np.eye(3), (3, 1, 1)))
-    believed = replace(judgement(), accepted=np.ones(3, bool), suspect=np.zeros(3, bool),
-                       sigmas=np.ones(3))
-    said = list(judgement_sentences(GraphRecord(graph, None, np.arange(3)), believed))
-    assert said == ['0 of 1 loop refused']
 
 
 def test_what_a_solve_finds_of_the_noise_is_told():

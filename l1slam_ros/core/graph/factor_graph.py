@@ -135,6 +135,12 @@ class FactorGraph:
         """Let `count` more keyframes exist; the next index is `n_poses` before the call."""
         self.n_poses += count
 
+    def append_step(self, measurement: Array, sqrt_information: Array) -> None:
+        """Append a keyframe and the factor to it from the one before: (1, p), (1, d, d)."""
+        self.add_poses(1)
+        k = np.array([self.n_poses - 1])
+        self.append_between(k - 1, k, measurement, sqrt_information)
+
     def add_between(self, i: Indices, j: Indices, measurement: Array, information: Array,
                     trusted: Mask | bool = False) -> None:
         """
@@ -222,15 +228,6 @@ def lowest_of_components(i: Indices, j: Indices, n: int) -> Indices:
         np.minimum.at(lowest, np.maximum(a, b), np.minimum(a, b))
         while (lowest[lowest] != lowest).any():
             lowest = lowest[lowest]
-
-
-def gaps(graph: FactorGraph) -> Indices:
-    """Return the keyframes k > 0 that no odometry joins to k - 1, (g,)."""
-    factors = graph.between
-    rows = factors.is_odometry
-    joined = np.zeros(graph.n_poses, bool)
-    joined[np.maximum(factors.i[rows], factors.j[rows])] = True
-    return 1 + np.flatnonzero(~joined[1:])
 
 
 def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:

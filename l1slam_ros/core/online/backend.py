@@ -173,9 +173,9 @@ class Backend(Upkeep):
         require_sound(sample)
         with self._lock:
             self._samples += 1
-            self._builder.add_odometry(sample)
+            used = self._builder.add_odometry(sample)
             self._begin_map()
-            map_to_odom = None if self._builder.held else self._map_to_odom_now()
+            map_to_odom = self._map_to_odom_now() if used else None
         self._wake()
         return map_to_odom
 

@@ -15,8 +15,9 @@ import numpy as np
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import MOST_OF_ODOMETRY, root_of_inverse
-from l1slam_ros.core.graph.factor_graph import FactorGraph, gaps
+from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.online.keyframes import KeyframeOptions, Motion, OdometryOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
 from l1slam_ros.core.online.notes import Notes
@@ -134,9 +135,9 @@ class GraphBuilder:
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """
-        Add one sample; return whether there is a new keyframe.
+        Add one sample; return whether it is used.
 
-        A sample that its predecessor does not explain is held, see `odometry_stream`: the next
+        If not it is held, as its predecessor does not explain it, see `odometry_stream`: the next
         one decides.
 
         Raises
@@ -149,16 +150,21 @@ class GraphBuilder:
             raise MessageError('old_stamp', f'odometry stamp {sample.stamp} ns is not after the '
                                f'last one, {track.last_stamp} ns')
         points = self._stream.take(sample, self._verbatim, not ignore)
-        keyframes = [self._add(point) for point in points]
-        return any(keyframes)
+        for point in points:
+            self._add(point)
+        track = self._track  # a new one, maybe
+        # Loops that are due become factors by the samples as they came.
+        if track.may_be_thinned and not self._loops.waiting.is_due(track.last):
+            track.thin()
+        return bool(points)
 
     def finish(self) -> None:
         """Use the last sample of all, if it is held for a pause alone; see `held`."""
         for point in self._stream.finish():
             self._add(point)
 
-    def _add(self, point: Point) -> bool:
-        """Add a sample of the robot's motion; return whether it made a keyframe."""
+    def _add(self, point: Point) -> None:
+        """Add a sample of the robot's motion."""
         on_gap, gap = self.options.on_time_jump, point.gap
         if not self._glued and point.stamp <= self._track.last_stamp:
             gap = f'odometry stamp {point.stamp} ns is before the end of the map'
@@ -168,10 +174,9 @@ class GraphBuilder:
             self.notes.warn(cause, f'{gap}; {said}')
         if point.anew or (gap and on_gap == 'reset'):
             self._forget()
-        if not len(self._track):
-            self._track.append(point.stamp, point.pose)
-            self._begin_keyframe(point.stamp, point.pose)
-            return True
+        if not self.graph.n_poses:
+            self._begin_part(point.stamp, point.pose)
+            return
         manifold, pose = self.graph.manifold, point.pose
         if gap or not (self._glued or self._track.goes_on(point.stamp, pose, self.offset)):
             self.offset = manifold.compose(self._track.last_pose, manifold.inverse(pose))
@@ -182,29 +187,21 @@ class GraphBuilder:
         if gap and on_gap == 'new_segment':
             if self._track.begin_part(point.stamp):
                 self._loops.waiting.begin_anew(self._track.time)
-            self._track.append(point.stamp, pose)
-            self._begin_keyframe(point.stamp, pose)
-            return True
-        return self._go_on(point, pose)
+            self._begin_part(point.stamp, pose)
+            return
+        unseen = (point.unseen, UNSEEN_TURN * point.seconds) if point.gap else None
+        motion = self._motion.step(point.sample, pose, self.options.keyframe,
+                                   self.options.odometry, self._verbatim, unseen)
+        self._track.append(point.stamp, pose, is_keyframe=motion is not None)
+        if motion is not None:
+            self.notes.warn_bounds('odometry', point.stamp, self._motion.bounded, MOST_OF_ODOMETRY)
+            self.graph.append_step(motion[0], root_of_inverse(motion[1][None]))
 
-    def _go_on(self, point: Point, pose: Array) -> bool:
-        """Add a sample at a pose (1, p) that goes on from the last one."""
-        self._track.append(point.stamp, pose)
-        if point.gap:
-            self._motion.add_unseen(point.sample, point.unseen, UNSEEN_TURN * point.seconds)
-        else:
-            self._motion.add(point.sample, pose, self.options.odometry)
-        # Where the frame has moved there is a keyframe: what is published goes by the last one.
-        if not point.gap and not self._motion.is_keyframe(self.options.keyframe):
-            return False
-        motion = self._motion
-        covariance = motion.covariance(self.options.odometry, self._verbatim)
-        self.notes.warn_bounds('odometry', point.stamp, motion.bounded, MOST_OF_ODOMETRY)
-        self._begin_keyframe(point.stamp, pose)
-        k = self.graph.n_poses - 1
-        self.graph.append_between(np.array([k - 1]), np.array([k]), motion.pose,
-                                  root_of_inverse(covariance[None]))
-        return True
+    def _begin_part(self, stamp: int, pose: Array) -> None:
+        """Begin a part of the map with a keyframe."""
+        self._track.append(stamp, pose, is_keyframe=True)
+        self.graph.add_poses(1)
+        self._motion = Motion(self.graph.manifold, stamp, pose)
 
     def begin_anew(self) -> None:
         """Forget the only sample so far, a stray; of a restored map: let odometry begin again."""
@@ -233,12 +230,12 @@ class GraphBuilder:
         """Go on where a run ended; odometry that begins elsewhere is taken to begin there."""
         self._begin(growth.graph)
         track, stamps = self._track, growth.stamps
-        for part in np.split(np.arange(len(stamps)), gaps(self.graph)):
+        for part in np.split(np.arange(len(stamps)), odometry_gaps(self.graph) + 1):
             track.extend_by_part(stamps[part], growth.odometry[part])
         self.offset = growth.offset
         self._motion = Motion(self.graph.manifold, track.last_stamp, track.last_pose)
         if growth.end > track.last_stamp:
-            track.append(growth.end, growth.end_pose)
+            track.append(growth.end, growth.end_pose, is_keyframe=False)
             self._motion.add_known(
                 growth.end, growth.end_pose, growth.end_covariance, self.options.odometry)
         self._glued, self._moved, self._resumed = False, True, True
@@ -257,8 +254,3 @@ class GraphBuilder:
         the first odometry), `same_keyframe`, `expired`.
         """
         return self._loops.add_due(self.graph, self._track, self.options.loop)
-
-    def _begin_keyframe(self, stamp: int, pose: Array) -> None:
-        self._track.mark_keyframe()
-        self.graph.add_poses(1)
-        self._motion = Motion(self.graph.manifold, stamp, pose)

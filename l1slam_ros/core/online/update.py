@@ -19,8 +19,8 @@ from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.incremental.front import Front, Gate
 from l1slam_ros.core.online.snapshot import Optimised, Problem
+from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.robust.judgement import Judgement
-from l1slam_ros.core.robust.robust_map import minimise_robustly
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.solvers.nonlinear import (
     OptimiserOptions,

@@ -210,28 +210,6 @@ def log_claims(factors: BetweenFactors, log_volume: Array) -> Array:
     return claims
 
 
-def exact_squares(graph: FactorGraph, poses: Array, posterior: Posterior) -> Array:
-    """
-    Return the squared innovations of the few between factors of a graph, (m,), without samples.
-
-    The covariance is I + J H^-1 J', from as many solutions as there are rows.
-    """
-    from l1slam_ros.core.kernels import prediction
-
-    system, count = linearise(graph, poses, fixed=posterior.fixed), len(graph.between)
-    k = system.block_size
-    right = np.zeros((system.size + 1, k, count * k))
-    rows = np.eye(count * k).reshape(count, k, count * k)
-    prediction.gather(system.keyframe, system.blocks, rows, right)
-    solved = np.zeros_like(right)
-    solved[:-1] = posterior.cholesky.solve_many(right[:-1])
-    every = prediction.moved(system.keyframe, system.blocks, solved)
-    own = np.arange(count)
-    covariance = np.eye(k) + every.reshape(count, k, count, k)[own, :, own]
-    square: Array = prediction.normalise(covariance, -system.b.reshape(count, k))[0]
-    return square
-
-
 def claimed_volume(manifold: Manifold, poses: Array, rng: np.random.Generator) -> Array:
     """
     Return the logarithm of the volume that the claims of false factors fill, (k,) its factors.

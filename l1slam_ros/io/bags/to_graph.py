@@ -27,6 +27,7 @@ from l1slam_ros.core.online.keyframes import (
     OdometryOptions,
     diagonal_covariance,
 )
+from l1slam_ros.io.bags.damaged.walk import BagMessage
 from l1slam_ros.io.bags.from_graph import (
     GRAPH_NOTE,
     SPACE_NOTE,
@@ -34,7 +35,7 @@ from l1slam_ros.io.bags.from_graph import (
     TURNED_STEPS,
     VERBATIM_NOTE,
 )
-from l1slam_ros.io.bags.reader import BagMessage, bag_summary, read_messages, read_note
+from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.messages import conversion
@@ -108,19 +109,19 @@ class _Growing:
         try:
             if message.msgtype in (MAP_GRAPH, POSE_GRAPH) and topic in (
                     self._topics.odometry, self._topics.loops):
-                self._add_graph(message.message, topic)
+                self._add_graph(message.data, topic)
             elif message.msgtype != expected:
                 raise MessageError('type', f'{message.msgtype} on {topic}; expected {expected}')
             elif topic == self._topics.odometry:
                 self._add_odometry(self._base_frame.take(
-                    message.message.child_frame_id, conversion.odometry_sample(message.message)))
+                    message.data.child_frame_id, conversion.odometry_sample(message.data)))
             elif topic == self._topics.absolute:
                 # The map is the frame that the first one names.
-                self._builder.add_loop(conversion.absolute_pose(message.message, self._map_frame))
-                self._map_frame = message.message.header.frame_id
+                self._builder.add_loop(conversion.absolute_pose(message.data, self._map_frame))
+                self._map_frame = message.data.header.frame_id
             else:
                 self._builder.add_loop(conversion.loop_closure(
-                    message.message, self._base_frame.name, topic == self._topics.trusted))
+                    message.data, self._base_frame.name, topic == self._topics.trusted))
         except MessageError as error:
             notes.refuse(error.cause, str(error))
         except (AttributeError, TypeError, ValueError):
@@ -187,7 +188,7 @@ def read_truth_topic(path: Path, topic: str, manifold: Manifold = se2) -> Refere
             raise FileError(path, f'{topic} is of {message.msgtype}; expected one of '
                             f'{", ".join(_POSES)}')
         try:
-            stamp, pose3 = conversion.stamped_pose(message.message)
+            stamp, pose3 = conversion.stamped_pose(message.data)
             pose_at.setdefault(stamp, pose3)
         except MessageError as error:
             refused[error.cause] += 1

@@ -11,7 +11,6 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -71,32 +70,22 @@ class BagWriter:
     def metadata(self, file: str, note: dict[str, str]) -> dict[str, Any]:
         """Return what metadata.yaml is to say of the file, and of a note in it."""
         start, stop = self._times
-        extent = {
-            'duration': {'nanoseconds': max(stop - start, 0)},
-            'starting_time': {'nanoseconds_since_epoch': start},
-            'message_count': self._counts.total(),
-        }
+        extent = {'duration': {'nanoseconds': max(stop - start, 0)},
+                  'starting_time': {'nanoseconds_since_epoch': start},
+                  'message_count': self._counts.total()}
         return {
-            'version': 9,
-            'storage_identifier': 'mcap',
-            'relative_file_paths': [file],
-            **extent,
+            'version': 9, 'storage_identifier': 'mcap', 'relative_file_paths': [file], **extent,
             'topics_with_message_count': [self._topic_metadata(name) for name in self._channels],
-            'compression_format': '',
-            'compression_mode': '',
-            'files': [{'path': file, **extent}],
+            'compression_format': '', 'compression_mode': '', 'files': [{'path': file, **extent}],
             'custom_data': {NOTE_KEY: _yaml(note, in_one_line=True)} if note else None,
-            'ros_distro': _DISTRIBUTION,
-        }
+            'ros_distro': _DISTRIBUTION}
 
     def _topic_metadata(self, topic: str) -> dict[str, Any]:
+        msgtype = self._msgtypes[topic]
         return {'message_count': self._counts[topic], 'topic_metadata': {
-            'name': topic,
-            'type': self._msgtypes[topic],
-            'serialization_format': 'cdr',
+            'name': topic, 'type': msgtype, 'serialization_format': 'cdr',
             'offered_qos_profiles': [_QOS],
-            'type_description_hash': self._typestore.hash_rihs01(self._msgtypes[topic]),
-        }}
+            'type_description_hash': self._typestore.hash_rihs01(msgtype)}}
 
 
 @contextmanager
@@ -133,15 +122,13 @@ def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagW
         (made / METADATA).write_text(_yaml(document) + '\n', 'utf-8')
 
 
+# Writes out twice whatever occurs in a document twice.
+_DUMPER = type('_Dumper', (yaml.SafeDumper,), {'ignore_aliases': lambda self, data: True})
+
+
 def _yaml(document: Any, in_one_line: bool = False) -> str:
-    """Return a document as YAML, whatever occurs in it twice written out twice."""
-    text = StringIO()
-    dumper = yaml.SafeDumper(text, sort_keys=False, width=2**16, default_flow_style=in_one_line)
-    dumper.ignore_aliases = lambda _: True
-    dumper.open()
-    dumper.represent(document)
-    dumper.close()
-    return text.getvalue().strip()
+    return str(yaml.dump(document, Dumper=_DUMPER, sort_keys=False, width=2**16,
+                         default_flow_style=in_one_line)).strip()
 
 
 def refuse_other_than_bag(target: Path) -> None:

@@ -10,6 +10,10 @@ from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.io.graphs.saved_map import keep_as, load_map, save_map
 from l1slam_ros.io.node_options import NodeOptions
 
+# An autosave begins after such a part of its period: a busy machine comes late to it, and odometry
+# on its way is not in it yet.
+_PART = 0.8
+
 
 class MapFile:
     """
@@ -70,7 +74,8 @@ class MapFile:
         """Return in how many seconds `autosave` is due, or when to ask again."""
         options = self._options()
         # It is to end within a period of the beginning of the last.
-        left = self._began + options.autosave_period - self._took - time.monotonic()
+        wait = _PART * options.autosave_period - 2 * self._took
+        left = self._began + wait - time.monotonic()
         return max(left, 0.0 if self._is_to_be_saved() else options.update.period)
 
     def autosave(self) -> None:

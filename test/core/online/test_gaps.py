@@ -11,8 +11,8 @@ from problems import PERIOD, covariance6, curve, loop, loops_of, odometry, secon
 
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import gaps
 from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
@@ -82,7 +82,7 @@ def undisturbed(world):
 def test_the_map_is_that_of_an_undisturbed_drive(world, undisturbed, frame, back):
     backend = fed(Backend(EVERY), moved(messages(world), frame, back))
     now = backend.snapshot()
-    assert now.gaps.tolist() == [HALF] and gaps(now.graph).tolist() == [HALF]
+    assert now.gaps.tolist() == [HALF] and odometry_gaps(now.graph).tolist() == [HALF - 1]
     assert len(now.poses) == N and (np.diff(now.stamps) < 0).sum() == (back > 0)
     assert np.bincount(backend.loop_states().state)[ACCEPTED] > 100
     # What the odometry knew of that step is lost.

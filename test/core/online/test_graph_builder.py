@@ -77,13 +77,13 @@ def test_keyframes_come_when_the_motion_passes_a_threshold():
     builder = GraphBuilder(se2, DEFAULTS)
     last, expected = 0, [0]
     for k, pose in enumerate(poses):
-        made = builder.add_odometry(odometry(k * PERIOD, pose))
+        builder.add_odometry(odometry(k * PERIOD, pose))
         moved = se2.between(poses[last : last + 1], pose[None])[0]
         due = k == 0 or np.hypot(*moved[:2]) >= 0.5 or abs(moved[2]) >= 0.2
-        assert made == due
         if due and k:
             expected.append(k)
             last = k
+        assert builder.graph.n_poses == len(expected)
     assert 20 < len(expected) < 60
     assert_array_equal(builder.stamps, [seconds(k * PERIOD) for k in expected])
     keyframes = poses[expected]

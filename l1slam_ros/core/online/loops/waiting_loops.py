@@ -68,6 +68,10 @@ class WaitingLoops:
         self._count += 1
         self._stamps = None
 
+    def is_due(self, now: int) -> bool:
+        """Tell whether odometry has reached the times of any loop."""
+        return bool(self._by_end) and self._by_end[0][0] <= now
+
     def due(self, now: int) -> list[WaitingLoop]:
         """Take out the loops whose times odometry has reached by `now`, in the order they came."""
         due = []
