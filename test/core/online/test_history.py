@@ -49,9 +49,7 @@ def test_what_is_left_finds_the_rest_again(rng, manifold, kind):
         if k in (2000, 2001):  # a part of one sample, too
             track.begin_part(int(stamps[k]))
             parts.append(k)
-        track.append(int(stamps[k]), poses[k : k + 1])
-        if k in marked or k in parts:
-            track.mark_keyframe()
+        track.append(int(stamps[k]), poses[k : k + 1], k in marked or k in parts)
         if track.may_be_thinned:
             track.thin()
     assert len(track) <= FEW[kind] + 1024
