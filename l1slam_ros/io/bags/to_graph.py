@@ -161,14 +161,12 @@ class _Growing:
         builder.finish()
         builder.add_due_loops()
         skipped = builder.notes.sentences()
-        if builder.held:
-            skipped.append(f'the last message is not used: {builder.held}')
-        if builder.n_waiting == 1:
-            skipped.append('1 loop names a time after the last odometry')
-        elif builder.n_waiting:
-            skipped.append(f'{builder.n_waiting} loops name times after the last odometry')
-        return GraphRecord(builder.graph, None, np.arange(builder.graph.n_poses), builder.stamps,
-                           tuple(skipped), damage)
+        if builder.stream.held:
+            skipped.append(f'the last message is not used: {builder.stream.reason()}')
+        if waiting := len(builder.loops.waiting):
+            skipped.append(f'{counted(waiting, "loop")} for times after the last odometry')
+        return GraphRecord(builder.graph, None, np.arange(builder.graph.n_poses),
+                           builder.track.keyframe_stamps, tuple(skipped), damage)
 
 
 def read_truth_topic(path: Path, topic: str, manifold: Manifold = se2) -> Reference:
