@@ -76,7 +76,7 @@ def _batch(norm: str) -> Callable[[FactorGraph, Array], Found]:
     def solve(graph: FactorGraph, poses: Array) -> Found:
         began = clock()
         try:
-            outcome = batch_map.solve(graph, None, batch_map.Wish(norm=norm, robust=True))
+            outcome = batch_map.solve(graph, None, batch_map.SolveOptions(norm=norm, robust=True))
         except L1SlamError as error:
             return Found(poses, clock() - began, graph.between.is_odometry.copy(),
                          status=REFUSED, why=str(error))

@@ -42,8 +42,7 @@ def bag_numbers(path: Path) -> list[tuple[str, str]]:
         ('duration', f'{summary.duration / NANOSECONDS:,.1f} s from {stamp_text(summary.start)}'),
         ('note', note or 'none of l1slam: keyframes and covariances by the options of the node'),
         *(('topic', f'{topic.name}: {topic.count:,} of {topic.msgtype}')
-          for topic in summary.topics),
-    ]
+          for topic in summary.topics)]
 
 
 def numbers(record: GraphRecord) -> list[tuple[str, str]]:
@@ -58,8 +57,7 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
         ('poses', f'{graph.n_poses:,} in {graph.manifold.NAME}, ids {ids[0]} to {ids[-1]}'),
         ('odometry', f'{int(factors.is_odometry.sum()):,}, {step_lengths(graph).sum():,.1f} m'),
         ('loops', f'{int(is_loop.sum()):,}{beside}'),
-        ('components', f'{len(connected_parts(graph)):,}'),
-    ]
+        ('components', f'{len(connected_parts(graph)):,}')]
     if absolute:
         rows.insert(3, ('absolute', f'{absolute:,}'))
     if record.stamps is not None:
@@ -93,14 +91,14 @@ def _on_parts(record: GraphRecord) -> Iterator[str]:
     joined = [part for part in parts if len(part) > 1]
     if lonely:
         names = [str(record.ids[k]) for k in lonely[:_NAMED]]
-        yield (f'no edge leads to {_listed("vertex", names, len(lonely), "vertices")}, so the '
-               'graph cannot be solved')
+        yield (f'no edge leads to {_listed("vertex", names, len(lonely), "vertices")}: place '
+               'unknown')
     if len(joined) > 1:
         joined.sort(key=len, reverse=True)
         names = [f'{len(part):,} vertices between ids {record.ids[part[0]]} and '
                  f'{record.ids[part[-1]]}' for part in joined[:_NAMED]]
-        yield ('the graph is not connected and cannot be solved: '
-               f'{_listed("part", names, len(joined))}')
+        yield (f'the graph is not connected: {_listed("part", names, len(joined))}; nothing says '
+               'where one lies from another')
 
 
 def _on_gaps(record: GraphRecord) -> Iterator[str]:

@@ -192,7 +192,9 @@ def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str) -> None:
 
 def _write_title(axes: Axes, title: str, small_print: str) -> None:
     """Write above a diagram, where nothing is drawn."""
-    axes.set_title(title, loc='left', fontweight='bold', pad=24 if small_print else None)
+    # The name of a file may hold a dollar, or bytes that are no text.
+    axes.set_title(title.encode(errors='replace').decode(), loc='left', fontweight='bold',
+                   pad=24 if small_print else None, parse_math=False)
     axes.annotate(small_print, (0, 1), (0, 7), xycoords='axes fraction',
                   textcoords='offset points', color='#555555', fontsize='small')
 

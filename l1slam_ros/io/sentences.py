@@ -33,8 +33,7 @@ _NOISE = (
     'the odometry is about {times:.1f} times as noisy as it says: loops far apart in time are '
     'judged by little',
     'the loops are about {times:.1f} times as noisy as they say: a false one that is little off '
-    'passes for noise',
-)
+    'passes for noise')
 
 # By the kind of a doubt.
 _REASONS = {

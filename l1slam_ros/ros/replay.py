@@ -21,7 +21,7 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from l1slam_ros.core.errors import FileError, L1SlamError, OptionError
-from l1slam_ros.io.bags.damaged.walk import RawMessage
+from l1slam_ros.io.bags.damaged.walk import BagMessage
 from l1slam_ros.io.bags.reader import BagSummary, bag_summary, read_raw
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.ros.publishing import header
@@ -115,7 +115,7 @@ class Player:
             if self._subscribed() > known:
                 known, quiet = self._subscribed(), time.monotonic() + _REST
 
-    def play(self, messages: Iterable[RawMessage], rate: float, progress: Progress) -> None:
+    def play(self, messages: Iterable[BagMessage], rate: float, progress: Progress) -> None:
         """Publish the messages, `rate` times as fast as they were recorded."""
         first, began, shown, next_clock = None, time.monotonic(), 0.0, 0.0
         for message in messages:

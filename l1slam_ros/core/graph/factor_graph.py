@@ -90,12 +90,14 @@ class FactorGraph:
         self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
                          GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_),
                          GrowingArray((), np.bool_)]
+        self._factors: BetweenFactors | None = None
 
     def copy(self) -> 'FactorGraph':
         """Return a graph that shares all factors so far; either may grow without the other."""
         clone = FactorGraph(self.manifold)
         clone.n_poses = self.n_poses
         clone._between = [column.copy() for column in self._between]
+        clone._factors = self._factors
         return clone
 
     def subset(self, chosen: Indices | Mask, variance: Array | None = None) -> 'FactorGraph':
@@ -120,16 +122,22 @@ class FactorGraph:
     @property
     def between(self) -> BetweenFactors:
         """All factors so far: a snapshot that later appends do not change."""
-        return BetweenFactors(*(column.view() for column in self._between))
+        if self._factors is None:
+            self._factors = BetweenFactors(*(column.view() for column in self._between))
+        return self._factors
 
     def add_poses(self, count: int = 1) -> None:
         """Let `count` more keyframes exist; the next index is `n_poses` before the call."""
         self.n_poses += count
 
-    def add_between(
-        self, i: Indices, j: Indices, measurement: Array, information: Array,
-        trusted: Mask | bool = False,
-    ) -> None:
+    def append_step(self, measurement: Array, sqrt_information: Array) -> None:
+        """Append a keyframe and the factor to it from the one before: (1, p), (1, d, d)."""
+        self.add_poses(1)
+        k = np.array([self.n_poses - 1])
+        self.append_between(k - 1, k, measurement, sqrt_information)
+
+    def add_between(self, i: Indices, j: Indices, measurement: Array, information: Array,
+                    trusted: Mask | bool = False) -> None:
         """
         Append between factors: i, j (m,), measurement (m, p), information (m, d, d), trusted (m,).
 
@@ -164,15 +172,14 @@ class FactorGraph:
             raise GraphError(f'measurement {row} is not finite: {measurement[row]}')
         self.append_between(i, j, measurement, square_root_information(information), trusted)
 
-    def append_between(
-        self, i: Indices, j: Indices, measurement: Array, sqrt_information: Array,
-        trusted: Mask | bool = False, struck: Mask | bool = False,
-    ) -> None:
+    def append_between(self, i: Indices, j: Indices, measurement: Array, sqrt_information: Array,
+                       trusted: Mask | bool = False, struck: Mask | bool = False) -> None:
         """Append between factors that are known to be sound, with the roots (m, d, d) at hand."""
         values = (i, j, measurement, sqrt_information, np.broadcast_to(trusted, len(i)),
                   np.broadcast_to(struck, len(i)))
         for column, value in zip(self._between, values, strict=True):
             column.extend(value)
+        self._factors = None
 
     def say(self, rows: Indices, trusted: bool) -> None:
         """Let some between factors be vouched for, or else struck out; the last word counts."""
@@ -182,6 +189,7 @@ class FactorGraph:
             # What was seen of the column before stays as it was.
             self._between[column] = GrowingArray((), np.bool_)
             self._between[column].extend(said)
+        self._factors = None
 
 
 def component_labels(graph: FactorGraph) -> Indices:
@@ -215,15 +223,6 @@ def lowest_of_components(i: Indices, j: Indices, n: int) -> Indices:
         np.minimum.at(lowest, np.maximum(a, b), np.minimum(a, b))
         while (lowest[lowest] != lowest).any():
             lowest = lowest[lowest]
-
-
-def gaps(graph: FactorGraph) -> Indices:
-    """Return the keyframes k > 0 that no odometry joins to k - 1, (g,)."""
-    factors = graph.between
-    rows = factors.is_odometry
-    joined = np.zeros(graph.n_poses, bool)
-    joined[np.maximum(factors.i[rows], factors.j[rows])] = True
-    return 1 + np.flatnonzero(~joined[1:])
 
 
 def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:

@@ -28,21 +28,23 @@ from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
 # In the place of a keyframe: one that is held fixed.
 FIXED = -1
-_FIRST_ROWS = 128
-_FIRST_TOUCHED = 32
 
 
 @dataclass(frozen=True)
 class Prediction:
     """
-    What the map says of J x before a factor tells.
+    What the map says of r + J x before the factor tells.
 
-    covariance : (k, k) of it; the rest is for the border to append the factor.
+    residual : (k,) to expect; covariance : (k, k) of it, without the factor's own noise; the rest
+    is for the border to append the factor.
     """
 
+    residual: Array
     covariance: Array
+    at_no_step: Array
     rows: Array
-    ends: Indices
+    ends: tuple[int, int]
+    names: Indices
     blocks: Array
 
 
@@ -87,13 +89,14 @@ class Border:
         self._begin = GrowingArray((), np.int64)
         self._begin.extend(np.zeros(1, np.int64))
         self._places, self._values = GrowingArray((), np.int32), GrowingArray()
-        self._covariance = np.empty((_FIRST_TOUCHED, _FIRST_TOUCHED, k, k))
+        self._covariance = GrowingArray((k, k))
         # The border: its rows of blocks, its factor, F^-1 times the right hand side.
         self._ends, self._blocks = GrowingArray((2,), np.int64), GrowingArray((2, k, k))
-        self._factor = np.zeros((_FIRST_ROWS, _FIRST_ROWS))
-        self._signs, self._right = GrowingArray(), GrowingArray()
+        self._factor, self._signs, self._right = GrowingArray(), GrowingArray(), GrowingArray()
         self._home: list[int] = []
-        self._solution: Array | None = None
+        # Multipliers and steps from some row on, and A' lambda; None: not known.
+        self._solution: tuple[int, Array] | None = None
+        self._pulled: Array | None = None
 
     @property
     def rows(self) -> int:
@@ -110,62 +113,74 @@ class Border:
         """How many of the old ones were asked for."""
         return len(self._touched)
 
-    def predict(self, ends: tuple[int, int], blocks: Array) -> Prediction:
+    def predict(self, ends: tuple[int, int], blocks: Array, residual: Array) -> Prediction:
         """
-        Return what is known of J_i x_i + J_j x_j.
+        Return what is known of r + J_i x_i + J_j x_j.
 
         ends : the keyframes i and j, `FIXED` for none, one past the last: not in the border yet,
-        left out; blocks : (2, k, k)
+        left out; blocks : (2, k, k); residual : r, (k,)
         """
         from l1slam_ros.core.kernels import border
 
-        own = np.array([self._name(end) for end in ends])
-        rows = np.empty((self._k, self.rows))
-        border.couple(self._covariance, self._ends.view(), self._blocks.view(), own, blocks, rows)
-        border.reduce(self._factor, rows, 0)
-        covariance = (rows * self._signs.view()) @ rows.T
-        for side, other in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            if min(own[side], own[other]) >= 0:
-                between = self._covariance[own[side], own[other]]
-                covariance += blocks[side] @ between @ blocks[other].T
-        return Prediction((covariance + covariance.T) / 2, rows, own, blocks)
+        names, rows = np.array([self._name(end) for end in ends]), np.empty((self._k, self.rows))
+        covariance, expected = np.zeros((self._k, self._k)), residual.copy()
+        border.predict(
+            self._covariance.view(), self._ends.view(), self._blocks.view(), self._factor.view(),
+            self._signs.view(), self._right.view(), names, blocks, rows, covariance, expected)
+        return Prediction(expected, covariance, residual, rows, ends, names, blocks)
 
-    def add_factor(self, predicted: Prediction, noise: Array, residual: Array) -> None:
-        """Append a factor just predicted: noise (k,) variances, residual (k,) at no step."""
-        pivot = predicted.covariance + np.diag(noise)
-        kept = np.where(predicted.ends >= 0, predicted.ends, FIXED)
-        self._append(predicted.rows, pivot, -1.0, -residual, kept, predicted.blocks)
+    def add(self, predicted: Prediction, noise: Array) -> None:
+        """
+        Append a factor just predicted, and the keyframe that it is the first to see, if it is.
 
-    def add_keyframe(self, block: Array) -> None:
-        """Append a keyframe that the last factor was the first to see, by its block (k, k)."""
+        noise : (k,) variances
+
+        Raises
+        ------
+        LinAlgError : beyond double precision; nothing is appended.
+
+        """
         from l1slam_ros.core.kernels import border
 
-        rows = np.zeros((self._k, self.rows))
-        rows[:, -self._k:] = block.T
-        border.reduce(self._factor, rows, self.rows - self._k)
-        self._home.append(len(self._ends))
-        self._append(rows, rows @ rows.T, 1.0, np.zeros(self._k), np.full(2, FIXED),
-                     np.zeros((2, self._k, self._k)))
+        n, k, unseen = self.rows, self._k, self.keyframes
+        seen = predicted.blocks[predicted.ends.index(unseen)] if unseen in predicted.ends else (
+            np.empty((0, 0)))
+        added = k + len(seen)
+        lines, right = np.empty(added * n + added * (added + 1) // 2), np.empty(added)
+        if not border.append(self._signs.view(), self._right.view(), predicted.rows,
+                             predicted.covariance + np.diag(noise), predicted.at_no_step, seen,
+                             lines, right):
+            raise np.linalg.LinAlgError
+        self._factor.extend(lines)
+        self._right.extend(right)
+        self._append(-1.0, np.maximum(predicted.names, FIXED), predicted.blocks)
+        if len(seen):
+            self._home.append(len(self._ends))
+            self._append(1.0, np.full(2, FIXED), np.zeros((2, k, k)))
+        self._solution = self._pulled = None
 
     def step(self, keyframe: int) -> Array:
         """Return the step of a keyframe, (k,)."""
-        name, z = self._name(keyframe), self._solved()
+        from l1slam_ros.core.kernels import border
+
+        name, k = self._name(keyframe), self._k
         if name < -1:
-            own: Array = z[-2 - name]
+            begin = (-2 - name) * k
+            own: Array = self._solved(begin)[:k]
             return own
-        if name == FIXED or not len(z):
-            return np.zeros(self._k)
-        pulled = self._covariance[name, :len(self._touched)] @ self._gradient()[:, :, None]
-        step: Array = -pulled.sum(axis=0)[:, 0]
+        if name == FIXED or not self.rows:
+            return np.zeros(k)
+        step: Array = border.move(self._covariance.view(), self._gradient(), name)
         return step
 
     def steps(self) -> Steps:
         """Return the steps of all keyframes as they are now."""
+        solved = self._solved(0).reshape(-1, self._k)
         return Steps(self._cholesky, self._size, np.fromiter(self._touched, np.int64),
-                     self._gradient(), self._solved()[self._home])
+                     self._gradient(), solved[self._home])
 
     def _name(self, keyframe: int) -> int:
-        """Return what a keyframe is called in `ends`, see `kernels.border.couple`."""
+        """Return what a keyframe is called by `kernels.border.predict`."""
         if keyframe == FIXED:
             return FIXED
         new = keyframe - self._size
@@ -181,49 +196,32 @@ class Border:
         self._values.extend(values.ravel())
         self._begin.extend(np.array([len(self._places)]))
         t = self._touched[keyframe] = len(self._touched)
-        if t == len(self._covariance):
-            grown = np.empty((2 * t, 2 * t, self._k, self._k))
-            grown[:t, :t] = self._covariance
-            self._covariance = grown
         product = np.empty((t + 1, self._k, self._k))
-        border.meet(self._begin.view(), self._places.view(), self._values.view(), self._k, product)
-        self._covariance[:t + 1, t] = product
-        self._covariance[t, :t] = product[:t].transpose(0, 2, 1)
+        border.meet(self._begin.view(), self._places.view(), self._values.view(), product)
+        self._covariance.extend(product)
         return t
 
-    def _append(self, rows: Array, pivot: Array, sign: float, right: Array, ends: Indices,
-                blocks: Array) -> None:
-        """Append a row of blocks: reduced rows (k, n), its pivot (k, k) without its sign."""
-        n, k = self.rows, self._k
-        if n + k > len(self._factor):
-            grown = np.zeros((2 * len(self._factor),) * 2)
-            grown[:n, :n] = self._factor[:n, :n]
-            self._factor = grown
-        root = np.linalg.cholesky(pivot)
-        left = rows * self._signs.view()
-        self._factor[n:n + k, :n] = left
-        self._factor[n:n + k, n:n + k] = root
-        self._right.extend(np.linalg.solve(root, right - left @ self._right.view()))
-        self._signs.extend(np.full(k, sign))
-        self._ends.extend(ends[None])
+    def _append(self, sign: float, names: Indices, blocks: Array) -> None:
+        self._signs.extend(np.full(self._k, sign))
+        self._ends.extend(names[None])
         self._blocks.extend(blocks[None])
-        self._solution = None
 
-    def _solved(self) -> Array:
-        """Return multipliers and steps, in the order of the rows of blocks, (b, k)."""
+    def _solved(self, begin: int) -> Array:
+        """Return multipliers and steps from some row on."""
         from l1slam_ros.core.kernels import border
 
-        if self._solution is None:
+        if self._solution is None or self._solution[0] > begin:
             x = self._signs.view() * self._right.view()
-            border.back_substitute(self._factor, x)
-            self._solution = x.reshape(-1, self._k)
-        return self._solution
+            border.back_substitute(self._factor.view(), x, begin)
+            self._solution = begin, x
+        return self._solution[1][begin:]
 
     def _gradient(self) -> Array:
         """Return A' lambda at the keyframes that are touched, (t, k)."""
-        ends, blocks, z = self._ends.view(), self._blocks.view(), self._solved()
-        gradient = np.zeros((len(self._touched), self._k))
-        for side in (0, 1):
-            at = np.flatnonzero(ends[:, side] >= 0)
-            np.add.at(gradient, ends[at, side], np.einsum('brc,br->bc', blocks[at, side], z[at]))
-        return gradient
+        from l1slam_ros.core.kernels import border
+
+        if self._pulled is None or len(self._pulled) < len(self._touched):
+            self._pulled = np.zeros((len(self._touched), self._k))
+            border.pull(self._ends.view(), self._blocks.view(),
+                        self._solved(0).reshape(-1, self._k), self._pulled)
+        return self._pulled

@@ -16,7 +16,8 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise
-from l1slam_ros.core.incremental.growing_map import Factor, GrowingMap, Predicted, View
+from l1slam_ros.core.incremental.border import Prediction
+from l1slam_ros.core.incremental.growing_map import L1, L2, GrowingMap, Linearised, View
 from l1slam_ros.core.robust.innovation import chi2_quantile, claimed_volume
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.optimality import smoothing
@@ -30,6 +31,8 @@ _SURE = 1000.0
 # Rows of a border, and keyframes touched, that one more update has the time and the memory for.
 # What comes then waits for the next map.
 _MOST_ROWS, _MOST_TOUCHED = 1800, 700
+# In the place of whether to believe a factor: the front finds out.
+UNKNOWN = -1
 
 
 @dataclass(frozen=True)
@@ -89,90 +92,111 @@ class Front:
 
     def __init__(self, part: FactorGraph, poses: Array, l2_poses: Array, cholesky: BlockCholesky,
                  loops: Indices, gate: Gate, rows: int):
-        self._gate, self.rows, self.closed = gate, rows, False
+        self.rows, self.closed = rows, False
         system, k = linearise(part, poses), part.manifold.TANGENT_SIZE
+        # What a square stays below, and the log ratio but for what hangs on the factor.
+        self._limit = float(chi2_quantile(1 - _REFUSED, np.array([k]))[0])
+        self._volume = (gate.log_volume - k * np.log(2 * np.pi) / 2
+                        - np.log(_SURE - 1) - gate.log_odds)
+        self._variance = np.repeat(gate.variance[:, None], k, axis=1)
         self._mu = _SMOOTHING * smoothing(system.b)
         other, l2_system = BlockCholesky(cholesky.pattern, system.keyframe), linearise(
             part, l2_poses)
-        variance = np.ones(len(system.b))
-        variance[:len(loops) * k] = np.repeat(gate.variance[loops], k)
+        variance = self._variance[loops].ravel()
         if not (cholesky.factorise(system, 1 / np.hypot(system.b, self._mu))
                 and other.factorise(l2_system, 1 / variance)):
             raise GraphError('a part of the graph is not tied to the anchor')
-        self._l1, self._l2 = (GrowingMap(part, poses, cholesky),
-                              GrowingMap(part, l2_poses, other))
+        self._map = GrowingMap(part, (poses, l2_poses), (cholesky, other))
 
     @property
     def keyframes(self) -> int:
         """How many keyframes it knows."""
-        return len(self._l1)
+        return len(self._map)
 
     @property
     def border(self) -> int:
         """How many rows have come since it was factored."""
-        return self._l1.rows
+        return self._map.rows
 
     @property
     def views(self) -> tuple[View, View]:
         """The L1 and the L2 map as they are now."""
-        return self._l1.view, self._l2.view
+        return self._map.views
 
     @property
     def newest(self) -> Array:
         """The pose of the last keyframe it knows, (1, p)."""
-        return self._l1.pose(self.keyframes - 1)
+        return self._map.poses(np.array([self.keyframes - 1]))[:, L1]
 
     def covariance(self, keyframe: int) -> Array:
         """Return the covariance of a keyframe's step from the L2 map, (k, k)."""
-        return self._l2.covariance(keyframe)
+        return self._map.covariance(keyframe)
 
-    def add(self, factors: BetweenFactors, accept: bool | None) -> Look | None:
+    def take(self, factors: BetweenFactors, accept: Indices) -> list[Look]:
         """
-        Take the next factor, row `rows`; None: that cannot be, and it takes no more.
+        Take the next factors, from row `rows` on, a few at a time; return looks at those it took.
 
-        accept : whether to believe it, None: find out
+        accept : of each 1 to believe it, 0 not to, `UNKNOWN`: find out. Fewer than these: the next
+        one cannot be, and it takes no more.
         """
-        row, count = self.rows, self.keyframes
-        pair = int(factors.i[row]), int(factors.j[row])
-        # The first that is believed of those that name the world gives the map another gauge.
-        other_gauge = min(pair) == WORLD and self._l1.fixed > 0
-        if (max(pair) > count or (accept and other_gauge) or self.border > _MOST_ROWS
-                or self._l2.touched > _MOST_TOUCHED):
-            self.closed = True
-            return None
-        self.rows += 1
-        factor = Factor(pair, factors.measurement[row:row + 1], factors.sqrt_information[row])
+        looks: list[Look] = []
+        self.closed = self._is_beyond(factors, int(accept[0]))
+        if self.closed:
+            return looks
+        linearised = self._map.linearise(factors, slice(self.rows, self.rows + len(accept)))
+        for at, known in enumerate(accept.tolist()):
+            look = None if self._is_beyond(factors, known) else self._look(
+                factors, linearised, at, known)
+            self.closed = look is None
+            if look is None:
+                break
+            self.rows += 1
+            looks.append(look)
+        return looks
+
+    def _is_beyond(self, factors: BetweenFactors, known: int) -> bool:
+        """Tell whether the next factor is for the next map."""
+        return (max(factors.i[self.rows], factors.j[self.rows]) > self.keyframes
+                or (known == 1 and self._turns(factors))
+                or self.border > _MOST_ROWS or self._map.touched > _MOST_TOUCHED)
+
+    def _turns(self, factors: BetweenFactors) -> bool:
+        """Tell whether the next factor is the first that names the world: the gauge is another."""
+        return bool(factors.i[self.rows] == WORLD) and self._map.fixed > 0
+
+    def _look(self, factors: BetweenFactors, new: Linearised, at: int, known: int) -> Look | None:
+        """Look at a factor, and make it part of the map where it is accepted; None: it cannot."""
+        own = np.diag(factors.sqrt_information[self.rows])
         # What is silent of some component is for the judgement, too.
-        if accept is False or other_gauge or (accept is None and not np.diag(factor.root).all()):
-            return Look(False, accept is None, np.nan)
+        if not known or (known == UNKNOWN and (self._turns(factors) or not own.all())):
+            return Look(False, known == UNKNOWN, np.nan)
+        first_seen = self.keyframes in (factors.i[self.rows], factors.j[self.rows])
+        variance = self._variance[0 if first_seen else 1]
         try:
-            return self._take(factor, count in pair, bool(accept))
+            predicted = self._map.predict(L2, new, at)
+            look, left = Look(True, False, 0.0), np.zeros(len(variance))
+            if not first_seen:
+                look, left = self._test(predicted, own, variance, known == 1)
+            if look.accepted:
+                self._map.add(L2, predicted, variance)
+                self._map.add(L1, self._map.predict(L1, new, at), np.hypot(left, self._mu))
         except np.linalg.LinAlgError:
             # Beyond double precision: the next map may be able to.
-            self.closed = True
             return None
-
-    def _take(self, factor: Factor, new: bool, sure: bool) -> Look:
-        """Look at a factor, and make it part of the map where it is accepted."""
-        variance = np.full(len(factor.root), self._gate.variance[0 if new else 1])
-        predicted = self._l2.predict(factor)
-        look, left = self._look(predicted, variance, sure or new)
-        if look.accepted:
-            self._l2.add(predicted, variance)
-            self._l1.add(self._l1.predict(factor), np.hypot(left, self._mu))
         return look
 
-    def _look(self, predicted: Predicted, variance: Array, sure: bool) -> tuple[Look, Array]:
-        """Return what to make of a factor, and its residual once it is part of the map, (k,)."""
-        k = len(variance)
-        root = np.linalg.cholesky(predicted.covariance + np.diag(variance))
-        innovation = np.linalg.solve(root, predicted.residual)
-        square = float(innovation @ innovation)
-        own = np.diag(predicted.factor.root)
-        log_ratio = (self._gate.log_volume + np.log(own[own > 0]).sum()
-                     - square / 2 - k * np.log(2 * np.pi) / 2 - np.log(np.diag(root)).sum())
-        fits = square < float(chi2_quantile(1 - _REFUSED, np.array([k]))[0])
-        left = variance * np.linalg.solve(root.T, innovation)
-        if sure or (fits and float(log_ratio) > np.log(_SURE - 1) + self._gate.log_odds):
-            return Look(True, False, float(np.sqrt((left * left / variance).sum()))), left
-        return Look(False, fits, float(np.sqrt(square))), left
+    def _test(self, predicted: Prediction, own: Array, variance: Array,
+              sure: bool) -> tuple[Look, Array]:
+        """Return what to make of a loop, and its residual once it is part of the map, (k,)."""
+        covariance = predicted.covariance + np.diag(variance)
+        whitened = np.linalg.solve(covariance, predicted.residual)
+        square, left = float(predicted.residual @ whitened), variance * whitened
+        sigmas = float(np.sqrt(left @ (left / variance)))
+        if sure:
+            return Look(True, False, sigmas), left
+        log_ratio = float(self._volume + np.log(own).sum() - square / 2
+                          - np.linalg.slogdet(covariance)[1] / 2)
+        fits = square < self._limit
+        accepted = fits and log_ratio > 0
+        return Look(accepted, fits and not accepted,
+                    sigmas if accepted else float(np.sqrt(square))), left

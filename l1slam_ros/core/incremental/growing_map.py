@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The poses of a factored map, and of what has come since, by one weighting of the factors.
+The poses of a factored map, and of what has come since, by two weightings of the factors.
 
-In: a graph, the poses it was factored at, new factors one by one. Out: poses of all keyframes.
+In: a graph, the poses it was factored at, new factors as they come. Out: poses of all keyframes.
 
 Jacobians of new factors are taken where their keyframes were first linearised, residuals where
 they are: with Jacobians at poses that have moved since, a map turns for which no factor speaks
@@ -15,41 +15,29 @@ from functools import cached_property
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.linear_system import anchor
 from l1slam_ros.core.incremental.border import FIXED, Border, Prediction, Steps
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
-
-@dataclass(frozen=True)
-class Factor:
-    """One factor: its keyframes, measurement (1, p) and root (k, k)."""
-
-    pair: tuple[int, int]
-    measurement: Array
-    root: Array
+# The two weightings.
+L1, L2 = 0, 1
 
 
 @dataclass(frozen=True)
-class Predicted:
+class Linearised:
     """
-    A factor before it is part of the map.
+    New factors, whitened, in both weightings.
 
-    residual : (k,) where the keyframes are, whitened; covariance : (k, k) of what the map says of
-    it, without its own noise; the rest is for `GrowingMap.add`.
+    ends : (m, 2) what their keyframes are called in the borders; blocks : (m, 2, 2, k, k) by
+    weighting and side; residual : (m, 2, k) at no step
     """
 
-    factor: Factor
-    residual: Array
+    ends: Indices
     blocks: Array
-    by_border: Prediction
-
-    @property
-    def covariance(self) -> Array:
-        """See above."""
-        return self.by_border.covariance
+    residual: Array
 
 
 @dataclass(frozen=True)
@@ -79,85 +67,103 @@ class GrowingMap:
     Parameters
     ----------
     graph : what was factored
-    poses : (n, p) at which it was, its optimum
-    cholesky : holds the factor, and must stay
+    poses : two of (n, p) at which it was, its optima
+    choleskys : hold the factors, and must stay
 
     """
 
-    def __init__(self, graph: FactorGraph, poses: Array, cholesky: BlockCholesky):
+    def __init__(self, graph: FactorGraph, poses: tuple[Array, Array],
+                 choleskys: tuple[BlockCholesky, BlockCholesky]):
         self._manifold, self.fixed = graph.manifold, anchor(graph)
-        k = graph.manifold.TANGENT_SIZE
-        self._border = Border(cholesky, len(poses) - self.fixed, k)
-        self._first = GrowingArray((graph.manifold.POSE_SIZE,))
-        self._first.extend(poses)
+        k, size = graph.manifold.TANGENT_SIZE, graph.n_poses - self.fixed
+        self._borders = [Border(cholesky, size, k) for cholesky in choleskys]
+        self._first = GrowingArray((2, graph.manifold.POSE_SIZE))
+        self._first.extend(np.stack(poses, axis=1))
 
     def __len__(self) -> int:
         # What a factor that failed wanted to see does not count.
-        return self.fixed + self._border.keyframes
+        return self.fixed + self._borders[L1].keyframes
 
     @property
     def rows(self) -> int:
         """How many rows have come since it was factored."""
-        return self._border.rows
+        return self._borders[L1].rows
 
     @property
     def touched(self) -> int:
         """How many old keyframes were asked for."""
-        return self._border.touched
+        return self._borders[L2].touched
 
     @property
-    def view(self) -> View:
+    def views(self) -> tuple[View, View]:
         """The map as it is now."""
-        return View(self._manifold, self._first.view()[:len(self)], self.fixed,
-                    self._border.steps())
+        first = self._first.view()[:len(self)]
+        return (View(self._manifold, first[:, L1], self.fixed, self._borders[L1].steps()),
+                View(self._manifold, first[:, L2], self.fixed, self._borders[L2].steps()))
 
-    def pose(self, keyframe: int) -> Array:
-        """Return where a keyframe is, (1, p)."""
-        step = self._border.step(self._end(keyframe))
-        return self._manifold.retract(self._first_pose(keyframe), step[None])
+    def poses(self, keyframes: Indices) -> Array:
+        """Return where keyframes are by both weightings, (m, 2, p)."""
+        return self._moved(keyframes)[2]
 
     def covariance(self, keyframe: int) -> Array:
-        """Return the covariance of the step of a keyframe, (k, k)."""
+        """Return the covariance of the step of a keyframe in the L2 map, (k, k)."""
         k = self._manifold.TANGENT_SIZE
-        blocks = np.stack((np.eye(k), np.zeros((k, k))))
-        return self._border.predict((self._end(keyframe), FIXED), blocks).covariance
+        blocks, end = np.stack((np.eye(k), np.zeros((k, k)))), max(keyframe - self.fixed, FIXED)
+        return self._borders[L2].predict((end, FIXED), blocks, np.zeros(k)).covariance
 
-    def predict(self, factor: Factor) -> Predicted:
+    def linearise(self, factors: BetweenFactors, rows: slice) -> Linearised:
         """
-        Return what is known of a factor.
+        Return some factors as the borders want them.
 
-        One of its keyframes may be new: it is put where the factor wants it.
+        Those that see keyframes for the first time see them in their order: these are put where
+        the factors want them. After a gap in that order none is returned.
         """
-        manifold, count = self._manifold, len(self)
-        if count in factor.pair:
-            step = factor.measurement
-            if factor.pair[0] == count:
-                step = manifold.inverse(step)
-            self._first.extend(manifold.compose(self.pose(min(factor.pair)), step))
-        J = manifold.residual_jacobians(factor.measurement,
-                                        *(self._first_pose(end) for end in factor.pair))
-        blocks = np.stack([factor.root @ side[0] for side in J])
-        at = (self.pose(end) for end in factor.pair)
-        residual = factor.root @ manifold.residual(factor.measurement, *at)[0]
-        ends = self._end(factor.pair[0]), self._end(factor.pair[1])
-        return Predicted(factor, residual, blocks, self._border.predict(ends, blocks))
+        manifold = self._manifold
+        pairs = np.stack((factors.i[rows], factors.j[rows]), axis=1)
+        known = np.maximum.accumulate(np.append(len(self._first) - 1, pairs.max(axis=1)))
+        gaps = np.flatnonzero(np.diff(known) > 1)
+        pairs = pairs[:gaps[0] if len(gaps) else None]
+        Z = factors.measurement[rows][:len(pairs)]
+        for row in np.flatnonzero((pairs >= len(self._first)).any(axis=1)).tolist():
+            if pairs[row].max() == len(self._first):
+                step = Z[row] if pairs[row, 1] == len(self._first) else manifold.inverse(Z[row])
+                self._first.extend(manifold.compose(self.poses(pairs[row].min(keepdims=True)),
+                                                    step))
+        keyframes, at = np.unique(pairs, return_inverse=True)
+        at = at.reshape(pairs.shape).T
+        first, steps, poses = self._moved(keyframes)
+        p, k = first.shape[2], steps.shape[2]
+        Z, root = np.repeat(Z, 2, axis=0), factors.sqrt_information[rows][:len(pairs), None]
+        J = manifold.residual_jacobians(Z, *first[at].reshape(2, -1, p))
+        e = manifold.residual(Z, *poses[at].reshape(2, -1, p)).reshape(-1, 2, k)
+        sides = [root @ side.reshape(-1, 2, k, k) for side in J]
+        residual = (root @ e[..., None])[..., 0]
+        for side, ends in zip(sides, at, strict=True):
+            residual -= (side @ steps[ends][..., None])[..., 0]
+        return Linearised(np.maximum(pairs - self.fixed, FIXED), np.stack(sides, axis=2), residual)
 
-    def add(self, predicted: Predicted, noise: Array) -> None:
-        """Make a factor just predicted part of the map, with variances (k,) of its rows."""
-        pair, blocks = predicted.factor.pair, predicted.blocks
-        ends = [self._end(end) for end in pair]
-        moved = sum(block @ self._border.step(end)
-                    for block, end in zip(blocks, ends, strict=True))
-        self._border.add_factor(predicted.by_border, noise, predicted.residual - moved)
-        for end, block in zip(ends, blocks, strict=True):
-            if end == self._border.keyframes:
-                self._border.add_keyframe(block)
+    def predict(self, weighting: int, factors: Linearised, at: int) -> Prediction:
+        """Return what is known of one of some factors."""
+        i, j = factors.ends[at].tolist()
+        return self._borders[weighting].predict(
+            (i, j), factors.blocks[at, weighting], factors.residual[at, weighting])
 
-    def _end(self, keyframe: int) -> int:
-        """Return what a keyframe is called in the border."""
-        return max(keyframe - self.fixed, FIXED)
+    def add(self, weighting: int, predicted: Prediction, noise: Array) -> None:
+        """
+        Make a factor just predicted part of the map, with variances (k,) of its rows.
 
-    def _first_pose(self, keyframe: int) -> Array:
-        if keyframe == WORLD:
-            return self._manifold.identity(1)
-        return self._first.view()[keyframe:keyframe + 1]
+        Raises
+        ------
+        LinAlgError : beyond double precision.
+
+        """
+        self._borders[weighting].add(predicted, noise)
+
+    def _moved(self, keyframes: Indices) -> tuple[Array, Array, Array]:
+        """Return where keyframes began, their steps and where they are, (m, 2, p or k) each."""
+        manifold = self._manifold
+        first = self._first.view()[keyframes]
+        first[keyframes == WORLD] = manifold.identity(1)
+        ends = np.maximum(keyframes - self.fixed, FIXED).tolist()
+        steps = np.array([[border.step(end) for border in self._borders] for end in ends])
+        return first, steps, manifold.retract(first, steps)

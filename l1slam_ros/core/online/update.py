@@ -106,7 +106,7 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
     graph = problem.part
     if budget == np.inf and problem.is_sparse:
         before = l1_cost(whitened_residual(graph, problem.poses))
-        solution = minimise_by(problem.choice, graph, problem.poses, options,
+        solution = minimise_by(problem.method, graph, problem.poses, options,
                                lambda *_: check())[0]
         return _improvement(solution, problem, problem.judgement, before, 0, start)
     starts = problem.starts
@@ -118,7 +118,7 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
     poses = starts[costs.index(cost)]
     dual = _dual_of(problem, poses)
     steps, far = 0, problem.may_be_far and is_far(cost, problem.last_cost)
-    cholesky = problem.choice.cholesky if far else None
+    cholesky = problem.method.cholesky if far else None
     while cholesky and far and (not steps or time.monotonic() < deadline):
         check()
         system = linearise(graph, poses)
@@ -148,8 +148,8 @@ def front_of(problem: Problem, poses: Array, rows: int,
 
     None: its factor would take longer than what it is for, or some keyframe is not tied to others.
     """
-    judgement, choice, part = problem.judgement, problem.choice, problem.part
-    if not problem.is_sparse or choice.cholesky is None:
+    judgement, method, part = problem.judgement, problem.method, problem.part
+    if not problem.is_sparse or method.cholesky is None:
         return None
     loops = ~problem.graph.between.is_odometry
     believed, kinds = loops & judgement.accepted, loops[judgement.accepted].astype(np.int64)
@@ -161,8 +161,8 @@ def front_of(problem: Problem, poses: Array, rows: int,
     # Until chi2 is within one of its minimum: far from it the gate would see ghosts.
     enough = LeastSquaresOptions(_L2_STEPS, 1 / max(len(part.between), 1))
     try:
-        l2_poses = minimise_l2(found, nearest, enough, choice.cholesky, lambda *_: check()).poses
-        return Front(part, poses, l2_poses, choice.cholesky, kinds, gate, rows)
+        l2_poses = minimise_l2(found, nearest, enough, method.cholesky, lambda *_: check()).poses
+        return Front(part, poses, l2_poses, method.cholesky, kinds, gate, rows)
     except GraphError:
         return None
 
@@ -192,8 +192,8 @@ def optimise(problem: Problem, options: OptimiserOptions,
 def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
             check: Check) -> Solution:
     check()
-    choice = choose(AUTO, graph, options.norm)
-    return minimise_by(choice, graph, poses, options, lambda *_: check())[0]
+    method = choose(AUTO, graph, options.norm)
+    return minimise_by(method, graph, poses, options, lambda *_: check())[0]
 
 
 def _improvement(solution: Solution, problem: Problem, judgement: Judgement, before: float,

@@ -117,9 +117,10 @@ def fits(growth: Growth) -> tuple[Array, Mask]:
     """
     accepted, square = growth.accepted & ~growth.cut, np.zeros(len(growth.factors))
     square[growth.accepted] = (growth.posterior.residual**2).sum(axis=1)
-    # While nothing ties the map to the world, nothing is known of what names it.
+    # While nothing ties the map to the world, nothing is known of what names it; nor, while
+    # nothing joins two parts, of what leads from one to the other.
     square[~accepted] = np.nan
-    outside = np.flatnonzero(~accepted & growth.may_be_predicted)
+    outside = np.flatnonzero(~accepted & growth.may_be_predicted & ~growth.across())
     cut, growth.cut = growth.cut, np.zeros_like(growth.cut)
     square[outside] = growth.innovations(outside).square
     growth.cut = cut

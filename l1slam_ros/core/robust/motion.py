@@ -114,7 +114,7 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     found = max((r**2).sum() / np.trace(R, axis1=1, axis2=2).sum(), 1.0)
     said = growth.variance_at_their_word()[0] / growth.variance[0]
     measured = np.max([log_likelihood_ratio(square / noise, log_det + k * np.log(noise),
-                                            np.zeros(1), factors.freedom[rows])
+                                            np.zeros(1), factors.freedom[rows], k)
                        for noise in (found, said)], axis=0) - np.linalg.slogdet(root)[1]
     start = manifold.identity(len(rows))
     moved = manifold.retract(growth.forward[rows], (root @ innovation)[:, :, 0])

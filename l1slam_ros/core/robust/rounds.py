@@ -219,9 +219,9 @@ class Growth:
         across: Mask = self.part[self.low] != self.part[self.high]
         return across & ~self.factors.is_absolute
 
-    def gate(self, freedom: Indices) -> Array:
+    def gate(self, freedom: Indices, refused: float = REFUSED) -> Array:
         """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""
-        return sampled_quantile(1 - REFUSED, freedom)
+        return sampled_quantile(1 - refused, freedom, self.graph.manifold.TANGENT_SIZE)
 
     def solve(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
@@ -272,7 +272,7 @@ class Growth:
     def doubted(self, freedom: Indices) -> Array:
         """Return what `Posterior.left_out` stays below, (m,), if all accepted ones are true."""
         accepted = int(np.count_nonzero(self.accepted))
-        return sampled_quantile(1 - _DOUBTED / accepted, freedom)
+        return self.gate(freedom, _DOUBTED / accepted)
 
     def _learn_variance(self, rows: Indices) -> None:
         """

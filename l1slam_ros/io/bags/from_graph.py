@@ -28,6 +28,7 @@ from l1slam_ros.core.geometry.noise import (
 )
 from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.measurements import FASTEST, LONGEST_PAUSE, SHORTEST_STEP
+from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.io.bags.topics import (
     ABSOLUTE_TOPIC,
     LOOP_TOPIC,
@@ -55,9 +56,8 @@ _LOOP = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 _LAST_STAMP = 2**31 * NANOSECONDS - 1
 
 
-def write_graph_bag(
-    path: str | os.PathLike[str], record: GraphRecord, truth: Array | None = None
-) -> None:
+def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
+                    truth: Array | None = None) -> None:
     """
     Write a graph as the messages a robot would have sent.
 
@@ -92,14 +92,17 @@ def write_graph_bag(
             true = to_pose3(truth)
         for k, stamp in enumerate(stamps):
             covariance = covariances[steps[k - 1]] if k else np.zeros(36)
-            writer.write(ODOMETRY_TOPIC, stamp, messages.odometry(stamp, chain[k], covariance))
+            writer.write(ODOMETRY_TOPIC, stamp, messages.stamped(
+                _ODOMETRY, 'odom', stamp, _BASE_FRAME, messages.pose(chain[k], covariance),
+                messages.standing))
             if truth is not None:
-                writer.write(TRUTH_TOPIC, stamp, messages.pose_stamped('map', stamp, true[k]))
+                writer.write(TRUTH_TOPIC, stamp, messages.stamped(
+                    _TRUTH, 'map', stamp, messages.pose(true[k])))
             for loop in loops[k]:
                 i = factors.i[loop]
                 frame = 'map' if i == WORLD else reference_frame_id(_BASE_FRAME, stamps[i])
-                writer.write(topics[loop], stamp, messages.loop(
-                    frame, stamp, measured[loop], covariances[loop]))
+                writer.write(topics[loop], stamp, messages.stamped(
+                    _LOOP, frame, stamp, messages.pose(measured[loop], covariances[loop])))
 
 
 class _Messages:
@@ -107,36 +110,24 @@ class _Messages:
 
     def __init__(self, types: dict[str, Any]):
         self._types = types
-        zero = types['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
-        self._standing = types['geometry_msgs/msg/TwistWithCovariance'](
-            types['geometry_msgs/msg/Twist'](zero, zero), np.zeros(36))
+        zero = self._geometry('Vector3', 0.0, 0.0, 0.0)
+        self.standing = self._geometry(
+            'TwistWithCovariance', self._geometry('Twist', zero, zero), np.zeros(36))
 
-    def odometry(self, stamp: int, pose3: Array, covariance: Array) -> Any:
-        """Return a message of the odometry topic."""
-        return self._types[_ODOMETRY](self._header('odom', stamp), _BASE_FRAME,
-                                      self._with_covariance(pose3, covariance), self._standing)
-
-    def loop(self, frame: str, stamp: int, pose3: Array, covariance: Array) -> Any:
-        """Return a loop closure; frame : names the earlier keyframe."""
-        return self._types[_LOOP](self._header(frame, stamp),
-                                  self._with_covariance(pose3, covariance))
-
-    def pose_stamped(self, frame: str, stamp: int, pose3: Array) -> Any:
-        """Return a true pose."""
-        return self._types[_TRUTH](self._header(frame, stamp), self._pose(pose3))
-
-    def _header(self, frame: str, stamp: int) -> Any:
+    def stamped(self, msgtype: str, frame: str, stamp: int, *fields: Any) -> Any:
+        """Return a message of a header and some fields."""
         time = self._types['builtin_interfaces/msg/Time'](*divmod(stamp, NANOSECONDS))
-        return self._types['std_msgs/msg/Header'](time, frame)
+        return self._types[msgtype](self._types['std_msgs/msg/Header'](time, frame), *fields)
 
-    def _with_covariance(self, pose3: Array, covariance: Array) -> Any:
-        return self._types['geometry_msgs/msg/PoseWithCovariance'](self._pose(pose3), covariance)
-
-    def _pose(self, pose3: Array) -> Any:
+    def pose(self, pose3: Array, *covariance: Array) -> Any:
+        """Return a Pose, or a PoseWithCovariance."""
         numbers = pose3.tolist()
-        return self._types['geometry_msgs/msg/Pose'](
-            self._types['geometry_msgs/msg/Point'](*numbers[:3]),
-            self._types['geometry_msgs/msg/Quaternion'](*numbers[3:]))
+        pose = self._geometry('Pose', self._geometry('Point', *numbers[:3]),
+                              self._geometry('Quaternion', *numbers[3:]))
+        return self._geometry('PoseWithCovariance', pose, *covariance) if covariance else pose
+
+    def _geometry(self, name: str, *fields: Any) -> Any:
+        return self._types[f'geometry_msgs/msg/{name}'](*fields)
 
 
 def _covariances(graph: FactorGraph) -> Array:
@@ -178,11 +169,10 @@ def _note(record: GraphRecord, stamps: list[int], steps: Indices) -> dict[str, s
 def _steps(record: GraphRecord) -> Indices:
     """Return which factor leads from each keyframe to the next, (n - 1,)."""
     factors, ids = record.graph.between, record.ids
-    rows = np.flatnonzero(factors.is_odometry)
+    rows, gaps = np.flatnonzero(factors.is_odometry), odometry_gaps(record.graph)
     first = np.minimum(factors.i, factors.j)[rows]
-    missing = np.setdiff1d(np.arange(len(ids) - 1), first)
-    if len(missing):
-        k = missing[0]
+    if len(gaps):
+        k = gaps[0]
         raise GraphError(f'no edge between the consecutive vertices {ids[k]} and {ids[k + 1]}; '
                          'a bag needs the odometry of every vertex')
     _refuse_backward(record, rows)

@@ -82,8 +82,13 @@ def test_a_border_is_the_whole_problem(k, shape, rng):
     whole, border = Whole(system, weights, k), Border(cholesky, OLD, k)
     assert_allclose(border.steps().all(), 0)
 
-    def compare(ends, blocks, count):
-        predicted = border.predict(ends, blocks)
+    def compare(ends, blocks, residual, count):
+        predicted = border.predict(ends, blocks, residual)
+        steps = np.zeros((OLD + NEW + 1, k))
+        steps[:count] = whole.steps(count)
+        expected = residual + sum(block @ steps[end] for block, end in zip(
+            blocks, ends, strict=True))
+        assert_allclose(predicted.residual, expected, rtol=1e-6, atol=1e-8)
         assert_allclose(predicted.covariance, whole.covariance(ends, blocks, count), rtol=1e-7,
                         atol=1e-9)
         return predicted
@@ -91,7 +96,7 @@ def test_a_border_is_the_whole_problem(k, shape, rng):
     def factor(ends, count):
         blocks = block(k, rng)
         noise, residual = rng.uniform(0.5, 2, k), rng.standard_normal(k)
-        border.add_factor(compare(ends, blocks, count), noise, residual)
+        border.add(compare(ends, blocks, residual, count), noise)
         whole.add(ends, blocks, noise, residual)
         return blocks
 
@@ -100,8 +105,7 @@ def test_a_border_is_the_whole_problem(k, shape, rng):
         blocks = block(k, rng)
         noise, residual = rng.uniform(0.5, 2, k), rng.standard_normal(k)
         ends = (last, count) if count % 2 else (count, last)
-        border.add_factor(border.predict(ends, blocks), noise, residual)
-        border.add_keyframe(blocks[ends.index(count)])
+        border.add(border.predict(ends, blocks, residual), noise)
         whole.add(ends, blocks, noise, residual)
         known = count + 1
         i, j = rng.choice(OLD, 2, replace=False).tolist()

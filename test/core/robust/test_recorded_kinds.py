@@ -10,7 +10,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.robust.batch import robust_solve
-from l1slam_ros.core.robust.batch_map import Wish
+from l1slam_ros.core.robust.batch_map import SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.robust.judgement import ONE_PLACE, OTHER_MAP
 
@@ -57,7 +57,7 @@ def test_two_sessions_are_joined_by_loops_or_stay_two_parts(world, joined):
     keep = ~across if not joined else ~(across & (high - low == 1))
     graph = bad.graph.subset(keep)
     assert odometry_gaps(graph).tolist() == [seam]
-    outcome = solve_graph(graph, None, Wish(norm='l2'))
+    outcome = solve_graph(graph, None, SolveOptions(norm='l2'))
     assert outcome.parts == (1 if joined else 2)
     assert not outcome.judgement.accepted[is_false(bad, graph.between)].any()
     halves = (slice(0, n),) if joined else (slice(0, 200), slice(200, n))

@@ -87,7 +87,11 @@ class LoopFactors:
 
     @property
     def stamps(self) -> tuple[Indices, Indices, Indices]:
-        """See `GraphBuilder.loop_stamps`."""
+        """
+        Stamps (reference, end) [ns] of the loops in the graph, waiting and expired, (k, 2) each.
+
+        Those in the graph are in the order of `rows`, to which they stay tied.
+        """
         return self._stamps.view(), self.waiting.stamps(), self._expired.view()
 
     @property
@@ -147,10 +151,9 @@ class LoopFactors:
 
     def _add_due(self, due: list[WaitingLoop], graph: FactorGraph, track: OdometryTrack,
                  options: LoopOptions) -> int:
-        begin, end = np.array([(one.begin, one.end) for one in due]).T
-        known = track.known_until(np.array([one.arrival for one in due]), end)
-        pairs = np.stack((track.nearest_keyframe(begin, known),
-                          track.nearest_keyframe(end, known)), axis=1)
+        times = np.array([(one.begin, one.end) for one in due])
+        known = track.known_until(np.array([one.arrival for one in due]), times[:, 1])
+        pairs = track.nearest_keyframe(times.ravel(), np.repeat(known, 2)).reshape(-1, 2)
         can = np.flatnonzero(self._can_be_factors(due, pairs, track.first)).tolist()
         new: list[int] = []
         before = len(graph.between)
@@ -168,16 +171,17 @@ class LoopFactors:
     def _append(self, loops: list[WaitingLoop], pairs: Indices, graph: FactorGraph,
                 track: OdometryTrack, options: LoopOptions) -> None:
         """Carry loops to the keyframes pairs (m, 2), and make factors of them."""
-        manifold, ends = self._manifold, track.keyframe_poses[pairs]
+        manifold, m = self._manifold, len(loops)
         begin, end = np.array([(one.begin, one.end) for one in loops]).T
-        to_reference = manifold.between(ends[:, 0], track.at(begin))
-        to_keyframe = manifold.between(track.at(end), ends[:, 1])
-        measurement, covariance, sound = carried(manifold, loops, to_reference, to_keyframe)
+        at, keyframes = track.at(np.append(begin, end)), track.keyframe_poses[pairs.T.ravel()]
+        ways = manifold.between(np.concatenate((keyframes[:m], at[m:])),
+                                np.concatenate((at[:m], keyframes[m:])))
+        measurement, covariance, sound = carried(manifold, loops, ways[:m], ways[m:])
         covariance = np.where(sound[:, None, None], covariance, self._model(options))
         i = np.where([one.loop.is_absolute for one in loops], WORLD, pairs[:, 0])
         graph.append_between(i, pairs[:, 1], measurement, root_of_inverse(covariance),
                              np.array([one.loop.trusted for one in loops]))
-        rows = len(graph.between) + np.arange(-len(loops), 0)
+        rows = len(graph.between) + np.arange(-m, 0)
         self._note(rows, np.array([one.loop.stamps for one in loops]))
 
     def _say(self, one: WaitingLoop, pair: tuple[int, int], graph: FactorGraph) -> None:
@@ -186,9 +190,8 @@ class LoopFactors:
         if loop.struck:
             self._struck.add(pair)
             factors = graph.between.pairs[self.rows]
-            graph.say(self.rows[
-                (factors == pair).all(axis=1) | (factors == pair[::-1]).all(axis=1)
-                | (self._stamps.view() == loop.stamps).all(axis=1)], trusted=False)
+            graph.say(self.rows[(factors == pair).all(axis=1) | (factors == pair[::-1]).all(axis=1)
+                                | (self._stamps.view() == loop.stamps).all(axis=1)], trusted=False)
         elif loop.trusted:
             self._struck.discard(pair)
             graph.say(np.array([self._row_of[one.key]]), trusted=True)

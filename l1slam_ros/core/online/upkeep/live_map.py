@@ -15,7 +15,7 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
-from l1slam_ros.core.incremental.front import Front
+from l1slam_ros.core.incremental.front import UNKNOWN, Front
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.snapshot import Optimised
 from l1slam_ros.core.online.update import Improvement
@@ -24,6 +24,8 @@ from l1slam_ros.core.solvers.optimality import Status
 
 # A map is factored anew from so many rows on that came since: those of ten keyframes.
 _MANY_ROWS = 90
+# Factors that a front takes while the lock is held.
+AT_ONCE = 16
 # [s] While loops come none of which fits, they are judged so often.
 _JUDGE_EVERY = 2.0
 # [s] What the exact map of a sparse graph takes a keyframe, before that was measured.
@@ -68,14 +70,14 @@ class LiveMap:
         # front left may be true.
         self._used, self._fits = np.zeros(0, bool), False
         known = len(optimised.judgement.accepted)
-        self._judged_loops = int(np.count_nonzero(builder.loop_rows < known))
+        self._judged_loops = int(np.count_nonzero(builder.loops.rows < known))
         self.note_newest()
 
     @property
     def all_judged(self) -> bool:
         """Whether no loop waits to be judged."""
         return not self.robust or (self.optimised.judgement.settled
-                                   and self._judged_loops == len(self._builder.loop_rows))
+                                   and self._judged_loops == len(self._builder.loops.rows))
 
     @property
     def accepted(self) -> Mask:
@@ -97,28 +99,25 @@ class LiveMap:
         self.looks.extend(looks)
         self._judged_loops, self.stale = -1, True
 
-    def take_one(self) -> bool:
-        """Let the front take one factor; return whether it did."""
+    def take_some(self) -> bool:
+        """Let the front take a few factors; return whether it did."""
         front, factors = self.front, self._builder.graph.between
         if front is None or front.closed or front.rows >= len(factors):
             return False
-        row, judged = front.rows, self.optimised.judgement.accepted
-        accept: bool | None = None
-        if factors.struck[row]:
-            accept = False
-        elif row < len(judged):
-            accept = bool(judged[row])
-        elif row < len(judged) + len(self.looks):
-            accept = bool(self.looks.view()[row - len(judged), 0])
-        elif factors.trusted[row] or not self.robust:
-            accept = True
-        look = front.add(factors, accept)
-        if look is None:
-            return False
-        if row == len(judged) + len(self.looks):
-            self.looks.extend(np.array([(look.accepted, look.suspect, look.sigmas)], float))
-            self._fits |= look.suspect
-        return True
+        first, judged = front.rows, self.optimised.judgement.accepted
+        rows = np.arange(first, min(first + AT_ONCE, len(factors)))
+        known = len(judged) + len(self.looks)
+        accept = np.where(factors.trusted[rows] | (not self.robust), 1, UNKNOWN)
+        before = rows[rows < known]
+        accept[:len(before)] = np.concatenate(
+            (judged[first:], self.looks.view()[max(first - len(judged), 0):, 0]))[:len(before)]
+        accept[factors.struck[rows]] = 0
+        looks = front.take(factors, accept)
+        new = np.array([(look.accepted, look.suspect, look.sigmas) for look in looks]).reshape(
+            -1, 3)[max(known - first, 0):]
+        self.looks.extend(new)
+        self._fits |= bool(new[:, 1].any())
+        return bool(looks)
 
     def is_map_due(self, idle: bool) -> bool:
         """Return whether to make the map anew; idle : nothing has come for a while."""
@@ -140,7 +139,7 @@ class LiveMap:
     def begin_judgement(self) -> int:
         """Expect a judgement of all loops there are; return how many."""
         self._fits = False
-        return len(self._builder.loop_rows)
+        return len(self._builder.loops.rows)
 
     def take_judgement(self, judgement: Judgement, poses: Array, loops: int) -> None:
         """Take over what is accepted of the first factors, so many loops, and its L2 map."""

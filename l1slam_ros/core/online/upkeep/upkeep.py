@@ -29,7 +29,7 @@ from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
 from l1slam_ros.core.online.update import Improvement, front_of, improve, optimise
-from l1slam_ros.core.online.upkeep.live_map import LiveMap
+from l1slam_ros.core.online.upkeep.live_map import AT_ONCE, LiveMap
 from l1slam_ros.core.online.upkeep.threads import Worker
 from l1slam_ros.core.robust.batch import judge
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
@@ -94,7 +94,8 @@ class Upkeep:
     def _version(self) -> tuple[int, int, int]:
         builder = self._builder
         # While loops wait, any sample may be the one that they wait for, or one too many.
-        return (self._changes, builder.graph.n_poses, self._samples if builder.n_waiting else 0)
+        waits = len(builder.loops.waiting) > 0
+        return (self._changes, builder.graph.n_poses, self._samples if waits else 0)
 
     def snapshot(self) -> Snapshot:
         """Return the back end as it is now, the due loops in its graph, to be read at leisure."""
@@ -103,10 +104,11 @@ class Upkeep:
 
     def _snapshot(self) -> Snapshot:
         builder, live = self._builder, self._live
+        track, loops = builder.track, builder.loops
         builder.add_due_loops()
         return Snapshot(
-            live.number, self._version(), builder.graph.copy(), builder.gaps, builder.stamps,
-            builder.odometry, self._map_to_odom_now(), builder.loop_rows, builder.loop_stamps,
+            live.number, self._version(), builder.graph.copy(), track.gaps, track.keyframe_stamps,
+            track.keyframe_poses, self._map_to_odom_now(), loops.rows, loops.stamps,
             live.optimised, live.robust, live.looks.view(), live.all_judged, live.judged,
             live.stale, live.front.views if live.front else ())
 
@@ -118,7 +120,7 @@ class Upkeep:
             return manifold.identity(1)
         # Asked for with every sample: worked out when an update or a new offset changes it.
         if self._map_to_odom is None or self._map_to_odom[0] is not offset:
-            odometry = self._builder.odometry[last : last + 1]
+            odometry = self._builder.track.keyframe_poses[last : last + 1]
             to_kept = manifold.compose(pose, manifold.inverse(odometry))
             self._map_to_odom = offset, manifold.compose(to_kept, offset)
         return self._map_to_odom[1]
@@ -185,9 +187,10 @@ class Upkeep:
             before, taken = self._map_to_odom_now(), False
         while time.monotonic() < deadline:
             with self._lock:
-                if not self._live.take_one():
+                if not self._live.take_some():
                     break
                 taken = True
+            time.sleep(0)  # who waits for the lock would else wait for the deadline
         if taken:
             with self._lock:
                 self._live.note_newest()
@@ -225,10 +228,9 @@ class Upkeep:
         for _ in range(_PASSES):
             with self._lock:
                 factors, accepted = self._builder.graph.between, live.accepted
-            while front is not None and front.rows < len(accepted):
+            while front is not None and not front.closed and front.rows < len(accepted):
                 check()
-                if not front.add(factors, bool(accepted[front.rows])):
-                    break
+                front.take(factors, accepted[front.rows:front.rows + AT_ONCE].astype(int))
         check()
         self.adopt(of_all(improvement, whole), front)
 
