@@ -15,8 +15,8 @@ from importlib import import_module
 from typing import Any
 
 _HOMES = {
-    'read_graph': 'io.graphs.door',
-    'write_graph': 'io.graphs.door',
+    'read_graph': 'io.formats',
+    'write_graph': 'io.formats',
     'solve': 'core.robust.door',
     'Solution': 'core.robust.door',
     'FactorGraph': 'core.graph.factor_graph',

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l1slam_ros.io.compilation import compile_now
-from l1slam_ros.io.warm_up import STEPS
+from l1slam_ros.io.compilation import STEPS, compile_now
 
 # A domain of its own, seen on this machine only: no robot nearby hears the tests, nor they it.
 os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 100 + 1)

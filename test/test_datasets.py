@@ -57,16 +57,16 @@ class Dataset:
         return odometry_poses(self.graph)
 
     @cached_property
-    def choice(self):
+    def method(self):
         return choose(AUTO, self.graph)
 
     @cached_property
     def seed(self):
-        return seed_poses(self.graph, self.choice.cholesky)
+        return seed_poses(self.graph, self.method.cholesky)
 
     @cached_property
     def l2(self):
-        return minimise_l2(self.graph, self.stored, LeastSquaresOptions(), self.choice.cholesky)
+        return minimise_l2(self.graph, self.stored, LeastSquaresOptions(), self.method.cholesky)
 
     def cost(self, poses):
         return l1_cost(whitened_residual(self.graph, poses))
@@ -116,7 +116,7 @@ def test_l2_finds_the_known_chi2(dataset):
 
 def test_huber_is_below_l2_where_factors_are_far_off(dataset):
     solution = minimise_huber(dataset.graph, dataset.stored, LeastSquaresOptions(),
-                              dataset.choice.cholesky)
+                              dataset.method.cholesky)
     assert solution.status is Status.CONVERGED
     assert solution.cost <= dataset.l2.cost * (1 + 1e-9)
     assert (solution.cost < 0.99 * dataset.l2.cost) == (dataset.known is INTEL)
@@ -125,7 +125,7 @@ def test_huber_is_below_l2_where_factors_are_far_off(dataset):
 @pytest.mark.parametrize('start', ['stored', 'odometry', 'seed'])
 def test_from_every_start_it_ends_at_the_lowest_cost_known(dataset, start):
     poses = getattr(dataset, start)
-    solution, solver = minimise_by(dataset.choice, dataset.graph, poses, OptimiserOptions())
+    solution, solver = minimise_by(dataset.method, dataset.graph, poses, OptimiserOptions())
     assert (solver, solution.status) == (INTERIOR_POINT, Status.CONVERGED)
     assert (np.diff(solution.history) <= 0).all()
     assert solution.history[0] == dataset.cost(poses)
@@ -139,7 +139,7 @@ def test_from_every_start_it_ends_at_the_lowest_cost_known(dataset, start):
 def check_near_optimum(dataset, start):
     known = dataset.known
     options = OptimiserOptions(outer_iterations=known.outer)
-    solution = minimise(dataset.graph, start, options, dataset.choice.cholesky)
+    solution = minimise(dataset.graph, start, options, dataset.method.cholesky)
     assert (np.diff(solution.history) <= 0).all()
     assert solution.cost == dataset.cost(solution.poses)
     assert (1 - 1e-6) * known.best <= solution.cost <= (1 + 1e-3) * known.best
@@ -160,7 +160,7 @@ def test_algorithm_4_from_other_starts_ends_there_too(dataset, start):
 
 @pytest.mark.parametrize('dataset', [INTEL], indirect=True, ids=lambda k: k.name)
 def test_with_the_dual_returned_it_goes_on_where_it_was(dataset):
-    cholesky = dataset.choice.cholesky
+    cholesky = dataset.method.cholesky
     first = minimise(dataset.graph, dataset.seed, OptimiserOptions(), cholesky)
     again = minimise(dataset.graph, first.poses, OptimiserOptions(), cholesky, first.dual)
     assert again.status is Status.CONVERGED

@@ -67,9 +67,28 @@ def test_what_cannot_be_solved_is_said(world):
         l1.solve(graph, norm='l3')
     with pytest.raises(l1.L1SlamError, match=r'start has the shape \(3, 3\), expected \(200, 3\)'):
         l1.solve(graph, start=poses[:3])
+    poses[7] = np.nan
+    with pytest.raises(l1.L1SlamError, match='start of keyframe 7 is no pose; expected finite'):
+        l1.solve(graph, start=poses)
     with pytest.raises(l1.L1SlamError, match=r'poses have the shape \(3, 3\)'):
         l1.write_graph(world.parent / 'x.g2o', graph, poses[:3])
     with pytest.raises(l1.L1SlamError, match='no such file'):
         l1.read_graph(world.parent / 'missing.g2o')
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         l1.nothing  # noqa: B018
+
+
+def test_a_start_of_long_quaternions_is_the_same_start(tmp_path):
+    path = tmp_path / 'world.g2o'
+    main(['simulate', str(path), '--poses', '30', '--edges', '50', '--world', 'sphere'])
+    graph, poses = l1.read_graph(path)
+    once, twice = (l1.solve(graph, robust=False, start=start).poses
+                   for start in (poses, poses * [1, 1, 1, 2, 2, 2, 2]))
+    np.testing.assert_allclose(twice, once, atol=1e-9)
+
+
+def test_what_a_file_says_in_vain_is_warned_of(world):
+    path = world.parent / 'fixed.g2o'
+    path.write_text(f'{world.read_text()}FIX 5\n')
+    with pytest.warns(UserWarning, match="FIX '5' is not used"):
+        l1.read_graph(path)

@@ -66,11 +66,12 @@ class Kind:
 LIES = ('random', 'identity', 'grouped')
 INTEL, MANHATTAN, CITY = PUBLIC = ('intel', 'manhattan3500', 'city10000')
 FR079, KITTI = RECORDED_CLEAN = ('fr079', 'kitti_00')
+SPHERE, GARAGE, TORUS = SPACE = ('sphere2500', 'parking-garage', 'torus3D')
 BICOCCA, BOVISA = 'bicocca25b', 'bovisa06'
 # Of our making.
 RING, WORLD = MADE = ('ring', 'world')
 # No loop of theirs may be lost when nothing is wrong.
-EXACT = RECORDED_CLEAN
+EXACT = (*RECORDED_CLEAN, *SPACE)
 # [m] A map holds when it is no further from the map of its true loops.
 HOLDS = {INTEL: 0.05, MANHATTAN: 0.3, CITY: 0.02}
 HOLDS_ELSEWHERE = 0.5
@@ -87,7 +88,7 @@ def _synthetic() -> list[Kind]:
     odometry = {'heading': ('heading', ()), 'odometry-3': ('odometry', (3.0,)),
                 'odometry-10': ('odometry', (10.0,))}
     return [
-        Kind('synthetic', 'clean', _ALL),
+        Kind('synthetic', 'clean', (*_ALL, *SPACE)),
         *(Kind('synthetic', lies, _ALL, lies=lies, shares=ten_to_ninety) for lies in LIES),
         *(Kind('synthetic', f'tenth-{lies}', PUBLIC, 'tenth', (), lies, (0.5,), worse)
           for lies in LIES),
@@ -134,6 +135,11 @@ def _others() -> list[Kind]:
     ]
 
 
-KINDS = (*_synthetic(), *_aliased(), *_noise(), *_others())
+def _in_space() -> list[Kind]:
+    return [Kind('synthetic', lies, graphs, lies=lies, shares=shares) for lies in LIES
+            for graphs, shares in (((SPHERE, GARAGE), (0.1, 0.5, 0.9)), ((TORUS,), (0.5,)))]
+
+
+KINDS = (*_synthetic(), *_aliased(), *_noise(), *_others(), *_in_space())
 SUITES = tuple(dict.fromkeys(kind.suite for kind in KINDS))
 GRAPHS = tuple(dict.fromkeys(graph for kind in KINDS for graph in kind.graphs))

@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from robust.kinds import BICOCCA, BOVISA, RING, WORLD
+from robust.kinds import BICOCCA, BOVISA, RING, TORUS, WORLD
 from scipy.spatial import cKDTree
 
 from l1slam_ros.core.geometry import se2
@@ -36,7 +36,7 @@ _LIE = 3.0
 _SECOND = 10**9
 _LONGEST, _LONGEST_OF_LOOPS = _SECOND, 2 * _SECOND
 _FILES = {BICOCCA: 'real/bicocca25b_0.150.g2o', BOVISA: 'real/bovisa06.g2o',
-          'fr079': 'real/fr079.graph', 'kitti_00': 'real/kitti_00.g2o'}
+          'fr079': 'real/fr079.graph', 'kitti_00': 'real/kitti_00.g2o', TORUS: 'real/torus3D.g2o'}
 
 Error = Callable[[Array], float]
 

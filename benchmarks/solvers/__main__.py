@@ -39,8 +39,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
                         help='of one run [s]; what takes longer runs only once')
     parser.add_argument('--output', type=Path, default=HERE,
                         help='folder of results/, RESULTS.md and results.png')
-    parser.add_argument('--compare', action='store_true',
-                        help='print the ratios to baseline.json')
+    parser.add_argument('--compare', action='store_true', help='print the ratios to baseline.json')
     parser.add_argument('--keep', action='store_true', help='make these results the baseline')
     arguments = parser.parse_args(words)
     public = arguments.graphs != (DENSE,) and set(arguments.only) != {'growth'}
@@ -108,8 +107,7 @@ def _names(allowed: tuple[str, ...]) -> Callable[[str], tuple[str, ...]]:
         names = tuple(text.split(','))
         unknown = set(names) - set(allowed)
         if unknown:
-            raise argparse.ArgumentTypeError(
-                f'{min(unknown)!r} is none of {", ".join(allowed)}')
+            raise argparse.ArgumentTypeError(f'{min(unknown)!r} is none of {", ".join(allowed)}')
         return names
 
     return read

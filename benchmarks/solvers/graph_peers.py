@@ -91,9 +91,8 @@ def _gtsam_by(optimiser: str, parameters: str) -> Callable[[Case, Array], Callab
     return prepare
 
 
-def _gtsam_l1(
-    kernels: tuple[float, ...], steps: int
-) -> Callable[[Case, Array], Callable[[], Answer]]:
+def _gtsam_l1(kernels: tuple[float, ...],
+              steps: int) -> Callable[[Case, Array], Callable[[], Answer]]:
     def prepare(case: Case, poses: Array) -> Callable[[], Answer]:
         import gtsam
 

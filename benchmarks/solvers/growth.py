@@ -46,9 +46,8 @@ def exponent(edges: np.ndarray, seconds: np.ndarray) -> float:
     return float(np.polyfit(np.log(edges), np.log(seconds), 1)[0])
 
 
-def _runner(
-    size: tuple[int, int], reports: dict[tuple[int, int], dict[str, Any]]
-) -> Callable[[], Answer]:
+def _runner(size: tuple[int, int],
+            reports: dict[tuple[int, int], dict[str, Any]]) -> Callable[[], Answer]:
     """Return what solves a world in a new process, and notes what that reports."""
 
     def run() -> Answer:

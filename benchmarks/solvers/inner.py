@@ -75,9 +75,8 @@ def _problem_rows(problem: InnerProblem, repeats: int, limit: float) -> list[Row
         for mark, setting in zip(MARKS, solver.reach(problem, costs, limit), strict=True):
             if setting is not None:
                 chosen[solver.name, mark] = solver, setting
-    measured = interleaved(
-        {key: partial(solver.run, problem, setting, _PATIENCE)
-         for key, (solver, setting) in chosen.items()}, repeats, limit)
+    measured = interleaved({key: partial(solver.run, problem, setting, _PATIENCE)
+                            for key, (solver, setting) in chosen.items()}, repeats, limit)
     rows, ours = [], {solver.name for solver in INNER}
     for mark in MARKS:
         for solver in solvers:

@@ -30,9 +30,8 @@ from l1slam_ros.core.geometry.manifold import Array
 _FOLDER = Path(__file__).resolve().parents[1]
 
 
-def clarabel_solution(
-    problem: InnerProblem, form: str, tolerance: float, limit: float
-) -> tuple[Answer, Array]:
+def clarabel_solution(problem: InnerProblem, form: str, tolerance: float,
+                      limit: float) -> tuple[Answer, Array]:
     """Return x with its time, and the dual y (rows,), by Clarabel's interior point."""
     import clarabel
 

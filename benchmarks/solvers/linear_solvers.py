@@ -35,9 +35,8 @@ class LinearSolver(Protocol):
     def name(self) -> str:
         """Of the row."""
 
-    def reach(
-        self, problem: InnerProblem, costs: Sequence[float], limit: float
-    ) -> list[Setting | None]:
+    def reach(self, problem: InnerProblem, costs: Sequence[float],
+              limit: float) -> list[Setting | None]:
         """Return the setting that reaches each cost the fastest; None: not in `limit` [s]."""
 
     def run(self, problem: InnerProblem, setting: Setting, limit: float) -> Answer:
@@ -57,9 +56,8 @@ class ByTolerance:
     sweeps: tuple[tuple[Setting, ...], ...]
     solve: Callable[[InnerProblem, Setting, float], Answer]
 
-    def reach(
-        self, problem: InnerProblem, costs: Sequence[float], limit: float
-    ) -> list[Setting | None]:
+    def reach(self, problem: InnerProblem, costs: Sequence[float],
+              limit: float) -> list[Setting | None]:
         """Try the settings of each sweep until one reaches the lowest cost or takes too long."""
         tried: list[tuple[float, float, Setting]] = []
         for sweep in self.sweeps:
@@ -86,9 +84,8 @@ class ByIterations:
     name: str
     iterates: Callable[[InnerProblem], Iterator[Array]]
 
-    def reach(
-        self, problem: InnerProblem, costs: Sequence[float], limit: float
-    ) -> list[Setting | None]:
+    def reach(self, problem: InnerProblem, costs: Sequence[float],
+              limit: float) -> list[Setting | None]:
         """Iterate, and note when each cost is first reached."""
         needed: list[Setting | None] = [None] * len(costs)
         deadline = time.monotonic() + limit
@@ -105,8 +102,7 @@ class ByIterations:
     def run(self, problem: InnerProblem, setting: Setting, limit: float) -> Answer:
         """Iterate as often as the setting says, however long that takes."""
         assert isinstance(setting, int)
-        return timed(lambda: next(itertools.islice(
-            self.iterates(problem), setting - 1, setting)))
+        return timed(lambda: next(itertools.islice(self.iterates(problem), setting - 1, setting)))
 
 
 def normal_factor(A: csr_array) -> SuperLU:

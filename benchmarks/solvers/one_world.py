@@ -22,17 +22,17 @@ from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 from l1slam_ros.core.worlds.simulate import World, WorldOptions, simulate_world
-from l1slam_ros.io.warm_up import warm_up
+from l1slam_ros.io.compilation import STEPS, make_ready
 
 
 def solve(world: World) -> dict[str, float]:
     """Return the seconds of each phase and the costs; the ordering counts with the seed."""
     graph = world.graph
     began = clock()
-    choice = choose(AUTO, graph)
-    seed = seed_poses(graph, choice.cholesky)
+    method = choose(AUTO, graph)
+    seed = seed_poses(graph, method.cholesky)
     seeded = clock()
-    solution, _ = minimise_by(choice, graph, seed, OptimiserOptions())
+    solution, _ = minimise_by(method, graph, seed, OptimiserOptions())
     solved = clock()
     return {'seed': seeded - began, 'solve': solved - seeded, 'cost': solution.cost,
             'true_cost': l1_cost(whitened_residual(graph, world.truth))}
@@ -47,7 +47,8 @@ def peak() -> float:
 def main() -> None:
     """Warm up, then solve a world of the size asked for."""
     size = [int(word) for word in sys.argv[1:3]]
-    warm_up()
+    for step in STEPS:
+        make_ready(step)
     world = simulate_world(size[0], size[1], WorldOptions(), np.random.default_rng(WORLD_SEED))
     before = peak()
     print(json.dumps(solve(world) | {'peak_before': before, 'peak': peak()}))

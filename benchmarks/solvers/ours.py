@@ -76,9 +76,8 @@ class _Halpern:
 
     name: str = 'ours, primal-dual'
 
-    def reach(
-        self, problem: InnerProblem, costs: Sequence[float], limit: float
-    ) -> list[Setting | None]:
+    def reach(self, problem: InnerProblem, costs: Sequence[float],
+              limit: float) -> list[Setting | None]:
         """Look up in the history of a run that is long enough where each cost is reached."""
         deadline, count = time.monotonic() + limit, _FEWEST
         while True:
@@ -96,9 +95,8 @@ class _Halpern:
         return timed(lambda: _halpern(problem, PrimalDualOptions(setting, 0.0), limit).x)
 
 
-def _halpern(
-    problem: InnerProblem, options: PrimalDualOptions, limit: float
-) -> PrimalDualSolution:
+def _halpern(problem: InnerProblem, options: PrimalDualOptions,
+             limit: float) -> PrimalDualSolution:
     deadline, system = time.monotonic() + limit, problem.system
     x = weighted_least_squares(system, cholesky_of(problem.graph), np.ones(len(system.b)))
     r = system.times(x) - system.b
@@ -128,7 +126,7 @@ INNER: tuple[LinearSolver, ...] = (
 
 
 def _l1(solver: str) -> GraphSolver:
-    """Solve by one of `choice.SOLVERS`, from given poses."""
+    """Solve by one of `names.SOLVERS`, from given poses."""
 
     def solve(graph: FactorGraph, poses: Array) -> Array:
         return minimise_by(choose(solver, graph), graph, poses, OptimiserOptions())[0].poses
@@ -152,9 +150,9 @@ def _seed_and_l1(graph: FactorGraph, poses: Array) -> Array:
 
 def seed_and_l1(graph: FactorGraph) -> tuple[Array, Array]:
     """Return the seed and the map, (n, p) each, by the default solver; one ordering for both."""
-    choice = choose(AUTO, graph)
-    seed = seed_poses(graph, choice.cholesky)
-    return seed, minimise_by(choice, graph, seed, OptimiserOptions())[0].poses
+    method = choose(AUTO, graph)
+    seed = seed_poses(graph, method.cholesky)
+    return seed, minimise_by(method, graph, seed, OptimiserOptions())[0].poses
 
 
 def _from_poses(name: str, solve: Callable[[FactorGraph, Array], Array]) -> GraphSolver:
@@ -216,7 +214,5 @@ def _fused_bytes(problem: InnerProblem) -> float:
     return float(each_edge + each_keyframe * problem.system.size / edges)
 
 
-ITERATIONS = (
-    Iteration('SciPy, Algorithm 2', _two_products),
-    Iteration('ours, fused', _fused, _fused_bytes),
-)
+ITERATIONS = (Iteration('SciPy, Algorithm 2', _two_products),
+              Iteration('ours, fused', _fused, _fused_bytes))

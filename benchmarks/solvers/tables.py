@@ -111,8 +111,7 @@ def iteration_tables(rows: Sequence[Row]) -> Lines:
         body.append((r.problem, r.solver, number(1e6 * r.seconds), number(_inverse(of[r.key])),
                      number(r.numbers.get('bytes_per_edge')),
                      number(_scaled(r.numbers.get('bandwidth'), 1e-9)),
-                     number(1e-9 * r.numbers['bandwidth_large']),
-                     number(_scaled(needed, 1e6)),
+                     number(1e-9 * r.numbers['bandwidth_large']), number(_scaled(needed, 1e6)),
                      number(r.seconds / needed if needed else None)))
     return table(('problem', 'iteration', 'µs', 'times faster', 'bytes per edge',
                   'GB/s at its size', 'GB/s of large arrays', 'µs its bytes need',

@@ -38,8 +38,7 @@ def measure(cases: Iterable[Case], repeats: int, limit: float) -> list[Row]:
         for start in STARTS:
             if start == 'stored' and np.array_equal(case.stored, case.starts['odometry']):
                 continue
-            found += _group_rows(case, start, case.starts[start], (*WHOLE, *PEERS), repeats,
-                                 limit)
+            found += _group_rows(case, start, case.starts[start], (*WHOLE, *PEERS), repeats, limit)
         found += _group_rows(case, NOTHING, case.stored, (*FROM_NOTHING, LAGO), repeats, limit)
         rows += with_excess(found, LOWEST.get(case.name, np.inf))
     return rows
@@ -61,8 +60,7 @@ def measure_starts(cases: Iterable[Case], repeats: int, limit: float) -> list[Ro
 def with_excess(rows: list[Row], lowest: float) -> list[Row]:
     """Return the rows of one graph with their L1 cost's part above the lowest known."""
     lowest = min(lowest, *(r.numbers['l1'] for r in rows))
-    return [replace(r, numbers=r.numbers | {'excess': r.numbers['l1'] / lowest - 1})
-            for r in rows]
+    return [replace(r, numbers=r.numbers | {'excess': r.numbers['l1'] / lowest - 1}) for r in rows]
 
 
 def _group_rows(case: Case, start: str, poses: Array, solvers: tuple[GraphSolver, ...],

@@ -35,9 +35,8 @@ def plot(arguments: argparse.Namespace) -> Ending:
     return Ending('; '.join(filter(None, damages)))
 
 
-def plot_outcome(
-    arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome, truth: Truth | None
-) -> None:
+def plot_outcome(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
+                 truth: Truth | None) -> None:
     """Draw the map of a solve, and beside it its costs."""
     note = f'{arguments.norm} cost {outcome.solution.cost:.6g}'
     plot_solution(arguments.plot, _drawing(

@@ -25,10 +25,8 @@ from l1slam_ros.paper import printed as paper
 
 BAD_INPUT, READ_IN_PART, DOUBTFUL, INTERRUPTED, BROKEN_PIPE = 2, 3, 4, 130, 141
 # By command: the module that runs it, imported only then.
-_MODULES = {
-    'solve': 'solving', 'convert': 'commands', 'info': 'commands', 'simulate': 'worlds',
-    'corrupt': 'worlds', 'plot': 'drawing', 'reproduce': 'reproducing',
-}
+_MODULES = {'solve': 'solving', 'convert': 'commands', 'info': 'commands', 'simulate': 'worlds',
+            'corrupt': 'worlds', 'plot': 'drawing', 'reproduce': 'reproducing'}
 
 _INPUT = '.g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1'
 _OUTPUT = '.g2o, .graph, .tum, or a name without a suffix for a bag directory'
@@ -143,10 +141,9 @@ def _parser() -> argparse.ArgumentParser:
     commands_of = parser.add_subparsers(metavar='COMMAND', dest='command')
 
     def add(name: str, text: str, example: str) -> argparse.ArgumentParser:
-        return commands_of.add_parser(
-            name, help=text, description=f'{text[0].upper()}{text[1:]}.',
-            epilog=f'example:\n  l1slam {name} {example}',
-            formatter_class=argparse.RawDescriptionHelpFormatter)
+        return commands_of.add_parser(name, help=text, description=f'{text[0].upper()}{text[1:]}.',
+                                      epilog=f'example:\n  l1slam {name} {example}',
+                                      formatter_class=argparse.RawDescriptionHelpFormatter)
 
     _add_solve(add('solve', 'optimise a graph or a bag',
                    'graph.g2o --output solved.g2o --plot map.png'))
@@ -176,14 +173,16 @@ def _add_bag_options(parser: argparse.ArgumentParser) -> None:
         help="3D g2o files, in and out: what the information's rotation block is of, the vector "
         'part of the quaternion, as g2o has it, or the angle (default: %(default)s)')
     add = parser.add_argument_group('how to read a bag').add_argument
-    add('--odom-topic', default=DEFAULT_TOPICS.odometry, metavar='TOPIC',
-        help='nav_msgs/Odometry (default: %(default)s)')
-    add('--loop-topic', default=DEFAULT_TOPICS.loops, metavar='TOPIC',
-        help='geometry_msgs/PoseWithCovarianceStamped (default: %(default)s)')
-    add('--trusted-topic', default=DEFAULT_TOPICS.trusted, metavar='TOPIC',
-        help='the same, loops somebody vouches for (default: %(default)s)')
-    add('--absolute-topic', default=DEFAULT_TOPICS.absolute, metavar='TOPIC',
-        help='the same, poses in the map frame (default: %(default)s)')
+    for name, default, what in (
+        ('odom', DEFAULT_TOPICS.odometry, 'nav_msgs/Odometry; or, as a whole, the pose graph of '
+         'an rtabmap_msgs/MapGraph or pose_graph_tools_msgs/PoseGraph'),
+        ('loop', DEFAULT_TOPICS.loops, 'geometry_msgs/PoseWithCovarianceStamped, or the loops of '
+         'such a pose graph'),
+        ('trusted', DEFAULT_TOPICS.trusted, 'the same, loops somebody vouches for'),
+        ('absolute', DEFAULT_TOPICS.absolute, 'the same, poses in the map frame'),
+    ):
+        add(f'--{name}-topic', default=default, metavar='TOPIC',
+            help=f'{what} (default: {default})')
     add('--params-file', type=Path, metavar='YAML',
         help="the node's parameter file: what makes keyframes, their noise, and the solver; "
         'without it, what a bag of l1slam notes of itself, or the defaults of the node')

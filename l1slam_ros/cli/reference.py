@@ -74,7 +74,7 @@ def read_truth(source: str, record: GraphRecord, input_path: Path) -> Truth:
 def _read(source: str, record: GraphRecord, input_path: Path) -> Reference:
     bag, colon, topic = source.rpartition(':/')
     if colon and not Path(source).exists():
-        from l1slam_ros.io.bags.truth_topic import read_truth_topic
+        from l1slam_ros.io.bags.to_graph import read_truth_topic
 
         path = Path(bag)
         if bag == 'bag' and not path.exists() and is_bag(input_path):
@@ -85,9 +85,8 @@ def _read(source: str, record: GraphRecord, input_path: Path) -> Reference:
     return read_reference(source, record.graph.manifold, by_stamps=record.stamps is not None)
 
 
-def _at_stamps(
-    record: GraphRecord, reference: Reference, stamps: Indices
-) -> tuple[Indices, Array, Indices]:
+def _at_stamps(record: GraphRecord, reference: Reference,
+               stamps: Indices) -> tuple[Indices, Array, Indices]:
     """Return the keyframes that have truth, it, and before which true poses there is a gap."""
     if len(reference.keys) < 2:
         return np.zeros(0, np.int64), reference.poses[:0], np.zeros(0, np.int64)

@@ -10,37 +10,39 @@ import numpy as np
 
 from l1slam_ros.cli.commands import Ending, read, warn
 from l1slam_ros.cli.reference import position_error, read_truth
-from l1slam_ros.core.robust.batch_map import Outcome, Wish
+from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import SENTENCES
 from l1slam_ros.core.solvers.solve import PRIMAL_DUAL
 from l1slam_ros.io import formats
-from l1slam_ros.io.compilation import compile_now
+from l1slam_ros.io.compilation import DENSE, JUDGEMENT, SPARSE, compile_now, with_space
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.node_options import read_params_file
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.sentences import DOUBTFUL, doubt_sentence, judgement_sentences
-from l1slam_ros.io.warm_up import DENSE, JUDGEMENT, SPARSE, with_space
 from l1slam_ros.io.wording import counted
 
 
 def solve(arguments: argparse.Namespace) -> Ending:
     """Optimise a graph; print, write and draw what came out."""
     _check_outputs(arguments)
-    wish = _wish(arguments)
+    asked = _asked(arguments)
     record = read(arguments, arguments.input, arguments.quiet)
     truth, warnings = None, list(record.skipped)
     if arguments.reference:
         truth = read_truth(arguments.reference, record, arguments.input)
         warn(truth.skipped, arguments.quiet)
         warnings += truth.skipped
-    compile_now(with_space(_steps(wish), record.graph.manifold), arguments.quiet)
-    outcome = _solved(arguments, record, wish)
-    if outcome.unjudged:
-        warnings.append(f'no loop was doubted: {outcome.unjudged}')
-        warn(warnings[-1:], arguments.quiet)
+    compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
+    outcome = _solved(arguments, record, asked)
+    remarks = [f'no loop was doubted: {outcome.unjudged}'] if outcome.unjudged else []
+    if outcome.parts > 1:
+        remarks.append(f'{outcome.parts:,} parts that nothing accepted joins: where one lies from '
+                       'another is a guess')
+    warn(remarks, arguments.quiet)
+    warnings += remarks
     judgement = outcome.judgement
     ending = Ending(record.damage, doubt_sentence(
         judgement.doubts if judgement else (), record.ids, record.stamps))
@@ -66,23 +68,23 @@ def solve(arguments: argparse.Namespace) -> Ending:
     return ending
 
 
-def _solved(arguments: argparse.Namespace, record: GraphRecord, wish: Wish) -> Outcome:
-    steps = (wish.options.outer_iterations if wish.norm == 'l1'
-             else wish.least_squares.iterations)
+def _solved(arguments: argparse.Namespace, record: GraphRecord, asked: SolveOptions) -> Outcome:
+    l1, l2 = asked.options, asked.least_squares
+    steps = l1.outer_iterations if asked.norm == 'l1' else l2.iterations
     quiet = arguments.quiet
     with (formats.named(arguments.input),
           Progress(None, 'round', quiet, 'judging loops') as judging,
           Progress(steps, 'step', quiet, 'solving') as solving):
         return solve_graph(
-            record.graph, record.poses, wish, solving.report,
+            record.graph, record.poses, asked, solving.report,
             lambda _, accepted: judging.advance(1, f'{counted(accepted, "loop")} believed'),
             record.ids)
 
 
-def _steps(wish: Wish) -> tuple[str, ...]:
+def _steps(asked: SolveOptions) -> tuple[str, ...]:
     """Return what to compile for a solve; a graph that fills in compiles more on its way."""
-    judgement = () if wish.robust is False else JUDGEMENT
-    dense = DENSE if wish.norm == 'l1' and wish.solver == PRIMAL_DUAL else ()
+    judgement = () if asked.robust is False else JUDGEMENT
+    dense = DENSE if asked.norm == 'l1' and asked.solver == PRIMAL_DUAL else ()
     return (*SPARSE, *judgement, *dense)
 
 
@@ -96,7 +98,7 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
         check_picture(arguments.plot)
 
 
-def _wish(arguments: argparse.Namespace) -> Wish:
+def _asked(arguments: argparse.Namespace) -> SolveOptions:
     solver, least_squares, robust = OptimiserOptions(), LeastSquaresOptions(), arguments.robust
     if arguments.params_file:
         options = read_params_file(arguments.params_file)
@@ -109,7 +111,8 @@ def _wish(arguments: argparse.Namespace) -> Wish:
     if arguments.inner is not None:
         solver = replace(solver, inner=replace(solver.inner, iterations=arguments.inner))
     arguments.norm = arguments.norm or solver.norm
-    return Wish(arguments.start, arguments.norm, arguments.solver, robust, solver, least_squares)
+    return SolveOptions(arguments.start, arguments.norm, arguments.solver, robust, solver,
+                        least_squares)
 
 
 def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:

@@ -12,19 +12,18 @@ from l1slam_ros.cli.commands import Ending, read
 from l1slam_ros.cli.reference import known_false
 from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry.manifold import Indices
-from l1slam_ros.core.robust.batch_map import Wish
+from l1slam_ros.core.robust.batch_map import SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
 from l1slam_ros.io import formats
-from l1slam_ros.io.compilation import compile_now
+from l1slam_ros.io.compilation import SPARSE, compile_now, with_space
 from l1slam_ros.io.files import put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import false_loops_path, pair_lines, truth_path
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.trajectory import write_truth
-from l1slam_ros.io.warm_up import SPARSE, with_space
 
 
 def simulate(arguments: argparse.Namespace) -> Ending:
@@ -34,13 +33,13 @@ def simulate(arguments: argparse.Namespace) -> Ending:
     world = simulate_world(arguments.poses, arguments.edges, WorldOptions(), rng, arguments.world)
     if arguments.false_loops:
         make = FALSE_LOOPS[arguments.kind]
-        world = with_false_loops(
-            world, make(world.graph, world.truth, arguments.false_loops, rng))
+        world = with_false_loops(world, make(world.graph, world.truth, arguments.false_loops, rng))
     ids = np.arange(world.graph.n_poses)
     record = GraphRecord(world.graph, world.odometry, ids)
-    write_truth(truth_path(output), ids, world.truth)
-    _write(output, world.false_loops,
-           lambda: formats.write_output(output, record, world.truth))
+    with replacing(truth_path(output)) as temporary:
+        write_truth(temporary, ids, world.truth)
+        _write(output, world.false_loops,
+               lambda: formats.write_output(output, record, world.truth))
     return Ending()
 
 
@@ -61,7 +60,7 @@ def corrupt(arguments: argparse.Namespace) -> Ending:
     with (formats.named(arguments.input),
           Progress(options.iterations, 'step', label='solving') as progress):
         solution = solve_graph(
-            believed, record.poses, Wish(norm='l2', robust=False, least_squares=options),
+            believed, record.poses, SolveOptions(norm='l2', robust=False, least_squares=options),
             progress.report, ids=record.ids).solution
     loops = FALSE_LOOPS[arguments.kind](record.graph, solution.poses, arguments.false_loops,
                                         np.random.default_rng(arguments.seed))

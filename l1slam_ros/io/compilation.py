@@ -2,12 +2,16 @@
 """
 Filling the cache of compiled loops before they are needed, by processes of their own.
 
+A loop is compiled at its first use after an installation, and later read from the cache. The
+modules of `kernels` know not of each other, so each can be made ready in a process of its own.
+
 In: nothing. Out: numba's cache, and beside it a note of what it holds, by which the next call
 knows without numba that nothing is to be done. The note counts only for the very sources, Python,
 numba and processor that it was made with, and while the files it names are there.
 """
 
 import hashlib
+import importlib
 import importlib.util
 import json
 import os
@@ -22,8 +26,22 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from l1slam_ros.core.geometry.manifold import Manifold
 from l1slam_ros.io.progress import Progress
-from l1slam_ros.io.warm_up import STEPS, make_ready, module_of
+
+# What a sparse graph is solved by, what false loops are told by, what a dense graph is solved by,
+# what keeps up with a graph that grows: modules of `kernels`, those first that take long to
+# compile.
+SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interior_point', 'se2')
+JUDGEMENT = ('prediction',)
+DENSE = ('halpern',)
+ONLINE = ('border',)
+STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
+# What poses in space need besides; after the colon: the versions for them of that module's loops.
+_SPACE = ':space'
+_IN_SPACE = {'halpern': f'halpern{_SPACE}', 'cholesky': f'cholesky{_SPACE}',
+             'blocks': f'blocks{_SPACE}', 'se2': 'se3'}
+STEPS_IN_SPACE = tuple(_IN_SPACE.values())
 
 _KERNELS = Path(__file__).parents[1] / 'core' / 'kernels'
 # [s] How often the caller is asked whether to stop.
@@ -34,8 +52,15 @@ _NICE = 5
 _PROCESSOR = ('model name', 'flags', 'Features', 'CPU implementer', 'CPU part')
 
 
+def with_space(steps: tuple[str, ...], manifold: Manifold) -> tuple[str, ...]:
+    """Return the steps, and where the poses are not in the plane, what they need besides."""
+    if manifold.NAME == 'SE2':
+        return steps
+    return (*(_IN_SPACE[step] for step in steps if step in _IN_SPACE), *steps)
+
+
 def compile_now(steps: Sequence[str], quiet: bool = False) -> None:
-    """Compile some of `warm_up.STEPS`, which takes long only at the first use on a machine."""
+    """Compile some of `STEPS`, which takes long only at the first use on a machine."""
     with Progress(None, 'part', quiet, 'compiling, once on this machine', delay=1.0) as progress:
         fill_cache(progress.reach, lambda: False, steps)
 
@@ -51,7 +76,7 @@ def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
     ----------
     report : called with how many steps are done, of how many: at first, and whenever one is
     stopped : asked now and then; once it says yes, compiling ends and the call returns
-    steps : what is needed, of `warm_up.STEPS`
+    steps : what is needed, of `STEPS`
 
     Returns
     -------
@@ -95,10 +120,8 @@ def _compiled(steps: list[str], stopped: Callable[[], bool]) -> Iterator[tuple[s
             worker.wait()
 
 
-def _drive(
-    worker: 'subprocess.Popen[str]', waiting: Iterator[str],
-    done: 'queue.Queue[tuple[str, list[str]] | None]',
-) -> None:
+def _drive(worker: 'subprocess.Popen[str]', waiting: Iterator[str],
+           done: 'queue.Queue[tuple[str, list[str]] | None]') -> None:
     """Give a process one step after the other, until none waits or it breaks; then say None."""
     assert worker.stdin is not None and worker.stdout is not None
     with suppress(OSError, ValueError), worker.stdin, worker.stdout:
@@ -132,10 +155,18 @@ def work() -> None:
 
     threading.Thread(target=read, daemon=True).start()
     while True:
-        step = steps.get()
-        folder = make_ready(step)
-        files = sorted(map(str, Path(folder).glob(f'{module_of(step)}.*.nbi'))) if folder else []
-        print(json.dumps(files), flush=True)
+        print(json.dumps(make_ready(steps.get())), flush=True)
+
+
+def make_ready(step: str) -> list[str]:
+    """Compile the loops of one step, or read them; return the files that keep them, if any."""
+    from l1slam_ros.core.kernels import compiled
+
+    name = step.removesuffix(_SPACE)
+    module = importlib.import_module(f'l1slam_ros.core.kernels.{name}')
+    folders = {compiled.make_ready(kernel, step != name) for kernel in list(vars(module).values())
+               if hasattr(kernel, 'takes')} - {''}
+    return sorted(str(file) for folder in folders for file in Path(folder).glob(f'{name}.*.nbi'))
 
 
 def _cores() -> int:

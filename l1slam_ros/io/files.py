@@ -14,19 +14,19 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.measurements import QUATERNION_NORM_ERROR
 from l1slam_ros.io.remarks import Remarks, read_remarks
 from l1slam_ros.io.wording import counted
 
 NANOSECONDS = 10**9
 # No pose or information is beyond this, and with less no square of one leaves the doubles.
 LARGEST = 1e30
-# Two printed digits stay below; an unset or broken quaternion does not.
-QUATERNION_NORM_ERROR = 0.1
 # The longest piece of a damaged file that is quoted in an error.
 _QUOTED = 40
 # So many lines are formatted in one go.
@@ -43,6 +43,15 @@ class TextLines:
 
 
 @contextmanager
+def reported(path: object, done: str = 'written') -> Iterator[None]:
+    """Let what the system refuses name the file: as one that cannot be written, or read."""
+    try:
+        yield
+    except OSError as error:
+        raise FileError(path, f'cannot be {done}: {error.strerror or error}') from error
+
+
+@contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     Yield a temporary neighbour of `path`; it takes the place of `path` when the block succeeds.
@@ -56,14 +65,21 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     # Not `tempfile`: its files are for their owner only, whatever the umask says.
     temporary = target.parent / f'.{target.name}.{secrets.token_hex(4)}.tmp'
     try:
-        yield temporary
-        os.replace(temporary, target)
-        sync_folder(target.parent)
-    except OSError as error:
-        raise FileError(path, f'cannot be written: {error.strerror or error}') from error
+        with reported(path):
+            yield temporary
+            os.replace(temporary, target)
+            sync_folder(target.parent)
     finally:
         with suppress(OSError):
             temporary.unlink()
+
+
+@contextmanager
+def new_folder_beside(target: Path) -> Iterator[Path]:
+    """Yield a new folder beside `target`, gone in the end with all that is still in it."""
+    with TemporaryDirectory('.tmp', f'.{target.name}.', target.absolute().parent,
+                            ignore_cleanup_errors=True) as folder:
+        yield Path(folder)
 
 
 def sync_folder(folder: Path) -> None:
@@ -125,12 +141,11 @@ def read_lines(path: str | os.PathLike[str]) -> TextLines:
     FileError : the file cannot be read, is no text, or is a saved map that is damaged.
 
     """
-    try:
+    with reported(path, 'read'):
         content = Path(path).read_bytes()
+    try:
         remarks = read_remarks(path, content)
         text = content.decode('utf-8-sig').replace('\r\n', '\n').replace('\r', '\n')
-    except OSError as error:
-        raise FileError(path, f'cannot be read: {error.strerror or error}') from error
     except UnicodeDecodeError as error:
         found = f'byte 0x{error.object[error.start]:02x} at offset {error.start}'
         raise FileError(path, f'{found}; expected a text file') from error
@@ -144,9 +159,8 @@ def quoted(text: str) -> str:
     return repr(text if len(text) <= _QUOTED else text[:_QUOTED] + '...')
 
 
-def parse_rows(
-    path: object, name: str, lines: TextLines, ids: int, values: int
-) -> tuple[Indices, Array]:
+def parse_rows(path: object, name: str, lines: TextLines, ids: int,
+               values: int) -> tuple[Indices, Array]:
     """
     Convert lines of `ids` whole numbers followed by `values` finite numbers, none beyond 1e30.
 
@@ -216,7 +230,7 @@ def stamp_from_text(text: str) -> int:
     return int((seconds * NANOSECONDS).to_integral_value())
 
 
-def settled(values: Array) -> Array:
+def rounded(values: Array) -> Array:
     """
     Return the 15-digit decimal next to each value where rounding cannot tell the two apart.
 

@@ -1,15 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Any input file -> graph, and a graph -> any output file; nothing is solved here."""
+"""
+Any input file -> graph, and a graph -> any output file; nothing is solved here.
 
+In the end `l1slam_ros.read_graph` and `write_graph`.
+"""
+
+import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from l1slam_ros.core.errors import FileError, GraphError
+import numpy as np
+
+from l1slam_ros.core.errors import FileError, GraphError, OptionError
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.names import QUATERNION
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.names import QUATERNION, ROTATION_INFORMATION
 from l1slam_ros.core.robust.inspection import initial_poses
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES, DEFAULT_TOPICS, Topics
 from l1slam_ros.io.files import require_folder
@@ -22,10 +31,9 @@ if TYPE_CHECKING:
 GRAPH_SUFFIXES = ('.g2o', '.graph')
 
 
-def read_input(
-    path: Path, options: 'GraphBuilderOptions | None' = None, topics: Topics = DEFAULT_TOPICS,
-    rotation_information: str = QUATERNION, dimension: int = 2,
-) -> GraphRecord:
+def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
+               topics: Topics = DEFAULT_TOPICS, rotation_information: str = QUATERNION,
+               dimension: int = 2) -> GraphRecord:
     """
     Read a graph file or grow a graph from a bag.
 
@@ -90,13 +98,17 @@ def stamps_of(record: GraphRecord) -> Indices:
 
 
 def check_output(path: Path) -> None:
-    """Refuse, before any work is done, an output whose suffix names no format."""
+    """Refuse, before any work is done, an output that could not be written in the end."""
     if path.suffix not in (*GRAPH_SUFFIXES, '.tum', ''):
         raise FileError(path, f'unknown suffix; expected {", ".join(GRAPH_SUFFIXES)}, .tum, or '
                         'none for a bag directory')
     require_folder(path)
     if path.suffix and path.is_dir():
         raise FileError(path, 'cannot be written: it is a directory')
+    if not path.suffix:
+        from l1slam_ros.io.bags.writer import refuse_other_than_bag
+
+        refuse_other_than_bag(path)
 
 
 def check_graph_output(path: Path) -> None:
@@ -128,3 +140,62 @@ def write_output(path: Path, record: GraphRecord, truth: Array | None = None) ->
         from l1slam_ros.io.bags.from_graph import write_graph_bag
 
         write_graph_bag(path, record, truth)
+
+
+def read_graph(path: str | os.PathLike[str], *,
+               rotation_information: str = QUATERNION) -> tuple[FactorGraph, Array | None]:
+    """
+    Return the graph in a file, and the poses (n, p) that it stores, None where none.
+
+    Poses are x y theta [m, rad] in the plane, x y z qx qy qz qw in space.
+
+    Keyframes are numbered from 0, in the order of the file's vertex ids. What was skipped, or lost
+    where a bag is damaged, is warned of.
+
+    Parameters
+    ----------
+    path : .g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1
+    rotation_information : what the rotation block of the information in a 3D g2o file is of,
+        `quaternion`, its vector part, as g2o has it, or `angle`
+
+    Raises
+    ------
+    FileError : naming file and line, what was found and what was expected.
+
+    """
+    _check_reading(rotation_information)
+    record = read_input(Path(path), rotation_information=rotation_information)
+    for sentence in filter(None, (*record.skipped, record.damage)):
+        warnings.warn(sentence, stacklevel=2)
+    return record.graph, record.poses
+
+
+def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, *,
+                rotation_information: str = QUATERNION) -> None:
+    """
+    Write a graph with poses (n, p), whole or not at all.
+
+    Parameters
+    ----------
+    path : .g2o, .graph, .tum (the poses alone), or a name without a suffix for a bag directory
+    rotation_information : see `read_graph`
+
+    Raises
+    ------
+    FileError : it cannot be written, or the format has no place for a part of the graph.
+    GraphError : poses of another shape.
+
+    """
+    _check_reading(rotation_information)
+    expected = (graph.n_poses, graph.manifold.POSE_SIZE)
+    if np.shape(poses) != expected:
+        raise GraphError(f'poses have the shape {np.shape(poses)}, expected {expected}')
+    write_output(Path(path), GraphRecord(
+        graph, np.asarray(poses, float), np.arange(graph.n_poses),
+        rotation_information=rotation_information))
+
+
+def _check_reading(rotation_information: str) -> None:
+    if rotation_information not in ROTATION_INFORMATION:
+        raise OptionError(f'rotation_information is {rotation_information!r}, expected one of '
+                          f'{", ".join(ROTATION_INFORMATION)}')

@@ -46,6 +46,16 @@ class NodeOptions(BackendOptions):
     load_on_start: bool = option(False, 'load the map of save_path at start', fixed=True)
     update: UpdateOptions = UpdateOptions()
 
+    def __post_init__(self) -> None:
+        """Check every field, and those that only make sense together."""
+        super().__post_init__()
+        frames = self.map_frame, self.odom_frame
+        if '' in frames or frames[0] == frames[1]:
+            raise OptionError(f'map_frame is {frames[0]!r} and odom_frame {frames[1]!r}, expected '
+                              'two names that differ')
+        if self.save_path and not self.save_path.endswith('.g2o'):
+            raise OptionError(f'save_path is {self.save_path!r}, expected the name of a .g2o file')
+
 
 def read_params_file(path: Path) -> NodeOptions:
     """

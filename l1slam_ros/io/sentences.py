@@ -33,8 +33,7 @@ _NOISE = (
     'the odometry is about {times:.1f} times as noisy as it says: loops far apart in time are '
     'judged by little',
     'the loops are about {times:.1f} times as noisy as they say: a false one that is little off '
-    'passes for noise',
-)
+    'passes for noise')
 
 # By the kind of a doubt.
 _REASONS = {
@@ -43,8 +42,8 @@ _REASONS = {
     ONE_PLACE: 'all {loops} loops that are used are of one place, {where}, and may be one mistake',
     OTHER_MAP: '{loops} refused loops of several places agree with each other on another map, '
                '{where}',
-    SLIP: 'the odometry may have slipped, as {loops} loops say {where}, but as many speak '
-          'against it',
+    SLIP: 'whether the odometry slipped or not {where}, the {loops} loops across that are used '
+          'do not say for sure',
 }
 _REMEDY = 'Vouch for a loop that is right, strike out one that is false, or state the noise'
 

@@ -50,9 +50,8 @@ def invented_stamps(n: int) -> Indices:
     return 1000 * NANOSECONDS + np.arange(n, dtype=np.int64) * (NANOSECONDS // 10)
 
 
-def write_tum(
-    path: str | os.PathLike[str], stamps: Indices, poses: Array, manifold: Manifold
-) -> None:
+def write_tum(path: str | os.PathLike[str], stamps: Indices, poses: Array,
+              manifold: Manifold) -> None:
     """
     Write a TUM file: stamps (n,) [ns], poses (n, p).
 
@@ -79,9 +78,8 @@ def write_truth(path: str | os.PathLike[str], ids: Indices, poses: Array) -> Non
                        for k, row in zip(ids.tolist(), poses.tolist(), strict=True)))
 
 
-def read_reference(
-    path: str | os.PathLike[str], manifold: Manifold = se2, by_stamps: bool = False
-) -> Reference:
+def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2,
+                   by_stamps: bool = False) -> Reference:
     """
     Read reference poses: TUM, a graph file's vertices, `id x y theta`, or `stamp, x, y, theta`.
 
@@ -98,7 +96,8 @@ def read_reference(
     lines = read_lines(path)
     if not lines.texts:
         raise FileError(path, 'the file is empty; expected reference poses')
-    number, is_csv, in_words = lines.numbers[0], ',' in lines.texts[0], _in_words(lines.texts[0])
+    number, first = lines.numbers[0], lines.texts[0].strip()
+    is_csv, in_words = ',' in first, first[0].isalpha()
     if is_csv:
         lines = TextLines(lines.numbers[in_words:],
                           [text.replace(',', ' ') for text in lines.texts[in_words:]])
@@ -122,12 +121,7 @@ def read_reference(
                     f'{others.format(1 + manifold.POSE_SIZE)}', number)
 
 
-def _in_words(text: str) -> bool:
-    return text.strip()[0].isalpha()
-
-
-def _read_vertices(path: str | os.PathLike[str], manifold: Manifold,
-                   by_stamps: bool) -> Reference:
+def _read_vertices(path: str | os.PathLike[str], manifold: Manifold, by_stamps: bool) -> Reference:
     ids, poses, stamps = read_vertices(path, manifold)
     if stamps is None or not by_stamps:
         return Reference(ids, poses, stamped=False)
@@ -136,18 +130,15 @@ def _read_vertices(path: str | os.PathLike[str], manifold: Manifold,
 
 
 def _whole_stamps(path: object, lines: TextLines) -> TextLines:
-    return TextLines(lines.numbers, [
-        _whole_stamp(path, number, text)
-        for number, text in zip(lines.numbers, lines.texts, strict=True)])
-
-
-def _whole_stamp(path: object, number: int, text: str) -> str:
-    """Return the line with its stamp in nanoseconds: a float would lose the last digits."""
-    stamp, *rest = text.split(None, 1)
-    try:
-        return f'{stamp_from_text(stamp)} {rest[0] if rest else ""}'
-    except ValueError as error:
-        raise FileError(path, f'stamp {quoted(stamp)}; expected seconds', number) from error
+    """Return the lines with their stamps in nanoseconds: floats would lose the last digits."""
+    texts = []
+    for number, text in zip(lines.numbers, lines.texts, strict=True):
+        stamp, *rest = text.split(None, 1)
+        try:
+            texts.append(' '.join([str(stamp_from_text(stamp)), *rest]))
+        except ValueError as error:
+            raise FileError(path, f'stamp {quoted(stamp)}; expected seconds', number) from error
+    return TextLines(lines.numbers, texts)
 
 
 def _sorted(path: object, lines: TextLines, keys: Indices, poses: Array, *,

@@ -3,8 +3,9 @@
 The paper's experiments: its algorithms as printed, beside those this package uses.
 
 In: a graph, where to start, and its seed. Out: the costs of Table I, the seconds per iteration of
-Table II and the curves of Figure 2, as numbers. *As printed* means Algorithm 2 without a primal
-weight, and in Algorithm 4 the full step, with a dual that restarts from zero.
+Table II and the curves of Figure 2, as numbers; and L-infinity, which the paper left for later.
+*As printed* means Algorithm 2 without a primal weight, and in Algorithm 4 the full step, with a
+dual that restarts from zero.
 """
 
 import time
@@ -27,7 +28,7 @@ from l1slam_ros.core.graph.linear_system import (
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
-from l1slam_ros.core.solvers.optimality import l1_cost
+from l1slam_ros.core.solvers.optimality import Largest, l1_cost, l2_cost
 from l1slam_ros.core.solvers.primal_dual import (
     CHECK_EVERY,
     PrimalDualOptions,
@@ -53,6 +54,8 @@ _SETTLED_STEPS, _SETTLED = 5, 1e-4
 _MOST_PASSES = 1.5e9
 # Gauss-Newton is timed over so many steps; from the seed it needs about as many.
 _TIMED_L2_STEPS = 3
+# Linearisations for L-infinity: from the L2 map its problem hardly changes.
+_LARGEST_STEPS = 3
 
 
 @dataclass(frozen=True)
@@ -103,12 +106,10 @@ class Seconds:
     l2: float
 
 
-def measure_costs(
-    graph: FactorGraph, start: Array, seed: Array, effort: Effort, report: Report
-) -> Costs:
+def measure_costs(graph: FactorGraph, start: Array, seed: Array, effort: Effort,
+                  report: Report) -> Costs:
     """Return what the solvers make of a graph from its seed; start, seed : (n, p) poses."""
-    solution, solver = minimise_by(choose(AUTO, graph), graph, seed, OptimiserOptions(),
-                                   report)
+    solution, solver = minimise_by(choose(AUTO, graph), graph, seed, OptimiserOptions(), report)
     most = max(1, int(_MOST_PASSES / (effort.inner * max(len(graph.between), 1))))
     bearable = replace(effort, outer=min(effort.outer, most))
     printed = printed_costs(graph, seed, bearable, report)
@@ -118,10 +119,8 @@ def measure_costs(
                  cut_short, solution, solver)
 
 
-def printed_costs(
-    graph: FactorGraph, poses: Array, effort: Effort,
-    report: Report = lambda outer, cost: None,
-) -> Array:
+def printed_costs(graph: FactorGraph, poses: Array, effort: Effort,
+                  report: Report = lambda outer, cost: None) -> Array:
     """Return the cost of the poses, then after each step of Algorithm 4 as printed, (k,)."""
     costs = np.array([_cost(graph, poses)])
     for outer in range(effort.outer):
@@ -153,8 +152,7 @@ def measure_seconds(graph: FactorGraph, seed: Array, effort: Effort) -> Seconds:
     systems = (rotation_system(graph, seed), translation_system(graph, seed),
                linearise(graph, seed))
     methods = {name: [_median(partial(timed, system, effort.timed)) / effort.timed
-                      for system in systems]
-               for name, timed in TIMED.items()}
+                      for system in systems] for name, timed in TIMED.items()}
     return Seconds(methods, _median(partial(_l2_seconds, graph, seed, cholesky_of(graph))))
 
 
@@ -188,15 +186,12 @@ def _l2_seconds(graph: FactorGraph, seed: Array, cholesky: BlockCholesky) -> flo
 
 
 # From a system and a number of iterations to the seconds they take, set-up not counted.
-TIMED: dict[str, Callable[[LinearSystem, int], float]] = {
-    'plain': _plain_seconds,
-    'fused': _fused_seconds,
-}
+TIMED: dict[str, Callable[[LinearSystem, int], float]] = {'plain': _plain_seconds,
+                                                          'fused': _fused_seconds}
 
 
-def measure_convergence(
-    graph: FactorGraph, start: Array, seed: Array, iterations: int
-) -> dict[str, dict[str, Array]]:
+def measure_convergence(graph: FactorGraph, start: Array, seed: Array,
+                        iterations: int) -> dict[str, dict[str, Array]]:
     """
     Return how the cost falls on the two problems of Algorithm 3, by every method.
 
@@ -214,9 +209,8 @@ def measure_convergence(
             'translation': _histories(translation, moved, cholesky, iterations)}
 
 
-def _histories(
-    system: LinearSystem, x: Array, cholesky: BlockCholesky, iterations: int
-) -> dict[str, Array]:
+def _histories(system: LinearSystem, x: Array, cholesky: BlockCholesky,
+               iterations: int) -> dict[str, Array]:
     """Return what becomes of x (columns,) by every method; one of them starts elsewhere."""
     A, b = system.A, system.b
     options = PrimalDualOptions(iterations=iterations, tolerance=0.0)
@@ -240,6 +234,26 @@ def _printed_history(system: LinearSystem, x: Array, iterations: int) -> Array:
 
 def _cost(graph: FactorGraph, poses: Array) -> float:
     return l1_cost(whitened_residual(graph, poses))
+
+
+def measure_largest(graph: FactorGraph, start: Array, effort: Effort) -> dict[str, Array]:
+    """
+    Return of the maps of L-infinity, L2 and L1 the largest residual [sigmas], L1 cost and chi2.
+
+    That of L-infinity from the L2 map on, by Algorithm 2 with the resolvent of that norm, its dual
+    kept from one linearisation to the next. start : (n, p)
+    """
+    l2 = minimise_l2(graph, start, LeastSquaresOptions(), cholesky_of(graph)).poses
+    l1 = minimise_by(choose(AUTO, graph), graph, l2, OptimiserOptions())[0].poses
+    norm, poses = Largest(len(whitened_residual(graph, l2))), l2
+    y, options = np.zeros(norm.size), PrimalDualOptions(effort.iterations, _SETTLED)
+    for _ in range(_LARGEST_STEPS):
+        system = linearise(graph, poses)
+        found = minimise_l1(system.A, system.b, np.zeros(system.A.shape[1]), y, options, norm=norm)
+        poses, y = step_poses(graph, poses, found.x), found.y
+    rows = {name: whitened_residual(graph, found)
+            for name, found in (('L-infinity', poses), ('L2', l2), ('L1', l1))}
+    return {name: np.array([norm.cost(r), l1_cost(r), l2_cost(r)]) for name, r in rows.items()}
 
 
 def _last(iterates: Iterator[tuple[Array, Array]], count: int) -> tuple[Array, Array]:

@@ -89,8 +89,7 @@ def figure_4(results: Results, folder: Path) -> list[str]:
               ('Seed, then L1', 'optimised'): runs.from_seed[L1]}
     plot_maps(folder / 'figure_4.png', [
         MapDrawing(title, shown.positions, loops=runs.loops, name=word,
-                   note=f'L1 cost {shown.cost:.6g}')
-        for (title, word), shown in panels.items()])
+                   note=f'L1 cost {shown.cost:.6g}') for (title, word), shown in panels.items()])
     return [_STARTS, '', '![a noisy start, and the maps made of it](figure_4.png)', '',
             *table_of_starts(runs)]
 
@@ -147,8 +146,7 @@ def _false_loop_panels(name: str, runs: LoopRuns) -> list[MapDrawing]:
     shown, lost = first.maps[ROBUST], (loops[:, None] == first.lost).all(axis=2).any(axis=1)
     return [*drawings, MapDrawing(
         'l1slam solve', shown.positions, loops=loops[~lost], false=first.kept,
-        rejected=np.concatenate((first.refused, first.lost)),
-        note=f'{metres(shown.error)} off')]
+        rejected=np.concatenate((first.refused, first.lost)), note=f'{metres(shown.error)} off')]
 
 
 def best_huber(runs: LoopRuns) -> str:

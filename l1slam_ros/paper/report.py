@@ -15,7 +15,7 @@ import scipy
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.io.plot import MapDrawing
 from l1slam_ros.paper.experiments import PROBLEMS, Costs, Seconds
-from l1slam_ros.paper.printed import PaperGraph
+from l1slam_ros.paper.printed import NOISY, PaperGraph
 from l1slam_ros.paper.runs import LoopRuns, StartRuns
 
 WORLD_SEED = 0
@@ -28,6 +28,8 @@ _COSTS = ("A graph is the paper's own where the costs of both starts agree. (*) 
           f"the paper's size (seed {WORLD_SEED}). (+) ended before it had settled: too large.")
 _SECONDS = ('Of the processor; the paper ran C++ on an Intel i7 at 2.9 GHz. *Plain* is Algorithm '
             '2 as printed, in SciPy; *fused* the compiled form that this package uses.')
+_LARGEST = ('Algorithm 2 with the projection onto the L1 ball as the resolvent of the dual, from '
+            'the L2 map. The worst factor is all that this norm sees.')
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Results:
 
     missing : graphs of the paper that were not run; convergence : of Figure 2, problem -> method
     -> (k, 2) rows (iteration, cost), empty where its graph was not run; starts : of Figure 4;
-    false_loops : of Figure 6, by the name of the graph.
+    false_loops : of Figure 6, by the name of the graph; largest : see `measure_largest`.
     """
 
     graphs: Sequence[GraphResult]
@@ -67,6 +69,7 @@ class Results:
     convergence: dict[str, dict[str, Array]] = field(default_factory=dict)
     starts: StartRuns | None = None
     false_loops: dict[str, LoopRuns] = field(default_factory=dict)
+    largest: dict[str, Array] = field(default_factory=dict)
 
 
 def head(results: Results) -> list[str]:
@@ -99,8 +102,7 @@ def table_1(results: Results) -> list[str]:
              cost(r.costs.seed), cost(r.paper.final),
              cost(r.costs.printed[-1]) + (' (+)' if r.costs.cut_short else ''),
              f'**{cost(r.costs.solution.cost)}**', r.costs.solver, cost(r.costs.l2),
-             '' if r.truth_cost is None else cost(r.truth_cost)]
-            for r in results.graphs]
+             '' if r.truth_cost is None else cost(r.truth_cost)] for r in results.graphs]
     return [*table(header, rows), '', _COSTS]
 
 
@@ -117,6 +119,15 @@ def table_2(results: Results) -> list[str]:
             times += [r.paper.seconds[k], *(r.seconds.methods[m][k] for m in methods)]
         rows.append([r.title, *map(milliseconds, [*times, r.paper.l2_seconds, r.seconds.l2])])
     return [*table([*header, 'L2: paper (g2o)', 'L2: ours'], rows), '', _SECONDS]
+
+
+def future_work(results: Results) -> list[str]:
+    """Return what the paper left for later: the map of the smallest largest residual."""
+    if not results.largest:
+        return [f'It is of {NOISY.name}, which was not run.']
+    rows = [[name, *map(cost, values)] for name, values in results.largest.items()]
+    return [*table([f'{NOISY.name}: the map of', 'largest residual [sigmas]', 'L1 cost', 'chi2'],
+                   rows), '', _LARGEST]
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> list[str]:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -23,12 +22,11 @@ from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io import formats
-from l1slam_ros.io.compilation import compile_now
-from l1slam_ros.io.files import put_lines, require_folder
+from l1slam_ros.io.compilation import STEPS, compile_now
+from l1slam_ros.io.files import new_folder_beside, put_lines, reported, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.plot import MapDrawing
 from l1slam_ros.io.progress import Progress
-from l1slam_ros.io.warm_up import STEPS
 from l1slam_ros.paper import figures, report
 from l1slam_ros.paper import printed as paper
 from l1slam_ros.paper.experiments import (
@@ -36,6 +34,7 @@ from l1slam_ros.paper.experiments import (
     Effort,
     measure_convergence,
     measure_costs,
+    measure_largest,
     measure_seconds,
 )
 from l1slam_ros.paper.printed import PaperGraph
@@ -51,9 +50,8 @@ from l1slam_ros.paper.runs import (
 REPORT = 'report.md'
 
 
-def reproduce(
-    datasets: Path | None, worlds: Sequence[PaperGraph], output: Path, effort: Effort
-) -> None:
+def reproduce(datasets: Path | None, worlds: Sequence[PaperGraph], output: Path,
+              effort: Effort) -> None:
     """
     Run the experiments and write the report into the folder `output`, whole or not at all.
 
@@ -108,9 +106,7 @@ def _read(path: Path) -> GraphRecord:
     return record
 
 
-def run(
-    records: dict[str, GraphRecord], worlds: Sequence[PaperGraph], effort: Effort
-) -> Results:
+def run(records: dict[str, GraphRecord], worlds: Sequence[PaperGraph], effort: Effort) -> Results:
     """Measure every graph, in the order of the paper; records as of `read_datasets`."""
     simulated = {world.name: world for world in worlds}
     graphs, convergence, missing = [], {}, []
@@ -126,7 +122,7 @@ def run(
         else:
             missing.append(graph)
     return Results(graphs, missing, convergence, _run_starts(records, effort),
-                   _run_false_loops(records, effort))
+                   _run_false_loops(records, effort), _run_largest(records, effort))
 
 
 def _say(work: str) -> None:
@@ -158,14 +154,21 @@ def _run_false_loops(records: dict[str, GraphRecord], effort: Effort) -> dict[st
     return runs
 
 
+def _run_largest(records: dict[str, GraphRecord], effort: Effort) -> dict[str, Array]:
+    record = records.get(paper.NOISY.name)
+    if record is None:
+        return {}
+    _say(f'{paper.NOISY.name} in L-infinity')
+    return measure_largest(record.graph, formats.stored_poses(record), effort)
+
+
 def _run_record(graph: PaperGraph, record: GraphRecord, effort: Effort) -> GraphResult:
     seed = seed_poses(record.graph, cholesky_of(record.graph))
     return _measured(graph, record.graph, formats.stored_poses(record), seed, effort)
 
 
-def _run_world(
-    graph: PaperGraph, effort: Effort
-) -> tuple[GraphResult, dict[str, dict[str, Array]]]:
+def _run_world(graph: PaperGraph,
+               effort: Effort) -> tuple[GraphResult, dict[str, dict[str, Array]]]:
     """Return what a world of the graph's size gives, with the curves if they are shown of it."""
     world = simulate_world(graph.poses, graph.edges, WorldOptions(),
                            np.random.default_rng(WORLD_SEED))
@@ -178,12 +181,9 @@ def _run_world(
     return result, {**curves, 'global': _global_curves(result.costs)}
 
 
-def _measured(
-    paper_graph: PaperGraph, graph: FactorGraph, start: Array, seed: Array, effort: Effort,
-    truth_cost: float | None = None,
-) -> GraphResult:
-    steps = (OptimiserOptions().outer_iterations + effort.outer
-             + LeastSquaresOptions().iterations)
+def _measured(paper_graph: PaperGraph, graph: FactorGraph, start: Array, seed: Array,
+              effort: Effort, truth_cost: float | None = None) -> GraphResult:
+    steps = (OptimiserOptions().outer_iterations + effort.outer + LeastSquaresOptions().iterations)
     with Progress(steps, 'step') as progress:
         costs = measure_costs(graph, start, seed, effort, progress.report)
     seconds = measure_seconds(graph, seed, effort)
@@ -208,11 +208,9 @@ def _global_curves(costs: Costs) -> dict[str, Array]:
 SECTIONS: dict[str, Callable[[Results, Path], list[str]]] = {
     'Table I: the cost': lambda results, _: report.table_1(results),
     'Table II: the time per iteration': lambda results, _: report.table_2(results),
-    'Figure 2: cost against iterations': figures.figure_2,
-    'Figure 3: the maps': figures.figure_3,
+    'Figure 2: cost against iterations': figures.figure_2, 'Figure 3: the maps': figures.figure_3,
     'Figure 4: a start that is mostly noise': figures.figure_4,
-    'Figure 6: loops that lie': figures.figure_6,
-}
+    'Figure 6: loops that lie': figures.figure_6}
 
 
 def _check_folder(output: Path) -> None:
@@ -225,14 +223,9 @@ def _check_folder(output: Path) -> None:
 @contextmanager
 def _filling(output: Path) -> Iterator[Path]:
     """Yield a new folder, whose files go into the folder `output` when the block succeeds."""
-    try:
-        with TemporaryDirectory('.tmp', f'.{output.name}.', output.absolute().parent,
-                                ignore_cleanup_errors=True) as scratch:
-            made = Path(scratch)
-            yield made
-            output.mkdir(exist_ok=True)
-            # The report last: it names the others.
-            for file in sorted(made.iterdir(), key=lambda file: file.name == REPORT):
-                os.replace(file, output / file.name)
-    except OSError as error:
-        raise FileError(output, f'cannot be written: {error.strerror or error}') from error
+    with reported(output), new_folder_beside(output) as made:
+        yield made
+        output.mkdir(exist_ok=True)
+        # The report last: it names the others.
+        for file in sorted(made.iterdir(), key=lambda file: file.name == REPORT):
+            os.replace(file, output / file.name)

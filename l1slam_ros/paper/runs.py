@@ -17,7 +17,7 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import pair_key
-from l1slam_ros.core.robust.robust_map import minimise_robustly
+from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_huber, minimise_l2
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Solution
@@ -99,10 +99,9 @@ class LoopRuns:
     bent: float
 
 
-def run_noisy_starts(
-    graph: FactorGraph, stored: Array, effort: Effort, printed: Effort,
-    rng: np.random.Generator, advance: Callable[[], None] = lambda: None,
-) -> StartRuns:
+def run_noisy_starts(graph: FactorGraph, stored: Array, effort: Effort, printed: Effort,
+                     rng: np.random.Generator,
+                     advance: Callable[[], None] = lambda: None) -> StartRuns:
     """
     Return what comes of the stored poses (n, p) under every noise, as often as `effort` says.
 
@@ -125,18 +124,15 @@ def run_noisy_starts(
                      _loops(graph), _bent(graph, ours))
 
 
-def with_noise(
-    graph: FactorGraph, poses: Array, sigma: float, rng: np.random.Generator
-) -> Array:
+def with_noise(graph: FactorGraph, poses: Array, sigma: float, rng: np.random.Generator) -> Array:
     """Return the poses (n, p), each moved at random by sigma [m] and [rad] in its own axes."""
     size = graph.manifold.TANGENT_SIZE
     return graph.manifold.retract(poses, sigma * rng.standard_normal((len(poses), size)))
 
 
-def run_false_loops(
-    graph: FactorGraph, stored: Array, count: int, effort: Effort,
-    rng: np.random.Generator, advance: Callable[[], None] = lambda: None,
-) -> LoopRuns:
+def run_false_loops(graph: FactorGraph, stored: Array, count: int, effort: Effort,
+                    rng: np.random.Generator,
+                    advance: Callable[[], None] = lambda: None) -> LoopRuns:
     """
     Return what comes of `count` loops between far poses that measure no motion at all.
 
@@ -175,9 +171,8 @@ def _poses(graph: FactorGraph, stored: Array) -> tuple[dict[str, Array], Mask]:
     """Return the poses by every method, and which factors the robust one accepted."""
     cholesky = cholesky_of(graph)
     seed, robust = seed_poses(graph, cholesky), minimise_robustly(graph, _minimise_l1)
-    hubers = {name: minimise_huber(
-        graph, stored, LeastSquaresOptions(huber_delta=width), cholesky).poses
-        for name, width in HUBERS.items()}
+    hubers = {name: minimise_huber(graph, stored, LeastSquaresOptions(huber_delta=width),
+                                   cholesky).poses for name, width in HUBERS.items()}
     return {SEED: seed, JOINT: _minimise_l1(graph, seed).poses, **hubers,
             ROBUST: robust.solution.poses}, robust.judgement.accepted
 

@@ -33,8 +33,8 @@ from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, aligned_positions
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.io.bags.to_graph import read_truth_topic
 from l1slam_ros.io.bags.topics import TRUTH_TOPIC
-from l1slam_ros.io.bags.truth_topic import read_truth_topic
 from l1slam_ros.io.files import stamp_from_text
 from l1slam_ros.io.formats import read_input, stamps_of
 from l1slam_ros.io.graphs.side_files import false_loops_path, read_false_loops

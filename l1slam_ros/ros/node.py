@@ -2,41 +2,32 @@
 """
 `backend`: the node. Odometry and loop closures in, the optimised Path out; no arithmetic.
 
-Callbacks convert a message and append it to the back end; none of it is compiled code. A timer
-wakes the solver's thread, which improves the map and publishes it; another thread carries out what
-services ask for. See `core.online.backend` for why none waits for the other.
+One thread takes messages in and answers with poses, one improves the map and publishes it, one
+carries out what services ask for, and saves. See `core.online.backend` for why none waits for the
+other.
 """
 
+import math
 import time
 from collections import Counter
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Path
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from l1slam_ros.core.errors import L1SlamError, MessageError
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.marginal import newest_covariance
 from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.graphs.map_file import MapFile
-from l1slam_ros.io.messages import cdr
-from l1slam_ros.io.messages.base_frame import BaseFrame
-from l1slam_ros.io.messages.conversion import (
-    absolute_pose,
-    false_loop,
-    loop_closure,
-    odometry_sample,
-)
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.diagnostics import Diagnosis
+from l1slam_ros.ros.inputs.inputs import Inputs
+from l1slam_ros.ros.inputs.intake import Intake
 from l1slam_ros.ros.loop_status import LoopStatus
 from l1slam_ros.ros.markers import GraphMarkers
 from l1slam_ros.ros.parameters import NodeParameters
@@ -45,12 +36,8 @@ from l1slam_ros.ros.services import MapServices
 from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.orders import Orders
 from l1slam_ros.ros.threads.solver_thread import SolverThread
-from l1slam_ros.ros.traffic import Traffic
 from l1slam_ros.ros.transform import MapToOdom
 
-_DEPTH = 1000
-# Messages of one topic at most before other callbacks have their turn.
-_AT_ONCE = 100
 _REPEAT_WARNING = 5.0  # [s]
 # [s] The end of the node waits so much longer for a map that is being saved.
 _SAVING = 4.0
@@ -83,49 +70,49 @@ class BackendNode(LifecycleNode):
         options = self.options
         self._backend = Backend(options, options.dimension)
         self._manifold = self._backend.manifold
-        self._base_frame = BaseFrame(options.base_frame)
-        self._refused: Counter[str] = Counter()
-        self._active = False
         self._told_map, self._told_version = 0, self._backend.version
         self.failures = Failures(self.get_logger(), self.context.ok)
         self._solver = SolverThread(self._backend, self.failures, self.get_logger(),
-                                    lambda: self.options.update.budget, self._tell)
+                                    lambda: self.options.update, self._tell)
         self._orders = Orders(self, self.failures, self._solver.hurry)
         self._make_publishers()
         self._map_file = MapFile(self._backend, lambda: self.options, self.get_logger().warning)
         if options.load_on_start:
             self.get_logger().info(self._map_file.load_at_start())
-        self._topics: dict[str, Traffic] = {}
-        self._make_subscriptions()
-        self._diagnosis = Diagnosis(self, self._topics, self._solver, self.failures)
+        self._intake = Intake(
+            self, self.failures,
+            lambda: self._transform.tick() if self._inputs.active else math.inf)
+        self._inputs = Inputs(
+            self._intake, self._backend, options, self._on_moved, self.get_logger())
+        self._diagnosis = Diagnosis(self, self._intake.topics, self._solver, self.failures)
         self._map_services = MapServices(
             self, self._backend, self._orders, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
+        guarded = self.failures.guarded
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
                           on_clock_change=False),
-            post_callback=self.failures.guarded('time jump', self._on_time_jump))
-        guarded = self.failures.guarded
+            post_callback=guarded('time jump', self._on_time_jump))
         # By a clock that goes on where simulated time stands still, or a bag has ended.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(options.update.period, guarded('timer', self._on_timer), clock=steady)
-        self._transform_timer = self.create_timer(
-            options.transform_period, guarded('transform', self._on_transform), clock=steady)
-        self.create_timer(1.0, guarded('diagnostics', self._on_second), clock=steady)
+        self.create_timer(1.0, guarded('diagnostics', self._on_second),
+                          clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._tell(None)  # a map may have been loaded
+        self._orders.start(self._map_services.autosave)
         self._solver.start()
+        self._intake.start()
         if options.autostart:
             self.trigger_configure()
             self.trigger_activate()
 
     def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Use messages from now on."""
-        self._active = True
+        self._inputs.active = True
+        self._intake.wake()
         return TransitionCallbackReturn.SUCCESS
 
     def on_deactivate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Leave messages alone, and the map as it is."""
-        self._active = False
+        self._inputs.active = False
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
@@ -142,8 +129,9 @@ class BackendNode(LifecycleNode):
         """End the threads and the node; return whether they ended within some seconds."""
         deadline = time.monotonic() + seconds
         self._solver.close(0.0)  # what it works at for an order stops
-        self._map_services.autosave(at_end=True)
-        ended = self._orders.close(seconds) or (
+        ended = self._intake.close(seconds)
+        self._map_services.save_at_end()
+        ended &= self._orders.close(seconds) or (
             self._map_file.is_saving and self._orders.close(_SAVING))
         ended &= self._solver.close(max(deadline - time.monotonic(), 0.0))
         if ended:
@@ -163,44 +151,8 @@ class BackendNode(LifecycleNode):
         self._covariance = self.create_publisher(
             PoseWithCovarianceStamped, 'pose_with_covariance', 10)
         self._markers = GraphMarkers(self)
-        self._transform = MapToOdom(self, self._backend, self.options.publish_tf)
+        self._transform = MapToOdom(self, self._backend, lambda: self.options)
         self._loop_status = LoopStatus(self)
-
-    def _make_subscriptions(self) -> None:
-        for kind, topic, callback in (
-            (Odometry, 'odom', self._on_odometry),
-            (PoseWithCovarianceStamped, 'loop_closures', self._on_loop),
-            (PoseWithCovarianceStamped, 'trusted_loop_closures', self._on_trusted_loop),
-            (PoseWithCovarianceStamped, 'false_loop_closures', self._on_false_loop),
-            (PoseWithCovarianceStamped, 'absolute_poses', self._on_absolute_pose),
-        ):
-            self._subscribe(kind, topic, callback)
-
-    def _subscribe(self, kind: Any, topic: str, callback: Callable[[Any], None]) -> None:
-        guarded = self.failures.guarded(topic, callback)
-        raw = kind is Odometry
-
-        def use(message: Any) -> None:
-            if self._active:
-                guarded(message)
-
-        def received(message: Any, information: Any) -> None:
-            traffic.note(information)
-            use(message)
-            # What has queued up is taken at once: a round of the executor costs more than a
-            # message, and at the rate of some odometry, messages would be lost meanwhile.
-            with subscription.handle:
-                for _ in range(_AT_ONCE):
-                    taken = subscription.handle.take_message(kind, raw)
-                    if taken is None:
-                        break
-                    traffic.note(taken[1])
-                    use(taken[0])
-
-        subscription = self.create_subscription(
-            kind, topic, received, QoSProfile(depth=_DEPTH), raw=raw,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
-        traffic = self._topics[topic] = Traffic(subscription.get_publisher_count)
 
     def _on_options(self, options: NodeOptions) -> None:
         self._backend.set_options(options)
@@ -211,73 +163,20 @@ class BackendNode(LifecycleNode):
             self.get_logger().warning('the clock jumped back: the map begins anew')
             self._orders.place('time jump', self._map_services.reset)
 
-    def _on_odometry(self, data: bytes) -> None:
-        try:
-            message = cdr.odometry(data)
-            found = self._base_frame.take(message.child_frame_id, odometry_sample(message))
-        except L1SlamError as error:
-            self._refuse(error)
-            return
-        if found.anew:
-            self._backend.begin_anew()
-        for other in found.others:
-            self._refuse(other)
-        for sample in found.ours:
-            self._add_odometry(sample)
-
-    def _add_odometry(self, sample: OdometrySample) -> None:
-        if self._transform_timer.is_canceled():
-            self._transform_timer.reset()
-        try:
-            map_to_odom = self._backend.add_odometry(sample)
-        except L1SlamError as error:
-            self._refuse(error)
-            return
-        if map_to_odom is None:
-            return
-        manifold = self._manifold
-        pose = manifold.compose(map_to_odom, manifold.from_pose3(sample.pose3[None]))
-        self._pose.publish(pose_bytes(self.options.map_frame, sample.stamp,
-                                      manifold.to_pose3(pose)[0]))
-
-    def _on_loop(self, message: PoseWithCovarianceStamped) -> None:
-        self._add_loop(loop_closure, message, self._base_frame.name, False)
-
-    def _on_trusted_loop(self, message: PoseWithCovarianceStamped) -> None:
-        self._add_loop(loop_closure, message, self._base_frame.name, True)
-
-    def _on_false_loop(self, message: PoseWithCovarianceStamped) -> None:
-        self._add_loop(false_loop, message, self._base_frame.name)
-
-    def _on_absolute_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._add_loop(absolute_pose, message, self.options.map_frame)
-
-    def _add_loop(self, read: Callable[..., LoopClosure], *message: Any) -> None:
-        try:
-            loop = read(*message)
-        except L1SlamError as error:
-            self._refuse(error)
-            return
-        self._backend.add_loop(loop)
-
-    def _refuse(self, error: L1SlamError) -> None:
-        self._refused[error.cause if isinstance(error, MessageError) else 'unusable'] += 1
-        self.get_logger().warning(f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
-
-    def _on_timer(self) -> None:
-        self._solver.wake()
-        self._map_services.autosave()
-
-    def _on_transform(self) -> None:
-        # Until odometry comes there is nothing to say, and a timer at rest costs processor time.
-        if self._active and not self._transform.publish(self.options):
-            self._transform_timer.cancel()
+    def _on_moved(self) -> None:
+        robot, manifold = self._backend.robot(), self._manifold
+        if robot is not None:  # else the map has been emptied meanwhile
+            pose = manifold.compose(robot.map_to_odom, robot.odometry)
+            self._pose.publish(pose_bytes(
+                self.options.map_frame, robot.stamp, manifold.to_pose3(pose)[0]))
 
     def _on_second(self) -> None:
+        self._intake.look_at_events()
         for sentence in self._backend.news():
             self.get_logger().warning(sentence)
         counts, refused = self._backend.counts()
-        self._diagnosis.publish(counts, self._refused + Counter(refused), self._twins())
+        self._diagnosis.publish(
+            counts, self._inputs.refused.copy() + Counter(refused), self._twins())
 
     def _twins(self) -> str:
         """Return what is wrong where another node has this one's name; else nothing."""

@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from std_msgs.msg import Header
 
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
@@ -58,13 +58,17 @@ def pose_bytes(frame: str, stamp: int, pose3: Array) -> bytes:
     return b''.join((ENCAPSULATION, start, b'\0' * (-len(start) % 8), pose3.tobytes()))
 
 
-def transform_stamped(parent: str, child: str, stamp: int, pose3: Array) -> TransformStamped:
-    """Return the pose (7,) of the child frame in the parent frame as a transform."""
-    message = TransformStamped(header=header(parent, stamp), child_frame_id=child)
-    translation, rotation = message.transform.translation, message.transform.rotation
-    translation.x, translation.y, translation.z = pose3[:3].tolist()
-    rotation.x, rotation.y, rotation.z, rotation.w = pose3[3:].tolist()
-    return message
+def transform_bytes(parent: str, child: str, stamp: int, pose3: Array,
+                    in_sequence: bool = False) -> bytes:
+    """
+    Return a serialised geometry_msgs/TransformStamped: the pose (7,) of the child in the parent.
+
+    in_sequence : as the only one of a sequence, which is a tf2_msgs/TFMessage
+    """
+    start: bytes = struct.pack('<I', 1) if in_sequence else b''
+    start += header_bytes(parent, stamp)
+    start += b'\0' * (-len(start) % 4) + string_bytes(child)
+    return b''.join((ENCAPSULATION, start, b'\0' * (-len(start) % 8), pose3.tobytes()))
 
 
 def pose_with_covariance(frame: str, stamp: int, manifold: Manifold, pose: Array,

@@ -86,7 +86,11 @@ def main() -> None:
     from l1slam_ros.core.errors import L1SlamError
     from l1slam_ros.ros.node import BackendNode
 
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # arguments, or a file of parameters, that ROS cannot read
+        print(f'backend: {" ".join(str(error).split())}', file=sys.stderr)
+        leave(1)
     node, code = None, 0
     ending.orderly(rclpy.try_shutdown)
     try:

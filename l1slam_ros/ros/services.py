@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The services of the node, and what the thread of the orders does for each."""
 
+import time
 from collections.abc import Awaitable, Callable
 
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from l1slam_ros.core.errors import DoubtfulError, L1SlamError
+from l1slam_ros.core.errors import DoubtfulError
 from l1slam_ros.core.online.backend import Backend, Stopped
 from l1slam_ros.io.graphs.map_file import MapFile
 from l1slam_ros.io.sentences import doubt_sentence
@@ -37,8 +37,6 @@ class MapServices:
                  failures: Failures, pause: Callable[[bool], None], stopped: Stopped):
         self._backend, self._orders, self._map_file = backend, orders, map_file
         self._failures, self._pause, self._stopped = failures, pause, stopped
-        self._autosaving = Future()
-        self._autosaving.set_result(None)
         # A group of their own: a service that awaits its answer would block its whole group.
         group = ReentrantCallbackGroup()
         for name, work in (('optimize', self._optimise), ('reset', self.reset),
@@ -79,15 +77,22 @@ class MapServices:
         self._backend.reset()
         return 'the map is empty'
 
-    def autosave(self, at_end: bool = False) -> None:
-        """Let the map be saved if it is time, or the end; it is told if that fails."""
-        if at_end or (self._autosaving.done() and self._map_file.is_due):
-            self._autosaving = self._orders.place('the map file', self._autosave)
+    def autosave(self) -> float:
+        """Save the map if it is time; return after how long to ask again [s]."""
+        wait, began = self._map_file.seconds_left(), time.monotonic()
+        if wait > 0:
+            return wait
+        self._autosave()
+        return time.monotonic() - began  # no more than half of the time
+
+    def save_at_end(self) -> None:
+        """Let the map be saved if it has changed."""
+        self._orders.place('the map file', self._autosave)
 
     def _autosave(self) -> str:
         try:
             self._map_file.autosave()
-        except (L1SlamError, OSError) as error:
+        except Exception as error:
             self._failures.note('autosave', error)
         else:
             self._failures.over('autosave')

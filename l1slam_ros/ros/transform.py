@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """map -> odom: on `map_to_odom` always, on /tf where tf2_msgs is installed."""
 
+import math
+import time
+from collections.abc import Callable
+
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.io.node_options import NodeOptions
-from l1slam_ros.ros.publishing import transform_stamped
+from l1slam_ros.ros.publishing import transform_bytes
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -27,25 +31,38 @@ class MapToOdom:
     ----------
     node : to publish from
     backend : which knows where the robot is
-    on_tf : publish on /tf, too
+    options : returns those of the node as they are now
 
     """
 
-    def __init__(self, node: Node, backend: Backend, on_tf: bool):
-        self._backend = backend
+    def __init__(self, node: Node, backend: Backend, options: Callable[[], NodeOptions]):
+        self._backend, self._options = backend, options
         self._publisher = node.create_publisher(TransformStamped, 'map_to_odom', 10)
         self._tf = None
-        if on_tf and TFMessage is not None:
+        if options().publish_tf and TFMessage is not None:
             self._tf = node.create_publisher(TFMessage, '/tf', 100)
         self._newest = self._stamp = self._before = 0
+        self._due = 0.0
+        # The newest as a pose of the manifold, and as it is published.
+        self._last = (backend.manifold.identity(0),) * 2
 
     def forget(self) -> None:
         """Be silent until there is other odometry: its stamps so far are of another time."""
         self._before = self._newest
 
-    def publish(self, options: NodeOptions) -> bool:
+    def tick(self) -> float:
+        """Publish if it is time; return when to call again [s], infinity: with new odometry."""
+        left = self._due - time.monotonic()
+        if left > 0:
+            return left
+        if not self._publish():
+            return math.inf
+        self._due = max(self._due + self._options().transform_period, time.monotonic())
+        return self._due - time.monotonic()
+
+    def _publish(self) -> bool:
         """Publish the transform as it is now; return whether any odometry has come."""
-        robot = self._backend.robot()
+        robot, options = self._backend.robot(), self._options()
         if robot is None or robot.stamp == self._before:
             return False
         self._before = 0
@@ -55,10 +72,11 @@ class MapToOdom:
         # tf2 ignores a second transform of one time, and warns of it.
         self._stamp = max(robot.stamp + int(options.transform_tolerance * _SECOND),
                           self._stamp + 1)
-        transform = transform_stamped(
-            options.map_frame, options.odom_frame, self._stamp,
-            self._backend.manifold.to_pose3(robot.map_to_odom)[0])
-        self._publisher.publish(transform)
+        if robot.map_to_odom is not self._last[0]:
+            self._last = (robot.map_to_odom,
+                          self._backend.manifold.to_pose3(robot.map_to_odom)[0])
+        said = options.map_frame, options.odom_frame, self._stamp, self._last[1]
+        self._publisher.publish(transform_bytes(*said))
         if self._tf is not None:
-            self._tf.publish(TFMessage(transforms=[transform]))
+            self._tf.publish(transform_bytes(*said, in_sequence=True))
         return True

@@ -138,12 +138,12 @@ def test_a_topic_is_a_truth(tmp_path, kind):
     truth = read_truth(f'{tmp_path}/mocap:/robot/truth', record, Path('graph.g2o'))
     assert truth.rows.tolist() == np.flatnonzero(SCORED).tolist()
     assert position_error(record, poses, truth) < 5e-4
-    assert truth.skipped == (
-        f'1 message on /robot/truth of {tmp_path}/mocap refused: not_finite',)
+    assert truth.skipped == (f'1 message on /robot/truth of {tmp_path}/mocap refused: not_finite',)
 
 
 @pytest.mark.parametrize('source, said', [
-    ('bag:/nothing', 'no poses on /nothing; expected true poses; there are poses on /pose'),
+    ('bag:/nothing', 'no poses on /nothing; expected true poses; geometry_msgs/msg/PoseStamped '
+     'is on /pose'),
     ('bag:/time', '/time is of builtin_interfaces/msg/Time; expected one of geometry_'),
     ('missing:/pose', 'missing: no such file or directory'),
     ('bag:/pose', 'shares 0 poses with the graph, expected 2 or more$'),

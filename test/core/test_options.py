@@ -162,6 +162,16 @@ def test_every_option_has_a_meaning(kind):
         assert not (ranged and meaning.choices)
 
 
+@pytest.mark.parametrize('values, said', [
+    ({'map_frame': ''}, "map_frame is '' and odom_frame 'odom', expected two names that differ"),
+    ({'odom_frame': ''}, "map_frame is 'map' and odom_frame '', expected two names that differ"),
+    ({'odom_frame': 'map'}, "map_frame is 'map' and odom_frame 'map', expected two names"),
+    ({'save_path': '/maps'}, "save_path is '/maps', expected the name of a .g2o file")])
+def test_names_that_cannot_be_used_are_refused(values, said):
+    with pytest.raises(OptionError, match=said):
+        NodeOptions(**values)
+
+
 @pytest.mark.parametrize('kind', option_classes(), ids=lambda kind: kind.__name__)
 def test_every_option_refuses_nonsense(kind):
     for f in fields(kind):

@@ -47,10 +47,9 @@ def test_maps_stand_beside_each_other(tmp_path):
 
 def test_everything_given_is_drawn_and_named(tmp_path):
     path = tmp_path / 'map.svg'
-    plot_maps(path, [MapDrawing(
-        'Some street', SQUARE, odometry=SQUARE * 1.1, truth=SQUARE * 0.9,
-        loops=np.array([[0, 4], [1, 3]]), rejected=np.array([[0, 2]]),
-        suspect=np.array([[2, 4]]), note='cost 12.5')])
+    plot_maps(path, [MapDrawing('Some street', SQUARE, odometry=SQUARE * 1.1, truth=SQUARE * 0.9,
+                                loops=np.array([[0, 4], [1, 3]]), rejected=np.array([[0, 2]]),
+                                suspect=np.array([[2, 4]]), note='cost 12.5')])
     ElementTree.parse(path)
     said = words(path)
     for word in ('Some street', 'optimised', 'odometry', 'truth', 'loops', 'refused loops',
@@ -64,6 +63,13 @@ def test_what_is_not_given_is_not_named(tmp_path):
     plot_maps(path, [MapDrawing('Some street', SQUARE)])
     assert '5 poses, 0 loops' in words(path)
     assert not {'odometry', 'truth', 'refused', 'suspect'} & set(words(path).split())
+
+
+@pytest.mark.parametrize('name, title', [
+    ('$\\frac$.g2o', '$\\frac$.g2o'), ('a\udce9.g2o', 'a?.g2o')])
+def test_a_name_is_written_as_it_is(tmp_path, name, title):
+    plot_maps(tmp_path / 'map.svg', [MapDrawing(name, SQUARE)])
+    assert title in words(tmp_path / 'map.svg')
 
 
 def test_refused_loops_are_red(tmp_path):
@@ -228,9 +234,8 @@ def test_a_solution_is_a_map_and_the_way_there(tmp_path):
         assert word in words(tmp_path / 'both.svg')
 
 
-@pytest.mark.parametrize('costs', [
-    [0.0], [0.0, 0.0], [5940.0], [971.78, 971.7, 971.69], [2.7e6, 3772.0], [5.0, 0.0],
-    np.linspace(9e3, 1e3, 1000)])
+@pytest.mark.parametrize('costs', [[0.0], [0.0, 0.0], [5940.0], [971.78, 971.7, 971.69],
+                                   [2.7e6, 3772.0], [5.0, 0.0], np.linspace(9e3, 1e3, 1000)])
 @pytest.mark.filterwarnings('error')
 def test_any_costs_are_drawn_without_a_warning(tmp_path, costs):
     plot_solution(tmp_path / 'a.png', MapDrawing('', SQUARE * [30, 1]), curve_of(list(costs)))

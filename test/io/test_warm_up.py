@@ -12,18 +12,9 @@ import pytest
 
 from l1slam_ros.core import kernels
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.compilation import fill_cache
+from l1slam_ros.io import compilation
+from l1slam_ros.io.compilation import STEPS, STEPS_IN_SPACE, fill_cache
 from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
-from l1slam_ros.io.warm_up import (
-    DENSE,
-    JUDGEMENT,
-    ONLINE,
-    SPARSE,
-    STEPS,
-    STEPS_IN_SPACE,
-    module_of,
-    warm_up,
-)
 
 # Prints what a process compiles.
 WORK = """
@@ -38,7 +29,7 @@ from problems import add_absolute, play
 
 from l1slam_ros.io import formats
 from l1slam_ros.core.robust import batch_map
-from l1slam_ros.io.compilation import fill_cache
+from l1slam_ros.io.compilation import STEPS, fill_cache, with_space
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core import kernels
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
@@ -51,7 +42,6 @@ from l1slam_ros.core.graph.linear_system import linearise
 from l1slam_ros.core.names import NORMS, STARTS
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.warm_up import STEPS, with_space
 
 MODULES = [importlib.import_module(f'{kernels.__name__}.{module.name}')
            for module in pkgutil.iter_modules(kernels.__path__)]
@@ -105,8 +95,8 @@ def slipped(world):
     graph.add_between(factors.i, factors.j, measurement, roots.transpose(0, 2, 1) @ roots)
     return graph
 
-def solved(graph, poses, **wish):
-    batch_map.solve(graph, poses, batch_map.Wish(**wish))
+def solved(graph, poses, **asked):
+    batch_map.solve(graph, poses, batch_map.SolveOptions(**asked))
 
 solved(slipped(world), None, robust=True)
 look('a slip')
@@ -153,8 +143,8 @@ record = formats.read_input(Path(sys.argv[1]))
 if sys.argv[2] == 'info':
     noise_scales(record.graph, np.random.default_rng(0))
 else:
-    wish = batch_map.Wish(robust=sys.argv[2] == 'robust')
-    batch_map.solve(record.graph, record.poses, wish)
+    asked = batch_map.SolveOptions(robust=sys.argv[2] == 'robust')
+    batch_map.solve(record.graph, record.poses, asked)
 kernels = [kernel for name in list(sys.modules) if name.startswith('l1slam_ros.core.kernels.')
            for kernel in vars(sys.modules[name]).values() if hasattr(kernel, 'takes')]
 print(sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels))
@@ -195,21 +185,16 @@ def test_only_what_is_needed_is_read(world, what, most_loops, missing):
     assert not missing & set(modules.split())
 
 
-def test_each_step_is_reported_once_it_is_done():
-    said = []
-    warm_up(said.append)
-    assert tuple(said) == STEPS
-
-
 def test_every_module_of_loops_is_a_step():
     modules = {module.name for module in pkgutil.iter_modules(kernels.__path__)}
-    assert {module_of(step) for step in (*STEPS, *STEPS_IN_SPACE)} == modules - {'compiled'}
-    assert set(STEPS) == {*SPARSE, *JUDGEMENT, *DENSE, *ONLINE}
+    assert {step.split(':')[0] for step in (*STEPS, *STEPS_IN_SPACE)} == modules - {'compiled'}
+    assert set(STEPS) == {*compilation.SPARSE, *compilation.JUDGEMENT, *compilation.DENSE,
+                          *compilation.ONLINE}
     assert not {'se3', *STEPS_IN_SPACE} & set(STEPS)
 
 
 def test_every_version_for_space_is_in_a_step_for_space():
-    for name in {module_of(step) for step in STEPS}:
+    for name in STEPS:
         module = importlib.import_module(f'{kernels.__name__}.{name}')
         wider = [kernel for kernel in vars(module).values()
                  if getattr(kernel, 'takes_in_space', ())]

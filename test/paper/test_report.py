@@ -67,8 +67,7 @@ def result(graph, initial, seed, printed, final, l2, truth=None, plain=2e-3):
     """What a graph of three poses would have given, had these been its numbers."""
     solution = Solution(np.zeros((3, 3)), final, Status.CONVERGED, 1, 0,
                         np.array([seed, final]), np.zeros(0))
-    costs = Costs(initial, seed, l2, np.array([seed, printed]), False, solution,
-                  'interior-point')
+    costs = Costs(initial, seed, l2, np.array([seed, printed]), False, solution, 'interior-point')
     seconds = Seconds({'plain': [plain] * 3, 'fused': [plain / 8] * 3}, 10 * plain)
     return report.GraphResult(graph, 3, 2, costs, seconds,
                               MapDrawing('map', np.zeros((3, 2))), truth)
@@ -79,11 +78,10 @@ def test_table_1_sets_the_costs_beside_those_of_the_paper():
     cut = replace(large, costs=replace(large.costs, cut_short=True))
     intel, world, ended = table(report.table_1(report.Results([
         result(paper.INTEL, 1513.17, 970.0, 1000.0, 960.0, 980.0), large, cut])))
-    assert intel == {
-        'L1 cost': 'Intel', 'poses, edges': '3, 2', 'start: paper': '1513.17',
-        'start: ours': '1513.17', 'seed: ours': '970', 'final: paper': '982.051',
-        'final: as printed': '1000', 'final: ours': '**960**', 'solver': 'interior-point',
-        'of the L2 map': '980', 'of the true poses': ''}
+    assert intel == {'L1 cost': 'Intel', 'poses, edges': '3, 2', 'start: paper': '1513.17',
+                     'start: ours': '1513.17', 'seed: ours': '970', 'final: paper': '982.051',
+                     'final: as printed': '1000', 'final: ours': '**960**',
+                     'solver': 'interior-point', 'of the L2 map': '980', 'of the true poses': ''}
     assert world['L1 cost'] == 'Manhattan50k (*)' and world['of the true poses'] == '125'
     assert world['start: paper'] == '7.14591e8'
     assert world['final: as printed'] == '120' and ended['final: as printed'] == '120 (+)'

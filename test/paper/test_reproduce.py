@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from problems import linprog_l1
+from scipy.optimize import linprog
 
 from l1slam_ros.cli.main import main
 from l1slam_ros.core.errors import FileError, OptionError
@@ -18,6 +19,7 @@ from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.geometry.se2 import wrap
 from l1slam_ros.core.graph.linear_system import linearise, step_poses, whitened_residual
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.seed import rotation_system, seed_poses, translation_system
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
@@ -31,6 +33,7 @@ from l1slam_ros.paper.experiments import (
     Effort,
     measure_convergence,
     measure_costs,
+    measure_largest,
     measure_seconds,
     printed_costs,
     printed_iterates,
@@ -211,6 +214,25 @@ def test_algorithm_4_as_printed_is_cut_short_on_the_largest_graphs(world, seed, 
     assert not few.cut_short
 
 
+def test_the_largest_residual_is_that_of_a_linear_program(world, seed):
+    graph = world.graph
+    found = measure_largest(graph, seed, replace(LITTLE, iterations=20_000))
+    largest = {name: values[0] for name, values in found.items()}
+    assert largest['L-infinity'] < largest['L2'] < largest['L1']
+    assert found['L1'][1] == min(values[1] for values in found.values())
+    assert found['L2'][2] == min(values[2] for values in found.values())
+    # To first order, as near as the map is to the L2 map.
+    l2 = minimise_l2(graph, seed, LeastSquaresOptions(), cholesky_of(graph)).poses
+    system = linearise(graph, l2)
+    A, b = system.A.toarray(), system.b
+    rows, columns = A.shape
+    level = np.ones((rows, 1))
+    best = linprog(np.append(np.zeros(columns), 1.0),
+                   A_ub=np.block([[A, -level], [-A, -level]]), b_ub=np.concatenate((b, -b)),
+                   bounds=[(None, None)] * columns + [(0, None)], method='highs').fun
+    assert largest['L-infinity'] == pytest.approx(best, rel=1e-2)
+
+
 def fails(results, folder):
     raise FileError(folder / 'figure_5.png', 'cannot be drawn')
 
@@ -259,8 +281,7 @@ def test_what_cannot_be_is_refused_at_once_in_one_line(capsys, tmp_path, changes
 @pytest.mark.parametrize(('text', 'says'), [
     ('EDGE_SE2 0 1 1 0 nonsense 1 0 0 1 0 1\n', 'intel.g2o:1: '),
     ('VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nVERTEX_SE2 2 1 0 0\n'
-     'EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n', 'intel.g2o: the graph is not connected: vertex 2'),
-])
+     'EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n', 'intel.g2o: the graph is not connected: vertex 2')])
 def test_a_graph_that_cannot_be_used_is_named(capsys, tmp_path, text, says):
     (tmp_path / 'intel.g2o').write_text(text)
     assert main(['reproduce', *arguments(tmp_path)]) == 2

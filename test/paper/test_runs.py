@@ -68,8 +68,7 @@ def test_a_method_never_ends_above_the_start_and_the_seed_needs_none(world, star
     assert ours.cost < seed.cost < l2.cost
     assert starts.printed[0] == seed.cost and len(starts.printed) == 3
     assert ours.error < 1e-12 < seed.error < starts.bent
-    other = runs.run_noisy_starts(world.graph, world.truth, Effort(draws=0), PRINTED,
-                                  generator())
+    other = runs.run_noisy_starts(world.graph, world.truth, Effort(draws=0), PRINTED, generator())
     assert {m: shown.cost for m, shown in other.from_seed.items()} == {
         m: shown.cost for m, shown in starts.from_seed.items()}
 

@@ -163,8 +163,9 @@ def test_bad_messages_are_counted_and_the_node_goes_on(bench):
     b.send('/loop_closures', loop)
     b.send('/odom', odometry(3 * 10**9, 1.0))
     b.until(lambda: len(b.path().poses) == 2, 'the good samples are in the Path')
-    b.until(lambda: b.backend._refused.total() == 4, 'the four bad ones are counted')
-    assert b.backend._refused == {'old_stamp': 1, 'not_finite': 1, 'child_frame': 1, 'frame': 1}
+    b.until(lambda: b.backend._inputs.refused.total() == 4, 'the four bad ones are counted')
+    assert b.backend._inputs.refused == {
+        'old_stamp': 1, 'not_finite': 1, 'child_frame': 1, 'frame': 1}
 
 
 def test_nonsense_parameters_are_refused_at_start_and_on_set(ros, bench):

@@ -6,11 +6,12 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Path
 from rclpy.serialization import deserialize_message
+from rosbags.typesys import Stores, get_typestore
 
-from l1slam_ros.ros.publishing import path_bytes, pose_bytes, transform_stamped
+from l1slam_ros.ros.publishing import path_bytes, pose_bytes, transform_bytes
 
 
 def numbers(pose):
@@ -41,13 +42,19 @@ def test_ros_reads_the_pose_that_was_meant(rng, frame):
     assert (pose.header.stamp.sec, pose.header.stamp.nanosec) == (5, 7)
 
 
-def test_a_pose_and_a_transform_hold_the_same_numbers():
-    pose3 = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 0.4])
-    pose = deserialize_message(pose_bytes('map', 2_000_000_003, pose3), PoseStamped)
-    transform = transform_stamped('map', 'odom', 2_000_000_003, pose3)
-    assert numbers(pose.pose) == pose3.tolist()
-    t, r = transform.transform.translation, transform.transform.rotation
+@pytest.mark.parametrize('parent', ['', *('map_of_robot1'[:k] for k in range(1, 9))])
+@pytest.mark.parametrize('child', ['', 'o', 'od', 'odo', 'odom'])
+def test_ros_reads_the_transform_that_was_meant(rng, parent, child):
+    pose3 = rng.normal(size=7)
+    read = deserialize_message(
+        transform_bytes(parent, child, 5_000_000_007, pose3), TransformStamped)
+    t, r = read.transform.translation, read.transform.rotation
     assert [t.x, t.y, t.z, r.x, r.y, r.z, r.w] == pose3.tolist()
-    assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'odom')
-    assert pose.header.stamp == transform.header.stamp
-    assert (pose.header.stamp.sec, pose.header.stamp.nanosec) == (2, 3)
+    assert (read.header.frame_id, read.child_frame_id) == (parent, child)
+    assert (read.header.stamp.sec, read.header.stamp.nanosec) == (5, 7)
+    # tf2_msgs is not everywhere: a library that needs no such package reads the sequence.
+    types = get_typestore(Stores.ROS2_JAZZY)
+    (one,) = types.deserialize_cdr(transform_bytes(parent, child, 5_000_000_007, pose3, True),
+                                   'tf2_msgs/msg/TFMessage').transforms
+    assert (one.header.frame_id, one.child_frame_id) == (parent, child)
+    assert one.transform.rotation.w == pose3[6]

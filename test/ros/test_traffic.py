@@ -3,7 +3,7 @@
 
 import pytest
 
-from l1slam_ros.ros.traffic import Traffic
+from l1slam_ros.ros.inputs.traffic import Traffic
 
 
 def count(numbers, publishers=1):

@@ -21,6 +21,8 @@ COVARIANCE_ROWS = (0, 1, 5)
 
 def wrap(angle: Array) -> Array:
     """Return the angle [rad] in (-pi, pi]; values already there are returned to the last bit."""
+    if np.abs(angle).max(initial=0.0) < np.pi:
+        return angle
     wrapped = angle - 2 * np.pi * np.rint(angle / (2 * np.pi))
     # Rounding can leave it one rounding outside.
     return np.where(wrapped <= -np.pi, np.pi, np.minimum(wrapped, np.pi))
@@ -158,7 +160,7 @@ def from_rotation(R: Array, t: Array) -> Array:
 
 def from_pose3(pose3: Array) -> Array:
     """Project x y z qx qy qz qw (n, 7) onto the plane: x, y and the yaw, (n, 3)."""
-    qx, qy, qz, qw = np.moveaxis(pose3[..., 3:], -1, 0)
+    qx, qy, qz, qw = (pose3[..., k] for k in range(3, 7))
     yaw = np.arctan2(2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
     return np.concatenate((pose3[..., :2], yaw[..., None]), axis=-1)
 

@@ -14,7 +14,12 @@ import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import Mask, square_root_information
+from l1slam_ros.core.geometry.noise import (
+    Mask,
+    covariance_of,
+    root_of_inverse,
+    square_root_information,
+)
 from l1slam_ros.core.graph.growable_array import GrowingArray
 
 # The first end of an absolute factor: the map frame, a keyframe that never moves. As an index into
@@ -130,10 +135,14 @@ class FactorGraph:
         """Let `count` more keyframes exist; the next index is `n_poses` before the call."""
         self.n_poses += count
 
-    def add_between(
-        self, i: Indices, j: Indices, measurement: Array, information: Array,
-        trusted: Mask | bool = False,
-    ) -> None:
+    def append_step(self, measurement: Array, sqrt_information: Array) -> None:
+        """Append a keyframe and the factor to it from the one before: (1, p), (1, d, d)."""
+        self.add_poses(1)
+        k = np.array([self.n_poses - 1])
+        self.append_between(k - 1, k, measurement, sqrt_information)
+
+    def add_between(self, i: Indices, j: Indices, measurement: Array, information: Array,
+                    trusted: Mask | bool = False) -> None:
         """
         Append between factors: i, j (m,), measurement (m, p), information (m, d, d), trusted (m,).
 
@@ -168,10 +177,8 @@ class FactorGraph:
             raise GraphError(f'measurement {row} is not finite: {measurement[row]}')
         self.append_between(i, j, measurement, square_root_information(information), trusted)
 
-    def append_between(
-        self, i: Indices, j: Indices, measurement: Array, sqrt_information: Array,
-        trusted: Mask | bool = False, struck: Mask | bool = False,
-    ) -> None:
+    def append_between(self, i: Indices, j: Indices, measurement: Array, sqrt_information: Array,
+                       trusted: Mask | bool = False, struck: Mask | bool = False) -> None:
         """Append between factors that are known to be sound, with the roots (m, d, d) at hand."""
         values = (i, j, measurement, sqrt_information, np.broadcast_to(trusted, len(i)),
                   np.broadcast_to(struck, len(i)))
@@ -223,15 +230,6 @@ def lowest_of_components(i: Indices, j: Indices, n: int) -> Indices:
             lowest = lowest[lowest]
 
 
-def gaps(graph: FactorGraph) -> Indices:
-    """Return the keyframes k > 0 that no odometry joins to k - 1, (g,)."""
-    factors = graph.between
-    rows = factors.is_odometry
-    joined = np.zeros(graph.n_poses, bool)
-    joined[np.maximum(factors.i[rows], factors.j[rows])] = True
-    return 1 + np.flatnonzero(~joined[1:])
-
-
 def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:
     """
     Return of all between factors the earlier and later keyframe (m,), and that from this.
@@ -241,3 +239,22 @@ def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:
     i, j, Z = graph.between.i, graph.between.j, graph.between.measurement
     forward = np.where((i > j)[:, None], graph.manifold.inverse(Z), Z)
     return np.minimum(i, j), np.maximum(i, j), forward
+
+
+def turned(graph: FactorGraph, rows: Indices | Mask) -> FactorGraph:
+    """
+    Return the graph with some factors, rows (k,) or (m,) bool, seen from the other end.
+
+    Z becomes Z^-1, its covariance Ad_Z C Ad_Z': to first order in the residual the same is said.
+    Turned twice it is the same to rounding.
+    """
+    factors, manifold = graph.between, graph.manifold
+    i, j, Z = factors.i.copy(), factors.j.copy(), factors.measurement.copy()
+    roots, adjoint = factors.sqrt_information.copy(), manifold.adjoint(Z[rows])
+    i[rows], j[rows], Z[rows] = factors.j[rows], factors.i[rows], manifold.inverse(Z[rows])
+    roots[rows] = root_of_inverse(
+        adjoint @ covariance_of(roots[rows]) @ adjoint.transpose(0, 2, 1))
+    other = FactorGraph(manifold)
+    other.add_poses(graph.n_poses)
+    other.append_between(i, j, Z, roots, factors.trusted, factors.struck)
+    return other

@@ -8,7 +8,7 @@ class GrowingArray:
     """
     Rows of one shape, appended in amortised constant time.
 
-    What `view` returned is never written to again, so it stays valid while the array grows.
+    What `view` returned is not written to by `extend`, so it stays valid while the array grows.
 
     Parameters
     ----------
@@ -34,6 +34,11 @@ class GrowingArray:
             self._data = grown
         self._data[self._length : end] = rows
         self._length = end
+
+    def replace(self, start: int, rows: np.ndarray) -> None:
+        """Let rows (k, *shape) stand from `start` on; views of what stood there are void."""
+        self._length = start
+        self.extend(rows)
 
     def view(self) -> np.ndarray:
         """Return all rows so far, (n, *shape), without copying."""

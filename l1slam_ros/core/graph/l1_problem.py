@@ -6,7 +6,6 @@ In: a graph, or a linear system in the place of one. Out: its residual, linearis
 """
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -19,42 +18,26 @@ from l1slam_ros.core.graph.linear_system import (
 )
 
 
-class Problem(Protocol):
-    """What is minimised: the L1 norm of a residual, over poses that move by steps."""
-
-    def residual(self, poses: Array) -> Array:
-        """Return the whitened residual, (rows,)."""
-
-    def linearise(self, poses: Array, residual: Array) -> LinearSystem:
-        """Return the linear system whose b is minus the residual."""
-
-    def step(self, poses: Array, x: Array) -> Array:
-        """Return the poses moved by x (columns,)."""
-
-    def curvature(self, poses: Array, dual: Array) -> Array | None:
-        """Return the Hessian of dual'e for each factor, (m, 2 k, 2 k)."""
-
-
 @dataclass(frozen=True)
 class GraphProblem:
-    """The poses of a graph."""
+    """The poses of a graph (n, p)."""
 
     graph: FactorGraph
 
     def residual(self, poses: Array) -> Array:
-        """See `Problem`."""
+        """Return the whitened residual, (rows,)."""
         return whitened_residual(self.graph, poses)
 
     def linearise(self, poses: Array, residual: Array) -> LinearSystem:
-        """See `Problem`."""
+        """Return the linear system whose b is minus the residual."""
         return linearise(self.graph, poses, residual)
 
     def step(self, poses: Array, x: Array) -> Array:
-        """See `Problem`."""
+        """Return the poses moved by x (columns,)."""
         return step_poses(self.graph, poses, x)
 
     def curvature(self, poses: Array, dual: Array) -> Array:
-        """See `Problem`."""
+        """Return the Hessian of dual'e for each factor, (m, 2 k, 2 k)."""
         from l1slam_ros.core.kernels.blocks import unwhiten
 
         manifold, factors = self.graph.manifold, self.graph.between
@@ -70,16 +53,19 @@ class LinearProblem:
     system: LinearSystem
 
     def residual(self, poses: Array) -> Array:
-        """See `Problem`."""
+        """See `GraphProblem`."""
         return self.system.times(poses) - self.system.b
 
     def linearise(self, poses: Array, residual: Array) -> LinearSystem:
-        """See `Problem`."""
+        """See `GraphProblem`."""
         return replace(self.system, b=-residual)
 
     def step(self, poses: Array, x: Array) -> Array:
-        """See `Problem`."""
+        """See `GraphProblem`."""
         return poses + x
 
     def curvature(self, poses: Array, dual: Array) -> None:
-        """See `Problem`."""
+        """See `GraphProblem`."""
+
+
+Problem = GraphProblem | LinearProblem

@@ -10,6 +10,7 @@ that leave a component unsaid may tie a part of the graph by less than it takes:
 fix leaves the map free to turn. What nothing determines stays as it is: see `loose_keyframes`.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -85,15 +86,11 @@ class LinearSystem:
 
     def weighted(self, roots: Array) -> 'LinearSystem':
         """Return the system with the rows of each factor multiplied by its root (m, k, k)."""
-        from l1slam_ros.core.kernels.blocks import whiten, whiten_blocks
+        from l1slam_ros.core.kernels.blocks import whiten
 
-        k, blocks = self.block_size, np.empty_like(self.blocks)
-        roots = np.ascontiguousarray(roots)
-        for side in range(2):
-            whiten_blocks(roots, np.ascontiguousarray(self.blocks[:, side]), side, blocks,
-                          (0,) * k)
+        k, roots = self.block_size, np.ascontiguousarray(roots)
         b: Array = whiten(roots, self.b.reshape(-1, k), (0,) * k).ravel()
-        return replace(self, blocks=blocks, b=b)
+        return replace(self, blocks=_whitened(roots, self.blocks.transpose(1, 0, 2, 3)), b=b)
 
     def part(self, entries: slice) -> 'LinearSystem':
         """Return the system of only these rows of each factor and columns of each keyframe."""
@@ -151,9 +148,8 @@ def whitened_residual(graph: FactorGraph, poses: Array) -> Array:
     return whitened.ravel()
 
 
-def linearise(
-    graph: FactorGraph, poses: Array, residual: Array | None = None, fixed: int | None = None
-) -> LinearSystem:
+def linearise(graph: FactorGraph, poses: Array, residual: Array | None = None,
+              fixed: int | None = None) -> LinearSystem:
     """
     Return the system at `poses` (n, p); Jacobians with respect to right steps.
 
@@ -163,18 +159,24 @@ def linearise(
     fixed : how many keyframes are held in the gauge of another graph; None: see `anchor`
 
     """
-    from l1slam_ros.core.kernels.blocks import whiten_blocks
-
-    manifold, factors = graph.manifold, graph.between
-    d = manifold.TANGENT_SIZE
-    blocks = np.empty((len(factors), 2, d, d))
-    pair = manifold.residual_jacobians(factors.measurement, *ends(graph, poses))
-    for side, J in enumerate(pair):
-        whiten_blocks(factors.sqrt_information, J, side, blocks, (0,) * d)
+    factors = graph.between
+    pair = graph.manifold.residual_jacobians(factors.measurement, *ends(graph, poses))
     if residual is None:
         residual = whitened_residual(graph, poses)
     fixed = anchor(graph) if fixed is None else fixed
-    return LinearSystem(keyframes_of(graph, fixed), blocks, -residual, graph.n_poses - fixed)
+    return LinearSystem(keyframes_of(graph, fixed), _whitened(factors.sqrt_information, pair),
+                        -residual, graph.n_poses - fixed)
+
+
+def _whitened(roots: Array, pair: Iterable[Array]) -> Array:
+    """Return both blocks of each factor, (m, k, k) each, multiplied by its root, (m, 2, k, k)."""
+    from l1slam_ros.core.kernels.blocks import whiten_blocks
+
+    m, k, _ = roots.shape
+    blocks = np.empty((m, 2, k, k))
+    for side, J in enumerate(pair):
+        whiten_blocks(roots, np.ascontiguousarray(J), side, blocks, (0,) * k)
+    return blocks
 
 
 def keyframes_of(graph: FactorGraph, fixed: int) -> Indices:

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What comes in from outside: odometry samples and loop closures, still in three dimensions."""
 
+import math
 from dataclasses import dataclass
+from numbers import Integral
 
 import numpy as np
 
+from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 
 # [m/s] The speed of sound: no vehicle on the ground has been faster (Thrust SSC, 341 m/s). Stamps
@@ -12,6 +15,9 @@ from l1slam_ros.core.geometry.manifold import Array
 FASTEST, SHORTEST_STEP = 340.0, 0.1
 # [s] The longest gap in the stamps of the odometry that is a pause without further evidence.
 LONGEST_PAUSE = 60.0
+# Two printed digits stay below; an unset or broken quaternion does not.
+QUATERNION_NORM_ERROR = 0.1
+
 
 @dataclass(frozen=True)
 class OdometrySample:
@@ -60,7 +66,25 @@ class LoopClosure:
         return self.stamp if self.reference_stamp is None else self.reference_stamp, self.stamp
 
 
-def require_finite(pose3: Array) -> None:
-    """Raise an ArithmeticError where a pose is not finite: it would spoil all after it."""
-    if not np.isfinite(pose3).all():
-        raise ArithmeticError(f'pose {pose3} is not finite')
+def require_sound(what: OdometrySample | LoopClosure) -> None:
+    """
+    Refuse what is no measurement: it would spoil all after it.
+
+    Raises
+    ------
+    MessageError : with the cause `stamp`, `shape`, `not_finite` or `quaternion`.
+
+    """
+    stamps = what.stamps if isinstance(what, LoopClosure) else (what.stamp,)
+    if not all(isinstance(stamp, Integral) for stamp in stamps):
+        raise MessageError('stamp', f'stamp {stamps}; expected whole nanoseconds')
+    shapes = [getattr(array, 'shape', None) for array in (what.pose3, what.covariance)]
+    if shapes != [(7,), (6, 6)]:
+        raise MessageError('shape', f'pose3 of shape {shapes[0]}, covariance of {shapes[1]}; '
+                           'expected arrays (7,) and (6, 6)')
+    if not np.isfinite(what.pose3).all():
+        raise MessageError('not_finite', f'pose {what.pose3}; expected finite numbers')
+    norm = math.hypot(*what.pose3[3:])
+    if abs(norm - 1) > QUATERNION_NORM_ERROR:
+        raise MessageError('quaternion', f'quaternion {what.pose3[3:]} of norm {norm:g}; '
+                           'expected 1')

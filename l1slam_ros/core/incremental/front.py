@@ -140,13 +140,13 @@ class Front:
         one cannot be, and it takes no more.
         """
         looks: list[Look] = []
-        self.closed = self._is_beyond(factors, accept[0])
+        self.closed = self._is_beyond(factors, int(accept[0]))
         if self.closed:
             return looks
         linearised = self._map.linearise(factors, slice(self.rows, self.rows + len(accept)))
         for at, known in enumerate(accept.tolist()):
-            beyond = at == len(linearised.ends) or self._is_beyond(factors, known)
-            look = None if beyond else self._look(factors, linearised, at, known)
+            look = None if self._is_beyond(factors, known) else self._look(
+                factors, linearised, at, known)
             self.closed = look is None
             if look is None:
                 break

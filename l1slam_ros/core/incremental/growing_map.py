@@ -113,27 +113,27 @@ class GrowingMap:
 
     def linearise(self, factors: BetweenFactors, rows: slice) -> Linearised:
         """
-        Return some factors as the borders want them, up to one that no keyframe ties to the map.
+        Return some factors as the borders want them.
 
         Those that see keyframes for the first time see them in their order: these are put where
-        the factors want them.
+        the factors want them. After a gap in that order none is returned.
         """
-        manifold, Z = self._manifold, factors.measurement[rows]
+        manifold = self._manifold
         pairs = np.stack((factors.i[rows], factors.j[rows]), axis=1)
+        known = np.maximum.accumulate(np.append(len(self._first) - 1, pairs.max(axis=1)))
+        gaps = np.flatnonzero(np.diff(known) > 1)
+        pairs = pairs[:gaps[0] if len(gaps) else None]
+        Z = factors.measurement[rows][:len(pairs)]
         for row in np.flatnonzero((pairs >= len(self._first)).any(axis=1)).tolist():
             if pairs[row].max() == len(self._first):
                 step = Z[row] if pairs[row, 1] == len(self._first) else manifold.inverse(Z[row])
                 self._first.extend(manifold.compose(self.poses(pairs[row].min(keepdims=True)),
                                                     step))
-        # What a keyframe beyond has to do with the map comes later.
-        beyond = (pairs >= len(self._first)).any(axis=1)
-        count = int(np.argmax(beyond)) if beyond.any() else len(pairs)
-        pairs, Z, root = pairs[:count], Z[:count], factors.sqrt_information[rows][:count, None]
         keyframes, at = np.unique(pairs, return_inverse=True)
         at = at.reshape(pairs.shape).T
         first, steps, poses = self._moved(keyframes)
         p, k = first.shape[2], steps.shape[2]
-        Z = np.repeat(Z, 2, axis=0)
+        Z, root = np.repeat(Z, 2, axis=0), factors.sqrt_information[rows][:len(pairs), None]
         J = manifold.residual_jacobians(Z, *first[at].reshape(2, -1, p))
         e = manifold.residual(Z, *poses[at].reshape(2, -1, p)).reshape(-1, 2, k)
         sides = [root @ side.reshape(-1, 2, k, k) for side in J]

@@ -3,8 +3,8 @@
 Many steps of all keyframes at once, and what they say of each factor.
 
 Arrays of steps are (n, k, q): q samples of the k numbers of each of n keyframes, the last keyframe
-standing for all that are held fixed. Other arrays are those of `LinearSystem` and of
-`cholesky`.
+standing for all that are held fixed; k is 3 or 6, and the work is done in tiles of 3 x 3. Other
+arrays are those of `LinearSystem` and of `cholesky`.
 """
 
 import numpy as np
@@ -15,15 +15,13 @@ from l1slam_ros.core.kernels.compiled import compiled, loop
 @loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, ::1])')
 def gather(keyframe, blocks, y, product):
     """Add A'y of all samples to product (n + 1, k, q); y : (m, k, q)."""
-    k, q = product.shape[1:]
+    k = product.shape[1]
     for f in range(len(blocks)):
         for side in range(2):
-            at = product[keyframe[f, side]]
-            for c in range(k):
-                for r in range(k):
-                    value = blocks[f, side, r, c]
-                    for t in range(q):
-                        at[c, t] += value * y[f, r, t]
+            J, to = blocks[f, side], product[keyframe[f, side]]
+            for c in range(0, k, 3):
+                for r in range(0, k, 3):
+                    _add(y[f], r, J[r:r + 3, c:c + 3].T, 1.0, to, c)
 
 
 @loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i4[::1], f8[:, :, ::1])')
@@ -32,57 +30,63 @@ def solve_many(panels, first, start, pattern, offset, position, right):
     n, k, q = right.shape
     x = np.empty((n * k, q))
     for f in range(n):
-        for a in range(k):
-            _copy(right[f, a], x[position[f] * k + a])
+        x[position[f] * k:(position[f] + 1) * k] = right[f]
     for s in range(len(first) - 1):
-        width, own = (first[s + 1] - first[s]) * k, x[first[s] * k:first[s + 1] * k]
-        at = offset[s]
-        for c in range(width):
-            for e in range(c):
-                _subtract(own[c], panels[at + e], own[e])
-            _divide(own[c], panels[at + c])
-            at += width
-        for below in range(start[s] + width // k, start[s + 1]):
-            for a in range(k):
-                for c in range(width):
-                    _subtract(x[pattern[below] * k + a], panels[at + c], own[c])
-                at += width
+        panel, rows = _panel(panels, first, start, pattern, offset, s, k)
+        for c in range(0, panel.shape[1], 3):
+            own = first[s] * k + c
+            _solve_three(panel[c:c + 3, c:c + 3], x, own)
+            for r in range(c + 3, len(panel), 3):
+                _add(x, own, panel[r:r + 3, c:c + 3], -1.0, x, rows[r // k] * k + r % k)
     for s in range(len(first) - 2, -1, -1):
-        width, own = (first[s + 1] - first[s]) * k, x[first[s] * k:first[s + 1] * k]
-        at = offset[s] + width * width
-        for below in range(start[s] + width // k, start[s + 1]):
-            for a in range(k):
-                for c in range(width):
-                    _subtract(own[c], panels[at + c], x[pattern[below] * k + a])
-                at += width
-        for c in range(width - 1, -1, -1):
-            at = offset[s] + c * width
-            _divide(own[c], panels[at + c])
-            for e in range(c):
-                _subtract(own[e], panels[at + e], own[c])
+        panel, rows = _panel(panels, first, start, pattern, offset, s, k)
+        for c in range(panel.shape[1] - 3, -1, -3):
+            own = first[s] * k + c
+            for r in range(c + 3, len(panel), 3):
+                _add(x, rows[r // k] * k + r % k, panel[r:r + 3, c:c + 3].T, -1.0, x, own)
+            _solve_three_transposed(panel[c:c + 3, c:c + 3], x, own)
     solution = np.empty((n, k, q))
     for f in range(n):
-        for a in range(k):
-            _copy(x[position[f] * k + a], solution[f, a])
+        solution[f] = x[position[f] * k:(position[f] + 1) * k]
     return solution
 
 
 @compiled
-def _copy(row, to):
-    for t in range(len(row)):
-        to[t] = row[t]
+def _panel(panels, first, start, pattern, offset, s, k):
+    """Return panel s as a matrix, and its rows."""
+    width = (first[s + 1] - first[s]) * k
+    return panels[offset[s]:offset[s + 1]].reshape(-1, width), pattern[start[s]:start[s + 1]]
 
 
 @compiled
-def _divide(row, by):
-    for t in range(len(row)):
-        row[t] /= by
+def _add(x, at, F, sign, y, to):
+    """Add sign F times three rows of x to three rows of y, F (3, 3)."""
+    a, b, c = sign * F[0, 0], sign * F[0, 1], sign * F[0, 2]
+    d, e, f = sign * F[1, 0], sign * F[1, 1], sign * F[1, 2]
+    g, h, i = sign * F[2, 0], sign * F[2, 1], sign * F[2, 2]
+    for t in range(x.shape[1]):
+        u, v, w = x[at, t], x[at + 1, t], x[at + 2, t]
+        y[to, t] += a * u + b * v + c * w
+        y[to + 1, t] += d * u + e * v + f * w
+        y[to + 2, t] += g * u + h * v + i * w
 
 
 @compiled
-def _subtract(row, factor, other):
-    for t in range(len(row)):
-        row[t] -= factor * other[t]
+def _solve_three(L, x, at):
+    """Solve L y = three rows of x, in place."""
+    for t in range(x.shape[1]):
+        x[at, t] /= L[0, 0]
+        x[at + 1, t] = (x[at + 1, t] - L[1, 0] * x[at, t]) / L[1, 1]
+        x[at + 2, t] = (x[at + 2, t] - L[2, 0] * x[at, t] - L[2, 1] * x[at + 1, t]) / L[2, 2]
+
+
+@compiled
+def _solve_three_transposed(L, x, at):
+    """Solve L'y = three rows of x, in place."""
+    for t in range(x.shape[1]):
+        x[at + 2, t] /= L[2, 2]
+        x[at + 1, t] = (x[at + 1, t] - L[2, 1] * x[at + 2, t]) / L[1, 1]
+        x[at, t] = (x[at, t] - L[1, 0] * x[at + 1, t] - L[2, 0] * x[at + 2, t]) / L[0, 0]
 
 
 @loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, ::1])')
@@ -91,9 +95,7 @@ def left_over(keyframe, blocks, x, y):
     k, q = x.shape[1:]
     moment, d = np.empty((len(blocks), k, k)), np.empty((k, q))
     for f in range(len(blocks)):
-        for r in range(k):
-            for t in range(q):
-                d[r, t] = y[f, r, t]
+        d[:] = y[f]
         _add_moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], -1.0, d)
         _second_moment(d, moment[f])
     return moment
@@ -105,9 +107,7 @@ def spreads(keyframe, blocks, x):
     k, q = x.shape[1:]
     moment, d = np.empty((len(blocks), k, k)), np.empty((k, q))
     for f in range(len(blocks)):
-        for r in range(k):
-            for t in range(q):
-                d[r, t] = 0.0
+        d[:] = 0.0
         _add_moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], 1.0, d)
         _second_moment(d, moment[f])
     return moment
@@ -125,10 +125,10 @@ def moved(keyframe, blocks, x):
 @compiled
 def _add_moved(pair, x_i, x_j, sign, d):
     """Add sign (J_i x_i + J_j x_j) of one factor to d (k, q)."""
-    for r in range(len(d)):
-        for c in range(len(d)):
-            _subtract(d[r], -sign * pair[0, r, c], x_i[c])
-            _subtract(d[r], -sign * pair[1, r, c], x_j[c])
+    for r in range(0, len(d), 3):
+        for c in range(0, len(d), 3):
+            _add(x_i, c, pair[0, r:r + 3, c:c + 3], sign, d, r)
+            _add(x_j, c, pair[1, r:r + 3, c:c + 3], sign, d, r)
 
 
 @compiled

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Solving with the factor that `cholesky` left in the panels, forwards and backwards."""
+"""
+Solving with the factor that `cholesky` left in the panels, forwards and backwards.
+
+Rows of a panel are taken three at a time, so that what is read of the solution serves all three.
+"""
 
 import numpy as np
 
@@ -9,70 +13,78 @@ from l1slam_ros.core.kernels.compiled import compiled, loop
 @loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i4[::1], f8[:, ::1])')
 def solve(panels, first, start, pattern, offset, position, right):
     """Return the solution of L L' x = right; both (n, k) in the order of the keyframes."""
-    k = right.shape[1]
-    x = np.empty_like(right)
-    for f in range(len(right)):
+    n, k = right.shape
+    x = np.empty(n * k)
+    for f in range(n):
         for a in range(k):
-            x[position[f], a] = right[f, a]
+            x[position[f] * k + a] = right[f, a]
     tallest = 0
     for s in range(len(first) - 1):
         tallest = max(tallest, start[s + 1] - start[s])
-    local = np.empty(tallest * k)
+    place = np.empty(tallest * k, np.int64)
     for s in range(len(first) - 1):
-        _forward(panels[offset[s]:offset[s + 1]], pattern[start[s]:start[s + 1]],
-                 first[s], first[s + 1] - first[s], x, local)
+        height = _write_places(pattern[start[s]:start[s + 1]], k, place)
+        own = x[first[s] * k:first[s + 1] * k]
+        _forward(panels[offset[s]:offset[s + 1]], place[:height], own, x)
     for s in range(len(first) - 2, -1, -1):
-        _backward(panels[offset[s]:offset[s + 1]], pattern[start[s]:start[s + 1]],
-                  first[s], first[s + 1] - first[s], x, local)
-    solution = np.empty_like(x)
-    for f in range(len(right)):
+        height = _write_places(pattern[start[s]:start[s + 1]], k, place)
+        own = x[first[s] * k:first[s + 1] * k]
+        _backward(panels[offset[s]:offset[s + 1]], place[:height], own, x)
+    solution = np.empty((n, k))
+    for f in range(n):
         for a in range(k):
-            solution[f, a] = x[position[f], a]
+            solution[f, a] = x[position[f] * k + a]
     return solution
 
 
 @compiled
-def _forward(panel, rows, first, columns, x, local):
-    """Solve for the supernode's own rows, and subtract what they do to the rows below."""
-    d = x.shape[1]
-    width = columns * d
-    at = 0
-    for k in range(columns):
-        for a in range(d):
-            total = x[first + k, a]
-            for c in range(k * d + a):
-                total -= panel[at + c] * local[c]
-            local[k * d + a] = total / panel[at + k * d + a]
-            x[first + k, a] = local[k * d + a]
-            at += width
-    for k in range(columns, len(rows)):
-        for a in range(d):
-            total = 0.0
-            for c in range(width):
-                total += panel[at + c] * local[c]
-            x[rows[k], a] -= total
-            at += width
+def _write_places(rows, k, place):
+    """Write where in the solution each row of a panel belongs; return how many there are."""
+    for r in range(len(rows)):
+        for a in range(k):
+            place[r * k + a] = rows[r] * k + a
+    return len(rows) * k
 
 
 @compiled
-def _backward(panel, rows, first, columns, x, local):
-    """Solve with the transpose for the supernode's own rows, once all below are known."""
-    d = x.shape[1]
-    width = columns * d
-    for k in range(columns):
-        for a in range(d):
-            local[k * d + a] = x[first + k, a]
-    at = width * width
-    for k in range(columns, len(rows)):
-        for a in range(d):
-            value = x[rows[k], a]
-            for c in range(width):
-                local[c] -= panel[at + c] * value
-            at += width
-    for r in range(width - 1, -1, -1):
-        local[r] /= panel[r * width + r]
+def _forward(panel, place, own, x):
+    """Solve for the supernode's own rows, and subtract what they do to the rows below."""
+    width, height = len(own), len(place)
+    for r in range(width):
+        row, total = panel[r * width:(r + 1) * width], 0.0
         for c in range(r):
-            local[c] -= panel[r * width + c] * local[r]
-    for k in range(columns):
-        for a in range(d):
-            x[first + k, a] = local[k * d + a]
+            total += row[c] * own[c]
+        own[r] = (own[r] - total) / row[r]
+    for r in range(width, height, 3):
+        r1, r2 = min(r + 1, height - 1), min(r + 2, height - 1)
+        row0, row1 = panel[r * width:(r + 1) * width], panel[r1 * width:(r1 + 1) * width]
+        row2 = panel[r2 * width:(r2 + 1) * width]
+        s0 = s1 = s2 = 0.0
+        for c in range(width):
+            s0 += row0[c] * own[c]
+            s1 += row1[c] * own[c]
+            s2 += row2[c] * own[c]
+        x[place[r]] -= s0
+        if r1 > r:
+            x[place[r1]] -= s1
+        if r2 > r1:
+            x[place[r2]] -= s2
+
+
+@compiled
+def _backward(panel, place, own, x):
+    """Solve with the transpose for the supernode's own rows, once all below are known."""
+    width, height = len(own), len(place)
+    for r in range(width, height, 3):
+        r1, r2 = min(r + 1, height - 1), min(r + 2, height - 1)
+        row0, row1 = panel[r * width:(r + 1) * width], panel[r1 * width:(r1 + 1) * width]
+        row2 = panel[r2 * width:(r2 + 1) * width]
+        x0, x1, x2 = x[place[r]], x[place[r1]], x[place[r2]]
+        x1, x2 = x1 if r1 > r else 0.0, x2 if r2 > r1 else 0.0
+        for c in range(width):
+            own[c] -= row0[c] * x0 + row1[c] * x1 + row2[c] * x2
+    for r in range(width - 1, -1, -1):
+        row = panel[r * width:(r + 1) * width]
+        own[r] /= row[r]
+        for c in range(r):
+            own[c] -= row[c] * own[r]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_finite
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_sound
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.loop_states import LoopStates
 from l1slam_ros.core.online.snapshot import Optimised, Robot, SavedMap
@@ -138,7 +138,7 @@ class Backend(Upkeep):
     def counts(self) -> tuple[dict[str, int], dict[str, int]]:
         """Return the sizes of the graph, and how many loops were refused for which cause."""
         with self._lock:
-            version, refused = self._version(), dict(self._builder.refused)
+            version, refused = self._version(), dict(self._builder.notes.refused)
         if self._counted[0] != version:
             self._counted = version, self.snapshot().sizes()
         return self._counted[1], refused
@@ -170,19 +170,19 @@ class Backend(Upkeep):
 
         None: it is held, not used yet; see `GraphBuilder.add_odometry`.
         """
-        require_finite(sample.pose3)
+        require_sound(sample)
         with self._lock:
             self._samples += 1
-            self._builder.add_odometry(sample)
+            used = self._builder.add_odometry(sample)
             self._begin_map()
-            map_to_odom = None if self._builder.held else self._map_to_odom_now()
+            map_to_odom = self._map_to_odom_now() if used else None
         self._wake()
         return map_to_odom
 
     def robot(self) -> Robot | None:
         """Return where the robot is; None: no odometry has said yet where it is in this map."""
         with self._lock:
-            last = self._builder.last
+            last = self._builder.stream.last
             return Robot(last.stamp, last.pose, self._map_to_odom_now()) if last else None
 
     def begin_anew(self) -> None:
@@ -201,7 +201,7 @@ class Backend(Upkeep):
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Add one loop closure; see `GraphBuilder.add_loop`."""
-        require_finite(loop.pose3)
+        require_sound(loop)
         with self._lock:
             self._changes += 1
             self._builder.add_loop(loop)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.geometry.noise import (
     MOST_OF_ODOMETRY,
@@ -24,6 +25,8 @@ from l1slam_ros.core.options import Options, option
 
 # Ten steps of 5 cm are half a metre, though the difference of coordinates be a rounding less.
 _ALMOST = 1 - 1e-9
+# So many messages without a keyframe are summed up at once: memory for more is not needed.
+_SUMMED = 512
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,29 @@ def reduced_covariance(manifold: Manifold, covariance: Array) -> Array:
     return part
 
 
+class Level:
+    """What poses of the odometry have beside those of the map: in the plane no z, and no tilt."""
+
+    def __init__(self, manifold: Manifold):
+        self._manifold = manifold
+        self._first: Array | None = None
+
+    def dropped(self, sample: OdometrySample, options: KeyframeOptions) -> tuple[float, float]:
+        """
+        Return how far [m] and how steeply [rad] a sample has left the level of the first one.
+
+        Zeros, where that would not make a keyframe: a floor is not quite even.
+        """
+        pose3 = sample.pose3[None]
+        off = se3.local(self._manifold.to_pose3(self._manifold.from_pose3(pose3)), pose3)
+        if self._first is None:
+            self._first = off
+        (length,), (angle,) = se3.motion(off - self._first)
+        even = (length <= (options.translation or KeyframeOptions.translation)
+                and angle <= (options.rotation or KeyframeOptions.rotation))
+        return (0.0, 0.0) if even else (float(length), float(angle))
+
+
 class Motion:
     """
     The motion since the last keyframe, grown message by message.
@@ -82,17 +108,45 @@ class Motion:
     """
 
     def __init__(self, manifold: Manifold, stamp: int, pose: Array):
-        d = manifold.TANGENT_SIZE
         self._manifold = manifold
+        self.bounded: list[tuple[float, float]] = []
+        self.begin(stamp, pose)
+
+    def begin(self, stamp: int, pose: Array) -> None:
+        """Begin at a keyframe: stamp [ns], pose (1, p)."""
+        d = self._manifold.TANGENT_SIZE
         self._start = self._stamp = stamp
         # The keyframe and the last sample.
         self._ends = np.concatenate((pose, pose))
         self._metres = self._radians = 0.0
         self._distance = self._turn = 0.0
-        self.bounded: list[tuple[float, float]] = []
         self._poses: list[Array] = []
         self._stated: list[Array] | None = []
         self._unseen = np.zeros((d, d))
+
+    def step(self, sample: OdometrySample, pose: Array, keyframe: KeyframeOptions,
+             odometry: OdometryOptions, verbatim: bool = False,
+             unseen: tuple[float, float] | None = None) -> tuple[Array, Array] | None:
+        """
+        Continue to a sample; where it makes a keyframe, return the motion, and begin there.
+
+        unseen : how far and by which angle the robot may have gone instead; that is a keyframe:
+        what is published goes by the last one
+
+        Returns
+        -------
+        relative pose (1, p) and covariance (d, d); None: no keyframe
+
+        """
+        if unseen is not None:
+            self._add_unseen(sample, *unseen)
+        else:
+            self.add(sample, pose, odometry)
+            if not self.is_keyframe(keyframe):
+                return None
+        motion = self.pose, self.covariance(odometry, verbatim)
+        self.begin(sample.stamp, pose)
+        return motion
 
     def add(self, sample: OdometrySample, pose: Array, options: OdometryOptions) -> None:
         """Continue to `pose` (1, p) in the odometry frame, that of a sample."""
@@ -103,24 +157,31 @@ class Motion:
         self._radians += radians
         if options.covariance_source == 'model':
             self._stated = None  # one message without a covariance: the model speaks for all
-        elif self._stated is not None:
+        elif self._stated is not None and len(self._stated) >= _SUMMED:
+            self._sum_up()
+        if self._stated is not None:
             self._poses.append(pose)
             self._stated.append(
                 sample.covariance if options.covariance_source == 'increment'
                 else sample.twist_covariance * ((sample.stamp - self._stamp) * 1e-9) ** 2)
         self._ends[1], self._stamp = pose[0], sample.stamp
 
+    def _sum_up(self) -> None:
+        """Let one covariance stand for those of all messages so far."""
+        end = self._poses[-1]
+        total = self._seen_from(end)
+        self._poses, self._stated = [end], None if total is None else [
+            _of_message(self._manifold, total.sum(axis=0))]
+
     def add_known(self, stamp: int, pose: Array, covariance: Array,
                   options: OdometryOptions) -> None:
         """Continue to `pose` (1, p) at a stamp [ns]; the covariance (d, d) is of the way there."""
-        rows = np.array(self._manifold.COVARIANCE_ROWS)
-        stated = np.zeros((6, 6))
-        stated[rows[:, None], rows] = covariance
+        stated = _of_message(self._manifold, covariance)
         seconds = (stamp - self._stamp) * 1e-9
         self.add(OdometrySample(stamp, self._manifold.to_pose3(pose)[0], stated,
                                 stated / seconds**2), pose, options)
 
-    def add_unseen(self, sample: OdometrySample, metres: float, radians: float) -> None:
+    def _add_unseen(self, sample: OdometrySample, metres: float, radians: float) -> None:
         """Continue to a sample at the same place, to which the robot may have gone some way."""
         self._unseen = self._unseen + diagonal_covariance(self._manifold, metres, radians)
         self._stamp = sample.stamp
@@ -143,6 +204,7 @@ class Motion:
 
         verbatim : as stated, though it be more, or less, than any odometry can know
         """
+        self.bounded = []
         model = diagonal_covariance(
             self._manifold,
             float(np.hypot(options.sigma_translation * self._metres, options.floor_translation)),
@@ -152,15 +214,10 @@ class Motion:
 
     def _sum(self, model: Array, verbatim: bool) -> Array | None:
         """Return the sum of what the messages state; None where one states no covariance."""
-        manifold = self._manifold
-        stated = reduced_covariance(manifold, np.array(self._stated))
-        if not usable(stated).all():
+        stated = self._seen_from(self._ends[1:])
+        if stated is None:
             return None
-        total = stated
-        if len(total) > 1:
-            # The errors on the way, seen from the end.
-            Ad = manifold.adjoint(manifold.between(self._ends[1:], np.concatenate(self._poses)))
-            total = (Ad @ total @ Ad.transpose(0, 2, 1)).sum(axis=0, keepdims=True)
+        total = stated.sum(axis=0, keepdims=True)
         if verbatim:
             exactly: Array = total[0]
             return exactly
@@ -169,3 +226,23 @@ class Motion:
         self.bounded = bounds(total, used, out | large)
         # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
         return used[0] if len(stated) == 1 or usable(used)[0] else None
+
+    def _seen_from(self, end: Array) -> Array | None:
+        """Return what each message states (k, d, d), seen from an end (1, p); None: see `_sum`."""
+        manifold = self._manifold
+        stated = reduced_covariance(manifold, np.array(self._stated))
+        if not usable(stated).all():
+            return None
+        if len(stated) == 1:
+            return stated
+        Ad = manifold.adjoint(manifold.between(end, np.concatenate(self._poses)))
+        turned: Array = Ad @ stated @ Ad.transpose(0, 2, 1)
+        return turned
+
+
+def _of_message(manifold: Manifold, covariance: Array) -> Array:
+    """Return a covariance (d, d) as a message has it, (6, 6)."""
+    rows = np.array(manifold.COVARIANCE_ROWS)
+    stated = np.zeros((6, 6))
+    stated[rows[:, None], rows] = covariance
+    return stated

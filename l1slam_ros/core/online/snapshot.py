@@ -28,7 +28,7 @@ from l1slam_ros.core.online.loop_states import (
 )
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.optimality import Status
-from l1slam_ros.core.solvers.solve import AUTO, PRIMAL_DUAL, Choice, choose
+from l1slam_ros.core.solvers.solve import AUTO, PRIMAL_DUAL, Method, choose
 
 # A large map gets but one linearisation into an update, and never meets a test that takes two of
 # them. It is at rest when so many updates in a row lowered the cost by less than is looked for.
@@ -68,14 +68,14 @@ class Problem:
         return self.graph.subset(self.judgement.accepted)
 
     @cached_property
-    def choice(self) -> Choice:
+    def method(self) -> Method:
         """What to solve them by."""
         return choose(AUTO, self.part)
 
     @property
     def is_sparse(self) -> bool:
         """Whether they are solved by factorisations."""
-        return self.choice.solver != PRIMAL_DUAL
+        return self.method.solver != PRIMAL_DUAL
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class Snapshot:
 
     map : its number; version : see `Backend.version`; graph : the factors so far; gaps : as in
     `Problem`; stamps (n,) [ns] and odometry (n, p) of the keyframes; map_to_odom : (1, p);
-    loop_rows, loop_stamps : see `GraphBuilder`; robust : loops may be doubted; looks : (k, 3) what
+    loop_rows, loop_stamps : see `LoopFactors`; robust : loops may be doubted; looks : (k, 3) what
     the front says of the factors after those that are judged: accepted, suspect, sigmas;
     all_judged : no loop is among them; judged : (k, p) the L2 map of the judgement, None: there is
     none; stale : the map is not of the factors that are accepted; views : the L1 and L2 map of the

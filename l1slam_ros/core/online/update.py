@@ -20,8 +20,8 @@ from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.incremental.front import Front, Gate
 from l1slam_ros.core.online.snapshot import Optimised, Problem
+from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.robust.judgement import Judgement
-from l1slam_ros.core.robust.robust_map import minimise_robustly
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.solvers.interior_point import interior_point, prove
 from l1slam_ros.core.solvers.nonlinear import (
@@ -125,7 +125,7 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
         return _improvement(solution, problem, problem.judgement, before, 0, start)
     dual = _dual_of(problem, poses)
     steps, far = 0, problem.may_be_far and is_far(cost, problem.last_cost)
-    cholesky = problem.choice.cholesky if far else None
+    cholesky = problem.method.cholesky if far else None
     while cholesky and far and (not steps or time.monotonic() < deadline):
         check()
         system = linearise(graph, poses)
@@ -141,15 +141,15 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
 def _follow(problem: Problem, poses: Array, options: OptimiserOptions, accuracy: Accuracy,
             check: Check) -> Solution:
     """Return the optimum that poses lead to, by some ten or twenty factorisations."""
-    graph, choice = problem.part, problem.choice
-    assert choice.cholesky is not None, 'a graph that is sparse'
-    optimum = interior_point(GraphProblem(graph), poses, choice.cholesky,
+    graph, method = problem.part, problem.method
+    assert method.cholesky is not None, 'a graph that is sparse'
+    optimum = interior_point(GraphProblem(graph), poses, method.cholesky,
                              options.outer_iterations, accuracy.tolerance, lambda *_: check())
     if optimum.status is not Status.CONVERGED:
-        return minimise_by(choice, graph, poses, options, lambda *_: check())[0]
+        return minimise_by(method, graph, poses, options, lambda *_: check())[0]
     dual, gap, status = optimum.ends[-1].y, np.inf, Status.OUT_OF_TIME
     if accuracy.proved:
-        dual, gap, status = prove(optimum, choice.cholesky)
+        dual, gap, status = prove(optimum, method.cholesky)
     if gap > EXACT.tolerance * optimum.costs[-1] and accuracy is not EXACT:
         status = Status.OUT_OF_TIME
     return Solution(optimum.poses, optimum.costs[-1], status, len(optimum.costs) - 1, 0,
@@ -183,8 +183,8 @@ def front_of(problem: Problem, poses: Array, rows: int,
 
     None: its factor would take longer than what it is for, or some keyframe is not tied to others.
     """
-    judgement, choice, part = problem.judgement, problem.choice, problem.part
-    if not problem.is_sparse or choice.cholesky is None:
+    judgement, method, part = problem.judgement, problem.method, problem.part
+    if not problem.is_sparse or method.cholesky is None:
         return None
     loops = ~problem.graph.between.is_odometry
     believed, kinds = loops & judgement.accepted, loops[judgement.accepted].astype(np.int64)
@@ -196,8 +196,8 @@ def front_of(problem: Problem, poses: Array, rows: int,
     # Until chi2 is within one of its minimum: far from it the gate would see ghosts.
     enough = LeastSquaresOptions(_L2_STEPS, 1 / max(len(part.between), 1))
     try:
-        l2_poses = minimise_l2(found, nearest, enough, choice.cholesky, lambda *_: check()).poses
-        return Front(part, poses, l2_poses, choice.cholesky, kinds, gate, rows)
+        l2_poses = minimise_l2(found, nearest, enough, method.cholesky, lambda *_: check()).poses
+        return Front(part, poses, l2_poses, method.cholesky, kinds, gate, rows)
     except GraphError:
         return None
 
@@ -227,8 +227,8 @@ def optimise(problem: Problem, options: OptimiserOptions,
 def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
             check: Check) -> Solution:
     check()
-    choice = choose(AUTO, graph, options.norm)
-    return minimise_by(choice, graph, poses, options, lambda *_: check())[0]
+    method = choose(AUTO, graph, options.norm)
+    return minimise_by(method, graph, poses, options, lambda *_: check())[0]
 
 
 def _improvement(solution: Solution, problem: Problem, judgement: Judgement, before: float,

@@ -24,29 +24,35 @@ A place
     neighbours hardly ever agree. Votes of several places count, each by itself
     (`pairwise_consistency`).
 A slip
-    is an odometry factor that says nothing; a gap, or the seam of two sessions, is one whose place
-    is known. The sides of it are right in themselves, so the true loops across agree with each
-    other. A slip is one explanation of loops that do not fit, lies are the other: `slips` compares
-    what each costs, chi2 for factors and a gate for a place.
+    is an odometry factor that says anything, while the robot moved on as ever (`motion`); of all
+    of them one is expected to be. A gap, or the seam of two sessions, is one whose place is known.
+    The sides of it are right in themselves, so the true loops across agree with each other. A slip
+    is one explanation of loops that do not fit, lies are the other: `slips` compares their odds,
+    with half a gate for each place that one of them calls a lie.
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
     is a rival explanation nearly as good as the one that won: `judgement` names it.
 
 No loop is factored before it is accepted, so none bends what it is judged by. Read on in `rounds`,
-`gating`, `innovation`, `places`, `pairwise_consistency`, `slips`, `judgement`.
+`gating`, `innovation`, `places`, `pairwise_consistency`, `motion`, `slips`, `judgement`.
 """
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.judgement import Judgement, doubts, judgement_of
 from l1slam_ros.core.robust.rounds import Growth
 from l1slam_ros.core.robust.slips import join, without_slip
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import l2_map
+from l1slam_ros.core.solvers.nonlinear import Solution
 
 # Every round accepts a loop, hence there is an end; this one is for the patience of people.
 _MOST_ROUNDS = 200
@@ -75,26 +81,62 @@ def robust_solve(
     return judgement_of(growth, doubts(growth)), growth.poses
 
 
-def rounds(growth: Growth, repaired: Callable[[Growth], Growth | None]) -> Iterator[Growth]:
+@dataclass(frozen=True)
+class RobustMap:
+    """The map of the accepted factors, the L2 map (n, p) it began with, the judgement on all."""
+
+    solution: Solution
+    seed: Array
+    judgement: Judgement
+
+
+def minimise_robustly(
+    graph: FactorGraph, minimise: Callable[[FactorGraph, Array], Solution],
+    report: Report = lambda round_, accepted: None, check: Callable[[], None] = lambda: None,
+) -> RobustMap:
+    """
+    Return the map that `minimise` makes of the factors that are accepted.
+
+    They are judged in L2, which spreads a doubt over all factors near it, where L1 leaves it on a
+    few.
+
+    minimise : from a graph and poses (n, p) to its solution; report, check : see `robust_solve`
+    """
+    judgement, poses = robust_solve(graph, report, check)
+    accepted = graph.subset(judgement.accepted)
+    whole = tied(accepted, poses)
+    seed = l2_map(whole, poses, cholesky_of(whole), lambda *_: check())
+    solution = minimise(whole, seed)
+    rows = len(accepted.between) * graph.manifold.TANGENT_SIZE
+    return RobustMap(replace(solution, dual=solution.dual[:rows]), seed, judgement)
+
+
+def rounds(
+    growth: Growth, repaired: Callable[[Growth, Indices], Growth | None]
+) -> Iterator[Growth]:
     """
     Yield the state after each round, until there is nothing more to accept.
 
-    repaired : asked for another state where nothing more can be accepted; None: there is none.
+    repaired : asked in the end for another state, from the one with the noise as it was found and
+    the loops that are left out though all may be as noisy as they say; None: there is none.
     """
+    found = None
     for _ in range(_MOST_ROUNDS):
         news = growth.believable(growth.undecided())
         growth.accepted[news] = True
         if len(news):
             growth.solve()
         elif not join(growth):
-            if growth.takes_at_their_word:
-                break
-            other = repaired(growth)
-            if other is None:
+            if not found:
+                found = growth.copy()
                 growth.take_at_their_word()
                 growth.solve()
             else:
-                growth = other
+                other = repaired(found, growth.undecided())
+                growth.slip_odds = found.slip_odds
+                if not other:
+                    break
+                growth, found = other, None
         yield growth
 
 
@@ -117,7 +159,7 @@ def judge(
     first, settled = Growth(graph, check), True
     first.resume(poses, known.accepted, known.variance)
     growth = first
-    for growth in rounds(first, lambda _: None):
+    for growth in rounds(first, lambda *_: None):
         # The end is not put off once it is in sight, or short budgets would never get there.
         if time.monotonic() > deadline and not growth.takes_at_their_word:
             settled = False

@@ -19,21 +19,21 @@ from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import bridged, odometry_gaps
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import Report as OnRound
+from l1slam_ros.core.robust.batch import RobustMap, minimise_robustly
 from l1slam_ros.core.robust.inspection import initial_poses, require_connected
 from l1slam_ros.core.robust.judgement import Judgement
-from l1slam_ros.core.robust.robust_map import RobustMap, minimise_robustly
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
 from l1slam_ros.core.solvers.optimality import norm_of
 from l1slam_ros.core.solvers.seed import seed_poses
-from l1slam_ros.core.solvers.solve import AUTO, Choice, choose, minimise_by
+from l1slam_ros.core.solvers.solve import AUTO, Method, choose, minimise_by
 
 # A graph with more gaps than this part of its steps is none of a robot that kept its odometry.
 _MOST_GAPS = 0.1
 
 
 @dataclass(frozen=True)
-class Wish:
+class SolveOptions:
     """
     How a graph is to be solved; see `core.names`.
 
@@ -71,7 +71,7 @@ class Outcome:
 
 
 def solve(
-    graph: FactorGraph, stored: Array | None, wish: Wish,
+    graph: FactorGraph, stored: Array | None, asked: SolveOptions,
     report: Report = lambda iteration, cost: None,
     on_round: OnRound = lambda round_, accepted: None, ids: Indices | None = None,
 ) -> Outcome:
@@ -93,22 +93,22 @@ def solve(
 
     """
     ids = np.arange(graph.n_poses) if ids is None else ids
-    _require_start(graph, stored, wish, ids)
+    _require_start(graph, stored, asked, ids)
     seed = None
-    initial = (odometry_poses(graph) if wish.start == 'odometry'
-               else initial_poses(graph if wish.robust is False else bridged(graph), stored, ids))
-    minimiser = _Minimiser(wish, report)
+    initial = (odometry_poses(graph) if asked.start == 'odometry'
+               else initial_poses(graph if asked.robust is False else bridged(graph), stored, ids))
+    minimiser = _Minimiser(asked, report)
     began = time.perf_counter()
-    robust, unjudged = _robust_map(graph, wish, minimiser, on_round, ids)
+    robust, unjudged = _robust_map(graph, asked, minimiser, on_round, ids)
     if robust:
         solution, seed = robust.solution, robust.seed
         graph = graph.subset(robust.judgement.accepted)
     else:
-        choice = minimiser.choose(graph)
-        seed = seed_poses(graph, choice.cholesky) if wish.start == 'seed' else None
-        solution = minimiser.minimise_by(choice, graph, initial if seed is None else seed)
+        method = minimiser.choose(graph)
+        seed = seed_poses(graph, method.cholesky) if asked.start == 'seed' else None
+        solution = minimiser.minimise_by(method, graph, initial if seed is None else seed)
     seconds = time.perf_counter() - began
-    cost = cost_function(graph, wish)
+    cost = cost_function(graph, asked)
     seed_cost = None if seed is None else cost(seed)
     if not np.isfinite([cost(initial), seed_cost or 0.0, solution.cost]).all():
         raise GraphError('the cost leaves double precision: measurements and information of the '
@@ -118,19 +118,18 @@ def solve(
                    judgement, unjudged, int(component_labels(graph).max()) + 1)
 
 
-def _robust_map(
-    graph: FactorGraph, wish: Wish, minimiser: '_Minimiser', on_round: OnRound, ids: Indices
-) -> tuple[RobustMap | None, str]:
+def _robust_map(graph: FactorGraph, asked: SolveOptions, minimiser: '_Minimiser',
+                on_round: OnRound, ids: Indices) -> tuple[RobustMap | None, str]:
     """Return the robust map; where nobody insists on one and there is none, None and why."""
     unjudged, gaps = '', odometry_gaps(graph)
-    if wish.robust is None and len(gaps) > _MOST_GAPS * (graph.n_poses - 1):
+    if asked.robust is None and len(gaps) > _MOST_GAPS * (graph.n_poses - 1):
         unjudged = (f'no edge between the consecutive vertices {ids[gaps[0]]} and '
                     f'{ids[gaps[0] + 1]}, so no chain of odometry to judge loops by')
-    elif wish.robust is not False:
+    elif asked.robust is not False:
         try:
             return minimise_robustly(graph, minimiser.minimise, on_round), ''
         except GraphError as error:
-            if wish.robust:
+            if asked.robust:
                 raise
             unjudged = str(error)
     require_connected(graph, ids)
@@ -140,42 +139,43 @@ def _robust_map(
 class _Minimiser:
     """Minimises the norm that was wished for; solver, reason : what did it last, and why."""
 
-    def __init__(self, wish: Wish, report: Report):
-        self._wish, self._report = wish, report
+    def __init__(self, asked: SolveOptions, report: Report):
+        self._asked, self._report = asked, report
         self.solver = self.reason = ''
 
-    def choose(self, graph: FactorGraph) -> Choice:
+    def choose(self, graph: FactorGraph) -> Method:
         """Return what the graph is solved by."""
-        return choose(self._wish.solver, graph, self._wish.norm)
+        return choose(self._asked.solver, graph, self._asked.norm)
 
     def minimise(self, graph: FactorGraph, poses: Array) -> Solution:
         """Return the solution from poses (n, p)."""
         return self.minimise_by(self.choose(graph), graph, poses)
 
-    def minimise_by(self, choice: Choice, graph: FactorGraph, poses: Array) -> Solution:
+    def minimise_by(self, method: Method, graph: FactorGraph, poses: Array) -> Solution:
         """Return the solution by what was chosen."""
-        wish, self.solver, self.reason = self._wish, choice.solver, choice.reason
-        solution, self.solver = minimise_by(choice, graph, poses, wish.options, self._report,
-                                            wish.least_squares)
-        if self.solver != choice.solver:
-            self.reason = f'it went on where {choice.solver} came no further'
+        asked, self.solver, self.reason = self._asked, method.solver, method.reason
+        solution, self.solver = minimise_by(method, graph, poses, asked.options, self._report,
+                                            asked.least_squares)
+        if self.solver != method.solver:
+            self.reason = f'it went on where {method.solver} came no further'
         return solution
 
 
-def cost_function(graph: FactorGraph, wish: Wish) -> Callable[[Array], float]:
+def cost_function(graph: FactorGraph, asked: SolveOptions) -> Callable[[Array], float]:
     """Return what is to be minimised, as a function of the poses."""
-    norm = norm_of(wish.norm, graph.manifold.TANGENT_SIZE, wish.least_squares.huber_delta)
+    norm = norm_of(asked.norm, graph.manifold.TANGENT_SIZE, asked.least_squares.huber_delta)
     return lambda poses: norm.cost(whitened_residual(graph, poses))
 
 
-def _require_start(graph: FactorGraph, stored: Array | None, wish: Wish, ids: Indices) -> None:
+def _require_start(graph: FactorGraph, stored: Array | None, asked: SolveOptions,
+                   ids: Indices) -> None:
     """Refuse, before any work is done, a graph that is not connected or has no such start."""
-    if wish.robust is False:
+    if asked.robust is False:
         require_connected(graph, ids)
-    if wish.start == 'file' and stored is None:
+    if asked.start == 'file' and stored is None:
         raise GraphError('the input stores no poses to start from; expected --start seed or '
                          'odometry')
-    if wish.start == 'odometry':
+    if asked.start == 'odometry':
         _require_chain(graph, ids, 'so no chain of odometry to start from; expected --start seed')
 
 

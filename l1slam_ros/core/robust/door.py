@@ -37,7 +37,8 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
     Parameters
     ----------
     graph : the factors, as of `read_graph`
-    norm : l1, the sum of the absolute whitened residuals; l2, that of their squares; huber
+    norm : l1, the sum of the absolute whitened residuals; group-l1, of the lengths of all;
+        l2, of their squares; huber
     robust : refuse loops that cannot be believed; False: believe all
     start : (n, p) poses to begin with; None: a seed computed from the graph alone, as a robust
         solve does in any case
@@ -45,17 +46,25 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
     Raises
     ------
     GraphError : the graph is not connected, its odometry has a gap where loops are to be
-        judged, or `start` has another shape.
+        judged, or `start` has another shape or is not finite.
     OptionError : there is no such norm.
 
     """
     if norm not in NORMS:
         raise OptionError(f'norm is {norm!r}, expected one of {", ".join(NORMS)}')
     expected = (graph.n_poses, graph.manifold.POSE_SIZE)
-    if start is not None and np.shape(start) != expected:
-        raise GraphError(f'start has the shape {np.shape(start)}, expected {expected}')
-    wish = batch_map.Wish('seed' if start is None else 'file', norm, robust=robust)
-    outcome = batch_map.solve(graph, None if start is None else np.asarray(start, float), wish)
+    if start is not None:
+        if np.shape(start) != expected:
+            raise GraphError(f'start has the shape {np.shape(start)}, expected {expected}')
+        # A quaternion may have another norm, an angle be of several turns.
+        with np.errstate(all='ignore'):
+            start = graph.manifold.compose(
+                graph.manifold.identity(graph.n_poses), np.asarray(start, float))
+        if not (finite := np.isfinite(start).all(axis=1)).all():
+            raise GraphError(f'start of keyframe {int(np.argmin(finite))} is no pose; expected '
+                             'finite numbers')
+    asked = batch_map.SolveOptions('seed' if start is None else 'file', norm, robust=robust)
+    outcome = batch_map.solve(graph, start, asked)
     judgement, status = outcome.judgement, outcome.solution.status.value
     if judgement is None:
         inliers = np.ones(len(graph.between), bool)

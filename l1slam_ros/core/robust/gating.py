@@ -79,20 +79,20 @@ def noise_variance(found: Innovations) -> Array:
         square, log_det = normalise(spread + ratio * np.eye(k), residual)
         log_det -= (k - freedom) * np.log(ratio)  # what says nothing has no noise
         for start in (1.0, *(np.quantile(square, (0.1, 0.5)) / k).tolist()):
-            likelihood, scale = _fitted_scale(square, log_det, log_claim, freedom, start)
+            likelihood, scale = _fitted_scale(square, log_det, log_claim, freedom, k, start)
             costs = _RATIO_COSTS * len(best) * (ratio != 1) + _DECADE_COSTS * abs(np.log10(scale))
             fits.append((likelihood - costs, scale, ratio))
     _, scale, ratio = max(fits)
     return np.array([scale, ratio * scale])
 
 
-def _fitted_scale(square: Array, log_det: Array, log_claim: Array, freedom: Indices, start: float
-                  ) -> tuple[float, float]:
+def _fitted_scale(square: Array, log_det: Array, log_claim: Array, freedom: Indices, k: int,
+                  start: float) -> tuple[float, float]:
     """Return the log likelihood of the best scale of C near a start, and that scale."""
     scale = start = max(start, _LEAST_START)
     for _ in range(_ROUNDS):
         log_ratio = log_likelihood_ratio(square / scale, log_det + freedom * np.log(scale),
-                                         log_claim, freedom)
+                                         log_claim, freedom, k)
         odds = log_odds_of_false(log_ratio, 0)
         true = probability(log_ratio - odds)
         # The one pseudo-factor at the start is for crowds without a true one.

@@ -25,8 +25,9 @@ from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, linearise
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
 _beta_quantile, _gamma_quantile = cache(beta_quantile), cache(gamma_quantile)
-# A covariance from that many samples has standard deviations right to 15% (1 / sqrt(2 SAMPLES)).
-SAMPLES = 24
+# So many samples for each number of a step, in all q: then standard deviations are right to 15% in
+# the plane (1 / sqrt(2 q)), and of two factors together there are far more samples than rows.
+SAMPLES = 8
 # A factor whose residual has a variance below this part of its noise is checked by no other.
 _REDUNDANT = 1e-6
 
@@ -36,7 +37,7 @@ class Posterior:
     """
     A graph at its optimum.
 
-    cholesky : of its normal matrix; samples : (free keyframes + 1, k, SAMPLES) steps from it, as
+    cholesky : of its normal matrix; samples : (free keyframes + 1, k, q) steps from it, as
     probable as the noise makes them, the last one of what is held fixed; residual : (m, k)
     whitened, of each factor; moment : (m, k, k) what noise as stated would make of it; speaks :
     (m, k) bool, see `BetweenFactors`; fixed : keyframes that are held, see `anchor`.
@@ -83,11 +84,12 @@ def sample_posterior(
         raise GraphError('the normal matrix is singular: a part of the graph is not tied to '
                          'the anchor, or weights differ beyond double precision')
     m, k = len(system.blocks), system.block_size
+    q = SAMPLES * k
     # Signs have the covariance of white noise, and are quicker to draw.
-    noise = 2.0 * rng.integers(0, 2, (m, k, SAMPLES), dtype=np.int8) - 1.0
+    noise = 2.0 * rng.integers(0, 2, (m, k, q), dtype=np.int8) - 1.0
     speaks = graph.between.speaks
     noise[~speaks] = 0.0
-    right = np.zeros((system.size + 1, k, SAMPLES))
+    right = np.zeros((system.size + 1, k, q))
     gather(system.keyframe, system.blocks, noise, right)
     samples = np.zeros_like(right)
     samples[:-1] = cholesky.solve_many(right[:-1])
@@ -97,14 +99,14 @@ def sample_posterior(
 
 
 def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array,
-                         freedom: Indices) -> Array:
+                         freedom: Indices, k: int) -> Array:
     """
     Return ln p(residual) + ln(volume of a false one's), (m,); freedom : (m,) of the residuals.
 
-    p is Student's: what a covariance from `SAMPLES` samples says of one more (Jeffreys' prior).
-    Where nothing but the noise speaks, that is a little generous.
+    p is Student's: what a covariance from samples, of steps of k numbers, says of one more
+    (Jeffreys' prior). Where nothing but the noise speaks, that is a little generous.
     """
-    q = SAMPLES
+    q = SAMPLES * k
     constant = by_freedom(lambda size: lgamma((q + 1) / 2) - lgamma((q + 1 - size) / 2)
                           - size * np.log(np.pi * q) / 2, freedom)
     density = constant - (log_det + (q + 1) * np.log1p(square / q)) / 2
@@ -138,7 +140,8 @@ class Innovations:
 
     def log_ratio(self) -> Array:
         """Return how much likelier each residual is if its factor is true, (m,) logarithms."""
-        return log_likelihood_ratio(self.square, self.log_det, self.log_claim, self.freedom)
+        return log_likelihood_ratio(self.square, self.log_det, self.log_claim, self.freedom,
+                                    self.system.block_size)
 
     def joint(self, posterior: Posterior, first: Indices, second: Indices) -> tuple[Array, Array]:
         """
@@ -154,12 +157,12 @@ class Innovations:
         residual = -system.b.reshape(-1, k)[rows]
         pairs = place.reshape(2, -1)
         both = np.concatenate((moved[pairs[0]], moved[pairs[1]]), axis=1)
-        covariance = both @ both.transpose(0, 2, 1) / SAMPLES + np.eye(2 * k)
+        covariance = both @ both.transpose(0, 2, 1) / both.shape[2] + np.eye(2 * k)
         square, log_det = prediction.normalise(
             covariance, np.concatenate((residual[pairs[0]], residual[pairs[1]]), axis=1))
         claim = self.log_claim[first] + self.log_claim[second]
         freedom = self.freedom[first] + self.freedom[second]
-        return square, log_likelihood_ratio(square, log_det, claim, freedom)
+        return square, log_likelihood_ratio(square, log_det, claim, freedom, k)
 
 
 def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
@@ -207,28 +210,6 @@ def log_claims(factors: BetweenFactors, log_volume: Array) -> Array:
     return claims
 
 
-def exact_squares(graph: FactorGraph, poses: Array, posterior: Posterior) -> Array:
-    """
-    Return the squared innovations of the few between factors of a graph, (m,), without samples.
-
-    The covariance is I + J H^-1 J', from as many solutions as there are rows.
-    """
-    from l1slam_ros.core.kernels import prediction
-
-    system, count = linearise(graph, poses, fixed=posterior.fixed), len(graph.between)
-    k = system.block_size
-    right = np.zeros((system.size + 1, k, count * k))
-    rows = np.eye(count * k).reshape(count, k, count * k)
-    prediction.gather(system.keyframe, system.blocks, rows, right)
-    solved = np.zeros_like(right)
-    solved[:-1] = posterior.cholesky.solve_many(right[:-1])
-    every = prediction.moved(system.keyframe, system.blocks, solved)
-    own = np.arange(count)
-    covariance = np.eye(k) + every.reshape(count, k, count, k)[own, :, own]
-    square: Array = prediction.normalise(covariance, -system.b.reshape(count, k))[0]
-    return square
-
-
 def claimed_volume(manifold: Manifold, poses: Array, rng: np.random.Generator) -> Array:
     """
     Return the logarithm of the volume that the claims of false factors fill, (k,) its factors.
@@ -249,16 +230,18 @@ def chi2_quantile(probability: float, freedom: Indices) -> Array:
     return by_freedom(lambda k: 2 * _gamma_quantile(k / 2, probability), freedom)
 
 
-def sampled_quantile(probability: float, freedom: Indices) -> Array:
+def sampled_quantile(probability: float, freedom: Indices, k: int) -> Array:
     """
     Return what r'C^-1 r of normal numbers stays below, (m,), by how many they are: freedom (m,).
 
-    C is the covariance of `SAMPLES` samples, so that has Hotelling's distribution:
-    T^2 (q - k + 1) / (q k) is Fisher's F of k and q - k + 1 degrees of freedom.
+    C is the covariance of q samples of steps of k numbers, so that has Hotelling's distribution:
+    T^2 (q - n + 1) / (q n) of n is Fisher's F of n and q - n + 1 degrees of freedom.
     """
-    def quantile(k: int) -> float:
-        x = _beta_quantile(k / 2, (SAMPLES - k + 1) / 2, probability)
-        return SAMPLES * x / (1 - x)
+    q = SAMPLES * k
+
+    def quantile(n: int) -> float:
+        x = _beta_quantile(n / 2, (q - n + 1) / 2, probability)
+        return q * x / (1 - x)
 
     return by_freedom(quantile, freedom)
 

@@ -7,7 +7,6 @@ reasons to doubt it, each with the keyframes where a person may look. What a per
 for a loop, strike one out, or state the noise as it is.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,9 +14,9 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.robust.pairwise_consistency import ASKED, strongest_group
+from l1slam_ros.core.robust.pairwise_consistency import ASKED, spanned, strongest_group
 from l1slam_ros.core.robust.rounds import Growth
-from l1slam_ros.core.robust.slips import SPANNING, jumping, refused, spanning, weakest_steps
+from l1slam_ros.core.robust.slips import SPANNING, SURE, common_steps, spanning
 
 # Most loops are refused; all that are accepted are of one place; refused loops of several places
 # agree on another map; an odometry factor may have slipped, and it was not believed.
@@ -118,9 +117,10 @@ def fits(growth: Growth) -> tuple[Array, Mask]:
     """
     accepted, square = growth.accepted & ~growth.cut, np.zeros(len(growth.factors))
     square[growth.accepted] = (growth.posterior.residual**2).sum(axis=1)
-    # While nothing ties the map to the world, nothing is known of what names it.
+    # While nothing ties the map to the world, nothing is known of what names it; nor, while
+    # nothing joins two parts, of what leads from one to the other.
     square[~accepted] = np.nan
-    outside = np.flatnonzero(~accepted & growth.may_be_predicted)
+    outside = np.flatnonzero(~accepted & growth.may_be_predicted & ~growth.across())
     cut, growth.cut = growth.cut, np.zeros_like(growth.cut)
     square[outside] = growth.innovations(outside).square
     growth.cut = cut
@@ -139,7 +139,11 @@ def doubts(growth: Growth) -> tuple[Doubt, ...]:
     if _carries_all(growth, accepted):
         reasons.append(_doubt(growth, ONE_PLACE, accepted))
     reasons += _other_map(growth)
-    reasons += [_doubt(growth, SLIP, rows) for rows in (*growth.suspected, *_ambiguous(growth))]
+    reasons += [
+        Doubt(SLIP, int(np.count_nonzero(growth.accepted & spanning(growth, step))),
+              int(growth.low[step]), int(growth.high[step]))
+        for step, odds in growth.slip_odds.items()
+        if (odds < SURE if growth.cut[step] else odds > -SURE)]
     return tuple(dict.fromkeys(reasons))
 
 
@@ -154,28 +158,20 @@ def _carries_all(growth: Growth, accepted: Indices) -> bool:
 
 def _other_map(growth: Growth) -> list[Doubt]:
     """Return a doubt where refused loops of several places agree: they may be right."""
-    outside = refused(growth)
+    outside = growth.undecided()
     group = strongest_group(growth, outside)
     if len(group.places) < SPANNING:
         return []
-    step = weakest_steps(growth, group)[0]
-    across = growth.accepted & spanning(growth, step)
-    size = len(group.rows) * max(len(outside) / ASKED, 1.0)
+    accepted, size = growth.accepted & growth.is_loop, len(group.rows) * max(
+        len(outside) / ASKED, 1.0)
+    trusted, across = (
+        spanned(growth.low[rows], growth.high[rows], growth.graph.n_poses)[
+            growth.low[common_steps(growth, group)]].min()
+        for rows in (accepted & growth.trusted, accepted))
     # What is trusted is right, whatever else speaks against it.
-    if (growth.trusted & across).any() or size < _AGAINST * np.count_nonzero(across):
+    if trusted or size < _AGAINST * across:
         return []
     return [_doubt(growth, OTHER_MAP, group.rows)]
-
-
-def _ambiguous(growth: Growth) -> Iterator[Indices]:
-    """Yield the loops across each slip that has a rival: a jump, and no loop ends in between."""
-    loops = np.flatnonzero(growth.is_loop & growth.accepted)
-    ends = np.unique((growth.low[loops], growth.high[loops]))
-    jumps = growth.low[jumping(growth)]
-    for slip in growth.low[np.flatnonzero(growth.cut & ~growth.gap)]:
-        place = np.searchsorted(ends, slip, side='right')
-        if (np.searchsorted(ends, jumps, side='right') == place).any():
-            yield loops[(growth.low[loops] <= slip) & (growth.high[loops] > slip)]
 
 
 def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:

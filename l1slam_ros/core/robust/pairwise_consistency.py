@@ -19,6 +19,8 @@ from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.innovation import claimed_volume, log_claims, log_likelihood_ratio
 from l1slam_ros.core.robust.rounds import Growth
 
+# First ends, second ends and measurements of loops.
+Ends = tuple[Indices, Indices, Array]
 # So many loops are asked.
 ASKED = 250
 # Of each one so many pairs are looked at closely, those that differ least.
@@ -47,17 +49,35 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     if len(rows) < 2:
         return NO_GROUP
     one, other, log_ratio = agreement(growth, rows)
-    place = np.unique(growth.place[rows], return_inverse=True)[1]
-    vote = np.zeros((len(rows), place.max() + 1))
-    np.maximum.at(vote, (one, place[other]), log_ratio - np.log(len(rows)))
-    own = np.arange(len(rows))
-    vote[own, place] = 0.0
-    evidence = vote.sum(axis=1)
-    best = int(np.argmax(evidence))
-    if evidence[best] < np.log(len(rows) / DOUBT):
+    place, first = np.unique(growth.place[rows], return_index=True, return_inverse=True)[2:0:-1]
+    evidence = _evidence(place, one, other, log_ratio)
+    best, needed = int(np.argmax(evidence)), np.log(len(rows) / DOUBT)
+    if evidence[best] < needed or evidence[best] < needed + _by_chance(growth, rows[first]):
         return NO_GROUP
     found = rows[np.concatenate(([best], other[one == best]))]
     return Group(found, np.unique(growth.place[found]))
+
+
+def _evidence(place: Indices, one: Indices, other: Indices, log_ratio: Array) -> Array:
+    """Return the sum of the votes for each loop, (k,), by the pairs that agree."""
+    vote = np.zeros((len(place), place.max() + 1))
+    np.maximum.at(vote, (one, place[other]), log_ratio - np.log(len(place)))
+    vote[np.arange(len(place)), place] = 0.0
+    evidence: Array = vote.sum(axis=1)
+    return evidence
+
+
+def _by_chance(growth: Growth, rows: Indices) -> float:
+    """
+    Return the evidence of loops of one place each whose second ends are exchanged at random.
+
+    On a sphere, or in any way that is alike everywhere, loops agree by chance far more often than
+    if what they claim filled a volume.
+    """
+    shuffled = growth.copy()
+    shuffled.high = growth.high.copy()
+    shuffled.high[rows] = growth.rng.permutation(growth.high[rows])
+    return float(_evidence(np.arange(len(rows)), *agreement(shuffled, rows)).max(initial=0.0))
 
 
 def spanned(low: Indices, high: Indices, n: int) -> Indices:
@@ -90,32 +110,27 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
     if not len(a):
         return a, b, np.zeros(0)
     ends = first, second, Z
-    error = _difference(manifold, ends, poses, a, b)
+    F, onward, _ = _follows(manifold, ends, poses, a, b)
+    error = manifold.local(Z[b], manifold.compose(F, onward))
     scatter = np.linalg.pinv(error.T @ error, hermitian=True)
     near = np.argsort(np.einsum('mi,ij,mj->m', error, scatter, error), kind='stable')
     near = near[: _NEAREST * len(rows)]
     a, b, error = a[near], b[near], error[near]
-    factors, fixed = growth.subgraph(rows).between, growth.posterior.fixed
+    factors, k = growth.subgraph(rows).between, manifold.TANGENT_SIZE
     roots = factors.sqrt_information[b]
-    start = manifold.identity(len(a))
-    there = manifold.retract(start, error)
-    k, steps = manifold.TANGENT_SIZE, growth.posterior.samples[:-1].transpose(2, 0, 1)
-    covariance = np.tile(2 * np.eye(k), (len(a), 1, 1))
-    for step in steps:
-        moved = np.concatenate((poses[:fixed], manifold.retract(poses[fixed:], step)))
-        here = manifold.retract(start, _difference(manifold, ends, moved, a, b))
-        change = whiten(roots, manifold.local(there, here))
-        covariance += change[:, :, None] * change[:, None, :] / len(steps)
+    change = _changes(growth, ends, a, b, roots)
+    covariance = 2 * np.eye(k) + change @ change.transpose(0, 2, 1) / change.shape[2]
     square, log_det = normalise(covariance, whiten(roots, error))
     volume = claimed_volume(manifold, poses, np.random.default_rng(0))
     freedom = factors.freedom[b]
-    log_ratio = log_likelihood_ratio(square, log_det, log_claims(factors, volume)[b], freedom)
+    log_ratio = log_likelihood_ratio(square, log_det, log_claims(factors, volume)[b], freedom,
+                                     k)
     good = np.flatnonzero((square < growth.gate(freedom)) & (log_ratio > np.log(len(rows))))
     a, b, log_ratio = a[good], b[good], log_ratio[good]
     return np.concatenate((a, b)), np.concatenate((b, a)), np.tile(log_ratio, 2)
 
 
-def _ends_by_part(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
+def _ends_by_part(growth: Growth, rows: Indices) -> Ends:
     """Return loops as from an earlier part to a later one, within a part to the later keyframe."""
     low, high, Z = growth.low[rows], growth.high[rows], growth.forward[rows]
     turn = growth.part[low] > growth.part[high]
@@ -123,12 +138,34 @@ def _ends_by_part(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Arra
             np.where(turn[:, None], growth.graph.manifold.inverse(Z), Z))
 
 
-def _difference(
-    manifold: Manifold, ends: tuple[Indices, Indices, Array], poses: Array, a: Indices, b: Indices
-) -> Array:
-    """Return t2v(Z_b^-1 Z) for pairs of factors, (pairs, k); Z : what follows from a for b."""
+def _follows(
+    manifold: Manifold, ends: Ends, poses: Array, a: Indices, b: Indices
+) -> tuple[Array, Array, Array]:
+    """Return F, Za S and S of pairs, (pairs, p): what follows from a for b is F Za S."""
     low, high, Z = ends
     poses = with_world(manifold, poses)
-    first = manifold.between(poses[low[b]], poses[low[a]])
-    second = manifold.between(poses[high[a]], poses[high[b]])
-    return manifold.local(Z[b], manifold.compose(manifold.compose(first, Z[a]), second))
+    S = manifold.between(poses[high[a]], poses[high[b]])
+    return manifold.between(poses[low[b]], poses[low[a]]), manifold.compose(Z[a], S), S
+
+
+def _changes(growth: Growth, ends: Ends, a: Indices, b: Indices, roots: Array) -> Array:
+    """
+    Return how the whitened difference of pairs changes by the samples, (pairs, k, q).
+
+    To first order Ad (Za S)^-1 and -Ad (F Za S)^-1 times the steps of the first ends of a and b,
+    -Ad S^-1 and the identity times those of the second ends.
+    """
+    from l1slam_ros.core.kernels.prediction import moved
+
+    manifold, (low, high, _) = growth.graph.manifold, ends
+    samples, fixed = growth.posterior.samples, growth.posterior.fixed
+    F, onward, S = _follows(manifold, ends, growth.poses, a, b)
+    J = [manifold.adjoint(manifold.inverse(T)) for T in (onward, manifold.compose(F, onward), S)]
+    pairs = ((low, roots @ J[0], -roots @ J[1]), (high, -roots @ J[2], roots))
+    changes = []
+    for end, J_a, J_b in pairs:
+        keyframe = np.stack((end[a], end[b]), axis=1) - fixed
+        keyframe[keyframe < 0] = len(samples) - 1
+        changes.append(moved(keyframe, np.stack((J_a, J_b), axis=1), samples))
+    total: Array = changes[0] + changes[1]
+    return total

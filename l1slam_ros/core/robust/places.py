@@ -18,9 +18,6 @@ from l1slam_ros.core.graph.linear_system import with_world
 _NEAR, _NEAR_STEPS = 5.0, 10
 # Claims are told apart to this part of it, so that a robot that stands has few different ones.
 _GRAIN = 0.1
-# So many times as long as what is near, a stretch of the way may be one street that is taken for
-# another.
-_STREET = 10.0
 
 
 def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
@@ -61,21 +58,6 @@ def neighbours_agree(place: Indices, ends: Array) -> float:
     with_neighbour, first = np.unique(a[nearest_first], return_index=True)
     agree = np.count_nonzero(place[with_neighbour] == place[b[nearest_first[first]]])
     return float((agree + 1) / (len(with_neighbour) + 1))
-
-
-def of_one_street(ends: Array, at: float, end: float) -> bool:
-    """
-    Return whether factors come from one street, or lead to one, though there is way for more.
-
-    One street taken for another makes loops from all that led through the one, but only to the
-    other.
-
-    ends : of factors across a step, see `places`; at, end : how far along the way the step is,
-    and the way is long, in the same units
-    """
-    early, late = (ends[:, 0] - ends[:, 1]) / 2, (ends[:, 0] + ends[:, 1]) / 2
-    return bool((np.ptp(early) < _STREET and at > 2 * _STREET)
-                or (np.ptp(late) < _STREET and end - at > 2 * _STREET))
 
 
 def _near(points: Array, reach: float) -> tuple[Indices, Indices]:

@@ -28,7 +28,8 @@ from l1slam_ros.core.robust.innovation import (
     sample_posterior,
     sampled_quantile,
 )
-from l1slam_ros.core.robust.places import neighbours_agree, of_one_street, places
+from l1slam_ros.core.robust.inspection import repeated_factors
+from l1slam_ros.core.robust.places import neighbours_agree, places
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 
@@ -74,8 +75,8 @@ class Growth:
     earlier and the later keyframe of each;
     place : (m,) see `places`; part : (n,) number of the part of each keyframe; poses : (n, p) the
     L2 map of the accepted; posterior : of these; variance : (2,) of odometry and loops in units of
-    what they state; suspected : the loops across each slip that was suspected and not
-    believed; check : called before long steps, raises where the work shall stop.
+    what they state; slip_odds : ln P(slipped) / P(measured) of the odometry factors that were
+    suspected; check : called before long steps, raises where the work shall stop.
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
@@ -93,7 +94,7 @@ class Growth:
         self.variance = np.ones(2)
         self._floor, self._at_their_word = np.full(2, _LEAST_VARIANCE), False
         self.posterior: Posterior
-        self.suspected: list[Indices] = []
+        self.slip_odds: dict[int, float] = {}
         self._drops = np.zeros(len(self.factors), np.int64)
 
     @cached_property
@@ -105,18 +106,13 @@ class Growth:
         """The number of the place of each factor, (m,)."""
         return self._places[0]
 
-    def of_one_street(self, rows: Indices, step: int) -> bool:
-        """Return whether factors across an odometry factor are so; see `of_one_street`."""
-        ends = self._places[1]
-        late = ends.sum(axis=1) / 2
-        return of_one_street(ends[rows], float(late[step]), float(late.max()))
-
     def begin(self) -> None:
         """Solve for what is accepted, and learn from the loops how large the noise is."""
         self._tie_to_world()
         self.solve()
         rows = self.undecided()
-        rows = rows[~self.factors.is_absolute[rows]]
+        # A factor that stands there twice fits itself, whatever the noise.
+        rows = np.setdiff1d(rows[~self.factors.is_absolute[rows]], repeated_factors(self.graph))
         # Loops of fewer places may be one mistake, which the noise learnt of them would fit.
         if len(np.unique(self.place[rows])) >= _FEWEST_PLACES:
             self.variance = self.variance * noise_variance(self.innovations(rows))
@@ -172,6 +168,7 @@ class Growth:
         clone = copy.copy(self)
         clone.accepted, clone._drops = self.accepted.copy(), self._drops.copy()
         clone.cut, clone.variance = self.cut.copy(), self.variance.copy()
+        clone.slip_odds = self.slip_odds.copy()
         return clone
 
     def subgraph(self, rows: Indices) -> FactorGraph:
@@ -224,9 +221,9 @@ class Growth:
         across: Mask = self.part[self.low] != self.part[self.high]
         return across & ~self.factors.is_absolute
 
-    def gate(self, freedom: Indices) -> Array:
+    def gate(self, freedom: Indices, refused: float = REFUSED) -> Array:
         """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""
-        return sampled_quantile(1 - REFUSED, freedom)
+        return sampled_quantile(1 - refused, freedom, self.graph.manifold.TANGENT_SIZE)
 
     def solve(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
@@ -277,7 +274,7 @@ class Growth:
     def doubted(self, freedom: Indices) -> Array:
         """Return what `Posterior.left_out` stays below, (m,), if all accepted ones are true."""
         accepted = int(np.count_nonzero(self.accepted))
-        return sampled_quantile(1 - _DOUBTED / accepted, freedom)
+        return self.gate(freedom, _DOUBTED / accepted)
 
     def _learn_variance(self, rows: Indices) -> None:
         """

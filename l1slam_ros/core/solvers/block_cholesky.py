@@ -29,6 +29,9 @@ _NONE = np.zeros(0, np.int64)
 
 # Numbers that one gigabyte holds.
 MOST_ENTRIES = 135_000_000
+# Multiplications for each block of the factor from which a factorisation takes longer than to find
+# another order.
+_LONG = 1500
 # Part of its diagonal by which a loose keyframe is damped: above what factorising leaves of a
 # pivot that is none, and for a heading the same as to know it to within thousands of turns.
 _LOOSE = 1e-9
@@ -56,23 +59,32 @@ class Pattern:
         return np.repeat(np.arange(len(self.first) - 1, dtype=np.int32), np.diff(self.first))
 
 
-def find_pattern(keyframe: Indices, size: int, most_blocks: int) -> Pattern:
+def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1) -> Pattern:
     """
-    Return a pattern of little fill; keyframe, size : as in `LinearSystem`.
+    Return a pattern of little fill; keyframe, size : as in `LinearSystem`; k : size of a block.
+
+    By minimum degree; where a factorisation takes longer than that, by dissection too, and the
+    better of the two.
 
     Raises
     ------
     FillError : the factor would have more than `most_blocks`.
 
     """
-    from l1slam_ros.core.kernels.ordering import minimum_degree
+    from l1slam_ros.core.kernels.ordering import dissect, minimum_degree
     from l1slam_ros.core.kernels.symbolic import lay_out
 
-    order, column, rows = minimum_degree(*neighbours(keyframe, size), most_blocks)
-    if len(order) < size:
+    graph = neighbours(keyframe, size)
+    found = minimum_degree(*graph, most_blocks, np.zeros(size, np.int32))
+    if len(found[0]) < size:
         raise FillError(f'the factor of {size} keyframes and {len(keyframe)} factors would have '
                         f'more than {most_blocks} blocks: too many far places are joined')
-    return Pattern(*lay_out(order, column, rows))
+    pattern = Pattern(*lay_out(*found))
+    if pattern.work * k**3 > _LONG * len(found[2]):
+        found = minimum_degree(*graph, most_blocks, dissect(*graph))
+        if len(found[0]) == size:
+            return min(pattern, Pattern(*lay_out(*found)), key=lambda pattern: pattern.work)
+    return pattern
 
 
 def neighbours(keyframe: Indices, size: int) -> tuple[Places, Places]:
@@ -202,5 +214,6 @@ def cholesky_of(graph: FactorGraph) -> BlockCholesky:
     fixed = anchor(graph)
     keyframe = keyframes_of(graph, fixed)
     most_blocks = MOST_ENTRIES // graph.manifold.TANGENT_SIZE**2
-    pattern = find_pattern(keyframe, graph.n_poses - fixed, most_blocks)
+    pattern = find_pattern(keyframe, graph.n_poses - fixed, most_blocks,
+                           graph.manifold.TANGENT_SIZE)
     return BlockCholesky(pattern, keyframe, loose_keyframes(graph))

@@ -138,6 +138,34 @@ class Huber:
         return self.cost(residual) + l2_cost(dual) / 4 - float((dual * residual).sum())
 
 
+@dataclass(frozen=True)
+class Largest:
+    """The largest of |r|, L-infinity: one group of all rows; for the reference method alone."""
+
+    size: int
+
+    def cost(self, residual: Array) -> float:
+        """See `Norm`."""
+        return float(np.abs(residual).max(initial=0.0))
+
+    def weights(self, residual: Array) -> Array:
+        """See `Norm`; of the largest rows alone."""
+        largest: Array = (np.abs(residual) == self.cost(residual)).astype(np.float64)
+        return largest
+
+    def resolvent(self, dual: Array, sigma: Array | float) -> Array:
+        """See `Norm`: the nearest dual whose |y| sum up to 1 at most; sigma is one number."""
+        size = np.sort(np.abs(dual))[::-1]
+        excess = np.maximum((np.cumsum(size) - 1) / np.arange(1, len(size) + 1), 0.0)
+        threshold = excess.max(initial=0.0)
+        nearest: Array = np.sign(dual) * np.maximum(np.abs(dual) - threshold, 0.0)
+        return nearest
+
+    def gap(self, residual: Array, dual: Array) -> float:
+        """See `Norm`; F* is 0 for a dual whose |y| sum up to no more than 1."""
+        return self.cost(residual) - float((dual * residual).sum())
+
+
 L1 = Lengths()
 
 

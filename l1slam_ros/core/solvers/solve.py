@@ -33,7 +33,7 @@ _TOO_DENSE = 'the graph is too dense to be factorised'
 
 
 @dataclass(frozen=True)
-class Choice:
+class Method:
     """
     What a graph is solved by.
 
@@ -49,7 +49,7 @@ class Choice:
     norm: str = L1_NORM
 
 
-def choose(solver: str, graph: FactorGraph, norm: str = L1_NORM) -> Choice:
+def choose(solver: str, graph: FactorGraph, norm: str = L1_NORM) -> Method:
     """
     Resolve one of `SOLVERS`: `auto` goes by the predicted work of a factorisation.
 
@@ -62,23 +62,23 @@ def choose(solver: str, graph: FactorGraph, norm: str = L1_NORM) -> Choice:
     """
     if norm != L1_NORM:
         found_by = PRIMAL_DUAL_NEWTON if norm == GROUP_L1_NORM else GAUSS_NEWTON
-        return Choice(cholesky_of(graph), found_by, f'the norm is {norm}', norm=norm)
+        return Method(cholesky_of(graph), found_by, f'the norm is {norm}', norm=norm)
     try:
         cholesky = cholesky_of(graph)
     except FillError:
         if solver == INTERIOR_POINT:
             raise
-        return Choice(None, PRIMAL_DUAL, _TOO_DENSE)
+        return Method(None, PRIMAL_DUAL, _TOO_DENSE)
     if solver != AUTO:
-        return Choice(cholesky, solver, 'asked for')
+        return Method(cholesky, solver, 'asked for')
     work = cholesky.pattern.work / max(len(graph.between), 1)
     if work <= _WORK_PER_FACTOR:
-        return Choice(cholesky, INTERIOR_POINT, _SPARSE, falls_back=True)
-    return Choice(cholesky, PRIMAL_DUAL, _DENSE, falls_back=True)
+        return Method(cholesky, INTERIOR_POINT, _SPARSE, falls_back=True)
+    return Method(cholesky, PRIMAL_DUAL, _DENSE, falls_back=True)
 
 
 def minimise_by(
-    choice: Choice, graph: FactorGraph, poses: Array, options: OptimiserOptions,
+    method: Method, graph: FactorGraph, poses: Array, options: OptimiserOptions,
     report: Report = lambda iteration, cost: None,
     least_squares: LeastSquaresOptions | None = None,
 ) -> tuple[Solution, str]:
@@ -88,17 +88,17 @@ def minimise_by(
     Where nobody asked for the interior point and it does not converge, Algorithm 4 goes on from
     its best poses.
     """
-    cholesky = choice.cholesky
-    if cholesky and choice.solver == PRIMAL_DUAL_NEWTON:
-        return minimise_group_l1(graph, poses, options, cholesky, report), choice.solver
-    if cholesky and choice.solver == GAUSS_NEWTON:
+    cholesky = method.cholesky
+    if cholesky and method.solver == PRIMAL_DUAL_NEWTON:
+        return minimise_group_l1(graph, poses, options, cholesky, report), method.solver
+    if cholesky and method.solver == GAUSS_NEWTON:
         least_squares = least_squares or LeastSquaresOptions()
-        norm = norm_of(choice.norm, graph.manifold.TANGENT_SIZE, least_squares.huber_delta)
-        return gauss_newton(graph, poses, norm, least_squares, cholesky, report), choice.solver
-    if choice.solver == PRIMAL_DUAL or cholesky is None:
+        norm = norm_of(method.norm, graph.manifold.TANGENT_SIZE, least_squares.huber_delta)
+        return gauss_newton(graph, poses, norm, least_squares, cholesky, report), method.solver
+    if method.solver == PRIMAL_DUAL or cholesky is None:
         return minimise(graph, poses, options, cholesky, report=report), PRIMAL_DUAL
     solution = minimise_interior_point(graph, poses, options, cholesky, report)
     content = solution.status is Status.CONVERGED or not options.outer_iterations
-    if content or not choice.falls_back:
+    if content or not method.falls_back:
         return solution, INTERIOR_POINT
     return minimise(graph, solution.poses, options, cholesky, report=report), PRIMAL_DUAL

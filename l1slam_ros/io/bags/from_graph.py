@@ -9,10 +9,12 @@ A graph as the messages of a bag, such that it can be had back exactly.
     /ground_truth    geometry_msgs/PoseStamped, where the truth is known
 
 Covariances are those of the factors, in the axes of the measured pose: of an odometry message
-that of the motion since the message before. What is left unsaid has an infinite variance.
+that of the motion since the message before. What is left unsaid has an infinite variance. In a bag
+a pose is seen from an earlier one: factors the other way are turned, and the note says which.
 """
 
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,10 +26,12 @@ from l1slam_ros.core.geometry.noise import (
     LEAST_VARIANCE,
     MOST_OF_ODOMETRY,
     MOST_VARIANCE,
+    Mask,
     covariance_of,
 )
-from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph, turned
 from l1slam_ros.core.graph.measurements import FASTEST, LONGEST_PAUSE, SHORTEST_STEP
+from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.io.bags.topics import (
     ABSOLUTE_TOPIC,
     LOOP_TOPIC,
@@ -47,6 +51,8 @@ GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
 VERBATIM_NOTE = {'messages': 'verbatim'}
 # Of a graph whose poses are in space.
 SPACE_NOTE = {'dimension': '3'}
+# And where factors led from a later keyframe to an earlier one: the numbers of those turned.
+TURNED_STEPS, TURNED_LOOPS = 'turned_steps', 'turned_loops'
 
 _BASE_FRAME = 'base_link'
 _ODOMETRY, _TRUTH = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped'
@@ -55,9 +61,8 @@ _LOOP = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 _LAST_STAMP = 2**31 * NANOSECONDS - 1
 
 
-def write_graph_bag(
-    path: str | os.PathLike[str], record: GraphRecord, truth: Array | None = None
-) -> None:
+def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
+                    truth: Array | None = None) -> None:
     """
     Write a graph as the messages a robot would have sent.
 
@@ -73,8 +78,9 @@ def write_graph_bag(
     FileError : the bag cannot be written, or something that is no bag is in its place.
 
     """
-    graph, stamps = record.graph, _stamps(record)
-    steps, loops = _steps(record), _loops(record)
+    stamps, backward = _stamps(record), _backward(record)
+    record = replace(record, graph=turned(record.graph, backward))
+    graph, steps, loops = record.graph, _steps(record), _loops(record)
     if truth is not None and len(truth) != len(stamps):
         raise GraphError(f'{len(truth)} true poses; expected {len(stamps)}, one for each vertex')
     to_pose3, factors = graph.manifold.to_pose3, graph.between
@@ -82,7 +88,8 @@ def write_graph_bag(
     chain, measured = to_pose3(_chain(graph, steps)), to_pose3(factors.measurement)
     topics = np.where(factors.is_absolute, ABSOLUTE_TOPIC, np.where(
         factors.trusted & ~factors.is_odometry, TRUSTED_LOOP_TOPIC, LOOP_TOPIC)).tolist()
-    with new_bag(path, _note(record, stamps, steps)) as writer:
+    note = _note(record, stamps, steps) | _turned_note(backward, steps, loops)
+    with new_bag(path, note) as writer:
         messages = _Messages(writer.types)
         writer.add_topic(ODOMETRY_TOPIC, _ODOMETRY)
         for topic in sorted({LOOP_TOPIC, *topics}):
@@ -92,14 +99,17 @@ def write_graph_bag(
             true = to_pose3(truth)
         for k, stamp in enumerate(stamps):
             covariance = covariances[steps[k - 1]] if k else np.zeros(36)
-            writer.write(ODOMETRY_TOPIC, stamp, messages.odometry(stamp, chain[k], covariance))
+            writer.write(ODOMETRY_TOPIC, stamp, messages.stamped(
+                _ODOMETRY, 'odom', stamp, _BASE_FRAME, messages.pose(chain[k], covariance),
+                messages.standing))
             if truth is not None:
-                writer.write(TRUTH_TOPIC, stamp, messages.pose_stamped('map', stamp, true[k]))
+                writer.write(TRUTH_TOPIC, stamp, messages.stamped(
+                    _TRUTH, 'map', stamp, messages.pose(true[k])))
             for loop in loops[k]:
                 i = factors.i[loop]
                 frame = 'map' if i == WORLD else reference_frame_id(_BASE_FRAME, stamps[i])
-                writer.write(topics[loop], stamp, messages.loop(
-                    frame, stamp, measured[loop], covariances[loop]))
+                writer.write(topics[loop], stamp, messages.stamped(
+                    _LOOP, frame, stamp, messages.pose(measured[loop], covariances[loop])))
 
 
 class _Messages:
@@ -107,36 +117,24 @@ class _Messages:
 
     def __init__(self, types: dict[str, Any]):
         self._types = types
-        zero = types['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
-        self._standing = types['geometry_msgs/msg/TwistWithCovariance'](
-            types['geometry_msgs/msg/Twist'](zero, zero), np.zeros(36))
+        zero = self._geometry('Vector3', 0.0, 0.0, 0.0)
+        self.standing = self._geometry(
+            'TwistWithCovariance', self._geometry('Twist', zero, zero), np.zeros(36))
 
-    def odometry(self, stamp: int, pose3: Array, covariance: Array) -> Any:
-        """Return a message of the odometry topic."""
-        return self._types[_ODOMETRY](self._header('odom', stamp), _BASE_FRAME,
-                                      self._with_covariance(pose3, covariance), self._standing)
-
-    def loop(self, frame: str, stamp: int, pose3: Array, covariance: Array) -> Any:
-        """Return a loop closure; frame : names the earlier keyframe."""
-        return self._types[_LOOP](self._header(frame, stamp),
-                                  self._with_covariance(pose3, covariance))
-
-    def pose_stamped(self, frame: str, stamp: int, pose3: Array) -> Any:
-        """Return a true pose."""
-        return self._types[_TRUTH](self._header(frame, stamp), self._pose(pose3))
-
-    def _header(self, frame: str, stamp: int) -> Any:
+    def stamped(self, msgtype: str, frame: str, stamp: int, *fields: Any) -> Any:
+        """Return a message of a header and some fields."""
         time = self._types['builtin_interfaces/msg/Time'](*divmod(stamp, NANOSECONDS))
-        return self._types['std_msgs/msg/Header'](time, frame)
+        return self._types[msgtype](self._types['std_msgs/msg/Header'](time, frame), *fields)
 
-    def _with_covariance(self, pose3: Array, covariance: Array) -> Any:
-        return self._types['geometry_msgs/msg/PoseWithCovariance'](self._pose(pose3), covariance)
-
-    def _pose(self, pose3: Array) -> Any:
+    def pose(self, pose3: Array, *covariance: Array) -> Any:
+        """Return a Pose, or a PoseWithCovariance."""
         numbers = pose3.tolist()
-        return self._types['geometry_msgs/msg/Pose'](
-            self._types['geometry_msgs/msg/Point'](*numbers[:3]),
-            self._types['geometry_msgs/msg/Quaternion'](*numbers[3:]))
+        pose = self._geometry('Pose', self._geometry('Point', *numbers[:3]),
+                              self._geometry('Quaternion', *numbers[3:]))
+        return self._geometry('PoseWithCovariance', pose, *covariance) if covariance else pose
+
+    def _geometry(self, name: str, *fields: Any) -> Any:
+        return self._types[f'geometry_msgs/msg/{name}'](*fields)
 
 
 def _covariances(graph: FactorGraph) -> Array:
@@ -178,14 +176,12 @@ def _note(record: GraphRecord, stamps: list[int], steps: Indices) -> dict[str, s
 def _steps(record: GraphRecord) -> Indices:
     """Return which factor leads from each keyframe to the next, (n - 1,)."""
     factors, ids = record.graph.between, record.ids
-    rows = np.flatnonzero(factors.is_odometry)
+    rows, gaps = np.flatnonzero(factors.is_odometry), odometry_gaps(record.graph)
     first = np.minimum(factors.i, factors.j)[rows]
-    missing = np.setdiff1d(np.arange(len(ids) - 1), first)
-    if len(missing):
-        k = missing[0]
+    if len(gaps):
+        k = gaps[0]
         raise GraphError(f'no edge between the consecutive vertices {ids[k]} and {ids[k + 1]}; '
                          'a bag needs the odometry of every vertex')
-    _refuse_backward(record, rows)
     unsaid = first[~factors.speaks[rows].all(axis=1)]
     if len(unsaid):
         raise GraphError(f'the odometry from vertex {ids[unsaid[0]]} leaves a component unsaid; '
@@ -201,20 +197,30 @@ def _loops(record: GraphRecord) -> list[list[int]]:
         raise GraphError(f'a trusted absolute pose of vertex {record.ids[trusted[0]]}; in a bag '
                          'it would be doubted')
     rows = np.flatnonzero(~factors.is_odometry)
-    _refuse_backward(record, rows)
     loops: list[list[int]] = [[] for _ in record.ids]
     for row, j in zip(rows.tolist(), factors.j[rows].tolist(), strict=True):
         loops[j].append(row)
     return loops
 
 
-def _refuse_backward(record: GraphRecord, rows: Indices) -> None:
-    """Refuse factors from a later keyframe to an earlier one: inverting them is not exact."""
-    i, j = record.graph.between.i[rows], record.graph.between.j[rows]
-    if (i > j).any():
-        k = int(np.argmax(i > j))
-        raise GraphError(f'an edge from vertex {record.ids[i[k]]} back to {record.ids[j[k]]}; '
-                         'in a bag a pose is seen from an earlier one')
+def _backward(record: GraphRecord) -> Mask:
+    """Return which factors lead from a later keyframe to an earlier one, (m,) bool."""
+    factors, ids = record.graph.between, record.ids
+    backward: Mask = factors.i > factors.j
+    unsaid = np.flatnonzero(backward & ~factors.speaks.all(axis=1))
+    if len(unsaid):
+        i, j = ids[factors.pairs[unsaid[0]]]
+        raise GraphError(f'an edge from vertex {i} back to {j} leaves a component unsaid; in '
+                         'a bag a pose is seen from an earlier one')
+    return backward
+
+
+def _turned_note(backward: Mask, steps: Indices, loops: list[list[int]]) -> dict[str, str]:
+    """Return which steps and which loops, in the order of the messages, were turned."""
+    in_order = np.array([row for ending in loops for row in ending], np.int64)
+    rows = {TURNED_STEPS: steps, TURNED_LOOPS: in_order}
+    return {name: ' '.join(map(str, np.flatnonzero(backward[of]).tolist()))
+            for name, of in rows.items() if backward[of].any()}
 
 
 def _stamps(record: GraphRecord) -> list[int]:

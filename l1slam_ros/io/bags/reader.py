@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 from rosbags.highlevel import AnyReader
@@ -29,7 +29,7 @@ from l1slam_ros.io.bags.damaged.salvage import (
     storage_files,
 )
 from l1slam_ros.io.bags.damaged.sqlite_pages import is_cut
-from l1slam_ros.io.bags.damaged.walk import RawMessage, ros1_types
+from l1slam_ros.io.bags.damaged.walk import BagMessage, ros1_types
 from l1slam_ros.io.bags.damaged.walk_mcap import is_indexed, mcap_metadata
 from l1slam_ros.io.bags.damaged.walk_sqlite import has_journal, sqlite_metadata
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES
@@ -38,15 +38,6 @@ from l1slam_ros.io.bags.writer import NOTE_KEY
 _TO_ITS_END = 'expected a bag that can be read to its end'
 # Told of damage, in one sentence.
 OnDamage = Callable[[str], None]
-
-
-class BagMessage(NamedTuple):
-    """A message of a bag; time : when it was recorded [ns]."""
-
-    topic: str
-    msgtype: str
-    time: int
-    message: Any
 
 
 @dataclass(frozen=True)
@@ -72,13 +63,10 @@ class BagSummary:
     note: dict[str, str]
 
 
-def read_messages(
-    path: str | os.PathLike[str],
-    topics: Collection[str] | None = None,
-    on_damage: OnDamage | None = None,
-) -> Iterator[BagMessage]:
+def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None = None,
+                  on_damage: OnDamage | None = None) -> Iterator[BagMessage]:
     """
-    Yield the messages of a bag in order of time.
+    Yield the messages of a bag in order of time, decoded.
 
     Parameters
     ----------
@@ -102,20 +90,15 @@ def read_messages(
                                 f'({complaint(error)}); {_TO_ITS_END}') from error
             continue
         count += 1
-        yield BagMessage(raw.topic, raw.msgtype, raw.time, message)
+        yield raw._replace(data=message)
     if undecodable and on_damage is not None:
         on_damage(f'{path} is damaged: {undecodable:,} messages cannot be decoded; '
                   f'{count:,} others were used')
 
 
-def read_raw(
-    path: str | os.PathLike[str],
-    topics: Collection[str] | None = None,
-    on_damage: OnDamage | None = None,
-    *,
-    start: int | None = None,
-    stop: int | None = None,
-) -> Iterator[RawMessage]:
+def read_raw(path: str | os.PathLike[str], topics: Collection[str] | None = None,
+             on_damage: OnDamage | None = None, *, start: int | None = None,
+             stop: int | None = None) -> Iterator[BagMessage]:
     """
     Yield the messages of a bag in order of time, as serialised; arguments as `read_messages`.
 
@@ -212,7 +195,7 @@ class _Place:
         # At that very time: the library may have another order than the file.
         self._read: Counter[tuple[str, bytes]] = Counter()
 
-    def advance(self, message: RawMessage) -> None:
+    def advance(self, message: BagMessage) -> None:
         """Count a message."""
         if message.time != self._time:
             self._read.clear()
@@ -220,7 +203,7 @@ class _Place:
         self._read[message.topic, message.data] += 1
         self.count += 1
 
-    def rest(self, messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
+    def rest(self, messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
         """Yield those of all messages, in order of time, that have not been read yet."""
         time, read = self._time, self._read.copy()
         for message in messages:
@@ -231,10 +214,8 @@ class _Place:
                 yield message
 
 
-def _messages(
-    path: str | os.PathLike[str], topics: Collection[str] | None, start: int | None,
-    stop: int | None, on_damage: OnDamage | None
-) -> Iterator[tuple[RawMessage, Any]]:
+def _messages(path: str | os.PathLike[str], topics: Collection[str] | None, start: int | None,
+              stop: int | None, on_damage: OnDamage | None) -> Iterator[tuple[BagMessage, Any]]:
     """Yield the messages of a bag, each with the types to decode it by."""
     bag, place = _bag_path(path), _Place()
     try:
@@ -255,16 +236,20 @@ def _messages(
         on_damage(damage.sentence(place.count))
 
 
-def _by_library(
-    bag: Path, topics: Collection[str] | None, start: int | None, stop: int | None
-) -> Iterator[tuple[RawMessage, Any]]:
+def _by_library(bag: Path, topics: Collection[str] | None, start: int | None,
+                stop: int | None) -> Iterator[tuple[BagMessage, Any]]:
     with _reader(bag) as reader:
         types = reader.typestore if reader.is2 else ros1_types(reader.typestore.fielddefs)
         connections = [c for c in reader.connections if topics is None or c.topic in topics]
+        missing = sum(c.msgcount for c in connections)
         # No connection would mean all of them to the library.
         for c, time, data in reader.messages(connections, start, stop) if connections else ():
+            missing -= 1
             cdr = bytes(data if reader.is2 else types.ros1_to_cdr(data, c.msgtype))
-            yield RawMessage(c.topic, c.msgtype, time, cdr), types
+            yield BagMessage(c.topic, c.msgtype, time, cdr), types
+        # Within a chunk the library stops at a damaged record without a word.
+        if missing > 0 and start is None and stop is None:
+            raise LookupError(f'{missing:,} messages are missing')
 
 
 @contextmanager

@@ -1,24 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag -> a graph, grown by the code that the node grows with: live and offline see one graph."""
+"""
+A bag -> a graph, grown by the code that the node grows with: live and offline see one graph.
 
+Where the topic of the loops has pose graphs of another front end, their loops are taken; where
+that of the odometry has, the graph as a whole.
+
+And the true poses that it has on a topic, stamped by their headers.
+"""
+
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from l1slam_ros.core.errors import FileError, MessageError
 from l1slam_ros.core.geometry import se2, se3
-from l1slam_ros.core.geometry.manifold import Manifold
+from l1slam_ros.core.geometry.manifold import Array, Manifold
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
+from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
-from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.io.bags.from_graph import GRAPH_NOTE, SPACE_NOTE, VERBATIM_NOTE
-from l1slam_ros.io.bags.reader import BagMessage, bag_summary, read_messages, read_note
+from l1slam_ros.core.online.keyframes import (
+    KeyframeOptions,
+    OdometryOptions,
+    diagonal_covariance,
+)
+from l1slam_ros.io.bags.damaged.walk import BagMessage
+from l1slam_ros.io.bags.from_graph import (
+    GRAPH_NOTE,
+    SPACE_NOTE,
+    TURNED_LOOPS,
+    TURNED_STEPS,
+    VERBATIM_NOTE,
+)
+from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
 from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.messages import conversion
 from l1slam_ros.io.messages.base_frame import BaseFrame, Sorted
-from l1slam_ros.io.messages.conversion import absolute_pose, loop_closure, odometry_sample
+from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
+from l1slam_ros.io.trajectory import Reference
+from l1slam_ros.io.wording import counted
 
 _ODOMETRY = 'nav_msgs/msg/Odometry'
+# What a topic of true poses may be of.
+_POSES = ('geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PoseWithCovarianceStamped',
+          'geometry_msgs/msg/TransformStamped', 'nav_msgs/msg/Odometry')
 
 
 def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topics,
@@ -47,10 +76,13 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
     for message in read_messages(path, topics.types(), damage.append):
         growing.take(message)
     record = growing.record('; '.join(damage))
+    if options is None:
+        record = replace(record, graph=turned(record.graph, _noted_turns(record.graph, note)))
     if record.graph.n_poses < 2:
         raise FileError(path, '; '.join([
             f'{record.graph.n_poses} keyframes from {topics.odometry}; expected 2 or more',
-            *_alternatives(path, topics.odometry, _ODOMETRY), *record.skipped, *damage]))
+            *_alternatives(path, topics.odometry, _ODOMETRY, MAP_GRAPH, POSE_GRAPH),
+            *record.skipped, *damage]))
     for topic in sorted(topics.types().keys() - DEFAULT_TOPICS.types().keys() - growing.seen):
         raise FileError(path, '; '.join([
             f'no messages on {topic}; expected {topics.types()[topic]}',
@@ -66,6 +98,7 @@ class _Growing:
         self._builder = GraphBuilder(manifold, options, verbatim)
         self._topics, self._types = topics, topics.types()
         self._base_frame, self._map_frame = BaseFrame(''), ''
+        self._graphs, self._is_graph = PoseGraphs(), False
         self.seen: set[str] = set()
 
     def take(self, message: BagMessage) -> None:
@@ -74,23 +107,36 @@ class _Growing:
         self.seen.add(topic)
         notes = self._builder.notes
         try:
-            if message.msgtype != expected:
+            if message.msgtype in (MAP_GRAPH, POSE_GRAPH) and topic in (
+                    self._topics.odometry, self._topics.loops):
+                self._add_graph(message.data, topic)
+            elif message.msgtype != expected:
                 raise MessageError('type', f'{message.msgtype} on {topic}; expected {expected}')
-            if topic == self._topics.odometry:
+            elif topic == self._topics.odometry:
                 self._add_odometry(self._base_frame.take(
-                    message.message.child_frame_id, odometry_sample(message.message)))
+                    message.data.child_frame_id, conversion.odometry_sample(message.data)))
             elif topic == self._topics.absolute:
                 # The map is the frame that the first one names.
-                self._builder.add_loop(absolute_pose(message.message, self._map_frame))
-                self._map_frame = message.message.header.frame_id
+                self._builder.add_loop(conversion.absolute_pose(message.data, self._map_frame))
+                self._map_frame = message.data.header.frame_id
             else:
-                self._builder.add_loop(loop_closure(
-                    message.message, self._base_frame.name, topic == self._topics.trusted))
+                self._builder.add_loop(conversion.loop_closure(
+                    message.data, self._base_frame.name, topic == self._topics.trusted))
         except MessageError as error:
             notes.refuse(error.cause, str(error))
         except (AttributeError, TypeError, ValueError):
             # The bag defines the type otherwise: it is damaged there, or of another ROS.
             notes.refuse('fields', f'a message on {topic}; expected the fields of {expected}')
+
+    def _add_graph(self, message: Any, topic: str) -> None:
+        self._is_graph |= topic == self._topics.odometry
+        for found in self._graphs.take(message):
+            if not isinstance(found, LoopClosure):
+                # Of the whole graph no keyframe's time need be known.
+                if not (self._is_graph and found.cause == 'keyframe'):
+                    self._builder.notes.refuse(found.cause, str(found))
+            elif not self._is_graph:
+                self._builder.add_loop(found)
 
     def _add_odometry(self, found: Sorted) -> None:
         if found.anew:
@@ -106,18 +152,52 @@ class _Growing:
     def record(self, damage: str) -> GraphRecord:
         """Return the graph that has grown; damage : of the bag."""
         builder = self._builder
+        if self._is_graph:
+            manifold, loop = builder.graph.manifold, builder.options.loop
+            graph, ids = self._graphs.graph(manifold, diagonal_covariance(
+                manifold, loop.sigma_translation, loop.sigma_rotation))
+            return GraphRecord(graph, None, ids, None, tuple(builder.notes.sentences()), damage)
         self._add_odometry(Sorted(others=self._base_frame.rest()))
         builder.finish()
         builder.add_due_loops()
         skipped = builder.notes.sentences()
-        if builder.held:
-            skipped.append(f'the last message is not used: {builder.held}')
-        if builder.n_waiting == 1:
-            skipped.append('1 loop names a time after the last odometry')
-        elif builder.n_waiting:
-            skipped.append(f'{builder.n_waiting} loops name times after the last odometry')
-        return GraphRecord(builder.graph, None, np.arange(builder.graph.n_poses), builder.stamps,
-                           tuple(skipped), damage)
+        if builder.stream.held:
+            skipped.append(f'the last message is not used: {builder.stream.reason()}')
+        if waiting := len(builder.loops.waiting):
+            skipped.append(f'{counted(waiting, "loop")} for times after the last odometry')
+        return GraphRecord(builder.graph, None, np.arange(builder.graph.n_poses),
+                           builder.track.keyframe_stamps, tuple(skipped), damage)
+
+
+def read_truth_topic(path: Path, topic: str, manifold: Manifold = se2) -> Reference:
+    """
+    Return the true poses on a topic of a bag, in order of their stamps; of one stamp the first.
+
+    Raises
+    ------
+    FileError : the bag cannot be read, or has no poses on the topic.
+
+    """
+    damage: list[str] = []
+    refused: Counter[str] = Counter()
+    pose_at: dict[int, Array] = {}
+    for message in read_messages(path, [topic], damage.append):
+        if message.msgtype not in _POSES:
+            raise FileError(path, f'{topic} is of {message.msgtype}; expected one of '
+                            f'{", ".join(_POSES)}')
+        try:
+            stamp, pose3 = conversion.stamped_pose(message.data)
+            pose_at.setdefault(stamp, pose3)
+        except MessageError as error:
+            refused[error.cause] += 1
+    skipped = [f'{counted(count, "message")} on {topic} of {path} refused: {cause}'
+               for cause, count in refused.items()]
+    if not pose_at:
+        raise FileError(path, '; '.join([f'no poses on {topic}; expected true poses',
+                                         *_alternatives(path, topic, *_POSES), *skipped, *damage]))
+    stamps = np.array(sorted(pose_at), np.int64)
+    poses = manifold.from_pose3(np.array([pose_at[stamp] for stamp in stamps.tolist()]))
+    return Reference(stamps, poses, stamped=True, skipped=(*skipped, *damage))
 
 
 def _noted_options(note: dict[str, str]) -> GraphBuilderOptions:
@@ -129,7 +209,20 @@ def _noted_options(note: dict[str, str]) -> GraphBuilderOptions:
     return options
 
 
-def _alternatives(path: Path, topic: str, msgtype: str) -> list[str]:
-    """Say on which other topics a bag has messages of a type; nothing where on none."""
-    others = [t.name for t in bag_summary(path).topics if t.msgtype == msgtype and t.name != topic]
-    return [f'{msgtype} is on {", ".join(others)}'] if others else []
+def _noted_turns(graph: FactorGraph, note: dict[str, str]) -> Mask:
+    """Return which factors were turned when they became messages, (m,) bool."""
+    odometry = graph.between.is_odometry
+    turns = np.zeros(len(odometry), bool)
+    for name, kind in (TURNED_STEPS, odometry), (TURNED_LOOPS, ~odometry):
+        numbers = np.array(note.get(name, '').split(), np.int64)
+        rows = np.flatnonzero(kind)
+        # Of a damaged bag the last ones may be missing.
+        turns[rows[numbers[numbers < len(rows)]]] = True
+    return turns
+
+
+def _alternatives(path: Path, topic: str, *msgtypes: str) -> list[str]:
+    """Say on which other topics a bag has messages of some types; nothing where on none."""
+    others = [(t.msgtype, t.name) for t in bag_summary(path).topics if t.name != topic]
+    return [f'{msgtype} is on {", ".join(name for found, name in others if found == msgtype)}'
+            for msgtype in msgtypes if msgtype in dict(others)]

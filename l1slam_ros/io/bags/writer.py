@@ -11,9 +11,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from io import StringIO
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import yaml
@@ -22,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.bags.damaged.salvage import METADATA
-from l1slam_ros.io.files import sync_folder
+from l1slam_ros.io.files import new_folder_beside, reported, sync_folder
 
 NOTE_KEY = 'l1slam'
 # What recorders leave in a bag's directory besides metadata.yaml.
@@ -33,11 +31,9 @@ _DISTRIBUTION = 'jazzy'
 # As rosbag2 writes them: no deadline is 2^63 - 1 ns, and so is the start of an empty bag.
 _FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 _NEVER = 2**63 - 1
-_QOS = {
-    'history': 'keep_last', 'depth': 1000, 'reliability': 'reliable', 'durability': 'volatile',
-    'deadline': _FOREVER, 'lifespan': _FOREVER, 'liveliness': 'automatic',
-    'liveliness_lease_duration': _FOREVER, 'avoid_ros_namespace_conventions': False,
-}
+_QOS = {'history': 'keep_last', 'depth': 1000, 'reliability': 'reliable', 'durability': 'volatile',
+        'deadline': _FOREVER, 'lifespan': _FOREVER, 'liveliness': 'automatic',
+        'liveliness_lease_duration': _FOREVER, 'avoid_ros_namespace_conventions': False}
 
 
 class BagWriter:
@@ -74,32 +70,22 @@ class BagWriter:
     def metadata(self, file: str, note: dict[str, str]) -> dict[str, Any]:
         """Return what metadata.yaml is to say of the file, and of a note in it."""
         start, stop = self._times
-        extent = {
-            'duration': {'nanoseconds': max(stop - start, 0)},
-            'starting_time': {'nanoseconds_since_epoch': start},
-            'message_count': self._counts.total(),
-        }
+        extent = {'duration': {'nanoseconds': max(stop - start, 0)},
+                  'starting_time': {'nanoseconds_since_epoch': start},
+                  'message_count': self._counts.total()}
         return {
-            'version': 9,
-            'storage_identifier': 'mcap',
-            'relative_file_paths': [file],
-            **extent,
+            'version': 9, 'storage_identifier': 'mcap', 'relative_file_paths': [file], **extent,
             'topics_with_message_count': [self._topic_metadata(name) for name in self._channels],
-            'compression_format': '',
-            'compression_mode': '',
-            'files': [{'path': file, **extent}],
+            'compression_format': '', 'compression_mode': '', 'files': [{'path': file, **extent}],
             'custom_data': {NOTE_KEY: _yaml(note, in_one_line=True)} if note else None,
-            'ros_distro': _DISTRIBUTION,
-        }
+            'ros_distro': _DISTRIBUTION}
 
     def _topic_metadata(self, topic: str) -> dict[str, Any]:
+        msgtype = self._msgtypes[topic]
         return {'message_count': self._counts[topic], 'topic_metadata': {
-            'name': topic,
-            'type': self._msgtypes[topic],
-            'serialization_format': 'cdr',
+            'name': topic, 'type': msgtype, 'serialization_format': 'cdr',
             'offered_qos_profiles': [_QOS],
-            'type_description_hash': self._typestore.hash_rihs01(self._msgtypes[topic]),
-        }}
+            'type_description_hash': self._typestore.hash_rihs01(msgtype)}}
 
 
 @contextmanager
@@ -136,19 +122,16 @@ def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagW
         (made / METADATA).write_text(_yaml(document) + '\n', 'utf-8')
 
 
+# Writes out twice whatever occurs in a document twice.
+_DUMPER = type('_Dumper', (yaml.SafeDumper,), {'ignore_aliases': lambda self, data: True})
+
+
 def _yaml(document: Any, in_one_line: bool = False) -> str:
-    """Return a document as YAML, whatever occurs in it twice written out twice."""
-    text = StringIO()
-    dumper = yaml.SafeDumper(text, sort_keys=False, width=2**16,
-                             default_flow_style=in_one_line)
-    dumper.ignore_aliases = lambda _: True
-    dumper.open()
-    dumper.represent(document)
-    dumper.close()
-    return text.getvalue().strip()
+    return str(yaml.dump(document, Dumper=_DUMPER, sort_keys=False, width=2**16,
+                         default_flow_style=in_one_line)).strip()
 
 
-def _refuse_other_than_bag(target: Path) -> None:
+def refuse_other_than_bag(target: Path) -> None:
     """Refuse to replace what is there, unless it is a bag and nothing else."""
     if not os.path.lexists(target):
         return
@@ -164,21 +147,18 @@ def _refuse_other_than_bag(target: Path) -> None:
 @contextmanager
 def _replacing_directory(target: Path) -> Iterator[Path]:
     """Yield the name of a directory to make, which takes the place of `target` in the end."""
-    try:
-        _refuse_other_than_bag(target)
-        with TemporaryDirectory('.tmp', f'.{target.name}.', target.parent,
-                                ignore_cleanup_errors=True) as scratch:
+    with reported(target):
+        refuse_other_than_bag(target)
+        with new_folder_beside(target) as scratch:
             # The bag is made under its own name: that of the file inside repeats it.
-            made = Path(scratch, target.name)
+            made = scratch / target.name
             yield made
             for file in made.iterdir():
                 with file.open('rb') as written:
                     os.fsync(written.fileno())
             sync_folder(made)
-            _swap(made, target, Path(scratch, f'{target.name}.former'))
+            _swap(made, target, scratch / f'{target.name}.former')
             sync_folder(target.parent)
-    except OSError as error:
-        raise FileError(target, f'cannot be written: {error.strerror or error}') from error
 
 
 def _swap(made: Path, target: Path, former: Path) -> None:

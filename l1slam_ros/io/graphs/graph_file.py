@@ -25,7 +25,7 @@ from l1slam_ros.io.files import (
     put_lines,
     quoted,
     replacing,
-    settled,
+    rounded,
 )
 from l1slam_ros.io.graphs.rows import (
     Rows,
@@ -106,9 +106,8 @@ def read_graph_file(path: str | os.PathLike[str],
                        rotation_information=rotation_information, remarks=remarks)
 
 
-def read_vertices(
-    path: str | os.PathLike[str], manifold: Manifold
-) -> tuple[Indices, Array, Indices | None]:
+def read_vertices(path: str | os.PathLike[str],
+                  manifold: Manifold) -> tuple[Indices, Array, Indices | None]:
     """
     Return of a graph's vertices ids (n,), ascending, poses (n, p), and stamps (n,) [ns], if any.
 
@@ -235,8 +234,7 @@ def _kinds(graph: FactorGraph) -> np.ndarray:
     size = graph.manifold.positions(rest).shape[1]
     is_position = ((factors.measurement[:, size:] == rest[:, size:]).all(axis=1)
                    & ~factors.speaks[:, graph.manifold.ROTATION].any(axis=1))
-    return np.where(~factors.is_absolute, 'between',
-                    np.where(is_position, 'position', 'absolute'))
+    return np.where(~factors.is_absolute, 'between', np.where(is_position, 'position', 'absolute'))
 
 
 def _lines(path: Path, record: GraphRecord, kind: str, ids: Indices, pose: Array,
@@ -256,7 +254,7 @@ def _lines(path: Path, record: GraphRecord, kind: str, ids: Indices, pose: Array
     if tag.information:
         rows, columns = np.array(tag.information).T
         roots = roots / tag.units(record.rotation_information)
-        information = settled(roots.transpose(0, 2, 1) @ roots)
+        information = rounded(roots.transpose(0, 2, 1) @ roots)
         values = np.concatenate((values, information[:, rows, columns]), axis=1)
     readable = (np.abs(values) <= LARGEST).all(axis=1)
     if not readable.all():

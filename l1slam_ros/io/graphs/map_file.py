@@ -10,6 +10,10 @@ from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.io.graphs.saved_map import keep_as, load_map, save_map
 from l1slam_ros.io.node_options import NodeOptions
 
+# An autosave begins after such a part of its period: a busy machine comes late to it, and odometry
+# on its way is not in it yet.
+_PART = 0.8
+
 
 class MapFile:
     """
@@ -64,21 +68,25 @@ class MapFile:
         try:
             return self.load()
         except FileError as error:
-            return f'the map begins empty: {error}'
+            sentence = f'the map begins empty: {error}'
+            if self._path().exists():
+                self._warn(sentence)
+            return sentence
 
-    @property
-    def is_due(self) -> bool:
-        """Whether it is time for `autosave`: each ends within a period of the one before."""
+    def seconds_left(self) -> float:
+        """Return in how many seconds `autosave` is due, or when to ask again."""
         options = self._options()
-        # Who asks does so once in a period of the updates.
-        wait = options.autosave_period - options.update.period - self._took
-        return time.monotonic() - self._began >= wait and self._is_to_be_saved()
+        # It is to end within a period of the beginning of the last.
+        wait = _PART * options.autosave_period - 2 * self._took
+        left = self._began + wait - time.monotonic()
+        return max(left, 0.0 if self._is_to_be_saved() else options.update.period)
 
     def autosave(self) -> None:
         """Save the map if it has changed; what stood in its place, if not its own, is kept."""
+        self._began = time.monotonic()
         if not self._is_to_be_saved() or self._backend.saved() is None:
             return
-        path, self._began = self._path(), time.monotonic()
+        path = self._path()
         if path != self._ours and path.exists():
             kept = path.with_name(f'{path.stem}.{_time_of(path)}{path.suffix}')
             keep_as(path, kept)
@@ -94,7 +102,7 @@ class MapFile:
         path = self._options().save_path
         if not path:
             raise OptionError('the parameter save_path is empty, expected the name of a .g2o file')
-        return Path(path).absolute()
+        return Path(path).expanduser().absolute()
 
 
 def _time_of(path: Path) -> str:

@@ -62,15 +62,12 @@ def lines_by_tag(path: str | os.PathLike[str]) -> tuple[dict[str, TextLines], Re
         group.texts.append(rest[0] if rest else '')
     if not groups:
         raise FileError(path, f'the file is empty; expected {expected_tags("between")} lines')
+    known = TAGS.keys() | TAGS_LEFT_OUT.keys() | {'FIX'}
     for tag, group in groups.items():
-        _refuse_unknown(path, tag, group.numbers[0])
+        if tag not in known and not tag.startswith('PARAMS_'):
+            raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(TAGS)}',
+                            group.numbers[0])
     return groups, lines.remarks
-
-
-def _refuse_unknown(path: object, tag: str, line: int) -> None:
-    if tag in TAGS or tag in TAGS_LEFT_OUT or tag == 'FIX' or tag.startswith('PARAMS_'):
-        return
-    raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(TAGS)}', line)
 
 
 def expected_tags(kind: str) -> str:

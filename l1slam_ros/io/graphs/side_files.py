@@ -27,6 +27,7 @@ from l1slam_ros.io.files import (
     quoted,
     read_lines,
     replacing,
+    reported,
     stamp_from_text,
 )
 
@@ -80,10 +81,8 @@ def _replaced(path: Path, lines: list[str]) -> Iterator[None]:
             yield
         return
     yield
-    try:
+    with reported(path, 'removed'):
         path.unlink(missing_ok=True)
-    except OSError as error:
-        raise FileError(path, f'cannot be removed: {error.strerror or error}') from error
 
 
 def _stamp_lines(ids: Indices, stamps: Indices) -> list[str]:

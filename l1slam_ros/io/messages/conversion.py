@@ -25,8 +25,12 @@ import numpy as np
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import silent_components
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.io.files import NANOSECONDS, QUATERNION_NORM_ERROR, quoted, stamp_text
+from l1slam_ros.core.graph.measurements import (
+    QUATERNION_NORM_ERROR,
+    LoopClosure,
+    OdometrySample,
+)
+from l1slam_ros.io.files import NANOSECONDS, quoted, stamp_text
 
 _REFERENCE_FRAME = re.compile(r'(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
 # builtin_interfaces/Time holds its seconds in 32 bits.
@@ -109,7 +113,7 @@ def absolute_pose(message: Any, map_frame: str) -> LoopClosure:
     position, rotation = message.pose.pose.position, message.pose.pose.orientation
     if silent_components(covariance[None], absolute=True)[0, 3:].all():
         rotation = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
-    return LoopClosure(None, stamp, _checked(position, rotation), covariance)
+    return LoopClosure(None, stamp, checked_pose3(position, rotation), covariance)
 
 
 def stamped_pose(message: Any) -> tuple[int, Array]:
@@ -124,7 +128,7 @@ def stamped_pose(message: Any) -> tuple[int, Array]:
 
     """
     if hasattr(message, 'transform'):
-        pose3 = _checked(message.transform.translation, message.transform.rotation)
+        pose3 = checked_pose3(message.transform.translation, message.transform.rotation)
     else:
         pose3 = _pose3(getattr(message.pose, 'pose', message.pose))
     return stamp_of(message.header), pose3
@@ -152,6 +156,26 @@ def stamp_of(header: Any) -> int:
     return stamp
 
 
+def checked_pose3(t: Any, q: Any) -> Array:
+    """
+    Return translation and rotation as one (7,), the quaternion normalised.
+
+    Raises
+    ------
+    MessageError : they are no pose.
+
+    """
+    position, quaternion = (t.x, t.y, t.z), (q.x, q.y, q.z, q.w)
+    if not all(map(math.isfinite, position + quaternion)):
+        raise MessageError('not_finite', f'pose {position} {quaternion}; expected finite numbers')
+    if max(map(abs, position)) > _FARTHEST:
+        raise MessageError('range', f'position {position}; expected it within {_FARTHEST:g} m')
+    norm = math.hypot(*quaternion)
+    if abs(norm - 1.0) > QUATERNION_NORM_ERROR:
+        raise MessageError('quaternion', f'quaternion {quaternion} of norm {norm:g}; expected 1')
+    return np.array((*position, *(component / norm for component in quaternion)))
+
+
 def _ends(message: Any, base_frame: str) -> tuple[int, int]:
     """Return reference and stamp of a loop [ns]."""
     stamp = stamp_of(message.header)
@@ -176,20 +200,7 @@ def _reference_stamp(frame_id: str, base_frame: str) -> int:
 
 def _pose3(pose: Any) -> Array:
     """Return x y z qx qy qz qw (7,) of a geometry_msgs/Pose, the quaternion normalised."""
-    return _checked(pose.position, pose.orientation)
-
-
-def _checked(t: Any, q: Any) -> Array:
-    """Return translation and rotation as one (7,), the quaternion normalised."""
-    position, quaternion = (t.x, t.y, t.z), (q.x, q.y, q.z, q.w)
-    if not all(map(math.isfinite, position + quaternion)):
-        raise MessageError('not_finite', f'pose {position} {quaternion}; expected finite numbers')
-    if max(map(abs, position)) > _FARTHEST:
-        raise MessageError('range', f'position {position}; expected it within {_FARTHEST:g} m')
-    norm = math.hypot(*quaternion)
-    if abs(norm - 1.0) > QUATERNION_NORM_ERROR:
-        raise MessageError('quaternion', f'quaternion {quaternion} of norm {norm:g}; expected 1')
-    return np.array((*position, *(component / norm for component in quaternion)))
+    return checked_pose3(pose.position, pose.orientation)
 
 
 def _covariance(entries: Any) -> Array:

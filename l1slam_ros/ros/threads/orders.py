@@ -4,6 +4,7 @@
 import queue
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 from rclpy.node import Node
@@ -49,7 +50,12 @@ class Orders:
     def __init__(self, node: Node, failures: Failures, done: Callable[[], None]):
         self._node, self._failures, self._done = node, failures, done
         self._queue: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
+        self._idle: Callable[[], float]
         self._thread = threading.Thread(target=self._work, name='services', daemon=True)
+
+    def start(self, idle: Callable[[], float]) -> None:
+        """Begin; idle : called where nothing is queued, again after so many seconds."""
+        self._idle = idle
         self._thread.start()
 
     def place(self, name: str, work: Callable[[], str]) -> Future:
@@ -65,8 +71,13 @@ class Orders:
         return not self._thread.is_alive()
 
     def _work(self) -> None:
-        while (order := self._queue.get()) is not None:
+        while (order := self._next()) is not None:
             order.future.set_result(self._carry_out(order))
+
+    def _next(self) -> _Order | None:
+        while True:
+            with suppress(queue.Empty):
+                return self._queue.get(timeout=self._idle())
 
     def _carry_out(self, order: _Order) -> Answer:
         try:

@@ -9,8 +9,8 @@ from typing import Any
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.update import Improvement
-from l1slam_ros.io.compilation import fill_cache
-from l1slam_ros.io.warm_up import STEPS, with_space
+from l1slam_ros.io.compilation import STEPS, fill_cache, with_space
+from l1slam_ros.io.node_options import UpdateOptions
 from l1slam_ros.ros.threads.failures import Failures
 
 # [s] After a failed update the next one waits; twice as long after each more, up to this.
@@ -21,22 +21,22 @@ _WORTH_TELLING = 1.0
 
 class SolverThread:
     """
-    Updates the map of a back end whenever it is woken.
+    Updates the map of a back end, once in a period.
 
     Parameters
     ----------
     backend : whose map
     failures : where to tell what an update raised
     logger : of the node
-    budget : returns how long one update may work [s]
+    options : returns how often to update, and how long one update may work
     tell : called before and after each update, with what it did, None: nothing; may publish
 
     """
 
     def __init__(self, backend: Backend, failures: Failures, logger: Any,
-                 budget: Callable[[], float], tell: Callable[[Improvement | None], None]):
+                 options: Callable[[], UpdateOptions], tell: Callable[[Improvement | None], None]):
         self._backend, self._failures, self._logger = backend, failures, logger
-        self._budget, self._tell = budget, tell
+        self._options, self._tell = options, tell
         self._woken = threading.Event()
         self._paused = self._closing = False
         self._pause, self._not_before = _FIRST_PAUSE, 0.0
@@ -48,12 +48,8 @@ class SolverThread:
         """Begin; before the first update, what is not in the cache is compiled."""
         self._thread.start()
 
-    def wake(self) -> None:
-        """Let an update begin, unless one is at work, or failed just now."""
-        self._woken.set()
-
     def hurry(self) -> None:
-        """Let an update begin even if the last one failed just now."""
+        """Let an update begin now, even if the last one failed just now."""
         self._not_before = 0.0
         self._woken.set()
 
@@ -79,8 +75,11 @@ class SolverThread:
 
     def _work(self) -> None:
         self._compile()
+        due = time.monotonic()
         while True:
-            self._woken.wait()
+            # From beginning to beginning: an update is a part of its period.
+            due = max(due + self._options().period, time.monotonic())
+            self._woken.wait(due - time.monotonic())
             # In this order, or the call to close is lost.
             self._woken.clear()
             if self._closing:
@@ -107,7 +106,7 @@ class SolverThread:
             return None
         self._behind_since = self._behind_since or time.monotonic()
         improvement = self._backend.update(
-            self._budget(), lambda: self._paused or self._closing)
+            self._options().budget, lambda: self._paused or self._closing)
         if improvement is None or improvement.judgement.settled:
             self._behind_since = 0.0
         return improvement

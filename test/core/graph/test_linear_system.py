@@ -59,16 +59,6 @@ def test_a_equals_differences_through_step_poses(case):
         assert_allclose(A[:, column], (change[0] - change[1]) / (2 * h), atol=1e-7)
 
 
-def test_the_linear_model_errs_by_the_square_of_the_step(case, rng):
-    graph, poses = case
-    system = linearise(graph, poses)
-    direction = rng.standard_normal(system.A.shape[1])
-    errors = [np.abs(whitened_residual(graph, step_poses(graph, poses, h * direction))
-                     - (system.A @ (h * direction) - system.b)).sum() for h in (1e-3, 1e-4)]
-    assert errors[0] > 1e-7
-    assert errors[0] / errors[1] == pytest.approx(100, rel=0.1)
-
-
 def test_the_gauge_is_fixed_by_keyframe_0_or_by_the_world(case, rng):
     graph, poses = case
     fixed = 0 if graph.between.is_absolute.any() else 1
@@ -101,24 +91,14 @@ def test_the_free_motion_of_the_whole_is_no_column(rng):
     assert_allclose(whitened_residual(graph, moved), whitened_residual(graph, truth), atol=1e-10)
 
 
-@pytest.mark.parametrize('step', [[], np.zeros(0)])
-def test_one_keyframe_without_factors_is_an_empty_system(step):
+@pytest.mark.parametrize('n, columns', [(0, 0), (1, 0), (3, 6)])
+def test_keyframes_without_factors_are_empty_columns(n, columns):
     graph = FactorGraph(se2)
-    graph.add_poses(1)
-    system = linearise(graph, se2.identity(1))
-    assert system.A.shape == (0, 0) and system.b.shape == (0,)
-    assert_array_equal(step_poses(graph, se2.identity(1), step), se2.identity(1))
-
-
-def test_keyframes_without_factors_are_empty_columns():
-    graph = FactorGraph(se2)
-    graph.add_poses(3)
-    system = linearise(graph, se2.identity(3))
-    assert system.A.shape == (0, 6) and system.A.nnz == 0
-
-
-def test_an_empty_graph_is_an_empty_system():
-    assert linearise(FactorGraph(se2), se2.identity(0)).A.shape == (0, 0)
+    graph.add_poses(n)
+    system = linearise(graph, se2.identity(n))
+    assert system.A.shape == (0, columns) and system.A.nnz == 0 and system.b.shape == (0,)
+    stepped = step_poses(graph, se2.identity(n), [0] * columns)
+    assert_array_equal(stepped, se2.identity(n))
 
 
 def test_poses_and_graph_are_left_as_they_were(case):

@@ -5,12 +5,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 from scipy.sparse import coo_array, eye_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 from scipy.spatial import Delaunay
 from systems import PLENTY, SHAPES
 
-from l1slam_ros.core.kernels.ordering import minimum_degree
+from l1slam_ros.core.kernels import ordering
 from l1slam_ros.core.kernels.symbolic import panel_rows, postorder, supernodes
+
+
+def minimum_degree(start, adjacent, limit):
+    return ordering.minimum_degree(start, adjacent, limit, np.zeros(len(start) - 1, np.int32))
 
 
 def adjacency_of(pairs, n):
@@ -124,6 +129,37 @@ def test_the_graph_is_left_as_it_was(graph):
     minimum_degree(*graph, PLENTY)
     for array, expected in zip(graph, before, strict=True):
         assert_array_equal(array, expected)
+
+
+# Dissection
+
+
+def torus(side):
+    """Return the pairs of a torus of side x side nodes: alike everywhere."""
+    k = np.arange(side**2).reshape(side, side)
+    return [pair for axis in range(2)
+            for pair in zip(k.ravel().tolist(), np.roll(k, 1, axis).ravel().tolist(), strict=True)]
+
+
+def test_what_is_cut_leaves_small_parts_that_come_first(rng):
+    """Also of two tori that nothing joins; the cuts of a part come after those within it."""
+    pairs = torus(30)
+    graph = adjacency_of(pairs + [(a + 900, b + 900) for a, b in pairs], 1800)
+    stage = ordering.dissect(*graph)
+    whole = [(a, b) for a, b in [*pairs] if not stage[a] and not stage[b]]
+    labels = connected_components(coo_array((np.ones(len(whole)), np.transpose(whole)),
+                                            shape=(900, 900)))[1]
+    assert np.bincount(labels[stage[:900] == 0]).max() <= 120
+    order, _, rows = ordering.minimum_degree(*graph, PLENTY, stage)
+    assert_array_equal(np.sort(order), np.arange(1800))
+    assert (np.diff(stage[order]) >= 0).all() and len(np.unique(stage)) > 3
+    assert len(rows) == sum(map(len, eliminate(*graph, order)))
+
+
+def test_what_is_small_or_joined_throughout_is_not_cut():
+    for n, pairs in ((100, torus(10)), (150, [(i, j) for i in range(150) for j in range(i)]),
+                     (0, [])):
+        assert not ordering.dissect(*adjacency_of(pairs, n)).any()
 
 
 # What follows from an order

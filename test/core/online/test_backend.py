@@ -18,9 +18,10 @@ from lies import (
 from numpy.testing import assert_allclose, assert_array_equal
 from problems import PERIOD, loop, odometry, play, seconds
 
-from l1slam_ros.core.errors import Interrupted, OptionError
+from l1slam_ros.core.errors import Interrupted, L1SlamError, OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loop_states import (
@@ -157,7 +158,7 @@ def test_a_loop_alone_settles_nothing_new(world):
     settled(backend)
     backend.add_loop(loop(0.0, 100.0, (1.0, 0.0, 0.0)))
     assert backend.update(PLENTY) is None
-    assert backend._builder.n_waiting == 1
+    assert len(backend._builder.loops.waiting) == 1
 
 
 # Time
@@ -696,3 +697,24 @@ def test_whether_loops_are_doubted_can_be_changed_while_it_runs():
     backend.set_options(CREDULOUS)
     settled(backend)
     assert LOOP_STATES[backend.loop_states().state[0]] == 'accepted'
+
+
+@pytest.mark.parametrize('dimension', [2, 3])
+@pytest.mark.parametrize('change, words', [
+    ({'pose3': np.zeros(3)}, r'pose3 of shape \(3,\), covariance of \(6, 6\); expected'),
+    ({'pose3': [0.0, 0, 0, 0, 0, 0, 1]}, 'pose3 of shape None'),
+    ({'covariance': np.eye(3)}, r'covariance of \(3, 3\)'),
+    ({'pose3': np.array([np.nan, 0, 0, 0, 0, 0, 1])}, 'expected finite numbers'),
+    ({'pose3': np.zeros(7)}, 'of norm 0; expected 1'),
+    ({'stamp': 2.5}, r'stamp \(.*2.5.*\); expected whole nanoseconds'),
+])
+def test_what_is_no_measurement_is_refused_and_leaves_no_trace(dimension, change, words):
+    here = np.array([0.0, 0, 0, 0, 0, 0, 1])
+    sample = OdometrySample(10**9, here, np.eye(6), np.eye(6))
+    with Backend(dimension=dimension) as backend:
+        backend.add_odometry(sample)
+        with pytest.raises(L1SlamError, match=words):
+            backend.add_odometry(replace(sample, **{'stamp': 2 * 10**9, **change}))
+        with pytest.raises(L1SlamError, match=words):
+            backend.add_loop(replace(LoopClosure(10**9, 2 * 10**9, here, np.eye(6)), **change))
+        assert len(backend.loop_states().state) == 0 and len(backend.poses) == 1

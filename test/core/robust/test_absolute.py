@@ -13,7 +13,7 @@ from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.robust.batch import robust_solve
-from l1slam_ros.core.robust.batch_map import Wish, solve
+from l1slam_ros.core.robust.batch_map import SolveOptions, solve
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import read_graph_file
 
@@ -31,14 +31,14 @@ def manhattan(datasets):
 def test_a_position_every_hundred_keyframes_holds_a_world_without_loops(manhattan, part_false):
     """What the odometry states is 40 times what it errs by, so the positions lead alone."""
     world = seen(*manhattan, 100, np.random.default_rng(1), part_false)
-    outcome = solve(world.graph, None, Wish(norm='l2'))
+    outcome = solve(world.graph, None, SolveOptions(norm='l2'))
     factors, judgement = world.graph.between, outcome.judgement
     assert factors.j[~judgement.accepted].tolist() == world.false.tolist()
     assert factors.is_absolute[~judgement.accepted].all() and judgement.doubt is None
     assert world.error(outcome.solution.poses) < 1.35
     # As good as if somebody had said which are false.
     known = world.graph.subset(judgement.accepted)
-    told = solve(known, None, Wish(norm='l2', robust=False)).solution
+    told = solve(known, None, SolveOptions(norm='l2', robust=False)).solution
     assert world.error(outcome.solution.poses) == pytest.approx(
         world.error(told.poses), rel=1e-3)
 
@@ -53,7 +53,7 @@ def world():
 
 @pytest.mark.parametrize('norm', ['l1', 'l2', 'huber'])
 def test_false_positions_are_refused_in_every_norm(world, norm):
-    outcome = solve(world.graph, None, Wish(norm=norm))
+    outcome = solve(world.graph, None, SolveOptions(norm=norm))
     assert world.graph.between.j[~outcome.judgement.accepted].tolist() == world.false.tolist()
     assert world.error(outcome.solution.poses) < 0.6
     assert outcome.parts == 1
@@ -64,7 +64,7 @@ def test_false_positions_are_refused_in_every_norm(world, norm):
 def test_who_believes_all_gets_the_map_in_the_world(norm, solver):
     made = simulate_world(200, 350, WorldOptions(), np.random.default_rng(4))
     world = seen(made.graph, made.truth, 10, np.random.default_rng(4), sigma=0.1)
-    outcome = solve(world.graph, None, Wish(norm=norm, solver=solver, robust=False))
+    outcome = solve(world.graph, None, SolveOptions(norm=norm, solver=solver, robust=False))
     assert world.error(outcome.solution.poses) < 0.3
 
 
@@ -97,7 +97,7 @@ def test_two_parts_that_only_gps_ties_together(rng):
     k = np.array([0, 10, 20, 29, 30, 40, 50, 59])
     add_absolute(graph, k, truth[k] * [1, 1, 0], np.tile(100 * POSITION, (8, 1, 1)))
     for norm in ('l1', 'l2', 'huber'):
-        outcome = solve(graph, None, Wish(norm=norm))
+        outcome = solve(graph, None, SolveOptions(norm=norm))
         assert outcome.parts == 1 and not outcome.unjudged
         assert_allclose(outcome.solution.poses, truth, atol=1e-4)
 

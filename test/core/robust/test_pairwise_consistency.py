@@ -10,7 +10,7 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
 from l1slam_ros.core.robust.judgement import doubts
 from l1slam_ros.core.robust.pairwise_consistency import spanned, strongest_group
 from l1slam_ros.core.robust.rounds import Growth
-from l1slam_ros.core.robust.slips import SPANNING, refused, weakest_steps
+from l1slam_ros.core.robust.slips import SPANNING, common_steps
 
 STEP = 200
 
@@ -22,10 +22,15 @@ def bad():
 
 def slipped(graph, step):
     """Return the graph, the robot turned by 90 degrees more at a step."""
+    return moved(graph, step, [0, 0, np.pi / 2])
+
+
+def moved(graph, step, more):
+    """Return the graph, its odometry wrong at a step."""
     factors, new = graph.between, FactorGraph(graph.manifold)
     row = int(np.flatnonzero(factors.is_odometry & (factors.i == step))[0])
     measurement = factors.measurement.copy()
-    measurement[row] = se2.retract(measurement[row][None], np.array([[0, 0, np.pi / 2]]))[0]
+    measurement[row] = se2.retract(measurement[row][None], np.array([more], float))[0]
     new.add_poses(graph.n_poses)
     new.add_between(factors.i, factors.j, measurement,
                     factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information)
@@ -44,12 +49,12 @@ def grown(graph):
 
 def test_loops_across_a_slip_agree(bad):
     growth = grown(slipped(bad.graph, STEP))
-    group = strongest_group(growth, refused(growth))
+    group = strongest_group(growth, growth.undecided())
     assert len(group.places) >= SPANNING
     assert not is_false(bad, growth.factors)[group.rows].any()
     assert ((growth.low[group.rows] <= STEP) & (growth.high[group.rows] > STEP)).all()
-    steps = growth.low[weakest_steps(growth, group)]
-    assert steps.min() <= STEP <= steps.max() and len(steps) < 20
+    steps = growth.low[common_steps(growth, group)]
+    assert steps.min() <= STEP <= steps.max()
 
 
 @pytest.mark.parametrize('kind', ['random', 'identity', 'grouped'])
@@ -60,7 +65,7 @@ def test_false_loops_agree_by_chance_at_most(kind):
 def test_where_nothing_is_refused_nobody_agrees():
     growth = grown(careful_world(60, 100).graph)
     growth.accepted[:] = True
-    assert not len(strongest_group(growth, refused(growth)).rows)
+    assert not len(strongest_group(growth, growth.undecided()).rows)
 
 
 def test_spanned_counts_the_factors_across_each_step():

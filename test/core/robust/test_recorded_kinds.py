@@ -10,7 +10,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.robust.batch import robust_solve
-from l1slam_ros.core.robust.batch_map import Wish
+from l1slam_ros.core.robust.batch_map import SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.robust.judgement import ONE_PLACE, OTHER_MAP
 
@@ -48,6 +48,13 @@ def test_misstated_information_changes_no_decision(world, odometry, loops):
     np.testing.assert_allclose(np.log10(found.variance / [odometry, loops]), 0, atol=1.0)
 
 
+def test_a_graph_that_says_all_twice_is_believed(world):
+    factors = world.graph.between
+    graph = world.graph.copy()
+    graph.append_between(factors.i, factors.j, factors.measurement, factors.sqrt_information)
+    assert robust_solve(graph)[0].accepted.all()
+
+
 @pytest.mark.parametrize('joined', [True, False])
 def test_two_sessions_are_joined_by_loops_or_stay_two_parts(world, joined):
     bad = spoilt(world, 'random', 170)
@@ -57,7 +64,7 @@ def test_two_sessions_are_joined_by_loops_or_stay_two_parts(world, joined):
     keep = ~across if not joined else ~(across & (high - low == 1))
     graph = bad.graph.subset(keep)
     assert odometry_gaps(graph).tolist() == [seam]
-    outcome = solve_graph(graph, None, Wish(norm='l2'))
+    outcome = solve_graph(graph, None, SolveOptions(norm='l2'))
     assert outcome.parts == (1 if joined else 2)
     assert not outcome.judgement.accepted[is_false(bad, graph.between)].any()
     halves = (slice(0, n),) if joined else (slice(0, 200), slice(200, n))

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
-from l1slam_ros.core.robust.robust_map import minimise_robustly
+from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions

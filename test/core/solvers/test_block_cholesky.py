@@ -288,6 +288,16 @@ def test_a_chain_and_a_star_do_not_fill_in():
         assert filled(shape(N), N, pattern.position).sum() == N + N - 1
 
 
+def test_large_blocks_are_worth_the_search_for_a_better_order():
+    """On a torus, which is alike everywhere, halves first fill in less than minimum degree."""
+    k = np.arange(2500).reshape(50, 50)
+    pairs = np.concatenate([np.stack((k.ravel(), np.roll(k, 1, axis).ravel()), axis=1)
+                            for axis in range(2)])
+    by_degree, better = (find_pattern(pairs, 2500, PLENTY, size) for size in (1, 6))
+    assert better.work < 0.8 * by_degree.work
+    assert_array_equal(np.sort(better.position), np.arange(2500))
+
+
 def test_too_much_fill_is_refused():
     keyframe = np.array([(i, j) for i in range(20) for j in range(i)])
     below = 20 * 19 // 2

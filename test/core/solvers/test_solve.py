@@ -35,11 +35,11 @@ def dense(rng):
 def test_sparse_graphs_get_the_interior_point_and_dense_ones_algorithm_4(world, dense):
     for graph, expected, expected_reason in ((world.graph, INTERIOR_POINT, 'sparse'),
                                              (dense, PRIMAL_DUAL, 'dense')):
-        choice = choose(AUTO, graph)
-        assert (choice.solver, choice.falls_back) == (expected, True)
-        assert choice.cholesky is not None
-        assert choice.reason == f'the graph is {expected_reason}'
-        _, solver = minimise_by(choice, graph, seed_poses(graph, choice.cholesky), DEFAULTS)
+        method = choose(AUTO, graph)
+        assert (method.solver, method.falls_back) == (expected, True)
+        assert method.cholesky is not None
+        assert method.reason == f'the graph is {expected_reason}'
+        _, solver = minimise_by(method, graph, seed_poses(graph, method.cholesky), DEFAULTS)
         assert solver == expected
 
 
@@ -54,9 +54,9 @@ def test_the_papers_graphs_get_the_interior_point(datasets):
 @pytest.mark.parametrize('solver', SOLVERS[1:])
 def test_a_solver_that_was_asked_for_is_the_one(solver, world, dense):
     for graph in world.graph, dense:
-        choice = choose(solver, graph)
-        assert (choice.solver, choice.reason, choice.falls_back) == (solver, 'asked for', False)
-        assert choice.cholesky is not None
+        method = choose(solver, graph)
+        assert (method.solver, method.reason, method.falls_back) == (solver, 'asked for', False)
+        assert method.cholesky is not None
 
 
 def test_both_solvers_end_at_one_cost(world):
@@ -75,10 +75,10 @@ def test_a_graph_that_fills_in_gets_algorithm_4(world, monkeypatch):
     expected = minimise_by(choose(AUTO, graph), graph, world.truth, DEFAULTS)[0].cost
     monkeypatch.setattr(cholesky, 'MOST_ENTRIES', 9 * 30)
     for solver in AUTO, PRIMAL_DUAL:
-        choice = choose(solver, graph)
-        assert (choice.cholesky, choice.solver) == (None, PRIMAL_DUAL)
-        assert choice.reason == 'the graph is too dense to be factorised'
-        solution, name = minimise_by(choice, graph, seed_poses(graph, None), DEFAULTS)
+        method = choose(solver, graph)
+        assert (method.cholesky, method.solver) == (None, PRIMAL_DUAL)
+        assert method.reason == 'the graph is too dense to be factorised'
+        solution, name = minimise_by(method, graph, seed_poses(graph, None), DEFAULTS)
         assert name == PRIMAL_DUAL
         assert solution.cost == pytest.approx(expected, rel=1e-3)
 
@@ -119,8 +119,8 @@ def test_auto_is_never_worse_than_the_interior_point_alone(seed):
 def test_progress_is_reported_by_every_solver(world):
     for solver in SOLVERS:
         reports = []
-        choice = choose(solver, world.graph)
-        solution, _ = minimise_by(choice, world.graph, world.truth, DEFAULTS,
+        method = choose(solver, world.graph)
+        solution, _ = minimise_by(method, world.graph, world.truth, DEFAULTS,
                                   lambda k, cost, reports=reports: reports.append((k, cost)))
         assert reports[-1][1] == solution.cost
         assert 0 < len(reports) <= solution.outer_iterations

@@ -93,9 +93,8 @@ def test_without_the_default_topic_all_odometry_is_named(tmp_path, world):
     path = mcap_file(tmp_path / 'a.mcap', both)
     with pytest.raises(FileError) as caught:
         read_input(path)
-    assert str(caught.value) == (
-        f'{path}: 0 keyframes from /odom; expected 2 or more; '
-        'nav_msgs/msg/Odometry is on /visual, /wheels')
+    assert str(caught.value) == (f'{path}: 0 keyframes from /odom; expected 2 or more; '
+                                 'nav_msgs/msg/Odometry is on /visual, /wheels')
 
 
 def test_a_topic_asked_for_that_is_not_there_is_an_error(tmp_path, world):
@@ -173,7 +172,7 @@ def test_what_cannot_be_used_is_counted_by_its_cause(tmp_path, world):
     broken(loops[4], lambda m: setattr(m.header.stamp, 'sec', 2_000_000))
     record = read_input(mcap_file(tmp_path / 'a.mcap', recording), EVERY)
     for said, start in zip(sorted(record.skipped), [
-            '1 loop names a time after the last odometry',
+            '1 loop for times after the last odometry',
             "1 message refused: frame 'map' of a loop; expected base_link@",
             '1 message refused: pose (nan, ', '1 message refused: stamp 0 s 0 ns; expected'],
             strict=True):

@@ -12,23 +12,10 @@ from disk import Disk
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.stream_reader import StreamReader
 
+from bags import NOTED, STRING, write_strings
 from l1slam_ros.core.errors import FileError, GraphError
 from l1slam_ros.io.bags.reader import read_messages
 from l1slam_ros.io.bags.writer import new_bag
-
-STRING = 'std_msgs/msg/String'
-NOTE = {'keyframes': 'every', 'covariance': 'increment'}
-
-
-def write_strings(path, count=5):
-    """Write a bag with `count` long strings on /a and one on /b."""
-    with new_bag(path, NOTE) as writer:
-        writer.add_topic('/a', STRING)
-        writer.add_topic('/b', STRING)
-        for k in range(count):
-            writer.write('/a', (10 + 2 * k) * 10**9, writer.types[STRING](data=f'a{k}' * 50))
-        writer.write('/b', 11 * 10**9, writer.types[STRING](data='b'))
-    return path
 
 
 @pytest.fixture
@@ -59,7 +46,7 @@ def test_the_file_is_what_rosbag2_and_mcap_tools_want(tmp_path):
     document = yaml.safe_load((path.parent / 'metadata.yaml').read_text())
     inside = yaml.safe_load(metadata['rosbag2']['serialized_metadata'])
     assert inside == document['rosbag2_bagfile_information']
-    assert metadata['l1slam'] == NOTE
+    assert metadata['l1slam'] == NOTED
 
 
 def test_every_chunk_and_the_index_carry_a_checksum(tmp_path):
@@ -86,9 +73,8 @@ def test_a_stream_of_the_file_is_enough(bag):
 
 
 def test_every_topic_has_its_type_and_all_qos_keys(bag):
-    qos_keys = {
-        'history', 'depth', 'reliability', 'durability', 'deadline', 'lifespan', 'liveliness',
-        'liveliness_lease_duration', 'avoid_ros_namespace_conventions'}
+    qos_keys = {'history', 'depth', 'reliability', 'durability', 'deadline', 'lifespan',
+                'liveliness', 'liveliness_lease_duration', 'avoid_ros_namespace_conventions'}
     data = yaml.safe_load((bag / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
     with (bag / 'bag.mcap').open('rb') as file:
         channels = {c.topic: c for c in make_reader(file).get_summary().channels.values()}

@@ -41,23 +41,20 @@ EDGE2 0 2 2 0.1 0.2 10 0 10 40 0 0
 """,
 }
 # What breaks readers: numbers at the ends of their ranges, words, signs, other tags.
-TOKENS = st.sampled_from([
-    '', '0', '-0', '1', '-1', '3', '2.5', '1e308', '-1e308', '1e-308', '5e-324', '1e154', '1e40',
-    '1e-40', 'nan', 'inf', '-inf', '9223372036854775807', '9223372036854775808', '1e3', '0x10',
-    '1_0', '++1', '1,5', 'x', '#', '\x00', '\u0663', '\u2028', '\x1b[31m', 'VERTEX_SE2',
-    'EDGE_SE2', 'EDGE2', 'VERTEX2', 'FIX', 'PARAMS_\x07', 'VERTEX_XY', 'EDGE_SE3:QUAT',
-])
-NUMBERS = st.sampled_from([
-    '0', '1', '-1', '2', '3', '0.1', '100', '3.14159265358979', '-3.2', '1e-9', '1e9', '1e-40',
-    '1e40', '1e-154', '1e154', '-1e154', '1e-300', '1e300', '1e308', '-1e308', '5e-324',
-])
-COMMANDS = st.sampled_from([
-    ('info', ()), ('convert', ('out.g2o',)), ('convert', ('out.graph',)), ('convert', ('out',)),
-    ('convert', ('out.tum',)), ('solve', ('--output', 'out.g2o', '--outer', '2')),
-    ('solve', ('--norm', 'l2', '--start', 'odometry', '--output', 'out.tum')),
-    ('solve', ('--norm', 'huber', '--start', 'file', '--output', 'out.g2o', '--json')),
-    ('corrupt', ('out.g2o', '--false-loops', '1')), ('plot', ('--output', 'out.png')),
-])
+TOKENS = st.sampled_from(
+    ['', '0', '-0', '1', '-1', '3', '2.5', '1e308', '-1e308', '1e-308', '5e-324', '1e154', '1e40',
+     '1e-40', 'nan', 'inf', '-inf', '9223372036854775807', '9223372036854775808', '1e3', '0x10',
+     '1_0', '++1', '1,5', 'x', '#', '\x00', '\u0663', '\u2028', '\x1b[31m', 'VERTEX_SE2',
+     'EDGE_SE2', 'EDGE2', 'VERTEX2', 'FIX', 'PARAMS_\x07', 'VERTEX_XY', 'EDGE_SE3:QUAT'])
+NUMBERS = st.sampled_from(
+    ['0', '1', '-1', '2', '3', '0.1', '100', '3.14159265358979', '-3.2', '1e-9', '1e9', '1e-40',
+     '1e40', '1e-154', '1e154', '-1e154', '1e-300', '1e300', '1e308', '-1e308', '5e-324'])
+COMMANDS = st.sampled_from(
+    [('info', ()), ('convert', ('out.g2o',)), ('convert', ('out.graph',)), ('convert', ('out',)),
+     ('convert', ('out.tum',)), ('solve', ('--output', 'out.g2o', '--outer', '2')),
+     ('solve', ('--norm', 'l2', '--start', 'odometry', '--output', 'out.tum')),
+     ('solve', ('--norm', 'huber', '--start', 'file', '--output', 'out.g2o', '--json')),
+     ('corrupt', ('out.g2o', '--false-loops', '1')), ('plot', ('--output', 'out.png'))])
 BOUNDED = settings(derandomize=True, deadline=None, database=None,
                    suppress_health_check=[HealthCheck.too_slow])
 

@@ -33,7 +33,7 @@ class Robot:
 
     def autosave(self):
         """Save where it is time, as the node does; return whether it was."""
-        due = self.map_file.is_due
+        due = self.map_file.seconds_left() == 0
         if due:
             self.map_file.autosave()
         return due
@@ -72,14 +72,26 @@ def test_it_is_saved_no_sooner_and_nowhere_that_nobody_said(tmp_path, changes):
     assert (tmp_path / 'map.g2o').exists() == (robot.options.autosave_period == HOUR)
 
 
+def test_the_next_is_due_before_a_period_is_over(tmp_path):
+    robot = Robot(tmp_path / 'map.g2o', period=HOUR)
+    robot.drive(3)
+    robot.map_file.autosave()
+    # Until there is something to be saved, it is asked again as often as updates come.
+    robot.options = replace(robot.options, autosave_period=1e-9)
+    assert robot.map_file.seconds_left() == robot.options.update.period
+    robot.options = replace(robot.options, autosave_period=HOUR)
+    robot.drive(1)
+    assert 0.79 * HOUR < robot.map_file.seconds_left() < 0.8 * HOUR
+
+
 def test_a_save_that_fails_is_tried_again_in_the_next_period(tmp_path):
     robot = Robot(tmp_path / 'none' / 'map.g2o', period=0.5)
     robot.drive(3)
-    while not robot.map_file.is_due:
+    while robot.map_file.seconds_left():
         time.sleep(0.01)
     with pytest.raises(FileError, match='none/map.g2o: cannot be written'):
         robot.map_file.autosave()
-    assert not robot.map_file.is_due and not robot.map_file.is_saving
+    assert robot.map_file.seconds_left() and not robot.map_file.is_saving
     (tmp_path / 'none').mkdir()
     while not robot.autosave():
         time.sleep(0.01)
@@ -137,8 +149,8 @@ def test_at_start_a_missing_map_is_no_error_and_a_damaged_one_is_kept(tmp_path):
     assert robot.warnings[0].startswith(f'3 keyframes loaded from {path}.1, the map before: ')
     (tmp_path / 'map.g2o.1').write_bytes(b'x')
     damaged, robot = path.read_bytes(), Robot(path)
-    assert robot.map_file.load_at_start().startswith(
-        f'the map begins empty: {path}: cannot be loaded: ')
+    assert robot.map_file.load_at_start() == robot.warnings[0]
+    assert robot.warnings[0].startswith(f'the map begins empty: {path}: cannot be loaded: ')
     robot.drive(3)
     robot.map_file.autosave()
     assert keyframes(path) == 3

@@ -52,11 +52,10 @@ def odometry(new, head=None, **pose):
     def vector():
         return new('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
 
-    return new(
-        'nav_msgs/msg/Odometry', header=head or header(new), child_frame_id='base_link',
-        pose=pose_with_covariance(new, **pose),
-        twist=new('geometry_msgs/msg/TwistWithCovariance', covariance=-np.arange(36.0),
-                  twist=new('geometry_msgs/msg/Twist', linear=vector(), angular=vector())))
+    return new('nav_msgs/msg/Odometry', header=head or header(new), child_frame_id='base_link',
+               pose=pose_with_covariance(new, **pose),
+               twist=new('geometry_msgs/msg/TwistWithCovariance', covariance=-np.arange(36.0),
+                         twist=new('geometry_msgs/msg/Twist', linear=vector(), angular=vector())))
 
 
 def loop(new, frame='base_link@10.000000007', **pose):
@@ -192,8 +191,7 @@ def test_without_a_heading_the_quaternion_may_be_none(new, unsaid):
 @pytest.mark.parametrize('fields, cause', [
     ({'frame': 'odom'}, 'frame'), ({'frame': ''}, 'frame'), ({'frame': 'a@1.000000000'}, 'frame'),
     ({'position': (math.nan, 0.0, 0.0)}, 'not_finite'), ({'position': (1e10, 0.0, 0.0)}, 'range'),
-    ({'variances': (1, 1, 1, 0, 0, 1), 'quaternion': (0.0, 0.0, 0.0, 0.0)}, 'quaternion'),
-])
+    ({'variances': (1, 1, 1, 0, 0, 1), 'quaternion': (0.0, 0.0, 0.0, 0.0)}, 'quaternion')])
 def test_an_absolute_pose_that_cannot_be_used(new, fields, cause):
     with pytest.raises(MessageError) as caught:
         absolute_pose(fix(new, **fields), 'map')

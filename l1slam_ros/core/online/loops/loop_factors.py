@@ -87,7 +87,11 @@ class LoopFactors:
 
     @property
     def stamps(self) -> tuple[Indices, Indices, Indices]:
-        """See `GraphBuilder.loop_stamps`."""
+        """
+        Stamps (reference, end) [ns] of the loops in the graph, waiting and expired, (k, 2) each.
+
+        Those in the graph are in the order of `rows`, to which they stay tied.
+        """
         return self._stamps.view(), self.waiting.stamps(), self._expired.view()
 
     @property
@@ -186,9 +190,8 @@ class LoopFactors:
         if loop.struck:
             self._struck.add(pair)
             factors = graph.between.pairs[self.rows]
-            graph.say(self.rows[
-                (factors == pair).all(axis=1) | (factors == pair[::-1]).all(axis=1)
-                | (self._stamps.view() == loop.stamps).all(axis=1)], trusted=False)
+            graph.say(self.rows[(factors == pair).all(axis=1) | (factors == pair[::-1]).all(axis=1)
+                                | (self._stamps.view() == loop.stamps).all(axis=1)], trusted=False)
         elif loop.trusted:
             self._struck.discard(pair)
             graph.say(np.array([self._row_of[one.key]]), trusted=True)

@@ -68,6 +68,10 @@ class WaitingLoops:
         self._count += 1
         self._stamps = None
 
+    def is_due(self, now: int) -> bool:
+        """Tell whether odometry has reached the times of any loop."""
+        return bool(self._by_end) and self._by_end[0][0] <= now
+
     def due(self, now: int) -> list[WaitingLoop]:
         """Take out the loops whose times odometry has reached by `now`, in the order they came."""
         due = []
@@ -118,9 +122,8 @@ class WaitingLoops:
         return self._loops.pop(number)
 
 
-def carried(
-    manifold: Manifold, used: list[WaitingLoop], to_reference: Array, to_keyframe: Array
-) -> tuple[Array, Array, Mask]:
+def carried(manifold: Manifold, used: list[WaitingLoop], to_reference: Array,
+            to_keyframe: Array) -> tuple[Array, Array, Mask]:
     """
     Return what loops say between keyframes near their times.
 
@@ -160,9 +163,8 @@ def carried(
     return measurement, covariance, usable(filled(covariance, silent))
 
 
-def loop_covariance(
-    stated: Array, model: Array | None, verbatim: bool
-) -> tuple[Array | None, list[tuple[float, float]]]:
+def loop_covariance(stated: Array, model: Array | None,
+                    verbatim: bool) -> tuple[Array | None, list[tuple[float, float]]]:
     """
     Return a covariance by what a loop states, (1, d, d), and variances found and used instead.
 

@@ -5,17 +5,28 @@ The raw odometry so far: where the robot was at any time, and which samples are 
 Stamps may go back: a clock was set, a bag is played again. The time of a sample is its stamp plus
 a shift, another one from where stamps went back, so that time only grows. A stamp means the
 latest stretch of time that had begun by it: the one the robot is in, if that goes back so far.
+
+A loop may name any time, so the motion between keyframes is kept: of old samples those that
+interpolation between their neighbours would miss by more than any measurement may claim to know.
 """
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.noise import LEAST_VARIANCE, Mask
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.measurements import LONGEST_PAUSE
 from l1slam_ros.core.online.odometry.odometry_stream import UNSEEN, is_identity
 
 # So many keyframes tell how fast the robot goes.
 _RECENT = 16
+
+# So many samples at once are thinned out, once as many more have come.
+_BLOCK = 512
+# [m], [rad] What interpolation may miss: the least standard deviation of a measurement.
+_MISSED = LEAST_VARIANCE**0.5
+# A round that spares less than such a part of the samples is the last.
+_WORTH = 1 / 8
 
 # [ns] Between the last sample before stamps went back, and the first after.
 _BETWEEN = 1_000_000_000
@@ -43,6 +54,7 @@ class OdometryTrack:
         # Of each part the first sample, its time and its keyframe; where shifts begin, and they.
         self._parts = GrowingArray((3,), np.int64)
         self._shifts: list[tuple[int, int]] = []
+        self._thinned = 0  # samples
 
     def __len__(self) -> int:
         return len(self._times)
@@ -65,7 +77,7 @@ class OdometryTrack:
     @property
     def last_pose(self) -> Array:
         """Pose of the last sample, (1, p)."""
-        pose: Array = self._poses.view()[-1:]
+        pose: Array = self._poses.view()[-1:].copy()
         return pose
 
     @property
@@ -101,17 +113,70 @@ class OdometryTrack:
             (len(self), stamp + self._shifts[-1][1], len(self._keyframes))]))
         return back
 
-    def append(self, stamp: int, pose: Array) -> None:
+    def append(self, stamp: int, pose: Array, is_keyframe: bool) -> None:
         """Append a sample after the last one, pose (1, p)."""
         if not len(self):
             self.begin_part(stamp)
         self._times.extend(np.array([stamp + self._shifts[-1][1]]))
         self._poses.extend(pose)
+        if is_keyframe:
+            self._keyframes.extend(np.array([len(self) - 1]))
+            self._keyframe_stamps.extend(np.array([stamp]))
 
-    def mark_keyframe(self) -> None:
-        """Make the last sample a keyframe."""
-        self._keyframes.extend(np.array([len(self) - 1]))
-        self._keyframe_stamps.extend(np.array([self.last_stamp]))
+    @property
+    def may_be_thinned(self) -> bool:
+        """Whether there are so many new samples that `thin` is worth it."""
+        return len(self) - self._thinned >= 2 * _BLOCK
+
+    def thin(self) -> None:
+        """Leave out of a block of samples what interpolation finds again; keyframes stay."""
+        start, end = self._thinned, self._thinned + _BLOCK
+        times, poses = self._times.view()[start:].copy(), self._poses.view()[start:].copy()
+        keyframes, parts = self._keyframes.view(), self._parts.view().copy()
+        first = int(np.searchsorted(keyframes, start))
+        fixed = np.zeros(len(times), bool)
+        fixed[keyframes[first:] - start] = True
+        opened = parts[:, 0] >= max(start, 1)
+        # The first sample of a part, and the last of the one before.
+        fixed[parts[opened, 0] - start] = fixed[np.maximum(parts[opened, 0] - start - 1, 0)] = True
+        kept = np.ones(len(times), bool)
+        kept[:_BLOCK] = self._needed(times[:_BLOCK], poses[:_BLOCK], fixed[:_BLOCK])
+        place = start + np.cumsum(kept) - 1
+        parts[opened, 0] = place[parts[opened, 0] - start]
+        self._keyframes.replace(first, place[keyframes[first:] - start])
+        self._parts.replace(0, parts)
+        self._times.replace(start, times[kept])
+        self._poses.replace(start, poses[kept])
+        # Its last sample is the first of the next block.
+        self._thinned = int(place[end - start - 1])
+
+    def _needed(self, times: Indices, poses: Array, fixed: Mask) -> Mask:
+        """
+        Return which samples (n,) are not found again between those, both ends and what is fixed.
+
+        Every other one is left out where all samples between its neighbours are found without it,
+        then every other one of the rest, and so on.
+        """
+        manifold, needed, first, idle = self._manifold, np.ones(len(times), bool), 1, 0
+        while idle < 2:
+            kept = np.flatnonzero(needed)
+            tried = kept[first:-1:2]
+            tried = tried[~fixed[tried]]
+            rest = needed.copy()
+            rest[tried] = False
+            ends = np.flatnonzero(rest)
+            after = np.clip(np.searchsorted(ends, np.arange(len(times))), 1, None)
+            i, j = ends[after - 1], ends[after]
+            found = manifold.interpolate(
+                poses[i], poses[j], (times - times[i]) / (times[j] - times[i]))
+            metres, radians = manifold.motion(manifold.local(found, poses))
+            missed = np.zeros(len(ends), bool)
+            missed[after[np.maximum(metres, radians) > _MISSED]] = True
+            spared = tried[~missed[after[tried]]]
+            needed[spared] = False
+            idle = 0 if len(spared) > _WORTH * len(kept) else idle + 1
+            first = 3 - first  # those between had no turn
+        return needed
 
     def extend_by_part(self, stamps: Indices, poses: Array) -> None:
         """Append a part, samples (n,) [ns], (n, p), a keyframe each."""

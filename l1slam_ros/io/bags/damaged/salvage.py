@@ -18,7 +18,7 @@ from typing import Any
 import yaml
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from l1slam_ros.io.bags.damaged.walk import BrokenRecordError, RawMessage, zstd_decoder
+from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError, zstd_decoder
 from l1slam_ros.io.bags.damaged.walk_mcap import walk_mcap
 from l1slam_ros.io.bags.damaged.walk_rosbag1 import walk_rosbag1
 from l1slam_ros.io.bags.damaged.walk_sqlite import walk_sqlite
@@ -78,9 +78,8 @@ class Salvage:
         except DamageError as error:
             self.damage = error
 
-    def messages(
-        self, topics: Collection[str] | None, start: int | None, stop: int | None
-    ) -> Iterator[RawMessage]:
+    def messages(self, topics: Collection[str] | None, start: int | None,
+                 stop: int | None) -> Iterator[BagMessage]:
         """
         Yield the messages in order of time, those of one time in the order of the files.
 
@@ -92,7 +91,7 @@ class Salvage:
         rank = [0] * len(order)
         for position, k in enumerate(order):
             rank[k] = position
-        waiting: dict[int, RawMessage] = {}
+        waiting: dict[int, BagMessage] = {}
         position = 0
         # `rank` first: it ends before the walk comes to the damage.
         for k, message in zip(rank, self._walk(), strict=False):
@@ -115,7 +114,7 @@ class Salvage:
                                 if other not in types.fielddefs})
         return types
 
-    def _walk(self) -> Iterator[RawMessage]:
+    def _walk(self) -> Iterator[BagMessage]:
         """Yield the messages of all files in the order in which they were written."""
         files, damage = _files(self._bag)
         for file in files:
@@ -130,7 +129,7 @@ class Salvage:
         if damage is not None:
             raise damage
 
-    def _messages_of(self, file: Path) -> Iterator[RawMessage]:
+    def _messages_of(self, file: Path) -> Iterator[BagMessage]:
         with _decompressed(file) as readable:
             walk = _WALKS[readable.suffix]
             try:
@@ -197,7 +196,7 @@ def _decompressed(file: Path) -> Iterator[Path]:
         yield readable
 
 
-def _unpacked(message: RawMessage) -> RawMessage:
+def _unpacked(message: BagMessage) -> BagMessage:
     """Return a message, decompressed where it was compressed by itself."""
     if not message.data.startswith(_ZSTD_MAGIC):
         return message

@@ -13,13 +13,13 @@ _BASIC = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfa
 _PIECE = 4096  # [bytes] a decoder is given at a time
 
 
-class RawMessage(NamedTuple):
-    """A message of a bag, still serialised (CDR); time : when it was recorded [ns]."""
+class BagMessage(NamedTuple):
+    """A message of a bag; time : when recorded [ns]; data : serialised (CDR), or decoded."""
 
     topic: str
     msgtype: str
     time: int
-    data: bytes
+    data: Any
 
 
 class BrokenRecordError(Exception):
@@ -30,7 +30,7 @@ class BrokenRecordError(Exception):
         self.position = position
 
 
-def broken_at(position: int, messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
+def broken_at(position: int, messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
     """Yield the messages; raise nothing but a BrokenRecordError with that position."""
     try:
         yield from messages

@@ -18,8 +18,8 @@ from mcap import data_stream, records
 from mcap.reader import make_reader
 
 from l1slam_ros.io.bags.damaged.walk import (
+    BagMessage,
     BrokenRecordError,
-    RawMessage,
     broken_at,
     uncompressed,
 )
@@ -34,7 +34,7 @@ _FOOTER = struct.Struct('<BQQQI')
 _CHECKSUM = 4  # [bytes] at the end of the footer
 
 
-def walk_mcap(path: Path, definitions: dict[str, str]) -> Iterator[RawMessage]:
+def walk_mcap(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
     """
     Yield the messages of a file in the order in which they were written.
 
@@ -127,13 +127,13 @@ class _Channels:
         # None: a channel whose messages are not of ROS 2.
         self._topics: dict[int, tuple[str, str] | None] = {}
 
-    def record(self, opcode: int, content: bytes) -> Iterator[RawMessage]:
+    def record(self, opcode: int, content: bytes) -> Iterator[BagMessage]:
         """Yield the message that a record is; of any other, learn what it says."""
         if opcode == _MESSAGE:
             channel_id, _, time, _ = _MESSAGE_HEAD.unpack_from(content)
             topic = self._topics[channel_id]
             if topic is not None:
-                yield RawMessage(*topic, time, content[_MESSAGE_HEAD.size:])
+                yield BagMessage(*topic, time, content[_MESSAGE_HEAD.size:])
         elif opcode == _SCHEMA:
             schema = _parsed('Schema', content)
             self._schemas[schema.id] = schema.name
@@ -141,11 +141,10 @@ class _Channels:
                 self._definitions[schema.name] = schema.data.decode()
         elif opcode == _CHANNEL:
             channel = _parsed('Channel', content)
-            self._topics[channel.id] = (
-                (channel.topic, self._schemas[channel.schema_id])
-                if channel.message_encoding == 'cdr' else None)
+            self._topics[channel.id] = ((channel.topic, self._schemas[channel.schema_id])
+                                        if channel.message_encoding == 'cdr' else None)
 
-    def chunk(self, content: bytes) -> Iterator[RawMessage]:
+    def chunk(self, content: bytes) -> Iterator[BagMessage]:
         """Yield the messages of a chunk, in part where it is damaged."""
         chunk = _parsed('Chunk', content)
         rows = uncompressed(chunk.data, chunk.compression)
@@ -159,13 +158,13 @@ class _Channels:
         if not whole:
             raise BrokenRecordError(len(rows))
 
-    def _rows(self, rows: bytes) -> Iterator[RawMessage]:
+    def _rows(self, rows: bytes) -> Iterator[BagMessage]:
         stream = BytesIO(rows)
         for _, opcode, length in _records(stream, len(rows)):
             yield from self.record(opcode, stream.read(length))
 
 
-def _before_a_break(messages: Iterator[RawMessage]) -> list[RawMessage]:
+def _before_a_break(messages: Iterator[BagMessage]) -> list[BagMessage]:
     """
     Return the messages of records that are known to be wrong somewhere.
 

@@ -16,8 +16,8 @@ from rosbags.rosbag1.reader import Header, ReaderError, RecordType, read_uint32
 from rosbags.typesys import get_types_from_msg
 
 from l1slam_ros.io.bags.damaged.walk import (
+    BagMessage,
     BrokenRecordError,
-    RawMessage,
     broken_at,
     ros1_types,
     uncompressed,
@@ -26,7 +26,7 @@ from l1slam_ros.io.bags.damaged.walk import (
 _MAGIC = b'#ROSBAG V2.0\n'
 
 
-def walk_rosbag1(path: Path, definitions: dict[str, str]) -> Iterator[RawMessage]:
+def walk_rosbag1(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
     """Yield the messages of a file in the order of writing; as `walk_mcap`."""
     size, chunks = path.stat().st_size, -1
     connections = _Connections(definitions)
@@ -69,7 +69,7 @@ class _Connections:
         self._types: Any = None
         self._topics: dict[int, tuple[str, str]] = {}
 
-    def record(self, header: Any, data: bytes) -> Iterator[RawMessage]:
+    def record(self, header: Any, data: bytes) -> Iterator[BagMessage]:
         """Yield the message that a record is; of a connection, learn what it says."""
         opcode = header.get_uint8('op')
         if opcode == RecordType.CONNECTION:
@@ -80,9 +80,9 @@ class _Connections:
         elif opcode == RecordType.MSGDATA:
             topic, msgtype = self._topics[header.get_uint32('conn')]
             cdr = bytes(self._types.ros1_to_cdr(data, msgtype))
-            yield RawMessage(topic, msgtype, header.get_time('time'), cdr)
+            yield BagMessage(topic, msgtype, header.get_time('time'), cdr)
 
-    def chunk(self, header: Any, data: bytes) -> Iterator[RawMessage]:
+    def chunk(self, header: Any, data: bytes) -> Iterator[BagMessage]:
         """Yield the messages of a chunk, in part where it is damaged."""
         rows = uncompressed(data, header.get_string('compression'))
         for _, inner, content in _records(BytesIO(rows), len(rows)):

@@ -9,10 +9,10 @@ from shutil import copyfile
 from tempfile import TemporaryDirectory
 
 from l1slam_ros.io.bags.damaged.sqlite_pages import Row, is_cut, leaf_rows
-from l1slam_ros.io.bags.damaged.walk import BrokenRecordError, RawMessage
+from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError
 
 
-def walk_sqlite(path: Path, definitions: dict[str, str]) -> Iterator[RawMessage]:
+def walk_sqlite(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
     """Yield the messages of a .db3 in the order of writing; put its definitions in."""
     with _opened(path) as database:
         with suppress(sqlite3.Error):  # older versions have no definitions
@@ -23,7 +23,7 @@ def walk_sqlite(path: Path, definitions: dict[str, str]) -> Iterator[RawMessage]
             "SELECT id, name, type FROM topics WHERE serialization_format = 'cdr'")}
         for _, key, time, data in _rows(database, path):
             if key in topics:
-                yield RawMessage(*topics[key], time, data)
+                yield BagMessage(*topics[key], time, data)
 
 
 def _rows(database: sqlite3.Connection, path: Path) -> Iterator[Row]:

@@ -3,6 +3,7 @@
 
 import re
 import shutil
+import struct
 import time
 from collections import Counter
 from contextlib import suppress
@@ -235,6 +236,18 @@ def test_wherever_a_bit_of_our_bag_is_wrong_no_message_is(tmp_path, bag, recordi
             assert said or len(found) == len(recording)
             told += bool(said)
     assert told > 15
+
+
+def test_a_record_that_swallows_the_rest_of_a_chunk_is_damage(tmp_path, recording):
+    path = mcap_file(tmp_path / 'a.mcap', recording, compression=CompressionType.NONE,
+                     enable_crcs=False)
+    whole, k = bytearray(path.read_bytes()), len(recording) // 2
+    head = whole.index(recording[k][3]) - 22 - 9  # of the message and of its record
+    whole[head:head + 9] = struct.pack('<BQ', 200, 2**40)
+    path.write_bytes(whole)
+    found, said = read(path)
+    assert found == recording[:k]
+    assert re.search(rf' is damaged after .*; {k:,} messages before that were used', said)
 
 
 def test_zeros_at_the_end_are_damage(tmp_path, recording):

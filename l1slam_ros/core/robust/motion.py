@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+How the robot moves, and what that and all loops say of each step of the odometry.
+
+In: a robust solve. Out: the motion that the odometry shows, and the odds that a step slipped: that
+it says nothing, and the robot moved on as ever.
+"""
+
+from dataclasses import dataclass, replace
+from math import lgamma
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.robust.innovation import claimed_volume, log_likelihood_ratio
+from l1slam_ros.core.robust.rounds import Growth
+
+# Motions are told apart to this part of what they are.
+_GRAIN, _TINY = 1e-3, 1e-12
+# The part of its noise that is left of a component that no other factor checks.
+_ALONE = 1e-9
+
+
+@dataclass(frozen=True)
+class Motion:
+    """
+    How the robot moves: steps as tangents, normal but for the few most unusual ones.
+
+    step : (n, k) those of the odometry; mean, covariance : of these; of a share 1 / sqrt(n) the
+    squared distance is beyond `start`, where it falls off by a power (B. M. Hill, A simple general
+    approach to inference about the tail of a distribution, 1975).
+    """
+
+    step: Array
+    mean: Array
+    covariance: Array
+    start: float
+    power: float
+
+    def square(self, step: Array, spread: Array | float = 0.0) -> tuple[Array, Array]:
+        """Return how unusual steps (m, k) are, squared, and ln det of their covariances, (m,)."""
+        from l1slam_ros.core.kernels.prediction import normalise
+
+        covariance = np.zeros((len(step), *self.covariance.shape)) + self.covariance + spread
+        square, log_det = normalise(covariance, step - self.mean)
+        return square, log_det
+
+    def log_density(self, step: Array, spread: Array | float = 0.0) -> Array:
+        """Return the logarithm of the density of steps (m, k), known to spread (m, k, k), (m,)."""
+        (square, log_det), k = self.square(step, spread), len(self.mean)
+        normal = -(square + k * np.log(2 * np.pi)) / 2
+        # From the density of the square to that of a point on its ellipsoid.
+        tail = (np.log(self.power / np.sqrt(len(self.step))) + self.power * np.log(self.start)
+                - (self.power + k / 2) * np.log(np.maximum(square, self.start))
+                + lgamma(k / 2) - k / 2 * np.log(np.pi))
+        density: Array = np.maximum(normal, tail) - log_det / 2
+        return density
+
+    def distance(self, step: Array, spread: Array) -> Array:
+        """Return the squared distances of a step (k,), known to spread (k, k), to all, (n,)."""
+        from l1slam_ros.core.kernels.prediction import normalise
+
+        n, k = self.step.shape
+        # All that there is lies in a cloud of Scott's bandwidth.
+        covariance = spread + self.covariance * n ** (-2 / (k + 4))
+        square: Array = normalise(np.tile(covariance, (n, 1, 1)), self.step - step)[0]
+        return square
+
+
+def steps_of(growth: Growth, rows: Indices) -> Array:
+    """Return what factors measure, in the order of time, as tangents (k, d)."""
+    manifold = growth.graph.manifold
+    steps: Array = manifold.local(manifold.identity(len(rows)), growth.forward[rows])
+    return steps
+
+
+def usual_motion(growth: Growth) -> Motion:
+    """Return how the robot moves by its odometry."""
+    step = steps_of(growth, np.flatnonzero(~growth.is_loop & ~growth.cut))
+    least = np.diag(_GRAIN**2 * (step**2).mean(axis=0) + _TINY)
+    motion = Motion(step, step.mean(axis=0), np.cov(step.T) + least, np.inf, 1.0)
+    square, few = np.sort(motion.square(step)[0]), int(np.sqrt(len(step)))
+    start = max(float(square[-few - 1]), float(len(least)))
+    # The one at the start is for steps that are all alike.
+    power = few / (1 + np.log(np.maximum(square[-few:] / start, 1.0)).sum())
+    return replace(motion, start=start, power=power)
+
+
+def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
+    """
+    Return ln P(slipped) / P(measured) of each odometry factor, (m,); -inf of all else.
+
+    Of all of them one is expected to have slipped. Then it may say anything, and the robot moved
+    as it does where all others say it did, m with a covariance C. If it did not slip, the robot
+    moved as it does where this factor says so, and all others say what it says:
+
+        p(m, C as motion) / (claims n p(z as motion) p(z - m; C))
+    """
+    from l1slam_ros.core.kernels.prediction import normalise
+
+    odds = np.full(len(growth.factors), -np.inf)
+    manifold, factors = growth.graph.manifold, growth.factors
+    k = manifold.TANGENT_SIZE
+    rows = np.flatnonzero(~growth.is_loop & ~growth.cut & (factors.freedom == k))
+    at = np.searchsorted(np.flatnonzero(growth.accepted), rows)
+    R, r = growth.posterior.moment[at], growth.posterior.residual[at]
+    inverse = np.linalg.inv(R + _ALONE * np.eye(k))
+    # Of what no other says, the residual is rounding.
+    innovation = inverse @ R @ inverse @ r[:, :, None]
+    root = unwhitening(growth, rows)
+    spread = root @ inverse @ root.transpose(0, 2, 1)
+    square, log_det = normalise(inverse.copy(), innovation[:, :, 0])
+    # All may be as noisy as they turn out, or as they say.
+    found = max((r**2).sum() / np.trace(R, axis1=1, axis2=2).sum(), 1.0)
+    said = growth.variance_at_their_word()[0] / growth.variance[0]
+    measured = np.max([log_likelihood_ratio(square / noise, log_det + k * np.log(noise),
+                                            np.zeros(1), factors.freedom[rows], k)
+                       for noise in (found, said)], axis=0) - np.linalg.slogdet(root)[1]
+    start = manifold.identity(len(rows))
+    moved = manifold.retract(growth.forward[rows], (root @ innovation)[:, :, 0])
+    J = manifold.local_jacobian(start, moved)
+    claims = claimed_volume(manifold, growth.poses, np.random.default_rng(0)).sum()
+    motions = motion.log_density(manifold.local(start, moved), J @ spread @ J.transpose(0, 2, 1))
+    odds[rows] = motions - motion.log_density(steps_of(growth, rows)) - measured - (
+        claims + np.log(len(rows)))
+    return odds
+
+
+def unwhitening(growth: Growth, rows: Indices) -> Array:
+    """Return what makes whitened residuals of odometry steps of it, in time, (k, d, d)."""
+    factors = growth.subgraph(rows).between
+    root = np.linalg.inv(factors.sqrt_information)
+    turned = -growth.graph.manifold.adjoint(factors.measurement) @ root
+    return np.where((factors.i < factors.j)[:, None, None], root, turned)
