@@ -3,12 +3,14 @@
 
 from collections import Counter, deque
 from collections.abc import Mapping
+from dataclasses import asdict
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.online.update import Improvement
+from l1slam_ros.core.online.upkeep.live_map import Behind
 from l1slam_ros.ros.inputs.traffic import Traffic
 from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.solver_thread import SolverThread
@@ -56,12 +58,13 @@ class Diagnosis:
         if max(metres, radians) > _STILL:
             self._jump = {'jump.translation': f'{metres:.4f}', 'jump.rotation': f'{radians:.5f}'}
 
-    def publish(self, counts: Mapping[str, int], refused: Counter[str], twins: str) -> None:
+    def publish(self, counts: Mapping[str, int], behind: Behind, refused: Counter[str],
+                twins: str) -> None:
         """
         Publish one status.
 
-        counts : sizes of the graph; refused : cause -> how many messages, since the start; twins :
-        what is wrong with the node's name, empty: nothing.
+        counts : sizes of the graph; behind : what goes on behind updates; refused : cause -> how
+        many messages, since the start; twins : what is wrong with the node's name, empty: nothing.
         """
         lately = refused - self._refused[0]
         self._refused.append(Counter(refused))
@@ -74,6 +77,7 @@ class Diagnosis:
             values |= {'l1_cost': f'{self._last.cost:.6g}', 'gap': f'{self._last.gap:.3g}',
                        'update_seconds': f'{self._last.seconds:.4f}',
                        'update_status': self._last.status.value}
+        values |= {f'behind.{name}': f'{value:.6g}' for name, value in asdict(behind).items()}
         values |= self._jump
         for cause, count in sorted((+refused).items()):
             values |= {f'refused.{cause}': count,

@@ -176,7 +176,8 @@ class BackendNode(LifecycleNode):
             self.get_logger().warning(sentence)
         counts, refused = self._backend.counts()
         self._diagnosis.publish(
-            counts, self._inputs.refused.copy() + Counter(refused), self._twins())
+            counts, self._backend.behind(), self._inputs.refused.copy() + Counter(refused),
+            self._twins())
 
     def _twins(self) -> str:
         """Return what is wrong where another node has this one's name; else nothing."""

@@ -104,3 +104,25 @@ def test_what_no_odometry_ties_to_the_map_is_for_the_next_one():
     drive(4)  # the clock is set back: a part of its own begins
     assert backend.update(10.0) is not None and backend._live.front.closed
     assert len(backend.poses) == 9 and np.isfinite(backend.poses).all()
+
+
+def test_how_far_the_optimum_is_at_most_is_known_at_any_time(world):
+    backend = Backend(EVERY)
+    assert np.isnan(backend.behind().bound)
+    play(backend, world, 0, KNOWN)
+    backend.settle()
+    proved = backend.behind()
+    backend._begin_due = lambda *_: False
+    play(backend, world, KNOWN, LAST)
+    backend.update(10.0)
+    now, behind = backend.snapshot(), backend.behind()
+    best = improve(now.problem(), EVERY.solver, 1.0, accuracy=EXACT).cost
+    assert behind.bound == proved.bound and behind.bound_age > proved.bound_age
+    # With ten keyframes more the optimum has risen, by little.
+    assert 0.8 * best < behind.bound <= best
+    assert behind.rows > 0 == proved.rows and behind.loops > 0 == proved.loops
+    # Of fewer factors nothing was proved.
+    loops = backend._builder.loops.rows
+    backend._builder.graph.say(loops[backend._live.accepted[loops]][:1], trusted=False)
+    backend.update(10.0)
+    assert np.isnan(backend.behind().bound)

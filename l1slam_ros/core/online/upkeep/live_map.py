@@ -7,7 +7,7 @@ keyframe is, what is accepted, and whether map or judgement are due. Its owner h
 """
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,18 +18,39 @@ from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.incremental.front import UNKNOWN, Front
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.snapshot import Optimised
-from l1slam_ros.core.online.update import Improvement
+from l1slam_ros.core.online.update import EXACT, ROUGH, ROUGH_PROVED, Accuracy, Improvement
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.optimality import Status
 
 # A map is factored anew from so many rows on that came since: those of ten keyframes.
 _MANY_ROWS = 90
+# [s] of processor time, the most that a round by factorisations takes.
+_LONGEST_ROUND = 0.5
+# [s] How often it is proved how far the optimum is, at most.
+_PROVE_EVERY = 1.0
 # Factors that a front takes while the lock is held.
 AT_ONCE = 16
 # [s] While loops come none of which fits, they are judged so often.
 _JUDGE_EVERY = 2.0
 # [s] What a round by factorisations takes a keyframe, before that was measured.
 _ROUND = 2e-5
+
+
+@dataclass(frozen=True)
+class Behind:
+    """
+    What goes on behind updates.
+
+    age : [s] of the map that was factored, NaN: there is none; rows : that came since; loops : not
+    judged yet; bound : what no map of the accepted factors has less L1 cost than, and its age [s],
+    NaN: nothing was proved of them.
+    """
+
+    age: float
+    rows: int
+    loops: int
+    bound: float
+    bound_age: float
 
 
 class LiveMap:
@@ -65,7 +86,9 @@ class LiveMap:
         self.stale = False
         self.last: Improvement | None = None
         self.newest: tuple[int, Array]
-        self.judge_took = self._judge_at = self.proved_at = 0.0
+        self.judge_took = self._judge_at = self.proved_at = self._factored_at = 0.0
+        # What the last proof says, and of which factors.
+        self._bound, self._proved = np.nan, np.zeros(0, bool)
         self.round_took = _ROUND * builder.graph.n_poses
         # The factors that the map is of, the loops that were judged, and whether one that the
         # front left may be true.
@@ -130,6 +153,20 @@ class LiveMap:
         falls = self.last is not None and self.last.falls
         return bool(graph.n_poses) and (self.stale or falls or (behind and late))
 
+    def accuracy(self, idle: bool, sparse: bool) -> Accuracy | None:
+        """Return how near the optimum the next map is to come by factorisations, None: by none."""
+        # For the first front of a map that was loaded nobody shall wait long.
+        if idle and self.front is not None:
+            return EXACT
+        if self.round_took > _LONGEST_ROUND or not sparse:
+            return None
+        return ROUGH_PROVED if time.monotonic() > self.proved_at + _PROVE_EVERY else ROUGH
+
+    def note_round(self, seconds: float, accuracy: Accuracy | None) -> None:
+        """Note what a round took, if by factorisations: to the last digits some twice as long."""
+        if accuracy:
+            self.round_took = seconds / (2 if accuracy is EXACT else 1)
+
     def is_judge_due(self, idle: bool, budget: float) -> bool:
         """Return whether to judge all loops; budget : there is so much time for it now [s]."""
         soon = self._fits or self.front is None
@@ -163,8 +200,10 @@ class LiveMap:
         """
         self.optimised = improvement.taken_over(self.optimised, tolerance)
         judgement = improvement.judgement
+        self._factored_at = time.monotonic()
         if improvement.gap < np.inf:
-            self.proved_at = time.monotonic()
+            self.proved_at, self._proved = self._factored_at, judgement.accepted
+            self._bound = improvement.cost - improvement.gap
         self.front, self.last, self._used = front, improvement, judgement.accepted
         # What the front begins with, no other may have looked at.
         first = len(self.optimised.judgement.accepted) + len(self.looks)
@@ -187,6 +226,15 @@ class LiveMap:
             return Improvement(self.number, now.poses, now.dual, judgement, 0.0, 0.0,
                                Status.OUT_OF_TIME, 0, 0, 0, np.inf, seconds)
         return replace(last, judgement=judgement, seconds=seconds)
+
+    def behind(self) -> Behind:
+        """Return what goes on behind updates. A factor more takes nothing from a bound."""
+        now, accepted, front = time.monotonic(), self.accepted, self.front
+        holds = not (self._proved & ~accepted[:len(self._proved)]).any()
+        return Behind(
+            now - self._factored_at if front else np.nan, front.border if front else 0,
+            0 if self.all_judged else len(self._builder.loops.rows) - max(self._judged_loops, 0),
+            self._bound if holds else np.nan, now - self.proved_at if holds else np.nan)
 
     def growth(self) -> tuple[FactorGraph, int, int]:
         """Return what changes when something comes."""

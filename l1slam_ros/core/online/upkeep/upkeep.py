@@ -28,17 +28,8 @@ from l1slam_ros.core.incremental.front import Front
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
-from l1slam_ros.core.online.update import (
-    EXACT,
-    ROUGH,
-    ROUGH_PROVED,
-    Accuracy,
-    Improvement,
-    front_of,
-    improve,
-    optimise,
-)
-from l1slam_ros.core.online.upkeep.live_map import AT_ONCE, LiveMap
+from l1slam_ros.core.online.update import Improvement, front_of, improve, optimise
+from l1slam_ros.core.online.upkeep.live_map import AT_ONCE, Behind, LiveMap
 from l1slam_ros.core.online.upkeep.threads import Worker
 from l1slam_ros.core.robust.batch import judge
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
@@ -49,10 +40,6 @@ Stopped = Callable[[], bool]
 _LEAST_TIME, _LEAST_ROUND = 0.02, 0.1
 # Linearisations of one round: more and it is late. Of the clock it may take some times as long.
 _OUTER, _PATIENCE = 2, 4
-# [s] of processor time, the most that a round by factorisations takes.
-_LONGEST_ROUND = 0.5
-# [s] How often it is proved how far the optimum is, at most.
-_PROVE_EVERY = 1.0
 # So often a new front takes what came meanwhile, before it is one.
 _PASSES = 3
 # [s] How often who waits looks whether to stop.
@@ -226,20 +213,12 @@ class Upkeep:
         whole = now.problem()
         problem = as_one(whole)
         check()
-        # For the first front of a map that was loaded nobody shall wait long.
-        accuracy: Accuracy | None = EXACT
-        rough = not idle or live.front is None
-        if rough:
-            due = time.monotonic() > live.proved_at + _PROVE_EVERY
-            accuracy = ROUGH_PROVED if due else ROUGH
-            if live.round_took > _LONGEST_ROUND or not problem.is_sparse:
-                accuracy = None
-                solver = replace(solver, outer_iterations=min(solver.outer_iterations, _OUTER))
+        accuracy = live.accuracy(idle, problem.is_sparse)
+        if accuracy is None:
+            solver = replace(solver, outer_iterations=min(solver.outer_iterations, _OUTER))
         improvement = improve(problem, solver, _PATIENCE * max(budget, _LEAST_ROUND), check,
                               accuracy)
-        if accuracy:
-            # To the last digits it takes some twice as many steps.
-            live.round_took = (time.thread_time() - start) / (1 if rough else 2)
+        live.note_round(time.thread_time() - start, accuracy)
         check()
         front = front_of(problem, improvement.poses, len(whole.graph.between), check)
         for _ in range(_PASSES):
@@ -260,9 +239,8 @@ class Upkeep:
         problem = as_one(whole)
         judgement, poses = judge(problem.graph, problem.poses, problem.judgement, np.inf, check)
         check()
-        judgement = judgement_of_all(judgement, whole)
         with self._lock:
-            live.take_judgement(judgement, poses, loops)
+            live.take_judgement(judgement_of_all(judgement, whole), poses, loops)
             live.judge_took = time.monotonic() - start
             self._changes += 1
 
@@ -333,6 +311,11 @@ class Upkeep:
         with self._lock:
             (before, after), self._moved = self._moved or 2 * (self._map_to_odom_now(),), None
             return before, after
+
+    def behind(self) -> Behind:
+        """Return what goes on behind updates."""
+        with self._lock:
+            return self._live.behind()
 
     def marginal_covariance(self, keyframe: int) -> Array | None:
         """
