@@ -1,98 +1,149 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-How many odometry messages the node takes in, beside a bare rclpy subscriber on the same topic.
+How many messages the node takes in, beside a bare rclpy subscriber, and how soon poses come.
 
-    python benchmarks/ros/throughput.py [MESSAGES [RATE]]
+    python benchmarks/ros/throughput.py [SECONDS [RATE [LOOPS [KEYFRAMES]]]]
 
-Three processes: this one publishes, paced; a bare subscriber only counts; the node runs as
-shipped. Prints what each received, and what the node says that it lost.
+Odometry and loop closures come at so many a second, to a map that begins with so many keyframes.
+Processes: this one publishes, paced; a bare subscriber of both only counts; one listens to `pose`,
+whose stamp says when the odometry was sent; the node runs as shipped. Prints what each received,
+what the node says that it lost, and how late poses were.
 """
 
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
-# Its own domain: nobody else's odometry is counted.
+# Its own domain: nobody else's messages are counted.
 os.environ.setdefault('ROS_DOMAIN_ID', '93')
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
+import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
+from l1slam_ros.io.messages.conversion import reference_frame_id, stamp_of
 from l1slam_ros.ros.demo import executable
 from l1slam_ros.ros.publishing import header
 
-MESSAGES, RATE = 25_000, 1_000.0
+SECONDS, RATE, LOOPS, KEYFRAMES = 60.0, 1_000, 100, 10_000
 _SPEED = 5.0  # [m/s] ten keyframes a second
-_BEGIN = 10**12  # [ns]
+_SIGMA = 0.02  # [m] of loops
+_LONGEST = 20.0  # [s] that a loop goes back
 _PATIENCE = 60.0  # [s]
+
+
 
 
 def main() -> int:
     """Measure and print."""
-    if sys.argv[1:] == ['bare']:
-        return _subscribe()
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else MESSAGES
-    rate = float(sys.argv[2]) if len(sys.argv) > 2 else RATE
-    bare = subprocess.Popen([sys.executable, __file__, 'bare'], stdout=subprocess.PIPE, text=True)
-    backend = subprocess.Popen([executable('backend')])
-    try:
-        said, seconds, cpu = _measure(count, rate, backend.pid)
-    finally:
-        for process in (bare, backend):
-            process.send_signal(signal.SIGINT)
-        received = int((bare.communicate()[0] or '0').split()[-1])
-        backend.wait()
-    node = int(said['odom.received'])
-    print(f'{count} messages sent in {seconds:.1f} s\n'
-          f'bare subscriber: {received} received, {1 - received / count:.2%} lost\n'
-          f'node: {node} received, {1 - node / count:.2%} lost; it says {said["odom.lost"]} lost, '
-          f'{said["odom.rate"]} a second; {said["keyframes"]} keyframes, {cpu:.1f} CPU s')
+    if sys.argv[1:] in (['count'], ['listen']):
+        return _count() if sys.argv[1] == 'count' else _listen()
+    given = [float(value) for value in sys.argv[1:]]
+    seconds, rate, loops, keyframes = given + [SECONDS, RATE, LOOPS, KEYFRAMES][len(given):]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / 'map.g2o'
+        _write_map(path, int(keyframes))
+        bare, ear = (subprocess.Popen([sys.executable, __file__, what], stdout=subprocess.PIPE,
+                                      text=True) for what in ('count', 'listen'))
+        backend = subprocess.Popen([
+            executable('backend'), '--ros-args', '--log-level', 'error',
+            '-p', f'save_path:={path}', '-p', 'autosave_period:=0.0', '-p', 'load_on_start:=true'])
+        try:
+            said, sent, cpu = _measure(seconds, rate, loops, backend.pid)
+        finally:
+            for process in (bare, ear, backend):
+                process.send_signal(signal.SIGINT)
+            counted, heard = (process.communicate()[0] for process in (bare, ear))
+            backend.wait()
+    counts, bare_late = counted.splitlines()
+    for topic, received in zip(('odom', 'loop_closures'), map(int, counts.split()), strict=True):
+        if sent[topic]:
+            node = int(said[f'{topic}.received'])
+            print(f'{topic}: {sent[topic]} sent; bare subscriber lost '
+                  f'{1 - received / sent[topic]:.3%}, node {1 - node / sent[topic]:.3%}; it says '
+                  f'{said[f"{topic}.lost"]} lost')
+    print(f'{bare_late}\n{heard.strip()}\n{said["keyframes"]} keyframes and {said["factors"]} '
+          f'factors in the end, {cpu:.0f} % of a core')
     return 0
 
 
-def _measure(count: int, rate: float, backend: int) -> tuple[dict[str, str], float, float]:
-    """Publish; return what the node last says, how long it took and the node's CPU time [s]."""
+def _write_map(path: Path, keyframes: int) -> None:
+    """Write a map whose keyframes are older than all that comes."""
+    world = simulate_world(keyframes, 2 * keyframes, WorldOptions(), np.random.default_rng(0))
+    stamps = 1 + np.arange(keyframes)
+    write_graph_file(path, GraphRecord(world.graph, world.truth, np.arange(keyframes), stamps))
+
+
+def _measure(seconds: float, rate: float, loops: float, backend: int
+             ) -> tuple[dict[str, str], dict[str, int], float]:
+    """Publish; return what the node last says, how much was sent, and the node's CPU [%]."""
     rclpy.init()
-    node = rclpy.create_node('robot')
-    publisher = node.create_publisher(Odometry, 'odom', QoSProfile(depth=1000))
+    node, qos = rclpy.create_node('robot'), QoSProfile(depth=1000)
+    publishers = {'odom': node.create_publisher(Odometry, 'odom', qos),
+                  'loop_closures': node.create_publisher(
+                      PoseWithCovarianceStamped, 'loop_closures', qos)}
     said: dict[str, str] = {}
     node.create_subscription(
         DiagnosticArray, '/diagnostics',
         lambda m: said.update({v.key: v.value for s in m.status for v in s.values},
                               message=m.status[0].message), 10)
-    _until(node, lambda: publisher.get_subscription_count() == 2 and 'odom.received' in said
-           and 'compiling' not in said['message'])
-    before, began = cpu_seconds(backend), time.monotonic()
-    for k, data in enumerate(_messages(count, rate)):
-        publisher.publish(data)
-        time.sleep(max(began + k / rate - time.monotonic(), 0.0))
-    seconds, cpu = time.monotonic() - began, cpu_seconds(backend) - before
+    _until(node, lambda: all(p.get_subscription_count() == 2 for p in publishers.values())
+           and 'odom.received' in said and 'compiling' not in said['message'])
+    sent, cpu = dict.fromkeys(publishers, 0), cpu_seconds(backend)
+    rng, began = np.random.default_rng(0), time.monotonic_ns()
+    odometry, loop = _odometry(), _loop()
+    while (now := (time.monotonic_ns() - began) * 1e-9) < seconds:
+        if sent['odom'] < now * rate:
+            _place(odometry, began, now)
+            publishers['odom'].publish(serialize_message(odometry))
+            sent['odom'] += 1
+        if sent['loop_closures'] < now * loops and now > 1:
+            before = rng.uniform(max(now - _LONGEST, 0), now - 0.5)
+            loop.header = header(reference_frame_id(
+                'base_link', began + round(before * 1e9)), began + round(now * 1e9))
+            loop.pose.pose.position.x = _SPEED * (now - before) + rng.normal(0, _SIGMA)
+            publishers['loop_closures'].publish(serialize_message(loop))
+            sent['loop_closures'] += 1
+        time.sleep(max((min((sent['odom']) / rate, (sent['loop_closures'] + 1) / max(loops, 1e-9))
+                        - now), 1e-4))
+    cpu = (cpu_seconds(backend) - cpu) / seconds * 100
     # Until two reports in a row say the same.
     seen = ''
     while seen != said['odom.received']:
         seen, until = said['odom.received'], time.monotonic() + 2.5
         _until(node, lambda until=until: time.monotonic() > until)  # type: ignore[misc]
-    return said, seconds, cpu
+    return said, sent, cpu
 
 
-def _messages(count: int, rate: float) -> list[bytes]:
-    """Return the odometry of a straight drive, serialised before the clock runs."""
-    messages = []
-    for k in range(count):
-        stamp = _BEGIN + round(k / rate * 1e9)
-        message = Odometry(header=header('odom', stamp), child_frame_id='base_link')
-        message.pose.pose.position.x = _SPEED * k / rate
-        messages.append(serialize_message(message))
-    return messages
+def _odometry() -> Odometry:
+    return Odometry(child_frame_id='base_link')
+
+
+def _place(message: Odometry, began: int, now: float) -> None:
+    """Let odometry be that of a straight drive, its stamp the clock of this machine."""
+    message.header = header('odom', began + round(now * 1e9))
+    message.pose.pose.position.x = _SPEED * now
+
+
+def _loop() -> PoseWithCovarianceStamped:
+    message = PoseWithCovarianceStamped()
+    message.pose.pose.orientation.w = 1.0
+    message.pose.covariance = (_SIGMA**2 * np.eye(6)).ravel()
+    return message
 
 
 def _until(node: Any, condition: Any) -> None:
@@ -109,18 +160,42 @@ def cpu_seconds(process: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
 
-def _subscribe() -> int:
-    """Count odometry until SIGINT; print how many."""
+def _count() -> int:
+    """Take messages until SIGINT; print how many, and how old they were."""
     rclpy.init()
-    node, received = rclpy.create_node('bare'), [0]
-
-    def count(_: Odometry) -> None:
-        received[0] += 1
-
-    node.create_subscription(Odometry, 'odom', count, QoSProfile(depth=1000))
+    node = rclpy.create_node('bare')
+    ages: list[list[float]] = [[], []]
+    for one, (kind, topic) in zip(ages, (
+            (Odometry, 'odom'), (PoseWithCovarianceStamped, 'loop_closures')), strict=True):
+        node.create_subscription(
+            kind, topic, lambda m, one=one: one.append(_age(m)), QoSProfile(depth=1000))
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
-    print(received[0])
+    print(*map(len, ages))
+    print(f'bare subscriber: {_late(ages[0])}')
+    return 0
+
+
+def _age(message: Any) -> float:
+    """Return how long ago a message was sent, or what it answers [ms]."""
+    return (time.monotonic_ns() - stamp_of(message.header)) * 1e-6
+
+
+def _late(ages: list[float]) -> str:
+    p50, p99 = np.percentile(ages, (50, 99))
+    return f'{len(ages)} messages, {p50:.1f} ms late in the median, p99 {p99:.1f}'
+
+
+def _listen() -> int:
+    """Note until SIGINT how old poses are when they come; print it."""
+    rclpy.init()
+    node = rclpy.create_node('ear')
+    ages: list[float] = []
+    node.create_subscription(
+        PoseStamped, 'pose', lambda m: ages.append(_age(m)), QoSProfile(depth=1000))
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(node)
+    print(f'pose: {_late(ages)}')
     return 0
 
 

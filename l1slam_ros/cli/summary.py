@@ -32,8 +32,8 @@ _WIDE_RANGE = 1e6
 # A reading of the rotations' information fits where their errors are as large as it says, to this
 # logarithm: half of what it is to the other reading.
 _FITS = math.log(2) / 2
-# So many examples are named in one sentence.
-_NAMED = 3
+# So many examples are named in one sentence, and so many characters of a note.
+_NAMED, _LONGEST = 3, 20
 
 
 def bag_numbers(path: Path) -> list[tuple[str, str]]:
@@ -41,7 +41,9 @@ def bag_numbers(path: Path) -> list[tuple[str, str]]:
     from l1slam_ros.io.bags.reader import bag_summary
 
     summary = bag_summary(path)
-    note = ', '.join(f'{key} {value}' for key, value in sorted(summary.note.items()))
+    # A list of numbers may be as long as the bag.
+    note = ', '.join(f'{key} {value if len(value) <= _LONGEST else value[:_LONGEST] + " ..."}'
+                     for key, value in sorted(summary.note.items()))
     return [
         ('duration', f'{summary.duration / NANOSECONDS:,.1f} s from {stamp_text(summary.start)}'),
         ('note', note or 'none of l1slam: keyframes and covariances by the options of the node'),

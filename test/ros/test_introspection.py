@@ -15,6 +15,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from node_bench import odometry
 from rcl_interfaces.srv import DescribeParameters, ListParameters
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rosbags.typesys import Stores, get_typestore
 
 CONFIG = Path(__file__).parents[2] / 'config'
 INPUTS = {
@@ -122,6 +123,28 @@ def test_layouts_show_what_the_node_publishes(name):
     topics = set(re.findall(r'["\s](/[a-z_]+)', text))
     assert layout and {'/path', '/graph', '/pose', '/pose_with_covariance'} <= topics
     assert topics <= OUTPUTS.keys() | INPUTS.keys()
+
+
+def test_rviz_displays_each_topic_as_what_it_is():
+    """With the durability that it has, or who starts RViz late sees nothing of what stands."""
+    layout = yaml.safe_load((CONFIG / 'l1slam.rviz').read_text())
+    shown = {display['Topic']['Value']: (
+        display['Class'].split('/')[1], display['Topic']['Durability Policy'] != 'Volatile')
+        for display in layout['Visualization Manager']['Displays'] if 'Topic' in display}
+    assert shown == {topic: (OUTPUTS[topic].split('/')[2].removesuffix('Stamped'),
+                             topic in LATCHED) for topic in shown} and len(shown) == 4
+
+
+def test_foxglove_plots_fields_that_there_are():
+    text = (CONFIG / 'foxglove.json').read_text()
+    types = get_typestore(Stores.ROS2_JAZZY)
+    paths = re.findall(r'"value": "(/[a-z_]+)\.([a-z_.]+)"', text)
+    for topic, path in paths:
+        kind = OUTPUTS[topic]
+        for name in path.split('.'):
+            kind = {field: entry[1] for field, entry in types.fielddefs[kind][1]}[name]
+        assert kind == ('float64', 0), path
+    assert len(paths) == 2
 
 
 def change(b, transition):

@@ -21,6 +21,8 @@ COVARIANCE_ROWS = (0, 1, 5)
 
 def wrap(angle: Array) -> Array:
     """Return the angle [rad] in (-pi, pi]; values already there are returned to the last bit."""
+    if np.abs(angle).max(initial=0.0) < np.pi:
+        return angle
     wrapped = angle - 2 * np.pi * np.rint(angle / (2 * np.pi))
     # Rounding can leave it one rounding outside.
     return np.where(wrapped <= -np.pi, np.pi, np.minimum(wrapped, np.pi))

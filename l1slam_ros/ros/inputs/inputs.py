@@ -57,7 +57,6 @@ class Inputs:
         self._subscribe(intake)
 
     def _subscribe(self, intake: Intake) -> None:
-        intake.subscribe(Odometry, 'odom', self._used(self._on_odometry), raw=True)
         for topic, read in (
             ('loop_closures', lambda m: loop_closure(m, self._base_frame.name, False)),
             ('trusted_loop_closures', lambda m: loop_closure(m, self._base_frame.name, True)),
@@ -72,6 +71,9 @@ class Inputs:
             with suppress(ImportError):
                 kind = getattr(import_module(f'{package}.msg'), name)
                 intake.subscribe(kind, topic, self.graph_reader())
+        # Last, so of what has come together it is taken last: a loop may come before odometry of
+        # its time, but not after the stamps have gone back.
+        intake.subscribe(Odometry, 'odom', self._used(self._on_odometry), raw=True)
 
     def graph_reader(self) -> Callable[[Any], None]:
         """Return what takes the pose graphs of a topic, message by message."""

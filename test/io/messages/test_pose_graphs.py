@@ -214,7 +214,7 @@ def test_the_node_reads_them_too(bag, ros):
     try:
         read = node._inputs.graph_reader()
         for message in read_messages(bag, ['/rtabmap/mapGraph']):
-            read(message.message)
+            read(message.data)
         assert node._backend.loop_states().stamps.tolist() == [[10 * SECOND, 15 * SECOND]]
     finally:
         node.close()

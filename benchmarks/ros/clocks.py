@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The demo bag through the real node, with clocks as they are.
+
+    python benchmarks/ros/clocks.py [BAG [RATE]]
+
+Played once, by the machine's clock: that map is the yardstick. Then with `use_sim_time` and
+`/clock` as a bag player sends it, with a clock that pauses for some seconds halfway, messages too
+or only the clock, twice in a row, with and without `/clock`, and with a clock, and the messages
+with it, that jump back by 20 s halfway. Said is of each part of the map, one for each time that
+stamps go back, how far its keyframes are at worst from where they are in the undisturbed map, and
+its error to the truth, aligned, beside those of the undisturbed map and of the odometry. Loops
+that are sent again are known: what was played twice is odometry the second time.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+# Its own domain: nobody else's messages are counted.
+os.environ.setdefault('ROS_DOMAIN_ID', '96')
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.io.bags.reader import read_messages, read_raw
+from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
+from l1slam_ros.io.messages import cdr
+from l1slam_ros.io.messages.conversion import stamp_of, stamped_pose
+from l1slam_ros.ros.demo import executable
+from l1slam_ros.ros.publishing import header
+
+BAG, RATE = Path('bags/demo'), 20.0
+_SECOND = 10**9  # [ns]
+_KINDS = {ODOMETRY_TOPIC: Odometry, LOOP_TOPIC: PoseWithCovarianceStamped}
+_TICK = _SECOND // 20  # [ns] from one message on /clock to the next
+_PAUSE, _BACK = 3.0, 20 * _SECOND  # [s], [ns]
+_PATIENCE = 300.0  # [s]
+
+# What comes when, in the order it is sent: time on the clock [ns], topic, None: only the clock.
+Event = tuple[int, str | None, bytes]
+
+
+class Robot:
+    """The node as a process, and a peer that plays to it."""
+
+    def __init__(self, sim_time: bool):
+        self.process = subprocess.Popen([
+            executable('backend'), '--ros-args', '--log-level', 'error',
+            '-p', f'use_sim_time:={str(sim_time).lower()}'])
+        self.node = rclpy.create_node('player')
+        self.maps: list[PathMessage] = []
+        self.said: dict[str, str] = {}
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(PathMessage, 'path', self.maps.append, latched)
+        self.node.create_subscription(
+            DiagnosticArray, '/diagnostics',
+            lambda m: self.said.update({v.key: v.value for v in m.status[0].values}), 10)
+        self.publishers = {topic: self.node.create_publisher(kind, topic, QoSProfile(depth=1000))
+                           for topic, kind in _KINDS.items()}
+        self.clock = self.node.create_publisher(Clock, '/clock', 10) if sim_time else None
+        self.until(lambda: bool(self.said) and all(
+            p.get_subscription_count() for p in self.publishers.values()))
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        """Listen until something holds."""
+        deadline = time.monotonic() + _PATIENCE
+        while not condition():
+            assert time.monotonic() < deadline, f'waited {_PATIENCE} s in vain: {self.said}'
+            rclpy.spin_once(self.node, timeout_sec=0.02)
+
+    def play(self, events: Iterator[Event], rate: float) -> None:
+        """Send events, so much faster than the clock in them runs."""
+        before, due = None, time.monotonic()
+        for now, topic, data in events:
+            due += max(now - (now if before is None else before), 0) / _SECOND / rate
+            before = now
+            self.until(lambda due=due: time.monotonic() >= due)  # type: ignore[misc]
+            if topic is not None:
+                self.publishers[topic].publish(data)
+            elif self.clock is not None:
+                self.clock.publish(Clock(clock=header('', now).stamp))
+
+    def finish(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return stamps (n,) and poses (n, 3) of the map once all that was sent is in it."""
+        self.until(lambda: int(self.said['odom.received']) == count)
+        client = self.node.create_client(Trigger, '/backend/optimize')
+        self.until(client.service_is_ready)
+        future = client.call_async(Trigger.Request())
+        self.until(future.done)
+        seen = ''
+        while seen != self.said['updates']:
+            seen, end = self.said['updates'], time.monotonic() + 2.5
+            self.until(lambda end=end: time.monotonic() > end)  # type: ignore[misc]
+        self.process.send_signal(signal.SIGINT)
+        assert self.process.wait(_PATIENCE) == 0
+        self.node.destroy_node()
+        poses = self.maps[-1].poses
+        pose3 = np.array([stamped_pose(pose)[1] for pose in poses])
+        return np.array([stamp_of(pose.header) for pose in poses]), se2.from_pose3(pose3)
+
+
+def with_clock(messages: list[Event]) -> Iterator[Event]:
+    """Yield messages between ticks of the clock that they were recorded by."""
+    tick = messages[0][0]
+    for message in messages:
+        while tick <= message[0]:
+            yield tick, None, b''
+            tick += _TICK
+        yield message
+
+
+def pausing(messages: list[Event], everything: bool) -> Iterator[Event]:
+    """Yield messages with a clock that stands for some seconds; everything: messages wait, too."""
+    middle = messages[len(messages) // 2][0]
+    stopped = False
+    for now, topic, data in with_clock(messages):
+        if now >= middle and not stopped:
+            stopped = True
+            if everything:
+                time.sleep(_PAUSE)
+        if topic is None and not everything and middle <= now < middle + _PAUSE * _SECOND:
+            yield middle, None, b''
+        else:
+            yield now, topic, data
+
+
+def jumping(messages: list[Event]) -> Iterator[Event]:
+    """Yield messages until halfway, then from some time before that on."""
+    middle = messages[len(messages) // 2][0]
+    yield from with_clock([one for one in messages if one[0] < middle])
+    yield from with_clock([one for one in messages if one[0] >= middle - _BACK])
+
+
+def main() -> None:
+    """Measure, and print."""
+    bag = Path(sys.argv[1]) if len(sys.argv) > 1 else BAG
+    rate = float(sys.argv[2]) if len(sys.argv) > 2 else RATE
+    rclpy.init()
+    messages: list[Event] = [(m.time, m.topic, m.data) for m in read_raw(bag, _KINDS)]
+    plays: dict[str, tuple[bool, Callable[[], Iterator[Event]]]] = {
+        'once, the yardstick': (False, lambda: iter(messages)),
+        'once again': (False, lambda: iter(messages)),
+        'with /clock': (True, lambda: with_clock(messages)),
+        'all pauses': (True, lambda: pausing(messages, True)),
+        'the clock pauses': (True, lambda: pausing(messages, False)),
+        'twice': (False, lambda: iter(messages * 2)),
+        'twice, with /clock': (True, lambda: (
+            e for _ in range(2) for e in with_clock(messages))),
+        'back by 20 s': (True, lambda: jumping(messages)),
+    }
+    truth = dict(stamped_pose(m.data) for m in read_messages(bag, [TRUTH_TOPIC]))
+    measured = {}
+    for _, topic, data in messages:
+        if topic == ODOMETRY_TOPIC:
+            stamp, pose3 = stamped_pose(cdr.odometry(data))
+            measured[stamp] = pose3[:2], truth[stamp][:2]
+    known: dict[int, np.ndarray] = {}
+    for name, (sim_time, events) in plays.items():
+        found = list(events())
+        robot = Robot(sim_time)
+        robot.play(iter(found) if 'pause' not in name else events(), rate)
+        stamps, poses = robot.finish(sum(topic == ODOMETRY_TOPIC for _, topic, _ in found))
+        known = known or dict(zip(stamps.tolist(), poses, strict=True))
+        _tell(name, stamps, poses, known, measured, robot.said)
+
+
+def _tell(name: str, stamps: np.ndarray, poses: np.ndarray, known: dict[int, np.ndarray],
+          measured: dict[int, tuple[np.ndarray, ...]], said: dict[str, Any]) -> None:
+    # A stamp that comes twice is in two parts; each is told of on its own.
+    parts = np.split(np.arange(len(stamps)), np.flatnonzero(np.diff(stamps) < 0) + 1)
+    print(f'{name}: {len(stamps)} keyframes, {said["accepted_loops"]} loops accepted, '
+          f'{said["rejected_loops"]} rejected', flush=True)
+    for part in parts:
+        both = [k for k in part if stamps[k] in known]
+        map_, undisturbed, odometry, true = (np.array(rows) for rows in zip(*(
+            (poses[k, :2], known[stamps[k]][:2], *measured[stamps[k]]) for k in both),
+            strict=True))
+        print(f'    of {len(both)}, off by at most {_worst(map_, undisturbed):.3f} m; to the '
+              f'truth {absolute_trajectory_error(map_, true):.3f} m, undisturbed '
+              f'{absolute_trajectory_error(undisturbed, true):.3f}, '
+              f'odometry {absolute_trajectory_error(odometry, true):.3f}', flush=True)
+
+
+def _worst(positions: np.ndarray, others: np.ndarray) -> float:
+    return float(np.linalg.norm(positions - others, axis=1).max())
+
+
+if __name__ == '__main__':
+    main()
