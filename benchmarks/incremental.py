@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import peer_environment
 
-from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
@@ -48,14 +48,20 @@ _IDLE = 1.0
 _RELINEARISE = 0.1
 
 
+def dimension_of(graph: FactorGraph) -> int:
+    """Return 2 or 3, as the back end calls it."""
+    return graph.manifold.positions(graph.manifold.identity(1)).shape[1]
+
+
 def measurements(record: GraphRecord) -> Iterator[tuple[OdometrySample, list[LoopClosure]]]:
     """Yield each keyframe's odometry and the loops that end at it."""
     graph, factors = record.graph, record.graph.between
     stamps = invented_stamps(graph.n_poses)
-    chain, measured = se2.to_pose3(odometry_poses(graph)), se2.to_pose3(factors.measurement)
+    manifold = graph.manifold
+    chain, measured = map(manifold.to_pose3, (odometry_poses(graph), factors.measurement))
     root = factors.sqrt_information
     covariance = np.zeros((len(factors), 6, 6))
-    rows = np.array(se2.COVARIANCE_ROWS)
+    rows = np.array(manifold.COVARIANCE_ROWS)
     covariance[:, rows[:, None], rows] = np.linalg.inv(root.transpose(0, 2, 1) @ root)
     ends = np.maximum(factors.i, factors.j)
     step = {int(ends[k]): k for k in np.flatnonzero(factors.is_odometry)}
@@ -75,11 +81,14 @@ class Isam2:
     def __init__(self, graph: FactorGraph):
         import gtsam
 
-        self._gtsam, self._factors = gtsam, graph.between
+        self._gtsam, self._factors, self._k = gtsam, graph.between, graph.manifold.TANGENT_SIZE
+        self._Pose, self._Between, self._Prior = (
+            (gtsam.Pose2, gtsam.BetweenFactorPose2, gtsam.PriorFactorPose2) if self._k == 3 else
+            (gtsam.Pose3, gtsam.BetweenFactorPose3, gtsam.PriorFactorPose3))
         options = gtsam.ISAM2Params()
         options.setRelinearizeThreshold(_RELINEARISE)
         options.relinearizeSkip = 1
-        self._isam, self._at = gtsam.ISAM2(options), gtsam.Pose2()
+        self._isam, self._at = gtsam.ISAM2(options), self._Pose()
         ends = np.maximum(self._factors.i, self._factors.j)
         self._rows = np.split(np.argsort(ends, kind='stable'),
                               np.searchsorted(np.sort(ends), np.arange(1, graph.n_poses)))
@@ -88,22 +97,30 @@ class Isam2:
     def update(self, k: int) -> float:
         """Add keyframe k and its factors; return the seconds that the update took."""
         gtsam, new, values, step = self._gtsam, self._gtsam.NonlinearFactorGraph(), \
-            self._gtsam.Values(), self._gtsam.Pose2()
+            self._gtsam.Values(), self._Pose()
         if k == 0:
-            new.add(gtsam.PriorFactorPose2(0, step, gtsam.noiseModel.Constrained.All(3)))
+            new.add(self._Prior(0, step, gtsam.noiseModel.Constrained.All(self._k)))
         for row in self._rows[k]:
             i, j = int(self._factors.i[row]), int(self._factors.j[row])
-            Z = gtsam.Pose2(*self._factors.measurement[row])
-            root = self._factors.sqrt_information[row]
-            new.add(gtsam.BetweenFactorPose2(
-                i, j, Z, gtsam.noiseModel.Gaussian.SqrtInformation(root)))
+            Z = self._pose(self._factors.measurement[row])
+            # In space gtsam's rotations come first.
+            root = np.roll(self._factors.sqrt_information[row], self._k // 6 * 3, axis=1)
+            new.add(self._Between(i, j, Z, gtsam.noiseModel.Gaussian.SqrtInformation(root)))
             if self._odometry[row]:
                 step = Z if j == k else Z.inverse()
         values.insert(k, self._at.compose(step))
         began = time.thread_time()
         self._isam.update(new, values)
-        self._at = self._isam.calculateEstimatePose2(k)
+        estimate = (self._isam.calculateEstimatePose2 if self._k == 3 else
+                    self._isam.calculateEstimatePose3)
+        self._at = estimate(k)
         return time.thread_time() - began
+
+    def _pose(self, pose: Array) -> Any:
+        if self._k == 3:
+            return self._Pose(*pose)
+        x, y, z, w = pose[3:]
+        return self._Pose(self._gtsam.Rot3.Quaternion(w, x, y, z), pose[:3])
 
 
 @dataclass
@@ -122,7 +139,7 @@ def run(graph: FactorGraph, truth: FactorGraph | None, robust: bool, rate: float
                              robust=RobustOptions(robust))
     found, peer = Run(), Isam2(truth) if truth else None
     every = max(graph.n_poses // CHECKPOINTS, 1)
-    with Backend(options) as backend:
+    with Backend(options, dimension_of(graph)) as backend:
         due, whole, alone = time.perf_counter(), time.process_time(), time.thread_time()
         for k, (sample, loops) in enumerate(measurements(GraphRecord(graph, None, None))):
             backend.add_odometry(sample)

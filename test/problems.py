@@ -226,7 +226,7 @@ def drive_on(growth, poses, first, covariance=UNKNOWN):
 
 def keyframe_samples(growth):
     """Return which sample each keyframe is, (n,)."""
-    return np.round(growth.stamps / seconds(PERIOD)).astype(int)
+    return np.round(growth.track.keyframe_stamps / seconds(PERIOD)).astype(int)
 
 
 def loops_of(growth):

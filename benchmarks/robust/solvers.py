@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import incremental
 import numpy as np
 from measuring import clock
-from robust.changes import information_of
 
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
+from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, turned
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.robust import batch_map
@@ -106,7 +105,7 @@ def _online(rate: float) -> Callable[[FactorGraph, Array], Found]:
         nothing = dict.fromkeys(('translation', 'rotation', 'period'), 0.0)
         options = BackendOptions.from_mapping(
             {'keyframe': nothing, 'odometry': {'covariance_source': 'increment'}})
-        with Backend(options, background=rate > 0) as backend:
+        with Backend(options, incremental.dimension_of(graph), rate > 0) as backend:
             for k, (sample, loops) in enumerate(incremental.measurements(_in_time(graph)), 1):
                 backend.add_odometry(sample)
                 for loop in loops:
@@ -148,14 +147,7 @@ def _found(backend: Backend, graph: FactorGraph, seconds: float,
 
 def _in_time(graph: FactorGraph) -> GraphRecord:
     """Return the graph with each factor from the earlier keyframe to the later one."""
-    i, j, measurement = ends_in_time(graph)
-    factors, information = graph.between, information_of(graph)
-    turned = factors.i > factors.j
-    adjoint = graph.manifold.adjoint(measurement[turned])
-    information[turned] = adjoint.transpose(0, 2, 1) @ information[turned] @ adjoint
-    forward = FactorGraph(graph.manifold)
-    forward.add_poses(graph.n_poses)
-    forward.add_between(i, j, measurement, information, factors.trusted)
+    forward = turned(graph, graph.between.i > graph.between.j)
     return GraphRecord(forward, None, np.arange(graph.n_poses))
 
 

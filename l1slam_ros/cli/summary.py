@@ -10,6 +10,7 @@ import numpy as np
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.graph.parts import odometry_gaps
+from l1slam_ros.core.names import ANGLE, QUATERNION
 from l1slam_ros.core.robust.inspection import (
     connected_parts,
     cost_at,
@@ -28,8 +29,11 @@ from l1slam_ros.io.wording import counted
 _OFF_SCALE = 3.0
 # So is information that differs that much from edge to edge.
 _WIDE_RANGE = 1e6
-# So many examples are named in one sentence.
-_NAMED = 3
+# A reading of the rotations' information fits where their errors are as large as it says, to this
+# logarithm: half of what it is to the other reading.
+_FITS = math.log(2) / 2
+# So many examples are named in one sentence, and so many characters of a note.
+_NAMED, _LONGEST = 3, 20
 
 
 def bag_numbers(path: Path) -> list[tuple[str, str]]:
@@ -37,7 +41,9 @@ def bag_numbers(path: Path) -> list[tuple[str, str]]:
     from l1slam_ros.io.bags.reader import bag_summary
 
     summary = bag_summary(path)
-    note = ', '.join(f'{key} {value}' for key, value in sorted(summary.note.items()))
+    # A list of numbers may be as long as the bag.
+    note = ', '.join(f'{key} {value if len(value) <= _LONGEST else value[:_LONGEST] + " ..."}'
+                     for key, value in sorted(summary.note.items()))
     return [
         ('duration', f'{summary.duration / NANOSECONDS:,.1f} s from {stamp_text(summary.start)}'),
         ('note', note or 'none of l1slam: keyframes and covariances by the options of the node'),
@@ -143,6 +149,7 @@ def _on_noise(record: GraphRecord) -> Iterator[str]:
     except L1SlamError as error:
         yield f'the noise cannot be judged: {error}'
         return
+    yield from _on_rotations(record, scales.turns)
     # Of too few factors nothing can be said.
     both = {'odometry': scales.odometry, 'loops': scales.loops}
     found = {name: scale for name, scale in both.items() if not math.isnan(scale)}
@@ -154,6 +161,16 @@ def _on_noise(record: GraphRecord) -> Iterator[str]:
     yield (f'errors at the L2 map of vertices {record.ids[scales.first]} to '
            f'{record.ids[scales.last]} are {times} times what the information says; expected '
            f'about 1: the information is {reason}')
+
+
+def _on_rotations(record: GraphRecord, turns: float) -> Iterator[str]:
+    """Say that rotation information is of what it was not read as: twice as large, or half."""
+    as_read = record.rotation_information
+    other, times = (ANGLE, 2.0) if as_read == QUATERNION else (QUATERNION, 0.5)
+    if record.graph.manifold.TANGENT_SIZE == 6 and abs(math.log(times * turns)) < _FITS:
+        yield (f'errors of rotations are {turns:.2g} times as large, beside those of '
+               f'translations, as information of the {as_read} says: it looks like one of the '
+               f'{other}; expected --rotation-information {other}')
 
 
 def _edges(record: GraphRecord, factors: Indices) -> list[str]:

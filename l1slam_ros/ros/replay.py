@@ -9,6 +9,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 
@@ -165,6 +166,9 @@ def _message_class(msgtype: str) -> type | None:
 def _play(arguments: argparse.Namespace, tell: Callable[[str], None]) -> None:
     """Play a bag once, or again and again with --loop; tell : is given what is damaged."""
     summary = bag_summary(arguments.bag)
+    if arguments.start * _SECOND > summary.duration:
+        raise OptionError(f'--start is {arguments.start:g}, expected at most the '
+                          f'{summary.duration / _SECOND:g} s of the bag')
     start = summary.start + round(arguments.start * _SECOND)
     stop = None
     if arguments.duration is not None:
@@ -195,18 +199,18 @@ def _remapping(text: str) -> tuple[str, str]:
     return old, new
 
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float('inf'):
-        raise argparse.ArgumentTypeError(f'{text}, expected above 0')
-    return value
+def _number(expected: str, allowed: Callable[[float], bool]) -> Callable[[str], float]:
+    def number(text: str) -> float:
+        with suppress(ValueError):
+            if allowed(value := float(text)) and value < float('inf'):
+                return value
+        raise argparse.ArgumentTypeError(f'{text}, expected a number {expected}')
+
+    return number
 
 
-def _not_negative(text: str) -> float:
-    value = float(text)
-    if not 0 <= value < float('inf'):
-        raise argparse.ArgumentTypeError(f'{text}, expected 0 or more')
-    return value
+_positive = _number('above 0', lambda value: value > 0)
+_not_negative = _number('of 0 or more', lambda value: value >= 0)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -37,6 +37,8 @@ def test_a_building_is_made_spoiled_recorded_and_mapped(capsys, building, tmp_pa
     assert len(spoiled['rejected']) == 20
     assert spoiled['ate'] == pytest.approx(clean['ate'], rel=0.02)
     run('plot', building, '--output', tmp_path / 'maps.png')
+    run('info', building, '--rotation-information', 'angle')
+    assert 'expected --rotation-information quaternion' in capsys.readouterr().out
     run('info', building)
     assert 'in SE3' in capsys.readouterr().out
 

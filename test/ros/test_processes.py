@@ -182,6 +182,14 @@ def test_replay_of_a_topic_that_is_not_there_names_those_that_are(bag):
 
 
 @pytest.mark.parametrize('arguments, words', [
+    (('--start', '1e9'), '--start is 1e+09, expected at most the 19.9 s of the bag'),
+    (('--rate', 'abc'), 'argument --rate: abc, expected a number above 0')])
+def test_replay_says_what_it_cannot_be_told(bag, arguments, words):
+    played = replay(bag, *arguments)
+    assert played.returncode == 2 and words in played.stderr
+
+
+@pytest.mark.parametrize('arguments, words', [
     (('-p', 'keyframe.translation:=-1.0'), 'keyframe.translation'),
     (('--params-file', '/no/such.yaml'), '/no/such.yaml')])
 def test_what_is_refused_at_start_is_one_line_and_exit_code_1(arguments, words):

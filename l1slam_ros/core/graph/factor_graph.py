@@ -14,7 +14,12 @@ import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import Mask, square_root_information
+from l1slam_ros.core.geometry.noise import (
+    Mask,
+    covariance_of,
+    root_of_inverse,
+    square_root_information,
+)
 from l1slam_ros.core.graph.growable_array import GrowingArray
 
 # The first end of an absolute factor: the map frame, a keyframe that never moves. As an index into
@@ -234,3 +239,22 @@ def ends_in_time(graph: FactorGraph) -> tuple[Indices, Indices, Array]:
     i, j, Z = graph.between.i, graph.between.j, graph.between.measurement
     forward = np.where((i > j)[:, None], graph.manifold.inverse(Z), Z)
     return np.minimum(i, j), np.maximum(i, j), forward
+
+
+def turned(graph: FactorGraph, rows: Indices | Mask) -> FactorGraph:
+    """
+    Return the graph with some factors, rows (k,) or (m,) bool, seen from the other end.
+
+    Z becomes Z^-1, its covariance Ad_Z C Ad_Z': to first order in the residual the same is said.
+    Turned twice it is the same to rounding.
+    """
+    factors, manifold = graph.between, graph.manifold
+    i, j, Z = factors.i.copy(), factors.j.copy(), factors.measurement.copy()
+    roots, adjoint = factors.sqrt_information.copy(), manifold.adjoint(Z[rows])
+    i[rows], j[rows], Z[rows] = factors.j[rows], factors.i[rows], manifold.inverse(Z[rows])
+    roots[rows] = root_of_inverse(
+        adjoint @ covariance_of(roots[rows]) @ adjoint.transpose(0, 2, 1))
+    other = FactorGraph(manifold)
+    other.add_poses(graph.n_poses)
+    other.append_between(i, j, Z, roots, factors.trusted, factors.struck)
+    return other

@@ -138,7 +138,7 @@ class Backend(Upkeep):
     def counts(self) -> tuple[dict[str, int], dict[str, int]]:
         """Return the sizes of the graph, and how many loops were refused for which cause."""
         with self._lock:
-            version, refused = self._version(), dict(self._builder.refused)
+            version, refused = self._version(), dict(self._builder.notes.refused)
         if self._counted[0] != version:
             self._counted = version, self.snapshot().sizes()
         return self._counted[1], refused
@@ -182,7 +182,7 @@ class Backend(Upkeep):
     def robot(self) -> Robot | None:
         """Return where the robot is; None: no odometry has said yet where it is in this map."""
         with self._lock:
-            last = self._builder.last
+            last = self._builder.stream.last
             return Robot(last.stamp, last.pose, self._map_to_odom_now()) if last else None
 
     def begin_anew(self) -> None:

@@ -7,18 +7,17 @@ new part of the map begins: at the end of the one before, which is a guess that 
 Loops join the parts, if there are any.
 """
 
-from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
 from l1slam_ros.core.errors import MessageError
-from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.geometry.noise import MOST_OF_ODOMETRY, root_of_inverse
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.graph.parts import odometry_gaps
-from l1slam_ros.core.online.keyframes import KeyframeOptions, Motion, OdometryOptions
+from l1slam_ros.core.online.keyframes import KeyframeOptions, Level, Motion, OdometryOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
 from l1slam_ros.core.online.notes import Notes
 from l1slam_ros.core.online.odometry.odometry_stream import UNSEEN_TURN, OdometryStream, Point
@@ -60,6 +59,9 @@ class GraphBuilder:
     Attributes
     ----------
     graph : the factor graph so far; loops enter it in `add_due_loops`
+    stream : passes on what is the robot's motion, and holds what may not be
+    track : the odometry so far, its keyframes and gaps
+    loops : those in the graph, and those that wait
     notes : of messages that were not used, or otherwise than they say
     offset : (1, p) takes poses of the odometry frame to those kept here: the identity, until
         after `restore`, or at a gap, the odometry goes on from where the robot was
@@ -71,8 +73,8 @@ class GraphBuilder:
         self.graph = FactorGraph(manifold)
         self.notes = Notes()
         self._verbatim = verbatim
-        self._stream = OdometryStream(manifold, self.notes)
-        self._loops = LoopFactors(manifold, self.notes, verbatim)
+        self.stream = OdometryStream(manifold, self.notes)
+        self.loops = LoopFactors(manifold, self.notes, verbatim)
         self._motion: Motion
         self._resumed = False
         self._begin(FactorGraph(manifold))
@@ -80,58 +82,9 @@ class GraphBuilder:
     def _begin(self, graph: FactorGraph) -> None:
         """Begin with a graph, of which no keyframe is known yet."""
         self.graph = graph
-        self._track = OdometryTrack(graph.manifold)
-        self.offset = graph.manifold.identity(1)
+        self.track = OdometryTrack(graph.manifold)
+        self.offset, self._level = graph.manifold.identity(1), Level(graph.manifold)
         self._moved, self._glued = False, True
-
-    @property
-    def refused(self) -> Counter[str]:
-        """Why messages were not used, cause -> count."""
-        return self.notes.refused
-
-    @property
-    def stamps(self) -> Indices:
-        """Stamps of the keyframes, (n,) [ns]."""
-        return self._track.keyframe_stamps
-
-    @property
-    def odometry(self) -> Array:
-        """Poses of the keyframes in the odometry frame, (n, p)."""
-        return self._track.keyframe_poses
-
-    @property
-    def gaps(self) -> Indices:
-        """Keyframes that no odometry joins to the ones before them, (g,)."""
-        return self._track.gaps
-
-    @property
-    def n_waiting(self) -> int:
-        """How many loops are not in the graph yet, nor refused."""
-        return len(self._loops.waiting)
-
-    @property
-    def last(self) -> Point | None:
-        """The last sample that was used since this map began or was restored."""
-        return self._stream.last
-
-    @property
-    def held(self) -> str:
-        """Why the last sample is not used until the next one speaks for it; empty: it is used."""
-        return self._stream.reason()
-
-    @property
-    def loop_stamps(self) -> tuple[Indices, Indices, Indices]:
-        """
-        Stamps (reference, end) [ns] of the loops in the graph, waiting and expired, (k, 2) each.
-
-        Those in the graph are in the order of `loop_rows`, to which they stay tied.
-        """
-        return self._loops.stamps
-
-    @property
-    def loop_rows(self) -> Indices:
-        """Which between factors of the graph are loops, (k,)."""
-        return self._loops.rows
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """
@@ -145,67 +98,76 @@ class GraphBuilder:
         MessageError : `old_stamp`, the stamp is not after the last one; nothing is added.
 
         """
-        ignore, track = self.options.on_time_jump == 'ignore', self._track
+        ignore, track = self.options.on_time_jump == 'ignore', self.track
         if ignore and not self._glued and sample.stamp <= track.last_stamp:
             raise MessageError('old_stamp', f'odometry stamp {sample.stamp} ns is not after the '
                                f'last one, {track.last_stamp} ns')
-        points = self._stream.take(sample, self._verbatim, not ignore)
+        points = self.stream.take(sample, self._verbatim, not ignore)
         for point in points:
             self._add(point)
-        track = self._track  # a new one, maybe
+        track = self.track  # a new one, maybe
         # Loops that are due become factors by the samples as they came.
-        if track.may_be_thinned and not self._loops.waiting.is_due(track.last):
+        if track.may_be_thinned and not self.loops.waiting.is_due(track.last):
             track.thin()
         return bool(points)
 
     def finish(self) -> None:
         """Use the last sample of all, if it is held for a pause alone; see `held`."""
-        for point in self._stream.finish():
+        for point in self.stream.finish():
             self._add(point)
 
     def _add(self, point: Point) -> None:
         """Add a sample of the robot's motion."""
         on_gap, gap = self.options.on_time_jump, point.gap
-        if not self._glued and point.stamp <= self._track.last_stamp:
+        if not self._glued and point.stamp <= self.track.last_stamp:
             gap = f'odometry stamp {point.stamp} ns is before the end of the map'
         if gap:
             self.add_due_loops()  # what came before is of that time
             cause, said = _SAID[on_gap]
             self.notes.warn(cause, f'{gap}; {said}')
+            self._level = Level(self.graph.manifold)
         if point.anew or (gap and on_gap == 'reset'):
             self._forget()
         if not self.graph.n_poses:
             self._begin_part(point.stamp, point.pose)
             return
         manifold, pose = self.graph.manifold, point.pose
-        if gap or not (self._glued or self._track.goes_on(point.stamp, pose, self.offset)):
-            self.offset = manifold.compose(self._track.last_pose, manifold.inverse(pose))
+        if gap or not (self._glued or self.track.goes_on(point.stamp, pose, self.offset)):
+            self.offset = manifold.compose(self.track.last_pose, manifold.inverse(pose))
             self._moved = True
         self._glued = True
         if self._moved:
             pose = manifold.compose(self.offset, pose)
         if gap and on_gap == 'new_segment':
-            if self._track.begin_part(point.stamp):
-                self._loops.waiting.begin_anew(self._track.time)
+            if self.track.begin_part(point.stamp):
+                self.loops.waiting.begin_anew(self.track.time)
             self._begin_part(point.stamp, pose)
             return
         unseen = (point.unseen, UNSEEN_TURN * point.seconds) if point.gap else None
         motion = self._motion.step(point.sample, pose, self.options.keyframe,
                                    self.options.odometry, self._verbatim, unseen)
-        self._track.append(point.stamp, pose, is_keyframe=motion is not None)
+        self.track.append(point.stamp, pose, is_keyframe=motion is not None)
         if motion is not None:
             self.notes.warn_bounds('odometry', point.stamp, self._motion.bounded, MOST_OF_ODOMETRY)
+            self._note_slope(point.sample)
             self.graph.append_step(motion[0], root_of_inverse(motion[1][None]))
+
+    def _note_slope(self, sample: OdometrySample) -> None:
+        length, angle = self._level.dropped(sample, self.options.keyframe)
+        if length or angle:
+            self.notes.warn('slope', f'odometry at {sample.stamp} ns has left the plane by '
+                            f'{length:.3g} m and {angle:.2g} rad, which are dropped; expected '
+                            'dimension 3 for a robot on slopes')
 
     def _begin_part(self, stamp: int, pose: Array) -> None:
         """Begin a part of the map with a keyframe."""
-        self._track.append(stamp, pose, is_keyframe=True)
+        self.track.append(stamp, pose, is_keyframe=True)
         self.graph.add_poses(1)
         self._motion = Motion(self.graph.manifold, stamp, pose)
 
     def begin_anew(self) -> None:
         """Forget the only sample so far, a stray; of a restored map: let odometry begin again."""
-        self._stream = OdometryStream(self.graph.manifold, self.notes, self._resumed)
+        self.stream = OdometryStream(self.graph.manifold, self.notes, self._resumed)
         if self._resumed:
             self._glued = False
             return
@@ -215,21 +177,22 @@ class GraphBuilder:
         """Begin anew; loops that came may yet find odometry of their times."""
         self._begin(FactorGraph(self.graph.manifold))
         self._resumed = False
-        self._loops.forget()
+        self.loops.forget()
 
     def grown(self) -> Growth:
         """Return what another builder goes on from; there are keyframes."""
-        track, loops = self._track, self._loops
+        track, loops = self.track, self.loops
         in_graph, _, expired = loops.stamps
         return Growth(
-            self.graph.copy(), self.stamps, self.odometry, self.offset, track.last_stamp,
-            track.last_pose, self._motion.covariance(self.options.odometry, self._verbatim),
+            self.graph.copy(), track.keyframe_stamps, track.keyframe_poses, self.offset,
+            track.last_stamp, track.last_pose,
+            self._motion.covariance(self.options.odometry, self._verbatim),
             loops.rows, in_graph, expired, loops.waiting.arrivals(track.last), loops.seen())
 
     def restore(self, growth: Growth) -> None:
         """Go on where a run ended; odometry that begins elsewhere is taken to begin there."""
         self._begin(growth.graph)
-        track, stamps = self._track, growth.stamps
+        track, stamps = self.track, growth.stamps
         for part in np.split(np.arange(len(stamps)), odometry_gaps(self.graph) + 1):
             track.extend_by_part(stamps[part], growth.odometry[part])
         self.offset = growth.offset
@@ -239,12 +202,12 @@ class GraphBuilder:
             self._motion.add_known(
                 growth.end, growth.end_pose, growth.end_covariance, self.options.odometry)
         self._glued, self._moved, self._resumed = False, True, True
-        self._stream = OdometryStream(self.graph.manifold, self.notes, resumed=True)
-        self._loops.restore(growth, track, self.options.loop)
+        self.stream = OdometryStream(self.graph.manifold, self.notes, resumed=True)
+        self.loops.restore(growth, track, self.options.loop)
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Take a loop closure or an absolute pose in, once; see `add_due_loops`."""
-        self._loops.add(loop, self._track, self.options.loop)
+        self.loops.add(loop, self.track, self.options.loop)
 
     def add_due_loops(self) -> int:
         """
@@ -253,4 +216,4 @@ class GraphBuilder:
         Loops that can never become one are counted in `refused`: `before_start` (a time before
         the first odometry), `same_keyframe`, `expired`.
         """
-        return self._loops.add_due(self.graph, self._track, self.options.loop)
+        return self.loops.add_due(self.graph, self.track, self.options.loop)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.geometry.noise import (
     MOST_OF_ODOMETRY,
@@ -66,6 +67,29 @@ def reduced_covariance(manifold: Manifold, covariance: Array) -> Array:
     rows = np.array(manifold.COVARIANCE_ROWS)
     part: Array = covariance[..., rows[:, None], rows]
     return part
+
+
+class Level:
+    """What poses of the odometry have beside those of the map: in the plane no z, and no tilt."""
+
+    def __init__(self, manifold: Manifold):
+        self._manifold = manifold
+        self._first: Array | None = None
+
+    def dropped(self, sample: OdometrySample, options: KeyframeOptions) -> tuple[float, float]:
+        """
+        Return how far [m] and how steeply [rad] a sample has left the level of the first one.
+
+        Zeros, where that would not make a keyframe: a floor is not quite even.
+        """
+        pose3 = sample.pose3[None]
+        off = se3.local(self._manifold.to_pose3(self._manifold.from_pose3(pose3)), pose3)
+        if self._first is None:
+            self._first = off
+        (length,), (angle,) = se3.motion(off - self._first)
+        even = (length <= (options.translation or KeyframeOptions.translation)
+                and angle <= (options.rotation or KeyframeOptions.rotation))
+        return (0.0, 0.0) if even else (float(length), float(angle))
 
 
 class Motion:

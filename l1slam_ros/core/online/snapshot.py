@@ -180,7 +180,7 @@ class Snapshot:
 
     map : its number; version : see `Backend.version`; graph : the factors so far; gaps : as in
     `Problem`; stamps (n,) [ns] and odometry (n, p) of the keyframes; map_to_odom : (1, p);
-    loop_rows, loop_stamps : see `GraphBuilder`; robust : loops may be doubted; looks : (k, 3) what
+    loop_rows, loop_stamps : see `LoopFactors`; robust : loops may be doubted; looks : (k, 3) what
     the front says of the factors after those that are judged: accepted, suspect, sigmas;
     all_judged : no loop is among them; judged : (k, p) the L2 map of the judgement, None: there is
     none; stale : the map is not of the factors that are accepted; views : the L1 and L2 map of the

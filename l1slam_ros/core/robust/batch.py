@@ -24,17 +24,18 @@ A place
     neighbours hardly ever agree. Votes of several places count, each by itself
     (`pairwise_consistency`).
 A slip
-    is an odometry factor that says nothing; a gap, or the seam of two sessions, is one whose place
-    is known. The sides of it are right in themselves, so the true loops across agree with each
-    other. A slip is one explanation of loops that do not fit, lies are the other: `slips` compares
-    what each costs, chi2 for factors and a gate for a place.
+    is an odometry factor that says anything, while the robot moved on as ever (`motion`); of all
+    of them one is expected to be. A gap, or the seam of two sessions, is one whose place is known.
+    The sides of it are right in themselves, so the true loops across agree with each other. A slip
+    is one explanation of loops that do not fit, lies are the other: `slips` compares their odds,
+    with half a gate for each place that one of them calls a lie.
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
     is a rival explanation nearly as good as the one that won: `judgement` names it.
 
 No loop is factored before it is accepted, so none bends what it is judged by. Read on in `rounds`,
-`gating`, `innovation`, `places`, `pairwise_consistency`, `slips`, `judgement`.
+`gating`, `innovation`, `places`, `pairwise_consistency`, `motion`, `slips`, `judgement`.
 """
 
 import time

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.linear_system import (
@@ -131,13 +131,15 @@ class NoiseScales:
     How many times as large as their information says the errors of factors are.
 
     odometry, loops : ratios of standard deviations, NaN where too few factors are left to tell;
-    first, last : the keyframes between which this was found.
+    first, last : the keyframes between which this was found; turns : how many times that of
+    translations the ratio of rotations is.
     """
 
     odometry: float
     loops: float
     first: int
     last: int
+    turns: float
 
 
 def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
@@ -156,7 +158,7 @@ def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
     part, keyframes, is_loop = _densest_part(graph)
     ends = int(keyframes[0]), int(keyframes[-1])
     if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < _FEWEST_SPARE:
-        return NoiseScales(np.nan, np.nan, *ends)
+        return NoiseScales(np.nan, np.nan, *ends, np.nan)
     system = _system(part, _l2_poses(part))
     group = np.repeat(is_loop.astype(np.int64), graph.manifold.TANGENT_SIZE)
     noise = rng.standard_normal(len(group)) * part.between.speaks.ravel()
@@ -171,7 +173,14 @@ def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
         if (np.abs(ratio - 1) < _SAME_RATIO).all():
             break
     odometry, loops = np.where(spare >= _FEWEST_SPARE, np.sqrt(variance), np.nan).tolist()
-    return NoiseScales(odometry, loops, *ends)
+    return NoiseScales(odometry, loops, *ends, _turns(part.manifold, left))
+
+
+def _turns(manifold: Manifold, left: Array) -> float:
+    """Return `NoiseScales.turns` of what is left (rows, 2) of residuals and of drawn noise."""
+    square = (left**2).reshape(-1, manifold.TANGENT_SIZE, 2).sum(axis=0)
+    found, drawn = (square[part].sum(axis=0) for part in (manifold.ROTATION, manifold.TRANSLATION))
+    return float(np.sqrt(found[0] / found[1] * drawn[1] / drawn[0])) if square.all() else np.nan
 
 
 def require_connected(graph: FactorGraph, ids: Indices) -> None:

@@ -28,6 +28,7 @@ from l1slam_ros.core.robust.innovation import (
     sample_posterior,
     sampled_quantile,
 )
+from l1slam_ros.core.robust.inspection import repeated_factors
 from l1slam_ros.core.robust.places import neighbours_agree, places
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
@@ -110,7 +111,8 @@ class Growth:
         self._tie_to_world()
         self.solve()
         rows = self.undecided()
-        rows = rows[~self.factors.is_absolute[rows]]
+        # A factor that stands there twice fits itself, whatever the noise.
+        rows = np.setdiff1d(rows[~self.factors.is_absolute[rows]], repeated_factors(self.graph))
         # Loops of fewer places may be one mistake, which the noise learnt of them would fit.
         if len(np.unique(self.place[rows])) >= _FEWEST_PLACES:
             self.variance = self.variance * noise_variance(self.innovations(rows))

@@ -99,16 +99,19 @@ def without_slip(growth: Growth, left_out: Indices) -> Growth | None:
 
 
 def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:
-    """Return the odometry factors that may have slipped."""
-    order = np.argsort(-odds, kind='stable')[:_TRIED]
-    suspects = order[odds[order] > -SURE].tolist()
-    for _ in range(_TRIED):
-        group = strongest_group(growth, left_out)
+    """Return the odometry factors that may have slipped: two by their odds, two by groups."""
+    order, rows = np.argsort(-odds, kind='stable')[:_TRIED], growth.undecided()
+    # Where loops are left out, one more place may be won.
+    least = max(SURE, _place(growth)) if len(left_out) else SURE
+    suspects = order[odds[order] > -least].tolist()
+    for _ in range(_TRIED if len(left_out) else 0):
+        group = strongest_group(growth, rows)
         if len(group.places) < SPANNING:
             break
-        common = common_steps(growth, group)
-        suspects.append(int(common[np.argmax(odds[common])]))
-        left_out = np.setdiff1d(left_out, group.rows)
+        if np.isin(group.rows, left_out).any():
+            common = common_steps(growth, group)
+            suspects.append(int(common[np.argmax(odds[common])]))
+        rows = np.setdiff1d(rows, group.rows)
     return list(dict.fromkeys(suspects))
 
 
@@ -153,8 +156,12 @@ def _gain(growth: Growth, cut: Growth) -> float:
     with_, without = (np.unique(growth.place[state.accepted & growth.is_loop])
                       for state in (cut, growth))
     won, lost = len(np.setdiff1d(with_, without)), len(np.setdiff1d(without, with_))
-    gate = growth.gate(np.array([growth.graph.manifold.TANGENT_SIZE]))[0]
-    return float(gate / 2 * (won - lost))
+    return _place(growth) * (won - lost)
+
+
+def _place(growth: Growth) -> float:
+    """Return what a place is worth, ln of odds: half a gate."""
+    return float(growth.gate(np.array([growth.graph.manifold.TANGENT_SIZE]))[0] / 2)
 
 
 def _likeliest(state: Growth, cut: int, motion: Motion) -> int:

@@ -9,10 +9,12 @@ A graph as the messages of a bag, such that it can be had back exactly.
     /ground_truth    geometry_msgs/PoseStamped, where the truth is known
 
 Covariances are those of the factors, in the axes of the measured pose: of an odometry message
-that of the motion since the message before. What is left unsaid has an infinite variance.
+that of the motion since the message before. What is left unsaid has an infinite variance. In a bag
+a pose is seen from an earlier one: factors the other way are turned, and the note says which.
 """
 
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,9 +26,10 @@ from l1slam_ros.core.geometry.noise import (
     LEAST_VARIANCE,
     MOST_OF_ODOMETRY,
     MOST_VARIANCE,
+    Mask,
     covariance_of,
 )
-from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph, turned
 from l1slam_ros.core.graph.measurements import FASTEST, LONGEST_PAUSE, SHORTEST_STEP
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.io.bags.topics import (
@@ -48,6 +51,8 @@ GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
 VERBATIM_NOTE = {'messages': 'verbatim'}
 # Of a graph whose poses are in space.
 SPACE_NOTE = {'dimension': '3'}
+# And where factors led from a later keyframe to an earlier one: the numbers of those turned.
+TURNED_STEPS, TURNED_LOOPS = 'turned_steps', 'turned_loops'
 
 _BASE_FRAME = 'base_link'
 _ODOMETRY, _TRUTH = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped'
@@ -73,8 +78,9 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
     FileError : the bag cannot be written, or something that is no bag is in its place.
 
     """
-    graph, stamps = record.graph, _stamps(record)
-    steps, loops = _steps(record), _loops(record)
+    stamps, backward = _stamps(record), _backward(record)
+    record = replace(record, graph=turned(record.graph, backward))
+    graph, steps, loops = record.graph, _steps(record), _loops(record)
     if truth is not None and len(truth) != len(stamps):
         raise GraphError(f'{len(truth)} true poses; expected {len(stamps)}, one for each vertex')
     to_pose3, factors = graph.manifold.to_pose3, graph.between
@@ -82,7 +88,8 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
     chain, measured = to_pose3(_chain(graph, steps)), to_pose3(factors.measurement)
     topics = np.where(factors.is_absolute, ABSOLUTE_TOPIC, np.where(
         factors.trusted & ~factors.is_odometry, TRUSTED_LOOP_TOPIC, LOOP_TOPIC)).tolist()
-    with new_bag(path, _note(record, stamps, steps)) as writer:
+    note = _note(record, stamps, steps) | _turned_note(backward, steps, loops)
+    with new_bag(path, note) as writer:
         messages = _Messages(writer.types)
         writer.add_topic(ODOMETRY_TOPIC, _ODOMETRY)
         for topic in sorted({LOOP_TOPIC, *topics}):
@@ -175,7 +182,6 @@ def _steps(record: GraphRecord) -> Indices:
         k = gaps[0]
         raise GraphError(f'no edge between the consecutive vertices {ids[k]} and {ids[k + 1]}; '
                          'a bag needs the odometry of every vertex')
-    _refuse_backward(record, rows)
     unsaid = first[~factors.speaks[rows].all(axis=1)]
     if len(unsaid):
         raise GraphError(f'the odometry from vertex {ids[unsaid[0]]} leaves a component unsaid; '
@@ -191,20 +197,30 @@ def _loops(record: GraphRecord) -> list[list[int]]:
         raise GraphError(f'a trusted absolute pose of vertex {record.ids[trusted[0]]}; in a bag '
                          'it would be doubted')
     rows = np.flatnonzero(~factors.is_odometry)
-    _refuse_backward(record, rows)
     loops: list[list[int]] = [[] for _ in record.ids]
     for row, j in zip(rows.tolist(), factors.j[rows].tolist(), strict=True):
         loops[j].append(row)
     return loops
 
 
-def _refuse_backward(record: GraphRecord, rows: Indices) -> None:
-    """Refuse factors from a later keyframe to an earlier one: inverting them is not exact."""
-    i, j = record.graph.between.i[rows], record.graph.between.j[rows]
-    if (i > j).any():
-        k = int(np.argmax(i > j))
-        raise GraphError(f'an edge from vertex {record.ids[i[k]]} back to {record.ids[j[k]]}; '
-                         'in a bag a pose is seen from an earlier one')
+def _backward(record: GraphRecord) -> Mask:
+    """Return which factors lead from a later keyframe to an earlier one, (m,) bool."""
+    factors, ids = record.graph.between, record.ids
+    backward: Mask = factors.i > factors.j
+    unsaid = np.flatnonzero(backward & ~factors.speaks.all(axis=1))
+    if len(unsaid):
+        i, j = ids[factors.pairs[unsaid[0]]]
+        raise GraphError(f'an edge from vertex {i} back to {j} leaves a component unsaid; in '
+                         'a bag a pose is seen from an earlier one')
+    return backward
+
+
+def _turned_note(backward: Mask, steps: Indices, loops: list[list[int]]) -> dict[str, str]:
+    """Return which steps and which loops, in the order of the messages, were turned."""
+    in_order = np.array([row for ending in loops for row in ending], np.int64)
+    rows = {TURNED_STEPS: steps, TURNED_LOOPS: in_order}
+    return {name: ' '.join(map(str, np.flatnonzero(backward[of]).tolist()))
+            for name, of in rows.items() if backward[of].any()}
 
 
 def _stamps(record: GraphRecord) -> list[int]:

@@ -18,6 +18,8 @@ import numpy as np
 from l1slam_ros.core.errors import FileError, MessageError
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import (
@@ -26,7 +28,13 @@ from l1slam_ros.core.online.keyframes import (
     diagonal_covariance,
 )
 from l1slam_ros.io.bags.damaged.walk import BagMessage
-from l1slam_ros.io.bags.from_graph import GRAPH_NOTE, SPACE_NOTE, VERBATIM_NOTE
+from l1slam_ros.io.bags.from_graph import (
+    GRAPH_NOTE,
+    SPACE_NOTE,
+    TURNED_LOOPS,
+    TURNED_STEPS,
+    VERBATIM_NOTE,
+)
 from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
 from l1slam_ros.io.graphs.graph_file import GraphRecord
@@ -68,6 +76,8 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
     for message in read_messages(path, topics.types(), damage.append):
         growing.take(message)
     record = growing.record('; '.join(damage))
+    if options is None:
+        record = replace(record, graph=turned(record.graph, _noted_turns(record.graph, note)))
     if record.graph.n_poses < 2:
         raise FileError(path, '; '.join([
             f'{record.graph.n_poses} keyframes from {topics.odometry}; expected 2 or more',
@@ -151,14 +161,12 @@ class _Growing:
         builder.finish()
         builder.add_due_loops()
         skipped = builder.notes.sentences()
-        if builder.held:
-            skipped.append(f'the last message is not used: {builder.held}')
-        if builder.n_waiting == 1:
-            skipped.append('1 loop names a time after the last odometry')
-        elif builder.n_waiting:
-            skipped.append(f'{builder.n_waiting} loops name times after the last odometry')
-        return GraphRecord(builder.graph, None, np.arange(builder.graph.n_poses), builder.stamps,
-                           tuple(skipped), damage)
+        if builder.stream.held:
+            skipped.append(f'the last message is not used: {builder.stream.reason()}')
+        if waiting := len(builder.loops.waiting):
+            skipped.append(f'{counted(waiting, "loop")} for times after the last odometry')
+        return GraphRecord(builder.graph, None, np.arange(builder.graph.n_poses),
+                           builder.track.keyframe_stamps, tuple(skipped), damage)
 
 
 def read_truth_topic(path: Path, topic: str, manifold: Manifold = se2) -> Reference:
@@ -199,6 +207,18 @@ def _noted_options(note: dict[str, str]) -> GraphBuilderOptions:
     if note.get('covariance') == GRAPH_NOTE['covariance']:
         options = replace(options, odometry=OdometryOptions(GRAPH_NOTE['covariance']))
     return options
+
+
+def _noted_turns(graph: FactorGraph, note: dict[str, str]) -> Mask:
+    """Return which factors were turned when they became messages, (m,) bool."""
+    odometry = graph.between.is_odometry
+    turns = np.zeros(len(odometry), bool)
+    for name, kind in (TURNED_STEPS, odometry), (TURNED_LOOPS, ~odometry):
+        numbers = np.array(note.get(name, '').split(), np.int64)
+        rows = np.flatnonzero(kind)
+        # Of a damaged bag the last ones may be missing.
+        turns[rows[numbers[numbers < len(rows)]]] = True
+    return turns
 
 
 def _alternatives(path: Path, topic: str, *msgtypes: str) -> list[str]:

@@ -68,7 +68,10 @@ class MapFile:
         try:
             return self.load()
         except FileError as error:
-            return f'the map begins empty: {error}'
+            sentence = f'the map begins empty: {error}'
+            if self._path().exists():
+                self._warn(sentence)
+            return sentence
 
     def seconds_left(self) -> float:
         """Return in how many seconds `autosave` is due, or when to ask again."""

@@ -7,13 +7,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 from problems import add_absolute, random_information, random_poses
 
 from l1slam_ros.core.errors import GraphError, L1SlamError, NoiseError
-from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.graph.factor_graph import (
     WORLD,
     BetweenFactors,
     FactorGraph,
     component_labels,
+    turned,
 )
+from l1slam_ros.core.graph.linear_system import whitened_residual
 
 
 def between(i, j):
@@ -184,3 +186,18 @@ def test_arrays_that_do_not_fit_together_are_refused(shape):
                           np.array([GOOD, GOOD]))
     columns = vars(graph.between).values()
     assert {len(column) for column in columns} == {0}
+
+
+@pytest.mark.parametrize('manifold', [se2, se3])
+def test_a_factor_that_is_turned_says_the_same_to_first_order(rng, manifold):
+    d = manifold.TANGENT_SIZE
+    graph, start = FactorGraph(manifold), manifold.identity(20)
+    poses = manifold.retract(start, rng.normal(size=(20, d)))
+    graph.add_poses(20)
+    i, j = rng.permutation(20).reshape(2, -1)
+    off = manifold.retract(manifold.between(poses[i], poses[j]), 1e-6 * rng.normal(size=(10, d)))
+    A = rng.normal(size=(10, d, d))
+    graph.add_between(i, j, off, A @ A.transpose(0, 2, 1) + 0.1 * np.eye(d))
+    squares = [(whitened_residual(g, poses).reshape(-1, d)**2).sum(axis=1)
+               for g in (graph, turned(graph, np.arange(5)))]
+    assert_allclose(squares[1], squares[0], rtol=1e-4)

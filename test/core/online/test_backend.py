@@ -158,7 +158,7 @@ def test_a_loop_alone_settles_nothing_new(world):
     settled(backend)
     backend.add_loop(loop(0.0, 100.0, (1.0, 0.0, 0.0)))
     assert backend.update(PLENTY) is None
-    assert backend._builder.n_waiting == 1
+    assert len(backend._builder.loops.waiting) == 1
 
 
 # Time

@@ -111,12 +111,12 @@ def test_until_loops_join_it_a_part_begins_where_the_last_one_ends():
         builder.add_odometry(odometry(100.0 + k * PERIOD, pose))
     for k, pose in enumerate(poses[40:]):
         builder.add_odometry(odometry(101.0 + k * PERIOD, pose))
-    assert builder.notes.warned == {'new_part': 1} and not +builder.refused
-    assert builder.gaps.tolist() == [40] and builder.graph.n_poses == 60
+    assert builder.notes.warned == {'new_part': 1} and not +builder.notes.refused
+    assert builder.track.gaps.tolist() == [40] and builder.graph.n_poses == 60
     assert len(builder.graph.between) == 58
     expected = se2.compose(poses[39:40], se2.between(np.repeat(poses[40:41], 20, 0), poses[40:]))
-    assert_allclose(builder.odometry[40:], expected, atol=1e-9)
-    assert builder.stamps[40] == seconds(101.0)
+    assert_allclose(builder.track.keyframe_poses[40:], expected, atol=1e-9)
+    assert builder.track.keyframe_stamps[40] == seconds(101.0)
 
 
 @pytest.mark.parametrize('reference, stamp, ends', [
@@ -154,7 +154,7 @@ def test_near_a_gap_nothing_is_carried_across_it():
         builder.add_odometry(odometry(1.0 + k * PERIOD, (1e6 + 0.1 * k, 0.0, 0.0)))
     builder.add_loop(loop(1.0, 2.3, (1.3, 0.0, 0.0)))
     builder.add_due_loops()
-    assert builder.stamps[[2, 3]].tolist() == [seconds(2.0), seconds(2.4)]
+    assert builder.track.keyframe_stamps[[2, 3]].tolist() == [seconds(2.0), seconds(2.4)]
     i, j, measurement = loops_of(builder)
     assert (i, j) == ([0], [2])
     assert_allclose(measurement, [[1.0, 0, 0]], atol=1e-9)
@@ -169,9 +169,9 @@ def test_one_old_stamp_is_dropped_and_two_near_ones_too():
             builder.add_odometry(odometry(time, (time, 0.0, 0.0)))
         except MessageError as error:
             refused += error.cause == 'old_stamp'
-    assert builder.refused == {'old_stamp': 1} and refused == 2
-    assert_array_equal(builder.stamps, [seconds(10 + k / 10) for k in range(5)])
-    assert not builder.gaps.size
+    assert builder.notes.refused == {'old_stamp': 1} and refused == 2
+    assert_array_equal(builder.track.keyframe_stamps, [seconds(10 + k / 10) for k in range(5)])
+    assert not builder.track.gaps.size
 
 
 @pytest.mark.parametrize('choice, poses, x', [

@@ -24,11 +24,12 @@ from problems import (
     seconds,
     true_loop,
 )
+from scipy.spatial.transform import Rotation
 
 from l1slam_ros.core.errors import MessageError
-from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.graph.factor_graph import WORLD
-from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopOptions
@@ -50,15 +51,16 @@ def assert_true(builder, poses):
 
 def test_nothing_yet():
     builder = GraphBuilder(se2, DEFAULTS)
-    assert builder.graph.n_poses == builder.n_waiting == builder.add_due_loops() == 0
-    assert builder.stamps.shape == (0,) and builder.odometry.shape == (0, 3)
+    assert builder.graph.n_poses == len(builder.loops.waiting) == builder.add_due_loops() == 0
+    assert builder.track.keyframe_stamps.shape == (0,)
+    assert builder.track.keyframe_poses.shape == (0, 3)
 
 
 def test_the_first_sample_is_keyframe_0_wherever_it_is():
     builder = GraphBuilder(se2, DEFAULTS)
     assert builder.add_odometry(odometry(5.0, (1.0, 2.0, 3.0)))
-    assert_array_equal(builder.stamps, [seconds(5.0)])
-    assert_allclose(builder.odometry, [[1.0, 2.0, 3.0]])
+    assert_array_equal(builder.track.keyframe_stamps, [seconds(5.0)])
+    assert_allclose(builder.track.keyframe_poses, [[1.0, 2.0, 3.0]])
     assert builder.graph.n_poses == 1 and len(builder.graph.between) == 0
 
 
@@ -66,8 +68,8 @@ def test_every_sample_can_be_a_keyframe(rng):
     poses = drive(30, rng)
     builder = grown(poses, EVERY)
     factors = builder.graph.between
-    assert_array_equal(builder.stamps, [seconds(k * PERIOD) for k in range(30)])
-    assert_allclose(builder.odometry, poses, atol=1e-12)
+    assert_array_equal(builder.track.keyframe_stamps, [seconds(k * PERIOD) for k in range(30)])
+    assert_allclose(builder.track.keyframe_poses, poses, atol=1e-12)
     assert_array_equal(np.stack((factors.i, factors.j)), [np.arange(29), np.arange(1, 30)])
     assert_allclose(factors.measurement, se2.between(poses[:-1], poses[1:]), atol=1e-12)
 
@@ -85,7 +87,7 @@ def test_keyframes_come_when_the_motion_passes_a_threshold():
             last = k
         assert builder.graph.n_poses == len(expected)
     assert 20 < len(expected) < 60
-    assert_array_equal(builder.stamps, [seconds(k * PERIOD) for k in expected])
+    assert_array_equal(builder.track.keyframe_stamps, [seconds(k * PERIOD) for k in expected])
     keyframes = poses[expected]
     assert_allclose(builder.graph.between.measurement,
                     se2.between(keyframes[:-1], keyframes[1:]), atol=1e-12)
@@ -99,7 +101,7 @@ def test_a_factor_has_the_covariance_of_the_whole_motion(rng):
     for k in range(1, 6):
         Ad = se2.adjoint(se2.between(poses[5:6], poses[k : k + 1]))[0]
         expected += Ad @ covariance @ Ad.T
-    assert_array_equal(builder.stamps, [0, seconds(0.5), seconds(1.0)])
+    assert_array_equal(builder.track.keyframe_stamps, [0, seconds(0.5), seconds(1.0)])
     assert_allclose(covariance_of(builder, 0), expected, rtol=1e-9)
 
 
@@ -112,7 +114,7 @@ def test_an_old_stamp_is_refused_and_nothing_is_added(time):
     assert caught.value.cause == 'old_stamp'
     assert str(caught.value) == (f'odometry stamp {seconds(time)} ns is not after the last one, '
                                  f'{seconds(0.9)} ns')
-    assert builder.graph.n_poses == len(builder.stamps) == 10
+    assert builder.graph.n_poses == len(builder.track.keyframe_stamps) == 10
     builder.add_odometry(odometry(1.0, poses[10]))
     assert_allclose(builder.graph.between.measurement[9:], se2.between(poses[9:10], poses[10:11]),
                     atol=1e-12)
@@ -120,7 +122,7 @@ def test_an_old_stamp_is_refused_and_nothing_is_added(time):
 
 def test_snapshots_stay_as_they_were():
     builder = grown(curve(5), EVERY)
-    stamps, poses = builder.stamps, builder.odometry
+    stamps, poses = builder.track.keyframe_stamps, builder.track.keyframe_poses
     before = stamps.copy(), poses.copy()
     drive_on(builder, curve(200), 5)
     assert_array_equal(stamps, before[0])
@@ -137,7 +139,7 @@ def test_a_true_loop_becomes_the_true_pose_between_keyframes(reference, sample):
     poses = curve(200)
     builder = grown(poses, DEFAULTS)
     builder.add_loop(true_loop(poses, reference, sample))
-    assert builder.add_due_loops() == 1 and builder.n_waiting == 0
+    assert builder.add_due_loops() == 1 and len(builder.loops.waiting) == 0
     assert_true(builder, poses)
     (i,), (j,), _ = loops_of(builder)
     keyframes = keyframe_samples(builder)
@@ -151,7 +153,7 @@ def test_a_loop_between_two_samples_is_interpolated():
     builder.add_loop(loop(1.03, 7.77, (6.74, 0.0, 0.0)))
     builder.add_due_loops()
     (i,), (j,), measurement = loops_of(builder)
-    x = builder.odometry[:, 0]
+    x = builder.track.keyframe_poses[:, 0]
     assert (x[i], x[j]) == (pytest.approx(1.0), pytest.approx(8.0))
     assert_allclose(measurement, [[7.0, 0, 0]], atol=1e-9)
 
@@ -207,13 +209,13 @@ def test_a_loop_waits_for_its_odometry():
     builder = grown(poses[:50], DEFAULTS)
     builder.add_loop(true_loop(poses, 3, 60))
     builder.add_loop(true_loop(poses, 3, 40))
-    assert builder.n_waiting == 2
-    assert builder.add_due_loops() == 1 and builder.n_waiting == 1
+    assert len(builder.loops.waiting) == 2
+    assert builder.add_due_loops() == 1 and len(builder.loops.waiting) == 1
     for k in range(50, 61):
         assert builder.add_due_loops() == 0
         builder.add_odometry(odometry(k * PERIOD, poses[k]))
-    assert builder.add_due_loops() == 1 and builder.n_waiting == 0
-    assert builder.add_due_loops() == 0 and not +builder.refused
+    assert builder.add_due_loops() == 1 and len(builder.loops.waiting) == 0
+    assert builder.add_due_loops() == 0 and not +builder.notes.refused
 
 
 def test_a_loop_expires_when_it_has_waited_too_long():
@@ -223,10 +225,10 @@ def test_a_loop_expires_when_it_has_waited_too_long():
     for k in range(21, 31):
         builder.add_odometry(odometry(k * PERIOD, poses[k]))
         assert builder.add_due_loops() == 0
-        assert builder.n_waiting == 1 and not +builder.refused
+        assert len(builder.loops.waiting) == 1 and not +builder.notes.refused
     builder.add_odometry(odometry(31 * PERIOD, poses[31]))
     builder.add_due_loops()
-    assert builder.n_waiting == 0 and +builder.refused == {'expired': 1}
+    assert len(builder.loops.waiting) == 0 and +builder.notes.refused == {'expired': 1}
     drive_on(builder, poses[:70], 32)
     assert builder.add_due_loops() == 0 and loops_of(builder)[0] == []
 
@@ -237,7 +239,7 @@ def test_a_loop_that_came_before_any_odometry_expires_too():
     for k in range(100):
         builder.add_odometry(odometry(k, (k, 0.0, 0.0)))
     builder.add_due_loops()
-    assert builder.n_waiting == 0 and +builder.refused == {'expired': 1}
+    assert len(builder.loops.waiting) == 0 and +builder.notes.refused == {'expired': 1}
 
 
 @pytest.mark.parametrize('reference, time, cause', [
@@ -247,8 +249,8 @@ def test_a_loop_that_can_be_no_factor_is_counted(reference, time, cause):
     builder = grown(curve(101), GraphBuilderOptions(keyframe=KeyframeOptions(0.0, 0.0, 1.0)))
     builder.add_loop(loop(reference, time, (1.0, 0.0, 0.0)))
     assert builder.add_due_loops() == 0
-    assert +builder.refused == {cause: 1}
-    assert builder.n_waiting == 0 and loops_of(builder)[0] == []
+    assert +builder.notes.refused == {cause: 1}
+    assert len(builder.loops.waiting) == 0 and loops_of(builder)[0] == []
 
 
 def test_good_loops_among_bad_ones_keep_their_order():
@@ -260,7 +262,7 @@ def test_good_loops_among_bad_ones_keep_their_order():
         builder.add_loop(loop(-1.0, 5.0, (1.0, k, 0.0)))
         builder.add_loop(loop(100.0, 200.0, (1.0, k, 0.0)))
     assert builder.add_due_loops() == 4
-    assert builder.n_waiting == 4 and +builder.refused == {'before_start': 4}
+    assert len(builder.loops.waiting) == 4 and +builder.notes.refused == {'before_start': 4}
     assert_true(builder, poses)
     i, j, _ = loops_of(builder)
     pairs = keyframe_samples(builder)[np.stack((i, j), axis=1)]
@@ -276,8 +278,8 @@ def stamps_of(*loops):
 
 def test_no_loops_have_no_stamps():
     builder = GraphBuilder(se2, DEFAULTS)
-    assert [part.shape for part in builder.loop_stamps] == [(0, 2)] * 3
-    assert builder.loop_rows.shape == (0,)
+    assert [part.shape for part in builder.loops.stamps] == [(0, 2)] * 3
+    assert builder.loops.rows.shape == (0,)
 
 
 def test_each_loop_of_the_graph_has_its_row_and_the_stamps_it_came_with():
@@ -293,12 +295,12 @@ def test_each_loop_of_the_graph_has_its_row_and_the_stamps_it_came_with():
              200)
     builder.add_loop(good[2])
     builder.add_due_loops()
-    in_graph, waiting, expired = builder.loop_stamps
+    in_graph, waiting, expired = builder.loops.stamps
     assert in_graph.tolist() == stamps_of(*good)
     assert len(waiting) == len(expired) == 0
     factors = builder.graph.between
-    assert_array_equal(builder.loop_rows, np.flatnonzero(~factors.is_odometry))
-    ends = builder.stamps[np.stack((factors.i, factors.j), axis=1)[builder.loop_rows]]
+    assert_array_equal(builder.loops.rows, np.flatnonzero(~factors.is_odometry))
+    ends = builder.track.keyframe_stamps[factors.pairs[builder.loops.rows]]
     assert 0 < np.abs(ends - in_graph).max() < seconds(0.5)
 
 
@@ -309,14 +311,14 @@ def test_loops_that_wait_and_loops_that_expired_keep_their_stamps():
     for one in loops:
         builder.add_loop(one)
     builder.add_due_loops()
-    assert [part.tolist() for part in builder.loop_stamps] == [[], stamps_of(*loops), []]
+    assert [part.tolist() for part in builder.loops.stamps] == [[], stamps_of(*loops), []]
     drive_on(builder, poses[:50], 20)
     late = true_loop(poses, 5, 60)
     builder.add_loop(late)
     builder.add_due_loops()
-    assert [part.tolist() for part in builder.loop_stamps] == [
+    assert [part.tolist() for part in builder.loops.stamps] == [
         stamps_of(loops[1]), stamps_of(late), stamps_of(loops[0], loops[2])]
-    assert +builder.refused == {'expired': 2} and builder.n_waiting == 1
+    assert +builder.notes.refused == {'expired': 2} and len(builder.loops.waiting) == 1
 
 
 def test_a_trusted_loop_becomes_a_trusted_factor():
@@ -326,7 +328,7 @@ def test_a_trusted_loop_becomes_a_trusted_factor():
     builder.add_loop(replace(true_loop(poses, 33, 188), trusted=True))
     builder.add_due_loops()
     trusted = builder.graph.between.trusted
-    assert trusted[builder.loop_rows].tolist() == [False, True] and trusted.sum() == 1
+    assert trusted[builder.loops.rows].tolist() == [False, True] and trusted.sum() == 1
 
 
 def test_the_loops_of_an_earlier_run_are_those_of_its_keyframes():
@@ -341,9 +343,9 @@ def test_the_loops_of_an_earlier_run_are_those_of_its_keyframes():
     for k in range(60, 64):
         second.add_odometry(odometry(k * PERIOD, (k, 0.0, 0.0)))
     second.add_due_loops()
-    assert second.loop_stamps[0].tolist() == [
-        *first.loop_stamps[0].tolist(), [0, seconds(6.2)]]
-    assert_array_equal(second.loop_rows, np.flatnonzero(~second.graph.between.is_odometry))
+    assert second.loops.stamps[0].tolist() == [
+        *first.loops.stamps[0].tolist(), [0, seconds(6.2)]]
+    assert_array_equal(second.loops.rows, np.flatnonzero(~second.graph.between.is_odometry))
 
 
 # The same loop again
@@ -362,7 +364,7 @@ def test_a_loop_sent_again_is_used_once(times):
             drive_on(builder, poses, 100)
         builder.add_due_loops()
     assert len(loops_of(builder)[0]) == 2
-    assert +builder.refused == {'repeated': 2 * (times - 1)}
+    assert +builder.notes.refused == {'repeated': 2 * (times - 1)}
     assert builder.notes.sentences() == [
         f'{2 * (times - 1)} messages refused: a loop from 700000000 ns to 9000000000 ns was sent '
         'before; expected each loop once']
@@ -377,8 +379,8 @@ def test_other_measurements_of_a_pair_are_other_loops():
     for other in others + others:
         builder.add_loop(other)
     assert builder.add_due_loops() == len(others) - 1
-    assert +builder.refused == {'repeated': len(others)}
-    assert builder.graph.between.trusted[builder.loop_rows].tolist() == [True] + 3 * [False]
+    assert +builder.notes.refused == {'repeated': len(others)}
+    assert builder.graph.between.trusted[builder.loops.rows].tolist() == [True] + 3 * [False]
 
 
 def test_a_loop_that_expired_may_be_sent_again():
@@ -387,10 +389,10 @@ def test_a_loop_that_expired_may_be_sent_again():
     one = true_loop(poses, 3, 60)
     builder.add_loop(one)
     drive_on(builder, poses[:50], 20)
-    assert builder.add_due_loops() == 0 and +builder.refused == {'expired': 1}
+    assert builder.add_due_loops() == 0 and +builder.notes.refused == {'expired': 1}
     drive_on(builder, poses, 50)
     builder.add_loop(one)
-    assert builder.add_due_loops() == 1 and +builder.refused == {'expired': 1}
+    assert builder.add_due_loops() == 1 and +builder.notes.refused == {'expired': 1}
 
 
 def test_a_loop_of_an_earlier_run_is_known_by_the_keyframes_it_named(rng):
@@ -406,7 +408,7 @@ def test_a_loop_of_an_earlier_run_is_known_by_the_keyframes_it_named(rng):
         second.add_loop(one)
     second.add_loop(replace(loops[0], covariance=1.01 * covariance))
     second.add_odometry(odometry(60 * PERIOD, poses[-1]))
-    assert second.add_due_loops() == 1 and +second.refused == {'repeated': 2}
+    assert second.add_due_loops() == 1 and +second.notes.refused == {'repeated': 2}
 
 
 def cpu(call, times):
@@ -427,10 +429,10 @@ def test_loops_that_wait_or_expired_cost_nothing():
     for k in range(10_000):
         busy.add_loop(loop(1.0, 2e5 + k, (1.0, 0.0, 0.0)))
     busy.add_due_loops()
-    assert busy.refused['expired'] == busy.n_waiting == 10_000
-    assert [len(part) for part in busy.loop_stamps] == [0, 10_000, 10_000]
+    assert busy.notes.refused['expired'] == len(busy.loops.waiting) == 10_000
+    assert [len(part) for part in busy.loops.stamps] == [0, 10_000, 10_000]
     assert cpu(busy.add_due_loops, 300) < 10 * cpu(idle.add_due_loops, 300)
-    assert cpu(lambda: busy.loop_stamps, 300) < 50 * cpu(lambda: idle.loop_stamps, 300)
+    assert cpu(lambda: busy.loops.stamps, 300) < 50 * cpu(lambda: idle.loops.stamps, 300)
 
 
 # The covariance of loops
@@ -538,7 +540,7 @@ def test_an_absolute_pose_is_a_factor_from_the_world():
     assert_allclose(factors.sqrt_information[-3:], [
         np.diag([5, 5, 10]), np.diag([5, 10 / 3, 0]), np.diag([0, 0, 10])], atol=1e-9)
     assert factors.trusted[-3:].tolist() == [False, False, True]
-    in_graph, waiting, _ = growth.loop_stamps
+    in_graph, waiting, _ = growth.loops.stamps
     assert in_graph.tolist() == [[seconds(t)] * 2 for t in (1.0, 2.0, 2.5)] and not len(waiting)
 
 
@@ -567,7 +569,7 @@ def test_absolute_poses_wait_expire_and_come_once():
     poses = curve(30)
     growth = grown(poses[:10], EVERY)
     growth.add_loop(absolute(1.5, (5, 6, 0.7)))
-    assert growth.add_due_loops() == 0 and growth.n_waiting == 1
+    assert growth.add_due_loops() == 0 and len(growth.loops.waiting) == 1
     drive_on(growth, poses, 10)
     growth.add_loop(absolute(1.5, (5, 6, 0.7)))
     growth.add_loop(absolute(-1.0, (5, 6, 0.7)))
@@ -575,9 +577,9 @@ def test_absolute_poses_wait_expire_and_come_once():
     growth.add_loop(absolute(1.5, (5, 6, 0.7), (2e6, 0, np.inf)))
     growth.add_loop(absolute(90.0, (5, 6, 0.7)))
     assert growth.add_due_loops() == 1
-    assert growth.refused == {'repeated': 1, 'before_start': 1, 'covariance': 2}
+    assert growth.notes.refused == {'repeated': 1, 'before_start': 1, 'covariance': 2}
     drive_on(growth, np.repeat(poses[-1:], 150, axis=0), 30)
-    assert growth.add_due_loops() == 0 and growth.refused['expired'] == 1
+    assert growth.add_due_loops() == 0 and growth.notes.refused['expired'] == 1
 
 
 def test_a_loop_may_leave_components_unsaid():
@@ -585,3 +587,19 @@ def test_a_loop_may_leave_components_unsaid():
     growth.add_loop(loop(0.5, 2.0, (1, 2, 0.3), covariance6(np.diag([0.04, np.inf, 0.01]))))
     growth.add_due_loops()
     assert_allclose(growth.graph.between.sqrt_information[-1], np.diag([5, 0, 10]))
+
+
+@pytest.mark.parametrize(('manifold', 'slope', 'mounted', 'says'), [
+    (se2, 0.1, 0.0, 'has left the plane by 0.5'), (se2, 0.0, 0.3, ''), (se2, 0.01, 0.3, ''),
+    (se3, 0.1, 0.3, '')])
+def test_a_slope_is_said_where_it_is_dropped(manifold, slope, mounted, says):
+    """Of a sensor that is mounted high and tilted, what changes is; by then it is half a metre."""
+    builder = GraphBuilder(manifold, GraphBuilderOptions())
+    turn = Rotation.from_euler('ZY', [[0.1 * k, mounted - slope] for k in range(20)]).as_quat()
+    for k in range(20):
+        pose3 = np.array([k * np.cos(slope), 0.0, mounted + k * np.sin(slope), *turn[k]])
+        builder.add_odometry(OdometrySample(seconds(k), pose3, np.eye(6), np.eye(6)))
+    sentences = builder.notes.sentences()
+    assert len(sentences) == bool(says)
+    if says:
+        assert says in sentences[0] and 'dimension 3' in sentences[0]

@@ -89,11 +89,11 @@ def test_loops_are_the_same_factors_as_with_all_samples(rng, monkeypatch, kind, 
             int(begin) * NS // 100 + 3, int(end) * NS // 100 + 3,
             se2.to_pose3(rng.normal(size=(1, 3)))[0], covariance6(0.01 * np.eye(3))))
     thinned, whole = grown(poses, loops, every), grown(poses, loops, monkeypatch=monkeypatch)
-    assert len(thinned._track) < len(whole._track) == N or not every
-    order = [np.lexsort(one.loop_stamps[0].T) for one in (thinned, whole)]
-    rows = [one.loop_rows[o] for one, o in zip((thinned, whole), order, strict=True)]
+    assert len(thinned.track) < len(whole.track) == N or not every
+    order = [np.lexsort(one.loops.stamps[0].T) for one in (thinned, whole)]
+    rows = [one.loops.rows[o] for one, o in zip((thinned, whole), order, strict=True)]
     a, b = (one.graph.between for one in (thinned, whole))
-    assert len(rows[0]) == len(rows[1]) > 100 and thinned.refused == whole.refused
+    assert len(rows[0]) == len(rows[1]) > 100 and thinned.notes.refused == whole.notes.refused
     assert (a.pairs[rows[0]] == b.pairs[rows[1]]).all()
     difference = se2.local(a.measurement[rows[0]], b.measurement[rows[1]])
     assert np.abs(difference).max() < 50 * MISSED  # by levers of a keyframe's way, and turns

@@ -50,7 +50,7 @@ def timed(poses):
 
 
 def assert_same(builder, expected):
-    assert_array_equal(builder.stamps, expected.stamps)
+    assert_array_equal(builder.track.keyframe_stamps, expected.track.keyframe_stamps)
     assert_allclose(builder.graph.between.measurement, expected.graph.between.measurement,
                     atol=1e-12)
 
@@ -61,7 +61,7 @@ def test_a_stamp_far_ahead_is_dropped_when_the_next_one_is_right(ahead, place):
     good = timed(curve(40))
     stray = (good[place][0] - 0.05 + ahead, good[place][1])
     builder, refused = fed(good[:place] + [stray] + good[place:])
-    assert +builder.refused == {'stamp_ahead': 1} and not refused and not builder.held
+    assert +builder.notes.refused == {'stamp_ahead': 1} and not refused and not builder.stream.held
     assert_same(builder, fed(good)[0])
 
 
@@ -69,7 +69,7 @@ def test_stamps_far_ahead_one_after_the_other():
     good = timed(curve(40))
     strays = [(1e6, good[9][1]), (2e6, good[9][1]), (1.5e6, good[9][1])]
     builder, _ = fed(good[:10] + strays + good[10:])
-    assert +builder.refused == {'stamp_ahead': 3}
+    assert +builder.notes.refused == {'stamp_ahead': 3}
     assert_same(builder, fed(good)[0])
 
 
@@ -82,7 +82,7 @@ def test_the_very_first_stamp_is_the_stray(stray):
     builder.add_loop(true_loop(poses, 12, 30))
     for time, pose in timed(poses):
         builder.add_odometry(odometry(time, pose))
-    assert +builder.refused == {'stamp_ahead': 1}
+    assert +builder.notes.refused == {'stamp_ahead': 1}
     assert_same(builder, fed(timed(poses))[0])
     assert builder.add_due_loops() == 1
 
@@ -95,8 +95,9 @@ def test_a_robot_that_pauses_loses_nothing(pause):
         samples = [(time + (pause if k >= 20 else 0.0), pose + [drift * (k >= 20), 0.0, 0.0])
                    for k, (time, pose) in enumerate(timed(poses))]
         builder, _ = fed(samples)
-        assert builder.graph.n_poses == 40 and not builder.refused and not builder.notes.warned
-        assert_allclose(builder.odometry, [pose for _, pose in samples], atol=1e-9)
+        assert builder.graph.n_poses == 40
+        assert not builder.notes.refused and not builder.notes.warned
+        assert_allclose(builder.track.keyframe_poses, [pose for _, pose in samples], atol=1e-9)
 
 
 @pytest.mark.parametrize('jump', [(5e8, 0.0), (0.0, -3e5), (1.2 * FASTEST * PERIOD, 0.0)])
@@ -107,7 +108,7 @@ def test_a_jump_and_back_again_leaves_the_map_unharmed(jump, count):
     bad = [(time, (*(k + 1) * np.array(jump), 1.0)) for k, (time, _) in enumerate(good[30:32])]
     builder, _ = fed(good[:30] + bad[:count] + good[30 + count:])
     expected, _ = fed(good[:30] + good[30 + count:])
-    assert +builder.refused == {'jump': count} and not builder.notes.warned
+    assert +builder.notes.refused == {'jump': count} and not builder.notes.warned
     assert_same(builder, expected)
     said = builder.notes.sentences()[0]
     assert said.startswith(f'{count} message{"s" * (count > 1)} refused: odometry ')
@@ -123,13 +124,13 @@ def test_odometry_that_moves_its_frame_goes_on_from_where_the_robot_was(new_fram
     after = np.repeat(poses[120:121], 80, axis=0) if not moving else poses[120:]
     moved = se2.compose(np.array([new_frame]), se2.between(poses[120:121], after))
     builder, _ = fed(timed(np.concatenate((poses[:120], moved))), options=IGNORE)
-    assert builder.graph.n_poses == 200 and not +builder.refused
+    assert builder.graph.n_poses == 200 and not +builder.notes.refused
     assert builder.notes.warned == {'moved': 1}
     assert 'the robot is taken to be where it was' in builder.notes.sentences()[0]
     # The robot did not move from 119 to 120, as far as is known; then as its odometry says.
     expected = se2.compose(poses[119:120], se2.between(poses[120:121], after))
-    assert_allclose(builder.odometry[:120], poses[:120], atol=1e-9)
-    assert_allclose(se2.local(expected, builder.odometry[120:]), 0, atol=1e-9)
+    assert_allclose(builder.track.keyframe_poses[:120], poses[:120], atol=1e-9)
+    assert_allclose(se2.local(expected, builder.track.keyframe_poses[120:]), 0, atol=1e-9)
     model = OdometryOptions()
     known = np.diag(covariance_of(builder, 118))
     assert (np.sqrt(np.diag(covariance_of(builder, 119))) >= 0.1).all() and known.max() < 1e-3
@@ -144,8 +145,9 @@ def test_where_the_frame_moves_there_is_a_keyframe():
     before = builder.graph.n_poses
     for k in range(20, 24):
         builder.add_odometry(odometry(k * PERIOD, (0.0, 0.0, 0.0)))
-    assert builder.graph.n_poses == before + 1 and builder.stamps[-1] == seconds(2.0)
-    assert_allclose(builder.odometry[-1], (2, 0, 0), atol=1e-9)
+    assert builder.graph.n_poses == before + 1
+    assert builder.track.keyframe_stamps[-1] == seconds(2.0)
+    assert_allclose(builder.track.keyframe_poses[-1], (2, 0, 0), atol=1e-9)
     assert_allclose(builder.offset, [(2, 0, 0)], atol=1e-9)
 
 
@@ -158,26 +160,26 @@ def test_a_fast_robot_is_a_robot(speed, period):
     samples = [(0.7 + 0.01 * k, (0.0, 0.0, 0.0)) for k in range(20)] + samples
     builder, _ = fed(samples)
     assert builder.graph.n_poses == len(samples)
-    assert not builder.refused and not builder.notes.warned
+    assert not builder.notes.refused and not builder.notes.warned
 
 
 def test_a_robot_that_comes_home_exactly_is_no_restart():
     """On a grid without noise, at once or after a rest."""
     steps = [(1, 0), (1, 0), (0, 0), (0, 0), (-1, 0), (-1, 0), (0, 1), (0, -1), (1, 0), (-1, 0)]
     builder, _ = fed(timed([(*at, 0.0) for at in np.cumsum([(0, 0), *steps], axis=0)]))
-    assert not builder.refused and not builder.notes.warned and builder.graph.n_poses == 11
+    assert not builder.notes.refused and not builder.notes.warned and builder.graph.n_poses == 11
 
 
 def test_the_last_sample_is_held_and_said_not_lost_in_silence():
     good = timed(curve(20))
     builder, _ = fed([*good[:19], (1e6, good[19][1])])
     builder.finish()
-    assert builder.graph.n_poses == 19 and not builder.refused
-    assert builder.held.startswith('odometry stamp 1000000000000000 ns is ')
+    assert builder.graph.n_poses == 19 and not builder.notes.refused
+    assert builder.stream.reason().startswith('odometry stamp 1000000000000000 ns is ')
     with pytest.raises(MessageError, match='is not after the last one, 1000000000000000 ns'):
         builder.add_odometry(odometry(1e6, good[19][1]))
     builder.add_odometry(odometry(1e6 + 0.1, good[19][1]))
-    assert builder.graph.n_poses == 21 and not builder.held and not builder.refused
+    assert builder.graph.n_poses == 21 and not builder.stream.held and not builder.notes.refused
 
 
 @pytest.mark.parametrize('period', [1.0, 2.5, 30.0])
@@ -186,16 +188,16 @@ def test_slow_odometry_passes(period):
     poses = curve(21)
     builder, _ = fed([(1.0 + k * period, pose) for k, pose in enumerate(poses[:20])])
     builder.finish()
-    assert builder.graph.n_poses == 20 and not builder.refused and not builder.held
+    assert builder.graph.n_poses == 20 and not builder.notes.refused and not builder.stream.held
     builder, _ = fed([(1.0 + k * period, pose) for k, pose in enumerate(poses)])
     builder.finish()
-    assert builder.graph.n_poses == 21 and not builder.refused and not builder.held
+    assert builder.graph.n_poses == 21 and not builder.notes.refused and not builder.stream.held
 
 
 def test_one_old_header_is_dropped_while_another_sample_is_held():
     good = timed(curve(20))
     builder, refused = fed([*good[:10], (1e6, good[9][1]), (1.5, good[9][1]), *good[10:]])
-    assert refused == [11] and +builder.refused == {'stamp_ahead': 1}
+    assert refused == [11] and +builder.notes.refused == {'stamp_ahead': 1}
     assert_same(builder, fed(good)[0])
 
 
@@ -207,15 +209,15 @@ def test_a_restored_map_does_not_begin_anew():
     for k in range(3):
         with pytest.raises(MessageError, match='is not after the last one'):
             second.add_odometry(odometry(100.0 + k, (0.0, 0.0, 0.0)))
-    assert second.graph.n_poses == 61 and (np.diff(second.stamps) > 0).all()
+    assert second.graph.n_poses == 61 and (np.diff(second.track.keyframe_stamps) > 0).all()
 
 
 def test_of_a_graph_each_message_is_meant():
     poses = [(0.0, 0.0, 0.0), (5e5, 0.0, 0.0), (5e5, 1.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)]
     times = [1.0, 1.1, 1e6, 1e6 + 0.1, 2e9]
     builder, _ = fed(zip(times, poses, strict=True), verbatim=True)
-    assert not builder.refused and not builder.notes.warned
-    assert_allclose(builder.odometry, poses, atol=1e-6)
+    assert not builder.notes.refused and not builder.notes.warned
+    assert_allclose(builder.track.keyframe_poses, poses, atol=1e-6)
 
 
 def test_a_graph_of_odd_messages_comes_back_from_a_bag_exactly(tmp_path):
@@ -226,12 +228,12 @@ def test_a_graph_of_odd_messages_comes_back_from_a_bag_exactly(tmp_path):
     for _ in range(2):
         builder.add_loop(loop(1.0, 1.2, (1.0, 2.0, 0.3), np.diag([1e-12, 1e9, 1, 1, 1, 0.1])))
     assert builder.add_due_loops() == 2
-    record = GraphRecord(builder.graph, None, np.arange(5), builder.stamps)
+    record = GraphRecord(builder.graph, None, np.arange(5), builder.track.keyframe_stamps)
     write_graph_bag(tmp_path / 'bag', record)
     read = graph_from_bag(tmp_path / 'bag', None, DEFAULT_TOPICS)
     assert read.skipped == ()
     ours, theirs = builder.graph.between, read.graph.between
-    assert_array_equal(read.stamps, builder.stamps)
+    assert_array_equal(read.stamps, builder.track.keyframe_stamps)
     assert_array_equal(np.sort(theirs.pairs, axis=0), np.sort(ours.pairs, axis=0))
     assert_allclose(theirs.measurement, ours.measurement, atol=1e-9)
     assert_allclose(theirs.sqrt_information, ours.sqrt_information, rtol=1e-6, atol=1e-6)
@@ -253,7 +255,7 @@ def test_no_recorded_graph_is_taken_for_a_fault(datasets, name):
         builder = GraphBuilder(se2, GraphBuilderOptions(KeyframeOptions(1e6, 0.0, 0.0)))
         for k, pose in enumerate(poses):
             builder.add_odometry(odometry(1.0 + k * period, pose))
-        assert not builder.refused and not builder.notes.warned and not builder.held
+        assert not builder.notes.refused and not builder.notes.warned and not builder.stream.held
 
 
 def test_loops_across_a_restart_join_the_right_places():
@@ -291,10 +293,10 @@ def test_whatever_comes_each_sample_is_used_held_or_counted(seed):
             old += 1
         builder.add_loop(loop(time - 5.0, time, rng.normal(size=3), covariance))
         builder.add_due_loops()
-    assert builder.refused['jump'] + builder.notes.warned['new_part'] > 0
-    lost = sum(builder.refused[cause] for cause in ('stamp_ahead', 'jump', 'old_stamp'))
-    assert builder.graph.n_poses + bool(builder.held) + lost + old == 200
-    for part in np.split(builder.stamps, builder.gaps):
+    assert builder.notes.refused['jump'] + builder.notes.warned['new_part'] > 0
+    lost = sum(builder.notes.refused[cause] for cause in ('stamp_ahead', 'jump', 'old_stamp'))
+    assert builder.graph.n_poses + bool(builder.stream.reason()) + lost + old == 200
+    for part in np.split(builder.track.keyframe_stamps, builder.track.gaps):
         assert (np.diff(part) > 0).all()
     factors = builder.graph.between
     assert np.isfinite(factors.sqrt_information).all() and np.isfinite(factors.measurement).all()

@@ -48,6 +48,13 @@ def test_misstated_information_changes_no_decision(world, odometry, loops):
     np.testing.assert_allclose(np.log10(found.variance / [odometry, loops]), 0, atol=1.0)
 
 
+def test_a_graph_that_says_all_twice_is_believed(world):
+    factors = world.graph.between
+    graph = world.graph.copy()
+    graph.append_between(factors.i, factors.j, factors.measurement, factors.sqrt_information)
+    assert robust_solve(graph)[0].accepted.all()
+
+
 @pytest.mark.parametrize('joined', [True, False])
 def test_two_sessions_are_joined_by_loops_or_stay_two_parts(world, joined):
     bad = spoilt(world, 'random', 170)

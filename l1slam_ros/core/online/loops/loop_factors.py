@@ -87,7 +87,11 @@ class LoopFactors:
 
     @property
     def stamps(self) -> tuple[Indices, Indices, Indices]:
-        """See `GraphBuilder.loop_stamps`."""
+        """
+        Stamps (reference, end) [ns] of the loops in the graph, waiting and expired, (k, 2) each.
+
+        Those in the graph are in the order of `rows`, to which they stay tied.
+        """
         return self._stamps.view(), self.waiting.stamps(), self._expired.view()
 
     @property

@@ -70,14 +70,14 @@ class LiveMap:
         # front left may be true.
         self._used, self._fits = np.zeros(0, bool), False
         known = len(optimised.judgement.accepted)
-        self._judged_loops = int(np.count_nonzero(builder.loop_rows < known))
+        self._judged_loops = int(np.count_nonzero(builder.loops.rows < known))
         self.note_newest()
 
     @property
     def all_judged(self) -> bool:
         """Whether no loop waits to be judged."""
         return not self.robust or (self.optimised.judgement.settled
-                                   and self._judged_loops == len(self._builder.loop_rows))
+                                   and self._judged_loops == len(self._builder.loops.rows))
 
     @property
     def accepted(self) -> Mask:
@@ -139,7 +139,7 @@ class LiveMap:
     def begin_judgement(self) -> int:
         """Expect a judgement of all loops there are; return how many."""
         self._fits = False
-        return len(self._builder.loop_rows)
+        return len(self._builder.loops.rows)
 
     def take_judgement(self, judgement: Judgement, poses: Array, loops: int) -> None:
         """Take over what is accepted of the first factors, so many loops, and its L2 map."""

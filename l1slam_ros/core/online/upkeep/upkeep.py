@@ -94,7 +94,8 @@ class Upkeep:
     def _version(self) -> tuple[int, int, int]:
         builder = self._builder
         # While loops wait, any sample may be the one that they wait for, or one too many.
-        return (self._changes, builder.graph.n_poses, self._samples if builder.n_waiting else 0)
+        waits = len(builder.loops.waiting) > 0
+        return (self._changes, builder.graph.n_poses, self._samples if waits else 0)
 
     def snapshot(self) -> Snapshot:
         """Return the back end as it is now, the due loops in its graph, to be read at leisure."""
@@ -103,10 +104,11 @@ class Upkeep:
 
     def _snapshot(self) -> Snapshot:
         builder, live = self._builder, self._live
+        track, loops = builder.track, builder.loops
         builder.add_due_loops()
         return Snapshot(
-            live.number, self._version(), builder.graph.copy(), builder.gaps, builder.stamps,
-            builder.odometry, self._map_to_odom_now(), builder.loop_rows, builder.loop_stamps,
+            live.number, self._version(), builder.graph.copy(), track.gaps, track.keyframe_stamps,
+            track.keyframe_poses, self._map_to_odom_now(), loops.rows, loops.stamps,
             live.optimised, live.robust, live.looks.view(), live.all_judged, live.judged,
             live.stale, live.front.views if live.front else ())
 
@@ -118,7 +120,7 @@ class Upkeep:
             return manifold.identity(1)
         # Asked for with every sample: worked out when an update or a new offset changes it.
         if self._map_to_odom is None or self._map_to_odom[0] is not offset:
-            odometry = self._builder.odometry[last : last + 1]
+            odometry = self._builder.track.keyframe_poses[last : last + 1]
             to_kept = manifold.compose(pose, manifold.inverse(odometry))
             self._map_to_odom = offset, manifold.compose(to_kept, offset)
         return self._map_to_odom[1]
