@@ -24,8 +24,8 @@ A place
     neighbours hardly ever agree. Votes of several places count, each by itself
     (`pairwise_consistency`).
 A slip
-    is an odometry factor that says anything, while the robot moved on as ever (`motion`); of all of
-    them one is expected to be. A gap, or the seam of two sessions, is one whose place is known. The
+    is an odometry factor that says anything, while the robot moved on as ever (`motion`); of all
+    one is expected to be. A gap, or the seam of two sessions, is one whose place is known. The
     sides of it are right in themselves, so the true loops across agree with each other. A slip is
     one explanation of loops that do not fit, lies are the other: `slips` compares their odds, with
     half a gate for each place that one of them calls a lie.
