@@ -102,7 +102,7 @@ def test_orders_are_carried_out_in_the_order_they_came(bench):
     assert all(order.result().success for order in orders)
 
 
-def patient(problem, options, budget, check):
+def patient(problem, options, budget, check, accuracy):
     """Stand for an update of a huge map: it ends when it is told to."""
     while True:
         check()

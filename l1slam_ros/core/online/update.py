@@ -15,6 +15,7 @@ import numpy as np
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.l1_problem import GraphProblem
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.incremental.front import Front, Gate
@@ -22,6 +23,7 @@ from l1slam_ros.core.online.snapshot import Optimised, Problem
 from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
+from l1slam_ros.core.solvers.interior_point import interior_point, prove
 from l1slam_ros.core.solvers.nonlinear import (
     OptimiserOptions,
     Solution,
@@ -41,6 +43,18 @@ _FALLS = 1e-3
 
 # Called on the way, often; raises where the work shall stop.
 Check = Callable[[], None]
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How near the optimum to come, see `interior_point`; whether to prove how near that is."""
+
+    tolerance: float
+    proved: bool
+
+
+# The last digits, and less than a tenth of a percent above the optimum.
+EXACT, ROUGH, ROUGH_PROVED = Accuracy(3e-5, True), Accuracy(1e-2, False), Accuracy(1e-2, True)
 
 
 @dataclass(frozen=True)
@@ -85,37 +99,30 @@ class Improvement:
 
     @property
     def falls(self) -> bool:
-        """Whether another round at once is worth it."""
-        return (self.status not in (Status.CONVERGED, Status.STALLED)
+        """Whether another round at once is worth it: iterations ended on the way down."""
+        return (self.inner_iterations > 0
+                and self.status not in (Status.CONVERGED, Status.STALLED)
                 and self.cost_before - self.cost > _FALLS * self.cost)
 
 
 def improve(problem: Problem, options: OptimiserOptions, budget: float,
-            check: Check = lambda: None) -> Improvement:
+            check: Check = lambda: None, accuracy: Accuracy | None = None) -> Improvement:
     """
     Lower the L1 cost of what is believed of a snapshot, for about `budget` seconds.
 
-    With an infinite budget to the optimum that the poses lead to, where there is a factor for it.
-    Where no front has, and the cost is far above what the last map left (a loop has closed),
-    reweighted least squares steps carry the long-range part: one factorisation bends the whole
-    chain, where a first-order method moves it a few keyframes per iteration. Then, always,
+    accuracy : how near to the optimum to come instead, by factorisations, if there are any
+
+    Without: where no front has, and the cost is far above what the last map left (a loop has
+    closed), reweighted least squares steps carry the long-range part: one factorisation bends the
+    whole chain, where a first-order method moves it a few keyframes per iteration. Then, always,
     Algorithm 4 from the kept dual.
     """
     start = time.monotonic()
-    deadline = start + budget
-    graph = problem.part
-    if budget == np.inf and problem.is_sparse:
-        before = l1_cost(whitened_residual(graph, problem.poses))
-        solution = minimise_by(problem.method, graph, problem.poses, options,
-                               lambda *_: check())[0]
+    graph, deadline = problem.part, start + budget
+    poses, before, cost = _nearest(problem)
+    if accuracy and problem.is_sparse:
+        solution = _follow(problem, poses, options, accuracy, check)
         return _improvement(solution, problem, problem.judgement, before, 0, start)
-    starts = problem.starts
-    if graph.between.is_absolute.any():
-        # The map may not have come to the world yet.
-        starts = [*starts, placed(graph, problem.poses)]
-    costs = [l1_cost(whitened_residual(graph, poses)) for poses in starts]
-    before, cost = costs[0], min(costs)
-    poses = starts[costs.index(cost)]
     dual = _dual_of(problem, poses)
     steps, far = 0, problem.may_be_far and is_far(cost, problem.last_cost)
     cholesky = problem.method.cholesky if far else None
@@ -129,6 +136,34 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
         far = is_far(previous, cost)
     solution = minimise(graph, poses, options, cholesky, dual, deadline, lambda *_: check())
     return _improvement(solution, problem, problem.judgement, before, steps, start)
+
+
+def _follow(problem: Problem, poses: Array, options: OptimiserOptions, accuracy: Accuracy,
+            check: Check) -> Solution:
+    """Return the optimum that poses lead to, by some ten or twenty factorisations."""
+    graph, method = problem.part, problem.method
+    assert method.cholesky is not None, 'a graph that is sparse'
+    optimum = interior_point(GraphProblem(graph), poses, method.cholesky,
+                             options.outer_iterations, accuracy.tolerance, lambda *_: check())
+    if optimum.status is not Status.CONVERGED:
+        return minimise_by(method, graph, poses, options, lambda *_: check())[0]
+    dual, gap, status = optimum.ends[-1].y, np.inf, Status.OUT_OF_TIME
+    if accuracy.proved:
+        dual, gap, status = prove(optimum, method.cholesky)
+    if gap > EXACT.tolerance * optimum.costs[-1] and accuracy is not EXACT:
+        status = Status.OUT_OF_TIME
+    return Solution(optimum.poses, optimum.costs[-1], status, len(optimum.costs) - 1, 0,
+                    np.array(optimum.costs), dual, gap)
+
+
+def _nearest(problem: Problem) -> tuple[Array, float, float]:
+    """Return the best poses to start from, the cost where the map is, and theirs."""
+    graph, starts = problem.part, problem.starts
+    if graph.between.is_absolute.any():
+        # The map may not have come to the world yet.
+        starts = [*starts, placed(graph, problem.poses)]
+    costs = [l1_cost(whitened_residual(graph, poses)) for poses in starts]
+    return starts[costs.index(min(costs))], costs[0], min(costs)
 
 
 def _dual_of(problem: Problem, poses: Array) -> Array:

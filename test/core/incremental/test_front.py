@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from lies import careful_world, is_false, spoilt
 from numpy.testing import assert_allclose
-from problems import play
+from problems import covariance6, odometry, play
 
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
-from l1slam_ros.core.online.update import improve
+from l1slam_ros.core.online.update import EXACT, improve
 from l1slam_ros.core.solvers.optimality import l1_cost
 
 EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
@@ -43,7 +43,7 @@ def test_without_a_worker_the_map_stays_near_the_optimum_and_knows_how_sure_it_i
     assert (now.loop_states().state == ACCEPTED).mean() > 0.98
     problem = now.problem()
     cost = l1_cost(whitened_residual(problem.part, now.poses))
-    assert cost < 1.1 * improve(problem, EVERY.solver, np.inf).cost
+    assert cost < 1.1 * improve(problem, EVERY.solver, 1.0, accuracy=EXACT).cost
     # The covariance of any keyframe is that of all factors at once, as they were linearised.
     kinds = (~problem.graph.between.is_odometry)[problem.judgement.accepted].astype(int)
     system = linearise(problem.part, now.views[1].first)
@@ -89,3 +89,18 @@ def test_a_front_that_fails_is_closed_and_moves_nothing(world, monkeypatch):
     assert_allclose(backend.poses[:KNOWN], before, atol=1e-12)
     # Keyframes to come follow the odometry.
     assert len(backend.poses) == KNOWN + 5 and np.isfinite(backend.poses).all()
+
+
+def test_what_no_odometry_ties_to_the_map_is_for_the_next_one():
+    backend = Backend(EVERY)
+
+    def drive(count):
+        for k in range(count):
+            backend.add_odometry(odometry(k + 1.0, (k, 0.0, 0.0), covariance6(1e-4 * np.eye(3))))
+
+    drive(5)
+    backend.settle()
+    backend._begin_due = lambda *_: False
+    drive(4)  # the clock is set back: a part of its own begins
+    assert backend.update(10.0) is not None and backend._live.front.closed
+    assert len(backend.poses) == 9 and np.isfinite(backend.poses).all()

@@ -28,8 +28,8 @@ _MANY_ROWS = 90
 AT_ONCE = 16
 # [s] While loops come none of which fits, they are judged so often.
 _JUDGE_EVERY = 2.0
-# [s] What the exact map of a sparse graph takes a keyframe, before that was measured.
-_OPTIMUM = 6e-5
+# [s] What a round by factorisations takes a keyframe, before that was measured.
+_ROUND = 2e-5
 
 
 class LiveMap:
@@ -52,7 +52,8 @@ class LiveMap:
     stale : the map is not of the factors that are accepted
     last : the last improvement, None: there was none
     newest : the last keyframe of the map, and its pose (1, p)
-    round_took, judge_took : processor time [s] of the last exact map, time of the last judgement
+    round_took, judge_took : processor time [s] of the last round by
+        factorisations, time of the last judgement
 
     """
 
@@ -64,8 +65,8 @@ class LiveMap:
         self.stale = False
         self.last: Improvement | None = None
         self.newest: tuple[int, Array]
-        self.judge_took = self._judge_at = 0.0
-        self.round_took = _OPTIMUM * builder.graph.n_poses
+        self.judge_took = self._judge_at = self.proved_at = 0.0
+        self.round_took = _ROUND * builder.graph.n_poses
         # The factors that the map is of, the loops that were judged, and whether one that the
         # front left may be true.
         self._used, self._fits = np.zeros(0, bool), False
@@ -162,6 +163,8 @@ class LiveMap:
         """
         self.optimised = improvement.taken_over(self.optimised, tolerance)
         judgement = improvement.judgement
+        if improvement.gap < np.inf:
+            self.proved_at = time.monotonic()
         self.front, self.last, self._used = front, improvement, judgement.accepted
         # What the front begins with, no other may have looked at.
         first = len(self.optimised.judgement.accepted) + len(self.looks)

@@ -28,7 +28,16 @@ from l1slam_ros.core.incremental.front import Front
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
-from l1slam_ros.core.online.update import Improvement, front_of, improve, optimise
+from l1slam_ros.core.online.update import (
+    EXACT,
+    ROUGH,
+    ROUGH_PROVED,
+    Accuracy,
+    Improvement,
+    front_of,
+    improve,
+    optimise,
+)
 from l1slam_ros.core.online.upkeep.live_map import AT_ONCE, LiveMap
 from l1slam_ros.core.online.upkeep.threads import Worker
 from l1slam_ros.core.robust.batch import judge
@@ -40,6 +49,10 @@ Stopped = Callable[[], bool]
 _LEAST_TIME, _LEAST_ROUND = 0.02, 0.1
 # Linearisations of one round: more and it is late. Of the clock it may take some times as long.
 _OUTER, _PATIENCE = 2, 4
+# [s] of processor time, the most that a round by factorisations takes.
+_LONGEST_ROUND = 0.5
+# [s] How often it is proved how far the optimum is, at most.
+_PROVE_EVERY = 1.0
 # So often a new front takes what came meanwhile, before it is one.
 _PASSES = 3
 # [s] How often who waits looks whether to stop.
@@ -213,16 +226,20 @@ class Upkeep:
         whole = now.problem()
         problem = as_one(whole)
         check()
-        round_ = max(budget, _LEAST_ROUND)
         # For the first front of a map that was loaded nobody shall wait long.
-        thorough = idle and live.front is not None
-        if problem.is_sparse and (thorough or live.round_took < round_):
-            improvement = improve(problem, solver, np.inf, check)
-            live.round_took = time.thread_time() - start
-        else:
-            outer = min(solver.outer_iterations, _OUTER)
-            improvement = improve(problem, replace(solver, outer_iterations=outer),
-                                  _PATIENCE * round_, check)
+        accuracy: Accuracy | None = EXACT
+        rough = not idle or live.front is None
+        if rough:
+            due = time.monotonic() > live.proved_at + _PROVE_EVERY
+            accuracy = ROUGH_PROVED if due else ROUGH
+            if live.round_took > _LONGEST_ROUND or not problem.is_sparse:
+                accuracy = None
+                solver = replace(solver, outer_iterations=min(solver.outer_iterations, _OUTER))
+        improvement = improve(problem, solver, _PATIENCE * max(budget, _LEAST_ROUND), check,
+                              accuracy)
+        if accuracy:
+            # To the last digits it takes some twice as many steps.
+            live.round_took = (time.thread_time() - start) / (1 if rough else 2)
         check()
         front = front_of(problem, improvement.poses, len(whole.graph.between), check)
         for _ in range(_PASSES):
