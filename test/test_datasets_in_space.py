@@ -3,17 +3,21 @@
 
 from functools import cache
 
+import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from l1slam_ros.core.graph.linear_system import whitened_residual
-from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.graph.spanning_tree import odometry_poses, pair_key
 from l1slam_ros.core.names import ANGLE, QUATERNION
+from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.exact import minimise_interior_point
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
 from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.io.graphs.graph_file import read_graph_file
 
 SPHERE, GARAGE, GRID = 'sphere2500', 'parking-garage', 'real/smallGrid3D'
@@ -47,3 +51,20 @@ def test_l1_optima(datasets, name, best, rotations):
         solution = minimise_interior_point(record.graph, start, OptimiserOptions(), cholesky)
         assert solution.status is Status.CONVERGED and solution.gap < 2e-3 * solution.cost
         assert solution.cost < best
+
+
+@pytest.mark.parametrize(('kind', 'count', 'seed'), [
+    ('random', 2450, 0), ('grouped', 272, (1, 56, 10))])
+def test_a_sphere_is_alike_everywhere_and_lies_do_not_agree_by_it(datasets, kind, count, seed):
+    """Half of all loops, or runs that agree: none is kept, no true one lost, nothing doubted."""
+    graph = loaded(datasets, SPHERE)[0].graph
+    best = minimise_l2(graph, loaded(datasets, SPHERE)[2], LeastSquaresOptions(),
+                       cholesky_of(graph)).poses
+    lies = FALSE_LOOPS[kind](graph, best, count, np.random.default_rng(seed))
+    spoiled = insert_loops(graph, lies)
+    judgement, _ = robust_solve(spoiled)
+    n = graph.n_poses
+    is_false = np.isin(pair_key(spoiled.between.i, spoiled.between.j, n),
+                       pair_key(lies.i, lies.j, n))
+    assert is_false.sum() == count and judgement.doubts == ()
+    assert_array_equal(judgement.accepted, ~is_false)

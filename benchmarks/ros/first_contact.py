@@ -5,7 +5,8 @@ What the node costs when it has nothing to do, and how soon it answers when it h
     python benchmarks/ros/first_contact.py GRAPH [POSES EDGES]
 
 A saved map of GRAPH is loaded and settles: processor's time then, in % of a core, without
-odometry and with that of a robot that stands; the same after 20,000 loops have expired. Then a
+odometry and with that of a robot that stands, at 50 Hz; the same after 20,000 loops have expired,
+and what a bare rclpy node takes that answers each message with an empty pose. Then a
 simulated world (50,000 poses, 80,000 edges) is loaded, services are called while it is judged, and
 SIGTERM ends the node amid an update. The node is a process, run as shipped.
 """
@@ -29,7 +30,7 @@ os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
@@ -47,7 +48,7 @@ _PATIENCE = 900.0  # [s]
 _QUIET = 10.0  # [s] without an update: the map has settled
 _WATCHED = 15.0  # [s] over which processor's time is taken
 _PACE = 1e-3  # [s] from loop to loop
-_STANDING = 0.05  # [s] from odometry to odometry
+_STANDING = 0.02  # [s] from odometry to odometry
 _WAIT = 11  # [s] longer than loops wait
 # [s] after the last moment, which begins with the load
 _MOMENTS = (0.0, 1.0, 4.0, 15.0, 30.0)
@@ -128,6 +129,9 @@ def running(path: Path) -> Iterator[Running]:
 
 def main() -> None:
     """Measure, and print."""
+    if sys.argv[1:] == ['bare']:
+        _answer()
+        return
     graph = Path(sys.argv[1])
     poses, edges = map(int, sys.argv[2:4]) if len(sys.argv) > 2 else (POSES, EDGES)
     rclpy.init()
@@ -137,6 +141,7 @@ def main() -> None:
         write_graph_file(path, replace(record, stamps=_stamps(len(record.ids))))
         with running(path) as backend:
             _at_rest(backend, len(record.ids))
+        _bare()
         world = simulate_world(poses, edges, WorldOptions(), np.random.default_rng(0))
         write_graph_file(
             path, GraphRecord(world.graph, world.odometry, np.arange(poses), _stamps(poses)))
@@ -185,6 +190,37 @@ def _at_rest(backend: Running, count: int) -> None:
     backend.until(lambda: int(backend.said['expired_loops']) == LOOPS)
     _settle(backend)
     measured(f'{LOOPS} loops expired')
+
+
+def _bare() -> None:
+    """Print the processor's time of a node that answers odometry, and does nothing else."""
+    process = subprocess.Popen([sys.executable, __file__, 'bare'])
+    node = rclpy.create_node('robot')
+    try:
+        publisher = node.create_publisher(Odometry, 'odom', QoSProfile(depth=1000))
+        while not publisher.get_subscription_count():
+            time.sleep(_STANDING)
+        time.sleep(1.0)
+        cpu, began, count = cpu_seconds(process.pid), time.monotonic(), 0
+        while (spent := time.monotonic() - began) < _WATCHED:
+            publisher.publish(Odometry(header=header('odom', 1 + count)))
+            count += 1
+            time.sleep(max(count * _STANDING - spent, 0.0))
+        busy = (cpu_seconds(process.pid) - cpu) / spent * 100
+        print(f'{"a bare node":28}{"":20}{busy:7.2f} % with odometry', flush=True)
+    finally:
+        process.kill()
+        process.wait()
+        node.destroy_node()
+
+
+def _answer() -> None:
+    rclpy.init()
+    node = rclpy.create_node('bare')
+    publisher, pose = node.create_publisher(PoseStamped, 'pose', 10), PoseStamped()
+    node.create_subscription(Odometry, 'odom', lambda _: publisher.publish(pose),
+                             QoSProfile(depth=1000))
+    rclpy.spin(node)
 
 
 def _settle(backend: Running) -> None:

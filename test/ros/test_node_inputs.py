@@ -9,7 +9,9 @@ import pytest
 pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
 from problems import seconds
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from test_node import Bench, header, odometry, poses_of
 
 NS = 10**9
@@ -64,3 +66,27 @@ def test_strays_do_not_stop_the_map(bench, capfd):
                  'odometry 5e+08 m from one message to the next',
                  'a loop from 11000000000 ns to 18000000000 ns was sent before'):
         bench.until(lambda part=part: is_told(part), f'it is told: {part}')
+
+
+def test_a_publisher_that_nobody_can_hear_is_told_of(bench, capfd):
+    """Who waits for messages in another thread than rclpy's own has to look for that."""
+    bench.peer.create_publisher(Odometry, 'odom', QoSProfile(
+        depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    told = ''
+
+    def is_told():
+        nonlocal told
+        told += capfd.readouterr().err
+        return "[backend]: New publisher discovered on topic 'odom', offering incompat" in told
+
+    bench.until(is_told, 'it is a warning')
+
+
+def test_no_executor_is_woken_by_a_message(bench):
+    """Each time it would make its wait set anew, ten times the work of a message."""
+    bench.until(lambda: bench.received['/diagnostics'], 'the node is up')
+    took = [one for one in (*bench.backend.subscriptions, *(
+        event for one in bench.backend.subscriptions for event in one.event_handlers))
+        if bench.executor.can_execute(one)]
+    assert {one.topic_name for one in took if hasattr(one, 'topic_name')} <= {
+        '/clock', '/parameter_events'} and all(hasattr(one, 'topic_name') for one in took)

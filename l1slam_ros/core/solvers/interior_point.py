@@ -22,6 +22,7 @@ Source: Mehrotra (1992) for the predictor and corrector; the rest is ours, defen
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -198,11 +199,19 @@ def interior_point(
     return Optimum(best.poses, costs, status, ends)
 
 
-def prove(optimum: Optimum, cholesky: BlockCholesky) -> tuple[Array, float, Status]:
-    """
-    Return a dual y (rows,) with A'y = 0, |y| <= 1, what it proves, and the status in its light.
+class Proof(NamedTuple):
+    """A dual y (rows,) with A'y = 0, |y| <= 1, what it proves, and the status in its light."""
 
-    No step of the linear problem at the poses can lower their cost by more than the second number,
+    dual: Array
+    gap: float
+    status: Status
+
+
+def prove(optimum: Optimum, cholesky: BlockCholesky) -> Proof:
+    """
+    Return what is known of an optimum.
+
+    No step of the linear problem at the poses can lower their cost by more than the gap,
     |b|_1 + b'y. A run that came to rest where one might lower it by a percent has not converged.
     """
     cost = optimum.costs[-1]
@@ -211,7 +220,7 @@ def prove(optimum: Optimum, cholesky: BlockCholesky) -> tuple[Array, float, Stat
     y, gap = min(proofs, key=lambda proof: proof[1])
     unproven = gap > _PROVEN * cost and not fits_exactly(cost, len(y))
     stalls = unproven and optimum.status is Status.CONVERGED
-    return y, gap, Status.STALLED if stalls else optimum.status
+    return Proof(y, gap, Status.STALLED if stalls else optimum.status)
 
 
 def feasible_dual(system: LinearSystem, y: Array, slack: Array, norm: Norm,

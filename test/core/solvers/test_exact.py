@@ -17,6 +17,7 @@ from l1slam_ros.core.solvers.optimality import Status, l1_cost
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.worlds.false_loops import random_false_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
+from l1slam_ros.io.graphs.graph_file import read_graph_file
 
 DEFAULTS = OptimiserOptions()
 
@@ -46,6 +47,14 @@ def test_it_agrees_with_algorithm_4_and_is_optimal_by_its_dual(world):
     assert np.abs(system.A.T @ solution.dual).max() < 1e-9 * np.abs(system.A).sum(axis=0).max()
     assert solution.dual @ -system.b == pytest.approx(solution.cost, rel=1e-3)
     assert 0 <= solution.gap == pytest.approx(solution.cost - solution.dual @ -system.b)
+
+
+def test_a_long_way_with_few_loops_is_solved_to_its_end(datasets):
+    """One run of it ends 3 above, where it can prove no more than 18."""
+    graph = read_graph_file(datasets / 'real' / 'kitti_00.g2o').graph
+    solution = solve(graph, odometry_poses(graph))
+    assert solution.status is Status.CONVERGED
+    assert solution.cost < 489.2 and solution.gap < 1
 
 
 def test_no_small_step_is_better_by_highs(world):
