@@ -21,7 +21,6 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.core.online.marginal import newest_covariance
 from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.graphs.map_file import MapFile
 from l1slam_ros.io.node_options import NodeOptions
@@ -219,9 +218,9 @@ class BackendNode(LifecycleNode):
         self._path.publish(path_bytes(frame, stamp, now.stamps, pose3))
         self._loop_status.publish(loops)
         self._markers.publish(frame, stamp, now)
-        # It takes a factorisation: not unless somebody listens.
         if self._covariance.get_subscription_count() and len(poses):
-            covariance = newest_covariance(now)
+            covariance = self._backend.marginal_covariance(len(poses) - 1)
+            # None: a later map knows it, if any.
             if covariance is not None:
                 self._covariance.publish(pose_with_covariance(
                     frame, int(now.stamps[-1]), self._manifold, poses[-1:], covariance))

@@ -9,14 +9,12 @@ pytest.importorskip('rclpy')
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from node_bench import odometry
 from rclpy.serialization import deserialize_message
+from systems import dense_covariance
 from test_node import EVERY_MESSAGE, play
 from visualization_msgs.msg import Marker, MarkerArray
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.linear_system import linearise
-from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED
-from l1slam_ros.core.online.marginal import newest_covariance
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bags.from_graph import write_graph_bag
 from l1slam_ros.io.graphs.graph_file import GraphRecord
@@ -54,13 +52,15 @@ def test_the_graph_is_drawn_for_who_looks_also_for_who_comes_late(bench, tmp_pat
     early = Drawing(b)
     play(b, tmp_path / 'bag')
 
-    def all_are_drawn(drawing):
+    def all_are_drawn(drawing, believed=0):
         points = drawing.sizes()
+        if points.get('loops', 0) < 2 * believed:
+            return False
         loops = [points.pop(name, 0) for name in ('loops', 'suspect_loops', 'rejected_loops')]
         return points == {'keyframes': 40, 'odometry': 2 * 39} and sum(loops) == 2 * 21
 
-    b.until(lambda: all_are_drawn(early), 'keyframes and both ends of each factor are drawn')
-    assert early.sizes()['loops'] > 2 * 14
+    b.until(lambda: all_are_drawn(early, believed=15),
+            'keyframes and both ends of each factor are drawn, most loops as believed')
     late = Drawing(b)
     b.until(lambda: all_are_drawn(late), 'who comes late sees all of it')
     assert late.heard == 1
@@ -92,13 +92,6 @@ def test_markers_are_what_their_bytes_say(frame, rng):
         assert not marker.text and not marker.mesh_resource and not marker.texture.data
 
 
-def dense(now):
-    """Return the covariance of the newest keyframe by a dense inverse."""
-    graph = now.graph.subset(now.optimised.judgement.accepted)
-    A = linearise(graph, now.poses).A.toarray()
-    return np.linalg.inv(A.T @ A)[-3:, -3:]
-
-
 def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path, rng):
     world = simulate_world(60, 130, WorldOptions(), rng)
     write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(60)))
@@ -110,7 +103,8 @@ def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path, rng):
     b.until(lambda: heard and heard[-1].header.stamp == b.path().poses[-1].header.stamp
             and b.backend._backend.update(0.0) is None, 'the map is done')
     now = b.backend._backend.snapshot()
-    expected = pose_with_covariance('map', int(now.stamps[-1]), se2, now.poses[-1:], dense(now))
+    dense = dense_covariance(now)[-1, :, -1]
+    expected = pose_with_covariance('map', int(now.stamps[-1]), se2, now.poses[-1:], dense)
 
     def agrees():
         return np.allclose(heard[-1].pose.covariance, expected.pose.covariance, rtol=1e-6)
@@ -118,22 +112,10 @@ def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path, rng):
     b.until(agrees, 'the covariance of the newest keyframe')
     whole = np.reshape(heard[-1].pose.covariance, (6, 6))
     R = se2.adjoint(now.poses[-1:])[0, :2, :2]
-    np.testing.assert_allclose(whole[:2, :2], R @ dense(now)[:2, :2] @ R.T, rtol=1e-6)
-    assert whole[5, 5] == pytest.approx(dense(now)[2, 2], rel=1e-6) and not whole[2:5].any()
+    np.testing.assert_allclose(whole[:2, :2], R @ dense[:2, :2] @ R.T, rtol=1e-6,
+                               atol=1e-8)
+    assert whole[5, 5] == pytest.approx(dense[2, 2], rel=1e-6) and not whole[2:5].any()
     assert heard[-1].header.frame_id == 'map'
-
-
-def test_of_a_part_that_nothing_joins_hardly_anything_is_known():
-    backend = Backend(BackendOptions())
-    assert newest_covariance(backend.snapshot()) is not None
-    from problems import odometry as sample
-    for k in range(10):
-        backend.add_odometry(sample(100.0 + k, (float(k), 0.0, 0.0)))
-    known = newest_covariance(backend.snapshot())
-    for k in range(3):
-        backend.add_odometry(sample(50.0 + k, (float(k), 0.0, 0.0)))
-    unknown = newest_covariance(backend.snapshot())
-    assert 0 < known[0, 0] < 0.1 and unknown[0, 0] > 50 and unknown[2, 2] > 0.9
 
 
 def test_a_person_strikes_a_loop_out_and_vouches_for_it_after_all(bench):

@@ -3,16 +3,21 @@
 
 import numpy as np
 import pytest
+from gps import seen
 from lies import careful_world, is_false, spoilt
 from numpy.testing import assert_allclose
 from problems import covariance6, odometry, play
+from systems import dense_covariance
 
-from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
+from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
+from l1slam_ros.core.online.snapshot import Growth, Optimised, SavedMap
 from l1slam_ros.core.online.update import EXACT, improve
 from l1slam_ros.core.solvers.optimality import l1_cost
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 N, KNOWN, LAST = 180, 140, 150
@@ -45,17 +50,52 @@ def test_without_a_worker_the_map_stays_near_the_optimum_and_knows_how_sure_it_i
     cost = l1_cost(whitened_residual(problem.part, now.poses))
     assert cost < 1.1 * improve(problem, EVERY.solver, 1.0, accuracy=EXACT).cost
     # The covariance of any keyframe is that of all factors at once, as they were linearised.
-    kinds = (~problem.graph.between.is_odometry)[problem.judgement.accepted].astype(int)
-    system = linearise(problem.part, now.views[1].first)
-    weights = np.repeat(1 / problem.judgement.variance[kinds], 3)
-    A = system.A.toarray()
-    whole = np.linalg.inv(A.T @ (weights[:, None] * A))
+    whole = dense_covariance(now)
     for keyframe in (1, 60, KNOWN - 1, KNOWN, LAST - 1):
-        own = slice(3 * keyframe - 3, 3 * keyframe)
-        assert_allclose(backend.marginal_covariance(keyframe), whole[own, own], rtol=1e-4,
-                        atol=1e-9)
+        assert_allclose(backend.marginal_covariance(keyframe),
+                        whole[keyframe - 1, :, keyframe - 1], rtol=1e-4, atol=1e-9)
     assert_allclose(backend.marginal_covariance(0), 0)
     assert backend.marginal_covariance(LAST) is None is Backend(EVERY).marginal_covariance(0)
+
+
+def in_space():
+    return simulate_world(60, 130, WorldOptions(), np.random.default_rng(2), 'building').graph
+
+
+def seen_from_above():
+    made = simulate_world(60, 90, WorldOptions(), np.random.default_rng(2))
+    return seen(made.graph, made.truth, 5, np.random.default_rng(3), sigma=0.3).graph
+
+
+@pytest.mark.parametrize(('graph_of', 'fixed'), [(in_space, 1), (seen_from_above, 0)])
+def test_how_sure_it_is_in_space_and_in_the_world(graph_of, fixed):
+    graph = graph_of()
+    poses = odometry_poses(graph)
+    growth = Growth.of_graph(graph, poses, np.arange(60) * 10**9)
+    backend = Backend(EVERY, len(graph.manifold.positions(poses)[0]))
+    backend.restore(SavedMap(growth, Optimised.nothing(poses), True))
+    assert backend.marginal_covariance(59) is None
+    backend.settle()
+    whole = dense_covariance(backend.snapshot())
+    assert len(whole) == 60 - fixed
+    for keyframe in (1, 30, 59):
+        own = keyframe - fixed
+        assert_allclose(backend.marginal_covariance(keyframe), whole[own, :, own], rtol=1e-6,
+                        atol=1e-9)
+
+
+def test_of_a_part_that_nothing_joins_hardly_anything_is_known():
+    backend = Backend(EVERY)
+
+    def drive(first, count):
+        for k in range(count):
+            backend.add_odometry(odometry(first + k, (k, 0.0, 0.0),
+                                          covariance6(1e-4 * np.eye(3))))
+        backend.settle()
+        return backend.marginal_covariance(len(backend.poses) - 1)
+
+    known, unknown = drive(100.0, 10), drive(50.0, 3)
+    assert 0 < known[0, 0] < 0.1 and unknown[0, 0] > 50 and unknown[2, 2] > 0.9
 
 
 @pytest.mark.parametrize('kind', ['random', 'identity', 'grouped'])

@@ -319,16 +319,16 @@ class Upkeep:
 
     def marginal_covariance(self, keyframe: int) -> Array | None:
         """
-        Return the covariance of a keyframe's step, (k, k), relative to what is held fixed.
+        Return the covariance of a keyframe in its own axes, (d, d).
 
-        Exact for the least squares map of what is accepted, with the noise as it was found. None:
-        the keyframe is not in a factored map yet.
+        Exact for the least squares map of what is accepted, the noise as it was found: relative
+        to the first keyframe, or to the world if absolute poses are believed. None: no factored
+        map has the keyframe, or it is too dense to be factored.
         """
         with self._lock:
             front = self._live.front
-            if front is None or not 0 <= keyframe < front.keyframes:
-                return None
-            return front.covariance(keyframe)
+            known = front is not None and 0 <= keyframe < front.keyframes
+            return front.covariance(keyframe) if front and known else None
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
