@@ -103,7 +103,8 @@ class Background:
     def _updated(self, idle: bool) -> bool:
         """Tell whether more may be to do later."""
         try:
-            return self._update(idle, lambda: self._closing) is not None
+            # What found nothing to do may only have had to wait until nothing comes.
+            return self._update(idle, lambda: self._closing) is not None or not idle
         except Interrupted:
             # By what wakes this thread when it is done.
             return False
