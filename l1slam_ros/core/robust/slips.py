@@ -100,10 +100,15 @@ def without_slip(growth: Growth, left_out: Indices) -> Growth | None:
 
 def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:
     """Return the odometry factors that may have slipped: two by their odds, two by groups."""
-    order, rows = np.argsort(-odds, kind='stable')[:_TRIED], growth.undecided()
+    tell = growth.accepted & growth.is_loop
+    tell[left_out] = True
+    across = spanned(growth.low[tell], growth.high[tell], growth.graph.n_poses)
+    # Where no loop can tell, an unusual motion is no more than that.
+    told = np.where(across[growth.low] > 0, odds, -np.inf)
+    order, rows = np.argsort(-told, kind='stable')[:_TRIED], growth.undecided()
     # Where loops are left out, one more place may be won.
     least = max(SURE, _place(growth)) if len(left_out) else SURE
-    suspects = order[odds[order] > -least].tolist()
+    suspects = order[told[order] > -least].tolist()
     for _ in range(_TRIED if len(left_out) else 0):
         group = strongest_group(growth, rows)
         if len(group.places) < SPANNING:

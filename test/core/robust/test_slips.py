@@ -9,6 +9,7 @@ from test_pairwise_consistency import STEP, grown, moved, slipped
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.motion import log_odds_of_slips, usual_motion
 from l1slam_ros.core.robust.slips import SURE, without_slip
 
@@ -57,6 +58,16 @@ def test_where_the_odometry_jumped_it_slipped(bad):
     odds = log_odds_of_slips(growth, usual_motion(growth))
     assert growth.low[np.argmax(odds)] == STEP and odds.max() > 0
     assert np.sort(odds)[-2] < -SURE
+
+
+def test_where_no_loop_can_tell_an_unusual_motion_is_no_slip(bad):
+    """The robot goes on behind its last loop, in other steps than ever before."""
+    graph = bad.graph.copy()
+    last = graph.n_poses - 1 + np.arange(4)
+    graph.add_poses(4)
+    graph.add_between(last, last + 1, np.tile([[0.1, 0.0, 0.0]], (4, 1)),
+                      np.tile(np.diag([1e4, 1e4, 1e4]), (4, 1, 1)))
+    assert robust_solve(graph)[0].doubts == ()
 
 
 def test_a_robot_does_not_jump_because_lies_say_so(bad):
