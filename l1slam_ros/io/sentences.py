@@ -8,6 +8,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.robust.judgement import (
     MOSTLY_REFUSED,
+    ONE_JOINS,
     ONE_PLACE,
     OTHER_MAP,
     SLIP,
@@ -40,6 +41,8 @@ _REASONS = {
     MOSTLY_REFUSED: '{loops} loops, most of all, are refused or suspect, {where}: either they are '
                     'false, or the odometry is worse than it says',
     ONE_PLACE: 'all {loops} loops that are used are of one place, {where}, and may be one mistake',
+    ONE_JOINS: 'of how two parts lie to each other only loops of one place agree ({loops}, '
+               '{where}), and they may be one mistake',
     OTHER_MAP: '{loops} refused loops of several places agree with each other on another map, '
                '{where}',
     SLIP: 'whether the odometry slipped or not {where}, the {loops} loops across that are used '

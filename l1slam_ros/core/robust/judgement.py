@@ -7,21 +7,28 @@ reasons to doubt it, each with the keyframes where a person may look. What a per
 for a loop, strike one out, or state the noise as it is.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.robust.pairwise_consistency import ASKED, spanned, strongest_group
+from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, lowest_of_components
+from l1slam_ros.core.robust.pairwise_consistency import (
+    ASKED,
+    agreement,
+    spanned,
+    strongest_group,
+)
 from l1slam_ros.core.robust.rounds import Growth
 from l1slam_ros.core.robust.slips import SPANNING, SURE, common_steps, spanning
 
-# Most loops are refused; all that are accepted are of one place; refused loops of several places
-# agree on another map; an odometry factor may have slipped, and it was not believed.
-MOSTLY_REFUSED, ONE_PLACE, OTHER_MAP, SLIP = (
-    'mostly refused', 'one place', 'another map', 'a slip suspected')
+# Most loops are refused; all that are accepted are of one place; loops of one place alone say how
+# two parts lie to each other; refused loops of several places agree on another map; an odometry
+# factor may have slipped, and it was not believed.
+MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP = (
+    'mostly refused', 'one place', 'one place joins', 'another map', 'a slip suspected')
 
 # Of fewer loops most may well be refused, and be of one place; most are more than half by some.
 _HANDFUL, _MOST = 5, 0.55
@@ -138,6 +145,8 @@ def doubts(growth: Growth) -> tuple[Doubt, ...]:
         reasons.append(_doubt(growth, MOSTLY_REFUSED, left_out))
     if _carries_all(growth, accepted):
         reasons.append(_doubt(growth, ONE_PLACE, accepted))
+    if growth.cut.any():
+        reasons += [_doubt(growth, ONE_JOINS, rows) for rows in _joining_alone(growth)]
     reasons += _other_map(growth)
     reasons += [
         Doubt(SLIP, int(np.count_nonzero(growth.accepted & spanning(growth, step))),
@@ -154,6 +163,42 @@ def _carries_all(growth: Growth, accepted: Indices) -> bool:
     joined = np.ptp(growth.low[accepted]) + np.ptp(growth.high[accepted])
     return len(np.unique(growth.place[accepted])) == 1 and bool(
         joined < _SMALL * growth.graph.n_poses)
+
+
+def _joining_alone(growth: Growth) -> Iterator[Indices]:
+    """
+    Yield the loops of one place, accepted or not, that alone say how two parts lie to each other.
+
+    Parts are what is between two gaps, or slips that were cut.
+    """
+    sure = ~growth.is_loop | growth.trusted | growth.factors.is_absolute
+    part = component_labels(growth.graph.subset(growth.accepted & ~growth.cut & sure))
+    rows = np.flatnonzero(growth.accepted & ~sure & (part[growth.low] != part[growth.high]))
+    rows = np.concatenate((rows, _agree_at_a_place(growth)))
+    i, j = part[growth.low[rows]], part[growth.high[rows]]
+    _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
+    joins = growth.accepted[rows]
+    for number in np.argsort(-count, kind='stable'):
+        own = place == number
+        without, joined = (
+            len(np.unique(lowest_of_components(i[some], j[some], part.max() + 1)))
+            for some in (joins & ~own, joins | own))
+        if joined < without:
+            # Rivals that say it otherwise are of the same doubt.
+            joins |= own
+            yield rows[own]
+
+
+def _agree_at_a_place(growth: Growth) -> Indices:
+    """Return loops from part to part that are left out, and agree with one of their place."""
+    rows = growth.joining()
+    _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
+    rows = growth.some(rows[count[place] > 1], ASKED)
+    if len(rows) < 2:
+        return rows[:0]
+    one, other, _ = agreement(growth, rows)
+    agree: Indices = rows[np.unique(one[growth.place[rows[one]] == growth.place[rows[other]]])]
+    return agree
 
 
 def _other_map(growth: Growth) -> list[Doubt]:

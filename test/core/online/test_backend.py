@@ -364,6 +364,22 @@ def test_no_lie_is_believed_at_any_time(careful, clean_errors, kind):
     assert np.count_nonzero(whole != online) <= 0.01 * len(truths)
 
 
+def test_at_rest_all_is_judged_from_the_graph_alone(careful, clean_errors):
+    """While driving a slip is not looked for, and what was believed of it stays."""
+    step, turn = 150, np.array([[0.0, 0.0, 0.8]])
+    before, after = careful.odometry[:step + 1], careful.odometry[step + 1:]
+    pivot = before[-1:]
+    turned = se2.compose(np.broadcast_to(pivot, after.shape), se2.compose(
+        np.broadcast_to(turn, after.shape), se2.between(
+            np.broadcast_to(pivot, after.shape), after)))
+    world, backend = replace(careful, odometry=np.vstack((before, turned))), Backend(EVERY)
+    drive(world, backend, lambda backend: None)
+    settled(backend)
+    now = backend.snapshot()
+    assert now.graph.between.i[now.optimised.judgement.slips].tolist() == [step]
+    assert position_error(backend.poses, careful.truth) < 1.2 * clean_errors[-1] + 0.1
+
+
 def test_who_does_not_doubt_is_led_astray(careful, clean_errors):
     """The same lies, believed: what the tests above would not survive."""
     world = spoilt(careful, 'grouped', 130)

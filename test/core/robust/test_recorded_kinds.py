@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lies as place recognition makes them, misstated noise, sessions, and what is doubtful."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lies import careful_world, is_false, position_error, spoilt
@@ -9,10 +11,10 @@ from torn import shifted_runs
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.parts import odometry_gaps
-from l1slam_ros.core.robust.batch import robust_solve
+from l1slam_ros.core.robust.batch import judge, robust_solve
 from l1slam_ros.core.robust.batch_map import SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
-from l1slam_ros.core.robust.judgement import ONE_PLACE, OTHER_MAP
+from l1slam_ros.core.robust.judgement import ONE_JOINS, ONE_PLACE, OTHER_MAP, Doubt
 
 
 @pytest.fixture(scope='module')
@@ -67,6 +69,7 @@ def test_two_sessions_are_joined_by_loops_or_stay_two_parts(world, joined):
     outcome = solve_graph(graph, None, SolveOptions(norm='l2'))
     assert outcome.parts == (1 if joined else 2)
     assert not outcome.judgement.accepted[is_false(bad, graph.between)].any()
+    assert not outcome.judgement.doubts
     halves = (slice(0, n),) if joined else (slice(0, 200), slice(200, n))
     for half in halves:
         assert position_error(outcome.solution.poses[half], world.truth[half]) < 0.5
@@ -87,6 +90,27 @@ def test_one_place_that_carries_all_is_doubtful_and_a_few_loops_are_not():
     assert ONE_PLACE in [doubt.kind for doubt in found.doubts]
     few, _ = robust_solve(graph.subset(np.arange(len(k) + 3)))
     assert not few.doubts
+
+
+@pytest.mark.parametrize('believed', [False, True])
+@pytest.mark.parametrize('ends, doubted', [
+    ([(16, 204), (14, 205)], (2, 2)), ([(134, 204), (136, 204), (135, 205)], (3, 3)),
+    # Nothing agrees with a single one; two are of two places.
+    ([(16, 204)], (0, 1)), ([(16, 204), (61, 200)], (0, 0))])
+def test_one_place_that_alone_joins_two_parts_is_doubtful(world, ends, doubted, believed):
+    factors, seam = world.graph.between, 199
+    low, high = np.minimum(factors.i, factors.j), np.maximum(factors.i, factors.j)
+    keep = (low > seam) | (high <= seam)
+    for i, j in ends:
+        keep |= (low == i) & (high == j)
+    graph = world.graph.subset(keep)
+    found, poses = robust_solve(graph)
+    assert np.count_nonzero(~found.accepted) == len(ends)
+    if believed:
+        known = replace(found, accepted=np.ones(len(graph.between), bool))
+        found, _ = judge(graph, poses, known, np.inf)
+    count, (first, last) = doubted[believed], (min(ends)[0], max(j for _, j in ends))
+    assert found.doubts == (Doubt(ONE_JOINS, count, first, last),) * (count > 0)
 
 
 def test_half_a_map_that_says_it_is_elsewhere_is_doubtful():

@@ -7,10 +7,12 @@ keyframe is, what is accepted, and whether map or judgement are due. Its owner h
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -86,7 +88,8 @@ class LiveMap:
         self.stale = False
         self.last: Improvement | None = None
         self.newest: tuple[int, Array]
-        self.judge_took = self._judge_at = self.proved_at = self._factored_at = 0.0
+        self.judge_took = self._judge_began = self._judge_at = 0.0
+        self.proved_at = self._factored_at = 0.0
         # What the last proof says, and of which factors.
         self._bound, self._proved = np.nan, np.zeros(0, bool)
         self.round_took = _ROUND * builder.graph.n_poses
@@ -95,6 +98,7 @@ class LiveMap:
         self._used, self._fits = np.zeros(0, bool), False
         known = len(optimised.judgement.accepted)
         self._judged_loops = int(np.count_nonzero(builder.loops.rows < known))
+        self._judged_anew = self._judged_loops
         self.note_newest()
 
     @property
@@ -102,6 +106,16 @@ class LiveMap:
         """Whether no loop waits to be judged."""
         return not self.robust or (self.optimised.judgement.settled
                                    and self._judged_loops == len(self._builder.loops.rows))
+
+    @property
+    def all_judged_anew(self) -> bool:
+        """
+        Whether all loops were judged from the graph alone.
+
+        What was believed when little was known stays as long as it fits: at rest there is time to
+        ask whether it would be believed now.
+        """
+        return self.all_judged and (not self.robust or self._judged_anew == self._judged_loops)
 
     @property
     def accepted(self) -> Mask:
@@ -171,22 +185,44 @@ class LiveMap:
         """Return whether to judge all loops; budget : there is so much time for it now [s]."""
         soon = self._fits or self.front is None
         wait = self.judge_took if soon else max(_JUDGE_EVERY, 2 * self.judge_took)
-        in_time = idle or budget > self.judge_took
-        return not self.all_judged and (in_time or time.monotonic() > self._judge_at + wait)
+        if idle:
+            return not self.all_judged_anew
+        return not self.all_judged and (budget > self.judge_took
+                                        or time.monotonic() > self._judge_at + wait)
 
     def begin_judgement(self) -> int:
         """Expect a judgement of all loops there are; return how many."""
-        self._fits = False
+        self._fits, self._judge_began = False, time.monotonic()
         return len(self._builder.loops.rows)
 
-    def take_judgement(self, judgement: Judgement, poses: Array, loops: int) -> None:
-        """Take over what is accepted of the first factors, so many loops, and its L2 map."""
+    def until_more_comes(self, check: Callable[[], None]) -> Callable[[], None]:
+        """Return a check that raises `Interrupted`, too, once more has come than there is now."""
+        grown = self.growth()
+
+        def at_rest() -> None:
+            check()
+            if self.growth() != grown:
+                raise Interrupted
+
+        return at_rest
+
+    def take_judgement(self, judgement: Judgement, poses: Array, loops: int,
+                       anew: bool) -> None:
+        """
+        Take over what is accepted of the first factors, so many loops, and its L2 map.
+
+        anew : from the graph alone
+        """
         looks, before = self.looks.view(), len(self.optimised.judgement.accepted)
         self.looks = GrowingArray((3,))
         self.looks.extend(looks[len(judgement.accepted) - before:])
         self.optimised = replace(self.optimised, judgement=judgement)
         self._judged_loops, self.judged = loops, poses
         self._judge_at = time.monotonic()
+        if anew:
+            self._judged_anew = loops
+        else:
+            self.judge_took = self._judge_at - self._judge_began
         self._compare()
 
     def adopt(self, improvement: Improvement, front: Front | None, tolerance: float) -> None:

@@ -7,7 +7,7 @@ not grow with the map. Two workers go on behind it, each in a thread of its own,
 to the next:
 
     map     lowers the L1 cost of what is accepted, and factors it for the next front
-    judge   looks at all loops anew, and moves nothing
+    judge   looks at all loops again, at rest anew, and moves nothing
 
 One lock is held to append, to take a snapshot, to look at one factor and to adopt, never while
 solving, reading or writing a file. A second one lets one thread at a time update. What is worked
@@ -31,7 +31,7 @@ from l1slam_ros.core.online.snapshot import Optimised, Snapshot
 from l1slam_ros.core.online.update import Improvement, front_of, improve, optimise
 from l1slam_ros.core.online.upkeep.live_map import AT_ONCE, Behind, LiveMap
 from l1slam_ros.core.online.upkeep.threads import Worker
-from l1slam_ros.core.robust.batch import judge
+from l1slam_ros.core.robust.batch import judge, robust_solve
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
 # Asked on the way, often: whether to stop.
@@ -202,7 +202,7 @@ class Upkeep:
             if self._live.is_map_due(idle):
                 self._mapper.start(lambda: self._map_anew(idle, budget, check))
             if self._live.is_judge_due(idle, budget):
-                self._judge.start(lambda: self._judge_anew(check))
+                self._judge.start(lambda: self._judge_all(idle, check))
             return self._mapper.busy or self._judge.busy
 
     def _map_anew(self, idle: bool, budget: float, check: Callable[[], None]) -> None:
@@ -230,18 +230,18 @@ class Upkeep:
         check()
         self.adopt(of_all(improvement, whole), front)
 
-    def _judge_anew(self, check: Callable[[], None]) -> None:
-        """Look at all loops anew; no keyframe is moved."""
-        start = time.monotonic()
+    def _judge_all(self, anew: bool, check: Callable[[], None]) -> None:
+        """Look at all loops again; anew: from the graph alone, until more comes."""
         with self._lock:
             live, now, loops = self._live, self._snapshot(), self._live.begin_judgement()
+            at_rest = live.until_more_comes(check)
         whole = now.problem()
         problem = as_one(whole)
-        judgement, poses = judge(problem.graph, problem.poses, problem.judgement, np.inf, check)
+        judgement, poses = robust_solve(problem.graph, check=at_rest) if anew else judge(
+            problem.graph, problem.poses, problem.judgement, np.inf, check)
         check()
         with self._lock:
-            live.take_judgement(judgement_of_all(judgement, whole), poses, loops)
-            live.judge_took = time.monotonic() - start
+            live.take_judgement(judgement_of_all(judgement, whole), poses, loops, anew)
             self._changes += 1
 
     def settle(self, stopped: Stopped = lambda: False) -> Improvement | None:
@@ -271,7 +271,7 @@ class Upkeep:
             with self._lock:
                 if live is not self._live:
                     raise Interrupted
-                live.take_judgement(improvement.judgement, improvement.poses, loops)
+                live.take_judgement(improvement.judgement, improvement.poses, loops, True)
                 self._adopt(improvement, front)
         self._on_end()
         return improvement
