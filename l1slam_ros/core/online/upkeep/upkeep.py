@@ -161,7 +161,7 @@ class Upkeep:
                 check()
                 if time.monotonic() >= start + budget:
                     return live.account(time.monotonic() - start)
-            if came or live.last is not last:
+            if came or live.last is not last or not idle:
                 return live.account(time.monotonic() - start)
             if idle:
                 self._at_rest = self.version
