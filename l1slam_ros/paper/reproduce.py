@@ -210,7 +210,8 @@ SECTIONS: dict[str, Callable[[Results, Path], list[str]]] = {
     'Table II: the time per iteration': lambda results, _: report.table_2(results),
     'Figure 2: cost against iterations': figures.figure_2, 'Figure 3: the maps': figures.figure_3,
     'Figure 4: a start that is mostly noise': figures.figure_4,
-    'Figure 6: loops that lie': figures.figure_6}
+    'Figure 6: loops that lie': figures.figure_6,
+    'Left for later: L-infinity': lambda results, _: report.future_work(results)}
 
 
 def _check_folder(output: Path) -> None:

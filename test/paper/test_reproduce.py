@@ -151,6 +151,7 @@ def test_a_report_is_whole_and_its_pictures_are_there(tmp_path):
         with Image.open(output / name) as image:
             assert image.format == 'PNG' and min(image.size) > 300
     assert re.findall('^## (.*)', text, re.MULTILINE) == list(reproduce.SECTIONS)
+    assert 'It is of Intel, which was not run.' in text
     assert 'Not run: Manhattan3500, Intel, City10k' in text
     assert all(name in text for name in (*paper.FILES, '--datasets'))
     assert '--worlds' not in text
@@ -238,7 +239,7 @@ def fails(results, folder):
 
 
 def test_nothing_is_left_of_a_report_that_fails(tmp_path, monkeypatch):
-    monkeypatch.setitem(reproduce.SECTIONS, 'Figure 5: what another issue will add', fails)
+    monkeypatch.setitem(reproduce.SECTIONS, 'Figure 5: to come', fails)
     with pytest.raises(FileError, match=r'figure_5\.png: cannot be drawn'):
         reproduce.reproduce(None, [TINY_50K], tmp_path / 'out', LITTLE)
     assert list(tmp_path.iterdir()) == []
