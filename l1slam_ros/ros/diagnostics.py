@@ -25,7 +25,7 @@ _FEW = 5
 _STILL = 1e-3
 
 
-class Diagnosis:
+class Diagnostics:
     """
     Publishes the state of the back end.
 

@@ -24,7 +24,7 @@ from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.graphs.map_file import MapFile
 from l1slam_ros.io.node_options import NodeOptions
-from l1slam_ros.ros.diagnostics import Diagnosis
+from l1slam_ros.ros.diagnostics import Diagnostics
 from l1slam_ros.ros.inputs.inputs import Inputs
 from l1slam_ros.ros.inputs.intake import Intake
 from l1slam_ros.ros.loop_status import LoopStatus
@@ -33,7 +33,7 @@ from l1slam_ros.ros.parameters import NodeParameters
 from l1slam_ros.ros.publishing import path_bytes, pose_bytes, pose_with_covariance
 from l1slam_ros.ros.services import MapServices
 from l1slam_ros.ros.threads.failures import Failures
-from l1slam_ros.ros.threads.orders import Orders
+from l1slam_ros.ros.threads.job_queue import JobQueue
 from l1slam_ros.ros.threads.solver_thread import SolverThread
 from l1slam_ros.ros.transform import MapToOdom
 
@@ -73,7 +73,7 @@ class BackendNode(LifecycleNode):
         self.failures = Failures(self.get_logger(), self.context.ok)
         self._solver = SolverThread(self._backend, self.failures, self.get_logger(),
                                     lambda: self.options.update, self._tell)
-        self._orders = Orders(self, self.failures, self._solver.hurry)
+        self._jobs = JobQueue(self, self.failures, self._solver.hurry)
         self._make_publishers()
         self._map_file = MapFile(self._backend, lambda: self.options, self.get_logger().warning)
         if options.load_on_start:
@@ -83,9 +83,9 @@ class BackendNode(LifecycleNode):
             lambda: self._transform.tick() if self._inputs.active else math.inf)
         self._inputs = Inputs(
             self._intake, self._backend, options, self._on_moved, self.get_logger())
-        self._diagnosis = Diagnosis(self, self._intake.topics, self._solver, self.failures)
+        self._diagnostics = Diagnostics(self, self._intake.topics, self._solver, self.failures)
         self._map_services = MapServices(
-            self, self._backend, self._orders, self._map_file, self.failures,
+            self, self._backend, self._jobs, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
         guarded = self.failures.guarded
         self._jumps = self.get_clock().create_jump_callback(
@@ -95,13 +95,14 @@ class BackendNode(LifecycleNode):
         # By a clock that goes on where simulated time stands still, or a bag has ended.
         self.create_timer(1.0, guarded('diagnostics', self._on_second),
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._tell(None)  # a map may have been loaded
-        self._orders.start(self._map_services.autosave)
-        self._solver.start()
-        self._intake.start()
         if options.autostart:
             self.trigger_configure()
             self.trigger_activate()
+        # Active first: who hears of a loaded map may send odometry at once.
+        self._tell(None)
+        self._jobs.start(self._map_services.autosave)
+        self._solver.start()
+        self._intake.start()
 
     def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Use messages from now on."""
@@ -116,7 +117,7 @@ class BackendNode(LifecycleNode):
 
     def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Empty the map."""
-        self._orders.place('clean up', self._map_services.reset)
+        self._jobs.put('clean up', self._map_services.reset)
         return TransitionCallbackReturn.SUCCESS
 
     @property
@@ -127,11 +128,11 @@ class BackendNode(LifecycleNode):
     def close(self, seconds: float = 60.0) -> bool:
         """End the threads and the node; return whether they ended within some seconds."""
         deadline = time.monotonic() + seconds
-        self._solver.close(0.0)  # what it works at for an order stops
+        self._solver.close(0.0)  # what it works at for a job stops
         ended = self._intake.close(seconds)
         self._map_services.save_at_end()
-        ended &= self._orders.close(seconds) or (
-            self._map_file.is_saving and self._orders.close(_SAVING))
+        ended &= self._jobs.close(seconds) or (
+            self._map_file.is_saving and self._jobs.close(_SAVING))
         ended &= self._solver.close(max(deadline - time.monotonic(), 0.0))
         if ended:
             self.destroy_node()
@@ -160,7 +161,7 @@ class BackendNode(LifecycleNode):
         self._transform.forget()
         if self.options.on_time_jump == 'reset':
             self.get_logger().warning('the clock jumped back: the map begins anew')
-            self._orders.place('time jump', self._map_services.reset)
+            self._jobs.put('time jump', self._map_services.reset)
 
     def _on_moved(self) -> None:
         robot, manifold = self._backend.robot(), self._manifold
@@ -174,7 +175,7 @@ class BackendNode(LifecycleNode):
         for sentence in self._backend.news():
             self.get_logger().warning(sentence)
         counts, refused = self._backend.counts()
-        self._diagnosis.publish(
+        self._diagnostics.publish(
             counts, self._backend.behind(), self._inputs.refused.copy() + Counter(refused),
             self._twins())
 
@@ -212,7 +213,7 @@ class BackendNode(LifecycleNode):
         if robot is not None:
             before, after = (self._manifold.compose(transform, robot.odometry)
                              for transform in self._backend.moved())
-            self._diagnosis.note_jump(self._manifold, before, after)
+            self._diagnostics.note_jump(self._manifold, before, after)
         frame, stamp = self.options.map_frame, self._newest()
         pose3 = self._manifold.to_pose3(poses)
         self._path.publish(path_bytes(frame, stamp, now.stamps, pose3))
@@ -231,7 +232,7 @@ class BackendNode(LifecycleNode):
         return robot.stamp if robot is not None else 0
 
     def _report(self, improvement: Improvement) -> None:
-        self._diagnosis.note(improvement)
+        self._diagnostics.note(improvement)
         self.get_logger().debug(
             f'update: cost {improvement.cost_before:.6g} -> {improvement.cost:.6g}, '
             f'{improvement.reweighted_steps} reweighted steps, {improvement.outer_iterations} '

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The services of the node, and what the thread of the orders does for each."""
+"""The services of the node, and what the thread of the jobs does for each."""
 
 import time
 from collections.abc import Awaitable, Callable
@@ -14,7 +14,7 @@ from l1slam_ros.core.online.backend import Backend, Stopped
 from l1slam_ros.io.graphs.map_file import MapFile
 from l1slam_ros.io.sentences import doubt_sentence
 from l1slam_ros.ros.threads.failures import Failures
-from l1slam_ros.ros.threads.orders import Orders
+from l1slam_ros.ros.threads.job_queue import JobQueue
 
 
 class MapServices:
@@ -25,7 +25,7 @@ class MapServices:
     ----------
     node : to create them on
     backend : what they act on
-    orders : where they place their work
+    jobs : where they queue their work
     map_file : of `~/save` and `~/load`
     failures : where to tell what nobody asked for
     pause : called, at once, with whether updates shall pause
@@ -33,9 +33,9 @@ class MapServices:
 
     """
 
-    def __init__(self, node: Node, backend: Backend, orders: Orders, map_file: MapFile,
+    def __init__(self, node: Node, backend: Backend, jobs: JobQueue, map_file: MapFile,
                  failures: Failures, pause: Callable[[bool], None], stopped: Stopped):
-        self._backend, self._orders, self._map_file = backend, orders, map_file
+        self._backend, self._jobs, self._map_file = backend, jobs, map_file
         self._failures, self._pause, self._stopped = failures, pause, stopped
         # A group of their own: a service that awaits its answer would block its whole group.
         group = ReentrantCallbackGroup()
@@ -49,7 +49,7 @@ class MapServices:
         self, name: str, work: Callable[[], str]
     ) -> Callable[[Trigger.Request, Trigger.Response], Awaitable[Trigger.Response]]:
         async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            result = await self._orders.place(f'~/{name}', work)
+            result = await self._jobs.put(f'~/{name}', work)
             response.success, response.message = result.success, result.message
             return response
 
@@ -73,7 +73,7 @@ class MapServices:
                 f'{improvement.status.value}, {improvement.seconds:.2f} s')
 
     def reset(self) -> str:
-        """Empty the map; the thread of the orders calls it."""
+        """Empty the map; the thread of the jobs calls it."""
         self._backend.reset()
         return 'the map is empty'
 
@@ -87,7 +87,7 @@ class MapServices:
 
     def save_at_end(self) -> None:
         """Let the map be saved if it has changed."""
-        self._orders.place('the map file', self._autosave)
+        self._jobs.put('the map file', self._autosave)
 
     def _autosave(self) -> str:
         try:

@@ -128,13 +128,28 @@ class Robot:
         return said
 
 
-def test_a_killed_node_goes_on_where_it_was_and_a_signal_loses_nothing(ros, tmp_path):
+@pytest.fixture
+def start(ros):
+    """Start robots that end with the test, however it ends."""
+    robots = []
+
+    def start(path):
+        robots.append(Robot(ros, path))
+        return robots[-1]
+
+    yield start
+    for robot in robots:
+        robot.process.kill()
+        robot.process.wait()
+
+
+def test_a_killed_node_goes_on_where_it_was_and_a_signal_loses_nothing(start, tmp_path):
     path = tmp_path / 'map.g2o'
-    first = Robot(ros, path)
+    first = start(path)
     first.drive(0, 10)
     first.until(lambda: keyframes(path) == 10, 'all is saved')
     first.end(signal.SIGKILL)
-    second = Robot(ros, path)
+    second = start(path)
     second.until(lambda: second.heard, 'the map is back')
     assert len(second.heard[-1].poses) == 10
     second.drive(10, 20)

@@ -93,13 +93,13 @@ assert len(backend.snapshot().poses) == 20
 def test_orders_are_carried_out_in_the_order_they_came(bench):
     b = bench()
     begin, done = threading.Event(), []
-    orders = [b.backend._orders.place('first', lambda: str(begin.wait(DEADLINE)))]
+    jobs = [b.backend._jobs.put('first', lambda: str(begin.wait(DEADLINE)))]
     for k in range(20):
-        orders.append(b.backend._orders.place('next', lambda k=k: str(done.append(k))))
+        jobs.append(b.backend._jobs.put('next', lambda k=k: str(done.append(k))))
     begin.set()
-    b.until(lambda: all(order.done() for order in orders), 'all are answered')
+    b.until(lambda: all(job.done() for job in jobs), 'all are answered')
     assert done == list(range(20))
-    assert all(order.result().success for order in orders)
+    assert all(job.result().success for job in jobs)
 
 
 def patient(problem, options, budget, check, accuracy):

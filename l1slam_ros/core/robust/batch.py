@@ -20,8 +20,8 @@ A lie
     loop is accepted where it and all accepted with it lie with a probability of 1% at most.
 A place
     is what loops near each other are of, in metres along the way (`places`). Lies of one place
-    may be one mistake: together they have one vote, unless the lies that were refused show that
-    neighbours hardly ever agree. Votes of several places count, each by itself
+    may be one mistake: together they count once, unless the lies that were refused show that
+    neighbours hardly ever agree. The evidence of several places adds up
     (`pairwise_consistency`).
 A slip
     is an odometry factor that says anything, while the robot moved on as ever (`motion`); of all

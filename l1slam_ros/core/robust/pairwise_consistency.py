@@ -42,7 +42,7 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     """
     Return of some loops the group that agrees best, empty where that may be chance.
 
-    Each place has one vote: the best log ratio of its loops, less ln m, for each could have agreed
+    Each place counts once, by the best log ratio of its loops, less ln m: each could have agreed
     by chance with any of the m that were asked.
     """
     rows = growth.some(rows, ASKED)
@@ -59,11 +59,11 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
 
 
 def _evidence(place: Indices, one: Indices, other: Indices, log_ratio: Array) -> Array:
-    """Return the sum of the votes for each loop, (k,), by the pairs that agree."""
-    vote = np.zeros((len(place), place.max() + 1))
-    np.maximum.at(vote, (one, place[other]), log_ratio - np.log(len(place)))
-    vote[np.arange(len(place)), place] = 0.0
-    evidence: Array = vote.sum(axis=1)
+    """Return the evidence of all places for each loop, (k,), by the pairs that agree."""
+    by_place = np.zeros((len(place), place.max() + 1))
+    np.maximum.at(by_place, (one, place[other]), log_ratio - np.log(len(place)))
+    by_place[np.arange(len(place)), place] = 0.0
+    evidence: Array = by_place.sum(axis=1)
     return evidence
 
 

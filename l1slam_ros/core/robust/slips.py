@@ -9,7 +9,7 @@ where loops of two places or more do. A slip is suspected where the odds of one 
 cut, the loops across are asked anew, and the rounds go on from there. To the odds comes a gate
 for each place that is won, less one for each that is lost. A slip is believed if that makes it
 likelier than not, and if three places span it where it is only places that say so. Loops do not
-make a robot jump: the slip mended, it has to move as at some other step, or rather so than as
+make a robot jump: the slip repaired, it has to move as at some other step, or rather so than as
 measured.
 """
 
@@ -176,22 +176,22 @@ def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
     stretch = np.searchsorted(ends, state.low, side='right')
     odometry = ~state.is_loop & (~state.cut | (np.arange(len(state.cut)) == cut))
     steps = np.flatnonzero(odometry & (stretch == stretch[cut]))
-    gain = motion.log_density(*_mended(state, cut, steps)) - motion.log_density(
+    gain = motion.log_density(*_repaired(state, cut, steps)) - motion.log_density(
         steps_of(state, steps))
     return int(steps[np.argmax(gain)])
 
 
 def _moves_as_usual(state: Growth, cut: int, motion: Motion) -> bool:
-    """Return whether the robot, mended, moves as elsewhere, or rather so than as measured."""
+    """Return whether the robot, repaired, moves as elsewhere, or rather so than as measured."""
     row = np.array([cut])
-    (mended,), (spread,) = _mended(state, cut, row)
+    (repaired,), (spread,) = _repaired(state, cut, row)
     # The nearest step to what was measured is itself.
     measured = np.sort(motion.distance(steps_of(state, row)[0], spread))[1]
-    gate = state.gate(np.array([len(mended)]))[0]
-    return bool(motion.distance(mended, spread).min() < max(gate, measured))
+    gate = state.gate(np.array([len(repaired)]))[0]
+    return bool(motion.distance(repaired, spread).min() < max(gate, measured))
 
 
-def _mended(state: Growth, cut: int, steps: Indices) -> tuple[Array, Array]:
+def _repaired(state: Growth, cut: int, steps: Indices) -> tuple[Array, Array]:
     """
     Return how the robot moved at some steps if one of these slipped rather than that which is cut.
 

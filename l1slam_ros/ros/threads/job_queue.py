@@ -26,30 +26,30 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class _Order:
+class _Job:
     name: str
     work: Callable[[], str]
     future: Future
 
 
-class Orders:
+class JobQueue:
     """
-    A queue of orders from service callbacks, carried out in the order they came.
+    A queue of jobs from service callbacks, carried out in the order they came.
 
-    A callback awaits `place`, so the executor goes on with other callbacks meanwhile. Whatever an
-    order raises, it is answered, and the next one follows.
+    A callback awaits `put`, so the executor goes on with other callbacks meanwhile. Whatever a
+    job raises, it is answered, and the next one follows.
 
     Parameters
     ----------
     node : whose executor runs the callbacks
     failures : where to tell what nobody foresaw
-    done : called after each order
+    done : called after each job
 
     """
 
     def __init__(self, node: Node, failures: Failures, done: Callable[[], None]):
         self._node, self._failures, self._done = node, failures, done
-        self._queue: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._idle: Callable[[], float]
         self._thread = threading.Thread(target=self._work, name='services', daemon=True)
 
@@ -58,10 +58,10 @@ class Orders:
         self._idle = idle
         self._thread.start()
 
-    def place(self, name: str, work: Callable[[], str]) -> Future:
+    def put(self, name: str, work: Callable[[], str]) -> Future:
         """Queue some work, which returns a sentence; the future's result is an `Answer`."""
         future = Future(executor=self._node.executor)
-        self._queue.put(_Order(name, work, future))
+        self._queue.put(_Job(name, work, future))
         return future
 
     def close(self, seconds: float) -> bool:
@@ -71,17 +71,17 @@ class Orders:
         return not self._thread.is_alive()
 
     def _work(self) -> None:
-        while (order := self._next()) is not None:
-            order.future.set_result(self._carry_out(order))
+        while (job := self._next()) is not None:
+            job.future.set_result(self._carry_out(job))
 
-    def _next(self) -> _Order | None:
+    def _next(self) -> _Job | None:
         while True:
             with suppress(queue.Empty):
                 return self._queue.get(timeout=self._idle())
 
-    def _carry_out(self, order: _Order) -> Answer:
+    def _carry_out(self, job: _Job) -> Answer:
         try:
-            answer = Answer(True, order.work())
+            answer = Answer(True, job.work())
             self._done()
         except Interrupted:
             return Answer(False, 'the node is ending')
@@ -89,7 +89,7 @@ class Orders:
             # The caller is told: the fault lies with the call, not with the node.
             return Answer(False, reason(error))
         except Exception as error:
-            self._failures.note(order.name, error, _REMEMBERED)
+            self._failures.note(job.name, error, _REMEMBERED)
             return Answer(False, reason(error))
-        self._failures.over(order.name)
+        self._failures.over(job.name)
         return answer
