@@ -21,7 +21,7 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.names import QUATERNION, ROTATION_INFORMATION
 from l1slam_ros.core.robust.inspection import initial_poses
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES, DEFAULT_TOPICS, Topics
-from l1slam_ros.io.files import require_folder
+from l1slam_ros.io.files import require_file, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 from l1slam_ros.io.trajectory import invented_stamps, write_tum
 
@@ -102,12 +102,12 @@ def check_output(path: Path) -> None:
     if path.suffix not in (*GRAPH_SUFFIXES, '.tum', ''):
         raise FileError(path, f'unknown suffix; expected {", ".join(GRAPH_SUFFIXES)}, .tum, or '
                         'none for a bag directory')
-    require_folder(path)
-    if path.suffix and path.is_dir():
-        raise FileError(path, 'cannot be written: it is a directory')
-    if not path.suffix:
+    if path.suffix:
+        require_file(path)
+    else:
         from l1slam_ros.io.bags.writer import refuse_other_than_bag
 
+        require_folder(path)
         refuse_other_than_bag(path)
 
 

@@ -685,6 +685,10 @@ def test_bad_input_is_one_line_exit_code_2_and_no_output(capsys, tmp_path, lines
     (['solve', 'graph.g2o', '--plot', 'out.doc'], '.png'),
     (['solve', 'graph.g2o', '--reference', 'missing.txt'], 'missing.txt'),
     (['solve', 'graph.g2o', '--params-file', 'graph.txt'], 'parameters'),
+    (['solve', 'graph.g2o', '--plot', 'taken.png'], 'taken.png: cannot be written: it is a di'),
+    (['solve', 'missing.g2o', '--output', '/proc/out.g2o'], '/proc/out.g2o: cannot be written'),
+    (['solve', 'missing.g2o', '--plot', '/proc/out.png'], '/proc/out.png: cannot be written'),
+    (['simulate', '/proc/a.g2o', '--poses', '1', '--edges', '5'], '/proc/a.g2o: cannot be wri'),
     (['simulate', 'out.g2o', '--poses', '10', '--edges', '5'], '9 to 45'),
     (['simulate', 'out.g2o', '--poses', '10', '--edges', '20', '--seed', '-1'], 'seed'),
 ])
@@ -693,14 +697,14 @@ def test_bad_arguments_are_one_line_and_exit_code_2(
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'graph.g2o').write_text('\n'.join(EDGES))
     (tmp_path / 'graph.txt').write_text('{}')
-    for name in ('other', 'taken.g2o'):
+    for name in ('other', 'taken.g2o', 'taken.png'):
         (tmp_path / name).mkdir()
     (tmp_path / 'gap.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 0 5 1 '))
     assert main([*arguments]) == 2
     _, err = capsys.readouterr()
     assert err.count('\n') == 1 and words in err, err
     assert sorted(p.name for p in tmp_path.iterdir()) == [
-        'gap.g2o', 'graph.g2o', 'graph.txt', 'other', 'taken.g2o']
+        'gap.g2o', 'graph.g2o', 'graph.txt', 'other', 'taken.g2o', 'taken.png']
 
 
 def test_a_graph_with_gaps_and_without_poses_is_solved_from_its_tree(capsys, tmp_path):

@@ -173,6 +173,14 @@ def test_what_is_no_bag_is_not_overwritten(tmp_path, bag):
     assert {p.name for p in tmp_path.iterdir()} == {'file', 'folder', 'bag'}
 
 
+def test_what_a_link_leads_to_is_replaced(tmp_path, bag):
+    link = tmp_path / 'link'
+    link.symlink_to(bag.name)
+    write_strings(link, 2)
+    assert link.is_symlink() and len(list(read_messages(bag))) == 3
+    assert {p.name for p in tmp_path.iterdir()} == {'link', 'bag'}
+
+
 def test_no_place_to_write(tmp_path):
     path = tmp_path / 'missing' / 'bag'
     with pytest.raises(FileError, match=f'^{re.escape(str(path))}: cannot be written: No such'):
