@@ -21,6 +21,7 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.solvers import block_cholesky as cholesky
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.io import progress
+from l1slam_ros.io.formats import read_input
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 
 VERTICES = ['VERTEX_SE2 0 0 0 0', 'VERTEX_SE2 1 1 0 0', 'VERTEX_SE2 2 2 0 0']
@@ -319,6 +320,16 @@ def test_a_graph_too_dense_to_judge_is_solved_all_the_same(capsys, world, monkey
     assert 'too many far places are joined' in capsys.readouterr().err
 
 
+def test_absolute_poses_are_no_loops_but_doubted_too(capsys, world):
+    absolute = [f'EDGE_PRIOR_SE2 {k} {999 * (k == 9)} 0 0 1 0 0 1 0 1' for k in (9, 10)]
+    world.write_text(world.read_text() + '\n'.join(absolute) + '\n')
+    report = solve_json(capsys, world)
+    assert (report['factors'], report['loops']) == (252, 101)
+    out = run(capsys, 'solve', world)[0]
+    assert '252 factors, 101 loops and 2 absolute poses\n' in out
+    assert f'{len(report["rejected"])} of 101 loops and 2 absolute poses refused\n' in out
+
+
 def test_a_graph_without_loops_is_its_odometry(capsys, tmp_path):
     report = solve_json(capsys, graph_file(tmp_path, EDGES[:2]))
     assert report['status'] == 'converged' and report['final_cost'] < 1e-6
@@ -451,6 +462,20 @@ def test_a_cut_bag_is_read_in_part_and_exits_with_3(capsys, world, tmp_path):
     assert main(['solve', str(cut), '--json']) == 2
     out, err = capsys.readouterr()
     assert out == '' and err.startswith(f'l1slam: {cut}') and err.count('\n') == 1
+
+
+@pytest.mark.parametrize('name', ['A.G2O', 'A.GRAPH', 'A.MCAP'])
+def test_a_suffix_may_be_in_capitals(capsys, world, tmp_path, name):
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    if name == 'A.MCAP':
+        (tmp_path / 'bag' / 'bag.mcap').rename(tmp_path / name)
+    else:
+        run(capsys, 'convert', world, tmp_path / name)
+    run(capsys, 'convert', tmp_path / name, tmp_path / 'B.TUM')
+    found, expected = (np.sort(read_input(path).graph.between.measurement, axis=0)
+                       for path in (tmp_path / name, world))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert len((tmp_path / 'B.TUM').read_text().split()) == 150 * 8
 
 
 def test_a_trajectory_goes_out_as_tum_and_in_as_reference_with_stamps_that_others_round(
