@@ -21,7 +21,7 @@ from PIL import Image
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.io.files import replacing, require_folder
+from l1slam_ros.io.files import replacing, require_file
 from l1slam_ros.io.wording import counted
 
 _SUFFIXES = ('.png', '.svg', '.pdf')
@@ -105,7 +105,7 @@ def check_picture(path: str | Path) -> None:
     """Refuse, before any work is done, a name that no picture can have."""
     if Path(path).suffix.lower() not in _SUFFIXES:
         raise FileError(path, f'unknown suffix; expected {", ".join(_SUFFIXES)}')
-    require_folder(path)
+    require_file(path)
 
 
 def plot_maps(path: str | Path, maps: Sequence[MapDrawing]) -> None:

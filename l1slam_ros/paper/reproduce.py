@@ -231,6 +231,8 @@ def _check_folder(output: Path) -> None:
     require_folder(output)
     if os.path.lexists(output) and not output.is_dir():
         raise FileError(output, 'is no folder; expected one, or nothing there')
+    if output.exists():
+        require_folder(output / REPORT)
 
 
 @contextmanager

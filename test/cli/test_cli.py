@@ -21,6 +21,7 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.solvers import block_cholesky as cholesky
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.io import progress
+from l1slam_ros.io.formats import read_input
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 
 VERTICES = ['VERTEX_SE2 0 0 0 0', 'VERTEX_SE2 1 1 0 0', 'VERTEX_SE2 2 2 0 0']
@@ -319,6 +320,16 @@ def test_a_graph_too_dense_to_judge_is_solved_all_the_same(capsys, world, monkey
     assert 'too many far places are joined' in capsys.readouterr().err
 
 
+def test_absolute_poses_are_no_loops_but_doubted_too(capsys, world):
+    absolute = [f'EDGE_PRIOR_SE2 {k} {999 * (k == 9)} 0 0 1 0 0 1 0 1' for k in (9, 10)]
+    world.write_text(world.read_text() + '\n'.join(absolute) + '\n')
+    report = solve_json(capsys, world)
+    assert (report['factors'], report['loops']) == (252, 101)
+    out = run(capsys, 'solve', world)[0]
+    assert '252 factors, 101 loops and 2 absolute poses\n' in out
+    assert f'{len(report["rejected"])} of 101 loops and 2 absolute poses refused\n' in out
+
+
 def test_a_graph_without_loops_is_its_odometry(capsys, tmp_path):
     report = solve_json(capsys, graph_file(tmp_path, EDGES[:2]))
     assert report['status'] == 'converged' and report['final_cost'] < 1e-6
@@ -451,6 +462,20 @@ def test_a_cut_bag_is_read_in_part_and_exits_with_3(capsys, world, tmp_path):
     assert main(['solve', str(cut), '--json']) == 2
     out, err = capsys.readouterr()
     assert out == '' and err.startswith(f'l1slam: {cut}') and err.count('\n') == 1
+
+
+@pytest.mark.parametrize('name', ['A.G2O', 'A.GRAPH', 'A.MCAP'])
+def test_a_suffix_may_be_in_capitals(capsys, world, tmp_path, name):
+    run(capsys, 'convert', world, tmp_path / 'bag')
+    if name == 'A.MCAP':
+        (tmp_path / 'bag' / 'bag.mcap').rename(tmp_path / name)
+    else:
+        run(capsys, 'convert', world, tmp_path / name)
+    run(capsys, 'convert', tmp_path / name, tmp_path / 'B.TUM')
+    found, expected = (np.sort(read_input(path).graph.between.measurement, axis=0)
+                       for path in (tmp_path / name, world))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert len((tmp_path / 'B.TUM').read_text().split()) == 150 * 8
 
 
 def test_a_trajectory_goes_out_as_tum_and_in_as_reference_with_stamps_that_others_round(
@@ -685,6 +710,10 @@ def test_bad_input_is_one_line_exit_code_2_and_no_output(capsys, tmp_path, lines
     (['solve', 'graph.g2o', '--plot', 'out.doc'], '.png'),
     (['solve', 'graph.g2o', '--reference', 'missing.txt'], 'missing.txt'),
     (['solve', 'graph.g2o', '--params-file', 'graph.txt'], 'parameters'),
+    (['solve', 'graph.g2o', '--plot', 'taken.png'], 'taken.png: cannot be written: it is a di'),
+    (['solve', 'missing.g2o', '--output', '/proc/out.g2o'], '/proc/out.g2o: cannot be written'),
+    (['solve', 'missing.g2o', '--plot', '/proc/out.png'], '/proc/out.png: cannot be written'),
+    (['simulate', '/proc/a.g2o', '--poses', '1', '--edges', '5'], '/proc/a.g2o: cannot be wri'),
     (['simulate', 'out.g2o', '--poses', '10', '--edges', '5'], '9 to 45'),
     (['simulate', 'out.g2o', '--poses', '10', '--edges', '20', '--seed', '-1'], 'seed'),
 ])
@@ -693,14 +722,14 @@ def test_bad_arguments_are_one_line_and_exit_code_2(
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'graph.g2o').write_text('\n'.join(EDGES))
     (tmp_path / 'graph.txt').write_text('{}')
-    for name in ('other', 'taken.g2o'):
+    for name in ('other', 'taken.g2o', 'taken.png'):
         (tmp_path / name).mkdir()
     (tmp_path / 'gap.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 0 5 1 '))
     assert main([*arguments]) == 2
     _, err = capsys.readouterr()
     assert err.count('\n') == 1 and words in err, err
     assert sorted(p.name for p in tmp_path.iterdir()) == [
-        'gap.g2o', 'graph.g2o', 'graph.txt', 'other', 'taken.g2o']
+        'gap.g2o', 'graph.g2o', 'graph.txt', 'other', 'taken.g2o', 'taken.png']
 
 
 def test_a_graph_with_gaps_and_without_poses_is_solved_from_its_tree(capsys, tmp_path):

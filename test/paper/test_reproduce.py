@@ -276,6 +276,8 @@ def arguments(folder, **changes):
     ({'datasets': Path('/no/such/folder')}, "none of the paper's graphs is there"),
     ({'worlds': '10k', 'datasets': None, 'output': Path('/no/such/folder')}, 'is no folder'),
     ({'worlds': '10k', 'datasets': None, 'output': Path(__file__)}, 'is no folder; expected one'),
+    ({'output': Path('/proc')}, '/proc/report.md: cannot be written'),
+    ({'output': Path('/proc/out')}, '/proc/out: cannot be written'),
 ])
 def test_what_cannot_be_is_refused_at_once_in_one_line(capsys, tmp_path, changes, says):
     assert main(['reproduce', *arguments(tmp_path, **changes)]) == 2

@@ -84,6 +84,17 @@ def test_how_sure_it_is_in_space_and_in_the_world(graph_of, fixed):
                         atol=1e-9)
 
 
+def test_at_rest_the_noise_is_that_of_the_last_judgement(world):
+    backend = Backend(EVERY)
+    for first in range(0, 120, 10):
+        play(backend, world, first, first + 10)
+        backend.update(10.0)
+    while backend.update(10.0) is not None:
+        pass
+    assert_allclose(backend.marginal_covariance(119),
+                    dense_covariance(backend.snapshot())[-1, :, -1], rtol=1e-6, atol=1e-12)
+
+
 def test_of_a_part_that_nothing_joins_hardly_anything_is_known():
     backend = Backend(EVERY)
 

@@ -15,6 +15,7 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import (
     LeastSquaresOptions,
+    l2_map,
     minimise_huber,
     minimise_l2,
 )
@@ -174,3 +175,13 @@ def test_a_loose_keyframe_is_refused(minimise):
     graph.add_between(0, 1, np.ones((1, 3)), np.eye(3)[None])
     with pytest.raises(GraphError, match='not tied to the anchor'):
         solve(minimise, graph, np.zeros((3, 3)))
+
+
+def test_a_step_that_does_what_it_promised_ends_the_map_within_its_noise(world):
+    graph, truth = world
+    steps = []
+    best = solve(minimise_l2, graph, truth)
+    for start in (truth, best.poses):
+        poses = l2_map(graph, start, cholesky_of(graph), lambda k, cost: steps.append(k))
+        assert chi2(graph, poses) < best.cost + 1
+    assert steps == [1, 1] and best.outer_iterations > 2

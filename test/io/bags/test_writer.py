@@ -170,3 +170,11 @@ def test_what_is_no_bag_is_not_overwritten(tmp_path, bag):
     assert (tmp_path / 'file').read_text() == 'precious'
     assert (bag / 'precious.txt').exists()
     assert {p.name for p in tmp_path.iterdir()} == {'file', 'folder', 'bag'}
+
+
+def test_what_a_link_leads_to_is_replaced(tmp_path, bag):
+    link = tmp_path / 'link'
+    link.symlink_to(bag.name)
+    write_strings(link, 2)
+    assert link.is_symlink() and len(list(read_messages(bag))) == 3
+    assert {p.name for p in tmp_path.iterdir()} == {'link', 'bag'}

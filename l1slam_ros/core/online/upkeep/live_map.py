@@ -93,9 +93,9 @@ class LiveMap:
         # What the last proof says, and of which factors.
         self._bound, self._proved = np.nan, np.zeros(0, bool)
         self.round_took = _ROUND * builder.graph.n_poses
-        # The factors that the map is of, the loops that were judged, and whether one that the
-        # front left may be true.
-        self._used, self._fits = np.zeros(0, bool), False
+        # The factors that the map is of and their noise, the loops that were judged, and whether
+        # one that the front left may be true.
+        self._used, self._noise, self._fits = np.zeros(0, bool), np.zeros(0), False
         known = len(optimised.judgement.accepted)
         self._judged_loops = int(np.count_nonzero(builder.loops.rows < known))
         self._judged_anew = self._judged_loops
@@ -165,7 +165,10 @@ class LiveMap:
                   or not optimised.at_rest)
         late = idle or front is None or front.closed or front.border >= _MANY_ROWS
         falls = self.last is not None and self.last.falls
-        return bool(graph.n_poses) and (self.stale or falls or (behind and late))
+        # The front goes by the noise that was known when it was made.
+        other_noise = idle and front is not None and bool(
+            (self._noise != optimised.judgement.variance).any())
+        return bool(graph.n_poses) and (self.stale or falls or other_noise or (behind and late))
 
     def accuracy(self, idle: bool, sparse: bool) -> Accuracy | None:
         """Return how near the optimum the next map is to come by factorisations, None: by none."""
@@ -240,7 +243,8 @@ class LiveMap:
         if improvement.gap < np.inf:
             self.proved_at, self._proved = self._factored_at, judgement.accepted
             self._bound = improvement.cost - improvement.gap
-        self.front, self.last, self._used = front, improvement, judgement.accepted
+        self.front, self.last = front, improvement
+        self._used, self._noise = judgement.accepted, judgement.variance
         # What the front begins with, no other may have looked at.
         first = len(self.optimised.judgement.accepted) + len(self.looks)
         self.looks.extend(np.column_stack(
