@@ -72,48 +72,6 @@ def test_odometry_factors_slip(place, what, metres, radians, count):
     assert np.abs(moved[changed, 2]) == pytest.approx(radians, abs=1e-9)
 
 
-@pytest.mark.parametrize(('part', 'is_odometry'), [('odometry', True), ('loops', False)])
-def test_information_is_stated_wrong_of_one_part_alone(place, part, is_odometry):
-    case = cases.false_case(place, kind(f'{part}-1e4'), 0.0, 0)
-    times = (case.graph.between.sqrt_information[:, 0, 0]
-             / place.graph.between.sqrt_information[:, 0, 0])
-    of_part = case.graph.between.is_odometry == is_odometry
-    assert times[of_part] == pytest.approx(100) and times[~of_part] == pytest.approx(1)
-
-
-@pytest.mark.parametrize(('streets', 'same'), [(3, False), (2, True)])
-def test_an_aliased_street_is_moved_by_one_transform(place, streets, same):
-    rng = np.random.default_rng(3)
-    lies = aliasing.aliased_loops(place.graph, place.best, streets, same, rng, length=10)
-    assert len(lies.i) == 10 * streets and (lies.i < lies.j).all()
-    # Z = Xi^-1 W Xj, and where the street is the earlier end, Z = Xi^-1 W^-1 Xj.
-    wrong = se2.compose(se2.compose(place.best[lies.i], lies.measurement),
-                        se2.inverse(place.best[lies.j]))
-    different = {tuple(each) for each in np.round(
-        np.where(wrong[:, 2:] < 0, se2.inverse(wrong), wrong), 6)}
-    assert len(different) == (1 if same else streets)
-    apart = np.linalg.norm(place.best[lies.i, :2] - place.best[lies.j, :2], axis=1)
-    assert apart.min() > 0.1 * np.linalg.norm(np.ptp(place.best[:, :2], axis=0))
-
-
-@pytest.mark.parametrize(('name', 'parts'), [('sessions', 1), ('apart', 2)])
-def test_a_session_begins_anywhere(place, name, parts):
-    case = cases.false_case(place, kind(name), 0.3, 0)
-    half = place.graph.n_poses // 2
-    factors = case.graph.between
-    assert not (factors.is_odometry & (np.minimum(factors.i, factors.j) == half - 1)).any()
-    assert component_labels(case.graph).max() + 1 == parts == case.session.max() + 1
-    step = se2.between(case.start[half - 1], case.start[half])
-    assert np.hypot(*step[:2]) > 2
-
-
-def test_a_track_without_times_is_found_wherever_it_lies():
-    track = np.cumsum(np.random.default_rng(0).standard_normal((60, 2)), axis=0)
-    moved = se2.compose(np.array([[4.0, -9.0, 2.0]]),
-                        np.concatenate((track, np.zeros((60, 1))), axis=1))
-    assert places.nearest_error(track)(moved[:, :2]) < 1e-9
-
-
 def run_of(place, name, share, found):
     case = cases.false_case(place, kind(name), share, 0)
     return runs.run_of(case, solvers.RobustSolver('x', 'l2', 'odometry',
