@@ -11,6 +11,7 @@ from scipy.spatial import Delaunay
 from systems import PLENTY, SHAPES
 
 from l1slam_ros.core.kernels import ordering
+from l1slam_ros.core.kernels.symbolic import postorder
 
 
 def minimum_degree(start, adjacent, limit):
@@ -139,3 +140,19 @@ def test_what_is_small_or_joined_throughout_is_not_cut():
 
 
 # What follows from an order
+
+
+def test_the_postorder_fills_in_alike(graph):
+    """A topological order of the elimination tree: as many entries, subtrees are runs."""
+    order, column, rows = minimum_degree(*graph, PLENTY)
+    position, parent, below, step = postorder(order, column, rows)
+    assert_array_equal(np.sort(position), np.arange(50))
+    again = np.argsort(position)
+    assert_array_equal(again, order[step])
+    columns = eliminate(*graph, again)
+    assert_array_equal(below, [len(entries) for entries in columns])
+    first = np.array([min((position[k] for k in entries), default=50) for entries in columns])
+    assert_array_equal(parent, first)
+    # In a postorder all between a node and its parent are descendants of the parent.
+    for k in np.flatnonzero(parent < 50):
+        assert (parent[k: parent[k]] <= parent[k]).all()
