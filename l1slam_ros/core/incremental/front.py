@@ -73,9 +73,8 @@ class Front:
     Parameters
     ----------
     part : the factors that are believed
-    poses, l2_poses : (n, p) their L1 map, and their L2 map with the noise as it was found
-    cholesky : of the part; the front keeps it
-    loops : (m,) 1 for each factor that is a loop, 0 for odometry
+    poses : their L1 map, (n, p), and their L2 map with the noise as it was found
+    choleskys : of the part, the second holds the factor of that L2 map; the front keeps them
     gate : see `Gate`
     rows : factors of the graph that grows, when `part` was taken from it
 
@@ -90,23 +89,19 @@ class Front:
 
     """
 
-    def __init__(self, part: FactorGraph, poses: Array, l2_poses: Array, cholesky: BlockCholesky,
-                 loops: Indices, gate: Gate, rows: int):
+    def __init__(self, part: FactorGraph, poses: tuple[Array, Array],
+                 choleskys: tuple[BlockCholesky, BlockCholesky], gate: Gate, rows: int):
         self.rows, self.closed = rows, False
-        system, k = linearise(part, poses), part.manifold.TANGENT_SIZE
+        system, k = linearise(part, poses[L1]), part.manifold.TANGENT_SIZE
         # What a square stays below, and the log ratio but for what hangs on the factor.
         self._limit = float(chi2_quantile(1 - _REFUSED, np.array([k]))[0])
         self._volume = (gate.log_volume - k * np.log(2 * np.pi) / 2
                         - np.log(_SURE - 1) - gate.log_odds)
         self._variance = np.repeat(gate.variance[:, None], k, axis=1)
         self._mu = _SMOOTHING * smoothing(system.b)
-        other, l2_system = BlockCholesky(cholesky.pattern, system.keyframe), linearise(
-            part, l2_poses)
-        variance = self._variance[loops].ravel()
-        if not (cholesky.factorise(system, 1 / np.hypot(system.b, self._mu))
-                and other.factorise(l2_system, 1 / variance)):
+        if not choleskys[L1].factorise(system, 1 / np.hypot(system.b, self._mu)):
             raise GraphError('a part of the graph is not tied to the anchor')
-        self._map = GrowingMap(part, (poses, l2_poses), (cholesky, other))
+        self._map = GrowingMap(part, poses, choleskys)
 
     @property
     def keyframes(self) -> int:
