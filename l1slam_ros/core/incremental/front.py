@@ -28,9 +28,9 @@ _SMOOTHING = 0.1
 _REFUSED = 1e-3
 # Of the loops admitted, one in so many may be false.
 _SURE = 1000.0
-# Rows of a border, and keyframes touched, that one more update has the time and the memory for.
+# Rows of a border, and keyframes it touches, that one more update has the time and the memory for.
 # What comes then waits for the next map.
-_MOST_ROWS, _MOST_TOUCHED = 1800, 700
+_MOST_ROWS, _MOST_POINTS = 1800, 1400
 # In the place of whether to believe a factor: the front finds out.
 UNKNOWN = -1
 
@@ -153,7 +153,7 @@ class Front:
         """Tell whether the next factor is for the next map."""
         return (max(factors.i[self.rows], factors.j[self.rows]) > self.keyframes
                 or (known == 1 and self._turns(factors))
-                or self.border > _MOST_ROWS or self._map.touched > _MOST_TOUCHED)
+                or self.border > _MOST_ROWS or self._map.points > _MOST_POINTS)
 
     def _turns(self, factors: BetweenFactors) -> bool:
         """Tell whether the next factor is the first that names the world: the gauge is another."""
@@ -166,12 +166,13 @@ class Front:
         if not known or (known == UNKNOWN and (self._turns(factors) or not own.all())):
             return Look(False, known == UNKNOWN, np.nan)
         first_seen = self.keyframes in (factors.i[self.rows], factors.j[self.rows])
-        variance = self._variance[0 if first_seen else 1]
         try:
-            predicted = self._map.predict(L2, new, at)
-            look, left = Look(True, False, 0.0), np.zeros(len(variance))
-            if not first_seen:
-                look, left = self._test(predicted, own, variance, known == 1)
+            if first_seen:
+                self._map.begin(L2, new, at, self._variance[0])
+                self._map.begin(L1, new, at, np.full(len(own), self._mu))
+                return Look(True, False, 0.0)
+            variance, predicted = self._variance[1], self._map.predict(L2, new, at)
+            look, left = self._test(predicted, own, variance, known == 1)
             if look.accepted:
                 self._map.add(L2, predicted, variance)
                 self._map.add(L1, self._map.predict(L1, new, at), np.hypot(left, self._mu))
