@@ -107,8 +107,8 @@ class Border:
         # The other factors: their points and blocks, F, F^-1 times the right hand side.
         self._ends, self._blocks = GrowingArray((2,), np.int64), GrowingArray((2, k, k))
         self._factor, self._right = GrowingArray(), GrowingArray()
-        # A' lambda at the first points, None: not known; nothing pulls at those that came since.
-        self._pulled: Array | None = None
+        # A' lambda at the first points; nothing pulls at those that came since. Empty: not known.
+        self._pulled = np.zeros((0, k))
 
     @property
     def rows(self) -> int:
@@ -182,7 +182,7 @@ class Border:
         self._right.extend(right)
         self._ends.extend(predicted.points[None])
         self._blocks.extend(predicted.blocks[None])
-        self._pulled = None
+        self._pulled = self._pulled[:0]
 
     def step(self, keyframes: list[int]) -> Array:
         """Return the steps of some keyframes, (m, k); zero of those that are not here yet."""
@@ -238,12 +238,11 @@ class Border:
         """Return A' lambda at all points, (t, k)."""
         from l1slam_ros.core.kernels import border
 
-        before = self._pulled
-        if before is None or len(before) < self.points:
-            self._pulled = np.zeros((self.points, self._k))
-            if before is None:
+        known = len(self._pulled)
+        if known < self.points:
+            before, self._pulled = self._pulled, np.zeros((self.points, self._k))
+            self._pulled[:known] = before
+            if not known:
                 border.pull(self._factor.view(), self._right.view(), self._ends.view(),
                             self._blocks.view(), self._pulled)
-            else:
-                self._pulled[:len(before)] = before
         return self._pulled

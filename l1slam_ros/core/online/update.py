@@ -8,7 +8,7 @@ may have to stop the work hands in a check.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,6 +35,9 @@ from l1slam_ros.core.solvers.reweighting import reweighted_step, weighted_least_
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 
+# Linearisations of one round, and iterations of one where a front carries what is far: more and
+# it is late.
+_OUTER, _INNER = 2, 80
 # Steps of Gauss-Newton that the gate's map gets each time it is made.
 _L2_STEPS = 4
 
@@ -120,6 +123,14 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
     solution = minimise(graph, poses, options, method.cholesky if steps else None, dual, deadline,
                         lambda *_: check())
     return _improvement(solution, problem, problem.judgement, before, steps, start)
+
+
+def one_round(options: OptimiserOptions, sparse: bool) -> OptimiserOptions:
+    """Return the options for one round of a map; sparse : there is to be a front."""
+    if not sparse:
+        return replace(options, outer_iterations=min(options.outer_iterations, _OUTER))
+    inner = replace(options.inner, iterations=min(options.inner.iterations, _INNER))
+    return replace(options, outer_iterations=min(options.outer_iterations, 1), inner=inner)
 
 
 def _nearest(problem: Problem) -> tuple[Array, float, float]:

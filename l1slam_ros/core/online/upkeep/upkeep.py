@@ -28,7 +28,7 @@ from l1slam_ros.core.incremental.front import Front
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
-from l1slam_ros.core.online.update import Improvement, front_of, improve, optimise
+from l1slam_ros.core.online.update import Improvement, front_of, improve, one_round, optimise
 from l1slam_ros.core.online.upkeep.live_map import AT_ONCE, Behind, LiveMap
 from l1slam_ros.core.online.upkeep.threads import Worker, until
 from l1slam_ros.core.robust.batch import judge, robust_solve
@@ -38,9 +38,8 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 Stopped = Callable[[], bool]
 # [s] So long an update may take what has come, and a map is improved, whatever the budget.
 _LEAST_TIME, _LEAST_ROUND = 0.02, 0.1
-# Linearisations of one round, and iterations of one where a front carries what is far: more and
-# it is late. Of the clock it may take some times as long.
-_OUTER, _INNER, _PATIENCE = 2, 80, 4
+# Of the clock a round may take some times as long.
+_PATIENCE = 4
 # So often a new front takes what came meanwhile, before it is one.
 _PASSES = 3
 # [s] How often who waits looks whether to stop.
@@ -212,7 +211,7 @@ class Upkeep:
         if exact:
             check = until(lambda: live.is_late, check)
         else:
-            solver = _one_round(solver, problem.is_sparse)
+            solver = one_round(solver, problem.is_sparse)
         check()
         improvement = improve(problem, solver, _PATIENCE * max(budget, _LEAST_ROUND), check, exact)
         check()
@@ -345,11 +344,3 @@ class Upkeep:
     def _on_end(self) -> None:
         """Hear that a worker is done."""
         self._ended.set()
-
-
-def _one_round(solver: OptimiserOptions, sparse: bool) -> OptimiserOptions:
-    """Return the options for one round of a map; sparse : there is a front."""
-    if not sparse:
-        return replace(solver, outer_iterations=min(solver.outer_iterations, _OUTER))
-    inner = replace(solver.inner, iterations=min(solver.inner.iterations, _INNER))
-    return replace(solver, outer_iterations=min(solver.outer_iterations, 1), inner=inner)
