@@ -94,8 +94,9 @@ def neighbours(keyframe: Indices, size: int) -> tuple[Places, Places]:
     Each once, ascending, both ways round; keyframe, size : as in `LinearSystem`
     """
     i, j = keyframe[(keyframe < size).all(axis=1)].T
-    row, adjacent = np.divmod(np.unique(np.concatenate((i * size + j, j * size + i))),
-                              max(size, 1))
+    # Not by `np.unique`, whose table of hashes takes longer than to sort.
+    joined = np.sort(np.concatenate((i * size + j, j * size + i)))
+    row, adjacent = np.divmod(joined[np.diff(joined, prepend=-1) > 0], max(size, 1))
     start = np.searchsorted(row, np.arange(size + 1)).astype(np.int32)
     return start, adjacent.astype(np.int32)
 
@@ -164,7 +165,6 @@ class BlockCholesky:
         assert layout is not None, 'solve before factorise'
         x: Array = solve_many(layout.panels, *layout.shape, self.pattern.position, right)
         return x
-
 
     def climb(self, keyframe: int) -> tuple[Places, Array]:
         """
