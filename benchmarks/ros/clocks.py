@@ -168,8 +168,8 @@ def main() -> None:
     measured = {}
     for _, topic, data in messages:
         if topic == ODOMETRY_TOPIC:
-            stamp, pose3 = stamped_pose(cdr.odometry(data))
-            measured[stamp] = pose3[:2], truth[stamp][:2]
+            sample = cdr.odometry(data)[1]
+            measured[sample.stamp] = sample.pose3[:2], truth[sample.stamp][:2]
     known: dict[int, np.ndarray] = {}
     for name, (sim_time, events) in plays.items():
         found = list(events())

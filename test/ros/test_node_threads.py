@@ -16,6 +16,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.core.online.upkeep import upkeep
+from l1slam_ros.io.messages import cdr
 from l1slam_ros.ros.threads import solver_thread
 
 DEADLINE = 60.0
@@ -131,6 +132,28 @@ def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
     b.until(lambda: len(b.path().poses) == 8, 'updates go on')
 
 
+def test_a_backlog_is_taken_over_from_dds_and_answered_at_its_end(bench, monkeypatch):
+    """More than the thousand messages that DDS queues up come while the first are in work."""
+    b = bench()
+    permits, decoded = threading.Semaphore(0), cdr.odometry
+    monkeypatch.setattr(cdr, 'odometry', lambda data: permits.acquire() and decoded(data))
+
+    def stand(first, last):
+        for k in range(first, last):
+            b.publishers['/odom'].publish(odometry((k + 1) * 10**7, 0.0))
+
+    stand(0, 900)
+    permits.release(150)
+    b.until(lambda: b.backend._intake.topics['odom'].received > 150, 'some are used')
+    stand(900, 1800)
+    permits.release(1800)
+    b.until(lambda: b.status()[2].get('odom.received') == '1800', 'all are used')
+    assert b.status()[2]['odom.lost'] == '0'
+    b.until(lambda: b.received['pose'] and b.received['pose'][-1].header.stamp.sec == 18,
+            'the newest is answered')
+    assert len(b.received['pose']) < 900
+
+
 def test_after_a_load_the_pose_is_right_at_once(bench, tmp_path):
     """Not only from the next keyframe on."""
     b = bench(save_path=str(tmp_path / 'map.g2o'))
@@ -184,12 +207,13 @@ def test_when_the_clock_jumps_back(bench, choice):
     assert poses_of(b.path())[-1, 0] == pytest.approx(end)
 
 
-def test_what_a_full_queue_has_dropped_is_said_to_be_lost(bench):
+def test_what_a_full_queue_has_dropped_is_said_to_be_lost(bench, monkeypatch):
     b = bench()
-    b.send('/odom', odometry(10**9, 0.0))
-    b.until(lambda: b.received['pose'], 'the first one')
-    for k in range(1, 3000):
+    go_on, decoded = threading.Event(), cdr.odometry
+    monkeypatch.setattr(cdr, 'odometry', lambda data: go_on.wait() and decoded(data))
+    for k in range(3000):
         b.publishers['/odom'].publish(odometry((k + 1) * 10**9, 0.0))
+    go_on.set()
     b.until(lambda: int(b.status()[2].get('odom.received', 0)) >= 1000, 'a part comes')
     b.until(lambda: sum(int(b.status()[2][f'odom.{name}']) for name in ('received', 'lost'))
             == 3000, 'all are accounted for')

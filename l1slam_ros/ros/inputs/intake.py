@@ -4,12 +4,15 @@ The thread that takes messages in.
 
 Each time that rclpy's executor wakes, it makes a wait set anew of all that a node has, services,
 timers and events: 1.5 ms, ten times what a message of the odometry costs. The wait set here is
-made once, of subscriptions alone, and all that has queued up is taken at once.
+made once, of subscriptions alone. What DDS has queued up is taken over first, some microseconds a
+message, before anything is made of it: a queue of DDS that is full drops messages without a word.
 """
 
 import math
+import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -24,8 +27,13 @@ from l1slam_ros.ros.inputs.traffic import Traffic
 from l1slam_ros.ros.threads.failures import Failures
 
 _DEPTH = 1000
-# Messages of one topic at most before others have their turn.
+# Messages of one topic at most before others have their turn, and before DDS is asked for more.
 _AT_ONCE = 100
+# More of one topic are left to DDS, to drop: ten seconds of a fast one, some megabytes.
+_BACKLOG = 10_000
+# [s] So long others run Python's code before a message may come in, and so long they wait once one
+# has: by turns of one length a busy machine would hand each message to and fro.
+_OTHERS_TURN, _OWN_TURN = 5e-4, 0.05
 # [s] What raises each time it is called shall not keep a core busy.
 _BREATH = 0.05
 
@@ -40,12 +48,15 @@ class _Apart(ReentrantCallbackGroup):  # type: ignore[misc]
 class _Input(NamedTuple):
     subscription: Any
     traffic: Traffic
-    callback: Callable[[Any], None]
+    callback: Callable[[Any, int], None]
+    queue: deque[tuple[Any, Any]]
 
 
 class Intake:
     """
-    Calls back with each message of some topics, in its own thread.
+    Calls back with each message of some topics, and how many more wait behind it.
+
+    It has a thread of its own.
 
     Parameters
     ----------
@@ -56,18 +67,19 @@ class Intake:
     Attributes
     ----------
     topics : name -> how its messages come
+    active : whether anything is called; messages that come meanwhile are gone
 
     """
 
     def __init__(self, node: Node, failures: Failures, tick: Callable[[], float]):
         self._node, self._failures, self._tick = node, failures, tick
-        self._group, self._closing = _Apart(), False
+        self._group, self.active, self._closing = _Apart(), False, False
         self._inputs: list[_Input] = []
         self._guard = GuardCondition(None, None, context=node.context)
         self._thread = threading.Thread(target=self._work, name='intake', daemon=True)
         self.topics: dict[str, Traffic] = {}
 
-    def subscribe(self, kind: Any, topic: str, callback: Callable[[Any], None],
+    def subscribe(self, kind: Any, topic: str, callback: Callable[[Any, int], None],
                   raw: bool = False) -> None:
         """Subscribe to a topic; raw : the callback gets the bytes of each message."""
         guarded = self._failures.guarded(topic, callback)
@@ -75,7 +87,7 @@ class Intake:
             kind, topic, guarded, QoSProfile(depth=_DEPTH), raw=raw, callback_group=self._group,
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         traffic = self.topics[topic] = Traffic(subscription.get_publisher_count)
-        self._inputs.append(_Input(subscription, traffic, guarded))
+        self._inputs.append(_Input(subscription, traffic, guarded, deque()))
 
     def start(self) -> None:
         """Begin; there is nothing to subscribe to any more."""
@@ -118,20 +130,22 @@ class Intake:
             seconds = math.inf
             while not self._closing and context.ok():
                 try:
+                    sys.setswitchinterval(_OTHERS_TURN)
                     self._wait(waiting, seconds)
-                    seconds = self._tick()
+                    seconds = min(self._use(), self._tick() if self.active else math.inf)
                     self._failures.over('intake')
                 except Exception as error:
                     self._failures.note('intake', error)
                     time.sleep(_BREATH)
 
     def _wait(self, waiting: Any, seconds: float) -> None:
-        """Wait for messages, for so long; take those that have come."""
+        """Wait for messages, for so long; take over those that have come."""
         waiting.clear_entities()
         for one in self._inputs:
             waiting.add_subscription(one.subscription.handle)
         waiting.add_guard_condition(self._guard.handle)
         waiting.wait(-1 if math.isinf(seconds) else max(round(seconds * 1e9), 0))
+        sys.setswitchinterval(_OWN_TURN)
         ready = waiting.get_ready_entities('subscription')
         for one in self._inputs:
             if one.subscription.handle.pointer in ready:
@@ -140,9 +154,16 @@ class Intake:
     def _take(self, one: _Input) -> None:
         subscription = one.subscription
         with subscription.handle:
-            for _ in range(_AT_ONCE):
-                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-                if taken is None:
-                    return
-                one.traffic.note(taken[1])
-                one.callback(taken[0])
+            while len(one.queue) < _BACKLOG and (taken := subscription.handle.take_message(
+                    subscription.msg_type, subscription.raw)) is not None:
+                one.queue.append(taken)
+
+    def _use(self) -> float:
+        """Call back with some messages; return after how many seconds to go on, 0 or infinity."""
+        for one in self._inputs:
+            for _ in range(min(len(one.queue), _AT_ONCE)):
+                message, information = one.queue.popleft()
+                one.traffic.note(information)
+                if self.active:
+                    one.callback(message, len(one.queue))
+        return 0.0 if any(one.queue for one in self._inputs) else math.inf
