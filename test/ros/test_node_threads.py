@@ -11,12 +11,14 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from node_bench import call, odometry, poses_of
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.messages import cdr
+from l1slam_ros.ros.publishing import header
 from l1slam_ros.ros.threads import solver_thread
 
 DEADLINE = 60.0
@@ -154,6 +156,22 @@ def test_a_backlog_is_taken_over_from_dds_and_answered_at_its_end(bench, monkeyp
     assert len(b.received['pose']) < 900
 
 
+def test_messages_of_all_topics_are_used_in_the_order_they_came(bench, monkeypatch):
+    b = bench()
+    go_on, used, backend = threading.Event(), [], b.backend._backend
+    monkeypatch.setattr(backend, 'add_odometry', lambda s: used.append(s.stamp) or go_on.wait())
+    monkeypatch.setattr(backend, 'add_loop', lambda loop: used.append(loop.stamp))
+    sent = [10**9 * k for k in range(1, 41)]
+    for k, stamp in enumerate(sent):
+        loop = PoseWithCovarianceStamped(header=header('base_link@0.500000000', stamp))
+        loop.pose.pose.orientation.w = 1.0
+        b.send('/loop_closures' if k % 3 == 2 else '/odom',
+               loop if k % 3 == 2 else odometry(stamp, 0.0))
+    go_on.set()
+    b.until(lambda: len(used) == len(sent), 'all are used')
+    assert used == sent
+
+
 def test_after_a_load_the_pose_is_right_at_once(bench, tmp_path):
     """Not only from the next keyframe on."""
     b = bench(save_path=str(tmp_path / 'map.g2o'))
@@ -227,10 +245,6 @@ def test_the_jump_of_the_transform_is_said(bench):
 
     The front takes the most of that step at once, the map behind it the rest.
     """
-    from geometry_msgs.msg import PoseWithCovarianceStamped
-
-    from l1slam_ros.ros.publishing import header
-
     b = bench()
     vouch = b.peer.create_publisher(PoseWithCovarianceStamped, 'trusted_loop_closures', 10)
     b.until(vouch.get_subscription_count, 'the node listens')

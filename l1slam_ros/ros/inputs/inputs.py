@@ -63,16 +63,13 @@ class Inputs:
             ('false_loop_closures', lambda m: false_loop(m, self._base_frame.name)),
             ('absolute_poses', lambda m: absolute_pose(m, self._map_frame)),
         ):
-            intake.subscribe(PoseWithCovarianceStamped, topic,
-                             partial(self._add_loop, read))
+            intake.subscribe(PoseWithCovarianceStamped, topic, partial(self._add_loop, read))
         # Pose graphs of other front ends, where their messages are installed.
         for msgtype, topic in (MAP_GRAPH, 'map_graph'), (POSE_GRAPH, 'pose_graph'):
             package, _, name = msgtype.split('/')
             with suppress(ImportError):
                 kind = getattr(import_module(f'{package}.msg'), name)
                 intake.subscribe(kind, topic, self.graph_reader())
-        # Last, so of what has come together it is taken last: a loop may come before odometry of
-        # its time, but not after the stamps have gone back.
         intake.subscribe(Odometry, 'odom', self._on_odometry, raw=True)
 
     def graph_reader(self) -> Callable[[Any, int], None]:

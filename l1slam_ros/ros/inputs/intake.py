@@ -6,6 +6,8 @@ Each time that rclpy's executor wakes, it makes a wait set anew of all that a no
 timers and events: 1.5 ms, ten times what a message of the odometry costs. The wait set here is
 made once, of subscriptions alone. What DDS has queued up is taken over first, some microseconds a
 message, before anything is made of it: a queue of DDS that is full drops messages without a word.
+Messages of all topics are used in the order they came: a loop that was sent before the stamps of
+the odometry went back is of the time before.
 """
 
 import math
@@ -14,6 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -27,9 +30,9 @@ from l1slam_ros.ros.inputs.traffic import Traffic
 from l1slam_ros.ros.threads.failures import Failures
 
 _DEPTH = 1000
-# Messages of one topic at most before others have their turn, and before DDS is asked for more.
+# So many are used before DDS is asked for more.
 _AT_ONCE = 100
-# More of one topic are left to DDS, to drop: ten seconds of a fast one, some megabytes.
+# More are left to DDS, to drop: ten seconds of a fast topic, some megabytes.
 _BACKLOG = 10_000
 # [s] So long others run Python's code before a message may come in, and so long they wait once one
 # has: by turns of one length a busy machine would hand each message to and fro.
@@ -49,7 +52,15 @@ class _Input(NamedTuple):
     subscription: Any
     traffic: Traffic
     callback: Callable[[Any, int], None]
-    queue: deque[tuple[Any, Any]]
+
+
+class _Message(NamedTuple):
+    """A message, what rclpy says about it, and when it came [ns]."""
+
+    received: int
+    input: _Input
+    content: Any
+    information: Any
 
 
 class Intake:
@@ -75,6 +86,7 @@ class Intake:
         self._node, self._failures, self._tick = node, failures, tick
         self._group, self.active, self._closing = _Apart(), False, False
         self._inputs: list[_Input] = []
+        self._queue: deque[_Message] = deque()
         self._guard = GuardCondition(None, None, context=node.context)
         self._thread = threading.Thread(target=self._work, name='intake', daemon=True)
         self.topics: dict[str, Traffic] = {}
@@ -87,7 +99,7 @@ class Intake:
             kind, topic, guarded, QoSProfile(depth=_DEPTH), raw=raw, callback_group=self._group,
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
         traffic = self.topics[topic] = Traffic(subscription.get_publisher_count)
-        self._inputs.append(_Input(subscription, traffic, guarded, deque()))
+        self._inputs.append(_Input(subscription, traffic, guarded))
 
     def start(self) -> None:
         """Begin; there is nothing to subscribe to any more."""
@@ -131,39 +143,46 @@ class Intake:
             while not self._closing and context.ok():
                 try:
                     sys.setswitchinterval(_OTHERS_TURN)
-                    self._wait(waiting, seconds)
-                    seconds = min(self._use(), self._tick() if self.active else math.inf)
+                    self._wait(waiting, 0.0 if self._queue else seconds)
+                    sys.setswitchinterval(_OWN_TURN)
+                    self._take()
+                    self._use()
+                    seconds = self._tick() if self.active else math.inf
                     self._failures.over('intake')
                 except Exception as error:
                     self._failures.note('intake', error)
                     time.sleep(_BREATH)
 
     def _wait(self, waiting: Any, seconds: float) -> None:
-        """Wait for messages, for so long; take over those that have come."""
+        """Wait for messages, for so long."""
         waiting.clear_entities()
         for one in self._inputs:
             waiting.add_subscription(one.subscription.handle)
         waiting.add_guard_condition(self._guard.handle)
         waiting.wait(-1 if math.isinf(seconds) else max(round(seconds * 1e9), 0))
-        sys.setswitchinterval(_OWN_TURN)
-        ready = waiting.get_ready_entities('subscription')
-        for one in self._inputs:
-            if one.subscription.handle.pointer in ready:
-                self._take(one)
 
-    def _take(self, one: _Input) -> None:
-        subscription = one.subscription
-        with subscription.handle:
-            while len(one.queue) < _BACKLOG and (taken := subscription.handle.take_message(
-                    subscription.msg_type, subscription.raw)) is not None:
-                one.queue.append(taken)
-
-    def _use(self) -> float:
-        """Call back with some messages; return after how many seconds to go on, 0 or infinity."""
+    def _take(self) -> None:
+        """Take over what has come of every topic."""
         for one in self._inputs:
-            for _ in range(min(len(one.queue), _AT_ONCE)):
-                message, information = one.queue.popleft()
-                one.traffic.note(information)
-                if self.active:
-                    one.callback(message, len(one.queue))
-        return 0.0 if any(one.queue for one in self._inputs) else math.inf
+            subscription = one.subscription
+            with subscription.handle:
+                while len(self._queue) < _BACKLOG and (taken := subscription.handle.take_message(
+                        subscription.msg_type, subscription.raw)) is not None:
+                    content, information = taken
+                    self._queue.append(_Message(
+                        information['received_timestamp'], one, content, information))
+
+    def _use(self) -> None:
+        """Call back with some of the messages in the order they came."""
+        until = max((message.received for message in self._queue), default=0)
+        # While one topic was emptied, older messages may have come of those before.
+        self._take()
+        if len(self._queue) > 1:
+            self._queue = deque(sorted(self._queue, key=itemgetter(0)))
+        for _ in range(_AT_ONCE):
+            if not self._queue or self._queue[0].received > until:
+                return
+            message = self._queue.popleft()
+            message.input.traffic.note(message.information)
+            if self.active:
+                message.input.callback(message.content, len(self._queue))
