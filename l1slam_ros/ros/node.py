@@ -85,6 +85,8 @@ class BackendNode(LifecycleNode):
             self, self._backend, self._jobs, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
         guarded = self.failures.guarded
+        for sentence in self._declared.unknown():
+            self.get_logger().warning(sentence)
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
                           on_clock_change=False),

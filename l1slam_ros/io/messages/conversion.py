@@ -32,7 +32,7 @@ from l1slam_ros.core.graph.measurements import (
 )
 from l1slam_ros.io.files import NANOSECONDS, quoted, stamp_text
 
-_REFERENCE_FRAME = re.compile(r'(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
+_REFERENCE_FRAME = re.compile(r'/?(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
 # builtin_interfaces/Time holds its seconds in 32 bits.
 _MAX_SECONDS = 2**31 - 1
 # [m] No robot's coordinates: beyond, differences of positions lose the millimetre, then overflow.
@@ -105,7 +105,7 @@ def absolute_pose(message: Any, map_frame: str) -> LoopClosure:
     MessageError : it cannot be used.
 
     """
-    stamp, frame = stamp_of(message.header), message.header.frame_id
+    stamp, frame = stamp_of(message.header), message.header.frame_id.removeprefix('/')
     if not frame or frame != (map_frame or frame):
         raise MessageError('frame', f'frame {quoted(frame)} of an absolute pose; expected '
                            f'{map_frame or "that of the map"}')
