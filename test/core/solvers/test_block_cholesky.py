@@ -22,7 +22,7 @@ from systems import (
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.linear_system import keyframes_of, linearise
+from l1slam_ros.core.graph.linear_system import linearise
 from l1slam_ros.core.solvers import block_cholesky
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, cholesky_of, find_pattern
 
