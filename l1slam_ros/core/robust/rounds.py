@@ -249,9 +249,14 @@ class Growth:
             drop = self._misfits(rows)
             self.accepted[drop] = False
             self._drops[drop] += 1
-        if not self._at_their_word and not np.array_equal(self.accepted, self._learnt_of):
+        if not self._knows_noise:
             self._learn_variance(rows)
             self._learnt_of = self.accepted.copy()
+
+    @property
+    def _knows_noise(self) -> bool:
+        """Whether there is nothing new to learn it of: what was learnt of, says always more."""
+        return self._at_their_word or np.array_equal(self.accepted, self._learnt_of)
 
     def noise(self) -> Array:
         """
@@ -273,7 +278,7 @@ class Growth:
     def _is_noisier(self, rows: Indices) -> bool:
         """Raise the variance where half of the factors say that it is far too small."""
         loops = self.is_loop[rows]
-        if self._at_their_word or np.count_nonzero(loops) < _KNOWN:
+        if self._knows_noise or np.count_nonzero(loops) < _KNOWN:
             return False
         square = (self.posterior.residual**2).sum(axis=1)
         stated = np.trace(self.posterior.moment, axis1=1, axis2=2)
