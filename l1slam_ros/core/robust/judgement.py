@@ -229,8 +229,10 @@ def _other_map(growth: Growth) -> list[Doubt]:
         spanned(growth.low[rows], growth.high[rows], growth.graph.n_poses)[
             growth.low[common_steps(growth, group)]].min()
         for rows in (accepted & growth.trusted, accepted))
-    # What is trusted is right, whatever else speaks against it.
-    if trusted or size < _AGAINST * across:
+    # What is trusted is right, whatever else speaks against it. Beside a slip, which is a guess of
+    # what happened, all of the loops across should agree.
+    slipped = (growth.cut & ~growth.gap).any()
+    if trusted or (size < _AGAINST * across and not slipped):
         return []
     return [_doubt(growth, OTHER_MAP, group.rows)]
 
