@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 from problems import PERIOD, seconds
 
-from l1slam_ros.core.errors import GraphError, OptionError
+from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
@@ -95,8 +95,3 @@ def test_a_back_end_in_space_ends_at_the_map_of_the_batch(world):
     with Backend(EVERY, dimension=2) as flat, pytest.raises(
             GraphError, match='a map of SE3, expected one of SE2'):
         flat.restore(saved)
-
-
-def test_there_is_no_other_dimension():
-    with pytest.raises(OptionError, match='dimension is 4, expected 2 or 3'):
-        Backend(EVERY, 4)
