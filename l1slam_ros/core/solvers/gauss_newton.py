@@ -91,7 +91,7 @@ def gauss_newton(
         candidate = step_poses(graph, poses, step)
         moved = whitened_residual(graph, candidate)
         cost = norm.cost(moved)
-        decrease, full = history[-1] - cost, damping <= _FIRST_DAMPING
+        decrease, full = history[-1] - cost, damping == 0.0
         if decrease >= 0:
             poses, residual = candidate, moved
             if decrease >= _FAITHFUL * predicted:
@@ -100,7 +100,8 @@ def gauss_newton(
             damping, cost = max(10 * damping, _FIRST_DAMPING), history[-1]
         history.append(cost)
         report(len(history) - 1, cost)
-        # By a step as good as undamped; at the optimum rounding may let the cost rise a little.
+        # Undamped, for loose keyframes may have more to gain; at the optimum rounding may let the
+        # cost rise a little.
         if full and (abs(decrease) <= options.tolerance * cost
                      or abs(decrease - predicted) < surprise):
             status = Status.CONVERGED
