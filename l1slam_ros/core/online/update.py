@@ -212,7 +212,7 @@ def optimise(problem: Problem, options: OptimiserOptions,
 def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
             check: Check) -> Solution:
     check()
-    method = choose(AUTO, graph, options.norm)
+    method = choose(AUTO, graph, options.norm, options.loop_norm)
     return minimise_by(method, graph, poses, options, lambda *_: check())[0]
 
 

@@ -111,6 +111,21 @@ def test_a_solve_to_the_end_is_as_good(world):
     assert_array_equal(backend.poses, solved.poses)
 
 
+def test_a_solve_to_the_end_minimises_the_norms_that_were_asked_for(world):
+    backend = Backend(EVERY)
+    play(backend, world)
+    problem = backend.snapshot().problem()
+    mixed, l1 = (optimise(problem, OptimiserOptions(norm=norm, loop_norm=loop_norm))
+                 for norm, loop_norm in (('l2', 'l1'), ('l1', 'same')))
+
+    def cost_at(poses):
+        rows = whitened_residual(problem.graph, poses).reshape(-1, 3)
+        odometry = problem.graph.between.is_odometry
+        return (rows[odometry] ** 2).sum() / 2 + np.abs(rows[~odometry]).sum()
+
+    assert mixed.cost == pytest.approx(cost_at(mixed.poses)) and mixed.cost < cost_at(l1.poses)
+
+
 def test_nothing_to_do_is_none(world):
     backend = Backend(EVERY)
     assert backend.update(PLENTY) is None
