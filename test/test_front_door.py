@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """`import l1slam_ros`: light, and the README's example of it runs."""
 
+import copy
 import inspect
+import pickle
 import re
 import subprocess
 import sys
@@ -72,10 +74,20 @@ def test_what_cannot_be_solved_is_said(world):
         l1.solve(graph, start=poses)
     with pytest.raises(l1.L1SlamError, match=r'poses have the shape \(3, 3\)'):
         l1.write_graph(world.parent / 'x.g2o', graph, poses[:3])
+    with pytest.raises(l1.L1SlamError, match='pose 7 is .*, expected finite numbers'):
+        l1.write_graph(world.parent / 'x.tum', graph, poses)
     with pytest.raises(l1.L1SlamError, match='no such file'):
         l1.read_graph(world.parent / 'missing.g2o')
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         l1.nothing  # noqa: B018
+
+
+@pytest.mark.parametrize('clone', [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def test_a_graph_goes_to_other_processes(world, clone):
+    graph, _ = l1.read_graph(world)
+    other = clone(graph)
+    assert other.manifold is graph.manifold
+    assert clone(l1.solve(other)).cost == l1.solve(graph).cost
 
 
 def test_a_start_of_long_quaternions_is_the_same_start(tmp_path):

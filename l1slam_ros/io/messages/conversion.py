@@ -26,6 +26,7 @@ from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import silent_components
 from l1slam_ros.core.graph.measurements import (
+    FARTHEST,
     QUATERNION_NORM_ERROR,
     LoopClosure,
     OdometrySample,
@@ -35,8 +36,6 @@ from l1slam_ros.io.files import NANOSECONDS, quoted, stamp_text
 _REFERENCE_FRAME = re.compile(r'(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
 # builtin_interfaces/Time holds its seconds in 32 bits.
 _MAX_SECONDS = 2**31 - 1
-# [m] No robot's coordinates: beyond, differences of positions lose the millimetre, then overflow.
-_FARTHEST = 1e9
 
 
 def odometry_sample(message: Any) -> OdometrySample:
@@ -168,8 +167,8 @@ def checked_pose3(t: Any, q: Any) -> Array:
     position, quaternion = (t.x, t.y, t.z), (q.x, q.y, q.z, q.w)
     if not all(map(math.isfinite, position + quaternion)):
         raise MessageError('not_finite', f'pose {position} {quaternion}; expected finite numbers')
-    if max(map(abs, position)) > _FARTHEST:
-        raise MessageError('range', f'position {position}; expected it within {_FARTHEST:g} m')
+    if max(map(abs, position)) > FARTHEST:
+        raise MessageError('range', f'position {position}; expected it within {FARTHEST:g} m')
     norm = math.hypot(*quaternion)
     if abs(norm - 1.0) > QUATERNION_NORM_ERROR:
         raise MessageError('quaternion', f'quaternion {quaternion} of norm {norm:g}; expected 1')
