@@ -56,6 +56,9 @@ class NodeOptions(BackendOptions):
     def __post_init__(self) -> None:
         """Check every field, and those that only make sense together."""
         super().__post_init__()
+        for name in ('map_frame', 'odom_frame', 'base_frame'):
+            # As tf2 has them.
+            object.__setattr__(self, name, getattr(self, name).removeprefix('/'))
         frames = self.map_frame, self.odom_frame
         if '' in frames or frames[0] == frames[1]:
             raise OptionError(f'map_frame is {frames[0]!r} and odom_frame {frames[1]!r}, expected '

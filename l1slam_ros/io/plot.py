@@ -126,11 +126,18 @@ def plot_maps(path: str | Path, maps: Sequence[MapDrawing]) -> None:
     _save(figure, path)
 
 
-def plot_curves(path: str | Path, curves: Sequence[Curve], title: str = '') -> None:
-    """Draw costs, on a logarithmic scale, against iterations; errors as for `plot_maps`."""
+def plot_curves(path: str | Path, curves: Sequence[Curve], title: str = '',
+                names: tuple[str, str] = ('iteration', 'cost')) -> None:
+    """
+    Draw costs, on a logarithmic scale, against iterations; errors as for `plot_maps`.
+
+    names : of the axes
+    """
     figure = _new_figure(path, 1.3, 0.8)
     axes = figure.add_subplot()
     _draw_curves(axes, curves, title)
+    axes.set_xlabel(names[0])
+    axes.set_ylabel(names[1])
     _draw_legend(axes)
     _save(figure, path)
 

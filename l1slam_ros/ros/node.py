@@ -7,7 +7,6 @@ carries out what services ask for, and saves. See `core.online.backend` for why 
 other.
 """
 
-import math
 import time
 from collections import Counter
 from typing import Any
@@ -78,9 +77,7 @@ class BackendNode(LifecycleNode):
         self._map_file = MapFile(self._backend, lambda: self.options, self.get_logger().warning)
         if options.load_on_start:
             self.get_logger().info(self._map_file.load_at_start())
-        self._intake = Intake(
-            self, self.failures,
-            lambda: self._transform.tick() if self._inputs.active else math.inf)
+        self._intake = Intake(self, self.failures, self._transform.tick)
         self._inputs = Inputs(
             self._intake, self._backend, options, self._on_moved, self.get_logger())
         self._diagnostics = Diagnostics(self, self._intake.topics, self._solver, self.failures)
@@ -88,6 +85,8 @@ class BackendNode(LifecycleNode):
             self, self._backend, self._jobs, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
         guarded = self.failures.guarded
+        for sentence in self._declared.unknown():
+            self.get_logger().warning(sentence)
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
                           on_clock_change=False),
@@ -106,13 +105,13 @@ class BackendNode(LifecycleNode):
 
     def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Use messages from now on."""
-        self._inputs.active = True
+        self._intake.active = True
         self._intake.wake()
         return TransitionCallbackReturn.SUCCESS
 
     def on_deactivate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Leave messages alone, and the map as it is."""
-        self._inputs.active = False
+        self._intake.active = False
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:

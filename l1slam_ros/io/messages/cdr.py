@@ -7,12 +7,12 @@ a multiple of its size, a string behind its length, with a closing zero.
 """
 
 import struct
-from typing import NamedTuple
 
 import numpy as np
 
 from l1slam_ros.core.errors import MessageError
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.measurements import OdometrySample
+from l1slam_ros.io.messages.conversion import sound_pose3, sound_stamp
 
 # The second byte of the four: plain CDR, most or least significant byte first.
 _ORDERS = {0: '>', 1: '<'}
@@ -20,59 +20,13 @@ _ORDERS = {0: '>', 1: '<'}
 _DOUBLES = 7 + 36 + 6 + 36
 
 
-class Stamp(NamedTuple):  # noqa: D101
-    sec: int
-    nanosec: int
-
-
-class Header(NamedTuple):  # noqa: D101
-    stamp: Stamp
-    frame_id: str
-
-
-class Vector(NamedTuple):  # noqa: D101
-    x: float
-    y: float
-    z: float
-
-
-class Quaternion(NamedTuple):  # noqa: D101
-    x: float
-    y: float
-    z: float
-    w: float
-
-
-class Pose(NamedTuple):  # noqa: D101
-    position: Vector
-    orientation: Quaternion
-
-
-class PoseWithCovariance(NamedTuple):  # noqa: D101
-    pose: Pose
-    covariance: Array
-
-
-class Twist(NamedTuple):  # noqa: D101
-    covariance: Array
-
-
-class Odometry(NamedTuple):
-    """What of a nav_msgs/Odometry is used, by the names that the message has for it."""
-
-    header: Header
-    child_frame_id: str
-    pose: PoseWithCovariance
-    twist: Twist
-
-
-def odometry(data: bytes) -> Odometry:
+def odometry(data: bytes) -> tuple[str, OdometrySample]:
     """
-    Return the message in some bytes.
+    Return whose odometry some bytes are, by its `child_frame_id`, and what they say.
 
     Raises
     ------
-    MessageError : they break off, or are no CDR.
+    MessageError : they break off, or are no CDR, or cannot be used.
 
     """
     order = _ORDERS.get(data[1]) if len(data) > 4 and not data[0] else None
@@ -80,21 +34,15 @@ def odometry(data: bytes) -> Odometry:
         raise MessageError('encoding', f'odometry that begins with {data[:4].hex()}; expected CDR')
     try:
         seconds, nanoseconds, length = struct.unpack_from(order + 'iII', data, 4)
-        frame, end = _text(data, 16, length)
-        at = end + -end % 4
-        child, end = _text(data, at + 4, *struct.unpack_from(order + 'I', data, at))
+        child_at = 16 + length + -length % 4
+        (length,) = struct.unpack_from(order + 'I', data, child_at)
+        end = child_at + 4 + length
+        child = data[child_at + 4 : end - 1].decode(errors='replace')
         # Eight bytes count from behind the first four.
-        numbers = np.frombuffer(data, order + 'f8', _DOUBLES, end + (4 - end) % 8)
+        numbers = np.frombuffer(data, order + 'f8', _DOUBLES, end + (4 - end) % 8).astype(float)
     except (struct.error, ValueError) as error:
         raise MessageError('encoding', f'odometry of {len(data)} bytes; expected more') from error
     x, y, z, *quaternion = numbers[:7].tolist()
-    return Odometry(
-        Header(Stamp(seconds, nanoseconds), frame), child,
-        PoseWithCovariance(Pose(Vector(x, y, z), Quaternion(*quaternion)), numbers[7:43]),
-        Twist(numbers[49:]))
-
-
-def _text(data: bytes, begin: int, length: int) -> tuple[str, int]:
-    """Return the string of so many bytes, closing zero included, and where it ends."""
-    end = begin + length
-    return data[begin : end - 1].decode(errors='replace'), end
+    return child, OdometrySample(
+        sound_stamp(seconds, nanoseconds), sound_pose3((x, y, z), tuple(quaternion)),
+        numbers[7:43].reshape(6, 6), numbers[49:].reshape(6, 6))

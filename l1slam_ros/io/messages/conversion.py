@@ -33,7 +33,8 @@ from l1slam_ros.core.graph.measurements import (
 )
 from l1slam_ros.io.files import NANOSECONDS, quoted, stamp_text
 
-_REFERENCE_FRAME = re.compile(r'(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
+_REFERENCE_FRAME = re.compile(
+    r'/?(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
 # builtin_interfaces/Time holds its seconds in 32 bits.
 _MAX_SECONDS = 2**31 - 1
 
@@ -104,7 +105,7 @@ def absolute_pose(message: Any, map_frame: str) -> LoopClosure:
     MessageError : it cannot be used.
 
     """
-    stamp, frame = stamp_of(message.header), message.header.frame_id
+    stamp, frame = stamp_of(message.header), message.header.frame_id.removeprefix('/')
     if not frame or frame != (map_frame or frame):
         raise MessageError('frame', f'frame {quoted(frame)} of an absolute pose; expected '
                            f'{map_frame or "that of the map"}')
@@ -147,7 +148,11 @@ def stamp_of(header: Any) -> int:
     MessageError : it is zero, negative or no time.
 
     """
-    seconds, nanoseconds = int(header.stamp.sec), int(header.stamp.nanosec)
+    return sound_stamp(int(header.stamp.sec), int(header.stamp.nanosec))
+
+
+def sound_stamp(seconds: int, nanoseconds: int) -> int:
+    """Return a stamp [ns]; see `stamp_of`."""
     stamp = seconds * NANOSECONDS + nanoseconds
     if seconds < 0 or not 0 <= nanoseconds < NANOSECONDS or stamp == 0:
         raise MessageError('stamp', f'stamp {seconds} s {nanoseconds} ns; '
@@ -164,7 +169,11 @@ def checked_pose3(t: Any, q: Any) -> Array:
     MessageError : they are no pose.
 
     """
-    position, quaternion = (t.x, t.y, t.z), (q.x, q.y, q.z, q.w)
+    return sound_pose3((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
+
+
+def sound_pose3(position: tuple[float, ...], quaternion: tuple[float, ...]) -> Array:
+    """Return a pose (7,) of x y z and qx qy qz qw; see `checked_pose3`."""
     if not all(map(math.isfinite, position + quaternion)):
         raise MessageError('not_finite', f'pose {position} {quaternion}; expected finite numbers')
     if max(map(abs, position)) > FARTHEST:

@@ -20,30 +20,31 @@ from l1slam_ros.io.messages.conversion import (
     absolute_pose,
     false_loop,
     loop_closure,
-    odometry_sample,
 )
 from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.inputs.intake import Intake
 
 _REPEAT_WARNING = 5.0  # [s]
+# Of a backlog so many messages, the newest, are answered with a pose: nobody waits for the others.
+_ANSWERED = 200
 
 
 class Inputs:
     """
-    Appends messages to the back end while it is active; what cannot be used is counted.
+    Appends messages to the back end; what cannot be used is counted.
 
     Parameters
     ----------
     intake : which takes the messages in
     backend : to append to
     options : of the node
-    moved : called after each sample of the odometry that is used
+    moved : called after a sample of the odometry that is used, unless so many more wait behind it
+        that nobody needs its answer
     logger : of the node
 
     Attributes
     ----------
-    active : whether messages are used
     refused : cause -> how many messages could not be used
 
     """
@@ -52,7 +53,6 @@ class Inputs:
                  moved: Callable[[], None], logger: Any):
         self._backend, self._moved, self._logger = backend, moved, logger
         self._base_frame, self._map_frame = BaseFrame(options.base_frame), options.map_frame
-        self.active = False
         self.refused: Counter[str] = Counter()
         self._subscribe(intake)
 
@@ -63,42 +63,31 @@ class Inputs:
             ('false_loop_closures', lambda m: false_loop(m, self._base_frame.name)),
             ('absolute_poses', lambda m: absolute_pose(m, self._map_frame)),
         ):
-            intake.subscribe(PoseWithCovarianceStamped, topic,
-                             self._used(partial(self._add_loop, read)))
+            intake.subscribe(PoseWithCovarianceStamped, topic, partial(self._add_loop, read))
         # Pose graphs of other front ends, where their messages are installed.
         for msgtype, topic in (MAP_GRAPH, 'map_graph'), (POSE_GRAPH, 'pose_graph'):
             package, _, name = msgtype.split('/')
             with suppress(ImportError):
                 kind = getattr(import_module(f'{package}.msg'), name)
                 intake.subscribe(kind, topic, self.graph_reader())
-        # Last, so of what has come together it is taken last: a loop may come before odometry of
-        # its time, but not after the stamps have gone back.
-        intake.subscribe(Odometry, 'odom', self._used(self._on_odometry), raw=True)
+        intake.subscribe(Odometry, 'odom', self._on_odometry, raw=True)
 
-    def graph_reader(self) -> Callable[[Any], None]:
+    def graph_reader(self) -> Callable[[Any, int], None]:
         """Return what takes the pose graphs of a topic, message by message."""
         graphs = PoseGraphs()
 
-        def read(message: Any) -> None:
+        def read(message: Any, _: int = 0) -> None:
             for found in graphs.take(message):
                 if isinstance(found, LoopClosure):
                     self._add_loop(lambda loop: loop, found)
                 else:
                     self._refuse(found)
 
-        return self._used(read)
+        return read
 
-    def _used(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
-        def use(message: Any) -> None:
-            if self.active:
-                callback(message)
-
-        return use
-
-    def _on_odometry(self, data: bytes) -> None:
+    def _on_odometry(self, data: bytes, behind: int) -> None:
         try:
-            message = cdr.odometry(data)
-            found = self._base_frame.take(message.child_frame_id, odometry_sample(message))
+            found = self._base_frame.take(*cdr.odometry(data))
         except L1SlamError as error:
             self._refuse(error)
             return
@@ -107,16 +96,16 @@ class Inputs:
         for other in found.others:
             self._refuse(other)
         for sample in found.ours:
-            self._add_odometry(sample)
+            self._add_odometry(sample, behind < _ANSWERED)
 
-    def _add_odometry(self, sample: OdometrySample) -> None:
+    def _add_odometry(self, sample: OdometrySample, answered: bool) -> None:
         try:
-            if self._backend.add_odometry(sample) is not None:
+            if self._backend.add_odometry(sample) is not None and answered:
                 self._moved()
         except L1SlamError as error:
             self._refuse(error)
 
-    def _add_loop(self, read: Callable[[Any], LoopClosure], message: Any) -> None:
+    def _add_loop(self, read: Callable[[Any], LoopClosure], message: Any, _: int = 0) -> None:
         try:
             self._backend.add_loop(read(message))
         except L1SlamError as error:

@@ -31,9 +31,8 @@ def message(rng, frame='odom', child='base_link'):
 
 
 def assert_same(decoded, message):
-    assert decoded.header.frame_id == message.header.frame_id
-    assert decoded.child_frame_id == message.child_frame_id
-    ours, theirs = odometry_sample(decoded), odometry_sample(message)
+    (child, ours), theirs = decoded, odometry_sample(message)
+    assert child == message.child_frame_id
     assert ours.stamp == theirs.stamp == 12_000_000_345
     for name in ('pose3', 'covariance', 'twist_covariance'):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
@@ -71,10 +70,10 @@ def test_nonsense_never_raises_anything_else(rng):
         for place in rng.integers(0, 48, 3):
             spoilt[place] = rng.integers(256)
         try:
-            decoded = cdr.odometry(bytes(spoilt))
+            _, sample = cdr.odometry(bytes(spoilt))
         except MessageError:
             continue
-        assert len(decoded.pose.covariance) == 36
+        assert sample.twist_covariance.shape == (6, 6)
     struct.pack_into('<I', data, 12, 2**32 - 1)
     with pytest.raises(MessageError, match='expected more'):
         cdr.odometry(bytes(data))
