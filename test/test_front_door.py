@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`import l1slam_ros`: light, and the README's example of it runs."""
 
+import ast
 import copy
 import inspect
 import pickle
@@ -44,6 +45,14 @@ def test_the_example_of_the_readme_runs_and_says_what_it_found(world):
     assert (ran.returncode, ran.stderr) == (0, '')
     assert re.match(r'converged: L1 cost [0-9.]+, 10 loops refused\n', ran.stdout)
     assert len(l1.read_graph(world.parent / 'solved.g2o')[1]) == 200
+
+
+def test_type_checkers_know_every_name():
+    found = {alias.name: node.module for node in ast.walk(ast.parse(inspect.getsource(l1)))
+             if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert {name: found[name] for name in l1.__all__} == {
+        name: getattr(l1, name).__module__ for name in l1.__all__}
+    assert Path(l1.__file__).with_name('py.typed').exists()
 
 
 @pytest.mark.parametrize('name', l1.__all__)
