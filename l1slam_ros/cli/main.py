@@ -96,6 +96,8 @@ def _answer(arguments: Sequence[str] | None) -> int:
 
 
 def _run(options: argparse.Namespace) -> Any:
+    # That of a notebook, which its children get too, may not be installed here.
+    os.environ.pop('MPLBACKEND', None)
     module = import_module(f'l1slam_ros.cli.{_MODULES[options.command]}')
     import numpy as np
 
