@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """`import l1slam_ros`: light, and the README's example of it runs."""
 
+import ast
+import copy
 import inspect
 import json
+import pickle
 import re
 import subprocess
 import sys
@@ -43,6 +46,14 @@ def test_the_example_of_the_readme_runs_and_says_what_it_found(world):
     assert (ran.returncode, ran.stderr) == (0, '')
     assert re.match(r'converged: L1 cost [0-9.]+, 10 loops refused\n', ran.stdout)
     assert len(l1.read_graph(world.parent / 'solved.g2o')[1]) == 200
+
+
+def test_type_checkers_know_every_name():
+    found = {alias.name: node.module for node in ast.walk(ast.parse(inspect.getsource(l1)))
+             if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert {name: found[name] for name in l1.__all__} == {
+        name: getattr(l1, name).__module__ for name in l1.__all__}
+    assert Path(l1.__file__).with_name('py.typed').exists()
 
 
 @pytest.mark.parametrize('name', l1.__all__)
@@ -92,10 +103,20 @@ def test_what_cannot_be_solved_is_said(world):
         l1.solve(graph, start=poses)
     with pytest.raises(l1.L1SlamError, match=r'poses have the shape \(3, 3\)'):
         l1.write_graph(world.parent / 'x.g2o', graph, poses[:3])
+    with pytest.raises(l1.L1SlamError, match='pose 7 is .*, expected finite numbers'):
+        l1.write_graph(world.parent / 'x.tum', graph, poses)
     with pytest.raises(l1.L1SlamError, match='no such file'):
         l1.read_graph(world.parent / 'missing.g2o')
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         l1.nothing  # noqa: B018
+
+
+@pytest.mark.parametrize('clone', [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def test_a_graph_goes_to_other_processes(world, clone):
+    graph, _ = l1.read_graph(world)
+    other = clone(graph)
+    assert other.manifold is graph.manifold
+    assert clone(l1.solve(other)).cost == l1.solve(graph).cost
 
 
 def test_a_start_of_long_quaternions_is_the_same_start(tmp_path):
