@@ -41,6 +41,12 @@ CITY, BICOCCA = cells.Cell('city10000', 'random', 0.3), cells.Cell('bicocca25b',
 LARGE = cells.Cell('world50k', 'clean', 0.0)
 
 
+def test_what_is_said_was_measured():
+    record = json.loads((FOLDER / 'results' / 'incremental.json').read_text())
+    lines = tables.document(record, [cells.Row.of(fields) for fields in record['rows']])
+    assert (FOLDER / 'INCREMENTAL.md').read_text().splitlines() == lines
+
+
 def test_a_cell_is_measured_from_the_graph_to_the_row(tiny):
     row = cells.measure(Path(), TINY, 0.0)
     assert (row.cell, row.n, row.peer) == (TINY, 100, None)
