@@ -128,7 +128,7 @@ def l2_map(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
         linear = _two_linear_steps(graph, poses, cholesky)
         poses = linear if _chi2(graph, linear) < chi2 else poses
     options = LeastSquaresOptions(_NOISE_STEPS, 1 / spare)
-    return gauss_newton(graph, poses, Huber(), options, cholesky, report, surprise=1.0).poses
+    return gauss_newton(graph, poses, Huber(), options, cholesky, report, surprise=0.1).poses
 
 
 def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:
