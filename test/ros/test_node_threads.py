@@ -17,7 +17,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.core.online.upkeep import upkeep
-from l1slam_ros.io.messages import cdr
+from l1slam_ros.io.messages import conversion
 from l1slam_ros.ros.publishing import header
 from l1slam_ros.ros.threads import solver_thread
 
@@ -137,8 +137,9 @@ def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
 def test_a_backlog_is_taken_over_from_dds_and_answered_at_its_end(bench, monkeypatch):
     """More than the thousand messages that DDS queues up come while the first are in work."""
     b = bench()
-    permits, decoded = threading.Semaphore(0), cdr.odometry
-    monkeypatch.setattr(cdr, 'odometry', lambda data: permits.acquire() and decoded(data))
+    permits, decoded = threading.Semaphore(0), conversion.odometry_in
+    monkeypatch.setattr(
+        conversion, 'odometry_in', lambda data: permits.acquire() and decoded(data))
 
     def stand(first, last):
         for k in range(first, last):
@@ -146,7 +147,7 @@ def test_a_backlog_is_taken_over_from_dds_and_answered_at_its_end(bench, monkeyp
 
     stand(0, 900)
     permits.release(150)
-    b.until(lambda: b.backend._intake.topics['odom'].received > 150, 'some are used')
+    b.until(lambda: b.backend._inputs.traffic['odom'].received > 150, 'some are used')
     stand(900, 1800)
     permits.release(1800)
     b.until(lambda: b.status()[2].get('odom.received') == '1800', 'all are used')
@@ -227,8 +228,8 @@ def test_when_the_clock_jumps_back(bench, choice):
 
 def test_what_a_full_queue_has_dropped_is_said_to_be_lost(bench, monkeypatch):
     b = bench()
-    go_on, decoded = threading.Event(), cdr.odometry
-    monkeypatch.setattr(cdr, 'odometry', lambda data: go_on.wait() and decoded(data))
+    go_on, decoded = threading.Event(), conversion.odometry_in
+    monkeypatch.setattr(conversion, 'odometry_in', lambda data: go_on.wait() and decoded(data))
     for k in range(3000):
         b.publishers['/odom'].publish(odometry((k + 1) * 10**9, 0.0))
     go_on.set()
