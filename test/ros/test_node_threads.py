@@ -13,6 +13,7 @@ pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from node_bench import call, odometry, poses_of
+from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
@@ -171,6 +172,30 @@ def test_messages_of_all_topics_are_used_in_the_order_they_came(bench, monkeypat
     go_on.set()
     b.until(lambda: len(used) == len(sent), 'all are used')
     assert used == sent
+
+
+def test_optimize_is_done_though_the_map_is_replaced_meanwhile(bench, monkeypatch):
+    """By a parameter that lets all loops be judged anew: it is no end of the node."""
+    b = bench()
+    drive(b, 0, 3)
+    b.until(lambda: len(b.path().poses) == 3, 'a map')
+    began, optimise = threading.Event(), upkeep.optimise
+
+    def interrupted(problem, options, check):
+        while not began.is_set():
+            began.set()
+            while True:
+                check()
+        return optimise(problem, options, check)
+
+    monkeypatch.setattr(upkeep, 'optimise', interrupted)
+    client = b.peer.create_client(Trigger, '/backend/optimize')
+    b.until(client.service_is_ready, 'optimize is offered')
+    answer = client.call_async(Trigger.Request())
+    b.until(began.is_set, 'it is at work')
+    assert b.backend.set_parameters([Parameter('robust.enabled', value=False)])[0].successful
+    b.until(answer.done, 'optimize is answered')
+    assert answer.result().success, answer.result().message
 
 
 def test_after_a_load_the_pose_is_right_at_once(bench, tmp_path):
