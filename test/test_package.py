@@ -69,6 +69,8 @@ def test_package_xml_and_setup_py_say_the_same(metadata, manifest):
     assert manifest.findtext('name') == metadata['Name'].replace('-', '_')
     assert manifest.findtext('version') == metadata['Version']
     assert manifest.findtext('description') == metadata['Summary']
+    assert metadata['Description-Content-Type'] == 'text/markdown'
+    assert metadata.get_payload(decode=True) == (ROOT / 'README.md').read_bytes()
     assert manifest.findtext('license') in (metadata['License'], metadata['License-Expression'])
     assert maintainer.text == metadata['Maintainer']
     assert maintainer.get('email') == metadata['Maintainer-email']

@@ -5,19 +5,18 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import incremental
 import numpy as np
 from measuring import clock
 
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, turned
+from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.robust import batch_map
 from l1slam_ros.core.robust.judgement import Doubt
-from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.paper.updates import dimension_of, measurements
 
 # Online: an update after so many keyframes, for so long [s].
 _EVERY, _BUDGET = 10, 0.1
@@ -105,8 +104,8 @@ def _online(rate: float) -> Callable[[FactorGraph, Array], Found]:
         nothing = dict.fromkeys(('translation', 'rotation', 'period'), 0.0)
         options = BackendOptions.from_mapping(
             {'keyframe': nothing, 'odometry': {'covariance_source': 'increment'}})
-        with Backend(options, incremental.dimension_of(graph), rate > 0) as backend:
-            for k, (sample, loops) in enumerate(incremental.measurements(_in_time(graph)), 1):
+        with Backend(options, dimension_of(graph), rate > 0) as backend:
+            for k, (sample, loops) in enumerate(measurements(graph), 1):
                 backend.add_odometry(sample)
                 for loop in loops:
                     backend.add_loop(loop)
@@ -143,12 +142,6 @@ def _found(backend: Backend, graph: FactorGraph, seconds: float,
     slips = np.flatnonzero(np.isin(steps, now.graph.between.i[judgement.slips]))
     return Found(backend.poses, seconds, _accepted(backend, graph), tuple(slips.tolist()),
                  *_said(judgement.doubt, ''), maps)
-
-
-def _in_time(graph: FactorGraph) -> GraphRecord:
-    """Return the graph with each factor from the earlier keyframe to the later one."""
-    forward = turned(graph, graph.between.i > graph.between.j)
-    return GraphRecord(forward, None, np.arange(graph.n_poses))
 
 
 def _updated(backend: Backend, budget: float) -> float:

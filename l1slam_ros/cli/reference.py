@@ -15,6 +15,7 @@ from l1slam_ros.io.formats import is_bag, stamps_of
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import false_loops_path, read_false_loops
 from l1slam_ros.io.trajectory import Reference, read_reference
+from l1slam_ros.io.wording import counted
 
 # [ns] As far as that a pose may lie before the first or after the last true one: files round.
 _SAME_STAMP = 1_000_000
@@ -62,8 +63,8 @@ def read_truth(source: str, record: GraphRecord, input_path: Path) -> Truth:
     if len(rows) < 2:
         stampless = reference.stamped and record.stamps is None
         hint = '; the graph has no stamps, so its poses are 0.1 s apart from 1000 s on'
-        raise FileError(source, f'shares {len(rows)} poses with the graph, expected 2 or more'
-                        f'{hint if stampless else ""}')
+        raise FileError(source, f'shares {counted(len(rows), "pose")} with the graph, expected '
+                        f'2 or more{hint if stampless else ""}')
     scored = keys[rows]
     first, last = np.searchsorted(reference.keys, [scored.min(), scored.max()])
     inside = gaps[(gaps > first) & (gaps <= last)] - first

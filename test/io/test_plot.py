@@ -58,13 +58,6 @@ def test_everything_given_is_drawn_and_named(tmp_path):
         assert word in said
 
 
-def test_what_is_not_given_is_not_named(tmp_path):
-    path = tmp_path / 'map.svg'
-    plot_maps(path, [MapDrawing('Some street', SQUARE)])
-    assert '5 poses, 0 loops' in words(path)
-    assert not {'odometry', 'truth', 'refused', 'suspect'} & set(words(path).split())
-
-
 @pytest.mark.parametrize('name, title', [
     ('$\\frac$.g2o', '$\\frac$.g2o'), ('a\udce9.g2o', 'a?.g2o')])
 def test_a_name_is_written_as_it_is(tmp_path, name, title):

@@ -106,7 +106,7 @@ def test_orders_are_carried_out_in_the_order_they_came(bench):
     assert all(job.result().success for job in jobs)
 
 
-def patient(problem, options, budget, check, accuracy):
+def patient(problem, options, budget, check, exact):
     """Stand for an update of a huge map: it ends when it is told to."""
     while True:
         check()

@@ -11,6 +11,7 @@ from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_sound
+from l1slam_ros.core.names import OF_THE_NODE
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.loop_states import LoopStates
 from l1slam_ros.core.online.snapshot import Optimised, Robot, SavedMap
@@ -38,7 +39,9 @@ class RobustOptions(Options):
 
 @dataclass(frozen=True)
 class BackendOptions(GraphBuilderOptions):
-    """Everything the back end can be told."""
+    """Everything the back end can be told; a mapping may say what its node is told besides."""
+
+    PASSED_OVER = OF_THE_NODE
 
     solver: OptimiserOptions = OptimiserOptions()
     robust: RobustOptions = RobustOptions()

@@ -86,9 +86,9 @@ def sample_posterior(
     m, k = len(system.blocks), system.block_size
     q = SAMPLES * k
     # Signs have the covariance of white noise, and are quicker to draw.
-    noise = 2.0 * rng.integers(0, 2, (m, k, q), dtype=np.int8) - 1.0
+    noise = 2 * rng.integers(0, 2, (m, k, q), dtype=np.int8) - np.int8(1)
     speaks = graph.between.speaks
-    noise[~speaks] = 0.0
+    noise[~speaks] = 0
     right = np.zeros((system.size + 1, k, q))
     gather(system.keyframe, system.blocks, noise, right)
     samples = np.zeros_like(right)

@@ -3,8 +3,8 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
-from problems import add_absolute, drive, graph_of, noisy_graph
+from numpy.testing import assert_allclose
+from problems import drive, graph_of, noisy_graph
 from scipy.optimize import approx_fprime, least_squares
 
 from l1slam_ros.core.errors import GraphError
@@ -15,6 +15,7 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import (
     LeastSquaresOptions,
+    l2_map,
     minimise_huber,
     minimise_l2,
 )
@@ -66,13 +67,6 @@ def test_l2_agrees_with_scipy(world):
     assert solution.status is Status.CONVERGED
     assert solution.cost == pytest.approx(2 * expected.cost, rel=1e-8)
     assert_allclose(se2.local(solution.poses, step_poses(graph, truth, expected.x)), 0, atol=1e-4)
-
-
-def test_the_cost_has_no_half(world):
-    graph, _ = world
-    solution = solve(minimise_l2, graph, odometry_poses(graph))
-    assert solution.cost == chi2(graph, solution.poses) == solution.history[-1]
-    assert solution.history[0] == chi2(graph, odometry_poses(graph))
 
 
 def test_huber_cost_by_hand():
@@ -152,14 +146,6 @@ def test_a_graph_without_noise_is_solved_exactly(minimise, exact):
 
 
 @BOTH
-def test_an_exact_start_is_the_end(minimise):
-    poses = np.array([[0.0, 0, 0], [1.0, 0, 0]])
-    solution = solve(minimise, parallel([1.0], [1.0]), poses)
-    assert (solution.cost, solution.status) == (0.0, Status.CONVERGED)
-    assert_array_equal(solution.poses, poses)
-
-
-@BOTH
 @pytest.mark.parametrize('seed', [0, 1, 3, 4])
 def test_where_a_plain_step_fails_damping_finds_the_way(minimise, seed):
     """From poses anywhere Gauss-Newton leaps too far: steps are refused, then shortened."""
@@ -174,32 +160,12 @@ def test_where_a_plain_step_fails_damping_finds_the_way(minimise, seed):
 
 
 @BOTH
-@pytest.mark.parametrize('iterations', [0, 1, 2])
-def test_the_iteration_limit_is_kept_and_named(minimise, iterations, world):
-    graph, _ = world
-    start = odometry_poses(graph)
-    solution = solve(minimise, graph, start, LeastSquaresOptions(iterations=iterations))
-    assert solution.status is Status.ITERATION_LIMIT
-    assert solution.outer_iterations == iterations == len(solution.history) - 1
-    assert iterations or solution.poses is start
-
-
-@BOTH
 def test_the_dual_begins_anew_and_there_is_no_gap(minimise, world):
     graph, truth = world
     solution = solve(minimise, graph, truth)
     rows = len(graph.between) * graph.manifold.TANGENT_SIZE
     assert solution.dual.shape == (rows,) and not solution.dual.any() and np.isinf(solution.gap)
     assert solution.inner_iterations == 0
-
-
-@BOTH
-def test_progress_is_reported(minimise, world):
-    graph, _ = world
-    reports = []
-    solution = minimise(graph, odometry_poses(graph), DEFAULTS, cholesky_of(graph),
-                        lambda k, cost: reports.append((k, cost)))
-    assert reports == list(enumerate(solution.history))[1:]
 
 
 @BOTH
@@ -211,11 +177,11 @@ def test_a_loose_keyframe_is_refused(minimise):
         solve(minimise, graph, np.zeros((3, 3)))
 
 
-def test_the_world_takes_the_place_of_the_anchor(world):
+def test_a_step_that_does_what_it_promised_ends_the_map_within_its_noise(world):
     graph, truth = world
-    alone = solve(minimise_l2, graph, truth)
-    there = se2.compose(np.broadcast_to([10.0, 20.0, 0.5], truth.shape), truth)
-    add_absolute(graph, np.array([3]), there[3:4], np.eye(3)[None])
-    solution = solve(minimise_l2, graph, truth)
-    assert solution.cost == pytest.approx(alone.cost, rel=1e-9)
-    assert_allclose(se2.local(solution.poses[3:4], there[3:4]), 0, atol=1e-6)
+    steps = []
+    best = solve(minimise_l2, graph, truth)
+    for start in (truth, best.poses):
+        poses = l2_map(graph, start, cholesky_of(graph), lambda k, cost: steps.append(k))
+        assert chi2(graph, poses) < best.cost + 1
+    assert steps == [1, 1] and best.outer_iterations > 2

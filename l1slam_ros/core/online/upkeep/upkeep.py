@@ -31,9 +31,9 @@ from l1slam_ros.core.incremental.growing_map import View
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
-from l1slam_ros.core.online.update import Improvement, front_of, improve, optimise
+from l1slam_ros.core.online.update import Improvement, front_of, improve, one_round, optimise
 from l1slam_ros.core.online.upkeep.live_map import AT_ONCE, LiveMap
-from l1slam_ros.core.online.upkeep.threads import Worker
+from l1slam_ros.core.online.upkeep.threads import Worker, until
 from l1slam_ros.core.robust.batch import judge, robust_solve
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
@@ -41,8 +41,8 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 Stopped = Callable[[], bool]
 # [s] So long an update may take what has come, and a map is improved, whatever the budget.
 _LEAST_TIME, _LEAST_ROUND = 0.02, 0.1
-# Linearisations of one round: more and it is late. Of the clock it may take some times as long.
-_OUTER, _PATIENCE = 2, 4
+# Of the clock a round may take some times as long.
+_PATIENCE = 4
 # So often a new front takes what came meanwhile, before it is one.
 _PASSES = 3
 # [s] How often who waits looks whether to stop.
@@ -182,11 +182,7 @@ class Upkeep:
 
     def _check_of(self, live: LiveMap, stopped: Stopped) -> Callable[[], None]:
         """Return what raises `Interrupted` where work for a map is not wanted any more."""
-        def check() -> None:
-            if self._make_way or stopped() or live is not self._live:
-                raise Interrupted
-
-        return check
+        return until(lambda: self._make_way or stopped() or live is not self._live)
 
     def _check_workers(self) -> None:
         for worker in self._workers:
@@ -223,18 +219,17 @@ class Upkeep:
 
     def _map_anew(self, idle: bool, budget: float, check: Callable[[], None]) -> None:
         """Lower the cost of the map, when idle to the end, and factor it."""
-        start = time.thread_time()
         with self._standing() as now:
             live, solver = self._live, self._solver
+            exact = live.is_exact_due(idle)
         whole = now.problem()
         problem = as_one(whole)
+        if exact:
+            check = until(lambda: live.is_late, check)
+        else:
+            solver = one_round(solver, problem.is_sparse)
         check()
-        accuracy = live.accuracy(idle, problem.is_sparse)
-        if accuracy is None:
-            solver = replace(solver, outer_iterations=min(solver.outer_iterations, _OUTER))
-        improvement = improve(problem, solver, _PATIENCE * max(budget, _LEAST_ROUND), check,
-                              accuracy)
-        live.note_round(time.thread_time() - start, accuracy)
+        improvement = improve(problem, solver, _PATIENCE * max(budget, _LEAST_ROUND), check, exact)
         check()
         front = front_of(problem, improvement.poses, len(whole.graph.between), check)
         for _ in range(_PASSES):
@@ -250,9 +245,10 @@ class Upkeep:
         """Look at all loops again; anew: from the graph alone, until more comes."""
         with self._standing() as now:
             live, loops = self._live, self._live.begin_judgement()
-            at_rest = live.until_more_comes(check)
+            grown = live.growth()
         whole = now.problem()
         problem = as_one(whole)
+        at_rest = until(lambda: live.growth() != grown, check)
         judgement, poses = robust_solve(problem.graph, check=at_rest) if anew else judge(
             problem.graph, problem.poses, problem.judgement, np.inf, check)
         check()
