@@ -5,8 +5,6 @@ import math
 from dataclasses import dataclass
 from numbers import Integral
 
-import numpy as np
-
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 
@@ -82,9 +80,10 @@ def require_sound(what: OdometrySample | LoopClosure) -> None:
     if shapes != [(7,), (6, 6)]:
         raise MessageError('shape', f'pose3 of shape {shapes[0]}, covariance of {shapes[1]}; '
                            'expected arrays (7,) and (6, 6)')
-    if not np.isfinite(what.pose3).all():
+    pose3 = what.pose3.tolist()
+    if not all(map(math.isfinite, pose3)):
         raise MessageError('not_finite', f'pose {what.pose3}; expected finite numbers')
-    norm = math.hypot(*what.pose3[3:])
+    norm = math.hypot(*pose3[3:])
     if abs(norm - 1) > QUATERNION_NORM_ERROR:
         raise MessageError('quaternion', f'quaternion {what.pose3[3:]} of norm {norm:g}; '
                            'expected 1')

@@ -174,7 +174,7 @@ class Inputs:
         return not self._thread.is_alive()
 
     def _work(self) -> None:
-        context = self._node.context
+        context, turn = self._node.context, sys.getswitchinterval()
         with context.handle, self._guard.handle:
             waiting = rclpy_implementation.WaitSet(
                 len(self._topics), 1, 0, 0, 0, 0, context.handle)
@@ -191,6 +191,7 @@ class Inputs:
                 except Exception as error:
                     self._failures.note('intake', error)
                     time.sleep(_BREATH)
+        sys.setswitchinterval(turn)
 
     def _wait(self, waiting: Any, seconds: float) -> None:
         """Wait for messages, for so long."""
