@@ -8,7 +8,7 @@ solution, what found it, and what is believed of the loops.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -110,6 +110,9 @@ def solve(
     seconds = time.perf_counter() - began
     cost = cost_function(graph, asked)
     seed_cost = None if seed is None else cost(seed)
+    if robust and not robust.judgement.is_noise_stated:
+        # Whatever the noise is: by what the file says of it.
+        solution = replace(solution, cost=cost(solution.poses))
     if not np.isfinite([cost(initial), seed_cost or 0.0, solution.cost]).all():
         raise GraphError('the cost leaves double precision: measurements and information of the '
                          'graph are too large, or too different from each other')
