@@ -183,13 +183,16 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
     Raises
     ------
     FileError : it cannot be written, or the format has no place for a part of the graph.
-    GraphError : poses of another shape.
+    GraphError : poses of another shape, or not finite.
 
     """
     _check_reading(rotation_information)
     expected = (graph.n_poses, graph.manifold.POSE_SIZE)
     if np.shape(poses) != expected:
         raise GraphError(f'poses have the shape {np.shape(poses)}, expected {expected}')
+    if not np.isfinite(poses).all():
+        row = int(np.argmin(np.isfinite(poses).all(axis=1)))
+        raise GraphError(f'pose {row} is {np.asarray(poses)[row]}, expected finite numbers')
     write_output(Path(path), GraphRecord(
         graph, np.asarray(poses, float), np.arange(graph.n_poses),
         rotation_information=rotation_information))

@@ -84,12 +84,6 @@ def test_a_csv_file_has_stamps(tmp_path, text):
     np.testing.assert_allclose(reference.poses, [[1, 2, 0], [3, 4, 0.5]], atol=1e-15)
 
 
-def test_the_papers_truth(datasets):
-    reference = read_reference(datasets / 'city10000.truth.txt')
-    assert reference.keys.tolist() == list(range(10000))
-    assert reference.poses[1].tolist() == [1, 0, 0]
-
-
 @pytest.mark.parametrize(('text', 'message'), [
     ('', ': the file is empty; expected reference poses'),
     ('1 2 3\n', ':1: 3 columns; expected 8 (TUM), 4 (id and pose) or a graph file'),

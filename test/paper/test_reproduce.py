@@ -15,7 +15,7 @@ from problems import linprog_l1
 from scipy.optimize import linprog
 
 from l1slam_ros.cli.main import main
-from l1slam_ros.core.errors import FileError, OptionError
+from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.geometry.se2 import wrap
 from l1slam_ros.core.graph.linear_system import linearise, step_poses, whitened_residual
@@ -296,8 +296,3 @@ def test_a_graph_that_cannot_be_used_is_named(capsys, tmp_path, text, says):
     out, err = capsys.readouterr()
     assert out == '' and says in err and err.count('\n') == 1
     assert [p.name for p in tmp_path.iterdir()] == ['intel.g2o']
-
-
-def test_nothing_to_run_is_an_error_of_options(tmp_path):
-    with pytest.raises(OptionError, match='nothing to run'):
-        reproduce.reproduce(None, [], tmp_path / 'out', LITTLE)

@@ -3,19 +3,20 @@
 What has come since a map was factored, as a small dense system on top of it.
 
 In: a factored normal matrix H = L L' of the keyframes there were, then factors and keyframes one
-by one. Out: steps of all keyframes, and the exact covariance of any linear function of them. With
-one multiplier for each row of a new factor, A its block of the old keyframes, B of the new ones,
-W^-1 its noise and r its residual, the least squares solution is that of
+by one. Out: steps of all keyframes, and the exact covariance of any linear function of them.
 
-    [-(W^-1 + A H^-1 A')   B ] [lambda]   [-r]
-    [         B'           0 ] [  x   ] = [ 0],      old keyframes: -H^-1 A' lambda,
+A keyframe is where the factor says that sees it first: it hangs on that factor's other end, x_j =
+T x_i + c and noise. With C the covariance that makes of H^-1, m the mean, A the blocks of all
+other factors, W^-1 their noise and r their residuals, the least squares solution is
 
-whose matrix is kept as F S F', F lower triangular and S signs. A row that is appended costs one
-substitution, and its pivot before the noise is added is minus the covariance of the factor's
-residual as all others predict it: who asks before appending has the test of a factor for free.
+    x = m + C A' lambda,    (W^-1 + A C A') lambda = -(r + A m),
 
-H^-1 is needed between the keyframes that new factors touch only. Each takes one climb of the
-elimination tree, L^-1 e_p, which is zero but between p and the root.
+whose matrix is kept as F F', F lower triangular. A row that is appended costs one substitution,
+and its pivot before the noise is added is the covariance of the factor's residual as all others
+predict it: who asks before appending has the test of a factor for free.
+
+C is needed between the keyframes that factors touch only. Each of the old ones takes one climb of
+the elimination tree, L^-1 e_p, which is zero but between p and the root.
 """
 
 from dataclasses import dataclass
@@ -41,10 +42,8 @@ class Prediction:
 
     residual: Array
     covariance: Array
-    at_no_step: Array
     rows: Array
-    ends: tuple[int, int]
-    names: Indices
+    points: Indices
     blocks: Array
 
 
@@ -53,22 +52,34 @@ class Steps:
     """
     The steps of all keyframes at one moment.
 
-    cholesky, size : see `Border`; touched (t,), gradient (t, k) : what pulls at which of the old
-    keyframes; new : the steps of the border's, (b, k).
+    cholesky, size : see `Border`; old, new : points that are old keyframes, as many keyframes
+    each, (2, t), and points that are the new ones; mean, gradient : of points, (t, k); parent,
+    turn, noise : see `kernels.border`.
     """
 
     cholesky: BlockCholesky
     size: int
-    touched: Indices
+    old: Indices
+    new: list[int]
+    mean: Array
     gradient: Array
-    new: Array
+    parent: Indices
+    turn: Array
+    noise: Array
 
     def all(self) -> Array:
         """Return the steps of all keyframes, (n + b, k)."""
-        right = np.zeros((self.size, self.new.shape[1]))
-        right[self.touched] = -self.gradient
-        old = self.cholesky.solve(right.ravel()) if len(self.touched) else right
-        return np.concatenate((old.reshape(right.shape), self.new))
+        from l1slam_ros.core.kernels import border
+
+        gradient, (points, keyframes) = self.gradient.copy(), self.old
+        border.pull_parents(self.parent, self.turn, gradient)
+        right = np.zeros((self.size, gradient.shape[1]))
+        right[keyframes] = gradient[points]
+        old = self.cholesky.solve(right.ravel()) if len(points) else right
+        moved = np.zeros_like(gradient)
+        moved[points] = old.reshape(right.shape)[keyframes]
+        border.move_children(self.parent, self.turn, self.noise, gradient, moved)
+        return np.concatenate((old.reshape(right.shape), (self.mean + moved)[self.new]))
 
 
 class Border:
@@ -84,19 +95,20 @@ class Border:
 
     def __init__(self, cholesky: BlockCholesky, size: int, k: int):
         self._cholesky, self._size, self._k = cholesky, size, k
-        # Climbs, and the blocks of H^-1 between the keyframes they began at.
+        # Points: which old keyframes they are, and which the new ones are; climbs, covariance.
         self._touched: dict[int, int] = {}
+        self._new: list[int] = []
         self._begin = GrowingArray((), np.int64)
         self._begin.extend(np.zeros(1, np.int64))
         self._places, self._values = GrowingArray((), np.int32), GrowingArray()
-        self._covariance = GrowingArray((k, k))
-        # The border: its rows of blocks, its factor, F^-1 times the right hand side.
+        self._covariance, self._mean = GrowingArray((k, k)), GrowingArray((k,))
+        self._parent = GrowingArray((), np.int64)
+        self._turn, self._noise = GrowingArray((k, k)), GrowingArray((k, k))
+        # The other factors: their points and blocks, F, F^-1 times the right hand side.
         self._ends, self._blocks = GrowingArray((2,), np.int64), GrowingArray((2, k, k))
-        self._factor, self._signs, self._right = GrowingArray(), GrowingArray(), GrowingArray()
-        self._home: list[int] = []
-        # Multipliers and steps from some row on, and A' lambda; None: not known.
-        self._solution: tuple[int, Array] | None = None
-        self._pulled: Array | None = None
+        self._factor, self._right = GrowingArray(), GrowingArray()
+        # A' lambda at the first points; nothing pulls at those that came since. Empty: not known.
+        self._pulled = np.zeros((0, k))
 
     @property
     def rows(self) -> int:
@@ -106,34 +118,53 @@ class Border:
     @property
     def keyframes(self) -> int:
         """How many keyframes there are, old and new."""
-        return self._size + len(self._home)
+        return self._size + len(self._new)
 
     @property
-    def touched(self) -> int:
-        """How many of the old ones were asked for."""
-        return len(self._touched)
+    def points(self) -> int:
+        """How many of them were asked for, or are new."""
+        return len(self._parent)
+
+    def begin(self, ends: tuple[int, int], blocks: Array, residual: Array, noise: Array) -> None:
+        """
+        Append a keyframe by the factor that sees it first; see `predict`, `add`.
+
+        Raises
+        ------
+        LinAlgError : that does not say where it is; nothing is appended.
+
+        """
+        from l1slam_ros.core.kernels import border
+
+        own = ends.index(self.keyframes)
+        parent, inverse = self._point(ends[1 - own]), np.linalg.inv(blocks[own])
+        turn, mean = -inverse @ blocks[1 - own], -inverse @ residual
+        if parent != FIXED:
+            mean += turn @ self._mean.view()[parent]
+        spread = inverse * noise @ inverse.T
+        product = np.empty((self.points + 1, self._k, self._k))
+        border.follow(self._covariance.view(), parent, turn, spread, product)
+        self._new.append(self._append(product, mean, parent, turn, spread))
 
     def predict(self, ends: tuple[int, int], blocks: Array, residual: Array) -> Prediction:
         """
         Return what is known of r + J_i x_i + J_j x_j.
 
-        ends : the keyframes i and j, `FIXED` for none, one past the last: not in the border yet,
-        left out; blocks : (2, k, k); residual : r, (k,)
+        ends : the keyframes i and j, `FIXED` for none; blocks : (2, k, k); residual : r, (k,)
         """
         from l1slam_ros.core.kernels import border
 
-        names, rows = np.array([self._name(end) for end in ends]), np.empty((self._k, self.rows))
-        covariance, expected = np.zeros((self._k, self._k)), residual.copy()
+        points = np.array([self._point(end) for end in ends])
+        rows, expected = np.empty((self._k, self.rows)), residual.copy()
+        covariance = np.empty((self._k, self._k))
         border.predict(
-            self._covariance.view(), self._ends.view(), self._blocks.view(), self._factor.view(),
-            self._signs.view(), self._right.view(), names, blocks, rows, covariance, expected)
-        return Prediction(expected, covariance, residual, rows, ends, names, blocks)
+            self._covariance.view(), self._mean.view(), self._ends.view(), self._blocks.view(),
+            self._factor.view(), self._right.view(), points, blocks, rows, covariance, expected)
+        return Prediction(expected, covariance, rows, points, blocks)
 
     def add(self, predicted: Prediction, noise: Array) -> None:
         """
-        Append a factor just predicted, and the keyframe that it is the first to see, if it is.
-
-        noise : (k,) variances
+        Append a factor just predicted; noise : (k,) variances.
 
         Raises
         ------
@@ -142,51 +173,41 @@ class Border:
         """
         from l1slam_ros.core.kernels import border
 
-        n, k, unseen = self.rows, self._k, self.keyframes
-        seen = predicted.blocks[predicted.ends.index(unseen)] if unseen in predicted.ends else (
-            np.empty((0, 0)))
-        added = k + len(seen)
-        lines, right = np.empty(added * n + added * (added + 1) // 2), np.empty(added)
-        if not border.append(self._signs.view(), self._right.view(), predicted.rows,
-                             predicted.covariance + np.diag(noise), predicted.at_no_step, seen,
-                             lines, right):
+        n, k = self.rows, self._k
+        lines, right = np.empty(k * n + k * (k + 1) // 2), np.empty(k)
+        if not border.append(predicted.rows, predicted.covariance + np.diag(noise),
+                             predicted.residual, lines, right):
             raise np.linalg.LinAlgError
         self._factor.extend(lines)
         self._right.extend(right)
-        self._append(-1.0, np.maximum(predicted.names, FIXED), predicted.blocks)
-        if len(seen):
-            self._home.append(len(self._ends))
-            self._append(1.0, np.full(2, FIXED), np.zeros((2, k, k)))
-        self._solution = self._pulled = None
+        self._ends.extend(predicted.points[None])
+        self._blocks.extend(predicted.blocks[None])
+        self._pulled = self._pulled[:0]
 
-    def step(self, keyframe: int) -> Array:
-        """Return the step of a keyframe, (k,)."""
+    def step(self, keyframes: list[int]) -> Array:
+        """Return the steps of some keyframes, (m, k); zero of those that are not here yet."""
         from l1slam_ros.core.kernels import border
 
-        name, k = self._name(keyframe), self._k
-        if name < -1:
-            begin = (-2 - name) * k
-            own: Array = self._solved(begin)[:k]
-            return own
-        if name == FIXED or not self.rows:
-            return np.zeros(k)
-        step: Array = border.move(self._covariance.view(), self._gradient(), name)
-        return step
+        points = np.array([self._point(keyframe) if keyframe < self.keyframes else FIXED
+                           for keyframe in keyframes])
+        steps: Array = border.move(self._covariance.view(), self._mean.view(), self._gradient(),
+                                   points)
+        return steps
 
     def steps(self) -> Steps:
         """Return the steps of all keyframes as they are now."""
-        solved = self._solved(0).reshape(-1, self._k)
-        return Steps(self._cholesky, self._size, np.fromiter(self._touched, np.int64),
-                     self._gradient(), solved[self._home])
+        old = np.array([*self._touched.items()], np.int64).reshape(-1, 2).T[::-1]
+        return Steps(self._cholesky, self._size, old, self._new.copy(), self._mean.view(),
+                     self._gradient(), self._parent.view(), self._turn.view(),
+                     self._noise.view())
 
-    def _name(self, keyframe: int) -> int:
-        """Return what a keyframe is called by `kernels.border.predict`."""
-        if keyframe == FIXED:
-            return FIXED
-        new = keyframe - self._size
-        if new >= 0:
-            return -2 - self._home[new] if new < len(self._home) else FIXED
-        return self._touched[keyframe] if keyframe in self._touched else self._touch(keyframe)
+    def _point(self, keyframe: int) -> int:
+        """Return the point that a keyframe is; `FIXED` is none."""
+        if keyframe >= self._size:
+            return self._new[keyframe - self._size]
+        if keyframe == FIXED or keyframe in self._touched:
+            return self._touched.get(keyframe, FIXED)
+        return self._touch(keyframe)
 
     def _touch(self, keyframe: int) -> int:
         from l1slam_ros.core.kernels import border
@@ -194,34 +215,34 @@ class Border:
         places, values = self._cholesky.climb(keyframe)
         self._places.extend(places)
         self._values.extend(values.ravel())
-        self._begin.extend(np.array([len(self._places)]))
-        t = self._touched[keyframe] = len(self._touched)
-        product = np.empty((t + 1, self._k, self._k))
-        border.meet(self._begin.view(), self._places.view(), self._values.view(), product)
-        self._covariance.extend(product)
+        t, k = self.points, self._k
+        product, none = np.empty((t + 1, k, k)), np.zeros((k, k))
+        begin = np.append(self._begin.view(), len(self._places))
+        border.meet(begin, self._places.view(), self._values.view(),
+                    np.append(self._parent.view(), FIXED), self._turn.view(), product)
+        self._touched[keyframe] = self._append(product, np.zeros(k), FIXED, none, none)
         return t
 
-    def _append(self, sign: float, names: Indices, blocks: Array) -> None:
-        self._signs.extend(np.full(self._k, sign))
-        self._ends.extend(names[None])
-        self._blocks.extend(blocks[None])
-
-    def _solved(self, begin: int) -> Array:
-        """Return multipliers and steps from some row on."""
-        from l1slam_ros.core.kernels import border
-
-        if self._solution is None or self._solution[0] > begin:
-            x = self._signs.view() * self._right.view()
-            border.back_substitute(self._factor.view(), x, begin)
-            self._solution = begin, x
-        return self._solution[1][begin:]
+    def _append(self, product: Array, mean: Array, parent: int, turn: Array,
+                noise: Array) -> int:
+        """Append a point; return it."""
+        self._begin.extend(np.array([len(self._places)]))
+        self._covariance.extend(product)
+        self._mean.extend(mean[None])
+        self._parent.extend(np.array([parent]))
+        self._turn.extend(turn[None])
+        self._noise.extend(noise[None])
+        return self.points - 1
 
     def _gradient(self) -> Array:
-        """Return A' lambda at the keyframes that are touched, (t, k)."""
+        """Return A' lambda at all points, (t, k)."""
         from l1slam_ros.core.kernels import border
 
-        if self._pulled is None or len(self._pulled) < len(self._touched):
-            self._pulled = np.zeros((len(self._touched), self._k))
-            border.pull(self._ends.view(), self._blocks.view(),
-                        self._solved(0).reshape(-1, self._k), self._pulled)
+        known = len(self._pulled)
+        if known < self.points:
+            before, self._pulled = self._pulled, np.zeros((self.points, self._k))
+            self._pulled[:known] = before
+            if not known:
+                border.pull(self._factor.view(), self._right.view(), self._ends.view(),
+                            self._blocks.view(), self._pulled)
         return self._pulled

@@ -28,9 +28,9 @@ _SMOOTHING = 0.1
 _REFUSED = 1e-3
 # Of the loops admitted, one in so many may be false.
 _SURE = 1000.0
-# Rows of a border, and keyframes touched, that one more update has the time and the memory for.
+# Rows of a border, and keyframes it touches, that one more update has the time and the memory for.
 # What comes then waits for the next map.
-_MOST_ROWS, _MOST_TOUCHED = 1800, 700
+_MOST_ROWS, _MOST_POINTS = 1800, 1400
 # In the place of whether to believe a factor: the front finds out.
 UNKNOWN = -1
 
@@ -73,15 +73,14 @@ class Front:
     Parameters
     ----------
     part : the factors that are believed
-    poses, l2_poses : (n, p) their L1 map, and their L2 map with the noise as it was found
-    cholesky : of the part; the front keeps it
-    loops : (m,) 1 for each factor that is a loop, 0 for odometry
+    poses : their L1 map, (n, p), and their L2 map with the noise as it was found
+    choleskys : of the part, the second holds the factor of that L2 map; the front keeps them
     gate : see `Gate`
     rows : factors of the graph that grows, when `part` was taken from it
 
     Attributes
     ----------
-    rows : how many of them it knows
+    rows : how many of them it knows; taken : of these have come since it was made
     closed : it takes no more
 
     Raises
@@ -90,23 +89,19 @@ class Front:
 
     """
 
-    def __init__(self, part: FactorGraph, poses: Array, l2_poses: Array, cholesky: BlockCholesky,
-                 loops: Indices, gate: Gate, rows: int):
-        self.rows, self.closed = rows, False
-        system, k = linearise(part, poses), part.manifold.TANGENT_SIZE
+    def __init__(self, part: FactorGraph, poses: tuple[Array, Array],
+                 choleskys: tuple[BlockCholesky, BlockCholesky], gate: Gate, rows: int):
+        self.rows, self.taken, self.closed = rows, 0, False
+        system, k = linearise(part, poses[L1]), part.manifold.TANGENT_SIZE
         # What a square stays below, and the log ratio but for what hangs on the factor.
         self._limit = float(chi2_quantile(1 - _REFUSED, np.array([k]))[0])
         self._volume = (gate.log_volume - k * np.log(2 * np.pi) / 2
                         - np.log(_SURE - 1) - gate.log_odds)
         self._variance = np.repeat(gate.variance[:, None], k, axis=1)
         self._mu = _SMOOTHING * smoothing(system.b)
-        other, l2_system = BlockCholesky(cholesky.pattern, system.keyframe), linearise(
-            part, l2_poses)
-        variance = self._variance[loops].ravel()
-        if not (cholesky.factorise(system, 1 / np.hypot(system.b, self._mu))
-                and other.factorise(l2_system, 1 / variance)):
+        if not choleskys[L1].factorise(system, 1 / np.hypot(system.b, self._mu)):
             raise GraphError('a part of the graph is not tied to the anchor')
-        self._map = GrowingMap(part, (poses, l2_poses), (cholesky, other))
+        self._map = GrowingMap(part, poses, choleskys)
 
     @property
     def keyframes(self) -> int:
@@ -151,6 +146,7 @@ class Front:
             if look is None:
                 break
             self.rows += 1
+            self.taken += 1
             looks.append(look)
         return looks
 
@@ -158,7 +154,7 @@ class Front:
         """Tell whether the next factor is for the next map."""
         return (max(factors.i[self.rows], factors.j[self.rows]) > self.keyframes
                 or (known == 1 and self._turns(factors))
-                or self.border > _MOST_ROWS or self._map.touched > _MOST_TOUCHED)
+                or self.border > _MOST_ROWS or self._map.points > _MOST_POINTS)
 
     def _turns(self, factors: BetweenFactors) -> bool:
         """Tell whether the next factor is the first that names the world: the gauge is another."""
@@ -171,12 +167,13 @@ class Front:
         if not known or (known == UNKNOWN and (self._turns(factors) or not own.all())):
             return Look(False, known == UNKNOWN, np.nan)
         first_seen = self.keyframes in (factors.i[self.rows], factors.j[self.rows])
-        variance = self._variance[0 if first_seen else 1]
         try:
-            predicted = self._map.predict(L2, new, at)
-            look, left = Look(True, False, 0.0), np.zeros(len(variance))
-            if not first_seen:
-                look, left = self._test(predicted, own, variance, known == 1)
+            if first_seen:
+                self._map.begin(L2, new, at, self._variance[0])
+                self._map.begin(L1, new, at, np.full(len(own), self._mu))
+                return Look(True, False, 0.0)
+            variance, predicted = self._variance[1], self._map.predict(L2, new, at)
+            look, left = self._test(predicted, own, variance, known == 1)
             if look.accepted:
                 self._map.add(L2, predicted, variance)
                 self._map.add(L1, self._map.predict(L1, new, at), np.hypot(left, self._mu))

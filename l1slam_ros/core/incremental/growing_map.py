@@ -39,6 +39,11 @@ class Linearised:
     blocks: Array
     residual: Array
 
+    def of(self, weighting: int, at: int) -> tuple[tuple[int, int], Array, Array]:
+        """Return the ends, blocks and residual of one of them."""
+        i, j = self.ends[at].tolist()
+        return (i, j), self.blocks[at, weighting], self.residual[at, weighting]
+
 
 @dataclass(frozen=True)
 class View:
@@ -90,9 +95,9 @@ class GrowingMap:
         return self._borders[L1].rows
 
     @property
-    def touched(self) -> int:
-        """How many old keyframes were asked for."""
-        return self._borders[L2].touched
+    def points(self) -> int:
+        """How many keyframes were asked for, or are new."""
+        return self._borders[L2].points
 
     @property
     def views(self) -> tuple[View, View]:
@@ -142,11 +147,20 @@ class GrowingMap:
             residual -= (side @ steps[ends][..., None])[..., 0]
         return Linearised(np.maximum(pairs - self.fixed, FIXED), np.stack(sides, axis=2), residual)
 
+    def begin(self, weighting: int, factors: Linearised, at: int, noise: Array) -> None:
+        """
+        Append the next keyframe by one of some factors, with variances (k,) of its rows.
+
+        Raises
+        ------
+        LinAlgError : the factor does not say where it is.
+
+        """
+        self._borders[weighting].begin(*factors.of(weighting, at), noise)
+
     def predict(self, weighting: int, factors: Linearised, at: int) -> Prediction:
         """Return what is known of one of some factors."""
-        i, j = factors.ends[at].tolist()
-        return self._borders[weighting].predict(
-            (i, j), factors.blocks[at, weighting], factors.residual[at, weighting])
+        return self._borders[weighting].predict(*factors.of(weighting, at))
 
     def add(self, weighting: int, predicted: Prediction, noise: Array) -> None:
         """
@@ -165,5 +179,5 @@ class GrowingMap:
         first = self._first.view()[keyframes]
         first[keyframes == WORLD] = manifold.identity(1)
         ends = np.maximum(keyframes - self.fixed, FIXED).tolist()
-        steps = np.array([[border.step(end) for border in self._borders] for end in ends])
+        steps = np.stack([border.step(ends) for border in self._borders], axis=1)
         return first, steps, manifold.retract(first, steps)

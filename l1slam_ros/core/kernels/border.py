@@ -6,8 +6,10 @@ The arrays of the sparse factor are those of `cholesky`. A climb is L^-1 e_p for
 one keyframe p: it is zero but on the way from p to the root of the elimination tree. Climbs are
 kept one after the other: the positions on the way, ascending, and the columns, each in one run.
 
-Triangles are kept row after row, row r from r (r + 1) / 2 on, so that they grow at their end: that
-of F, and the blocks of H^-1 between keyframes climbed from, the earlier first.
+Points are the keyframes that factors touch. Those that came later have an empty climb; where they
+are hangs on another point, their parent: x = turn x_parent + noise. Triangles are kept row after
+row, row r from r (r + 1) / 2 on, so that they grow at their end: that of the factor F, and the
+covariances of points, that of s <= t at t (t + 1) / 2 + s.
 """
 
 import numpy as np
@@ -94,17 +96,21 @@ def _dot_three(line, length, x, y, z):
     return of_x, of_y, of_z
 
 
-@loop('(i8[::1], i4[::1], f8[::1], f8[:, :, ::1])')
-def meet(begin, places, values, product):
+@loop('(i8[::1], i4[::1], f8[::1], i8[::1], f8[:, :, ::1], f8[:, :, ::1])')
+def meet(begin, places, values, parent, turn, product):
     """
-    Write the blocks of H^-1 between each keyframe and the last climbed from, (t, k, k).
+    Write the covariances of all points with the last one, that was climbed from, (t, k, k).
 
-    begin : (t + 1,) of each climb in `places`; its columns begin at values[begin k^2]
+    begin : (t + 1,) of each climb in `places`; its columns begin at values[begin k^2]; parent,
+    turn : (t,), (t, k, k), see above
     """
     t, k = product.shape[:2]
     own_end, own = begin[t], begin[t - 1]
     own_length = (own_end - own) * k
     for s in range(t):
+        if parent[s] >= 0:
+            _multiply(turn[s], product[parent[s]], product[s])
+            continue
         end, common = begin[s + 1], 0
         most = min(end - begin[s], own_end - own)
         # What two ways have in common is their end.
@@ -124,89 +130,114 @@ def meet(begin, places, values, product):
                     left, len(left), x, y, z)
 
 
-@loop('(f8[:, :, ::1], i8[:, ::1], f8[:, :, :, ::1], f8[::1], f8[::1], f8[::1], i8[::1], '
+@loop('(f8[:, :, ::1], i8, f8[:, ::1], f8[:, ::1], f8[:, :, ::1])')
+def follow(covariance, parent, turn, noise, product):
+    """Write the covariances of all points with a new one that hangs on `parent`, (t, k, k)."""
+    last = len(product) - 1
+    product[last] = noise
+    if parent < 0:
+        product[:last] = 0.0
+        return
+    middle = np.empty_like(turn)
+    for s in range(last):
+        _multiply(turn, _between(covariance, parent, s), middle)
+        product[s] = middle.T
+    _multiply(turn, product[parent], middle)
+    product[last] += middle
+
+
+@compiled
+def _between(covariance, s, t):
+    """Return the covariance of points s and t, (k, k)."""
+    return covariance[t * (t + 1) // 2 + s] if s <= t else covariance[s * (s + 1) // 2 + t].T
+
+
+@compiled
+def _multiply(left, right, product):
+    k = len(left)
+    for r in range(k):
+        for c in range(k):
+            total = 0.0
+            for e in range(k):
+                total += left[r, e] * right[e, c]
+            product[r, c] = total
+
+
+@loop('(f8[:, :, ::1], f8[:, ::1], i8[:, ::1], f8[:, :, :, ::1], f8[::1], f8[::1], i8[::1], '
       'f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1])')
-def predict(covariance, ends, blocks, factor, signs, right, own_ends, own_blocks, rows, said,
+def predict(covariance, mean, ends, blocks, factor, right, own_ends, own_blocks, rows, said,
             expected):
     """
-    Write the rows of a factor, reduced by the border so far, (k, n), and what is said of J x.
+    Write the rows of a factor, reduced by those before, (k, n), and what is said of J x.
 
-    Its covariance, (k, k), and its mean is added to what is expected, (k,). Of the border:
+    Its covariance, (k, k), and its mean is added to what is expected, (k,).
 
-    covariance : of the keyframes that are touched; ends, blocks : (b, 2) and (b, 2, k, k) of each
-    row of blocks: a factor's touched keyframes, -1 for none; own_ends : the same, -2 - b for the
-    border's own keyframe at b
+    covariance, mean : of points; ends, blocks : (b, 2) and (b, 2, k, k) of the factors so far,
+    points, -1 for none; own_ends, own_blocks : the same of this one; factor, right : F and F^-1
+    times the right hand side
     """
-    k, begin = len(rows), len(ends)
+    k = len(rows)
     rows[:] = 0.0
+    said[:] = 0.0
     for side in range(2):
-        end = own_ends[side]
-        if end < -1:
-            begin = min(begin, -2 - end)
-            for r in range(k):
-                for c in range(k):
-                    rows[r, (-2 - end) * k + c] += own_blocks[side, r, c]
-        elif end >= 0:
-            begin = 0
-            for b in range(len(ends)):
-                for other in range(2):
-                    if ends[b, other] >= 0:
-                        _subtract_product(own_blocks[side], covariance, end, ends[b, other],
-                                          blocks[b, other], rows[:, b * k:(b + 1) * k])
-    _reduce(factor, rows, begin * k)
-    for side in range(2):
+        end, own = own_ends[side], own_blocks[side]
+        if end < 0:
+            continue
+        for b in range(len(ends)):
+            for other in range(2):
+                if ends[b, other] >= 0:
+                    _add_product(own, _between(covariance, end, ends[b, other]),
+                                 blocks[b, other], rows[:, b * k:(b + 1) * k])
         for other in range(2):
-            if own_ends[side] >= 0 and own_ends[other] >= 0:
-                _subtract_product(own_blocks[side], covariance, own_ends[side], own_ends[other],
-                                  own_blocks[other], said)
+            if own_ends[other] >= 0:
+                _add_product(own, _between(covariance, end, own_ends[other]),
+                             own_blocks[other], said)
+        for r in range(k):
+            for c in range(k):
+                expected[r] += own[r, c] * mean[end, c]
+    _reduce(factor, rows)
     for r in range(k):
-        for e in range(begin * k, rows.shape[1]):
-            expected[r] += rows[r, e] * signs[e] * right[e]
+        for e in range(rows.shape[1]):
+            expected[r] += rows[r, e] * right[e]
         for c in range(r + 1):
-            total = -(said[r, c] + said[c, r]) / 2
-            for e in range(begin * k, rows.shape[1]):
-                total += rows[r, e] * signs[e] * rows[c, e]
+            total = (said[r, c] + said[c, r]) / 2
+            for e in range(rows.shape[1]):
+                total -= rows[r, e] * rows[c, e]
             said[r, c] = said[c, r] = total
 
 
 @compiled
-def _subtract_product(left, covariance, s, t, right, out):
-    """Subtract left H^-1_st right' from out, (k, k) each."""
+def _add_product(left, middle, right, out):
+    """Add left middle right' to out, (k, k) each."""
     k = len(left)
-    middle = covariance[t * (t + 1) // 2 + s] if s <= t else covariance[s * (s + 1) // 2 + t].T
     for r in range(k):
         for e in range(k):
             total = 0.0
             for c in range(k):
                 total += left[r, c] * middle[c, e]
             for c in range(k):
-                out[r, c] -= total * right[c, e]
+                out[r, c] += total * right[c, e]
 
 
 @compiled
-def _reduce(factor, rows, begin):
-    """Turn rows (m, n) into rows F^-T in place; what is before column `begin` is zero."""
-    for r in range(begin, rows.shape[1]):
+def _reduce(factor, rows):
+    """Turn rows (m, n) into rows F^-T in place."""
+    for r in range(rows.shape[1]):
         line = factor[r * (r + 1) // 2:(r + 1) * (r + 2) // 2]
         for q in range(len(rows)):
             row = rows[q]
             total = row[r]
-            for c in range(begin, r):
+            for c in range(r):
                 total -= line[c] * row[c]
             row[r] = total / line[r]
 
 
-@loop('(f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])')
-def append(signs, right, rows, pivot, residual, seen, lines, values):
+@loop('(f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[::1])')
+def append(rows, pivot, residual, lines, values):
     """
-    Write the rows of F, and of F^-1 times the right hand side, of a factor and what it sees first.
+    Write the rows of F, and of F^-1 times the right hand side, of a factor just predicted.
 
-    Parameters
-    ----------
-    signs, right : S and F^-1 times the right hand side, (n,) so far
-    rows, pivot : (k, n), (k, k) of the factor, see `predict`, with its noise
-    residual : (k,)
-    seen : (k, k) the factor's block of the new keyframe, (0, 0): there is none
+    rows, pivot : (k, n), (k, k), see `predict`, with its noise; residual : (k,) as expected
 
     Returns
     -------
@@ -216,91 +247,78 @@ def append(signs, right, rows, pivot, residual, seen, lines, values):
     k, n = rows.shape
     for r in range(k):
         line = lines[r * n + r * (r + 1) // 2:]
+        line[:n] = rows[r]
         values[r] = -residual[r]
-        for c in range(n):
-            line[c] = rows[r, c] * signs[c]
-            values[r] -= line[c] * right[c]
-    if not _take_root(lines, n, 0, pivot, values):
-        return False
-    if not len(seen):
-        return True
-    # The keyframe is joined to this factor alone: its rows are X = seen' R^-T, with signs -1.
-    X = seen.T.copy()
-    for c in range(k):
-        root = lines[c * n + c * (c + 1) // 2 + n:]
-        for r in range(k):
-            for e in range(c):
-                X[r, c] -= root[e] * X[r, e]
-            X[r, c] /= root[c]
-    square = np.zeros((k, k))
-    for r in range(k):
-        line = lines[(k + r) * n + (k + r) * (k + r + 1) // 2:]
-        line[:n] = 0.0
-        values[k + r] = 0.0
-        for c in range(k):
-            line[n + c] = -X[r, c]
-            values[k + r] += X[r, c] * values[c]
-            for e in range(k):
-                square[r, c] += X[r, e] * X[c, e]
-    return _take_root(lines, n, k, square, values)
-
-
-@compiled
-def _take_root(lines, n, begin, pivot, values):
-    """Write the root of a pivot, (k, k), to the ends of lines; values become root^-1 values."""
-    for r in range(len(pivot)):
-        own = begin + r
-        line = lines[own * n + own * (own + 1) // 2 + n + begin:]
         for c in range(r + 1):
-            other = begin + c
-            above = lines[other * n + other * (other + 1) // 2 + n + begin:]
+            above = lines[c * n + c * (c + 1) // 2 + n:]
             entry = pivot[r, c]
             for e in range(c):
-                entry -= line[e] * above[e]
+                entry -= line[n + e] * above[e]
             if c < r:
-                line[c] = entry / above[c]
-                values[own] -= line[c] * values[other]
+                line[n + c] = entry / above[c]
+                values[r] -= line[n + c] * values[c]
             elif entry > 0:
-                line[c] = np.sqrt(entry)
-                values[own] /= line[c]
+                line[n + c] = np.sqrt(entry)
+                values[r] /= line[n + c]
             else:
                 return False
     return True
 
 
-@loop('(f8[::1], f8[::1], i8)')
-def back_substitute(factor, x, begin):
-    """Turn x (n,) into F^-T x in place, from row `begin` on."""
-    for r in range(len(x) - 1, begin - 1, -1):
+@loop('(f8[::1], f8[::1], i8[:, ::1], f8[:, :, :, ::1], f8[:, ::1])')
+def pull(factor, right, ends, blocks, gradient):
+    """Add to the gradient (t, k) what factors pull at points: A'lambda, F'lambda = right."""
+    t, k = gradient.shape
+    x = right.copy()
+    for r in range(len(x) - 1, -1, -1):
         line = factor[r * (r + 1) // 2:(r + 1) * (r + 2) // 2]
         x[r] /= line[r]
         value = x[r]
-        for c in range(begin, r):
+        for c in range(r):
             x[c] -= line[c] * value
-
-
-@loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, ::1], f8[:, ::1])')
-def pull(ends, blocks, multipliers, gradient):
-    """Add A'lambda to the gradient (t, k) at the keyframes that are touched."""
-    t, k = gradient.shape
     for b in range(len(ends)):
         for side in range(2):
             end = ends[b, side]
             if end >= 0:
                 for r in range(k):
                     for c in range(k):
-                        gradient[end, c] += blocks[b, side, r, c] * multipliers[b, r]
+                        gradient[end, c] += blocks[b, side, r, c] * x[b * k + r]
 
 
-@loop('(f8[:, :, ::1], f8[:, ::1], i8)')
-def move(covariance, gradient, s):
-    """Return the step of a touched keyframe, (k,), by what pulls at all of them."""
+@loop('(f8[:, :, ::1], f8[:, ::1], f8[:, ::1], i8[::1])')
+def move(covariance, mean, gradient, points):
+    """Return the steps of some points, (m, k), -1 for none, by what pulls at all of them."""
     t, k = gradient.shape
-    step = np.zeros(k)
-    for other in range(t):
-        first, last = min(s, other), max(s, other)
-        between = covariance[last * (last + 1) // 2 + first]
+    steps = np.zeros((len(points), k))
+    for m in range(len(points)):
+        if points[m] < 0:
+            continue
+        steps[m] = mean[points[m]]
+        for other in range(t):
+            between = _between(covariance, points[m], other)
+            for r in range(k):
+                for c in range(k):
+                    steps[m, r] += between[r, c] * gradient[other, c]
+    return steps
+
+
+@loop('(i8[::1], f8[:, :, ::1], f8[:, ::1])')
+def pull_parents(parent, turn, gradient):
+    """Let what pulls at points, (t, k), pull at what they hang on, too."""
+    for s in range(len(parent) - 1, -1, -1):
+        if parent[s] >= 0:
+            for r in range(gradient.shape[1]):
+                for c in range(gradient.shape[1]):
+                    gradient[parent[s], c] += turn[s, r, c] * gradient[s, r]
+
+
+@loop('(i8[::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1])')
+def move_children(parent, turn, noise, gradient, moved):
+    """Write how far from their means points are that hang on others, (t, k); see `move`."""
+    k = moved.shape[1]
+    for s in range(len(parent)):
         for r in range(k):
             for c in range(k):
-                step[r] -= (between[r, c] if s == first else between[c, r]) * gradient[other, c]
-    return step
+                moved[s, r] += noise[s, r, c] * gradient[s, c]
+                if parent[s] >= 0:
+                    moved[s, r] += turn[s, r, c] * moved[parent[s], c]

@@ -8,22 +8,21 @@ may have to stop the work hands in a check.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.l1_problem import GraphProblem
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.incremental.front import Front, Gate
 from l1slam_ros.core.online.snapshot import Optimised, Problem
 from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.solvers.interior_point import interior_point, prove
 from l1slam_ros.core.solvers.nonlinear import (
     OptimiserOptions,
     Solution,
@@ -31,30 +30,28 @@ from l1slam_ros.core.solvers.nonlinear import (
     is_far,
     minimise,
 )
-from l1slam_ros.core.solvers.optimality import Status, l1_cost, l2_cost, smoothing
-from l1slam_ros.core.solvers.reweighting import reweighted_step
+from l1slam_ros.core.solvers.optimality import (
+    Status,
+    fits_exactly,
+    l1_cost,
+    l2_cost,
+    smoothing,
+)
+from l1slam_ros.core.solvers.reweighting import reweighted_step, weighted_least_squares
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 
+# Where the weights of reweighted steps turn over, in mean |e|: at first, from one to the next, and
+# at last.
+_SMOOTHING, _SHARPER, _SHARPEST = 0.1, 0.3, 1e-2
+# Linearisations of one round, and iterations of one where a front carries what is far: more and
+# it is late.
+_OUTER, _INNER = 2, 80
 # Steps of Gauss-Newton that the gate's map gets each time it is made.
 _L2_STEPS = 4
-# A map whose cost fell by more than this part is worth another round at once.
-_FALLS = 1e-3
 
 # Called on the way, often; raises where the work shall stop.
 Check = Callable[[], None]
-
-
-@dataclass(frozen=True)
-class Accuracy:
-    """How near the optimum to come, see `interior_point`; whether to prove how near that is."""
-
-    tolerance: float
-    proved: bool
-
-
-# The last digits, and less than a tenth of a percent above the optimum.
-EXACT, ROUGH, ROUGH_PROVED = Accuracy(3e-5, True), Accuracy(1e-2, False), Accuracy(1e-2, True)
 
 
 @dataclass(frozen=True)
@@ -100,60 +97,50 @@ class Improvement:
     @property
     def falls(self) -> bool:
         """Whether another round at once is worth it: iterations ended on the way down."""
-        return (self.inner_iterations > 0
-                and self.status not in (Status.CONVERGED, Status.STALLED)
-                and self.cost_before - self.cost > _FALLS * self.cost)
+        return (self.status not in (Status.CONVERGED, Status.STALLED)
+                and is_far(self.cost_before, self.cost))
 
 
 def improve(problem: Problem, options: OptimiserOptions, budget: float,
-            check: Check = lambda: None, accuracy: Accuracy | None = None) -> Improvement:
+            check: Check = lambda: None, exact: bool = False) -> Improvement:
     """
     Lower the L1 cost of what is believed of a snapshot, for about `budget` seconds.
 
-    accuracy : how near to the optimum to come instead, by factorisations, if there are any
+    exact : to the end instead, where that is done by factorisations
 
-    Without: where no front has, and the cost is far above what the last map left (a loop has
-    closed), reweighted least squares steps carry the long-range part: one factorisation bends the
-    whole chain, where a first-order method moves it a few keyframes per iteration. Then, always,
-    Algorithm 4 from the kept dual.
+    Without: where the cost is far above what the last map left (a loop has closed), reweighted
+    least squares steps carry the long-range part: one factorisation bends the whole chain, where a
+    first-order method moves it a few keyframes per iteration. Then, always, Algorithm 4 from the
+    kept dual.
     """
     start = time.monotonic()
-    graph, deadline = problem.part, start + budget
+    graph, method, deadline = problem.part, problem.method, start + budget
     poses, before, cost = _nearest(problem)
-    if accuracy and problem.is_sparse:
-        solution = _follow(problem, poses, options, accuracy, check)
+    if exact and problem.is_sparse:
+        solution, _ = minimise_by(method, graph, poses, options, lambda *_: check())
         return _improvement(solution, problem, problem.judgement, before, 0, start)
     dual = _dual_of(problem, poses)
-    steps, far = 0, problem.may_be_far and is_far(cost, problem.last_cost)
-    cholesky = problem.method.cholesky if far else None
-    while cholesky and far and (not steps or time.monotonic() < deadline):
+    steps, far = 0, not fits_exactly(cost, len(dual)) and is_far(cost, problem.last_cost)
+    while method.cholesky and far and (not steps or time.monotonic() < deadline):
         check()
         system = linearise(graph, poses)
-        step, dual = reweighted_step(system, cholesky, system.b, smoothing(system.b))
+        mu = max(_SMOOTHING * _SHARPER**steps, _SHARPEST) * smoothing(system.b)
+        step, dual = reweighted_step(system, method.cholesky, system.b, mu)
         previous = cost
         poses, cost = backtrack(graph, poses, step, cost)
         steps += 1
         far = is_far(previous, cost)
-    solution = minimise(graph, poses, options, cholesky, dual, deadline, lambda *_: check())
+    solution = minimise(graph, poses, options, method.cholesky if steps else None, dual, deadline,
+                        lambda *_: check())
     return _improvement(solution, problem, problem.judgement, before, steps, start)
 
 
-def _follow(problem: Problem, poses: Array, options: OptimiserOptions, accuracy: Accuracy,
-            check: Check) -> Solution:
-    """Return the optimum that poses lead to, by some ten or twenty factorisations."""
-    graph, method = problem.part, problem.method
-    assert method.cholesky is not None, 'a graph that is sparse'
-    optimum = interior_point(GraphProblem(graph), poses, method.cholesky,
-                             options.outer_iterations, accuracy.tolerance, lambda *_: check())
-    if optimum.status is not Status.CONVERGED:
-        return minimise_by(method, graph, poses, options, lambda *_: check())[0]
-    dual, gap, status = optimum.ends[-1].y, np.inf, Status.OUT_OF_TIME
-    if accuracy.proved:
-        dual, gap, status = prove(optimum, method.cholesky)
-    if gap > EXACT.tolerance * optimum.costs[-1] and accuracy is not EXACT:
-        status = Status.OUT_OF_TIME
-    return Solution(optimum.poses, optimum.costs[-1], status, len(optimum.costs) - 1, 0,
-                    np.array(optimum.costs), dual, gap)
+def one_round(options: OptimiserOptions, sparse: bool) -> OptimiserOptions:
+    """Return the options for one round of a map; sparse : there is to be a front."""
+    if not sparse:
+        return replace(options, outer_iterations=min(options.outer_iterations, _OUTER))
+    inner = replace(options.inner, iterations=min(options.inner.iterations, _INNER))
+    return replace(options, outer_iterations=min(options.outer_iterations, 1), inner=inner)
 
 
 def _nearest(problem: Problem) -> tuple[Array, float, float]:
@@ -194,12 +181,18 @@ def front_of(problem: Problem, poses: Array, rows: int,
     kinds = kinds * judgement.is_noise_stated
     found = part.subset(np.arange(len(kinds)), judgement.variance[kinds])
     starts = [poses, *problem.starts[1:]]
-    nearest = min(starts, key=lambda start: l2_cost(whitened_residual(found, start)))
-    # Until chi2 is within one of its minimum: far from it the gate would see ghosts.
-    enough = LeastSquaresOptions(_L2_STEPS, 1 / max(len(part.between), 1))
+    l2_poses = min(starts, key=lambda start: l2_cost(whitened_residual(found, start)))
+    system = linearise(found, l2_poses)
+    cholesky = BlockCholesky(method.cholesky.pattern, system.keyframe)
     try:
-        l2_poses = minimise_l2(found, nearest, enough, method.cholesky, lambda *_: check()).poses
-        return Front(part, poses, l2_poses, method.cholesky, kinds, gate, rows)
+        step = weighted_least_squares(system, cholesky, np.ones_like(system.b))
+        # Far from the minimum of chi2 the gate would see ghosts; one above it is none.
+        if step @ system.transposed_times(system.b) > 1:
+            enough = LeastSquaresOptions(_L2_STEPS, 1 / len(part.between))
+            l2_poses = minimise_l2(found, l2_poses, enough, cholesky, lambda *_: check()).poses
+            cholesky.factorise(linearise(found, l2_poses), np.ones_like(system.b))
+        check()
+        return Front(part, (poses, l2_poses), (method.cholesky, cholesky), gate, rows)
     except GraphError:
         return None
 
@@ -229,7 +222,7 @@ def optimise(problem: Problem, options: OptimiserOptions,
 def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
             check: Check) -> Solution:
     check()
-    method = choose(AUTO, graph, options.norm)
+    method = choose(AUTO, graph, options.norm, options.loop_norm)
     return minimise_by(method, graph, poses, options, lambda *_: check())[0]
 
 

@@ -105,7 +105,7 @@ def test_a_border_is_the_whole_problem(k, shape, rng):
         blocks = block(k, rng)
         noise, residual = rng.uniform(0.5, 2, k), rng.standard_normal(k)
         ends = (last, count) if count % 2 else (count, last)
-        border.add(border.predict(ends, blocks, residual), noise)
+        border.begin(ends, blocks, residual, noise)
         whole.add(ends, blocks, noise, residual)
         known = count + 1
         i, j = rng.choice(OLD, 2, replace=False).tolist()
@@ -114,8 +114,9 @@ def test_a_border_is_the_whole_problem(k, shape, rng):
                 factor(pair, known)
         steps = whole.steps(known)
         assert_allclose(border.steps().all(), steps, rtol=1e-6, atol=1e-8)
-        for v in (i, j, OLD - 1, count):
-            assert_allclose(border.step(v), steps[v], rtol=1e-6, atol=1e-8)
+        some = [i, j, OLD - 1, count]
+        assert_allclose(border.step([*some, FIXED, known]),
+                        [*steps[some], *np.zeros((2, k))], rtol=1e-6, atol=1e-8)
     taken = border.steps()
     factor((0, OLD + NEW - 1), OLD + NEW)
     assert_allclose(taken.all(), steps, rtol=1e-6, atol=1e-8)

@@ -15,7 +15,7 @@ from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.online.snapshot import Growth, Optimised, SavedMap
-from l1slam_ros.core.online.update import EXACT, improve
+from l1slam_ros.core.online.update import improve
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
@@ -48,7 +48,7 @@ def test_without_a_worker_the_map_stays_near_the_optimum_and_knows_how_sure_it_i
     assert (now.loop_states().state == ACCEPTED).mean() > 0.98
     problem = now.problem()
     cost = l1_cost(whitened_residual(problem.part, now.poses))
-    assert cost < 1.1 * improve(problem, EVERY.solver, 1.0, accuracy=EXACT).cost
+    assert cost < 1.1 * improve(problem, EVERY.solver, 1.0, exact=True).cost
     # The covariance of any keyframe is that of all factors at once, as they were linearised.
     whole = dense_covariance(now)
     for keyframe in (1, 60, KNOWN - 1, KNOWN, LAST - 1):
@@ -167,7 +167,7 @@ def test_how_far_the_optimum_is_at_most_is_known_at_any_time(world):
     play(backend, world, KNOWN, LAST)
     backend.update(10.0)
     now, behind = backend.snapshot(), backend.behind()
-    best = improve(now.problem(), EVERY.solver, 1.0, accuracy=EXACT).cost
+    best = improve(now.problem(), EVERY.solver, 1.0, exact=True).cost
     assert behind.bound == proved.bound and behind.bound_age > proved.bound_age
     # With ten keyframes more the optimum has risen, by little.
     assert 0.8 * best < behind.bound <= best

@@ -109,7 +109,7 @@ def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):
     drive(backend, 0, 5)
     ended = []
 
-    def slowly(problem, options, budget, check, accuracy):
+    def slowly(problem, options, budget, check, exact):
         made = improve(problem, options, budget)  # deaf to what it is told
         meeting()
         return made
@@ -129,7 +129,7 @@ def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):
     np.testing.assert_allclose(backend.snapshot().poses[:, 0], [100, 101])
 
 
-def patient(problem, options, budget, check, accuracy):
+def patient(problem, options, budget, check, exact):
     """Stand for an update of a huge map: it ends when it is told to."""
     while True:
         check()
@@ -177,7 +177,7 @@ def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
     assert settle() > 0
     looked = []
     snapshot = backend._snapshot
-    monkeypatch.setattr(backend, '_snapshot', lambda: looked.append(1) or snapshot())
+    monkeypatch.setattr(backend, '_snapshot', lambda views: looked.append(1) or snapshot(views))
     version = backend.version
     backend.counts()
     looked.clear()

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The block Cholesky factorisation against dense NumPy, on graphs of every shape."""
 
+from threading import Thread
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -21,6 +23,7 @@ from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise
+from l1slam_ros.core.solvers import block_cholesky
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, cholesky_of, find_pattern
 
 N = 26
@@ -102,6 +105,52 @@ def test_a_large_grid_leaves_a_small_residual(rng):
     x = cholesky.solve(right)
     left = system.transposed_times(weights * system.times(x)) + 0.1 * x
     assert_allclose(left, right, atol=1e-10)
+
+
+@pytest.fixture(scope='module')
+def large():
+    """Large enough for a second thread; k = 6."""
+    system = random_system(2 * grid(1800), 1800, 6, np.random.default_rng(5))
+    pattern = find_pattern(system.keyframe, 1800, PLENTY, 6)
+    assert pattern.work * 6**3 > block_cholesky._SHARED
+    return system, pattern
+
+
+def test_halves_have_nothing_to_do_with_each_other(large):
+    pattern = large[1]
+    halves = pattern.halves
+    for s, half in enumerate(halves):
+        above = halves[pattern.owner[pattern.rows[pattern.start[s]:pattern.start[s + 1]]]]
+        assert set(above.tolist()) <= {half, 2}
+    work = np.bincount(halves, np.diff(pattern.first) * np.diff(pattern.start) ** 2.0, 3)
+    assert work.all() and work.max() < 0.5 * work.sum()
+
+
+@pytest.mark.parametrize('cores', [1, 2])
+def test_the_factor_does_not_depend_on_the_cores(cores, large, monkeypatch, rng):
+    monkeypatch.setattr('os.sched_getaffinity', lambda _: range(cores), raising=False)
+    started = []
+    monkeypatch.setattr(Thread, 'start', lambda self, start=Thread.start: (
+        started.append(self), start(self)))
+    system, pattern = large
+    right, found = rng.standard_normal(6 * 1800), []
+    for add in (0.1, 0.1, -1e3):
+        cholesky = BlockCholesky(pattern, system.keyframe)
+        assert cholesky.factorise(system, np.ones(len(system.b)), add) == (add > 0)
+        found.append(cholesky.solve(right))
+    left = system.transposed_times(system.times(found[0])) + 0.1 * found[0]
+    assert_allclose(left, right, atol=1e-9)
+    assert_array_equal(found[0], found[1])
+    assert len(started) == 3 * (cores - 1)
+
+
+@pytest.mark.parametrize('keyframe', [0, 900, 1799])
+def test_a_bad_pivot_is_found_in_either_half(keyframe, large):
+    system, pattern = large
+    added = np.zeros((1800, 6))
+    added[keyframe] = -1e6
+    assert not BlockCholesky(pattern, system.keyframe).factorise(
+        system, np.ones(len(system.b)), added.ravel())
 
 
 def test_one_serves_blocks_of_every_size(rng):

@@ -3,39 +3,31 @@
 The state of the map of a back end: what was made of its graph, and what is due.
 
 In: the graph as it grows, and what workers have made of snapshots of it. Out: where the newest
-keyframe is, what is accepted, and whether map or judgement are due. Its owner holds the lock.
+keyframe is, what is accepted, and whether map or judgement are due. Its owner holds the locks.
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.incremental.front import UNKNOWN, Front
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.snapshot import Optimised
-from l1slam_ros.core.online.update import EXACT, ROUGH, ROUGH_PROVED, Accuracy, Improvement
+from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.optimality import Status
 
-# A map is factored anew from so many rows on that came since: those of ten keyframes.
-_MANY_ROWS = 90
-# [s] of processor time, the most that a round by factorisations takes.
-_LONGEST_ROUND = 0.5
-# [s] How often it is proved how far the optimum is, at most.
-_PROVE_EVERY = 1.0
-# Factors that a front takes while the lock is held.
+# A map is factored anew from so many factors on that came since: those of ten keyframes.
+_MANY = 20
+# Factors that a front takes while its lock is held.
 AT_ONCE = 16
 # [s] While loops come none of which fits, they are judged so often.
 _JUDGE_EVERY = 2.0
-# [s] What a round by factorisations takes a keyframe, before that was measured.
-_ROUND = 2e-5
 
 
 @dataclass(frozen=True)
@@ -75,8 +67,7 @@ class LiveMap:
     stale : the map is not of the factors that are accepted
     last : the last improvement, None: there was none
     newest : the last keyframe of the map, and its pose (1, p)
-    round_took, judge_took : processor time [s] of the last round by
-        factorisations, time of the last judgement
+    judge_took : [s] time of the last judgement
 
     """
 
@@ -89,10 +80,10 @@ class LiveMap:
         self.last: Improvement | None = None
         self.newest: tuple[int, Array]
         self.judge_took = self._judge_began = self._judge_at = 0.0
-        self.proved_at = self._factored_at = 0.0
+        self._heard = builder.graph.said
+        self._bound_at = self._factored_at = 0.0
         # What the last proof says, and of which factors.
         self._bound, self._proved = np.nan, np.zeros(0, bool)
-        self.round_took = _ROUND * builder.graph.n_poses
         # The factors that the map is of and their noise, the loops that were judged, and whether
         # one that the front left may be true.
         self._used, self._noise, self._fits = np.zeros(0, bool), np.zeros(0), False
@@ -124,7 +115,10 @@ class LiveMap:
 
     def hear(self) -> None:
         """Take over what a person said of factors that were looked at before."""
-        factors, before = self._builder.graph.between, self.accepted
+        graph = self._builder.graph
+        if graph.said == self._heard:
+            return
+        factors, before, self._heard = graph.between, self.accepted, graph.said
         count, judgement = len(before), self.optimised.judgement
         after = (before | factors.trusted[:count]) & ~factors.struck[:count]
         if (after == before).all():
@@ -137,9 +131,9 @@ class LiveMap:
         self.looks.extend(looks)
         self._judged_loops, self.stale = -1, True
 
-    def take_some(self) -> bool:
-        """Let the front take a few factors; return whether it did."""
-        front, factors = self.front, self._builder.graph.between
+    def take_some(self, factors: BetweenFactors) -> bool:
+        """Let the front take a few of the graph's factors; return whether it did."""
+        front = self.front
         if front is None or front.closed or front.rows >= len(factors):
             return False
         first, judged = front.rows, self.optimised.judgement.accepted
@@ -163,26 +157,26 @@ class LiveMap:
         rows = len(graph.between) * graph.manifold.TANGENT_SIZE
         behind = (len(optimised.poses) < graph.n_poses or len(optimised.dual) < rows
                   or not optimised.at_rest)
-        late = idle or front is None or front.closed or front.border >= _MANY_ROWS
-        falls = self.last is not None and self.last.falls
         # The front goes by the noise that was known when it was made.
         other_noise = idle and front is not None and bool(
             (self._noise != optimised.judgement.variance).any())
-        return bool(graph.n_poses) and (self.stale or falls or other_noise or (behind and late))
+        return bool(graph.n_poses) and (self.stale or self.falls or other_noise
+                                        or (behind and (idle or self.is_late)))
 
-    def accuracy(self, idle: bool, sparse: bool) -> Accuracy | None:
-        """Return how near the optimum the next map is to come by factorisations, None: by none."""
-        # For the first front of a map that was loaded nobody shall wait long.
-        if idle and self.front is not None:
-            return EXACT
-        if self.round_took > _LONGEST_ROUND or not sparse:
-            return None
-        return ROUGH_PROVED if time.monotonic() > self.proved_at + _PROVE_EVERY else ROUGH
+    @property
+    def falls(self) -> bool:
+        """Whether the last round ended on the way down."""
+        return self.last is not None and self.last.falls
 
-    def note_round(self, seconds: float, accuracy: Accuracy | None) -> None:
-        """Note what a round took, if by factorisations: to the last digits some twice as long."""
-        if accuracy:
-            self.round_took = seconds / (2 if accuracy is EXACT else 1)
+    @property
+    def is_late(self) -> bool:
+        """Whether the front has more to carry than it should."""
+        return self.front is None or self.front.closed or self.front.taken >= _MANY
+
+    def is_exact_due(self, idle: bool) -> bool:
+        """Return whether the next map is to be solved to the end: this one is of all there is."""
+        return (idle and self.front is not None and not self.front.taken
+                and not self.stale and not self.falls)
 
     def is_judge_due(self, idle: bool, budget: float) -> bool:
         """Return whether to judge all loops; budget : there is so much time for it now [s]."""
@@ -197,17 +191,6 @@ class LiveMap:
         """Expect a judgement of all loops there are; return how many."""
         self._fits, self._judge_began = False, time.monotonic()
         return len(self._builder.loops.rows)
-
-    def until_more_comes(self, check: Callable[[], None]) -> Callable[[], None]:
-        """Return a check that raises `Interrupted`, too, once more has come than there is now."""
-        grown = self.growth()
-
-        def at_rest() -> None:
-            check()
-            if self.growth() != grown:
-                raise Interrupted
-
-        return at_rest
 
     def take_judgement(self, judgement: Judgement, poses: Array, loops: int,
                        anew: bool) -> None:
@@ -241,7 +224,7 @@ class LiveMap:
         judgement = improvement.judgement
         self._factored_at = time.monotonic()
         if improvement.gap < np.inf:
-            self.proved_at, self._proved = self._factored_at, judgement.accepted
+            self._bound_at, self._proved = self._factored_at, judgement.accepted
             self._bound = improvement.cost - improvement.gap
         self.front, self.last = front, improvement
         self._used, self._noise = judgement.accepted, judgement.variance
@@ -274,7 +257,7 @@ class LiveMap:
         return Behind(
             now - self._factored_at if front else np.nan, front.border if front else 0,
             0 if self.all_judged else len(self._builder.loops.rows) - max(self._judged_loops, 0),
-            self._bound if holds else np.nan, now - self.proved_at if holds else np.nan)
+            self._bound if holds else np.nan, now - self._bound_at if holds else np.nan)
 
     def growth(self) -> tuple[FactorGraph, int, int]:
         """Return what changes when something comes."""

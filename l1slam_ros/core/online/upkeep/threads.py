@@ -7,6 +7,17 @@ from collections.abc import Callable
 from l1slam_ros.core.errors import Interrupted
 
 
+def until(over: Callable[[], bool],
+          check: Callable[[], None] = lambda: None) -> Callable[[], None]:
+    """Return a check that raises `Interrupted` where another does, or something is over."""
+    def checked() -> None:
+        check()
+        if over():
+            raise Interrupted
+
+    return checked
+
+
 class Worker:
     """
     Does one piece of work at a time, in a thread that ends with it.
