@@ -119,7 +119,8 @@ def record(part: str, rows: list[Row]) -> dict[str, Any]:
     """Return what is written about a part: the machine, the versions, the rows."""
     return {
         'part': part,
-        'machine': {'cpu': _cpu_model(), 'cores': os.cpu_count(), 'used': 1},
+        'machine': {'cpu': _cpu_model(), 'cores': os.cpu_count(),
+                    'used': len(os.sched_getaffinity(0))},
         'versions': {'python': platform.python_version()} | {
             name: version(name) for name in _PACKAGES if _is_there(name)},
         'rows': [asdict(r) for r in rows],

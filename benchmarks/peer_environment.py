@@ -28,12 +28,12 @@ ONE_THREAD = {f'{library}_NUM_THREADS': '1' for library in
                ('OMP', 'OPENBLAS', 'MKL', 'NUMBA')}
 
 
-def enter() -> None:
+def enter(one_core: bool = True) -> None:
     """Go on in the environment, on the first core this process may use; return once there."""
     if os.environ.get(_MARK) == '1':
         return
     python = _environment()
-    if hasattr(os, 'sched_setaffinity'):
+    if one_core and hasattr(os, 'sched_setaffinity'):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     variables = {name: value for name, value in os.environ.items() if name not in _LENT}
     sys.stdout.flush()

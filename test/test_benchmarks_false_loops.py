@@ -2,7 +2,6 @@
 """The false-loop suite without its peers: cases, judgement, record, tables."""
 
 import importlib
-import json
 import sys
 import time
 from pathlib import Path
@@ -57,11 +56,6 @@ def test_the_share_is_of_all_loops(place, lies):
     assert np.array_equal(again.graph.between.pairs, case.graph.between.pairs)
 
 
-def test_a_tenth_of_the_true_loops_is_kept_and_as_many_are_false(place):
-    case = cases.false_case(place, kind('tenth-random'), 0.5, 0)
-    assert loops_of(case.clean) == round(loops_of(place.graph) / 10) == case.is_false.sum()
-
-
 @pytest.mark.parametrize('count', [1, 2])
 @pytest.mark.parametrize(('what', 'metres', 'radians'),
                          [('translation', 5.0, 0.0), ('rotation', 0.0, np.pi / 2)])
@@ -76,61 +70,6 @@ def test_odometry_factors_slip(place, what, metres, radians, count):
     assert not component_labels(case.clean).any()
     assert np.hypot(*moved[changed, :2].T) == pytest.approx(metres, abs=1e-9)
     assert np.abs(moved[changed, 2]) == pytest.approx(radians, abs=1e-9)
-
-
-@pytest.mark.parametrize(('part', 'is_odometry'), [('odometry', True), ('loops', False)])
-def test_information_is_stated_wrong_of_one_part_alone(place, part, is_odometry):
-    case = cases.false_case(place, kind(f'{part}-1e4'), 0.0, 0)
-    times = (case.graph.between.sqrt_information[:, 0, 0]
-             / place.graph.between.sqrt_information[:, 0, 0])
-    of_part = case.graph.between.is_odometry == is_odometry
-    assert times[of_part] == pytest.approx(100) and times[~of_part] == pytest.approx(1)
-
-
-def test_noise_free_loops_measure_the_map(place):
-    case = cases.false_case(place, kind('noise-free-loops'), 0.5, 0)
-    factors = case.graph.between
-    off = se2.residual(factors.measurement, place.best[factors.i], place.best[factors.j])
-    assert np.abs(off[case.is_true]).max() < 1e-9 < np.abs(off[case.is_false]).max(axis=1).min()
-
-
-@pytest.mark.parametrize(('streets', 'same'), [(3, False), (2, True)])
-def test_an_aliased_street_is_moved_by_one_transform(place, streets, same):
-    rng = np.random.default_rng(3)
-    lies = aliasing.aliased_loops(place.graph, place.best, streets, same, rng, length=10)
-    assert len(lies.i) == 10 * streets and (lies.i < lies.j).all()
-    # Z = Xi^-1 W Xj, and where the street is the earlier end, Z = Xi^-1 W^-1 Xj.
-    wrong = se2.compose(se2.compose(place.best[lies.i], lies.measurement),
-                        se2.inverse(place.best[lies.j]))
-    different = {tuple(each) for each in np.round(
-        np.where(wrong[:, 2:] < 0, se2.inverse(wrong), wrong), 6)}
-    assert len(different) == (1 if same else streets)
-    apart = np.linalg.norm(place.best[lies.i, :2] - place.best[lies.j, :2], axis=1)
-    assert apart.min() > 0.1 * np.linalg.norm(np.ptp(place.best[:, :2], axis=0))
-
-
-@pytest.mark.parametrize(('name', 'parts'), [('sessions', 1), ('apart', 2)])
-def test_a_session_begins_anywhere(place, name, parts):
-    case = cases.false_case(place, kind(name), 0.3, 0)
-    half = place.graph.n_poses // 2
-    factors = case.graph.between
-    assert not (factors.is_odometry & (np.minimum(factors.i, factors.j) == half - 1)).any()
-    assert component_labels(case.graph).max() + 1 == parts == case.session.max() + 1
-    step = se2.between(case.start[half - 1], case.start[half])
-    assert np.hypot(*step[:2]) > 2
-
-
-def test_made_worlds_are_what_their_kinds_need():
-    ring, world = (places.place(Path('nowhere'), name) for name in kinds.MADE)
-    assert loops_of(ring.graph) == 20 and loops_of(world.graph) == 109
-    assert cases.false_case(world, kind('half'), 0.0, 0).is_false.sum() == 54
-
-
-def test_a_track_without_times_is_found_wherever_it_lies():
-    track = np.cumsum(np.random.default_rng(0).standard_normal((60, 2)), axis=0)
-    moved = se2.compose(np.array([[4.0, -9.0, 2.0]]),
-                        np.concatenate((track, np.zeros((60, 1))), axis=1))
-    assert places.nearest_error(track)(moved[:, :2]) < 1e-9
 
 
 def run_of(place, name, share, found):
@@ -200,23 +139,6 @@ def test_an_error_in_a_run_is_not_taken_for_a_time_out(place):
 
     with pytest.raises(ValueError, match='no such kernel'):
         run_of(place, 'random', 0.3, broken)
-
-
-def test_partial_runs_are_merged_and_tabled(tmp_path):
-    head = {'machine': {'cpu': 'one', 'cores': 2, 'used': 1},
-            'versions': {'python': '3', 'numpy': '2', 'gtsam': '4'}}
-
-    def run(seed, seconds, **values):
-        return runs.Run('synthetic', 'intel', 'random', 0.5, seed, 'mine', seconds, **values)
-
-    right = {'error': 0.01, 'false': 10, 'true': 10, 'right': True, 'passed': True}
-    suite.write(tmp_path, head, [run(0, 1.0, **right), run(1, 1.0, **right)])
-    suite.write(tmp_path, head, [run(1, None), run(2, 3.0, **right | {'kept': 5})])
-    rows = json.loads((tmp_path / 'results' / 'false_loops.json').read_text())['rows']
-    assert [(row['seed'], row['seconds']) for row in rows] == [(0, 1.0), (1, None), (2, 3.0)]
-    text = (tmp_path / 'FALSE_LOOPS.md').read_text()
-    assert '| random | 50% | mine | 3 | 2/3 | 2/3 | 0/3 | 2.5/10 | 0/10 | 0/0 | 0.0100 |' in text
-    assert '| mine | 2/3 |' in text
 
 
 def test_nonsense_is_refused_before_any_work(tmp_path, capsys):

@@ -130,14 +130,6 @@ def test_the_sdist_has_what_builds_the_package_and_nothing_else(distributions, s
     assert not unwanted
 
 
-def test_the_readme_is_the_long_description(distributions):
-    with zipfile.ZipFile(distributions['wheel']) as archive:
-        (name,) = [name for name in archive.namelist() if name.endswith('.dist-info/METADATA')]
-        fields, _, description = archive.read(name).decode().partition('\n\n')
-    assert 'Description-Content-Type: text/markdown' in fields.splitlines()
-    assert description == (ROOT / 'README.md').read_text(encoding='utf-8')
-
-
 @pytest.fixture(scope='module', params=['wheel', 'sdist'])
 def installed(request, distributions, requirements, tmp_path_factory):
     """Install the wheel or the sdist where there is nothing but what it says that it needs."""

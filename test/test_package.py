@@ -69,6 +69,8 @@ def test_package_xml_and_setup_py_say_the_same(metadata, manifest):
     assert manifest.findtext('name') == metadata['Name'].replace('-', '_')
     assert manifest.findtext('version') == metadata['Version']
     assert manifest.findtext('description') == metadata['Summary']
+    assert metadata['Description-Content-Type'] == 'text/markdown'
+    assert metadata.get_payload(decode=True) == (ROOT / 'README.md').read_bytes()
     assert manifest.findtext('license') in (metadata['License'], metadata['License-Expression'])
     assert maintainer.text == metadata['Maintainer']
     assert maintainer.get('email') == metadata['Maintainer-email']
@@ -101,8 +103,8 @@ def test_the_licence_is_apache(wheel):
 def test_every_module_is_in_the_wheel_and_no_test(wheel):
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / 'l1slam_ros').rglob('*.py')}
     in_wheel = {name for name in wheel.namelist()
-                if name.endswith('.py') and '.data/' not in name}
-    assert in_wheel == modules
+                if name.endswith(('.py', 'py.typed')) and '.data/' not in name}
+    assert in_wheel == modules | {'l1slam_ros/py.typed'}
 
 
 def test_every_folder_with_modules_is_a_package():

@@ -5,24 +5,24 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import incremental
 import numpy as np
 from measuring import clock
 
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, turned
+from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.robust import batch_map
 from l1slam_ros.core.robust.judgement import Doubt
-from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.paper.updates import dimension_of, measurements
 
 # Online: an update after so many keyframes, for so long [s].
 _EVERY, _BUDGET = 10, 0.1
-# Updates after the last keyframe, while the robot stands still.
-_LAST_UPDATES, _LAST_BUDGET = 5, 0.5
+# Updates after the last keyframe, while the robot stands still: until there is nothing more to do,
+# but so many at most.
+_LAST_UPDATES, _LAST_BUDGET = 200, 0.5
 # [m, rad] Two measurements of one pair are the same loop.
 _SAME = 1e-6
 # Live: [s] at rest when no map came for so long, and in any case after so long.
@@ -105,22 +105,26 @@ def _online(rate: float) -> Callable[[FactorGraph, Array], Found]:
         nothing = dict.fromkeys(('translation', 'rotation', 'period'), 0.0)
         options = BackendOptions.from_mapping(
             {'keyframe': nothing, 'odometry': {'covariance_source': 'increment'}})
-        with Backend(options, incremental.dimension_of(graph), rate > 0) as backend:
-            for k, (sample, loops) in enumerate(incremental.measurements(_in_time(graph)), 1):
+        with Backend(options, dimension_of(graph), rate > 0) as backend:
+            for k, (sample, loops) in enumerate(measurements(graph), 1):
                 backend.add_odometry(sample)
                 for loop in loops:
                     backend.add_loop(loop)
                 if rate:
                     time.sleep(max(0.0, began + k / rate - time.monotonic()))
                 elif k % _EVERY == 0:
-                    seconds += _updated(backend, _BUDGET)
+                    seconds += _updated(backend, _BUDGET)[0]
                 if k % LOOK == 0:
                     maps.append(backend.poses)
             if rate:
                 _come_to_rest(backend)
                 seconds = clock() - process
             else:
-                seconds += sum(_updated(backend, _LAST_BUDGET) for _ in range(_LAST_UPDATES))
+                for _ in range(_LAST_UPDATES):
+                    took, was_due = _updated(backend, _LAST_BUDGET)
+                    seconds += took
+                    if not was_due:
+                        break
             return _found(backend, graph, seconds, tuple(maps))
 
     return solve
@@ -145,16 +149,11 @@ def _found(backend: Backend, graph: FactorGraph, seconds: float,
                  *_said(judgement.doubt, ''), maps)
 
 
-def _in_time(graph: FactorGraph) -> GraphRecord:
-    """Return the graph with each factor from the earlier keyframe to the later one."""
-    forward = turned(graph, graph.between.i > graph.between.j)
-    return GraphRecord(forward, None, np.arange(graph.n_poses))
-
-
-def _updated(backend: Backend, budget: float) -> float:
+def _updated(backend: Backend, budget: float) -> tuple[float, bool]:
+    """Return how long an update took, and whether there was anything to do."""
     began = clock()
-    backend.update(budget)
-    return clock() - began
+    was_due = backend.update(budget) is not None
+    return clock() - began, was_due
 
 
 def _accepted(backend: Backend, graph: FactorGraph) -> Mask:

@@ -10,17 +10,19 @@ or only the clock, twice in a row, with and without `/clock`, and with a clock, 
 with it, that jump back by 20 s halfway. Said is of each part of the map, one for each time that
 stamps go back, how far its keyframes are at worst from where they are in the undisturbed map, and
 its error to the truth, aligned, beside those of the undisturbed map and of the odometry. Loops
-that are sent again are known: what was played twice is odometry the second time.
+that are sent again are known: what was played twice is odometry the second time. Where loops join
+two parts, the map is compared, too, with the L1 optimum of the same factors and of what nobody
+told the node: that each keyframe at which a part begins is where the robot was at that stamp.
 """
 
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 # Its own domain: nobody else's messages are counted.
 os.environ.setdefault('ROS_DOMAIN_ID', '96')
@@ -36,11 +38,14 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
+import l1slam_ros as l1
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.core.graph.factor_graph import component_labels
 from l1slam_ros.io.bags.reader import read_messages, read_raw
 from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
-from l1slam_ros.io.messages import cdr
+from l1slam_ros.io.graphs.saved_map import load_map
+from l1slam_ros.io.messages import conversion
 from l1slam_ros.io.messages.conversion import stamp_of, stamped_pose
 from l1slam_ros.ros.demo import executable
 from l1slam_ros.ros.publishing import header
@@ -50,6 +55,7 @@ _SECOND = 10**9  # [ns]
 _KINDS = {ODOMETRY_TOPIC: Odometry, LOOP_TOPIC: PoseWithCovarianceStamped}
 _TICK = _SECOND // 20  # [ns] from one message on /clock to the next
 _PAUSE, _BACK = 3.0, 20 * _SECOND  # [s], [ns]
+_EXACT = 1e-4  # [m], [rad] what is nearer is the same
 _PATIENCE = 300.0  # [s]
 
 # What comes when, in the order it is sent: time on the clock [ns], topic, None: only the clock.
@@ -59,10 +65,11 @@ Event = tuple[int, str | None, bytes]
 class Robot:
     """The node as a process, and a peer that plays to it."""
 
-    def __init__(self, sim_time: bool):
+    def __init__(self, sim_time: bool, path: Path):
+        self.path = path
         self.process = subprocess.Popen([
             executable('backend'), '--ros-args', '--log-level', 'error',
-            '-p', f'use_sim_time:={str(sim_time).lower()}'])
+            '-p', f'save_path:={path}', '-p', f'use_sim_time:={str(sim_time).lower()}'])
         self.node = rclpy.create_node('player')
         self.maps: list[PathMessage] = []
         self.said: dict[str, str] = {}
@@ -113,6 +120,19 @@ class Robot:
         poses = self.maps[-1].poses
         pose3 = np.array([stamped_pose(pose)[1] for pose in poses])
         return np.array([stamp_of(pose.header) for pose in poses]), se2.from_pose3(pose3)
+
+    def joined(self) -> np.ndarray | None:
+        """Return the optimum (n, 3) of the saved map, its parts joined; None: no loops do."""
+        saved = load_map(self.path)[0]
+        stamps, accepted = saved.growth.stamps, saved.optimised.judgement.accepted
+        graph = saved.growth.graph.subset(accepted)
+        if component_labels(graph).any():
+            return None
+        for begin in np.flatnonzero(np.diff(stamps) < 0) + 1:
+            (same,) = np.flatnonzero(stamps[:begin] == stamps[begin])
+            graph.add_between(np.array([same]), np.array([begin]), np.zeros((1, 3)),
+                              np.eye(3)[None] / _EXACT**2)
+        return l1.solve(graph, robust=False).poses
 
 
 def with_clock(messages: list[Event]) -> Iterator[Event]:
@@ -168,20 +188,22 @@ def main() -> None:
     measured = {}
     for _, topic, data in messages:
         if topic == ODOMETRY_TOPIC:
-            stamp, pose3 = stamped_pose(cdr.odometry(data))
-            measured[stamp] = pose3[:2], truth[stamp][:2]
+            sample = conversion.odometry_in(data)[1]
+            measured[sample.stamp] = sample.pose3[:2], truth[sample.stamp][:2]
     known: dict[int, np.ndarray] = {}
+    folder = tempfile.TemporaryDirectory()
     for name, (sim_time, events) in plays.items():
         found = list(events())
-        robot = Robot(sim_time)
+        robot = Robot(sim_time, Path(folder.name) / 'map.g2o')
         robot.play(iter(found) if 'pause' not in name else events(), rate)
         stamps, poses = robot.finish(sum(topic == ODOMETRY_TOPIC for _, topic, _ in found))
         known = known or dict(zip(stamps.tolist(), poses, strict=True))
-        _tell(name, stamps, poses, known, measured, robot.said)
+        _tell(name, stamps, poses, known, measured, robot)
 
 
 def _tell(name: str, stamps: np.ndarray, poses: np.ndarray, known: dict[int, np.ndarray],
-          measured: dict[int, tuple[np.ndarray, ...]], said: dict[str, Any]) -> None:
+          measured: dict[int, tuple[np.ndarray, ...]], robot: Robot) -> None:
+    said, joined = robot.said, robot.joined()
     # A stamp that comes twice is in two parts; each is told of on its own.
     parts = np.split(np.arange(len(stamps)), np.flatnonzero(np.diff(stamps) < 0) + 1)
     print(f'{name}: {len(stamps)} keyframes, {said["accepted_loops"]} loops accepted, '
@@ -195,6 +217,9 @@ def _tell(name: str, stamps: np.ndarray, poses: np.ndarray, known: dict[int, np.
               f'truth {absolute_trajectory_error(map_, true):.3f} m, undisturbed '
               f'{absolute_trajectory_error(undisturbed, true):.3f}, '
               f'odometry {absolute_trajectory_error(odometry, true):.3f}', flush=True)
+        if joined is not None and len(parts) > 1:
+            print(f'    of the optimum that knows where it began, off by at most '
+                  f'{_worst(poses[part, :2], joined[part, :2]):.3f} m', flush=True)
 
 
 def _worst(positions: np.ndarray, others: np.ndarray) -> float:

@@ -15,6 +15,7 @@ from l1slam_ros.io.formats import is_bag, stamps_of
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import false_loops_path, read_false_loops
 from l1slam_ros.io.trajectory import Reference, read_reference
+from l1slam_ros.io.wording import counted
 
 # [ns] As far as that a pose may lie before the first or after the last true one: files round.
 _SAME_STAMP = 1_000_000
@@ -44,7 +45,7 @@ def read_truth(source: str, record: GraphRecord, input_path: Path) -> Truth:
     Parameters
     ----------
     source : a TUM or CSV file, a graph file, `id x y theta` text; or `BAG:/TOPIC`, where `bag`
-        stands for the input itself unless there is something of this name
+        stands for an input that is one
     record, input_path : the graph, and where it is from
 
     Raises
@@ -62,8 +63,8 @@ def read_truth(source: str, record: GraphRecord, input_path: Path) -> Truth:
     if len(rows) < 2:
         stampless = reference.stamped and record.stamps is None
         hint = '; the graph has no stamps, so its poses are 0.1 s apart from 1000 s on'
-        raise FileError(source, f'shares {len(rows)} poses with the graph, expected 2 or more'
-                        f'{hint if stampless else ""}')
+        raise FileError(source, f'shares {counted(len(rows), "pose")} with the graph, expected '
+                        f'2 or more{hint if stampless else ""}')
     scored = keys[rows]
     first, last = np.searchsorted(reference.keys, [scored.min(), scored.max()])
     inside = gaps[(gaps > first) & (gaps <= last)] - first
@@ -76,9 +77,7 @@ def _read(source: str, record: GraphRecord, input_path: Path) -> Reference:
     if colon and not Path(source).exists():
         from l1slam_ros.io.bags.to_graph import read_truth_topic
 
-        path = Path(bag)
-        if bag == 'bag' and not path.exists() and is_bag(input_path):
-            path = input_path
+        path = input_path if bag == 'bag' and is_bag(input_path) else Path(bag)
         if not path.exists():
             raise FileError(path, 'no such file or directory')
         return read_truth_topic(path, f'/{topic}', record.graph.manifold)

@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from l1slam_ros.cli.commands import Ending, read, warn
-from l1slam_ros.cli.reference import position_error, read_truth
+from l1slam_ros.cli.reference import known_false, position_error, read_truth
+from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
@@ -21,7 +22,7 @@ from l1slam_ros.io.compilation import DENSE, JUDGEMENT, SPARSE, compile_now, wit
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.node_options import read_params_file
 from l1slam_ros.io.progress import Progress
-from l1slam_ros.io.sentences import DOUBTFUL, doubt_sentence, judgement_sentences
+from l1slam_ros.io.sentences import DOUBTFUL, doubt_sentence, doubted, judgement_sentences
 from l1slam_ros.io.wording import counted
 
 
@@ -35,6 +36,8 @@ def solve(arguments: argparse.Namespace) -> Ending:
         truth = read_truth(arguments.reference, record, arguments.input)
         warn(truth.skipped, arguments.quiet)
         warnings += truth.skipped
+    if arguments.plot:
+        known_false(arguments.input, record)  # damaged, it is refused before the work
     compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
     outcome = _solved(arguments, record, asked)
     remarks = [f'no loop was doubted: {outcome.unjudged}'] if outcome.unjudged else []
@@ -62,7 +65,7 @@ def solve(arguments: argparse.Namespace) -> Ending:
         print(json.dumps({name: None if isinstance(value, float) and not math.isfinite(value)
                           else value for name, value in report.items()}))
     elif not arguments.quiet:
-        _print_report(report, arguments.norm, outcome)
+        _print_report(report, record, arguments.norm, outcome)
         for sentence in judgement_sentences(record, judgement) if judgement else ():
             print(sentence)
     return ending
@@ -110,8 +113,9 @@ def _asked(arguments: argparse.Namespace) -> SolveOptions:
         least_squares = replace(least_squares, iterations=arguments.outer)
     if arguments.inner is not None:
         solver = replace(solver, inner=replace(solver.inner, iterations=arguments.inner))
-    arguments.norm = arguments.norm or solver.norm
-    return SolveOptions(arguments.start, arguments.norm, arguments.solver, robust, solver,
+    norm, loop_norm = arguments.norm or solver.norm, arguments.loop_norm or solver.loop_norm
+    arguments.norm = norm if loop_norm in (SAME, norm) else f'{norm}, of loops {loop_norm},'
+    return SolveOptions(arguments.start, norm, loop_norm, arguments.solver, robust, solver,
                         least_squares)
 
 
@@ -124,7 +128,7 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
     return {
         'poses': record.graph.n_poses,
         'factors': len(factors),
-        'loops': int((~factors.is_odometry).sum()),
+        'loops': int((~factors.is_odometry & ~factors.is_absolute).sum()),
         'initial_cost': outcome.initial_cost,
         'seed_cost': outcome.seed_cost,
         'final_cost': solution.cost,
@@ -140,11 +144,13 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
     }
 
 
-def _print_report(report: dict[str, object], norm: str, outcome: Outcome) -> None:
+def _print_report(report: dict[str, object], record: GraphRecord, norm: str,
+                  outcome: Outcome) -> None:
     solution = outcome.solution
     seed = f'seed {outcome.seed_cost:.6g}, ' if outcome.seed_cost is not None else ''
-    numbers = [counted(int(str(report[name])), name[:-1]) for name in ('factors', 'loops')]
-    print(f'{counted(len(solution.poses), "pose")}, {", ".join(numbers)}')
+    factors = record.graph.between
+    print(f'{counted(len(solution.poses), "pose")}, {counted(len(factors), "factor")}, '
+          f'{doubted(factors)}')
     print(f'{norm} cost: initial {outcome.initial_cost:.6g}, {seed}final {solution.cost:.6g}')
     inner = f', {counted(solution.inner_iterations, "inner one")}' if (
         solution.inner_iterations) else ''

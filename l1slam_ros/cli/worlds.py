@@ -23,7 +23,7 @@ from l1slam_ros.io.files import put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import false_loops_path, pair_lines, truth_path
 from l1slam_ros.io.progress import Progress
-from l1slam_ros.io.trajectory import write_truth
+from l1slam_ros.io.trajectory import truth_lines
 
 
 def simulate(arguments: argparse.Namespace) -> Ending:
@@ -37,7 +37,7 @@ def simulate(arguments: argparse.Namespace) -> Ending:
     ids = np.arange(world.graph.n_poses)
     record = GraphRecord(world.graph, world.odometry, ids)
     with replacing(truth_path(output)) as temporary:
-        write_truth(temporary, ids, world.truth)
+        put_lines(temporary, truth_lines(ids, world.truth))
         _write(output, world.false_loops,
                lambda: formats.write_output(output, record, world.truth))
     return Ending()

@@ -4,8 +4,17 @@
 # The first of each is the default.
 STARTS = ('seed', 'file', 'odometry')
 NORMS = ('l1', 'group-l1', 'l2', 'huber')
+# Of loops and absolute poses: that of the odometry.
+SAME = 'same'
 SOLVERS = ('auto', 'primal-dual', 'interior-point')
 WORLDS = ('streets', 'building', 'sphere', 'torus')
 KINDS_OF_FALSE_LOOPS = ('random', 'identity', 'grouped')
 # What the rotation block of the information in a g2o file of poses in space is of.
 ROTATION_INFORMATION = QUATERNION, ANGLE = ('quaternion', 'angle')
+# What a parameter file may say besides, dotted names by their first part: to every node of ROS,
+# and to the one around a back end.
+OF_ROS = frozenset(('use_sim_time', 'start_type_description_service', 'qos_overrides'))
+OF_THE_NODE = OF_ROS | {
+    'autostart', 'dimension', 'map_frame', 'odom_frame', 'base_frame', 'publish_tf',
+    'transform_period', 'transform_tolerance', 'save_path', 'autosave_period', 'load_on_start',
+    'update'}

@@ -8,7 +8,7 @@ another `Options`. A default is written once, at its field.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from l1slam_ros.core.errors import OptionError
 
@@ -52,7 +52,13 @@ def option(default: Scalar, doc: str, unit: str = '', low: float | None = None,
 
 @dataclass(frozen=True)
 class Options:
-    """Base of all options: refuses values outside their type and range."""
+    """
+    Base of all options: refuses values outside their type and range.
+
+    PASSED_OVER : names, or first parts of dotted ones, that `from_mapping` takes no notice of
+    """
+
+    PASSED_OVER: ClassVar[frozenset[str]] = frozenset()
 
     def __post_init__(self) -> None:
         """Check every field; ints are taken for floats, as people write them."""
@@ -85,6 +91,8 @@ class Options:
             raise OptionError(f'options are {values!r}, expected a mapping of names to values')
         flat: dict[str, Scalar] = {}
         for name, value in dotted(values):
+            if name.split('.')[0] in cls.PASSED_OVER:
+                continue
             if name in flat:
                 raise OptionError(f'{name} is set twice, to {flat[name]!r} and to {value!r}')
             flat[name] = value

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, TemporaryFile
 
 import numpy as np
 
@@ -56,12 +56,14 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     Yield a temporary neighbour of `path`; it takes the place of `path` when the block succeeds.
 
+    A link stays a link: what it leads to is replaced.
+
     Raises
     ------
     FileError : naming `path`; whatever goes wrong, `path` is then as it was before.
 
     """
-    target = Path(path)
+    target = Path(os.path.realpath(path))
     # Not `tempfile`: its files are for their owner only, whatever the umask says.
     temporary = target.parent / f'.{target.name}.{secrets.token_hex(4)}.tmp'
     try:
@@ -93,10 +95,19 @@ def sync_folder(folder: Path) -> None:
 
 
 def require_folder(path: str | os.PathLike[str]) -> None:
-    """Refuse, before any work is done, to write where there is no folder."""
-    folder = Path(path).absolute().parent
+    """Refuse, before any work is done, to write where there is no folder, or none to write in."""
+    folder = Path(os.path.realpath(path)).parent
     if not folder.is_dir():
         raise FileError(path, f'cannot be written: {folder} is no folder')
+    with reported(path), TemporaryFile(dir=folder):
+        pass
+
+
+def require_file(path: str | os.PathLike[str]) -> None:
+    """Refuse, before any work is done, to write a file where none can be."""
+    require_folder(path)
+    if Path(path).is_dir():
+        raise FileError(path, 'cannot be written: it is a directory')
 
 
 def put_lines(path: Path, lines: Iterable[str]) -> None:

@@ -21,7 +21,7 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.names import QUATERNION, ROTATION_INFORMATION
 from l1slam_ros.core.robust.inspection import initial_poses
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES, DEFAULT_TOPICS, Topics
-from l1slam_ros.io.files import require_folder
+from l1slam_ros.io.files import require_file, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 from l1slam_ros.io.trajectory import invented_stamps, write_tum
 
@@ -59,7 +59,7 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
         record = graph_from_bag(path, options, topics, dimension)
         return replace(record, rotation_information=rotation_information)
     # The map before the one of that name, too.
-    if path.name.removesuffix('.1').endswith(GRAPH_SUFFIXES):
+    if path.name.lower().removesuffix('.1').endswith(GRAPH_SUFFIXES):
         return read_graph_file(path, rotation_information)
     raise FileError(path, f'unknown kind of file; expected {", ".join(GRAPH_SUFFIXES)}, '
                     f'{", ".join(BAG_SUFFIXES)} or a rosbag2 directory')
@@ -67,7 +67,7 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
 
 def is_bag(path: Path) -> bool:
     """Tell whether an input is taken for a bag."""
-    return path.is_dir() or path.suffix in BAG_SUFFIXES
+    return path.is_dir() or path.suffix.lower() in BAG_SUFFIXES
 
 
 def stored_poses(record: GraphRecord) -> Array:
@@ -99,22 +99,22 @@ def stamps_of(record: GraphRecord) -> Indices:
 
 def check_output(path: Path) -> None:
     """Refuse, before any work is done, an output that could not be written in the end."""
-    if path.suffix not in (*GRAPH_SUFFIXES, '.tum', ''):
+    if path.suffix.lower() not in (*GRAPH_SUFFIXES, '.tum', ''):
         raise FileError(path, f'unknown suffix; expected {", ".join(GRAPH_SUFFIXES)}, .tum, or '
                         'none for a bag directory')
-    require_folder(path)
-    if path.suffix and path.is_dir():
-        raise FileError(path, 'cannot be written: it is a directory')
-    if not path.suffix:
+    if path.suffix:
+        require_file(path)
+    else:
         from l1slam_ros.io.bags.writer import refuse_other_than_bag
 
+        require_folder(path)
         refuse_other_than_bag(path)
 
 
 def check_graph_output(path: Path) -> None:
     """Refuse, as `check_output`, an output that does not hold a graph."""
     check_output(path)
-    if path.suffix == '.tum':
+    if path.suffix.lower() == '.tum':
         raise FileError(path, 'a trajectory has no edges; expected '
                         f'{", ".join(GRAPH_SUFFIXES)}, or no suffix for a bag directory')
 
@@ -132,9 +132,9 @@ def write_output(path: Path, record: GraphRecord, truth: Array | None = None) ->
 
     """
     check_output(path)
-    if path.suffix in GRAPH_SUFFIXES:
+    if path.suffix.lower() in GRAPH_SUFFIXES:
         write_graph_file(path, record)
-    elif path.suffix == '.tum':
+    elif path.suffix.lower() == '.tum':
         write_tum(path, stamps_of(record), stored_poses(record), record.graph.manifold)
     else:
         from l1slam_ros.io.bags.from_graph import write_graph_bag
@@ -183,13 +183,16 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
     Raises
     ------
     FileError : it cannot be written, or the format has no place for a part of the graph.
-    GraphError : poses of another shape.
+    GraphError : poses of another shape, or not finite.
 
     """
     _check_reading(rotation_information)
     expected = (graph.n_poses, graph.manifold.POSE_SIZE)
     if np.shape(poses) != expected:
         raise GraphError(f'poses have the shape {np.shape(poses)}, expected {expected}')
+    if not np.isfinite(poses).all():
+        row = int(np.argmin(np.isfinite(poses).all(axis=1)))
+        raise GraphError(f'pose {row} is {np.asarray(poses)[row]}, expected finite numbers')
     write_output(Path(path), GraphRecord(
         graph, np.asarray(poses, float), np.arange(graph.n_poses),
         rotation_information=rotation_information))

@@ -1,15 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the node can be told, and the YAML file that tells it; without ROS, for `l1slam` too."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from l1slam_ros.core.errors import FileError, OptionError
+from l1slam_ros.core.names import OF_ROS
 from l1slam_ros.core.online.backend import BackendOptions
-from l1slam_ros.core.options import Options, Scalar, dotted, option, with_values
+from l1slam_ros.core.options import Options, Scalar, dotted, option
+
+# The name of the node, unless it was given another.
+_NODE = 'backend'
 
 
 @dataclass(frozen=True)
@@ -24,6 +29,8 @@ class UpdateOptions(Options):
 @dataclass(frozen=True)
 class NodeOptions(BackendOptions):
     """Everything the node can be told: the back end's options and its own."""
+
+    PASSED_OVER = OF_ROS
 
     autostart: bool = option(
         True, 'be active from the start, as a node that nobody manages', fixed=True)
@@ -49,6 +56,9 @@ class NodeOptions(BackendOptions):
     def __post_init__(self) -> None:
         """Check every field, and those that only make sense together."""
         super().__post_init__()
+        for name in ('map_frame', 'odom_frame', 'base_frame'):
+            # As tf2 has them.
+            object.__setattr__(self, name, getattr(self, name).removeprefix('/'))
         frames = self.map_frame, self.odom_frame
         if '' in frames or frames[0] == frames[1]:
             raise OptionError(f'map_frame is {frames[0]!r} and odom_frame {frames[1]!r}, expected '
@@ -59,7 +69,7 @@ class NodeOptions(BackendOptions):
 
 def read_params_file(path: Path) -> NodeOptions:
     """
-    Return the options that a ROS parameter file sets, for any node name.
+    Return the options that a ROS parameter file sets for the node, or for any if not by its name.
 
     Raises
     ------
@@ -70,13 +80,24 @@ def read_params_file(path: Path) -> NodeOptions:
         content = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise FileError(path, 'expected a YAML file: ' + ' '.join(str(error).split())) from error
+    sections = list(_sections(content))
+    named = any(name == _NODE for name, _ in sections)
     values: dict[str, Scalar] = {}
-    for node in content.values() if isinstance(content, Mapping) else ():
-        if isinstance(node, Mapping) and isinstance(node.get('ros__parameters'), Mapping):
-            values.update(dotted(node['ros__parameters']))
+    for name, section in sections:
+        if not named or name in (_NODE, '*', '**'):
+            values.update(dotted(section))
     if not values:
         raise FileError(path, 'sets no parameters; expected `/**: {ros__parameters: {...}}`')
     try:
-        return with_values(NodeOptions(), values)
+        return NodeOptions.from_mapping(values)
     except OptionError as error:
         raise FileError(path, str(error)) from error
+
+
+def _sections(content: Any, name: str = '') -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield name, without namespaces, and parameters of each node of a parameter file."""
+    for key, value in content.items() if isinstance(content, Mapping) else ():
+        if key == 'ros__parameters' and isinstance(value, Mapping):
+            yield name, value
+        else:
+            yield from _sections(value, str(key).rpartition('/')[2])

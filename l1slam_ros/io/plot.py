@@ -21,7 +21,7 @@ from PIL import Image
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.io.files import replacing, require_folder
+from l1slam_ros.io.files import replacing, require_file
 from l1slam_ros.io.wording import counted
 
 _SUFFIXES = ('.png', '.svg', '.pdf')
@@ -105,7 +105,7 @@ def check_picture(path: str | Path) -> None:
     """Refuse, before any work is done, a name that no picture can have."""
     if Path(path).suffix.lower() not in _SUFFIXES:
         raise FileError(path, f'unknown suffix; expected {", ".join(_SUFFIXES)}')
-    require_folder(path)
+    require_file(path)
 
 
 def plot_maps(path: str | Path, maps: Sequence[MapDrawing]) -> None:
@@ -126,11 +126,18 @@ def plot_maps(path: str | Path, maps: Sequence[MapDrawing]) -> None:
     _save(figure, path)
 
 
-def plot_curves(path: str | Path, curves: Sequence[Curve], title: str = '') -> None:
-    """Draw costs, on a logarithmic scale, against iterations; errors as for `plot_maps`."""
+def plot_curves(path: str | Path, curves: Sequence[Curve], title: str = '',
+                names: tuple[str, str] = ('iteration', 'cost')) -> None:
+    """
+    Draw costs, on a logarithmic scale, against iterations; errors as for `plot_maps`.
+
+    names : of the axes
+    """
     figure = _new_figure(path, 1.3, 0.8)
     axes = figure.add_subplot()
     _draw_curves(axes, curves, title)
+    axes.set_xlabel(names[0])
+    axes.set_ylabel(names[1])
     _draw_legend(axes)
     _save(figure, path)
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.graph.factor_graph import BetweenFactors
 from l1slam_ros.core.robust.judgement import (
     MOSTLY_REFUSED,
     ONE_JOINS,
@@ -61,7 +62,7 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
     refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect)
     suspect = np.flatnonzero(is_loop & judgement.suspect)
     if is_loop.any():
-        yield f'{len(refused):,} of {counted(int(np.count_nonzero(is_loop)), "loop")} refused'
+        yield f'{len(refused):,} of {doubted(factors)} refused'
     worst = refused[np.argsort(-judgement.sigmas[refused], kind='stable')]
     for row in worst[:_NAMED].tolist():
         yield f'  {_named(pairs[row])}: {judgement.sigmas[row]:.1f} sigmas off the accepted ones'
@@ -74,6 +75,13 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
     for sentence, times in zip(_NOISE, np.sqrt(judgement.variance).tolist(), strict=True):
         if times >= _NOISY:
             yield sentence.format(times=times)
+
+
+def doubted(factors: BetweenFactors) -> str:
+    """Return how many loops, and absolute poses if any, there are to be doubted."""
+    absolute = int(factors.is_absolute.sum())
+    loops = counted(int((~factors.is_odometry).sum()) - absolute, 'loop')
+    return f'{loops} and {counted(absolute, "absolute pose")}' if absolute else loops
 
 
 def doubt_sentence(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None) -> str:

@@ -6,6 +6,7 @@ TUM: `stamp x y z qx qy qz qw`, stamps in seconds, exact to the nanosecond.
 """
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,17 +66,10 @@ def write_tum(path: str | os.PathLike[str], stamps: Indices, poses: Array,
                        for stamp, row in zip(stamps.tolist(), rows, strict=True)))
 
 
-def write_truth(path: str | os.PathLike[str], ids: Indices, poses: Array) -> None:
-    """
-    Write true poses, `id x y theta` (the columns of the manifold): ids (n,), poses (n, p).
-
-    Raises
-    ------
-    FileError : the file cannot be written.
-
-    """
-    write_lines(path, (f'{k} {" ".join(map(repr, row))}'
-                       for k, row in zip(ids.tolist(), poses.tolist(), strict=True)))
+def truth_lines(ids: Indices, poses: Array) -> Iterator[str]:
+    """Yield lines of true poses, `id x y theta` (the columns of the manifold): (n,), (n, p)."""
+    for k, row in zip(ids.tolist(), poses.tolist(), strict=True):
+        yield f'{k} {" ".join(map(repr, row))}'
 
 
 def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2,

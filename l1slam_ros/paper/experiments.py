@@ -65,7 +65,7 @@ class Effort:
 
     outer : most linearisations of Algorithm 4 as printed, inner : iterations of each; iterations :
     of the angle and translation problems of Figure 2; timed : what one time is taken of; draws :
-    of what is random in Figures 4 and 6.
+    of what is random in Figures 4 and 6; keyframes : of Figure 5, at `rate` per second.
     """
 
     outer: int = 30
@@ -73,6 +73,8 @@ class Effort:
     iterations: int = 10_000
     timed: int = 40
     draws: int = 5
+    keyframes: int = 3000
+    rate: float = 200.0
 
 
 @dataclass(frozen=True)

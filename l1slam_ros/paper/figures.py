@@ -13,7 +13,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.io.plot import Curve, MapDrawing, plot_curves, plot_maps
 from l1slam_ros.paper import printed as paper
-from l1slam_ros.paper.report import Results, cost, metres, table
+from l1slam_ros.paper.report import WORLD_SEED, Results, cost, metres, table
 from l1slam_ros.paper.runs import (
     HUBER_OF_G2O,
     HUBERS,
@@ -28,6 +28,7 @@ from l1slam_ros.paper.runs import (
     Map,
     StartRuns,
 )
+from l1slam_ros.paper.updates import Growth, spread
 
 # Within this of the lowest cost of a diagram, a method has arrived.
 _ARRIVED = 0.001
@@ -37,6 +38,14 @@ _CURVES = ('The paper shows 100,000 iterations of the angle and translation prob
            'compiled, restarted form.')
 _STARTS = ('Every stored pose moved at random by these standard deviations, medians of several '
            f'draws. *Off*: RMSE of the positions from our map, aligned. {_SHAPE}')
+_UPDATES = ('A simulated world in the proportions of City10k (seed {seed}), {poses:,} keyframes, '
+            'an update after each, at {rate:.0f} keyframes per second. Ours is L1 and doubts '
+            'every loop; *ISAM2* is gtsam: L2, every loop believed, linearised again above 0.1; '
+            '*batch L2* solves all that has come anew, from the map as it is, at some sizes. '
+            'Milliseconds of the processor; what our other threads take is *behind*.')
+_NO_PEER = 'Without ISAM2: gtsam is not installed (`pip install gtsam`).'
+# Of so many updates one after the other the median and the 95th percentile are drawn.
+_WINDOWS = 40
 _LIES = ('False loops at random between far poses, as sure as true ones; the pictures show the '
          'first draw. *Off*: RMSE of the positions from the map that the same method makes '
          f'without them, aligned. {_SHAPE}')
@@ -117,6 +126,46 @@ def table_of_starts(runs: StartRuns) -> list[str]:
         rows.append(row)
     rows.append(['the seed, then as printed', cost(runs.printed[0]), '', '', '',
                  cost(runs.printed[-1]), '', ''])
+    return table(header, rows)
+
+
+def figure_5(results: Results, folder: Path) -> list[str]:
+    """Draw the time of an update over the keyframes that there are, with a table."""
+    growth = results.growth
+    if growth is None:
+        return ['Not run: no keyframes.']
+    updates = growth.updates
+    curves = [*_windows('ours', updates.ours), *_windows('ISAM2', updates.peer),
+              Curve('batch L2', growth.sizes, 1e3 * growth.batch)]
+    plot_curves(folder / 'figure_5.png', curves, 'time per update', ('keyframes', 'ms'))
+    said = _UPDATES.format(seed=WORLD_SEED, poses=len(updates.ours),
+                           rate=len(updates.ours) / updates.elapsed)
+    return [said, *([] if updates.peer else ['', _NO_PEER]), '',
+            '![time per update over keyframes](figure_5.png)', '', *table_of_updates(growth)]
+
+
+def _windows(name: str, seconds: Sequence[float]) -> list[Curve]:
+    """Return the median and the 95th percentile of updates one after the other."""
+    if not seconds:
+        return []
+    parts = np.array_split(1e3 * np.array(seconds), min(_WINDOWS, len(seconds)))
+    ends = np.cumsum([len(part) for part in parts])
+    return [Curve(f'{name}, {word}', ends, np.array([np.percentile(part, q) for part in parts]))
+            for word, q in (('median', 50), ('95%', 95))]
+
+
+def table_of_updates(growth: Growth) -> list[str]:
+    """Return what updates cost, of each method."""
+    header = ['ms per update', 'median', '95%', '99%', 'most', '95% of the second quarter',
+              'of the last', 'all [s]', 'behind [s]']
+    rows = []
+    for name, seconds, behind in (('ours', growth.updates.ours, f'{growth.updates.behind:.1f}'),
+                                  ('ISAM2', growth.updates.peer, ''),
+                                  ('batch L2', growth.batch.tolist(), '')):
+        if len(seconds):
+            of = spread(seconds)
+            rows.append([name, *(f'{of[key]:.2f}' for key in (
+                'median', 'p95', 'p99', 'max', 'second', 'last')), f'{of["total"]:.1f}', behind])
     return table(header, rows)
 
 

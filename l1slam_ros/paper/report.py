@@ -17,6 +17,7 @@ from l1slam_ros.io.plot import MapDrawing
 from l1slam_ros.paper.experiments import PROBLEMS, Costs, Seconds
 from l1slam_ros.paper.printed import NOISY, PaperGraph
 from l1slam_ros.paper.runs import LoopRuns, StartRuns
+from l1slam_ros.paper.updates import Growth
 
 WORLD_SEED = 0
 _SOURCE_OF_FILES = 'https://github.com/OpenSLAM-org/openslam_vertigo'
@@ -61,13 +62,15 @@ class Results:
 
     missing : graphs of the paper that were not run; convergence : of Figure 2, problem -> method
     -> (k, 2) rows (iteration, cost), empty where its graph was not run; starts : of Figure 4;
-    false_loops : of Figure 6, by the name of the graph; largest : see `measure_largest`.
+    growth : of Figure 5; false_loops : of Figure 6, by the name of the graph; largest : see
+    `measure_largest`.
     """
 
     graphs: Sequence[GraphResult]
     missing: Sequence[PaperGraph] = ()
     convergence: dict[str, dict[str, Array]] = field(default_factory=dict)
     starts: StartRuns | None = None
+    growth: Growth | None = None
     false_loops: dict[str, LoopRuns] = field(default_factory=dict)
     largest: dict[str, Array] = field(default_factory=dict)
 

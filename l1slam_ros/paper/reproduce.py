@@ -46,6 +46,7 @@ from l1slam_ros.paper.runs import (
     run_false_loops,
     run_noisy_starts,
 )
+from l1slam_ros.paper.updates import Growth, measure_growth
 
 REPORT = 'report.md'
 
@@ -122,7 +123,8 @@ def run(records: dict[str, GraphRecord], worlds: Sequence[PaperGraph], effort: E
         else:
             missing.append(graph)
     return Results(graphs, missing, convergence, _run_starts(records, effort),
-                   _run_false_loops(records, effort), _run_largest(records, effort))
+                   _run_growth(effort), _run_false_loops(records, effort),
+                   _run_largest(records, effort))
 
 
 def _say(work: str) -> None:
@@ -138,6 +140,15 @@ def _run_starts(records: dict[str, GraphRecord], effort: Effort) -> StartRuns | 
     with Progress(len(NOISES) * effort.draws, 'start') as progress:
         return run_noisy_starts(record.graph, formats.stored_poses(record), effort, as_in_paper,
                                 np.random.default_rng(WORLD_SEED), progress.advance)
+
+
+def _run_growth(effort: Effort) -> Growth | None:
+    if not effort.keyframes:
+        return None
+    _say('a world, pose by pose')
+    with Progress(effort.keyframes, 'keyframe') as progress:
+        return measure_growth(effort.keyframes, effort.rate, np.random.default_rng(WORLD_SEED),
+                              progress.advance)
 
 
 def _run_false_loops(records: dict[str, GraphRecord], effort: Effort) -> dict[str, LoopRuns]:
@@ -210,6 +221,7 @@ SECTIONS: dict[str, Callable[[Results, Path], list[str]]] = {
     'Table II: the time per iteration': lambda results, _: report.table_2(results),
     'Figure 2: cost against iterations': figures.figure_2, 'Figure 3: the maps': figures.figure_3,
     'Figure 4: a start that is mostly noise': figures.figure_4,
+    'Figure 5: the time per update': figures.figure_5,
     'Figure 6: loops that lie': figures.figure_6,
     'Left for later: L-infinity': lambda results, _: report.future_work(results)}
 
@@ -219,6 +231,8 @@ def _check_folder(output: Path) -> None:
     require_folder(output)
     if os.path.lexists(output) and not output.is_dir():
         raise FileError(output, 'is no folder; expected one, or nothing there')
+    if output.exists():
+        require_folder(output / REPORT)
 
 
 @contextmanager

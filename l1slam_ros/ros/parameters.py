@@ -2,6 +2,7 @@
 """Options <-> ROS parameters, generically: a parameter is declared nowhere but at its field."""
 
 from collections.abc import Callable
+from difflib import get_close_matches
 from typing import Generic
 
 from rcl_interfaces.msg import (
@@ -36,7 +37,7 @@ class NodeParameters(Generic[AnyOptions]):
 
     def __init__(self, node: Node, defaults: AnyOptions,
                  on_change: Callable[[AnyOptions], None]):
-        self._names = set(flatten(defaults))
+        self._node, self._names = node, set(flatten(defaults))
         self._on_change = on_change
         try:
             given = {name: node.declare_parameter(name, value, _descriptor(value, meaning)).value
@@ -46,6 +47,16 @@ class NodeParameters(Generic[AnyOptions]):
         self.options = with_values(defaults, given)
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
+
+    def unknown(self) -> list[str]:
+        """Return a sentence for each parameter given at start that the node does not have."""
+        overrides, known = self._node._parameter_overrides, self._node._parameters
+        sentences = []
+        for name in sorted(overrides.keys() - known.keys()):
+            near = get_close_matches(name, known, 1)
+            sentences.append(f'there is no parameter {name!r}: it is not used'
+                             + (f'; did you mean {near[0]!r}?' if near else ''))
+        return sentences
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         try:

@@ -4,7 +4,7 @@
 import importlib
 import math
 import pkgutil
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import pytest
@@ -12,8 +12,10 @@ import yaml
 
 import l1slam_ros.core
 from l1slam_ros.core.errors import L1SlamError, OptionError
+from l1slam_ros.core.online.backend import BackendOptions
+from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.options import Options, dotted, flatten, option, with_values
-from l1slam_ros.io.node_options import NodeOptions
+from l1slam_ros.io.node_options import NodeOptions, read_params_file
 
 SHIPPED = Path(__file__).parents[2] / 'config' / 'backend.yaml'
 
@@ -198,6 +200,29 @@ def test_the_shipped_file_equals_the_defaults():
     assert shipped == defaults
     assert {name: type(value) for name, value in shipped.items()} == {
         name: type(value) for name, value in defaults.items()}
+
+
+def test_a_mapping_for_the_back_end_is_what_a_parameter_file_says():
+    content = yaml.safe_load(SHIPPED.read_text())['/**']['ros__parameters']
+    content['keyframe']['translation'] = 2.0
+    of_ros = {'use_sim_time': True, 'qos_overrides': {'/odom': {'subscription': {'depth': 5}}}}
+    expected = replace(BackendOptions(), keyframe=KeyframeOptions(2.0))
+    assert BackendOptions.from_mapping(content | of_ros) == expected
+    with pytest.raises(OptionError, match='no option is called use_time'):
+        BackendOptions.from_mapping(content | {'use_time': True})
+
+
+OURS, OTHERS = '{ros__parameters: {update: {period: 1}}}', '{ros__parameters: {wheels: 4}}'
+OF_ALL = '/**: {ros__parameters: {use_sim_time: true, qos_overrides./odom.subscription.depth: 5}}'
+
+
+@pytest.mark.parametrize('text', [
+    f'/**: {OURS}', f'renamed: {OURS}', f'/robot/backend: {OURS}', f'/robot: {{backend: {OURS}}}',
+    f'{OF_ALL}\nbackend: {OURS}\nrobot: {{wheels: {OTHERS}}}', f'{OF_ALL}\nrenamed: {OURS}'])
+def test_a_parameter_file_is_read_as_ros_reads_it(tmp_path, text):
+    path = tmp_path / 'params.yaml'
+    path.write_text(text)
+    assert read_params_file(path) == NodeOptions.from_mapping({'update.period': 1})
 
 
 def test_the_shipped_file_says_what_each_option_means():

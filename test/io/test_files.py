@@ -59,6 +59,16 @@ def test_a_power_cut_leaves_the_old_file_or_the_new_one(tmp_path, monkeypatch, e
     assert set(found) == {b'old\n', b'new\n'} and found[-1] == b'new\n'
 
 
+def test_what_a_link_leads_to_is_written(tmp_path):
+    (tmp_path / 'folder').mkdir()
+    path, link = tmp_path / 'folder' / 'a.txt', tmp_path / 'link.txt'
+    link.symlink_to('folder/a.txt')
+    for text in 'old', 'new':
+        write_lines(link, [text])
+        assert link.is_symlink() and path.read_text() == f'{text}\n'
+    assert {p.name for p in tmp_path.rglob('*')} == {'folder', 'a.txt', 'link.txt'}
+
+
 def test_others_may_read_what_is_written(tmp_path):
     ordinary = tmp_path / 'ordinary'
     ordinary.touch()

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from problems import retold
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -46,7 +47,8 @@ def judgement(refused=(), suspect=(), slips=(), variance=(1.0, 1.0)):
         doubtful[N - 1 + loop], accepted[N - 1 + loop] = True, False
     for step in slips:
         sigmas[step], accepted[step] = 40.0 + step, False
-    return Judgement(accepted, doubtful, sigmas, np.array(variance), np.array(slips, np.int64))
+    return Judgement(accepted, doubtful, sigmas, np.array(variance),
+                     np.ones(len(accepted)), np.array(slips, np.int64))
 
 
 @pytest.mark.parametrize('count, more', [(19, None), (20, None), (21, 1), (27, 7)])
@@ -108,13 +110,8 @@ def test_a_doubt_says_why_and_where(stamps, when):
 
 def test_what_a_solve_finds_of_the_noise_is_told():
     world = simulate_world(200, 400, WorldOptions(), np.random.default_rng(2))
-    factors = world.graph.between
-    information = factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information
     # The odometry boasts of a fifth of its sigmas, the loops tell the truth.
-    boast = np.where(factors.is_odometry, 25.0, 1.0)[:, None, None]
-    graph = FactorGraph(se2)
-    graph.add_poses(world.graph.n_poses)
-    graph.add_between(factors.i, factors.j, factors.measurement, information * boast)
+    graph = retold(world.graph, times=np.where(world.graph.between.is_odometry, 0.2, 1.0))
     found = minimise_robustly(graph, lambda part, poses: minimise_l2(
         part, poses, LeastSquaresOptions(), cholesky_of(part)))
     said = list(judgement_sentences(GraphRecord(graph, None, np.arange(200)), found.judgement))[-1]

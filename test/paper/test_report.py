@@ -26,6 +26,7 @@ from l1slam_ros.paper.runs import (
     Map,
     StartRuns,
 )
+from l1slam_ros.paper.updates import Growth, Updates
 
 BENT = 1.0
 NO_PAIRS = np.zeros((0, 2), np.int64)
@@ -125,6 +126,19 @@ def test_figure_4_has_every_noise_and_the_seed():
     ([0.1, 2.0, 0.1, 3.0], 0.5), ([0.1, 0.1, (0.1, 3.0), 3.0], 2), ([0.1] * 4, 2)])
 def test_the_start_that_is_drawn_is_the_first_that_l2_does_not_survive(errors, noise):
     assert figures.drawn_noise(starts(errors, [0.0] * 4)) == noise
+
+
+def test_figure_5_has_every_method_that_ran(tmp_path):
+    ms = [*[1.0] * 96, *[4.0] * 4]
+    grown = Growth(Updates([each / 1e3 for each in ms], [], 2.5, 0.5), np.arange(25, 125, 25),
+                   np.array([0.01, 0.02, 0.02, 0.03]))
+    ours, batch = table(figures.figure_5(report.Results([], growth=grown), tmp_path))
+    assert [*ours.values()] == ['ours', '1.00', '1.00', '4.00', '4.00', '1.00', '4.00', '0.1',
+                                '2.5']
+    assert [*batch.values()][:2] == ['batch L2', '20.00'] and batch['behind [s]'] == ''
+    beside = replace(grown, updates=replace(grown.updates, peer=[0.002] * 60))
+    lines = figures.figure_5(report.Results([], growth=beside), tmp_path)
+    assert table(lines)[1]['most'] == '2.00' and '200 keyframes per second' in lines[0]
 
 
 def test_figure_6_has_every_method_and_what_was_refused():

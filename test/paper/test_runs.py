@@ -4,7 +4,6 @@
 import numpy as np
 import pytest
 
-from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.paper import runs
@@ -122,9 +121,3 @@ def test_each_method_is_compared_with_its_own_clean_map_and_a_lie_costs_in_l1(li
 
 def test_each_step_is_counted(starts, liars, told):
     assert told.count('start') == 2 * len(NOISES) and told.count('draw') == 1 + 2
-
-
-def test_too_small_a_graph_has_no_room_for_them():
-    world = simulate_world(6, 6, WorldOptions(), np.random.default_rng(3))
-    with pytest.raises(GraphError, match='50 false loops asked for'):
-        runs.run_false_loops(world.graph, world.odometry, 50, TWICE, generator())

@@ -116,6 +116,20 @@ def test_parameters_are_described_with_unit_and_range(bench):
                                                       or not unit), name
 
 
+def test_parameters_given_by_a_wrong_name_are_told_of(bench, capfd):
+    """To rclpy they are none: `keyframe.translaton` would do nothing without a word."""
+    bench(**{'keyframe.translaton': 2.0, 'solver.norm': 'l1', 'zzz': 1,
+             'qos_overrides./odm.subscription.reliability': 'best_effort'})
+    told = [line.split(': ', 1)[1] for line in capfd.readouterr().err.splitlines()
+            if 'there is no parameter' in line]
+    assert told == [
+        "there is no parameter 'keyframe.translaton': it is not used; did you mean "
+        "'keyframe.translation'?",
+        "there is no parameter 'qos_overrides./odm.subscription.reliability': it is not used; "
+        "did you mean 'qos_overrides./odom.subscription.reliability'?",
+        "there is no parameter 'zzz': it is not used"]
+
+
 @pytest.mark.parametrize('name', ['l1slam.rviz', 'foxglove.json'])
 def test_layouts_show_what_the_node_publishes(name):
     text = (CONFIG / name).read_text()

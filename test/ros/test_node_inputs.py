@@ -30,6 +30,28 @@ def bench(ros):
     made.close()
 
 
+@pytest.mark.parametrize('given, of_odometry, of_loops', [
+    ('', '/base_link', 'base_link'), ('', 'base_link', '/base_link'),
+    ('/base_link', 'base_link', 'base_link')])
+def test_a_slash_before_a_frame_says_nothing(ros, given, of_odometry, of_loops):
+    """To tf2, too: it was the habit of ROS 1."""
+    b = Bench(ros, {'base_frame': given, 'map_frame': '/map', 'robust.enabled': False})
+    try:
+        for k in range(1, 6):
+            b.send('/odom', odometry(k * NS, float(k), of_odometry))
+        closure = loop(1, 5 * NS, 3.5)
+        closure.header.frame_id = closure.header.frame_id.replace('base_link', of_loops)
+        b.send('/loop_closures', closure)
+        fix = loop(1, 2 * NS, 2.0)
+        fix.header.frame_id, fix.pose.covariance = 'map', np.eye(6).ravel()
+        b.send('/absolute_poses', fix)
+        b.until(lambda: b.backend._backend.counts()[0]['accepted_loops'] == 2, 'both are used')
+        b.until(lambda: len(b.path().poses) == 5, 'a map')
+        assert b.path().header.frame_id == 'map' and not b.backend._inputs.refused
+    finally:
+        b.close()
+
+
 def test_strays_do_not_stop_the_map(bench, capfd):
     """A first message of another robot, a stamp of tomorrow, a teleport, loops five times."""
     bench.send('/odom', odometry(5 * NS, 7.0, 'gripper'))

@@ -11,11 +11,15 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from node_bench import call, odometry, poses_of
+from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.core.online.upkeep import upkeep
+from l1slam_ros.io.messages import conversion
+from l1slam_ros.ros.publishing import header
 from l1slam_ros.ros.threads import solver_thread
 
 DEADLINE = 60.0
@@ -131,6 +135,69 @@ def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
     b.until(lambda: len(b.path().poses) == 8, 'updates go on')
 
 
+def test_a_backlog_is_taken_over_from_dds_and_answered_at_its_end(bench, monkeypatch):
+    """More than the thousand messages that DDS queues up come while the first are in work."""
+    b = bench()
+    permits, decoded = threading.Semaphore(0), conversion.odometry_in
+    monkeypatch.setattr(
+        conversion, 'odometry_in', lambda data: permits.acquire() and decoded(data))
+
+    def stand(first, last):
+        for k in range(first, last):
+            b.publishers['/odom'].publish(odometry((k + 1) * 10**7, 0.0))
+
+    stand(0, 900)
+    permits.release(150)
+    b.until(lambda: b.backend._inputs.traffic['odom'].received > 150, 'some are used')
+    stand(900, 1800)
+    permits.release(1800)
+    b.until(lambda: b.status()[2].get('odom.received') == '1800', 'all are used')
+    assert b.status()[2]['odom.lost'] == '0'
+    b.until(lambda: b.received['pose'] and b.received['pose'][-1].header.stamp.sec == 18,
+            'the newest is answered')
+    assert len(b.received['pose']) < 900
+
+
+def test_messages_of_all_topics_are_used_in_the_order_they_came(bench, monkeypatch):
+    b = bench()
+    go_on, used, backend = threading.Event(), [], b.backend._backend
+    monkeypatch.setattr(backend, 'add_odometry', lambda s: used.append(s.stamp) or go_on.wait())
+    monkeypatch.setattr(backend, 'add_loop', lambda loop: used.append(loop.stamp))
+    sent = [10**9 * k for k in range(1, 41)]
+    for k, stamp in enumerate(sent):
+        loop = PoseWithCovarianceStamped(header=header('base_link@0.500000000', stamp))
+        loop.pose.pose.orientation.w = 1.0
+        b.send('/loop_closures' if k % 3 == 2 else '/odom',
+               loop if k % 3 == 2 else odometry(stamp, 0.0))
+    go_on.set()
+    b.until(lambda: len(used) == len(sent), 'all are used')
+    assert used == sent
+
+
+def test_optimize_is_done_though_the_map_is_replaced_meanwhile(bench, monkeypatch):
+    """By a parameter that lets all loops be judged anew: it is no end of the node."""
+    b = bench()
+    drive(b, 0, 3)
+    b.until(lambda: len(b.path().poses) == 3, 'a map')
+    began, optimise = threading.Event(), upkeep.optimise
+
+    def interrupted(problem, options, check):
+        while not began.is_set():
+            began.set()
+            while True:
+                check()
+        return optimise(problem, options, check)
+
+    monkeypatch.setattr(upkeep, 'optimise', interrupted)
+    client = b.peer.create_client(Trigger, '/backend/optimize')
+    b.until(client.service_is_ready, 'optimize is offered')
+    answer = client.call_async(Trigger.Request())
+    b.until(began.is_set, 'it is at work')
+    assert b.backend.set_parameters([Parameter('robust.enabled', value=False)])[0].successful
+    b.until(answer.done, 'optimize is answered')
+    assert answer.result().success, answer.result().message
+
+
 def test_after_a_load_the_pose_is_right_at_once(bench, tmp_path):
     """Not only from the next keyframe on."""
     b = bench(save_path=str(tmp_path / 'map.g2o'))
@@ -184,12 +251,13 @@ def test_when_the_clock_jumps_back(bench, choice):
     assert poses_of(b.path())[-1, 0] == pytest.approx(end)
 
 
-def test_what_a_full_queue_has_dropped_is_said_to_be_lost(bench):
+def test_what_a_full_queue_has_dropped_is_said_to_be_lost(bench, monkeypatch):
     b = bench()
-    b.send('/odom', odometry(10**9, 0.0))
-    b.until(lambda: b.received['pose'], 'the first one')
-    for k in range(1, 3000):
+    go_on, decoded = threading.Event(), conversion.odometry_in
+    monkeypatch.setattr(conversion, 'odometry_in', lambda data: go_on.wait() and decoded(data))
+    for k in range(3000):
         b.publishers['/odom'].publish(odometry((k + 1) * 10**9, 0.0))
+    go_on.set()
     b.until(lambda: int(b.status()[2].get('odom.received', 0)) >= 1000, 'a part comes')
     b.until(lambda: sum(int(b.status()[2][f'odom.{name}']) for name in ('received', 'lost'))
             == 3000, 'all are accounted for')
@@ -203,10 +271,6 @@ def test_the_jump_of_the_transform_is_said(bench):
 
     The front takes the most of that step at once, the map behind it the rest.
     """
-    from geometry_msgs.msg import PoseWithCovarianceStamped
-
-    from l1slam_ros.ros.publishing import header
-
     b = bench()
     vouch = b.peer.create_publisher(PoseWithCovarianceStamped, 'trusted_loop_closures', 10)
     b.until(vouch.get_subscription_count, 'the node listens')

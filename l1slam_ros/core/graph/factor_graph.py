@@ -9,6 +9,8 @@ stays valid while the graph grows. Poses live outside, in (n, p) arrays.
 
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 
@@ -101,6 +103,13 @@ class FactorGraph:
                          GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_),
                          GrowingArray((), np.bool_)]
         self._factors: BetweenFactors | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all, the manifold by its name: modules are not pickled, nor deeply copied."""
+        return {**vars(self), 'manifold': vars(self.manifold)['__name__']}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, manifold=import_module(state['manifold']))
 
     def copy(self) -> 'FactorGraph':
         """Return a graph that shares all factors so far; either may grow without the other."""

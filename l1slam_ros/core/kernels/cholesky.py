@@ -68,36 +68,37 @@ def assemble(panels, address, width, turned, corner, stride, blocks, weights, di
                     panels[address[f, part] + r * width[f, part] + c] += total
 
 
-@for_sizes(_PANELS, ANY_SIZE)
-def factorise(panels, first, start, pattern, offset, size):
+@for_sizes(_PANELS + ', i4[::1], i1[::1], i8, i4[:, ::1], i8[::1]', ANY_SIZE)
+def factorise(panels, first, start, pattern, offset, owner, share, mine, lists, reach, size):
     """
-    Turn the lower triangle in `panels` into its Cholesky factor.
+    Turn the lower triangle in `panels` into its Cholesky factor, for one share of the supernodes.
+
+    Shares may be worked on at the same time, and the last one after all others.
+
+    owner : (n,) the supernode of each position; share : of each supernode; mine : the one to do
+    lists, reach : (2, supernodes) -1 and (supernodes,) 0, kept from one share to the next
 
     Returns the first position whose pivot is not positive; the number of positions when all are.
     """
     count, n, d = len(first) - 1, first[-1], len(size)
-    # Supernodes that have something to subtract from s are a linked list; reach: from which of
-    # their rows on.
-    waiting, following = np.empty(count, np.int32), np.empty(count, np.int32)
-    reach = np.empty(count, np.int64)
-    owner, local = np.empty(n, np.int32), np.empty(n, np.int64)
-    tallest = 0
+    local, tallest = np.empty(n, np.int64), 0
     for s in range(count):
-        waiting[s] = following[s] = -1
-        for column in range(first[s], first[s + 1]):
-            owner[column] = s
         tallest = max(tallest, (start[s + 1] - start[s]) * d)
+        if share[s] < mine:
+            _enqueue(s, reach, start, pattern, owner, share, mine, lists)
     place, target = np.empty(tallest, np.int64), np.empty(tallest, np.int64)
     least = np.empty(tallest)
     for s in range(count):
+        if share[s] != mine:
+            continue
         width = (first[s + 1] - first[s]) * d
         for k in range(start[s], start[s + 1]):
             local[pattern[k]] = offset[s] + (k - start[s]) * d * width
         for c in range(width):
             least[c] = _SINGULAR * panels[offset[s] + c * (width + 1)]
-        source = waiting[s]
+        source = lists[0, s]
         while source >= 0:
-            next_source = following[source]
+            next_source = lists[1, source]
             rows = pattern[start[source] + reach[source]:start[source + 1]]
             inner = (first[source + 1] - first[source]) * d
             top = offset[source] + reach[source] * d * inner
@@ -110,14 +111,14 @@ def factorise(panels, first, start, pattern, offset, size):
                     target[k * d + a] = (rows[k] - first[s]) * d + a
             _subtract(panels, top, inner, len(rows) * d, columns * d, place, target, size)
             reach[source] += columns
-            _enqueue(source, reach[source], start, pattern, owner, waiting, following)
+            _enqueue(source, reach, start, pattern, owner, share, mine, lists)
             source = next_source
         panel = panels[offset[s]:offset[s + 1]]
         bad = _factorise_panel(panel, (start[s + 1] - start[s]) * d, width, least)
         if bad < width:
             return first[s] + bad // d
         reach[s] = first[s + 1] - first[s]
-        _enqueue(s, reach[s], start, pattern, owner, waiting, following)
+        _enqueue(s, reach, start, pattern, owner, share, mine, lists)
     return n
 
 
@@ -131,12 +132,18 @@ def _within(rows, end):
 
 
 @compiled
-def _enqueue(source, reach, start, pattern, owner, waiting, following):
-    """Let a supernode wait for the one that owns its next row."""
-    if start[source] + reach < start[source + 1]:
-        target = owner[pattern[start[source] + reach]]
-        following[source] = waiting[target]
-        waiting[target] = source
+def _enqueue(source, reach, start, pattern, owner, share, mine, lists):
+    """
+    Let a supernode wait for the one that owns its next row, if that is of this share.
+
+    Supernodes that have something to subtract from s are a linked list: lists[0, s] is the first,
+    lists[1, t] the one behind t; reach: from which of their rows on.
+    """
+    if start[source] + reach[source] < start[source + 1]:
+        target = owner[pattern[start[source] + reach[source]]]
+        if share[target] == mine:
+            lists[1, source] = lists[0, target]
+            lists[0, target] = source
 
 
 @compiled

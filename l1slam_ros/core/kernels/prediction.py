@@ -12,16 +12,18 @@ import numpy as np
 from l1slam_ros.core.kernels.compiled import compiled, loop
 
 
-@loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, ::1])')
+@loop('(i8[:, ::1], f8[:, :, :, ::1], i1[:, :, ::1], f8[:, :, ::1])')
 def gather(keyframe, blocks, y, product):
-    """Add A'y of all samples to product (n + 1, k, q); y : (m, k, q)."""
-    k = product.shape[1]
+    """Add A'y of all samples to product (n + 1, k, q); y : (m, k, q) whole numbers."""
+    k, q = product.shape[1:]
+    z = np.empty((k, q))
     for f in range(len(blocks)):
+        z[:] = y[f]
         for side in range(2):
             J, to = blocks[f, side], product[keyframe[f, side]]
             for c in range(0, k, 3):
                 for r in range(0, k, 3):
-                    _add(y[f], r, J[r:r + 3, c:c + 3].T, 1.0, to, c)
+                    _add(z, r, J[r:r + 3, c:c + 3].T, 1.0, to, c)
 
 
 @loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i4[::1], f8[:, :, ::1])')
@@ -89,9 +91,9 @@ def _solve_three_transposed(L, x, at):
         x[at, t] = (x[at, t] - L[1, 0] * x[at + 1, t] - L[2, 0] * x[at + 2, t]) / L[0, 0]
 
 
-@loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, ::1])')
+@loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1], i1[:, :, ::1])')
 def left_over(keyframe, blocks, x, y):
-    """Return the second moment of y - A x for each factor, (m, k, k); y : (m, k, q)."""
+    """Return the second moment of y - A x for each factor, (m, k, k); y as above."""
     k, q = x.shape[1:]
     moment, d = np.empty((len(blocks), k, k)), np.empty((k, q))
     for f in range(len(blocks)):

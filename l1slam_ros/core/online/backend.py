@@ -11,9 +11,11 @@ from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_sound
+from l1slam_ros.core.names import OF_THE_NODE
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.loop_states import LoopStates
 from l1slam_ros.core.online.snapshot import Optimised, Robot, SavedMap
+from l1slam_ros.core.online.upkeep.live_map import Behind
 from l1slam_ros.core.online.upkeep.threads import Background
 from l1slam_ros.core.online.upkeep.upkeep import Stopped as Stopped
 from l1slam_ros.core.online.upkeep.upkeep import Upkeep
@@ -37,7 +39,9 @@ class RobustOptions(Options):
 
 @dataclass(frozen=True)
 class BackendOptions(GraphBuilderOptions):
-    """Everything the back end can be told."""
+    """Everything the back end can be told; a mapping may say what its node is told besides."""
+
+    PASSED_OVER = OF_THE_NODE
 
     solver: OptimiserOptions = OptimiserOptions()
     robust: RobustOptions = RobustOptions()
@@ -104,10 +108,10 @@ class Backend(Upkeep):
 
     def saved(self) -> SavedMap | None:
         """Return all that another back end goes on from; None: there are no factors yet."""
-        with self._lock:
-            if self._builder.graph.between.is_absolute.all():
+        with self._standing() as now:
+            if now.graph.between.is_absolute.all():
                 return None
-            now, growth = self._snapshot(), self._builder.grown()
+            growth = self._builder.grown()
         return SavedMap(growth, now.known(), now.robust)
 
     def restore(self, saved: SavedMap) -> None:
@@ -143,6 +147,24 @@ class Backend(Upkeep):
             self._counted = version, self.snapshot().sizes()
         return self._counted[1], refused
 
+    def behind(self) -> Behind:
+        """Return what goes on behind updates."""
+        with self._lock:
+            return self._live.behind()
+
+    def marginal_covariance(self, keyframe: int) -> Array | None:
+        """
+        Return the covariance of a keyframe in its own axes, (d, d).
+
+        Exact for the least squares map of what is accepted, the noise as it was found: relative
+        to the first keyframe, or to the world if absolute poses are believed. None: no factored
+        map has the keyframe, or it is too dense to be factored.
+        """
+        with self._front:
+            front = self._live.front
+            known = front is not None and 0 <= keyframe < front.keyframes
+            return front.covariance(keyframe) if front and known else None
+
     def news(self) -> list[str]:
         """Return what is new in the notes on messages; see `GraphBuilder.notes`."""
         with self._lock:
@@ -155,13 +177,13 @@ class Backend(Upkeep):
         Where loops are to be doubted that were not before, or the other way round, all are judged
         anew.
         """
-        with self._lock:
+        with self._standing() as now:
             self._changes += 1
             doubted, self._robust = self._robust, options.robust.enabled
             self._options = self._builder.options = options
             self._solver = options.solver
             if doubted != self._robust:
-                self._begin(self._builder, self._snapshot().known().unjudged())
+                self._begin(self._builder, now.known().unjudged())
         self._wake()
 
     def add_odometry(self, sample: OdometrySample) -> Array | None:

@@ -118,9 +118,13 @@ class GraphBuilder:
 
     def _add(self, point: Point) -> None:
         """Add a sample of the robot's motion."""
-        on_gap, gap = self.options.on_time_jump, point.gap
+        on_gap, pose = self.options.on_time_jump, point.pose
+        goes_on = self._glued or self.track.goes_on(point.stamp, pose, self.offset)
+        gap = point.gap
         if not self._glued and point.stamp <= self.track.last_stamp:
             gap = f'odometry stamp {point.stamp} ns is before the end of the map'
+        elif not goes_on and on_gap == 'new_segment':
+            gap = f'odometry at {point.stamp} ns begins elsewhere than the map ends'
         if gap:
             self.add_due_loops()  # what came before is of that time
             cause, said = _SAID[on_gap]
@@ -129,10 +133,10 @@ class GraphBuilder:
         if point.anew or (gap and on_gap == 'reset'):
             self._forget()
         if not self.graph.n_poses:
-            self._begin_part(point.stamp, point.pose)
+            self._begin_part(point.stamp, pose)
             return
-        manifold, pose = self.graph.manifold, point.pose
-        if gap or not (self._glued or self.track.goes_on(point.stamp, pose, self.offset)):
+        manifold = self.graph.manifold
+        if gap or not goes_on:
             self.offset = manifold.compose(self.track.last_pose, manifold.inverse(pose))
             self._moved = True
         self._glued = True
@@ -190,7 +194,7 @@ class GraphBuilder:
             loops.rows, in_graph, expired, loops.waiting.arrivals(track.last), loops.seen())
 
     def restore(self, growth: Growth) -> None:
-        """Go on where a run ended; odometry that begins elsewhere is taken to begin there."""
+        """Go on where a run ended; odometry that begins elsewhere begins a part there."""
         self._begin(growth.graph)
         track, stamps = self.track, growth.stamps
         for part in np.split(np.arange(len(stamps)), odometry_gaps(self.graph) + 1):

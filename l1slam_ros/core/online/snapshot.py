@@ -65,7 +65,7 @@ class Problem:
     @cached_property
     def part(self) -> FactorGraph:
         """The factors that are believed."""
-        return self.graph.subset(self.judgement.accepted)
+        return self.judgement.believed(self.graph)
 
     @cached_property
     def method(self) -> Method:

@@ -177,6 +177,8 @@ def front_of(problem: Problem, poses: Array, rows: int,
     believed, kinds = loops & judgement.accepted, loops[judgement.accepted].astype(np.int64)
     gate = Gate.of(part.manifold, poses, judgement.variance, int(believed.sum()),
                    int((loops & ~believed).sum()))
+    # Where the part is as noisy as was found, odometry is its unit.
+    kinds = kinds * judgement.is_noise_stated
     found = part.subset(np.arange(len(kinds)), judgement.variance[kinds])
     starts = [poses, *problem.starts[1:]]
     l2_poses = min(starts, key=lambda start: l2_cost(whitened_residual(found, start)))
@@ -212,7 +214,7 @@ def optimise(problem: Problem, options: OptimiserOptions,
         starts = (problem.poses, seed_poses(graph, choose(AUTO, graph).cholesky, check=check))
         solution = min((_solved(graph, poses, options, check) for poses in starts),
                        key=lambda s: s.cost)
-    part = graph.subset(judgement.accepted)
+    part = judgement.believed(graph)
     before = l1_cost(whitened_residual(part, problem.poses))
     return _improvement(solution, problem, judgement, before, 0, start)
 
@@ -220,7 +222,7 @@ def optimise(problem: Problem, options: OptimiserOptions,
 def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
             check: Check) -> Solution:
     check()
-    method = choose(AUTO, graph, options.norm)
+    method = choose(AUTO, graph, options.norm, options.loop_norm)
     return minimise_by(method, graph, poses, options, lambda *_: check())[0]
 
 

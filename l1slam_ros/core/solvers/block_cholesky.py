@@ -7,8 +7,12 @@ and the pattern of the factor are those of keyframes, found once (`Pattern`) and
 every size: of the rotations alone, of the translations, of whole poses.
 """
 
+import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from threading import Thread
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +28,7 @@ from l1slam_ros.core.graph.linear_system import (
     size_of_blocks,
 )
 
+Result = TypeVar('Result')
 Places = NDArray[np.int32]
 _NONE = np.zeros(0, np.int64)
 
@@ -32,6 +37,8 @@ MOST_ENTRIES = 135_000_000
 # Multiplications for each block of the factor from which a factorisation takes longer than to find
 # another order.
 _LONG = 1500
+# Multiplications of numbers from which a factorisation, of some 2 ms, is worth a second thread.
+_SHARED = 20e6
 # Part of its diagonal by which a loose keyframe is damped: above what factorising leaves of a
 # pivot that is none, and for a heading the same as to know it to within thousands of turns.
 _LOOSE = 1e-9
@@ -57,6 +64,30 @@ class Pattern:
     def owner(self) -> Places:
         """The panel of each position, (n,)."""
         return np.repeat(np.arange(len(self.first) - 1, dtype=np.int32), np.diff(self.first))
+
+    @cached_property
+    def halves(self) -> NDArray[np.int8]:
+        """
+        What to factorise at the same time, 0 and 1, and what after both, 2, (panels,).
+
+        A cut through the postorder leaves whole subtrees on either side, 0 and 1; the panels with
+        descendants on both are 2. Of all cuts the one that takes least time.
+        """
+        count, width, height = len(self.first) - 1, np.diff(self.first), np.diff(self.start)
+        below = np.minimum(self.start[:-1] + width, len(self.rows) - 1)
+        parent = np.where(width < height, self.owner[self.rows[below]], count).tolist()
+        lowest = [*range(count), count]  # the first of each subtree
+        for s, above in enumerate(parent):
+            lowest[above] = min(lowest[above], lowest[s])
+        low, own = np.array(lowest[:-1], np.int64), width * (height - width / 2.0) ** 2
+        left = np.concatenate(([0.0], np.cumsum(own)))
+        last = np.bincount(low + 1, own, count + 2) - np.bincount(np.arange(count) + 1, own,
+                                                                  count + 2)
+        after = np.cumsum(last)[:count + 1]
+        cut = int(np.argmin(np.maximum(left, left[-1] - left - after) + after))
+        sides = np.where(low >= cut, 1, 2)
+        sides[:cut] = 0
+        return sides.astype(np.int8)
 
 
 def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1) -> Pattern:
@@ -145,7 +176,23 @@ class BlockCholesky:
         cholesky.assemble(layout.panels, *layout.places, system.blocks, weights.reshape(-1, k),
                           added, curvature, share, layout.size)
         self._factored = layout
-        return bool(cholesky.factorise(layout.panels, *layout.shape, layout.size) == system.size)
+        return self._factorise(layout) == system.size
+
+    def _factorise(self, layout: '_Layout') -> int:
+        """Return how many positions have a positive pivot before the first that has not."""
+        from l1slam_ros.core.kernels.cholesky import factorise
+
+        pattern, shared = self.pattern, self.pattern.work * len(layout.size) ** 3 > _SHARED
+        count = len(pattern.first) - 1
+        shares = pattern.halves if shared else np.zeros(count, np.int8)
+        lists, reach = np.full((2, count), -1, np.int32), np.zeros(count, np.int64)
+
+        def share(mine: int) -> int:
+            end: int = factorise(layout.panels, *layout.shape, pattern.owner, shares, mine, lists,
+                                 reach, layout.size)
+            return end
+
+        return min(*_at_once(share), share(2)) if shared else share(0)
 
     def solve(self, right: Array) -> Array:
         """Return the solution for a right hand side (columns,) by the last factorisation."""
@@ -180,6 +227,19 @@ class BlockCholesky:
             layout.panels, *layout.shape, self.pattern.owner, self.pattern.position[keyframe],
             len(layout.size))
         return found
+
+
+def _at_once(share: Callable[[int], Result]) -> tuple[Result, Result]:
+    """Return share(0) and share(1), at the same time where there is more than one core."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()
+    if cores == 1:
+        return share(0), share(1)
+    found: list[Result] = []
+    thread = Thread(target=lambda: found.append(share(1)))
+    thread.start()
+    first = share(0)
+    thread.join()
+    return first, found[0]
 
 
 class _Layout:

@@ -19,11 +19,14 @@ from l1slam_ros.core.solvers.nonlinear import Report, Solution
 from l1slam_ros.core.solvers.optimality import Huber, Norm, Status, fits_exactly, l1_cost, l2_cost
 from l1slam_ros.core.solvers.reweighting import weighted_least_squares
 
-_FIRST_DAMPING = 1e-6
-_MOST_DAMPING = 1e6
+# Damping: the first, the least, the most. A chain's slow bends feel even the least of it.
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 3e-8, 1e6
 # A map to within its noise: Gauss-Newton begins where chi2 is at most so many times what the noise
 # makes of it, and takes so many steps at most.
 _FITS, _NOISE_STEPS = 3, 60
+# Of chi2. What a step was wrong by is to first order in the length of what is left to go, what is
+# left of chi2 to second.
+_SURPRISE = 0.1
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,14 @@ def gauss_newton(
     options: LeastSquaresOptions,
     cholesky: BlockCholesky,
     report: Report = lambda iteration, cost: None,
+    surprise: float = 0.0,
 ) -> Solution:
-    """Minimise a norm, reweighted at each step; arguments as `optimiser.minimise`."""
+    """
+    Minimise a norm, reweighted at each step; arguments as `optimiser.minimise`.
+
+    surprise : an undamped step that lowers the cost by what its linear problem says, but for so
+    much, is the last one
+    """
     residual = whitened_residual(graph, poses)
     history = [norm.cost(residual)]
     status, damping = Status.ITERATION_LIMIT, 0.0
@@ -77,21 +86,24 @@ def gauss_newton(
         if fits_exactly(l1_cost(residual), len(residual)):
             status = Status.CONVERGED
             break
-        system = linearise(graph, poses, residual)
-        step = weighted_least_squares(system, cholesky, norm.weights(residual), damping)
+        system, weights = linearise(graph, poses, residual), norm.weights(residual)
+        step = weighted_least_squares(system, cholesky, weights, damping)
+        predicted = float((step * system.transposed_times(weights * system.b)).sum())
         candidate = step_poses(graph, poses, step)
         moved = whitened_residual(graph, candidate)
         cost = norm.cost(moved)
-        decrease, full = history[-1] - cost, damping <= _FIRST_DAMPING
+        decrease = history[-1] - cost
+        full, free = damping <= _FIRST_DAMPING, not damping
         if decrease >= 0:
             poses, residual = candidate, moved
-            damping = damping / 10 if damping > _FIRST_DAMPING else 0.0
+            damping = damping / 10 if damping > _LEAST_DAMPING else 0.0
         else:
             damping, cost = max(10 * damping, _FIRST_DAMPING), history[-1]
         history.append(cost)
         report(len(history) - 1, cost)
         # By a step as good as undamped; at the optimum rounding may let the cost rise a little.
-        if full and abs(decrease) <= options.tolerance * cost:
+        if (full and abs(decrease) <= options.tolerance * cost) or (
+                free and abs(decrease - predicted) < surprise):
             status = Status.CONVERGED
             break
         if damping > _MOST_DAMPING:
@@ -116,8 +128,8 @@ def l2_map(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
     if chi2 > _FITS * spare:
         linear = _two_linear_steps(graph, poses, cholesky)
         poses = linear if _chi2(graph, linear) < chi2 else poses
-    return minimise_l2(graph, poses, LeastSquaresOptions(_NOISE_STEPS, 1 / spare), cholesky,
-                       report).poses
+    options = LeastSquaresOptions(_NOISE_STEPS, 1 / spare)
+    return gauss_newton(graph, poses, Huber(), options, cholesky, report, surprise=_SURPRISE).poses
 
 
 def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:

@@ -161,9 +161,9 @@ def _note_in(file: Path) -> dict[str, str]:
     metadata: dict[str, Any] = {}
     if file.is_dir():
         metadata = directory_metadata(file)
-    elif file.suffix == '.db3':
+    elif file.suffix.lower() == '.db3':
         metadata = yaml.safe_load(sqlite_metadata(file)) or {}
-    elif file.suffix == '.mcap':
+    elif file.suffix.lower() == '.mcap':
         for name, entries in mcap_metadata(file):
             if name == NOTE_KEY:
                 return entries
@@ -177,7 +177,7 @@ def _bag_path(path: str | os.PathLike[str]) -> Path:
     bag = Path(path)
     if not bag.exists():
         raise FileError(path, 'no such file or directory; expected a bag')
-    if bag.is_file() and bag.suffix not in BAG_SUFFIXES:
+    if bag.is_file() and bag.suffix.lower() not in BAG_SUFFIXES:
         raise FileError(path, f'no bag by its name; expected {", ".join(BAG_SUFFIXES)} '
                         'or a rosbag2 directory')
     if bag.is_dir() and not (bag / METADATA).is_file() and len(bag_names(bag)) != 1:

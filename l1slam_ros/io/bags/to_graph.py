@@ -80,7 +80,8 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
         record = replace(record, graph=turned(record.graph, _noted_turns(record.graph, note)))
     if record.graph.n_poses < 2:
         raise FileError(path, '; '.join([
-            f'{record.graph.n_poses} keyframes from {topics.odometry}; expected 2 or more',
+            f'{counted(record.graph.n_poses, "keyframe")} from {topics.odometry}; '
+            'expected 2 or more',
             *_alternatives(path, topics.odometry, _ODOMETRY, MAP_GRAPH, POSE_GRAPH),
             *record.skipped, *damage]))
     for topic in sorted(topics.types().keys() - DEFAULT_TOPICS.types().keys() - growing.seen):

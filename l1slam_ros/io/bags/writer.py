@@ -103,7 +103,7 @@ def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagW
     FileError : the bag cannot be written, or something that is no bag is in its place.
 
     """
-    target = Path(os.path.abspath(path))
+    target = Path(os.path.realpath(path))
     with _replacing_directory(target) as made:
         made.mkdir()
         file = made / f'{target.name}.mcap'

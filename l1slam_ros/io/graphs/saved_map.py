@@ -79,7 +79,7 @@ def keep_as(path: Path, another: Path) -> None:
     """
     with replacing(another) as temporary:
         try:
-            os.link(path, temporary)
+            os.link(os.path.realpath(path), temporary)
         except OSError:  # not every file system has links
             shutil.copyfile(path, temporary)
 
@@ -109,6 +109,7 @@ def _keep(path: Path) -> None:
 
 def _remove_leftovers(path: Path) -> None:
     """Remove what is left of writers of this file that were killed."""
+    path = Path(os.path.realpath(path))
     for leftover in path.parent.glob(f'.{glob.escape(path.name)}*.tmp'):
         leftover.unlink(missing_ok=True)
 

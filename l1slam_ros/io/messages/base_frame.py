@@ -34,18 +34,20 @@ class BaseFrame:
 
     Attributes
     ----------
-    name : the frame as far as is known; messages without one go with any
+    name : the frame as far as is known, without a slash before it, as in tf2; messages without one
+        go with any
 
     """
 
     def __init__(self, name: str):
-        self.name = name
+        self.name = name.removeprefix('/')
         self._sure = bool(name)
         self._used = 0
         self._held: list[tuple[str, OdometrySample]] = []
 
     def take(self, frame: str, sample: OdometrySample) -> Sorted:
         """Sort a sample, and those that are held."""
+        frame = frame.removeprefix('/')
         if frame and not self.name:
             self.name, self._sure = frame, self._used > 0
         elif frame == self.name:

@@ -75,18 +75,6 @@ def test_sizes_are_those_of_the_arrays(manifold):
     assert len(manifold.COVARIANCE_ROWS) == manifold.TANGENT_SIZE
 
 
-def test_composition_is_associative(manifold, triple):
-    a, b, c = triple
-    compose = manifold.compose
-    assert_same(manifold, compose(compose(a, b), c), compose(a, compose(b, c)))
-
-
-def test_identity_changes_nothing(manifold, triple):
-    a, e = triple[0], manifold.identity(N)
-    assert_same(manifold, manifold.compose(a, e), a)
-    assert_same(manifold, manifold.compose(e, a), a)
-
-
 def test_inverse_undoes_on_both_sides(manifold, triple):
     a, e = triple[0], manifold.identity(N)
     assert_same(manifold, manifold.compose(a, manifold.inverse(a)), e)
@@ -123,12 +111,6 @@ def test_adjoint_carries_a_step_from_right_to_left(manifold, triple):
 
     numeric = differences(manifold, conjugated, manifold.identity(N))
     assert_allclose(manifold.adjoint(a), numeric, atol=1e-8)
-
-
-def test_adjoint_of_a_product_is_the_product(manifold, triple):
-    a, b, _ = triple
-    assert_allclose(manifold.adjoint(manifold.compose(a, b)),
-                    manifold.adjoint(a) @ manifold.adjoint(b), atol=1e-11)
 
 
 def test_residual_reads_the_coordinates_off_the_error(manifold, triple):
@@ -198,15 +180,9 @@ def test_interpolation_goes_from_end_to_end_by_equal_parts(manifold, triple):
     assert_same(manifold, parts[0], a)
     assert_same(manifold, parts[2], b)
     assert_allclose(manifold.local(a, parts[1]), manifold.local(a, b) / 4, atol=1e-12)
-
-
-def test_interpolation_takes_a_fraction_for_each_pose(manifold, triple, rng):
-    a, b, _ = triple
-    fraction = rng.random(N)
-    together = manifold.interpolate(a, b, fraction)
-    for k in range(N):
-        alone = manifold.interpolate(a[k : k + 1], b[k : k + 1], fraction[k : k + 1])
-        assert_array_equal(together[k : k + 1], alone)
+    fraction = np.linspace(0, 1, N)
+    each = manifold.local(a, manifold.interpolate(a, b, fraction))
+    assert_allclose(each, fraction[:, None] * manifold.local(a, b), atol=1e-12)
 
 
 def test_motion_measures_length_and_angle(manifold):
@@ -272,13 +248,6 @@ def test_wrap_moves_by_whole_turns():
 
 def test_wrap_never_returns_minus_pi():
     assert se2.wrap(np.array([np.nextafter(np.pi, 4.0)]))[0] > -np.pi
-
-
-def test_a_quarter_turn_by_hand():
-    a, b = np.array([[1.0, 2.0, np.pi / 2]]), np.array([[3.0, 0.0, np.pi]])
-    assert_allclose(se2.compose(a, b), [[1.0, 5.0, -np.pi / 2]])
-    assert_allclose(se2.between(a, b), [[-2.0, -2.0, np.pi / 2]], atol=1e-15)
-    assert_allclose(se2.inverse(a), [[-2.0, 1.0, -np.pi / 2]], atol=1e-15)
 
 
 def test_yaw_is_read_off_tilted_poses(rng):

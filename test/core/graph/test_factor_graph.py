@@ -61,14 +61,6 @@ def test_trust_is_of_each_factor_and_none_where_nobody_speaks():
     assert graph.between.trusted.tolist() == [False, True, False, True, True, True, True]
 
 
-def test_trust_of_too_few_factors_is_refused():
-    graph = graph_with(3, [])
-    with pytest.raises(ValueError):
-        graph.add_between(np.array([0, 1, 0]), np.array([1, 2, 2]), np.zeros((3, 3)),
-                          np.tile(np.eye(3), (3, 1, 1)), np.array([True, False]))
-    assert {len(column) for column in vars(graph.between).values()} == {0}
-
-
 def test_the_world_is_an_end_like_any_keyframe(rng):
     graph = graph_with(3, [(0, 1)])
     measurement, information = random_poses(2, rng), random_information(2, rng)

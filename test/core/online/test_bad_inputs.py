@@ -3,10 +3,9 @@
 
 import numpy as np
 import pytest
-from problems import PERIOD, covariance6, loop, odometry
+from problems import PERIOD, covariance6, loop, odometry, retold
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
@@ -101,12 +100,9 @@ def test_no_variance_makes_an_update_fail(source, component, period, rng):
 def exact_world(n, edges, rng, false_loops):
     """Return a graph whose odometry has noise and whose loops have none, and its truth."""
     world = simulate_world(n, edges, WorldOptions(), rng)
-    factors, graph = world.graph.between, FactorGraph(se2)
+    factors = world.graph.between
     exact = se2.between(world.truth[factors.i], world.truth[factors.j])
-    graph.add_poses(n)
-    graph.append_between(factors.i, factors.j,
-                         np.where(factors.is_odometry[:, None], factors.measurement, exact),
-                         factors.sqrt_information)
+    graph = retold(world.graph, np.where(factors.is_odometry[:, None], factors.measurement, exact))
     if false_loops:
         graph = insert_loops(graph, FALSE_LOOPS['random'](graph, world.truth, false_loops, rng))
     return graph, world.truth

@@ -205,6 +205,28 @@ def test_a_saved_map_keeps_its_parts(world):
     assert_allclose(second.poses[N], first.poses[-1], atol=1e-9)
 
 
+@pytest.mark.parametrize('choice, gaps', [
+    ('new_segment', [HALF]), ('reset', []), ('ignore', [])])
+def test_a_robot_carried_off_while_its_map_was_saved_is_where_loops_say(world, choice, gaps):
+    """What begins elsewhere begins a part; or, by the user's word, where the robot was."""
+    unseen, found = 40, list(moved(messages(world), (50.0, 60.0, 1.0)))
+    first, last = seconds(1.0 + HALF * PERIOD), seconds(1.0 + (HALF + unseen) * PERIOD)
+    # Times that nobody saw no loop can be of.
+    def seen(message):
+        stamps = (getattr(message, 'reference_stamp', message.stamp), message.stamp)
+        return not any(first <= stamp < last for stamp in stamps)
+
+    one = fed(Backend(EVERY), (message for message in found if message.stamp < first))
+    second = Backend(replace(EVERY, on_time_jump=choice))
+    second.restore(one.saved())
+    fed(second, (message for message in found if message.stamp >= last and seen(message)))
+    now = second.snapshot()
+    assert now.gaps.tolist() == gaps and len(now.poses) == N - unseen
+    if gaps:
+        truth = np.delete(world.truth, np.s_[HALF:HALF + unseen], axis=0)
+        assert position_error(now.poses, truth) < 0.2
+
+
 # A person's hand
 
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The block Cholesky factorisation against dense NumPy, on graphs of every shape."""
 
+from threading import Thread
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -20,7 +22,8 @@ from systems import (
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.linear_system import keyframes_of, linearise
+from l1slam_ros.core.graph.linear_system import linearise
+from l1slam_ros.core.solvers import block_cholesky
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, cholesky_of, find_pattern
 
 N = 26
@@ -47,8 +50,9 @@ def test_it_solves_as_numpy_does(shape, k, rng):
     system = random_system(3 * shape(N), N, k, rng)
     weights = rng.uniform(0.1, 3, len(system.b))
     cholesky = cholesky_of_system(system)
-    assert cholesky.factorise(system, weights, 0.1)
-    check_solution(cholesky, normal(system, weights, 0.1), rng)
+    for added in 0.1, rng.uniform(0.1, 2, k * N):
+        assert cholesky.factorise(system, weights, added)
+        check_solution(cholesky, normal(system, weights, added), rng)
 
 
 @pytest.mark.parametrize('n', [1, 2, 3])
@@ -103,6 +107,52 @@ def test_a_large_grid_leaves_a_small_residual(rng):
     assert_allclose(left, right, atol=1e-10)
 
 
+@pytest.fixture(scope='module')
+def large():
+    """Large enough for a second thread; k = 6."""
+    system = random_system(2 * grid(1800), 1800, 6, np.random.default_rng(5))
+    pattern = find_pattern(system.keyframe, 1800, PLENTY, 6)
+    assert pattern.work * 6**3 > block_cholesky._SHARED
+    return system, pattern
+
+
+def test_halves_have_nothing_to_do_with_each_other(large):
+    pattern = large[1]
+    halves = pattern.halves
+    for s, half in enumerate(halves):
+        above = halves[pattern.owner[pattern.rows[pattern.start[s]:pattern.start[s + 1]]]]
+        assert set(above.tolist()) <= {half, 2}
+    work = np.bincount(halves, np.diff(pattern.first) * np.diff(pattern.start) ** 2.0, 3)
+    assert work.all() and work.max() < 0.5 * work.sum()
+
+
+@pytest.mark.parametrize('cores', [1, 2])
+def test_the_factor_does_not_depend_on_the_cores(cores, large, monkeypatch, rng):
+    monkeypatch.setattr('os.sched_getaffinity', lambda _: range(cores), raising=False)
+    started = []
+    monkeypatch.setattr(Thread, 'start', lambda self, start=Thread.start: (
+        started.append(self), start(self)))
+    system, pattern = large
+    right, found = rng.standard_normal(6 * 1800), []
+    for add in (0.1, 0.1, -1e3):
+        cholesky = BlockCholesky(pattern, system.keyframe)
+        assert cholesky.factorise(system, np.ones(len(system.b)), add) == (add > 0)
+        found.append(cholesky.solve(right))
+    left = system.transposed_times(system.times(found[0])) + 0.1 * found[0]
+    assert_allclose(left, right, atol=1e-9)
+    assert_array_equal(found[0], found[1])
+    assert len(started) == 3 * (cores - 1)
+
+
+@pytest.mark.parametrize('keyframe', [0, 900, 1799])
+def test_a_bad_pivot_is_found_in_either_half(keyframe, large):
+    system, pattern = large
+    added = np.zeros((1800, 6))
+    added[keyframe] = -1e6
+    assert not BlockCholesky(pattern, system.keyframe).factorise(
+        system, np.ones(len(system.b)), added.ravel())
+
+
 def test_one_serves_blocks_of_every_size(rng):
     """Rotations, translations, poses: the last factorisation is the one that solves."""
     whole = random_system(3 * random_loops(N), N, 3, rng)
@@ -134,15 +184,6 @@ def test_a_pattern_of_more_factors_serves_fewer(rng):
 
 
 # What may be added to the matrix
-
-
-def test_a_diagonal_is_added(rng):
-    system = random_system(3 * grid(N), N, 3, rng)
-    weights, diagonal = rng.uniform(0.1, 3, len(system.b)), rng.uniform(0, 2, 3 * N)
-    cholesky = cholesky_of_system(system)
-    for added in (diagonal, 0.5, 0.0):
-        assert cholesky.factorise(system, weights, added)
-        check_solution(cholesky, normal(system, weights, added), rng)
 
 
 @pytest.mark.parametrize('share', [0.0, 0.3, 1.0])
@@ -255,15 +296,11 @@ def pairs(request):
     return request.param(N)
 
 
-def test_the_pattern_is_a_permutation_in_panels(pairs):
+def test_the_panels_and_the_work_are_those_of_dense_elimination(pairs):
     pattern = find_pattern(np.array(pairs), N, PLENTY)
     assert_array_equal(np.sort(pattern.position), np.arange(N))
     assert (pattern.first[0], pattern.first[-1]) == (0, N)
     assert pattern.start[-1] == len(pattern.rows)
-
-
-def test_the_panels_cover_the_fill_of_dense_elimination(pairs):
-    pattern = find_pattern(np.array(pairs), N, PLENTY)
     expected = filled(pairs, N, pattern.position)
     stored = np.zeros((N, N), bool)
     for s, first in enumerate(pattern.first[:-1]):
@@ -273,13 +310,8 @@ def test_the_panels_cover_the_fill_of_dense_elimination(pairs):
     assert not (expected & ~stored).any()
     # Panels hold some zeros for the sake of being large: no more than is said.
     assert stored.sum() <= expected.sum() / (1 - 0.2)
-
-
-def test_the_work_is_that_of_dense_elimination(pairs):
-    """Half of the square of each column: its products with itself below the diagonal."""
-    pattern = find_pattern(np.array(pairs), N, PLENTY)
-    columns = filled(pairs, N, pattern.position).sum(axis=0)
-    assert pattern.work == (columns.astype(float) ** 2).sum() / 2
+    # Half of the square of each column: its products with itself below the diagonal.
+    assert pattern.work == (expected.sum(axis=0).astype(float) ** 2).sum() / 2
 
 
 def test_a_chain_and_a_star_do_not_fill_in():
@@ -305,12 +337,3 @@ def test_too_much_fill_is_refused():
     with pytest.raises(FillError, match=f'20 keyframes and {below} factors .* more than '
                        f'{below - 1} blocks'):
         find_pattern(keyframe, 20, below - 1)
-
-
-def test_the_pattern_of_a_graph_is_that_of_its_free_keyframes(rng):
-    graph, _ = noisy_graph(40, 40, rng)
-    ours = cholesky_of(graph).pattern
-    expected = find_pattern(keyframes_of(graph, 1), 39, PLENTY)
-    assert len(ours.position) == 39
-    assert_array_equal(ours.position, expected.position)
-    assert ours.work == expected.work

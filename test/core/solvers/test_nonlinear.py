@@ -62,13 +62,6 @@ def test_no_small_step_is_better_by_highs(start_of, world):
     assert solution.cost < cost(graph, truth)
 
 
-def test_all_starts_lead_to_one_cost(world):
-    graph, truth = world
-    costs = [solve(graph, start, DEFAULTS).cost
-             for start in (seed_of(graph), odometry_poses(graph), truth)]
-    assert_allclose(costs, costs[0], rtol=1e-4)
-
-
 def test_without_a_factorisation_it_ends_there_too(world):
     """Of a graph that fills in; the linear problems then begin where the last one ended."""
     graph, truth = world
@@ -86,14 +79,6 @@ def test_the_cost_never_rises(inner, world):
     assert (np.diff(solution.history) <= 0).all()
     assert solution.history[-1] == solution.cost
     assert len(solution.history) == solution.outer_iterations + 1
-
-
-def test_keyframe_0_stays_where_it_was(world):
-    graph, truth = world
-    moved = se2.compose(np.broadcast_to([3.0, -1.0, 2.0], truth.shape), truth)
-    solution = solve(graph, moved, DEFAULTS)
-    assert_array_equal(solution.poses[0], moved[0])
-    assert solution.cost == pytest.approx(solve(graph, truth, DEFAULTS).cost, rel=1e-4)
 
 
 def test_parallel_factors_meet_at_their_median():
@@ -115,18 +100,6 @@ def test_it_converges(world):
     assert small[-2:].all() and not (small[:-2] & small[1:-1]).any()
 
 
-@pytest.mark.parametrize('outer', [0, 1, 3])
-def test_the_iteration_limit_is_kept_and_named(outer, world):
-    graph, _ = world
-    options = OptimiserOptions(outer_iterations=outer)
-    solution = solve(graph, odometry_poses(graph), options)
-    assert solution.status is Status.ITERATION_LIMIT
-    assert solution.outer_iterations == outer
-    assert 0 <= solution.inner_iterations <= outer * options.inner.iterations
-    assert solution.dual.shape == (3 * len(graph.between),)
-    assert np.isinf(solution.gap) == (outer == 0)
-
-
 def test_where_nothing_is_better_it_has_converged():
     """At the median to the last bit no step lowers the cost, and the dual proves it."""
     poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
@@ -145,22 +118,6 @@ def test_a_deadline_that_has_passed_leaves_one_linearisation(world):
     assert solution.cost < cost(graph, start)
 
 
-def test_a_cost_of_zero_is_the_end(rng):
-    graph = parallel(1.0)
-    solution = solve(graph, odometry_poses(graph), DEFAULTS)
-    assert (solution.status, solution.cost, solution.gap) == (Status.CONVERGED, 0.0, 0.0)
-    assert solution.outer_iterations == solution.inner_iterations == 0
-    assert_array_equal(solution.dual, np.zeros(3))
-
-
-def test_one_keyframe_is_solved():
-    graph = FactorGraph(se2)
-    graph.add_poses(1)
-    solution = solve(graph, se2.identity(1), DEFAULTS)
-    assert (solution.status, solution.cost) == (Status.CONVERGED, 0.0)
-    assert_array_equal(solution.poses, se2.identity(1))
-
-
 def test_a_graph_that_fits_to_rounding_is_solved(rng):
     truth = drive(30, rng)
     graph = graph_of(truth, chain_and_loops(30, 20, rng))
@@ -175,24 +132,6 @@ def test_chains_without_loops_are_solved_from_anywhere():
         truth = drive(2, rng)
         solution = solve(graph_of(truth, [(0, 1)]), se2.identity(2), DEFAULTS)
         assert_allclose(solution.poses, truth, atol=1e-9)
-
-
-def test_progress_is_reported(world):
-    graph, truth = world
-    reports = []
-    solution = solve(graph, truth, OptimiserOptions(outer_iterations=4),
-                        report=lambda k, value: reports.append((k, value)))
-    assert reports == list(enumerate(solution.history))[1:]
-
-
-def test_poses_and_dual_are_left_as_they_were(world):
-    graph, poses = world
-    dual = np.zeros(3 * len(graph.between))
-    before = poses.copy()
-    poses.flags.writeable = dual.flags.writeable = False
-    solve(graph, poses, OptimiserOptions(outer_iterations=2), dual=dual)
-    assert_array_equal(poses, before)
-    assert_array_equal(dual, 0)
 
 
 # The dual
@@ -212,6 +151,7 @@ def test_the_dual_proves_how_good_the_last_step_was(world):
 def test_with_the_dual_returned_it_converges_at_once(world):
     graph, truth = world
     first = solve(graph, truth, OptimiserOptions(outer_iterations=1000))
+    first.dual.flags.writeable = False
     again = solve(graph, first.poses, DEFAULTS, dual=first.dual)
     assert again.status in (Status.CONVERGED, Status.STALLED)
     assert again.outer_iterations <= 4
@@ -270,28 +210,6 @@ def test_far_is_more_than_a_hundredth():
 
 
 # Absolute factors
-
-
-def test_absolute_factors_meet_at_their_median():
-    """All look north, so that x and y of the map are the axes of their residuals."""
-    graph = FactorGraph(se2)
-    graph.add_poses(1)
-    places = np.array([(0.0, 2.0, np.pi / 2), (1.0, 4.0, np.pi / 2), (5.0, 3.0, np.pi / 2)])
-    add_absolute(graph, np.zeros(3, int), places, np.broadcast_to(np.eye(3), (3, 3, 3)))
-    solution = solve(graph, se2.identity(1), DEFAULTS)
-    assert_allclose(solution.poses, [[1.0, 3.0, np.pi / 2]], atol=1e-3)
-    assert solution.cost == pytest.approx(5.0 + 2.0, abs=1e-2)
-
-
-def test_an_absolute_factor_puts_the_map_in_its_place(world, rng):
-    graph, truth = world
-    alone = solve(graph, truth, DEFAULTS)
-    there = se2.compose(np.broadcast_to([10.0, 20.0, 0.5], truth.shape), truth)
-    add_absolute(graph, np.array([0]), there[:1], np.eye(3)[None])
-    solution = solve(graph, there, DEFAULTS)
-    assert solution.cost == pytest.approx(alone.cost, rel=1e-4)
-    assert_allclose(solution.poses[0], there[0], atol=1e-3)
-    assert len(solution.dual) == 3 * len(graph.between)
 
 
 @pytest.mark.parametrize('outer', [0, 30])

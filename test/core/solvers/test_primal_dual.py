@@ -1,18 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Algorithms 1 and 2 against closed forms, hand-solved LPs, HiGHS and bounded least squares."""
 
-import time
 from itertools import islice
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from problems import HAND_SOLVED, RANDOM_SYSTEMS, linprog_l1, noisy_graph, random_system
-from scipy.optimize import lsq_linear
+from problems import HAND_SOLVED, RANDOM_SYSTEMS, linprog_l1, random_system
 from scipy.sparse import csr_array
 
-from l1slam_ros.core.graph.linear_system import linearise
-from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.optimality import Status, duality_gap, l1_cost
 from l1slam_ros.core.solvers.primal_dual import (
     CHECK_EVERY,
@@ -22,7 +18,6 @@ from l1slam_ros.core.solvers.primal_dual import (
     primal_dual,
     primal_weight,
 )
-from l1slam_ros.core.solvers.reweighting import reweighted_start
 
 LONG = PrimalDualOptions(iterations=8000, tolerance=1e-5)
 
@@ -53,32 +48,6 @@ def test_algorithm_1_takes_the_steps_of_the_paper(theta, rng):
         found_x, found_y = next(iterates)
         assert_allclose(found_x, x)
         assert_allclose(found_y, y)
-
-
-def test_algorithm_1_soft_thresholds():
-    """F = |. - b|_1, K = 1, G = |. - c|^2 / 2: x is c, drawn towards b by 1 at most."""
-    b, c = np.zeros(5), np.array([-3.0, -0.4, 0.0, 0.9, 2.5])
-    x, y = nth(primal_dual(
-        csr_array(np.eye(5)), lambda v: np.clip(v - 0.9 * b, -1, 1),
-        lambda v: (v + 0.9 * c) / 1.9, b, b, tau=0.9, sigma=0.9), 200)
-    assert_allclose(x, [-2.0, 0.0, 0.0, 0.0, 1.5], atol=1e-9)
-    assert_allclose(y, c - x, atol=1e-9)
-
-
-def test_algorithm_1_denoises_as_bounded_least_squares_does(rng):
-    """
-    F = 2 |.|_1, K = differences, G = |. - c|^2 / 2: total variation.
-
-    Its dual is min |K'y - c|^2 with |y| <= 2, then x = c - K'y.
-    """
-    c = np.repeat([0.0, 4.0, 1.0], 10) + 0.5 * rng.standard_normal(30)
-    K = csr_array(np.diff(np.eye(30), axis=0))
-    tau = sigma = 0.5  # |K|^2 < 4
-    x, y = nth(primal_dual(K, lambda v: np.clip(v, -2, 2), lambda v: (v + tau * c) / (1 + tau),
-                           c, np.zeros(29), tau, sigma), 3000)
-    expected = lsq_linear(K.T.toarray(), c, (-2, 2), tol=1e-12).x
-    assert_allclose(x, c - K.T @ expected, atol=1e-5)
-    assert np.abs(y).max() <= 2
 
 
 @pytest.mark.parametrize('kind', RANDOM_SYSTEMS)
@@ -134,15 +103,9 @@ def test_algorithm_2_solves_what_was_solved_by_hand(make):
     assert_allclose(solution.x, problem.x, atol=2e-4)
     assert solution.objective == pytest.approx(problem.optimum, rel=1e-4, abs=1e-6)
     assert np.abs(solution.y).max() <= 1
-
-
-@pytest.mark.parametrize('make', HAND_SOLVED[:-1], ids=lambda make: make.__name__)
-def test_algorithm_2_finds_the_dual_too(make):
-    """Every hand-solved problem has one dual, but the line and the exact fit."""
-    problem = make()
-    y = minimise_l1(problem.A, problem.b, *zeros(problem.A), LONG).y
-    assert_allclose(problem.A.T @ y, 0, atol=1e-3)
-    assert -problem.b @ y == pytest.approx(problem.optimum, rel=1e-3)
+    if problem.optimum:
+        assert_allclose(problem.A.T @ solution.y, 0, atol=1e-3)
+        assert -problem.b @ solution.y == pytest.approx(problem.optimum, rel=1e-3)
 
 
 @pytest.mark.parametrize('kind, within', [
@@ -162,15 +125,6 @@ def test_algorithm_2_with_less_relaxation(theta, rng):
     options = PrimalDualOptions(iterations=20_000, tolerance=1e-4)
     solution = minimise_l1(A, b, *zeros(A), options, theta=theta)
     assert solution.objective <= 1.01 * linprog_l1(A, b)[0]
-
-
-def test_algorithm_2_on_a_pose_graph(rng):
-    graph, truth = noisy_graph(30, 25, rng)
-    system = linearise(graph, truth)
-    start = reweighted_start(system, cholesky_of(graph))
-    solution = minimise_l1(system.A, system.b, *start, LONG)
-    assert solution.objective == pytest.approx(linprog_l1(system.A, system.b)[0], rel=5e-4)
-    assert solution.objective < l1_cost(system.A @ start[0] - system.b)
 
 
 @pytest.mark.parametrize('kind', RANDOM_SYSTEMS)
@@ -202,53 +156,6 @@ def test_an_empty_row_does_not_keep_the_gap_open():
     assert solution.status is Status.CONVERGED
 
 
-@pytest.mark.parametrize('iterations', [1, 39, 40, 41, 100])
-def test_the_iteration_limit_is_kept_and_named(iterations, rng):
-    A, b = random_system('dense', rng)
-    options = PrimalDualOptions(iterations=iterations, tolerance=0.0)
-    solution = minimise_l1(A, b, *zeros(A), options)
-    assert solution.status is Status.ITERATION_LIMIT
-    assert solution.iterations == iterations == solution.history[-1, 0]
-
-
-def test_the_history_starts_at_the_start_and_ends_at_the_answer(rng):
-    A, b = random_system('dense', rng)
-    options = PrimalDualOptions(iterations=100, tolerance=0.0)
-    solution = minimise_l1(A, b, *zeros(A), options)
-    assert_array_equal(solution.history[:, 0], [0, 40, 80, 100])
-    assert solution.history[0, 1] == l1_cost(b)
-    assert solution.history[-1, 1] == solution.objective
-
-
-def test_a_deadline_that_has_passed_ends_it_at_the_next_look(rng):
-    A, b = random_system('dense', rng)
-    options = PrimalDualOptions(iterations=1000, tolerance=0.0)
-    solution = minimise_l1(A, b, *zeros(A), options, deadline=time.monotonic())
-    assert solution.status is Status.OUT_OF_TIME
-    assert solution.iterations == CHECK_EVERY
-
-
-def test_a_deadline_to_come_is_kept(rng):
-    A, b = random_system('dense', rng)
-    options = PrimalDualOptions(iterations=10**7, tolerance=0.0)
-    start = time.monotonic()
-    solution = minimise_l1(A, b, *zeros(A), options, deadline=start + 0.05)
-    assert solution.status is Status.OUT_OF_TIME
-    assert 0.05 <= time.monotonic() - start < 1
-
-
-@pytest.mark.parametrize('kind', RANDOM_SYSTEMS[:-1])
-def test_a_warm_start_needs_fewer_iterations(kind, rng):
-    A, b = random_system(kind, rng)
-    options = PrimalDualOptions(iterations=100_000, tolerance=1e-3)
-    cold = minimise_l1(A, b, *zeros(A), options)
-    moved = b + 1e-4 * rng.standard_normal(len(b))
-    cold_again = minimise_l1(A, moved, *zeros(A), options)
-    warm = minimise_l1(A, moved, cold.x, cold.y, options)
-    assert warm.status is cold_again.status is Status.CONVERGED
-    assert warm.iterations < cold_again.iterations / 2
-
-
 def test_a_start_at_the_optimum_stays_there():
     for make in HAND_SOLVED:
         problem = make()
@@ -256,31 +163,6 @@ def test_a_start_at_the_optimum_stays_there():
         assert solution.iterations == CHECK_EVERY or problem.optimum == 0
         assert_allclose(solution.x, problem.x, atol=1e-9)
         assert_allclose(solution.y, problem.y, atol=1e-9)
-
-
-def test_inputs_are_never_written_to(rng):
-    A, b = random_system('sparse', rng)
-    x, y = rng.standard_normal(A.shape[1]), rng.uniform(-1, 1, len(b))
-    for array in (A.data, A.indices, A.indptr, b, x, y):
-        array.flags.writeable = False
-    before = A.toarray(), b.copy(), x.copy(), y.copy()
-    minimise_l1(A, b, x, y, PrimalDualOptions(iterations=100))
-    primal_weight(A, b, x)
-    for array, expected in zip((A.toarray(), b, x, y), before, strict=True):
-        assert_array_equal(array, expected)
-
-
-@pytest.mark.parametrize('factor', [1000.0, 1e-6])
-@pytest.mark.parametrize('kind', RANDOM_SYSTEMS)
-def test_the_unit_of_length_does_not_matter(kind, factor, rng):
-    """Columns in another unit: the same iterations, the same objective, x in the new unit."""
-    A, b = random_system(kind, rng)
-    options = PrimalDualOptions(iterations=4000, tolerance=1e-3)
-    one = minimise_l1(A, b, *zeros(A), options)
-    other = minimise_l1(factor * A, b, *zeros(A), options)
-    assert other.iterations == one.iterations and other.status == one.status
-    assert other.objective == pytest.approx(one.objective, rel=1e-9)
-    assert_allclose(factor * other.x, one.x, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize('factor', [1000.0, 1e-6])

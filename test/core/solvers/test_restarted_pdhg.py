@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fast primal-dual method: kernel against NumPy, answers against HiGHS, starts, deadlines."""
 
-import time
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from l1slam_ros.core.graph.linear_system import LinearSystem, linearise
 from l1slam_ros.core.graph.tiles import Tiles
 from l1slam_ros.core.kernels import halpern as kernels
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
-from l1slam_ros.core.solvers.primal_dual import CHECK_EVERY, PrimalDualOptions, minimise_l1
+from l1slam_ros.core.solvers.primal_dual import PrimalDualOptions, minimise_l1
 from l1slam_ros.core.solvers.restarted_pdhg import halpern_step, minimise_l1_halpern, scaled_system
 
 BLOCK_SIZES = [1, 2, 3, 6]
@@ -79,7 +78,7 @@ def test_a_keyframe_without_factors_is_no_trouble(rng):
 @pytest.mark.parametrize('dtype, within', [(np.float32, 2e-4), (np.float64, 1e-6)])
 @pytest.mark.parametrize('k', BLOCK_SIZES)
 def test_the_kernel_takes_the_steps_of_the_page(k, dtype, within, rng):
-    """Iteration for iteration; tiles are packed in single precision, so A itself is rounded."""
+    """One and some at a time; tiles are packed in single precision, so A itself is rounded."""
     system, _ = scaled_system(chain_with_loops(k, rng))
     y0 = rng.uniform(-1, 1, len(system.b))
     y, weight, K = y0.copy(), 0.7, (0,) * k
@@ -87,31 +86,17 @@ def test_the_kernel_takes_the_steps_of_the_page(k, dtype, within, rng):
     x, z, g = np.zeros((3, system.size + 1, k), dtype)
     kernels.adjoint(flat, layout.keyframes, g, K)
     expected = np.zeros(system.size * k)
-    for iteration in range(30):
-        kernels.iterate(flat, layout.keyframes, x, z, g, weight, iteration, 1, K)
-        expected, y = halpern_step(system.A, system.b, expected, y, y0, weight, iteration)
+    done = 0
+    for count in (*[1] * 12, 5, 12):
+        kernels.iterate(flat, layout.keyframes, x, z, g, weight, done, count, K)
+        for iteration in range(done, done + count):
+            expected, y = halpern_step(system.A, system.b, expected, y, y0, weight, iteration)
+        done += count
         found_y = layout.unpack(packed[:, 2 * k * k + k: 2 * k * k + 2 * k]).ravel()
         assert_allclose(x[:-1].ravel(), expected, atol=within * max(1, np.abs(expected).max()))
         assert_allclose(found_y, y, atol=within)
         assert_allclose(g[:-1].ravel(), system.A.T @ y, atol=10 * within)
         assert_array_equal(x[-1], 0)
-
-
-@pytest.mark.parametrize('k', BLOCK_SIZES)
-def test_many_iterations_at_once_are_as_many_single_ones(k, rng):
-    system, _ = scaled_system(chain_with_loops(k, rng))
-    _, y = zeros(system)
-    ends = []
-    for counts in ([17], [1] * 17, [5, 12]):
-        layout, _, flat = laid_out(system, y, y, np.float32)
-        x, z, g = np.zeros((3, system.size + 1, k), np.float32)
-        done = 0
-        for count in counts:
-            kernels.iterate(flat, layout.keyframes, x, z, g, 0.3, done, count, (0,) * k)
-            done += count
-        ends.append(x)
-    assert_array_equal(ends[0], ends[1])
-    assert_array_equal(ends[0], ends[2])
 
 
 @pytest.mark.parametrize('k', BLOCK_SIZES)
@@ -194,60 +179,6 @@ def test_the_gap_bounds_the_error_within_its_box(k, rng):
         assert solution.objective - solution.gap <= best * (1 + 1e-5)
 
 
-def test_a_warm_start_needs_fewer_iterations(rng):
-    graph, truth = noisy_graph(200, 300, rng)
-    system = linearise(graph, truth)
-    options = PrimalDualOptions(iterations=100_000, tolerance=1e-3)
-    cold = minimise_l1_halpern(system, *zeros(system), options)
-    moved = LinearSystem(system.keyframe, system.blocks,
-                         system.b + 1e-4 * rng.standard_normal(len(system.b)), system.size)
-    again = minimise_l1_halpern(moved, *zeros(system), options)
-    warm = minimise_l1_halpern(moved, cold.x, cold.y, options, cold.weight)
-    assert warm.status is again.status is Status.CONVERGED
-    assert warm.iterations < again.iterations / 2
-
-
-@pytest.mark.parametrize('iterations', [1, 39, 40, 41, 100])
-def test_the_iteration_limit_is_kept_and_named(iterations, rng):
-    system = chain_with_loops(3, rng)
-    solution = minimise_l1_halpern(system, *zeros(system), PrimalDualOptions(
-        iterations=iterations, tolerance=0.0))
-    assert solution.status is Status.ITERATION_LIMIT
-    assert solution.iterations == iterations == solution.history[-1, 0]
-    assert solution.history[0, 1] == l1_cost(system.b)
-    assert solution.history[-1, 1] == solution.objective
-
-
-def test_a_deadline_that_has_passed_ends_it_at_the_next_look(rng):
-    system = chain_with_loops(3, rng)
-    options = PrimalDualOptions(iterations=10**6, tolerance=0.0)
-    solution = minimise_l1_halpern(system, *zeros(system), options, deadline=time.monotonic())
-    assert solution.status is Status.OUT_OF_TIME
-    assert solution.iterations == CHECK_EVERY
-
-
-def test_a_deadline_to_come_is_kept(rng):
-    system = chain_with_loops(3, rng)
-    options = PrimalDualOptions(iterations=10**7, tolerance=0.0)
-    minimise_l1_halpern(system, *zeros(system), PrimalDualOptions(iterations=1))
-    start = time.monotonic()
-    solution = minimise_l1_halpern(system, *zeros(system), options, deadline=start + 0.05)
-    assert solution.status is Status.OUT_OF_TIME
-    assert 0.05 <= time.monotonic() - start < 1
-
-
-def test_inputs_are_never_written_to(rng):
-    system = chain_with_loops(2, rng)
-    x, y = rng.standard_normal(24), rng.uniform(-1, 1, len(system.b))
-    arrays = (system.keyframe, system.blocks, system.b, x, y)
-    before = [array.copy() for array in arrays]
-    for array in arrays:
-        array.flags.writeable = False
-    minimise_l1_halpern(system, x, y, PrimalDualOptions(iterations=200, tolerance=0.0))
-    for array, expected in zip(arrays, before, strict=True):
-        assert_array_equal(array, expected)
-
-
 def test_a_system_without_factors_or_without_keyframes():
     empty = LinearSystem(np.zeros((0, 2), np.int64), np.zeros((0, 2, 3, 3)), np.zeros(0), 4)
     solution = minimise_l1_halpern(empty, np.ones(12), np.zeros(0), PrimalDualOptions())
@@ -267,14 +198,3 @@ def test_an_exact_fit_stays_finite(rng):
     cold = minimise_l1_halpern(exact, *zeros(exact), PrimalDualOptions(
         iterations=20_000, tolerance=1e-6))
     assert cold.objective < 1e-6 * l1_cost(exact.b)
-
-
-@pytest.mark.parametrize('factor', [1000.0, 1e-6])
-def test_the_unit_of_length_does_not_matter(factor, rng):
-    """Columns in another unit: the same path but for rounding."""
-    system = chain_with_loops(3, rng)
-    other = LinearSystem(system.keyframe, factor * system.blocks, system.b, system.size)
-    options = PrimalDualOptions(iterations=400, tolerance=0.0)
-    one, two = (minimise_l1_halpern(s, *zeros(s), options) for s in (system, other))
-    assert two.objective == pytest.approx(one.objective, rel=1e-3)
-    assert_allclose(factor * two.x, one.x, rtol=0.05, atol=0.05 * np.abs(one.x).max())

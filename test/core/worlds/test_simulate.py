@@ -12,8 +12,7 @@ from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 OPTIONS = WorldOptions()
 
@@ -88,15 +87,6 @@ def test_noise_has_the_information_stated(rng):
         np.testing.assert_allclose(part.std(axis=0), 1, atol=spread)
 
 
-def test_odometry_is_the_chain_of_its_factors(rng):
-    world = simulate_world(50, 120, OPTIONS, rng)
-    factors = world.graph.between
-    pose = np.zeros((1, 3))
-    for k, z in enumerate(factors.measurement[factors.is_odometry], 1):
-        pose = se2.compose(pose, z[None])
-        np.testing.assert_allclose(world.odometry[k], pose[0], atol=1e-12)
-
-
 def test_a_seed_makes_one_world():
     worlds = [simulate_world(200, 500, OPTIONS, np.random.default_rng(seed)) for seed in (5, 5, 6)]
     measurements = [world.graph.between.measurement for world in worlds]
@@ -119,23 +109,6 @@ def test_the_largest_world_of_the_paper(rng):
     factors = world.graph.between
     assert len(np.unique(factors.i * 50_000 + factors.j)) == 700_000
     assert np.isfinite(world.odometry).all()
-
-
-@pytest.mark.parametrize('kind', FALSE_LOOPS)
-def test_false_loops_come_on_top_and_at_their_time(kind, rng):
-    clean = simulate_world(600, 1000, OPTIONS, rng)
-    loops = FALSE_LOOPS[kind](clean.graph, clean.truth, 40, rng)
-    world = with_false_loops(clean, loops)
-    factors = world.graph.between
-    assert len(factors) == 1040 and len(clean.graph.between) == 1000
-    assert (np.diff(factors.j) >= 0).all()
-    assert factors.is_odometry.sum() == 599
-    np.testing.assert_array_equal(world.odometry, clean.odometry)
-    pairs = np.stack((factors.i, factors.j), axis=1).tolist()
-    false = world.false_loops.tolist()
-    assert [pair for pair in pairs if pair in false] == false
-    rows = [pairs.index(pair) for pair in false]
-    np.testing.assert_array_equal(factors.measurement[rows], loops.measurement)
 
 
 @pytest.mark.parametrize('n_poses, n_edges, said', [

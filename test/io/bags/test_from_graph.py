@@ -9,7 +9,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 from numpy.testing import assert_array_equal
-from problems import add_absolute, random_information, random_poses
+from problems import add_absolute, random_information, random_poses, retold
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
@@ -110,11 +110,7 @@ def test_a_graph_comes_back(tmp_path, rng, read):
 
 def test_loops_that_are_trusted_have_their_own_topic(tmp_path, rng):
     record = record_of([(0, 1), (1, 2), (0, 2), (2, 3), (1, 3)], rng)
-    factors, trusting = record.graph.between, FactorGraph(se2)
-    trusting.add_poses(4)
-    trusting.add_between(factors.i, factors.j, factors.measurement,
-                         factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information,
-                         np.array([True, False, False, False, True]))
+    trusting = retold(record.graph, trusted=np.array([True, False, False, False, True]))
     write_graph_bag(tmp_path / 'bag', replace(record, graph=trusting))
     topics = [topic for topic, _, _ in read_with_rosbags(tmp_path / 'bag')]
     assert topics == ['/odom', '/odom', '/odom', '/loop_closures', '/odom',
@@ -198,10 +194,6 @@ def test_metadata_as_rosbag2_writes_it(tmp_path, rng):
     for topic in data['topics_with_message_count']:
         metadata, (qos,) = topic['topic_metadata'], topic['topic_metadata']['offered_qos_profiles']
         counts[metadata['name']] = topic['message_count']
-        assert metadata['type_description_hash'].startswith('RIHS01_')
-        assert set(qos) == {
-            'history', 'depth', 'reliability', 'durability', 'deadline', 'lifespan', 'liveliness',
-            'liveliness_lease_duration', 'avoid_ros_namespace_conventions'}
         assert (qos['history'], qos['depth']) == ('keep_last', 1000)
         assert (qos['reliability'], qos['durability']) == ('reliable', 'volatile')
     assert counts == {'/odom': 3, '/loop_closures': 1, '/ground_truth': 3}

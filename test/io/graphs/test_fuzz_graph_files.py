@@ -7,15 +7,12 @@ import tempfile
 import warnings
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from l1slam_ros.cli.main import main
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
+from l1slam_ros.io.graphs.graph_file import read_graph_file
 
 VALID = {
     '.g2o': """\
@@ -129,73 +126,6 @@ def test_arbitrary_bytes(suffix, content, command):
 @given(file=mutations(), command=COMMANDS)
 def test_mutated_files(file, command):
     answer(*file, *command)
-
-
-@st.composite
-def records(draw):
-    """A random graph: any ids, edges either way, any numbers, with poses and stamps or not."""
-    ids = sorted(draw(st.sets(st.integers(-2**63, 2**63 - 1) | st.integers(0, 20),
-                              min_size=2, max_size=6)))
-    n, m = len(ids), draw(st.integers(1, 8))
-    number = st.floats(-1e30, 1e30) | st.floats(-10, 10) | st.sampled_from([0.0, -0.0, 1 / 3])
-    pairs = np.array(draw(st.lists(st.tuples(st.integers(0, n - 1), st.integers(1, n - 1)),
-                                   min_size=m, max_size=m)))
-    # Every vertex has an edge, or a file without poses would not know it.
-    pairs = np.concatenate((pairs, np.stack((np.arange(n), np.ones(n, int)), axis=1)))
-    m = len(pairs)
-
-    def numbers(*shape):
-        count = int(np.prod(shape))
-        return np.array(draw(st.lists(number, min_size=count, max_size=count))).reshape(shape)
-
-    root = np.tril(np.clip(numbers(m, 3, 3), -1, 1))
-    root[:, range(3), range(3)] = np.array(
-        draw(st.lists(st.floats(0.5, 2), min_size=3 * m, max_size=3 * m))).reshape(m, 3)
-    scale = np.array(draw(st.lists(st.integers(-20, 20), min_size=m, max_size=m)))
-    graph = FactorGraph(se2)
-    graph.add_poses(n)
-    graph.add_between(pairs[:, 0], pairs.sum(axis=1) % n, numbers(m, 3),
-                      (root @ root.transpose(0, 2, 1)) * 10.0 ** scale[:, None, None])
-    stamps = draw(st.none() | st.lists(st.integers(0, 2**62), min_size=n, max_size=n))
-    return GraphRecord(graph, draw(st.none() | st.just(numbers(n, 3))), np.array(ids),
-                       None if stamps is None else np.array(stamps))
-
-
-def assert_same(a, b):
-    """Numbers to the last bit, signs of zeros too; the information to rounding."""
-    for x, y in ((a.ids, b.ids), (a.poses, b.poses), (a.stamps, b.stamps),
-                 (a.graph.between.i, b.graph.between.i), (a.graph.between.j, b.graph.between.j),
-                 (a.graph.between.measurement, b.graph.between.measurement)):
-        assert (x is None) == (y is None)
-        assert x is None or x.tobytes() == y.tobytes()
-    roots = a.graph.between.sqrt_information
-    scale = np.abs(roots).max(axis=(1, 2), keepdims=True)
-    np.testing.assert_allclose(b.graph.between.sqrt_information / scale, roots / scale,
-                               rtol=0, atol=1e-13)
-
-
-@settings(BOUNDED, max_examples=100)
-@given(record=records())
-def test_what_is_written_is_read(record):
-    with tempfile.TemporaryDirectory() as name:
-        g2o, toro, again = (Path(name) / file for file in ('a.g2o', 'b.graph', 'c.g2o'))
-        write_graph_file(g2o, record)
-        read = read_graph_file(g2o)
-        assert_same(record, read)
-        write_graph_file(toro, read)
-        assert_same(record, read_graph_file(toro))
-        write_graph_file(again, read_graph_file(toro))
-        assert_same(record, read_graph_file(again))
-        assert len(list(Path(name).iterdir())) == (3 if record.stamps is None else 6)
-
-
-@settings(BOUNDED, max_examples=40)
-@given(record=records(), command=COMMANDS)
-def test_commands_on_random_graphs(record, command):
-    with tempfile.TemporaryDirectory() as name:
-        write_graph_file(Path(name) / 'a.g2o', record)
-        content = (Path(name) / 'a.g2o').read_bytes()
-    answer('.g2o', content, *command)
 
 
 @pytest.mark.parametrize('suffix', sorted(VALID))

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Graph files: g2o and TORO in, the same numbers out, every malformed line named."""
 
-import os
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from problems import add_absolute
+from problems import add_absolute, retold
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
@@ -82,13 +81,6 @@ def test_edges_alone_name_the_vertices(write):
     assert record.graph.between.i.tolist() == [1]
 
 
-def test_ids_beyond_the_floats(write):
-    # Names such as x0, x1 of other tools: a letter in the top byte.
-    a = ord('x') << 56
-    record = read_graph_file(write(f'EDGE_SE2 {a} {a + 1} 1 0 0 1 0 0 1 0 1\n'))
-    assert record.ids.tolist() == [a, a + 1]
-
-
 def test_priors_are_seen_from_the_world(write):
     factors = read_graph_file(write(
         'EDGE_PRIOR_SE2 7 1 2 0.5 10 1 2 20 3 30\n' + SQUARE + 'EDGE_PRIOR_SE2_XY 9 3 4 5 1 6\n'
@@ -99,18 +91,6 @@ def test_priors_are_seen_from_the_world(write):
     np.testing.assert_allclose(information_of(factors)[factors.is_absolute], [
         [[10, 1, 2], [1, 20, 3], [2, 3, 30]], [[5, 1, 0], [1, 6, 0], [0, 0, 0]],
         np.diag([0, 0, 9])], rtol=1e-15)
-
-
-def test_edges_of_both_formats_keep_the_order_of_the_file(write):
-    record = read_graph_file(write('EDGE2 0 1 1 0 0 1 0 1 1 0 0\nEDGE_SE2 0 1 2 0 0 1 0 0 1 0 1\n'
-                                   'EDGE2 0 1 3 0 0 1 0 1 1 0 0\n'))
-    assert record.graph.between.measurement[:, 0].tolist() == [1, 2, 3]
-
-
-def test_a_disconnected_graph_is_read(write):
-    record = read_graph_file(write(
-        'EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 5 6 1 0 0 1 0 0 1 0 1\n'))
-    assert record.graph.n_poses == 4
 
 
 def test_what_is_not_used_is_said(write):
@@ -135,10 +115,6 @@ def test_known_tags_may_say_anything(write, tag):
     assert record.graph.n_poses == 3 and len(record.graph.between) == 3
 
 
-def test_a_fixed_first_vertex_is_no_news(write):
-    assert read_graph_file(write(SQUARE + 'FIX 3\n')).skipped == ()
-
-
 # The square again, as TORO has it.
 TORO_SQUARE = """\
 # a comment
@@ -161,12 +137,9 @@ def test_the_same_square_in_toro(write):
 MALFORMED = [
     ('EDGE 3 7 1 0 0 1 0 0 1 0', 'EDGE: 10 fields; expected 2 whole and 9 finite numbers'),
     ('EDGE 3 7 1 0 0 1 0 0 1 0 1 1', 'EDGE: 12 fields; expected 2 whole'),
-    ('EDGE', 'EDGE: 0 fields; expected 2 whole'),
     ('EDGE 3 7 # 1 0 0 1 0 0 1 0 1', 'EDGE: 2 fields; expected 2 whole'),
     ('VERTEX 5 0 0', 'VERTEX: 3 fields; expected 1 whole and 3 finite numbers'),
-    ('VERTEX', 'VERTEX: 0 fields; expected 1 whole and 3 finite numbers'),
     ('VERTEX 5 0 nan 0', "VERTEX: 'nan' is not a finite number; expected"),
-    ('VERTEX 5 0 O 0', "VERTEX: 'O' is not a finite number; expected"),
     ('VERTEX 5 0 0x10 0', "VERTEX: '0x10' is not a finite number; expected"),
     ('VERTEX 5 0 1_0 0', "VERTEX: '1_0' is not a finite number; expected"),
     ('VERTEX 5 0 1e999 0', "VERTEX: '1e999' is not a finite number; expected"),
@@ -176,21 +149,17 @@ MALFORMED = [
     ('VERTEX 9223372036854775808 0 0 0',
      "VERTEX: '9223372036854775808' is not a whole number of 64 bits; expected"),
     ('EDGE 3 7.5 1 0 0 1 0 0 1 0 1', "EDGE: '7.5' is not a whole number of 64 bits"),
-    ('EDGE 3 x 1 0 0 1 0 0 1 0 1', "EDGE: 'x' is not a whole number of 64 bits"),
     ('EDGE 3 7 1 inf 0 1 0 0 1 0 1', "EDGE: 'inf' is not a finite number; expected"),
-    ('EDGE 3 7 1 0 0 nan 0 0 1 0 1', "EDGE: 'nan' is not a finite number; expected"),
     ('EDGE 3 7 1 0 0 -1e99 0 0 1 0 1', "EDGE: '-1e99' is beyond 1e+30; expected"),
     ('EDGE 3 7 1 0 0 0 0 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected a positive'),
     ('EDGE 3 8 1 0 0 1 0 0 1 0 1', 'vertex 8 is unknown; expected one of the 3 vertices'),
     ('EDGE 100 3 1 0 0 1 0 0 1 0 1', 'vertex 100 is unknown; expected one of the 3 vertices'),
     ('VERTEX 7 0 0 0', 'vertex 7 stands twice, before at line 2; expected each once'),
     ('EGDE_SE2 3 7 1 0 0 1 0 0 1 0 1', "unknown tag 'EGDE_SE2'; expected VERTEX_SE2, EDGE_SE2, "),
-    ('vertex_se2 5 0 0 0', "unknown tag 'vertex_se2'; expected VERTEX_SE2, EDGE_SE2, "),
     ('VERTEX_SE3:QUAT 5 0 0 0 0 0 0 1', 'VERTEX_SE3:QUAT: a line of SE3 beside VERTEX at line 2; '
      'expected all poses in the plane, or all in space'),
     ('EDGE3 5 6', 'EDGE3: a line of SE3 beside VERTEX at line 2; expected all poses in'),
     ('VERTEX_SE3:EXPMAP 5 6', "unknown tag 'VERTEX_SE3:EXPMAP'; expected VERTEX_SE2, "),
-    ('VERTEX_SIM3:EXPMAP 5 6', "unknown tag 'VERTEX_SIM3:EXPMAP'; expected VERTEX_SE2, "),
 ]
 
 
@@ -245,13 +214,6 @@ def test_what_is_no_graph_is_told(write, content, message):
 def test_no_file_and_a_directory(tmp_path):
     assert message_of(tmp_path / 'none.g2o') == ': cannot be read: No such file or directory'
     assert message_of(tmp_path) == ': cannot be read: Is a directory'
-
-
-@pytest.mark.skipif(not hasattr(os, 'geteuid') or os.geteuid() == 0, reason='root reads all')
-def test_an_unreadable_file(write):
-    path = write(SQUARE)
-    path.chmod(0)
-    assert message_of(path) == ': cannot be read: Permission denied'
 
 
 def random_record(rng, n=40, stamps=True):
@@ -357,21 +319,10 @@ def test_information_of_many_digits_keeps_them(tmp_path, rng, exponent):
                                square_root_information(information), rtol=1e-15, atol=0)
 
 
-def test_a_graph_without_stamps_does_not_inherit_those_of_its_predecessor(tmp_path, rng):
-    path, record = tmp_path / 'a.g2o', random_record(rng)
-    write_graph_file(path, record)
-    write_graph_file(path, replace(record, stamps=None))
-    assert read_graph_file(path).stamps is None
-    assert list(tmp_path.iterdir()) == [path]
-
-
 def with_trust(record, rows):
     """Return the record with only these rows of its factors trusted."""
-    graph, factors = FactorGraph(se2), record.graph.between
-    graph.add_poses(record.graph.n_poses)
-    graph.add_between(factors.i, factors.j, factors.measurement, information_of(factors),
-                      np.isin(np.arange(len(factors)), rows))
-    return replace(record, graph=graph)
+    trusted = np.isin(np.arange(len(record.graph.between)), rows)
+    return replace(record, graph=retold(record.graph, trusted=trusted))
 
 
 @pytest.mark.parametrize('name', ['a.g2o', 'a.graph'])
@@ -420,13 +371,14 @@ def test_damaged_trust_is_named(write, text, message):
     assert message_of(path).startswith(f'.trusted.txt{message}')
 
 
-def test_a_graph_without_trust_is_not_lent_that_of_its_predecessor(tmp_path, rng):
+def test_a_graph_is_not_lent_the_stamps_or_the_trust_of_its_predecessor(tmp_path, rng):
     path, record = tmp_path / 'a.g2o', random_record(rng)
     write_graph_file(path, with_trust(record, [50, 60]))
-    assert trusted_path(path).exists()
-    write_graph_file(path, record)
-    assert not trusted_path(path).exists()
-    assert not read_graph_file(path).graph.between.trusted.any()
+    assert trusted_path(path).exists() and stamps_path(path).exists()
+    write_graph_file(path, replace(record, stamps=None))
+    assert list(tmp_path.iterdir()) == [path]
+    back = read_graph_file(path)
+    assert back.stamps is None and not back.graph.between.trusted.any()
 
 
 def test_graph_stamps_and_trust_are_replaced_together_or_not_at_all(tmp_path, rng):

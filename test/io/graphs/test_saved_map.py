@@ -276,6 +276,14 @@ def test_a_power_cut_leaves_a_map_at_any_moment(two, halfway, monkeypatch, early
     assert set(kept) == {old[1], old[0]} and kept[-1] == old[0]
 
 
+def test_behind_a_link_the_map_before_is_kept_too(two, halfway):
+    link = two.with_name('link.g2o')
+    link.symlink_to(two.name)
+    save_map(link, halfway.saved())
+    assert link.is_symlink() and len(load_map(two)[0].optimised.poses) == len(halfway.poses)
+    assert load_map(link.with_name('link.g2o.1'))[1].startswith('6 keyframes loaded')
+
+
 def test_without_links_the_map_before_is_a_copy(two, halfway, monkeypatch):
     def refuse(*_):
         raise PermissionError

@@ -91,6 +91,12 @@ class OdometryTrack:
         poses: Array = self._poses.view()[self._keyframes.view()]
         return poses
 
+    def keyframe_pose(self, k: int) -> Array:
+        """Return the pose of a keyframe, (1, p)."""
+        sample = int(self._keyframes.view()[k])
+        pose: Array = self._poses.view()[sample : sample + 1]
+        return pose
+
     @property
     def gaps(self) -> Indices:
         """The first keyframe of each part but the first, (g,)."""

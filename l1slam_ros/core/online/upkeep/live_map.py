@@ -3,7 +3,7 @@
 The state of the map of a back end: what was made of its graph, and what is due.
 
 In: the graph as it grows, and what workers have made of snapshots of it. Out: where the newest
-keyframe is, what is accepted, and whether map or judgement are due. Its owner holds the lock.
+keyframe is, what is accepted, and whether map or judgement are due. Its owner holds the locks.
 """
 
 import time
@@ -13,7 +13,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.incremental.front import UNKNOWN, Front
 from l1slam_ros.core.online.graph_builder import GraphBuilder
@@ -24,7 +24,7 @@ from l1slam_ros.core.solvers.optimality import Status
 
 # A map is factored anew from so many factors on that came since: those of ten keyframes.
 _MANY = 20
-# Factors that a front takes while the lock is held.
+# Factors that a front takes while its lock is held.
 AT_ONCE = 16
 # [s] While loops come none of which fits, they are judged so often.
 _JUDGE_EVERY = 2.0
@@ -131,9 +131,9 @@ class LiveMap:
         self.looks.extend(looks)
         self._judged_loops, self.stale = -1, True
 
-    def take_some(self) -> bool:
-        """Let the front take a few factors; return whether it did."""
-        front, factors = self.front, self._builder.graph.between
+    def take_some(self, factors: BetweenFactors) -> bool:
+        """Let the front take a few of the graph's factors; return whether it did."""
+        front = self.front
         if front is None or front.closed or front.rows >= len(factors):
             return False
         first, judged = front.rows, self.optimised.judgement.accepted

@@ -9,9 +9,11 @@ to the next:
     map     lowers the L1 cost of what is accepted, and factors it for the next front
     judge   looks at all loops again, at rest anew, and moves nothing
 
-One lock is held to append, to take a snapshot, to look at one factor and to adopt, never while
-solving, reading or writing a file. A second one lets one thread at a time update. What is worked
-out for a map that is replaced, or that `settle` is to solve, is told to stop, and never adopted.
+One lock is held to append, to take a snapshot and to adopt, for moments, so that messages never
+wait. Who uses or replaces the front, or what was made so far, holds the front's before it; never
+while solving, reading or writing a file. A third one lets one thread at a time update. What is
+worked out for a map that is replaced, or that `settle` is to solve, is told to stop, and never
+adopted.
 """
 
 import threading
@@ -25,11 +27,12 @@ import numpy as np
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.incremental.front import Front
+from l1slam_ros.core.incremental.growing_map import View
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
 from l1slam_ros.core.online.update import Improvement, front_of, improve, one_round, optimise
-from l1slam_ros.core.online.upkeep.live_map import AT_ONCE, Behind, LiveMap
+from l1slam_ros.core.online.upkeep.live_map import AT_ONCE, LiveMap
 from l1slam_ros.core.online.upkeep.threads import Worker, until
 from l1slam_ros.core.robust.batch import judge, robust_solve
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
@@ -63,7 +66,8 @@ class Upkeep:
 
     def __init__(self, solver: OptimiserOptions, robust: bool):
         self._solver, self._robust = solver, robust
-        self._lock, self._updating = threading.Lock(), threading.Lock()
+        # In the order in which they are taken.
+        self._updating, self._front, self._lock = (threading.Lock() for _ in range(3))
         self._ended = threading.Event()
         self._workers = self._mapper, self._judge = (
             Worker('map', self._on_end), Worker('judge', self._on_end))
@@ -99,10 +103,19 @@ class Upkeep:
 
     def snapshot(self) -> Snapshot:
         """Return the back end as it is now, the due loops in its graph, to be read at leisure."""
-        with self._lock:
-            return self._snapshot()
+        with self._standing() as now:
+            return now
 
-    def _snapshot(self) -> Snapshot:
+    @contextmanager
+    def _standing(self) -> Iterator[Snapshot]:
+        """Let nothing change; give a snapshot, see `snapshot`."""
+        with self._front:
+            # First what takes long: until then messages come in.
+            views = self._live.front.views if self._live.front else ()
+            with self._lock:
+                yield self._snapshot(views)
+
+    def _snapshot(self, views: tuple[View, ...]) -> Snapshot:
         builder, live = self._builder, self._live
         track, loops = builder.track, builder.loops
         builder.add_due_loops()
@@ -110,7 +123,7 @@ class Upkeep:
             live.number, self._version(), builder.graph.copy(), track.gaps, track.keyframe_stamps,
             track.keyframe_poses, self._map_to_odom_now(), loops.rows, loops.stamps,
             live.optimised, live.robust, live.looks.view(), live.all_judged, live.judged,
-            live.stale, live.front.views if live.front else ())
+            live.stale, views)
 
     def _map_to_odom_now(self) -> Array:
         """Return the odometry frame seen from the map: what its last keyframe says."""
@@ -120,7 +133,7 @@ class Upkeep:
             return manifold.identity(1)
         # Asked for with every sample: worked out when an update or a new offset changes it.
         if self._map_to_odom is None or self._map_to_odom[0] is not offset:
-            odometry = self._builder.track.keyframe_poses[last : last + 1]
+            odometry = self._builder.track.keyframe_pose(last)
             to_kept = manifold.compose(pose, manifold.inverse(odometry))
             self._map_to_odom = offset, manifold.compose(to_kept, offset)
         return self._map_to_odom[1]
@@ -177,20 +190,23 @@ class Upkeep:
 
     def _take(self, deadline: float) -> None:
         """Let the front take what has come, until a time [s]."""
-        with self._lock:
+        with self._front, self._lock:
             self._builder.add_due_loops()
             self._live.hear()
             before, taken = self._map_to_odom_now(), False
         while time.monotonic() < deadline:
-            with self._lock:
-                if not self._live.take_some():
+            with self._front:
+                with self._lock:
+                    factors = self._builder.graph.between
+                if not self._live.take_some(factors):
                     break
                 taken = True
             time.sleep(0)  # who waits for the lock would else wait for the deadline
         if taken:
-            with self._lock:
+            with self._front:
                 self._live.note_newest()
-                self._note_map(before)
+                with self._lock:
+                    self._note_map(before)
 
     def _begin_due(self, idle: bool, budget: float, check: Callable[[], None]) -> bool:
         """Let the workers begin what is due; return whether any is at work."""
@@ -203,8 +219,8 @@ class Upkeep:
 
     def _map_anew(self, idle: bool, budget: float, check: Callable[[], None]) -> None:
         """Lower the cost of the map, when idle to the end, and factor it."""
-        with self._lock:
-            live, now, solver = self._live, self._snapshot(), self._solver
+        with self._standing() as now:
+            live, solver = self._live, self._solver
             exact = live.is_exact_due(idle)
         whole = now.problem()
         problem = as_one(whole)
@@ -217,7 +233,7 @@ class Upkeep:
         check()
         front = front_of(problem, improvement.poses, len(whole.graph.between), check)
         for _ in range(_PASSES):
-            with self._lock:
+            with self._front, self._lock:
                 factors, accepted = self._builder.graph.between, live.accepted
             while front is not None and not front.closed and front.rows < len(accepted):
                 check()
@@ -227,8 +243,8 @@ class Upkeep:
 
     def _judge_all(self, anew: bool, check: Callable[[], None]) -> None:
         """Look at all loops again; anew: from the graph alone, until more comes."""
-        with self._lock:
-            live, now, loops = self._live, self._snapshot(), self._live.begin_judgement()
+        with self._standing() as now:
+            live, loops = self._live, self._live.begin_judgement()
             grown = live.growth()
         whole = now.problem()
         problem = as_one(whole)
@@ -236,7 +252,7 @@ class Upkeep:
         judgement, poses = robust_solve(problem.graph, check=at_rest) if anew else judge(
             problem.graph, problem.poses, problem.judgement, np.inf, check)
         check()
-        with self._lock:
+        with self._front, self._lock:
             live.take_judgement(judgement_of_all(judgement, whole), poses, loops, anew)
             self._changes += 1
 
@@ -252,8 +268,8 @@ class Upkeep:
 
         """
         with self._alone():
-            with self._lock:
-                live, now, loops = self._live, self._snapshot(), self._live.begin_judgement()
+            with self._standing() as now:
+                live, loops = self._live, self._live.begin_judgement()
                 self._grown = live.growth()
             whole = now.problem()
             if not len(whole.graph.between):
@@ -264,7 +280,7 @@ class Upkeep:
             front = front_of(replace(problem, judgement=improvement.judgement), improvement.poses,
                              len(whole.graph.between), check)
             improvement = of_all(improvement, whole)
-            with self._lock:
+            with self._front, self._lock:
                 if live is not self._live:
                     raise Interrupted
                 live.take_judgement(improvement.judgement, improvement.poses, loops, True)
@@ -284,7 +300,7 @@ class Upkeep:
         ArithmeticError : it is not finite; nothing is taken over.
 
         """
-        with self._lock:
+        with self._front, self._lock:
             if improvement.map != self._live.number:
                 raise Interrupted
             self._adopt(improvement, front)
@@ -307,24 +323,6 @@ class Upkeep:
         with self._lock:
             (before, after), self._moved = self._moved or 2 * (self._map_to_odom_now(),), None
             return before, after
-
-    def behind(self) -> Behind:
-        """Return what goes on behind updates."""
-        with self._lock:
-            return self._live.behind()
-
-    def marginal_covariance(self, keyframe: int) -> Array | None:
-        """
-        Return the covariance of a keyframe in its own axes, (d, d).
-
-        Exact for the least squares map of what is accepted, the noise as it was found: relative
-        to the first keyframe, or to the world if absolute poses are believed. None: no factored
-        map has the keyframe, or it is too dense to be factored.
-        """
-        with self._lock:
-            front = self._live.front
-            known = front is not None and 0 <= keyframe < front.keyframes
-            return front.covariance(keyframe) if front and known else None
 
     @contextmanager
     def _alone(self) -> Iterator[None]:

@@ -131,7 +131,7 @@ class Salvage:
 
     def _messages_of(self, file: Path) -> Iterator[BagMessage]:
         with _decompressed(file) as readable:
-            walk = _WALKS[readable.suffix]
+            walk = _WALKS[readable.suffix.lower()]
             try:
                 yield from map(_unpacked, walk(readable, self._definitions))
             except BrokenRecordError as error:

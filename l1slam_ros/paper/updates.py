@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What an update costs while the map grows: Figure 5, and what `benchmarks/incremental.py` measures.
+
+In: a graph, fed to the back end pose by pose, in turn with gtsam's ISAM2 where that is installed.
+Out: the seconds of each update, and the maps on the way. Seconds are of the thread's processor
+time: others on the machine do not lengthen them, and what goes on behind is counted by itself.
+"""
+
+import importlib.util
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
+from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.snapshot import Snapshot
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.trajectory import invented_stamps
+
+# [m or rad] ISAM2 linearises again what has moved by more, after each pose.
+_RELINEARISE = 0.1
+# [s] What is left to the workers after the last keyframe; the driver lags no more than this.
+IDLE, _LAG = 1.0, 0.1
+# As in City10k, the graph of the figure in the paper.
+_EDGES_PER_POSE = 2.07
+# Everything is called before it is timed, on a world of so many keyframes.
+_WARM_UP = 200
+# The batch is solved at so many sizes of the map.
+_BATCHES = 40
+
+
+@dataclass
+class Updates:
+    """
+    What was measured of one graph.
+
+    ours, peer : seconds of each update; the peer's time may have been up before the end; behind :
+    seconds of our other threads; elapsed : wall time [s]; on_the_way : snapshots at regular
+    distances, the last one at the last keyframe; at_rest : a second later.
+    """
+
+    ours: list[float] = field(default_factory=list)
+    peer: list[float] = field(default_factory=list)
+    behind: float = 0.0
+    elapsed: float = 0.0
+    on_the_way: list[Snapshot] = field(default_factory=list)
+    at_rest: Snapshot | None = None
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Of Figure 5: the updates, and keyframes (k,) and seconds (k,) of each batch L2 solve."""
+
+    updates: Updates
+    sizes: Array
+    batch: Array
+
+
+class Isam2:
+    """
+    The peer: L2, every loop of the graph believed.
+
+    Parameters
+    ----------
+    graph : what it is fed with
+    patience : [s] of its updates in all; then it is left behind
+
+    """
+
+    def __init__(self, graph: FactorGraph, patience: float = float('inf')):
+        gtsam: Any = importlib.import_module('gtsam')
+        self._gtsam, self._factors, self._k = gtsam, graph.between, graph.manifold.TANGENT_SIZE
+        self._Pose, self._Between, self._Prior = (
+            (gtsam.Pose2, gtsam.BetweenFactorPose2, gtsam.PriorFactorPose2) if self._k == 3 else
+            (gtsam.Pose3, gtsam.BetweenFactorPose3, gtsam.PriorFactorPose3))
+        options = gtsam.ISAM2Params()
+        options.setRelinearizeThreshold(_RELINEARISE)
+        options.relinearizeSkip = 1
+        self._isam, self._at = gtsam.ISAM2(options), self._Pose()
+        ends = np.maximum(self._factors.i, self._factors.j)
+        self._rows = np.split(np.argsort(ends, kind='stable'),
+                              np.searchsorted(np.sort(ends), np.arange(1, graph.n_poses)))
+        self._odometry, self._left = self._factors.is_odometry, patience
+
+    def update(self, k: int) -> list[float]:
+        """Add keyframe k and its factors; return the seconds, [] once its time was up."""
+        if self._left <= 0:
+            return []
+        gtsam, new, values, step = self._gtsam, self._gtsam.NonlinearFactorGraph(), \
+            self._gtsam.Values(), self._Pose()
+        if k == 0:
+            new.add(self._Prior(0, step, gtsam.noiseModel.Constrained.All(self._k)))
+        for row in self._rows[k]:
+            i, j = int(self._factors.i[row]), int(self._factors.j[row])
+            Z = self._pose(self._factors.measurement[row])
+            # In space gtsam's rotations come first.
+            root = np.roll(self._factors.sqrt_information[row], self._k // 6 * 3, axis=1)
+            new.add(self._Between(i, j, Z, gtsam.noiseModel.Gaussian.SqrtInformation(root)))
+            if self._odometry[row]:
+                step = Z if j == k else Z.inverse()
+        values.insert(k, self._at.compose(step))
+        began = time.thread_time()
+        self._isam.update(new, values)
+        estimate = (self._isam.calculateEstimatePose2 if self._k == 3 else
+                    self._isam.calculateEstimatePose3)
+        self._at = estimate(k)
+        seconds = time.thread_time() - began
+        self._left -= seconds
+        return [seconds]
+
+    def _pose(self, pose: Array) -> Any:
+        if self._k == 3:
+            return self._Pose(*pose)
+        x, y, z, w = pose[3:]
+        return self._Pose(self._gtsam.Rot3.Quaternion(w, x, y, z), pose[:3])
+
+
+def measurements(graph: FactorGraph) -> Iterator[tuple[OdometrySample, list[LoopClosure]]]:
+    """Yield each keyframe's odometry and the loops that end at it."""
+    forward = turned(graph, graph.between.i > graph.between.j)
+    factors, manifold, stamps = forward.between, graph.manifold, invented_stamps(graph.n_poses)
+    chain, measured = map(manifold.to_pose3, (odometry_poses(graph), factors.measurement))
+    root = factors.sqrt_information
+    covariance = np.zeros((len(factors), 6, 6))
+    said = np.array(manifold.COVARIANCE_ROWS)
+    covariance[:, said[:, None], said] = np.linalg.inv(root.transpose(0, 2, 1) @ root)
+    step = {int(factors.j[row]): row for row in np.flatnonzero(factors.is_odometry)}
+    loops: dict[int, list[LoopClosure]] = {}
+    for row in np.flatnonzero(~factors.is_odometry):
+        i, j = int(factors.i[row]), int(factors.j[row])
+        loops.setdefault(j, []).append(
+            LoopClosure(int(stamps[i]), int(stamps[j]), measured[row], covariance[row]))
+    none = np.zeros((6, 6))
+    for k in range(graph.n_poses):
+        motion = covariance[step[k]] if k else none
+        yield OdometrySample(int(stamps[k]), chain[k], motion, none), loops.get(k, [])
+
+
+def run_updates(graph: FactorGraph, peer: Isam2 | None, rate: float, snapshots: int,
+                robust: bool = True, advance: Callable[[], None] = lambda: None) -> Updates:
+    """
+    Feed the back end with a graph, an update after each keyframe, and the peer in turn.
+
+    rate : keyframes per second, fewer where the updates of both take longer; snapshots : how many
+    are kept; advance : called after each keyframe
+    """
+    options = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'),
+                             robust=RobustOptions(robust))
+    kept = set(np.linspace(graph.n_poses / snapshots, graph.n_poses, snapshots).astype(int))
+    found = Updates()
+    with Backend(options, dimension_of(graph)) as backend:
+        began, whole, alone = time.perf_counter(), time.process_time(), time.thread_time()
+        due = began
+        for k, (sample, loops) in enumerate(measurements(graph)):
+            backend.add_odometry(sample)
+            for loop in loops:
+                backend.add_loop(loop)
+            before = time.thread_time()
+            backend.update(0.0)
+            found.ours.append(time.thread_time() - before)
+            if peer:
+                found.peer += peer.update(k)
+            if k + 1 in kept:
+                found.on_the_way.append(backend.snapshot())
+            advance()
+            due = max(due + 1 / rate, time.perf_counter() - _LAG)
+            time.sleep(max(due - time.perf_counter(), 0.0))
+        found.elapsed = time.perf_counter() - began
+        found.behind = (time.process_time() - whole) - (time.thread_time() - alone)
+        end = time.perf_counter() + IDLE
+        while backend.update(0.1) is not None and time.perf_counter() < end:
+            pass
+        found.at_rest = backend.snapshot()
+    return found
+
+
+def dimension_of(graph: FactorGraph) -> int:
+    """Return 2 or 3, as the back end calls it."""
+    return int(graph.manifold.positions(graph.manifold.identity(1)).shape[1])
+
+
+def measure_growth(keyframes: int, rate: float, rng: np.random.Generator,
+                   advance: Callable[[], None] = lambda: None) -> Growth:
+    """
+    Return what updates and batch solves cost in a world in the proportions of City10k.
+
+    The batch is Gauss-Newton on all that has come, from the map as it is, ordered anew.
+    """
+    run_updates(_world(_WARM_UP, rng), None, np.inf, 1)
+    graph = _world(keyframes, rng)
+    peer = Isam2(graph) if importlib.util.find_spec('gtsam') else None
+    updates = run_updates(graph, peer, rate, _BATCHES, advance=advance)
+    sizes = np.array([now.graph.n_poses for now in updates.on_the_way])
+    return Growth(updates, sizes, np.array([_batch_seconds(now) for now in updates.on_the_way]))
+
+
+def _world(keyframes: int, rng: np.random.Generator) -> FactorGraph:
+    return simulate_world(keyframes, round(_EDGES_PER_POSE * keyframes), WorldOptions(), rng).graph
+
+
+def _batch_seconds(now: Snapshot) -> float:
+    began = time.process_time()
+    minimise_l2(now.graph, now.poses, LeastSquaresOptions(), cholesky_of(now.graph))
+    return time.process_time() - began
+
+
+def spread(seconds: Sequence[float]) -> dict[str, float]:
+    """Return what updates cost: [ms], `second` and `last` the p95 of a quarter; total [s]."""
+    ms = 1e3 * np.array(seconds)
+    _, second, _, last = np.array_split(ms, 4)
+    return {'median': float(np.median(ms)), 'p95': float(np.percentile(ms, 95)),
+            'p99': float(np.percentile(ms, 99)), 'max': float(ms.max()),
+            'second': float(np.percentile(second, 95)), 'last': float(np.percentile(last, 95)),
+            'total': float(ms.sum() / 1e3)}

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A growing map, measured: the back end gets the graph, the peer its turn, the batch its sizes."""
+
+import numpy as np
+
+from l1slam_ros.core.graph.factor_graph import turned
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.paper.updates import measure_growth, run_updates
+
+
+class Peer:
+    """Takes 2 ms each, and has no time left after 50."""
+
+    def update(self, k):
+        return [0.002] if k < 50 else []
+
+
+def test_the_back_end_gets_all_of_the_graph_and_the_peer_its_turns():
+    graph = simulate_world(80, 160, WorldOptions(), np.random.default_rng(3)).graph
+    backward = ~graph.between.is_odometry & (np.arange(160) % 2 == 0)
+    told = []
+    found = run_updates(turned(graph, backward), Peer(), 1e4, 4, advance=lambda: told.append(1))
+    assert len(found.ours) == len(told) == 80 and min(found.ours) > 0
+    assert found.peer == [0.002] * 50
+    assert [now.graph.n_poses for now in found.on_the_way] == [20, 40, 60, 80]
+    kept = found.at_rest.graph.between
+    np.testing.assert_array_equal(kept.pairs, graph.between.pairs)
+    np.testing.assert_allclose(kept.measurement, graph.between.measurement, atol=1e-9)
+    np.testing.assert_allclose(kept.sqrt_information, graph.between.sqrt_information, atol=1e-9)
+
+
+def test_updates_keep_to_their_rate_and_the_batch_is_solved_on_the_way():
+    grown = measure_growth(60, 200.0, np.random.default_rng(0))
+    assert grown.updates.elapsed >= 60 / 200
+    assert grown.sizes[-1] == 60 and (np.diff(grown.sizes) > 0).all()
+    assert len(grown.batch) == len(grown.sizes) and (grown.batch > 0).all()

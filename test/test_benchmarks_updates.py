@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The suite of growing maps without its peer: cells, what is counted, bars, what is left out."""
+
+import importlib
+import json
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).parents[1] / 'benchmarks'
+sys.path.append(str(FOLDER))
+cells, tables, suite, kinds, cases = (importlib.import_module(name) for name in (
+    'updates.cells', 'updates.tables', 'incremental', 'robust.kinds', 'robust.cases'))
+TINY = cells.Cell('world10k', 'random', 0.3, 100, 1e4)
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """Make the world of the suite a little one."""
+    monkeypatch.setitem(cells.WORLDS, 'world10k', (120, 260))
+
+
+def spread(**values):
+    return dict.fromkeys(('median', 'p95', 'p99', 'max', 'second', 'last', 'total'), 1.0) | values
+
+
+def row_of(cell, **values):
+    """What a cell would have given that reaches every bar."""
+    peer = spread(p99=5.0, max=5.0, total=5.0)
+    return replace(cells.Row(
+        cell, 'abc', 2000, 4000, 200.0, spread(), 3.0, 300.0, [1000, 2000], peer, 2000, spread(),
+        [9.0, 0.4, 0.05], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [9.0, 9.0, 9.0], [0, 0, 0], [3, 2, 1],
+        10, 20, 1.0), **values)
+
+
+CITY, BICOCCA = cells.Cell('city10000', 'random', 0.3), cells.Cell('bicocca25b', 'recorded', 0.0)
+LARGE = cells.Cell('world50k', 'clean', 0.0)
+
+
+def test_a_cell_is_measured_from_the_graph_to_the_row(tiny):
+    row = cells.measure(Path(), TINY, 0.0)
+    assert (row.cell, row.n, row.peer) == (TINY, 100, None)
+    assert row.keyframes == list(range(5, 105, 5)) and row.true > 90
+    assert row.false == pytest.approx(row.true * 3 / 7, abs=1) and row.edges > row.true + row.false
+    assert len(row.excess) == len(row.error) == len(row.clean) == len(row.odometry) == 21
+    assert min(row.excess) > -0.1 and max(row.clean) < 1 and row.memory > 50
+    assert [cells.Row.of(json.loads(json.dumps(asdict(row))))] == [row]
+    assert '| world10k | random | 30% | 100 |' in '\n'.join(tables.document(
+        {'machine': {'cpu': 'one', 'cores': 2, 'used': 2}, 'versions': {}}, [row]))
+
+
+def test_false_loops_that_are_held_and_true_ones_that_are_not_are_counted(tiny):
+    kind = next(kind for kind in kinds.KINDS if kind.name == 'random')
+    case = cases.false_case(cells._place(Path(), TINY), kind, 0.3, 0)
+    half, odometry = cells.prefix(case.graph, 50), case.graph.between.is_odometry
+    for graph, accepted, expected in (
+            (case.graph, odometry | True, (case.is_false.sum(), 0)),
+            (case.graph, odometry, (0, case.is_true.sum())),
+            (half, half.between.is_odometry,
+             (0, (case.is_true & (case.graph.between.pairs < 50).all(axis=1)).sum()))):
+        now = SimpleNamespace(graph=graph, judgement=SimpleNamespace(accepted=accepted))
+        assert cells.held(now, case) == expected
+    assert (case.graph.between.pairs[np.flatnonzero(case.is_false)] < 100).all()
+
+
+@pytest.mark.parametrize(('cell', 'values', 'missed'), [
+    (CITY, {}, []), (BICOCCA, {}, []), (LARGE, {}, []),
+    (CITY, {'excess': [0.0, 2.5, 0.2]}, ['excess at rest', 'excess', 'most excess']),
+    (CITY, {'error': [1.0, 1.1, 1.0]}, ['error']),
+    (CITY, {'error': [3.6, 1.0, 1.0]}, ['running error']),
+    (CITY, {'kept': [0, 1, 0], 'differs': 1}, ['lies', 'final set']),
+    (CITY, {'peer': spread(p99=3.9, max=3.9, total=2.9)},
+     ['p99 / ISAM2', 'longest / ISAM2', 'sum / ISAM2', 'all / ISAM2']),
+    (CITY, {'peer': spread(p99=3.9), 'peer_poses': 1500}, []),
+    (CITY, {'ours': spread(last=5.1)}, ['last quarter', 'growth']),
+    (BICOCCA, {'error': [10.1, 2.0, 1.2]}, ['final error', 'odometry']),
+    (LARGE, {'ours': spread(p99=21.0), 'memory': 1025.0}, ['p99', 'memory']),
+    (replace(LARGE, graph='intel'), {'ours': spread(p99=21.0)}, [])])
+def test_bars_that_are_missed_are_named(cell, values, missed):
+    row = row_of(cell, **values)
+    assert tables.missed(row) == missed
+    assert f'| {", ".join(missed) or "none"} | abc |' in '\n'.join(tables.document(
+        {'machine': {'cpu': 'one', 'cores': 2, 'used': 2}, 'versions': {}}, [row]))
+
+
+def test_what_was_measured_of_a_commit_with_all_that_is_asked_for_is_done():
+    row = row_of(CITY)
+    assert cells.is_done(row, CITY, True, 'abc')
+    assert not cells.is_done(row, CITY, True, 'def')
+    assert not cells.is_done(row, replace(CITY, poses=100), True, 'abc')
+    assert not cells.is_done(replace(row, commit='abc+'), CITY, True, 'abc+')
+    alone = replace(row, peer=None)
+    assert cells.is_done(alone, CITY, False, 'abc') and not cells.is_done(alone, CITY, True, 'abc')
+
+
+def test_cells_are_chosen_by_graph_kind_and_share(tmp_path, capsys):
+    (tmp_path / 'manhattan3500.g2o').touch()
+    folder = ['--datasets', str(tmp_path), '--graphs']
+    parsed = suite.parse([*folder, 'world50k,manhattan3500', '--kinds', 'clean,grouped'])
+    assert [(cell.graph, cell.kind, cell.share) for cell in parsed.cells] == [
+        ('world50k', 'clean', 0.0), ('world50k', 'grouped', 0.3), ('manhattan3500', 'clean', 0.0),
+        ('manhattan3500', 'grouped', 0.3), ('manhattan3500', 'grouped', 0.5)]
+    for words, expected in (([*folder, 'world10k', '--kinds', 'evil'], "'evil' is none of clean"),
+                            ([*folder, 'intel'], 'has no intel'),
+                            ([*folder, 'bicocca25b', '--kinds', 'clean'], 'no such kind'),
+                            ([*folder, 'world10k', '--shares', '1'], 'between 0 and 1')):
+        with pytest.raises(SystemExit):
+            suite.parse(words)
+        assert expected in capsys.readouterr().err
