@@ -4,6 +4,7 @@
 import ast
 import copy
 import inspect
+import json
 import pickle
 import re
 import subprocess
@@ -72,10 +73,29 @@ def test_the_refused_are_the_false_and_a_start_is_begun_from(world):
     assert from_there.inliers.all()
 
 
+def test_every_door_takes_a_norm_of_loops_alone(world, tmp_path, capsys):
+    graph, _ = l1.read_graph(world)
+    solution = l1.solve(graph, norm='l2', loop_norm='group-l1', robust=False)
+    params = tmp_path / 'params.yaml'
+    params.write_text('/**: {ros__parameters: {solver: {norm: l2, loop_norm: group-l1}}}')
+    costs = []
+    for asked in (('--norm', 'l2', '--loop-norm', 'group-l1'), ('--params-file', str(params)),
+                  ('--norm', 'group-l1', '--params-file', str(params))):
+        assert main(['solve', str(world), '--no-robust', '--json', '--quiet', *asked]) == 0
+        report = json.loads(capsys.readouterr().out)
+        assert report['status'] == 'converged'
+        costs.append(report['final_cost'])
+    # The last is group L1 of all: a norm of the odometry that is that of the loops.
+    assert costs[0] == costs[1] == solution.cost < costs[2]
+    assert solution.status == 'converged'
+
+
 def test_what_cannot_be_solved_is_said(world):
     graph, poses = l1.read_graph(world)
     with pytest.raises(l1.L1SlamError, match="norm is 'l3', expected one of l1, group-l1, l2, "):
         l1.solve(graph, norm='l3')
+    with pytest.raises(l1.L1SlamError, match="loop_norm is 'l3', expected one of same, l1, "):
+        l1.solve(graph, loop_norm='l3')
     with pytest.raises(l1.L1SlamError, match=r'start has the shape \(3, 3\), expected \(200, 3\)'):
         l1.solve(graph, start=poses[:3])
     poses[7] = np.nan

@@ -20,8 +20,9 @@ from l1slam_ros.paper.updates import dimension_of, measurements
 
 # Online: an update after so many keyframes, for so long [s].
 _EVERY, _BUDGET = 10, 0.1
-# Updates after the last keyframe, while the robot stands still.
-_LAST_UPDATES, _LAST_BUDGET = 5, 0.5
+# Updates after the last keyframe, while the robot stands still: until there is nothing more to do,
+# but so many at most.
+_LAST_UPDATES, _LAST_BUDGET = 200, 0.5
 # [m, rad] Two measurements of one pair are the same loop.
 _SAME = 1e-6
 # Live: [s] at rest when no map came for so long, and in any case after so long.
@@ -112,14 +113,18 @@ def _online(rate: float) -> Callable[[FactorGraph, Array], Found]:
                 if rate:
                     time.sleep(max(0.0, began + k / rate - time.monotonic()))
                 elif k % _EVERY == 0:
-                    seconds += _updated(backend, _BUDGET)
+                    seconds += _updated(backend, _BUDGET)[0]
                 if k % LOOK == 0:
                     maps.append(backend.poses)
             if rate:
                 _come_to_rest(backend)
                 seconds = clock() - process
             else:
-                seconds += sum(_updated(backend, _LAST_BUDGET) for _ in range(_LAST_UPDATES))
+                for _ in range(_LAST_UPDATES):
+                    took, was_due = _updated(backend, _LAST_BUDGET)
+                    seconds += took
+                    if not was_due:
+                        break
             return _found(backend, graph, seconds, tuple(maps))
 
     return solve
@@ -144,10 +149,11 @@ def _found(backend: Backend, graph: FactorGraph, seconds: float,
                  *_said(judgement.doubt, ''), maps)
 
 
-def _updated(backend: Backend, budget: float) -> float:
+def _updated(backend: Backend, budget: float) -> tuple[float, bool]:
+    """Return how long an update took, and whether there was anything to do."""
     began = clock()
-    backend.update(budget)
-    return clock() - began
+    was_due = backend.update(budget) is not None
+    return clock() - began, was_due
 
 
 def _accepted(backend: Backend, graph: FactorGraph) -> Mask:

@@ -16,6 +16,7 @@ from l1slam_ros.core.names import (
     KINDS_OF_FALSE_LOOPS,
     NORMS,
     ROTATION_INFORMATION,
+    SAME,
     SOLVERS,
     STARTS,
     WORLDS,
@@ -199,6 +200,9 @@ def _add_solve(parser: argparse.ArgumentParser) -> None:
     add('--norm', choices=NORMS,
         help='what is minimised: l1, of each component; group-l1, of the length of each factor, '
         'whatever axes it is written in; l2; huber (default: as of solver.norm, l1)')
+    add('--loop-norm', choices=(SAME, *NORMS),
+        help='what is minimised of loops and absolute poses (default: as of solver.loop_norm, '
+        'same)')
     add('--solver', choices=SOLVERS, default=SOLVERS[0],
         help='for l1; auto: interior-point on sparse graphs (default: %(default)s)')
     add('--robust', action=argparse.BooleanOptionalAction,

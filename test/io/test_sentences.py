@@ -47,7 +47,8 @@ def judgement(refused=(), suspect=(), slips=(), variance=(1.0, 1.0)):
         doubtful[N - 1 + loop], accepted[N - 1 + loop] = True, False
     for step in slips:
         sigmas[step], accepted[step] = 40.0 + step, False
-    return Judgement(accepted, doubtful, sigmas, np.array(variance), np.array(slips, np.int64))
+    return Judgement(accepted, doubtful, sigmas, np.array(variance),
+                     np.ones(len(accepted)), np.array(slips, np.int64))
 
 
 @pytest.mark.parametrize('count, more', [(19, None), (20, None), (21, 1), (27, 7)])

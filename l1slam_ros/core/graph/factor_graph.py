@@ -88,11 +88,16 @@ class FactorGraph:
     ----------
     manifold : the module the poses live on, e.g. `se2`
 
+    Attributes
+    ----------
+    n_poses : how many keyframes exist
+    said : how often a person changed what counts, see `say`
+
     """
 
     def __init__(self, manifold: Manifold):
         self.manifold = manifold
-        self.n_poses = 0
+        self.n_poses = self.said = 0
         p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
         self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
                          GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_),
@@ -203,7 +208,7 @@ class FactorGraph:
             # What was seen of the column before stays as it was.
             self._between[column] = GrowingArray((), np.bool_)
             self._between[column].extend(said)
-        self._factors = None
+        self._factors, self.said = None, self.said + 1
 
 
 def component_labels(graph: FactorGraph) -> Indices:

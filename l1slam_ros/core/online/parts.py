@@ -35,7 +35,8 @@ def as_one(problem: Problem) -> Problem:
         judgement=replace(
             judgement, accepted=np.append(judgement.accepted[rows], np.ones(g, bool)),
             suspect=np.append(judgement.suspect[rows], np.zeros(g, bool)),
-            sigmas=np.append(judgement.sigmas[rows], np.zeros(g))))
+            sigmas=np.append(judgement.sigmas[rows], np.zeros(g)),
+            noise=np.append(judgement.noise[rows], np.ones(g))))
 
 
 def of_all(improvement: Improvement, problem: Problem) -> Improvement:
@@ -54,6 +55,7 @@ def judgement_of_all(judgement: Judgement, problem: Problem) -> Judgement:
         judgement, accepted=_spread(judgement.accepted, problem, False),
         suspect=_spread(judgement.suspect, problem, False),
         sigmas=_spread(judgement.sigmas, problem, np.nan),
+        noise=_spread(judgement.noise, problem, 1.0),
         slips=slips if rows is None else rows[slips[slips < len(rows)]])
 
 

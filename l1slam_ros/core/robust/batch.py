@@ -103,7 +103,7 @@ def minimise_robustly(
     minimise : from a graph and poses (n, p) to its solution; report, check : see `robust_solve`
     """
     judgement, poses = robust_solve(graph, report, check)
-    accepted = graph.subset(judgement.accepted)
+    accepted = judgement.believed(graph)
     whole = tied(accepted, poses)
     seed = l2_map(whole, poses, cholesky_of(whole), lambda *_: check())
     solution = minimise(whole, seed)

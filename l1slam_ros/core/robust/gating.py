@@ -7,10 +7,14 @@ that may be believed. The odds come from the factors themselves (empirical Bayes
 false ones is assumed.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.robust.innovation import Innovations, log_likelihood_ratio
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.robust.innovation import Innovations, Posterior, log_likelihood_ratio
+from l1slam_ros.core.robust.places import neighbours_agree
 
 # Of factors that are believed at one time, any is false with at most this probability.
 DOUBT = 0.01
@@ -25,6 +29,8 @@ _RATIO_COSTS = 0.25
 _LEAST_START = 1e-9
 # A factor of ten that files are off has to be worth so much, ln: a few lies are no measure.
 _DECADE_COSTS = 5.0
+# Pairs are formed of so many factors that fit best.
+_CANDIDATES = 200
 
 
 def log_odds_of_false(log_ratio: Array, others: int, believed: int = 0) -> float:
@@ -57,6 +63,46 @@ def believable(log_ratio: Array, log_odds: float) -> Indices:
     doubt = doubt[order]
     good = np.cumsum(doubt) < DOUBT
     believed: Indices = order[good]
+    return believed
+
+
+def together(
+    found: Innovations, posterior: Posterior, gate: Callable[[Indices], Array],
+    alone: tuple[Mask, Array, float], where: tuple[Indices, Array],
+) -> Indices:
+    """
+    Return which factors may be believed for what others say that fit, (k,).
+
+    To the log ratio of a factor a come that of the best one b of another place, given a, less the
+    odds that b is false by chance too; and of each one b of its own place, but no more than
+    -ln q: q is how often neighbours agree that are refused.
+
+    Parameters
+    ----------
+    gate : what squares of true factors stay below, by their freedom
+    alone : which fit (m,), the log ratios (m,), and the log odds
+    where : see `places`
+
+    """
+    (fits, log_ratio, odds), (place, ends) = alone, where
+    best = np.flatnonzero(fits)
+    best = best[np.argsort(-log_ratio[best], kind='stable')[:_CANDIDATES]]
+    a, b = (best[side] for side in np.triu_indices(len(best), 1))
+    if not len(a):
+        return best[:0]
+    square, both = found.joint(posterior, a, b)
+    agree = np.flatnonzero(square < gate(found.freedom[a] + found.freedom[b]))
+    a, b, both = a[agree], b[agree], both[agree]
+    own = place[a] == place[b]
+    most = -np.log(neighbours_agree(place[~fits], ends[~fits]))
+    far, near = np.zeros(len(fits)), np.zeros(len(fits))
+    for one in (a, b):
+        more = both - log_ratio[one]
+        np.maximum.at(far, one[~own], more[~own] - max(odds, 0.0))
+        np.add.at(near, one[own], np.clip(more[own], 0.0, most))
+    evidence = log_ratio + far + near
+    sure = (evidence > odds + np.log(1 / DOUBT - 1)) & (far + near > 0)
+    believed: Indices = best[sure[best]]
     return believed
 
 

@@ -37,18 +37,32 @@ class Posterior:
     """
     A graph at its optimum.
 
-    cholesky : of its normal matrix; samples : (free keyframes + 1, k, q) steps from it, as
-    probable as the noise makes them, the last one of what is held fixed; residual : (m, k)
-    whitened, of each factor; moment : (m, k, k) what noise as stated would make of it; speaks :
-    (m, k) bool, see `BetweenFactors`; fixed : keyframes that are held, see `anchor`.
+    system : its linearisation; noise : (m, k, q) signs, of each factor; samples : (free keyframes
+    + 1, k, q) steps from it that the noise makes, the last one of what is held fixed; moment :
+    (m, k, k) what noise as stated would make of the residual; speaks : (m, k) bool, see
+    `BetweenFactors`; fixed : keyframes that are held, see `anchor`.
     """
 
-    cholesky: BlockCholesky
+    system: LinearSystem
+    noise: np.ndarray
     samples: Array
-    residual: Array
     moment: Array
     speaks: Mask
     fixed: int
+
+    @property
+    def residual(self) -> Array:
+        """Of each factor, whitened, (m, k)."""
+        return -self.system.b.reshape(len(self.system.blocks), -1)
+
+    def left_over(self, rows: Indices) -> Array:
+        """Return what the noise makes of the residuals of some factors, (l, k, q)."""
+        from l1slam_ros.core.kernels.prediction import moved
+
+        system = self.system
+        drawn: Array = self.noise[rows] - moved(system.keyframe[rows], system.blocks[rows],
+                                                self.samples)
+        return drawn
 
     def left_out(self) -> Array:
         """
@@ -94,8 +108,7 @@ def sample_posterior(
     samples = np.zeros_like(right)
     samples[:-1] = cholesky.solve_many(right[:-1])
     moment = left_over(system.keyframe, system.blocks, samples, noise)
-    return Posterior(cholesky, samples, -system.b.reshape(m, k), moment, speaks,
-                     anchor(graph))
+    return Posterior(system, noise, samples, moment, speaks, anchor(graph))
 
 
 def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array,

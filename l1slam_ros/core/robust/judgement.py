@@ -62,7 +62,8 @@ class Judgement:
     that is neither is rejected; sigmas : (m,) how far off each factor is, in units of its noise,
     as stated or larger if it was found so: the length of the residual, and where it is not
     accepted, of that over the uncertainty of the map, NaN before a loop was looked at; variance :
-    (2,) of odometry and of loops as it was found, in units of what they state; slips : (k,) the
+    (2,) of odometry and of loops as it was found, in units of what they state; noise : (m,), see
+    `Growth.noise`; slips : (k,) the
     odometry factors that slipped, not accepted; doubts : reasons not to rely on the map; settled :
     no more is to be found out from the factors that are there.
     """
@@ -71,6 +72,7 @@ class Judgement:
     suspect: Mask
     sigmas: Array
     variance: Array
+    noise: Array
     slips: Indices
     doubts: tuple[Doubt, ...] = ()
     settled: bool = True
@@ -84,7 +86,17 @@ class Judgement:
     def nothing() -> 'Judgement':
         """Return the judgement before there are factors."""
         none = np.zeros(0, bool)
-        return Judgement(none, none, np.zeros(0), np.ones(2), np.zeros(0, np.int64))
+        return Judgement(none, none, np.zeros(0), np.ones(2), np.zeros(0),
+                         np.zeros(0, np.int64))
+
+    @property
+    def is_noise_stated(self) -> bool:
+        """Whether factors are as noisy as they say."""
+        return bool((self.noise == 1).all())
+
+    def believed(self, graph: FactorGraph) -> FactorGraph:
+        """Return the accepted factors of a graph, as noisy as they are."""
+        return graph.subset(self.accepted, self.noise[self.accepted])
 
     def extended(self, graph: FactorGraph, robust: bool) -> 'Judgement':
         """
@@ -99,9 +111,13 @@ class Judgement:
         accepted = (accepted | factors.trusted) & ~factors.struck
         suspect = np.concatenate((self.suspect, ~odometry)) & ~accepted & ~factors.struck
         sigmas = np.concatenate((self.sigmas, np.full(len(factors) - known, np.nan)))
+        noise = np.ones(len(factors))
+        if not self.is_noise_stated:
+            noise[~factors.is_odometry] = self.variance[1] / self.variance[0]
+        noise[:len(self.noise)] = self.noise
         told = not np.array_equal(accepted[:known], self.accepted)
         return replace(
-            self, accepted=accepted, suspect=suspect, sigmas=sigmas,
+            self, accepted=accepted, suspect=suspect, sigmas=sigmas, noise=noise,
             settled=not robust or (self.settled and not told and not suspect[known:].any()))
 
 
@@ -112,7 +128,7 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
     size, slip = growth.size, growth.cut & ~growth.gap
     accepted = growth.accepted & ~slip
     return Judgement(accepted[:size], suspect[:size], np.sqrt(square[:size]), growth.variance,
-                     np.flatnonzero(slip[:size]), reasons, settled)
+                     growth.noise()[:size], np.flatnonzero(slip[:size]), reasons, settled)
 
 
 def fits(growth: Growth) -> tuple[Array, Mask]:
@@ -213,8 +229,10 @@ def _other_map(growth: Growth) -> list[Doubt]:
         spanned(growth.low[rows], growth.high[rows], growth.graph.n_poses)[
             growth.low[common_steps(growth, group)]].min()
         for rows in (accepted & growth.trusted, accepted))
-    # What is trusted is right, whatever else speaks against it.
-    if trusted or size < _AGAINST * across:
+    # What is trusted is right, whatever else speaks against it. Beside a slip, which is a guess of
+    # what happened, all of the loops across should agree.
+    slipped = (growth.cut & ~growth.gap).any()
+    if trusted or (size < _AGAINST * across and not slipped):
         return []
     return [_doubt(growth, OTHER_MAP, group.rows)]
 

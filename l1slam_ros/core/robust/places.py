@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Places: loops that may be one mistake, and how often neighbours among the refused are.
+Places: loops that may be one mistake, or have one error.
 
 In: a graph. Out: the number of the place of each loop. Two loops that join the same two stretches
 of the way and claim nearly the same are linked; a place is what links tie together (single
-linkage). Near is measured along the way in metres, never in keyframes.
+linkage). Near is measured along the way in metres, never in keyframes. And how often neighbours
+are of one place, and whether the loops of a place err together.
 """
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.quantiles import gamma_quantile
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, lowest_of_components
 from l1slam_ros.core.graph.linear_system import with_world
 
@@ -18,6 +20,38 @@ from l1slam_ros.core.graph.linear_system import with_world
 _NEAR, _NEAR_STEPS = 5.0, 10
 # Claims are told apart to this part of it, so that a robot that stands has few different ones.
 _GRAIN = 0.1
+# One in so many maps of loops that err each for itself is taken for one where they share.
+_BY_CHANCE = 1e-6
+
+
+def err_together(place: Indices, residual: Array, drawn: Array) -> bool:
+    """
+    Return whether loops of a place err together beyond doubt, and not each for itself.
+
+    Then their sums over a place are larger, compared with single loops.
+
+    Parameters
+    ----------
+    place : (m,) of each loop
+    residual : (m, k) whitened
+    drawn : (m, k, q) what is left of it by noise that is drawn for each loop
+
+    """
+    _, number, count = np.unique(place, return_inverse=True, return_counts=True)
+    sums, left = (np.zeros((len(count), *values.shape[1:])) for values in (residual, drawn))
+    np.add.at(sums, number, residual)
+    np.add.at(left, number, drawn)
+    found, expected = (
+        values[count > 1] for values in ((sums**2).sum(axis=1) / count,
+                                         (left**2).mean(axis=2) / count[:, None]))
+    if not expected.any():
+        return False
+    larger = (found.sum() / (residual**2).sum()
+              * (drawn**2).mean(axis=2).sum() / expected.sum())
+    # Of a weighted sum of squares (F. E. Satterthwaite, An approximate distribution of estimates
+    # of variance components, 1946).
+    freedom = expected.sum() ** 2 / (expected**2).sum()
+    return bool(larger > 2 * gamma_quantile(freedom / 2, 1 - _BY_CHANCE) / freedom)
 
 
 def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:

@@ -18,7 +18,12 @@ from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.parts import bridged, vague_odometry
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.robust.gating import DOUBT, believable, log_odds_of_false, noise_variance
+from l1slam_ros.core.robust.gating import (
+    believable,
+    log_odds_of_false,
+    noise_variance,
+    together,
+)
 from l1slam_ros.core.robust.innovation import (
     Innovations,
     Posterior,
@@ -29,7 +34,7 @@ from l1slam_ros.core.robust.innovation import (
     sampled_quantile,
 )
 from l1slam_ros.core.robust.inspection import repeated_factors
-from l1slam_ros.core.robust.places import neighbours_agree, places
+from l1slam_ros.core.robust.places import err_together, places
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 
@@ -61,8 +66,6 @@ _WORD = 100.0
 _CUT = 1e4
 # The noise is learnt before anything is accepted from loops of so many places at least.
 _FEWEST_PLACES = 3
-# Pairs are formed of so many loops that fit best.
-_CANDIDATES = 200
 
 
 class Growth:
@@ -92,6 +95,7 @@ class Growth:
         self.poses = placed(self.graph.subset(self.accepted), odometry_poses(self.graph))
         self.part = np.zeros(graph.n_poses, np.int64)
         self.variance = np.ones(2)
+        self._learnt_of = np.zeros(0, bool)
         self._floor, self._at_their_word = np.full(2, _LEAST_VARIANCE), False
         self.posterior: Posterior
         self.slip_odds: dict[int, float] = {}
@@ -127,6 +131,8 @@ class Growth:
         self.cut |= ~self.accepted & ~self.is_loop
         self.accepted |= self.cut
         self._tie_to_world(_LATEST)
+        # What the noise of these is, is known.
+        self._learnt_of = self.accepted.copy()
         if (self.accepted & self.is_loop).any():
             self.solve()
         else:
@@ -243,13 +249,36 @@ class Growth:
             drop = self._misfits(rows)
             self.accepted[drop] = False
             self._drops[drop] += 1
-        if not self._at_their_word:
+        if not self._knows_noise:
             self._learn_variance(rows)
+            self._learnt_of = self.accepted.copy()
+
+    @property
+    def _knows_noise(self) -> bool:
+        """Whether there is nothing new to learn it of: what was learnt of, says always more."""
+        return self._at_their_word or np.array_equal(self.accepted, self._learnt_of)
+
+    def noise(self) -> Array:
+        """
+        Return the variance of each factor in a map, (m,), in units of what it states.
+
+        Ones, unless these are wrong beyond doubt: where loops of a place err together, those of a
+        place are worth one, and all are as noisy as was found; odometry is the unit.
+        """
+        noise, rows = np.ones(len(self.factors)), np.flatnonzero(self.accepted)
+        at = np.flatnonzero((self.is_loop & ~self.factors.is_absolute)[rows])
+        loops = rows[at]
+        if len(loops) and err_together(self.place[loops], self.posterior.residual[at],
+                                       self.posterior.left_over(at)):
+            noise[self.is_loop] = self.variance[1] / self.variance[0]
+            noise[self.factors.is_absolute] = 1 / self.variance[0]
+            noise[loops] *= np.bincount(self.place[loops])[self.place[loops]]
+        return noise
 
     def _is_noisier(self, rows: Indices) -> bool:
         """Raise the variance where half of the factors say that it is far too small."""
         loops = self.is_loop[rows]
-        if self._at_their_word or np.count_nonzero(loops) < _KNOWN:
+        if self._knows_noise or np.count_nonzero(loops) < _KNOWN:
             return False
         square = (self.posterior.residual**2).sum(axis=1)
         stated = np.trace(self.posterior.moment, axis1=1, axis2=2)
@@ -307,39 +336,10 @@ class Growth:
         odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)), int(true))
         good = np.flatnonzero(fits)[believable(log_ratio[fits], odds)]
         if not len(good):
-            good = self._together(found, rows, fits, log_ratio, odds)
+            good = together(found, self.posterior, self.gate, (fits, log_ratio, odds),
+                            (self.place[rows], self._places[1][rows]))
         believed: Indices = rows[good]
         return believed
-
-    def _together(self, found: Innovations, rows: Indices, fits: Mask, log_ratio: Array,
-                  odds: float) -> Indices:
-        """
-        Return which loops may be accepted for what others say that fit, (k,).
-
-        To the log ratio of a loop a come that of the best loop b of another place, given a, less
-        the odds that b is false by chance too; and of each loop b of its own place, but no more
-        than -ln q: q is how often neighbours agree that are refused.
-        """
-        best = np.flatnonzero(fits)
-        best = best[np.argsort(-log_ratio[best], kind='stable')[:_CANDIDATES]]
-        a, b = (best[side] for side in np.triu_indices(len(best), 1))
-        if not len(a):
-            return best[:0]
-        square, both = found.joint(self.posterior, a, b)
-        place, ends = self._places[0][rows], self._places[1][rows]
-        agree = np.flatnonzero(square < self.gate(found.freedom[a] + found.freedom[b]))
-        a, b, both = a[agree], b[agree], both[agree]
-        own = place[a] == place[b]
-        most = -np.log(neighbours_agree(place[~fits], ends[~fits]))
-        far, near = np.zeros(len(rows)), np.zeros(len(rows))
-        for one in (a, b):
-            more = both - log_ratio[one]
-            np.maximum.at(far, one[~own], more[~own] - max(odds, 0.0))
-            np.add.at(near, one[own], np.clip(more[own], 0.0, most))
-        evidence = log_ratio + far + near
-        sure = (evidence > odds + np.log(1 / DOUBT - 1)) & (far + near > 0)
-        together: Indices = best[sure[best]]
-        return together
 
     def some(self, rows: Indices, count: int) -> Indices:
         """Return so many of some factors, at random, or all, (k,)."""

@@ -13,6 +13,8 @@ make a robot jump: the slip repaired, it has to move as at some other step, or r
 measured.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
@@ -81,21 +83,37 @@ def without_slip(growth: Growth, left_out: Indices) -> Growth | None:
     if np.count_nonzero(~growth.is_loop & ~growth.cut) < _FEWEST_STEPS:
         return None
     motion = usual_motion(growth)
-    odds = log_odds_of_slips(growth, motion)
     found, most = None, 0.0
+    for steps, odds, state in _tried(growth, left_out, motion):
+        usual = state is not None and all(_moves_as_usual(state, step, motion) for step in steps)
+        evidence = odds + _gain(growth, state) if state and usual else odds
+        if len(steps) == 1:
+            growth.slip_odds[steps[0]] = evidence
+        if state and evidence > most and (
+                (odds > 0 and len(steps) == 1)
+                or (usual and all(_spans(state, step) for step in steps))):
+            found, most = state, evidence
+            state.slip_odds.update(dict.fromkeys(steps, evidence))
+    return found
+
+
+def _tried(growth: Growth, left_out: Indices, motion: Motion, more: bool = True
+           ) -> Iterator[tuple[list[int], float, Growth | None]]:
+    """
+    Yield steps, their log odds to have slipped, and the state without them; None: it falls apart.
+
+    Where the robot does not move as usual without one step, a second one may bend what the loops
+    across the first one say: more : try that, too.
+    """
+    odds = log_odds_of_slips(growth, motion)
     for step in _suspected(growth, odds, left_out):
         state = _without(growth, step)
         if state and (likeliest := _likeliest(state, step, motion)) != step:
             state, step = _without(growth, likeliest), likeliest
-        evidence = float(odds[step])
-        usual = state is not None and _moves_as_usual(state, step, motion)
-        if state and usual:
-            evidence += _gain(growth, state)
-        growth.slip_odds[step] = evidence
-        if state and evidence > most and (odds[step] > 0 or (usual and _spans(state, step))):
-            found, most = state, evidence
-            state.slip_odds[step] = evidence
-    return found
+        yield [step], float(odds[step]), state
+        if more and state and not _moves_as_usual(state, step, motion):
+            for steps, other, both in _tried(state, state.undecided(), motion, False):
+                yield [step, *steps], float(odds[step]) + other, both
 
 
 def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loops of a place may err together: then they are worth one, and the noise stays what it is."""
+
+import numpy as np
+import pytest
+from lies import roundabout
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.robust import batch_map
+from l1slam_ros.core.robust.batch import judge, robust_solve
+from l1slam_ros.core.robust.places import err_together
+
+
+@pytest.mark.parametrize('shared, together', [(0.0, False), (0.5, True), (1.0, True)])
+def test_sums_over_places_tell_whether_loops_err_together(shared, together):
+    rng = np.random.default_rng(0)
+    place = np.repeat(np.arange(9), 20)
+    found = 0
+    for _ in range(50):
+        own, common = (rng.standard_normal((size, 3)) for size in (180, 9))
+        residual = np.sqrt(1 - shared) * own + np.sqrt(shared) * common[place]
+        found += err_together(place, residual, rng.standard_normal((180, 3, 24)))
+    assert found == 50 * together
+
+
+def test_loops_each_of_its_own_place_tell_nothing():
+    rng = np.random.default_rng(0)
+    assert not err_together(np.arange(30), rng.standard_normal((30, 3)),
+                            rng.standard_normal((30, 3, 24)))
+
+
+STEP, LOOP = np.array([0.03, 0.03, 0.0005]), np.array([1.0, 1.0, 0.1])
+# Loops of each place.
+COUNTS = np.array([50, *[8] * 7])
+
+
+def rounds_of(seed, shared):
+    """Return two rounds with loops that share a part of their error by place, and the truth."""
+    rng, truth, graph = np.random.default_rng(seed), roundabout(400), FactorGraph(se2)
+    graph.add_poses(len(truth))
+    first = np.concatenate([start + np.arange(count) for start, count in zip(
+        (0, *range(64, 190, 18)), COUNTS, strict=True)])
+    own, common = (rng.standard_normal((m, 3)) for m in (COUNTS.sum(), len(COUNTS)))
+    error = LOOP * (np.sqrt(1 - shared) * own + np.sqrt(shared) * common.repeat(COUNTS, axis=0))
+    k = np.arange(len(truth) - 1)
+    for i, j, e, sigma in ((k, k + 1, STEP * rng.standard_normal((len(k), 3)), STEP),
+                           (first, first + 200, error, LOOP)):
+        graph.add_between(i, j, se2.retract(se2.between(truth[i], truth[j]), e),
+                          np.tile(np.diag(sigma**-2), (len(i), 1, 1)))
+    return graph, truth
+
+
+def ate(poses, truth):
+    return absolute_trajectory_error(se2.positions(poses), se2.positions(truth))
+
+
+def solved(graph, robust):
+    return batch_map.solve(graph, None, batch_map.SolveOptions(norm='l2', robust=robust))
+
+
+def test_loops_that_err_together_are_worth_one_in_the_map():
+    """And the cost is told by what the file says of the noise."""
+    for seed in range(3):
+        graph, truth = rounds_of(seed, 0.9)
+        all_said, judged = solved(graph, False), solved(graph, True)
+        assert judged.judgement.accepted.all() and not judged.judgement.is_noise_stated
+        assert judged.solution.cost > all_said.solution.cost
+        assert ate(judged.solution.poses, truth) < 0.95 * ate(all_said.solution.poses, truth)
+
+
+def test_loops_each_with_an_error_of_its_own_keep_the_optimum_they_state():
+    graph, _ = rounds_of(0, 0.0)
+    all_said, judged = solved(graph, False), solved(graph, True)
+    assert judged.judgement.is_noise_stated
+    assert judged.solution.cost == pytest.approx(all_said.solution.cost, rel=1e-9)
+
+
+def test_a_graph_judged_again_says_the_same_of_its_noise():
+    """However often: else the scale of the odometry climbs as loops come."""
+    graph, _ = rounds_of(0, 0.9)
+    first, poses = robust_solve(graph)
+    judgement = first
+    for _ in range(10):
+        judgement, poses = judge(graph, poses, judgement, np.inf)
+    assert judgement.variance == pytest.approx(first.variance, rel=0.05)
