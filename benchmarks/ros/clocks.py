@@ -45,7 +45,7 @@ from l1slam_ros.core.graph.factor_graph import component_labels
 from l1slam_ros.io.bags.reader import read_messages, read_raw
 from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
 from l1slam_ros.io.graphs.saved_map import load_map
-from l1slam_ros.io.messages import cdr
+from l1slam_ros.io.messages import conversion
 from l1slam_ros.io.messages.conversion import stamp_of, stamped_pose
 from l1slam_ros.ros.demo import executable
 from l1slam_ros.ros.publishing import header
@@ -188,7 +188,7 @@ def main() -> None:
     measured = {}
     for _, topic, data in messages:
         if topic == ODOMETRY_TOPIC:
-            sample = cdr.odometry(data)[1]
+            sample = conversion.odometry_in(data)[1]
             measured[sample.stamp] = sample.pose3[:2], truth[sample.stamp][:2]
     known: dict[int, np.ndarray] = {}
     folder = tempfile.TemporaryDirectory()

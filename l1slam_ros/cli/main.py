@@ -187,8 +187,8 @@ def _add_bag_options(parser: argparse.ArgumentParser) -> None:
         add(f'--{name}-topic', default=default, metavar='TOPIC',
             help=f'{what} (default: {default})')
     add('--params-file', type=Path, metavar='YAML',
-        help="the node's parameter file: what makes keyframes, their noise, and the solver; "
-        'without it, what a bag of l1slam notes of itself, or the defaults of the node')
+        help="the node's parameter file: what makes keyframes, their noise, and the solver; what "
+        'a bag of l1slam notes of itself comes before defaults')
 
 
 def _add_solve(parser: argparse.ArgumentParser) -> None:

@@ -40,8 +40,8 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
     Parameters
     ----------
     path : .g2o, .graph, .mcap, .db3, .bag (ROS 1) or a rosbag2 directory
-    options : what makes keyframes of a bag's messages; None: what the bag's note says, or the
-        node's defaults
+    options : what makes keyframes of a bag's messages; None: the node's defaults. Where the bag's
+        note says it otherwise, defaults give way
     topics : where in a bag to look
     rotation_information : see `GraphRecord`; written back it is as it was read
     dimension : of the world of a bag that does not note it

@@ -25,7 +25,6 @@ from l1slam_ros.io.graphs.map_file import MapFile
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.diagnostics import Diagnostics
 from l1slam_ros.ros.inputs.inputs import Inputs
-from l1slam_ros.ros.inputs.intake import Intake
 from l1slam_ros.ros.loop_status import LoopStatus
 from l1slam_ros.ros.markers import GraphMarkers
 from l1slam_ros.ros.parameters import NodeParameters
@@ -77,10 +76,9 @@ class BackendNode(LifecycleNode):
         self._map_file = MapFile(self._backend, lambda: self.options, self.get_logger().warning)
         if options.load_on_start:
             self.get_logger().info(self._map_file.load_at_start())
-        self._intake = Intake(self, self.failures, self._transform.tick)
-        self._inputs = Inputs(
-            self._intake, self._backend, options, self._on_moved, self.get_logger())
-        self._diagnostics = Diagnostics(self, self._intake.topics, self._solver, self.failures)
+        self._inputs = Inputs(self, self._backend, options, self.failures, self._on_moved,
+                              self._transform.tick)
+        self._diagnostics = Diagnostics(self, self._inputs.traffic, self._solver, self.failures)
         self._map_services = MapServices(
             self, self._backend, self._jobs, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
@@ -101,17 +99,17 @@ class BackendNode(LifecycleNode):
         self._tell(None)
         self._jobs.start(self._map_services.autosave)
         self._solver.start()
-        self._intake.start()
+        self._inputs.start()
 
     def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Use messages from now on."""
-        self._intake.active = True
-        self._intake.wake()
+        self._inputs.active = True
+        self._inputs.wake()
         return TransitionCallbackReturn.SUCCESS
 
     def on_deactivate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Leave messages alone, and the map as it is."""
-        self._intake.active = False
+        self._inputs.active = False
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
@@ -128,7 +126,7 @@ class BackendNode(LifecycleNode):
         """End the threads and the node; return whether they ended within some seconds."""
         deadline = time.monotonic() + seconds
         self._solver.close(0.0)  # what it works at for a job stops
-        ended = self._intake.close(seconds)
+        ended = self._inputs.close(seconds)
         self._map_services.save_at_end()
         ended &= self._jobs.close(seconds) or (
             self._map_file.is_saving and self._jobs.close(_SAVING))
@@ -170,7 +168,7 @@ class BackendNode(LifecycleNode):
                 self.options.map_frame, robot.stamp, manifold.to_pose3(pose)[0]))
 
     def _on_second(self) -> None:
-        self._intake.look_at_events()
+        self._inputs.look_at_events()
         for sentence in self._backend.news():
             self.get_logger().warning(sentence)
         counts, refused = self._backend.counts()

@@ -9,8 +9,9 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
-from l1slam_ros.core.errors import DoubtfulError
+from l1slam_ros.core.errors import DoubtfulError, Interrupted
 from l1slam_ros.core.online.backend import Backend, Stopped
+from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.graphs.map_file import MapFile
 from l1slam_ros.io.sentences import doubt_sentence
 from l1slam_ros.ros.threads.failures import Failures
@@ -62,7 +63,7 @@ class MapServices:
         return response
 
     def _optimise(self) -> str:
-        improvement = self._backend.settle(self._stopped)
+        improvement = self._settled()
         if improvement is None:
             return 'there are no factors yet'
         doubts = improvement.judgement.doubts
@@ -71,6 +72,15 @@ class MapServices:
             raise DoubtfulError(doubt_sentence(doubts, np.arange(len(stamps)), stamps))
         return (f'L1 cost {improvement.cost_before:.6g} -> {improvement.cost:.6g}, '
                 f'{improvement.status.value}, {improvement.seconds:.2f} s')
+
+    def _settled(self) -> Improvement | None:
+        """Return what solving the map there is to the end did, though others take its place."""
+        while True:
+            try:
+                return self._backend.settle(self._stopped)
+            except Interrupted:
+                if self._stopped():
+                    raise
 
     def reset(self) -> str:
         """Empty the map; the thread of the jobs calls it."""

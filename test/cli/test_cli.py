@@ -646,6 +646,10 @@ def test_a_parameter_file_speaks_to_both_growth_and_solver(capsys, world, tmp_pa
                       'solver: {outer_iterations: 2}}}')
     report = solve_json(capsys, tmp_path / 'bag', '--params-file', params)
     assert report['poses'] < 60 and report['outer_iterations'] == 2
+    # What it leaves as it is, the bag says of itself.
+    params.write_text('/**: {ros__parameters: {keyframe: {translation: 0.5}, solver: {norm: l2}}}')
+    said = solve_json(capsys, tmp_path / 'bag', '--params-file', params)['final_cost']
+    assert said == pytest.approx(solve_json(capsys, world, '--norm', 'l2')['final_cost'], rel=1e-6)
 
 
 @pytest.mark.parametrize('lines, line, words', [

@@ -16,7 +16,7 @@ from node_bench import call, odometry
 
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs import saved_map
-from l1slam_ros.io.messages import cdr
+from l1slam_ros.io.messages import conversion
 from l1slam_ros.ros import node
 from l1slam_ros.ros.publishing import header
 
@@ -132,7 +132,7 @@ def test_a_service_that_fails(bench, monkeypatch, tmp_path, kind, service, modul
 
 @pytest.mark.parametrize('kind', FAULTS[:2])
 def test_a_callback_that_fails(bench, monkeypatch, kind):
-    fault = Fault(monkeypatch, cdr, 'odometry', kind)
+    fault = Fault(monkeypatch, conversion, 'odometry_in', kind)
     b = bench()
     drive(b, 0, 3)
     b.until(lambda: len(b.path().poses) == 3, 'a map')

@@ -13,11 +13,12 @@ pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from node_bench import call, odometry, poses_of
+from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.core.online.upkeep import upkeep
-from l1slam_ros.io.messages import cdr
+from l1slam_ros.io.messages import conversion
 from l1slam_ros.ros.publishing import header
 from l1slam_ros.ros.threads import solver_thread
 
@@ -137,8 +138,9 @@ def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
 def test_a_backlog_is_taken_over_from_dds_and_answered_at_its_end(bench, monkeypatch):
     """More than the thousand messages that DDS queues up come while the first are in work."""
     b = bench()
-    permits, decoded = threading.Semaphore(0), cdr.odometry
-    monkeypatch.setattr(cdr, 'odometry', lambda data: permits.acquire() and decoded(data))
+    permits, decoded = threading.Semaphore(0), conversion.odometry_in
+    monkeypatch.setattr(
+        conversion, 'odometry_in', lambda data: permits.acquire() and decoded(data))
 
     def stand(first, last):
         for k in range(first, last):
@@ -146,7 +148,7 @@ def test_a_backlog_is_taken_over_from_dds_and_answered_at_its_end(bench, monkeyp
 
     stand(0, 900)
     permits.release(150)
-    b.until(lambda: b.backend._intake.topics['odom'].received > 150, 'some are used')
+    b.until(lambda: b.backend._inputs.traffic['odom'].received > 150, 'some are used')
     stand(900, 1800)
     permits.release(1800)
     b.until(lambda: b.status()[2].get('odom.received') == '1800', 'all are used')
@@ -170,6 +172,30 @@ def test_messages_of_all_topics_are_used_in_the_order_they_came(bench, monkeypat
     go_on.set()
     b.until(lambda: len(used) == len(sent), 'all are used')
     assert used == sent
+
+
+def test_optimize_is_done_though_the_map_is_replaced_meanwhile(bench, monkeypatch):
+    """By a parameter that lets all loops be judged anew: it is no end of the node."""
+    b = bench()
+    drive(b, 0, 3)
+    b.until(lambda: len(b.path().poses) == 3, 'a map')
+    began, optimise = threading.Event(), upkeep.optimise
+
+    def interrupted(problem, options, check):
+        while not began.is_set():
+            began.set()
+            while True:
+                check()
+        return optimise(problem, options, check)
+
+    monkeypatch.setattr(upkeep, 'optimise', interrupted)
+    client = b.peer.create_client(Trigger, '/backend/optimize')
+    b.until(client.service_is_ready, 'optimize is offered')
+    answer = client.call_async(Trigger.Request())
+    b.until(began.is_set, 'it is at work')
+    assert b.backend.set_parameters([Parameter('robust.enabled', value=False)])[0].successful
+    b.until(answer.done, 'optimize is answered')
+    assert answer.result().success, answer.result().message
 
 
 def test_after_a_load_the_pose_is_right_at_once(bench, tmp_path):
@@ -227,8 +253,8 @@ def test_when_the_clock_jumps_back(bench, choice):
 
 def test_what_a_full_queue_has_dropped_is_said_to_be_lost(bench, monkeypatch):
     b = bench()
-    go_on, decoded = threading.Event(), cdr.odometry
-    monkeypatch.setattr(cdr, 'odometry', lambda data: go_on.wait() and decoded(data))
+    go_on, decoded = threading.Event(), conversion.odometry_in
+    monkeypatch.setattr(conversion, 'odometry_in', lambda data: go_on.wait() and decoded(data))
     for k in range(3000):
         b.publishers['/odom'].publish(odometry((k + 1) * 10**9, 0.0))
     go_on.set()

@@ -5,8 +5,6 @@ import math
 from dataclasses import dataclass
 from numbers import Integral
 
-import numpy as np
-
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 
@@ -88,12 +86,13 @@ def require_sound(what: OdometrySample | LoopClosure) -> None:
         shape = getattr(getattr(what, name, None), 'shape', None)
         if hasattr(what, name) and shape != expected:
             raise MessageError('shape', f'{name} of shape {shape}; expected an array {expected}')
-    if not np.isfinite(what.pose3).all():
+    pose3 = what.pose3.tolist()
+    if not all(map(math.isfinite, pose3)):
         raise MessageError('not_finite', f'pose {what.pose3}; expected finite numbers')
-    if max(map(abs, what.pose3[:3].tolist())) > FARTHEST:
+    if max(map(abs, pose3[:3])) > FARTHEST:
         raise MessageError('range', f'position {what.pose3[:3]}; expected it within '
                            f'{FARTHEST:g} m')
-    norm = math.hypot(*what.pose3[3:])
+    norm = math.hypot(*pose3[3:])
     if abs(norm - 1) > QUATERNION_NORM_ERROR:
         raise MessageError('quaternion', f'quaternion {what.pose3[3:]} of norm {norm:g}; '
                            'expected 1')

@@ -121,7 +121,7 @@ class Front:
     @property
     def newest(self) -> Array:
         """The pose of the last keyframe it knows, (1, p)."""
-        return self._map.poses(np.array([self.keyframes - 1]))[:, L1]
+        return self._map.newest
 
     def covariance(self, keyframe: int) -> Array:
         """Return the covariance of a keyframe's step from the L2 map, (k, k)."""

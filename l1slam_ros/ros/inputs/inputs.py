@@ -1,33 +1,82 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the node hears: messages of every topic -> the back end; none of it is compiled code."""
+"""
+What the node hears: messages of every topic -> the back end, in a thread that does nothing else.
 
-from collections import Counter
+Each time that rclpy's executor wakes, it makes a wait set anew of all that a node has, services,
+timers and events: 1.5 ms, ten times what a message of the odometry costs. The wait set here is
+made once, of subscriptions alone. What DDS has queued up is taken over first, some microseconds a
+message, before anything is made of it: a queue of DDS that is full drops messages without a word.
+Messages of all topics are used in the order they came: a loop that was sent before the stamps of
+the odometry went back is of the time before. None of it is compiled code.
+"""
+
+import math
+import sys
+import threading
+import time
+from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
-from typing import Any
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.guard_condition import GuardCondition
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from l1slam_ros.core.errors import L1SlamError, MessageError
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.io.messages import cdr
+from l1slam_ros.io.messages import conversion
 from l1slam_ros.io.messages.base_frame import BaseFrame
-from l1slam_ros.io.messages.conversion import (
-    absolute_pose,
-    false_loop,
-    loop_closure,
-)
 from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
 from l1slam_ros.io.node_options import NodeOptions
-from l1slam_ros.ros.inputs.intake import Intake
+from l1slam_ros.ros.inputs.traffic import Traffic
+from l1slam_ros.ros.threads.failures import Failures
 
-_REPEAT_WARNING = 5.0  # [s]
+_DEPTH = 1000
+# So many are used before DDS is asked for more.
+_AT_ONCE = 100
+# More are left to DDS, to drop: ten seconds of a fast topic, some megabytes.
+_BACKLOG = 10_000
 # Of a backlog so many messages, the newest, are answered with a pose: nobody waits for the others.
 _ANSWERED = 200
+# [s] So long others run Python's code before a message may come in, and so long they wait once one
+# has: by turns of one length a busy machine would hand each message to and fro.
+_OTHERS_TURN, _OWN_TURN = 5e-4, 0.05
+# [s] What raises each time it is called shall not keep a core busy.
+_BREATH = 0.05
+_REPEAT_WARNING = 5.0  # [s]
+
+
+class _Apart(ReentrantCallbackGroup):  # type: ignore[misc]
+    """Leaves all in it to others than the executor."""
+
+    def can_execute(self, _: Any) -> bool:
+        return False
+
+
+class _Topic(NamedTuple):
+    name: str
+    subscription: Any
+    traffic: Traffic
+    use: Callable[[Any], None]
+
+
+class _Message(NamedTuple):
+    """A message, what rclpy says about it, and when it came [ns]."""
+
+    received: int
+    topic: _Topic
+    content: Any
+    information: Any
 
 
 class Inputs:
@@ -36,81 +85,180 @@ class Inputs:
 
     Parameters
     ----------
-    intake : which takes the messages in
+    node : to subscribe with
     backend : to append to
     options : of the node
-    moved : called after a sample of the odometry that is used, unless so many more wait behind it
-        that nobody needs its answer
-    logger : of the node
+    failures : where to tell what nobody foresaw
+    moved : called after a sample of the odometry that is used, but not if many more wait behind it
+    tick : called after messages, and again after as many seconds as it returns
 
     Attributes
     ----------
+    active : whether messages are used, and `tick` is called
+    traffic : of each topic by its name
     refused : cause -> how many messages could not be used
 
     """
 
-    def __init__(self, intake: Intake, backend: Backend, options: NodeOptions,
-                 moved: Callable[[], None], logger: Any):
-        self._backend, self._moved, self._logger = backend, moved, logger
+    def __init__(self, node: Node, backend: Backend, options: NodeOptions, failures: Failures,
+                 moved: Callable[[], None], tick: Callable[[], float]):
+        self._node, self._backend, self._failures = node, backend, failures
+        self._moved, self._tick = moved, tick
         self._base_frame, self._map_frame = BaseFrame(options.base_frame), options.map_frame
+        self._group, self.active, self._closing = _Apart(), False, False
         self.refused: Counter[str] = Counter()
-        self._subscribe(intake)
+        self._topics: list[_Topic] = []
+        self._queue: deque[_Message] = deque()
+        self._guard = GuardCondition(None, None, context=node.context)
+        self._thread = threading.Thread(target=self._work, name='intake', daemon=True)
+        self._subscribe_all()
+        self.traffic = {topic.name: topic.traffic for topic in self._topics}
 
-    def _subscribe(self, intake: Intake) -> None:
-        for topic, read in (
-            ('loop_closures', lambda m: loop_closure(m, self._base_frame.name, False)),
-            ('trusted_loop_closures', lambda m: loop_closure(m, self._base_frame.name, True)),
-            ('false_loop_closures', lambda m: false_loop(m, self._base_frame.name)),
-            ('absolute_poses', lambda m: absolute_pose(m, self._map_frame)),
+    def _subscribe_all(self) -> None:
+        self._subscribe(Odometry, 'odom', self._on_odometry, raw=True)
+        for name, read in (
+            ('loop_closures', lambda m: conversion.loop_closure(m, self._base_frame.name, False)),
+            ('trusted_loop_closures',
+             lambda m: conversion.loop_closure(m, self._base_frame.name, True)),
+            ('false_loop_closures', lambda m: conversion.false_loop(m, self._base_frame.name)),
+            ('absolute_poses', lambda m: conversion.absolute_pose(m, self._map_frame)),
         ):
-            intake.subscribe(PoseWithCovarianceStamped, topic, partial(self._add_loop, read))
+            self._subscribe(PoseWithCovarianceStamped, name, partial(self._on_loop, read))
         # Pose graphs of other front ends, where their messages are installed.
-        for msgtype, topic in (MAP_GRAPH, 'map_graph'), (POSE_GRAPH, 'pose_graph'):
-            package, _, name = msgtype.split('/')
+        for msgtype, name in (MAP_GRAPH, 'map_graph'), (POSE_GRAPH, 'pose_graph'):
+            package, _, kind = msgtype.split('/')
             with suppress(ImportError):
-                kind = getattr(import_module(f'{package}.msg'), name)
-                intake.subscribe(kind, topic, self.graph_reader())
-        intake.subscribe(Odometry, 'odom', self._on_odometry, raw=True)
+                self._subscribe(getattr(import_module(f'{package}.msg'), kind), name,
+                                partial(self._on_pose_graph, PoseGraphs()))
 
-    def graph_reader(self) -> Callable[[Any, int], None]:
-        """Return what takes the pose graphs of a topic, message by message."""
-        graphs = PoseGraphs()
+    def _subscribe(self, kind: Any, name: str, use: Callable[[Any], None],
+                   raw: bool = False) -> None:
+        """Subscribe to a topic; raw : its messages are used as bytes."""
+        subscription = self._node.create_subscription(
+            kind, name, use, QoSProfile(depth=_DEPTH), raw=raw, callback_group=self._group,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        traffic = Traffic(subscription.get_publisher_count)
+        self._topics.append(_Topic(name, subscription, traffic, use))
 
-        def read(message: Any, _: int = 0) -> None:
-            for found in graphs.take(message):
-                if isinstance(found, LoopClosure):
-                    self._add_loop(lambda loop: loop, found)
-                else:
-                    self._refuse(found)
+    def start(self) -> None:
+        """Begin; there is nothing to subscribe to any more."""
+        self._thread.start()
 
-        return read
+    def wake(self) -> None:
+        """Let `tick` be called now."""
+        self._guard.trigger()
 
-    def _on_odometry(self, data: bytes, behind: int) -> None:
-        try:
-            found = self._base_frame.take(*cdr.odometry(data))
-        except L1SlamError as error:
-            self._refuse(error)
-            return
+    def look_at_events(self) -> None:
+        """
+        Call back what has happened to the subscriptions: publishers whose QoS does not match.
+
+        To be called now and then: who waits for such events wakes for each message.
+        """
+        context = self._node.context
+        events = [event for one in self._topics for event in one.subscription.event_handlers]
+        with context.handle:
+            waiting = rclpy_implementation.WaitSet(0, 0, 0, 0, 0, len(events), context.handle)
+            waiting.clear_entities()
+            for event in events:
+                event.add_to_wait_set(waiting)
+            waiting.wait(0)
+            for event in events:
+                if event.is_ready(waiting):
+                    event.callback(event.take_data())
+
+    def close(self, seconds: float) -> bool:
+        """End the thread; return whether it ended within some seconds."""
+        self._closing = True
+        self.wake()
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+    def _work(self) -> None:
+        context, turn = self._node.context, sys.getswitchinterval()
+        with context.handle, self._guard.handle:
+            waiting = rclpy_implementation.WaitSet(
+                len(self._topics), 1, 0, 0, 0, 0, context.handle)
+            seconds = math.inf
+            while not self._closing and context.ok():
+                try:
+                    sys.setswitchinterval(_OTHERS_TURN)
+                    self._wait(waiting, 0.0 if self._queue else seconds)
+                    sys.setswitchinterval(_OWN_TURN)
+                    self._take()
+                    self._use()
+                    seconds = self._tick() if self.active else math.inf
+                    self._failures.over('intake')
+                except Exception as error:
+                    self._failures.note('intake', error)
+                    time.sleep(_BREATH)
+        sys.setswitchinterval(turn)
+
+    def _wait(self, waiting: Any, seconds: float) -> None:
+        """Wait for messages, for so long."""
+        waiting.clear_entities()
+        for one in self._topics:
+            waiting.add_subscription(one.subscription.handle)
+        waiting.add_guard_condition(self._guard.handle)
+        waiting.wait(-1 if math.isinf(seconds) else max(round(seconds * 1e9), 0))
+
+    def _take(self) -> None:
+        """Take over what has come of every topic."""
+        for topic in self._topics:
+            subscription = topic.subscription
+            with subscription.handle:
+                while len(self._queue) < _BACKLOG and (taken := subscription.handle.take_message(
+                        subscription.msg_type, subscription.raw)) is not None:
+                    content, information = taken
+                    self._queue.append(_Message(
+                        information['received_timestamp'], topic, content, information))
+
+    def _use(self) -> None:
+        """Use some of the messages in the order they came."""
+        until = max((message.received for message in self._queue), default=0)
+        # While one topic was emptied, older messages may have come of those before.
+        self._take()
+        if len(self._queue) > 1:
+            self._queue = deque(sorted(self._queue, key=itemgetter(0)))
+        for _ in range(_AT_ONCE):
+            if not self._queue or self._queue[0].received > until:
+                return
+            _, topic, content, information = self._queue.popleft()
+            topic.traffic.note(information)
+            if not self.active:
+                continue
+            try:
+                topic.use(content)
+            except L1SlamError as error:
+                self._refuse(error)
+            except Exception as error:
+                self._failures.note(topic.name, error)
+                continue
+            self._failures.over(topic.name)
+
+    def _on_odometry(self, data: bytes) -> None:
+        found = self._base_frame.take(*conversion.odometry_in(data))
         if found.anew:
             self._backend.begin_anew()
         for other in found.others:
             self._refuse(other)
         for sample in found.ours:
-            self._add_odometry(sample, behind < _ANSWERED)
-
-    def _add_odometry(self, sample: OdometrySample, answered: bool) -> None:
-        try:
-            if self._backend.add_odometry(sample) is not None and answered:
+            used = self._backend.add_odometry(sample) is not None
+            if used and len(self._queue) < _ANSWERED:
                 self._moved()
-        except L1SlamError as error:
-            self._refuse(error)
 
-    def _add_loop(self, read: Callable[[Any], LoopClosure], message: Any, _: int = 0) -> None:
-        try:
-            self._backend.add_loop(read(message))
-        except L1SlamError as error:
-            self._refuse(error)
+    def _on_loop(self, read: Callable[[Any], LoopClosure], message: Any) -> None:
+        self._backend.add_loop(read(message))
+
+    def _on_pose_graph(self, graphs: PoseGraphs, message: Any) -> None:
+        for found in graphs.take(message):
+            try:
+                if not isinstance(found, LoopClosure):
+                    raise found
+                self._backend.add_loop(found)
+            except L1SlamError as error:
+                self._refuse(error)
 
     def _refuse(self, error: L1SlamError) -> None:
         self.refused[error.cause if isinstance(error, MessageError) else 'unusable'] += 1
-        self._logger.warning(f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
+        self._node.get_logger().warning(
+            f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)

@@ -40,6 +40,18 @@ def test_without_a_slip_nothing_is_left_out(bad):
     assert repaired(bad.graph) is None
 
 
+@pytest.mark.parametrize('steps, offset', [([100, 180], [5.0, 0.0, 0.0]),
+                                           ([150, 230], [0.0, 0.0, 1.5])])
+def test_two_slips_are_found_together(bad, steps, offset):
+    """Each bends what the loops across the other one say."""
+    graph = bad.graph
+    for step in steps:
+        graph = moved(graph, step, offset)
+    judgement, _ = robust_solve(graph)
+    assert graph.between.i[judgement.slips].tolist() == steps
+    assert not judgement.doubts
+
+
 @pytest.mark.parametrize('stated', [1.0, 10.0])
 def test_what_is_within_the_noise_as_stated_is_no_slip(stated):
     """40 sigmas are a slip; 4 are none, though loops that know better all speak against it."""

@@ -212,9 +212,9 @@ def test_who_has_no_odometry_is_told_of_the_graph(bag):
 def test_the_node_reads_them_too(bag, ros):
     node = pytest.importorskip('l1slam_ros.ros.node').BackendNode()
     try:
-        read = node._inputs.graph_reader()
+        graphs = PoseGraphs()
         for message in read_messages(bag, ['/rtabmap/mapGraph']):
-            read(message.data)
+            node._inputs._on_pose_graph(graphs, message.data)
         assert node._backend.loop_states().stamps.tolist() == [[10 * SECOND, 15 * SECOND]]
     finally:
         node.close()

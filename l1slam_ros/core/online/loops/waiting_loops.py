@@ -8,19 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import (
-    LEAST_VARIANCE,
-    MOST_VARIANCE,
-    Mask,
-    at_most,
-    bounds,
-    filled,
-    or_model,
-    silenced,
-    silent_components,
-    usable,
-)
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.measurements import LoopClosure
 
 
@@ -120,79 +108,3 @@ class WaitingLoops:
     def _take(self, number: int) -> WaitingLoop:
         self._stamps = None
         return self._loops.pop(number)
-
-
-def carried(manifold: Manifold, used: list[WaitingLoop], to_reference: Array,
-            to_keyframe: Array) -> tuple[Array, Array, Mask]:
-    """
-    Return what loops say between keyframes near their times.
-
-    Parameters
-    ----------
-    to_reference : (m, p) the robot at the reference, seen from the first keyframe; an absolute
-        pose has none
-    to_keyframe : (m, p) the second keyframe, seen from the robot at the end
-
-    Returns
-    -------
-    measurement : (m, p); covariance : (m, d, d) in the axes of the keyframe. A loop that leaves
-        components unsaid keeps its own axes, the way being short; one without a heading goes that
-        way in a direction unknown, which is noise.
-    sound : (m,) bool, the covariance is one: a heading nearly unknown, at the end of a long lever,
-        leaves rounding where position was.
-
-    """
-    stated = np.concatenate([one.measurement for one in used])
-    covariance = np.concatenate([one.covariance for one in used])
-    absolute = np.array([one.loop.is_absolute for one in used])
-    silent = np.diagonal(covariance, axis1=1, axis2=2) == 0
-    unturned = silent[:, manifold.ROTATION].any(axis=1)
-    measurement = np.where(absolute[:, None], stated, manifold.compose(to_reference, stated))
-    measurement = np.where(unturned[:, None], measurement,
-                           manifold.compose(measurement, to_keyframe))
-    # The error lives in the axes of the measured pose; see it from the keyframe instead.
-    Ad = manifold.adjoint(manifold.inverse(to_keyframe))
-    turned = Ad @ covariance @ Ad.transpose(0, 2, 1)
-    if not silent.any():
-        return measurement, turned, usable(turned)
-    way = manifold.local(manifold.identity(len(used)), to_keyframe)
-    lost = np.zeros(silent.shape)
-    lost[:, manifold.TRANSLATION] = (way[:, manifold.TRANSLATION] ** 2).mean(axis=1)[:, None]
-    kept = covariance + (lost * (unturned[:, None] & ~silent))[:, :, None] * np.eye(lost.shape[1])
-    covariance = np.where(silent.any(axis=1)[:, None, None], kept, turned)
-    return measurement, covariance, usable(filled(covariance, silent))
-
-
-def loop_covariance(stated: Array, model: Array | None,
-                    verbatim: bool) -> tuple[Array | None, list[tuple[float, float]]]:
-    """
-    Return a covariance by what a loop states, (1, d, d), and variances found and used instead.
-
-    Zeros stand for what is left unsaid. Where nothing can be used it is the model.
-
-    Parameters
-    ----------
-    stated : (1, d, d) of a message
-    model : (d, d); None for an absolute pose, there is no model of these: None is returned then
-    verbatim : as stated, though its variances be none of a measurement
-
-    """
-    silent = silent_components(stated, absolute=model is None)
-    whole = filled(stated, silent)
-    if silent.all() or not usable(whole)[0]:
-        return None if model is None else model[None], []
-    if verbatim:
-        return silenced(stated, silent), []
-    cut, large = at_most(whole, MOST_VARIANCE)
-    used, small = or_model(cut, LEAST_VARIANCE * np.eye(len(cut[0])) if model is None else model)
-    return silenced(used, silent), bounds(whole, used, large | small)
-
-
-def said(manifold: Manifold, loop: LoopClosure, covariance: Array) -> Array:
-    """Return what a loop measures, (1, p), without a rotation that it leaves unsaid."""
-    measurement = manifold.from_pose3(loop.pose3[None])
-    if np.diagonal(covariance[0])[manifold.ROTATION].all():
-        return measurement
-    pose = manifold.local(manifold.identity(1), measurement)
-    pose[:, manifold.ROTATION] = 0.0
-    return manifold.retract(manifold.identity(1), pose)
