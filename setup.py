@@ -32,6 +32,7 @@ setup(
     maintainer_email='maintainers@l1slam-ros.invalid',
     license='Apache-2.0',
     packages=find_packages(exclude=['test']),
+    package_data={package_name: ['py.typed']},  # its annotations are there to be used
     data_files=data_files,
     zip_safe=True,
     python_requires='>=3.10',

@@ -12,7 +12,19 @@ Importing this imports neither ROS nor numba; a name is fetched when it is first
 """
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # for editors and type checkers, which run nothing
+    from l1slam_ros.core.errors import L1SlamError as L1SlamError
+    from l1slam_ros.core.graph.factor_graph import FactorGraph as FactorGraph
+    from l1slam_ros.core.graph.measurements import LoopClosure as LoopClosure
+    from l1slam_ros.core.graph.measurements import OdometrySample as OdometrySample
+    from l1slam_ros.core.online.backend import Backend as Backend
+    from l1slam_ros.core.online.backend import BackendOptions as BackendOptions
+    from l1slam_ros.core.robust.door import Solution as Solution
+    from l1slam_ros.core.robust.door import solve as solve
+    from l1slam_ros.io.formats import read_graph as read_graph
+    from l1slam_ros.io.formats import write_graph as write_graph
 
 _HOMES = {
     'read_graph': 'io.formats',

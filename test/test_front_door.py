@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """`import l1slam_ros`: light, and the README's example of it runs."""
 
+import ast
+import copy
 import inspect
+import json
+import pickle
 import re
 import subprocess
 import sys
@@ -44,6 +48,14 @@ def test_the_example_of_the_readme_runs_and_says_what_it_found(world):
     assert len(l1.read_graph(world.parent / 'solved.g2o')[1]) == 200
 
 
+def test_type_checkers_know_every_name():
+    found = {alias.name: node.module for node in ast.walk(ast.parse(inspect.getsource(l1)))
+             if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert {name: found[name] for name in l1.__all__} == {
+        name: getattr(l1, name).__module__ for name in l1.__all__}
+    assert Path(l1.__file__).with_name('py.typed').exists()
+
+
 @pytest.mark.parametrize('name', l1.__all__)
 def test_every_name_explains_itself(name):
     assert len(inspect.getdoc(getattr(l1, name))) > 30
@@ -61,10 +73,29 @@ def test_the_refused_are_the_false_and_a_start_is_begun_from(world):
     assert from_there.inliers.all()
 
 
+def test_every_door_takes_a_norm_of_loops_alone(world, tmp_path, capsys):
+    graph, _ = l1.read_graph(world)
+    solution = l1.solve(graph, norm='l2', loop_norm='group-l1', robust=False)
+    params = tmp_path / 'params.yaml'
+    params.write_text('/**: {ros__parameters: {solver: {norm: l2, loop_norm: group-l1}}}')
+    costs = []
+    for asked in (('--norm', 'l2', '--loop-norm', 'group-l1'), ('--params-file', str(params)),
+                  ('--norm', 'group-l1', '--params-file', str(params))):
+        assert main(['solve', str(world), '--no-robust', '--json', '--quiet', *asked]) == 0
+        report = json.loads(capsys.readouterr().out)
+        assert report['status'] == 'converged'
+        costs.append(report['final_cost'])
+    # The last is group L1 of all: a norm of the odometry that is that of the loops.
+    assert costs[0] == costs[1] == solution.cost < costs[2]
+    assert solution.status == 'converged'
+
+
 def test_what_cannot_be_solved_is_said(world):
     graph, poses = l1.read_graph(world)
     with pytest.raises(l1.L1SlamError, match="norm is 'l3', expected one of l1, group-l1, l2, "):
         l1.solve(graph, norm='l3')
+    with pytest.raises(l1.L1SlamError, match="loop_norm is 'l3', expected one of same, l1, "):
+        l1.solve(graph, loop_norm='l3')
     with pytest.raises(l1.L1SlamError, match=r'start has the shape \(3, 3\), expected \(200, 3\)'):
         l1.solve(graph, start=poses[:3])
     poses[7] = np.nan
@@ -72,10 +103,20 @@ def test_what_cannot_be_solved_is_said(world):
         l1.solve(graph, start=poses)
     with pytest.raises(l1.L1SlamError, match=r'poses have the shape \(3, 3\)'):
         l1.write_graph(world.parent / 'x.g2o', graph, poses[:3])
+    with pytest.raises(l1.L1SlamError, match='pose 7 is .*, expected finite numbers'):
+        l1.write_graph(world.parent / 'x.tum', graph, poses)
     with pytest.raises(l1.L1SlamError, match='no such file'):
         l1.read_graph(world.parent / 'missing.g2o')
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         l1.nothing  # noqa: B018
+
+
+@pytest.mark.parametrize('clone', [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def test_a_graph_goes_to_other_processes(world, clone):
+    graph, _ = l1.read_graph(world)
+    other = clone(graph)
+    assert other.manifold is graph.manifold
+    assert clone(l1.solve(other)).cost == l1.solve(graph).cost
 
 
 def test_a_start_of_long_quaternions_is_the_same_start(tmp_path):

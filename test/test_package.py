@@ -103,8 +103,8 @@ def test_the_licence_is_apache(wheel):
 def test_every_module_is_in_the_wheel_and_no_test(wheel):
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / 'l1slam_ros').rglob('*.py')}
     in_wheel = {name for name in wheel.namelist()
-                if name.endswith('.py') and '.data/' not in name}
-    assert in_wheel == modules
+                if name.endswith(('.py', 'py.typed')) and '.data/' not in name}
+    assert in_wheel == modules | {'l1slam_ros/py.typed'}
 
 
 def test_every_folder_with_modules_is_a_package():

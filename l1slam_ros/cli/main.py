@@ -16,6 +16,7 @@ from l1slam_ros.core.names import (
     KINDS_OF_FALSE_LOOPS,
     NORMS,
     ROTATION_INFORMATION,
+    SAME,
     SOLVERS,
     STARTS,
     WORLDS,
@@ -96,6 +97,8 @@ def _answer(arguments: Sequence[str] | None) -> int:
 
 
 def _run(options: argparse.Namespace) -> Any:
+    # That of a notebook, which its children get too, may not be installed here.
+    os.environ.pop('MPLBACKEND', None)
     module = import_module(f'l1slam_ros.cli.{_MODULES[options.command]}')
     import numpy as np
 
@@ -184,8 +187,8 @@ def _add_bag_options(parser: argparse.ArgumentParser) -> None:
         add(f'--{name}-topic', default=default, metavar='TOPIC',
             help=f'{what} (default: {default})')
     add('--params-file', type=Path, metavar='YAML',
-        help="the node's parameter file: what makes keyframes, their noise, and the solver; "
-        'without it, what a bag of l1slam notes of itself, or the defaults of the node')
+        help="the node's parameter file: what makes keyframes, their noise, and the solver; what "
+        'a bag of l1slam notes of itself comes before defaults')
 
 
 def _add_solve(parser: argparse.ArgumentParser) -> None:
@@ -197,6 +200,9 @@ def _add_solve(parser: argparse.ArgumentParser) -> None:
     add('--norm', choices=NORMS,
         help='what is minimised: l1, of each component; group-l1, of the length of each factor, '
         'whatever axes it is written in; l2; huber (default: as of solver.norm, l1)')
+    add('--loop-norm', choices=(SAME, *NORMS),
+        help='what is minimised of loops and absolute poses (default: as of solver.loop_norm, '
+        'same)')
     add('--solver', choices=SOLVERS, default=SOLVERS[0],
         help='for l1; auto: interior-point on sparse graphs (default: %(default)s)')
     add('--robust', action=argparse.BooleanOptionalAction,
@@ -207,7 +213,8 @@ def _add_solve(parser: argparse.ArgumentParser) -> None:
     add('--output', type=Path, metavar='OUT', help=_OUTPUT)
     add('--reference', metavar='TRUTH',
         help='print the position error to it: TUM, g2o, `id x y theta` text, CSV of `stamp, x, y, '
-        "theta`, or a bag's topic, BAG:/TOPIC; interpolated at the stamps of the poses")
+        "theta`, or a bag's topic, BAG:/TOPIC, where `bag` is INPUT; interpolated at the "
+        'stamps of the poses')
     add('--plot', type=Path, metavar='PNG', help='draw the map and its cost; .svg and .pdf too')
     add('--json', action='store_true', help='one object on standard output')
     add('--quiet', action='store_true', help='no progress, no summary, no warning')

@@ -45,7 +45,7 @@ def read_truth(source: str, record: GraphRecord, input_path: Path) -> Truth:
     Parameters
     ----------
     source : a TUM or CSV file, a graph file, `id x y theta` text; or `BAG:/TOPIC`, where `bag`
-        stands for the input itself unless there is something of this name
+        stands for an input that is one
     record, input_path : the graph, and where it is from
 
     Raises
@@ -77,9 +77,7 @@ def _read(source: str, record: GraphRecord, input_path: Path) -> Reference:
     if colon and not Path(source).exists():
         from l1slam_ros.io.bags.to_graph import read_truth_topic
 
-        path = Path(bag)
-        if bag == 'bag' and not path.exists() and is_bag(input_path):
-            path = input_path
+        path = input_path if bag == 'bag' and is_bag(input_path) else Path(bag)
         if not path.exists():
             raise FileError(path, 'no such file or directory')
         return read_truth_topic(path, f'/{topic}', record.graph.manifold)

@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from l1slam_ros.cli.commands import Ending, read, warn
-from l1slam_ros.cli.reference import position_error, read_truth
+from l1slam_ros.cli.reference import known_false, position_error, read_truth
+from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
@@ -35,6 +36,8 @@ def solve(arguments: argparse.Namespace) -> Ending:
         truth = read_truth(arguments.reference, record, arguments.input)
         warn(truth.skipped, arguments.quiet)
         warnings += truth.skipped
+    if arguments.plot:
+        known_false(arguments.input, record)  # damaged, it is refused before the work
     compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
     outcome = _solved(arguments, record, asked)
     remarks = [f'no loop was doubted: {outcome.unjudged}'] if outcome.unjudged else []
@@ -110,8 +113,9 @@ def _asked(arguments: argparse.Namespace) -> SolveOptions:
         least_squares = replace(least_squares, iterations=arguments.outer)
     if arguments.inner is not None:
         solver = replace(solver, inner=replace(solver.inner, iterations=arguments.inner))
-    arguments.norm = arguments.norm or solver.norm
-    return SolveOptions(arguments.start, arguments.norm, arguments.solver, robust, solver,
+    norm, loop_norm = arguments.norm or solver.norm, arguments.loop_norm or solver.loop_norm
+    arguments.norm = norm if loop_norm in (SAME, norm) else f'{norm}, of loops {loop_norm},'
+    return SolveOptions(arguments.start, norm, loop_norm, arguments.solver, robust, solver,
                         least_squares)
 
 

@@ -4,6 +4,8 @@
 # The first of each is the default.
 STARTS = ('seed', 'file', 'odometry')
 NORMS = ('l1', 'group-l1', 'l2', 'huber')
+# Of loops and absolute poses: that of the odometry.
+SAME = 'same'
 SOLVERS = ('auto', 'primal-dual', 'interior-point')
 WORLDS = ('streets', 'building', 'sphere', 'torus')
 KINDS_OF_FALSE_LOOPS = ('random', 'identity', 'grouped')

@@ -40,8 +40,8 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
     Parameters
     ----------
     path : .g2o, .graph, .mcap, .db3, .bag (ROS 1) or a rosbag2 directory
-    options : what makes keyframes of a bag's messages; None: what the bag's note says, or the
-        node's defaults
+    options : what makes keyframes of a bag's messages; None: the node's defaults. Where the bag's
+        note says it otherwise, defaults give way
     topics : where in a bag to look
     rotation_information : see `GraphRecord`; written back it is as it was read
     dimension : of the world of a bag that does not note it
@@ -183,13 +183,16 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
     Raises
     ------
     FileError : it cannot be written, or the format has no place for a part of the graph.
-    GraphError : poses of another shape.
+    GraphError : poses of another shape, or not finite.
 
     """
     _check_reading(rotation_information)
     expected = (graph.n_poses, graph.manifold.POSE_SIZE)
     if np.shape(poses) != expected:
         raise GraphError(f'poses have the shape {np.shape(poses)}, expected {expected}')
+    if not np.isfinite(poses).all():
+        row = int(np.argmin(np.isfinite(poses).all(axis=1)))
+        raise GraphError(f'pose {row} is {np.asarray(poses)[row]}, expected finite numbers')
     write_output(Path(path), GraphRecord(
         graph, np.asarray(poses, float), np.arange(graph.n_poses),
         rotation_information=rotation_information))

@@ -36,6 +36,8 @@ _NOISE = (
     'judged by little',
     'the loops are about {times:.1f} times as noisy as they say: a false one that is little off '
     'passes for noise')
+_TOGETHER = ('the loops of a place err together: in the map each place counts as one loop, and '
+             'all are as noisy as was found')
 
 # By the kind of a doubt.
 _REASONS = {
@@ -75,6 +77,8 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
     for sentence, times in zip(_NOISE, np.sqrt(judgement.variance).tolist(), strict=True):
         if times >= _NOISY:
             yield sentence.format(times=times)
+    if not judgement.is_noise_stated:
+        yield _TOGETHER
 
 
 def doubted(factors: BetweenFactors) -> str:

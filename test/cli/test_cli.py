@@ -520,13 +520,15 @@ def test_plot_draws_several_maps_with_false_loops_where_they_are_known(capsys, w
     assert '150 poses, 101 loops' in said and '150 poses, 113 loops (12 false)' in said
 
 
+@pytest.mark.parametrize('command, output', [('plot', '--output'), ('solve', '--plot')])
 @pytest.mark.parametrize('line, words', [
     ('3 5', 'no edge between 3 and 5'), ('3 999', 'no edge between 3 and 999'),
     ('3', '1 field; expected 2 whole numbers'), ('3 x', "'x' is not a whole number")])
-def test_a_file_of_other_false_loops_is_refused(capsys, tmp_path, line, words):
-    path = graph_file(tmp_path, [*VERTICES, *EDGES])
+def test_a_file_of_other_false_loops_is_refused(capsys, tmp_path, line, words, command, output):
+    """Before the work, at whose end it would be too late: this graph cannot be solved."""
+    path = graph_file(tmp_path, [*VERTICES, 'VERTEX_SE2 9 0 0 0', *EDGES])
     (tmp_path / 'graph.g2o.false.txt').write_text(f'0 2\n{line}\n')
-    assert main(['plot', str(path), '--output', str(tmp_path / 'map.png')]) == 2
+    assert main([command, str(path), output, str(tmp_path / 'map.png')]) == 2
     _, err = capsys.readouterr()
     assert err.startswith(f'l1slam: {path}.false.txt') and words in err and err.count('\n') == 1
 
@@ -644,6 +646,10 @@ def test_a_parameter_file_speaks_to_both_growth_and_solver(capsys, world, tmp_pa
                       'solver: {outer_iterations: 2}}}')
     report = solve_json(capsys, tmp_path / 'bag', '--params-file', params)
     assert report['poses'] < 60 and report['outer_iterations'] == 2
+    # What it leaves as it is, the bag says of itself.
+    params.write_text('/**: {ros__parameters: {keyframe: {translation: 0.5}, solver: {norm: l2}}}')
+    said = solve_json(capsys, tmp_path / 'bag', '--params-file', params)['final_cost']
+    assert said == pytest.approx(solve_json(capsys, world, '--norm', 'l2')['final_cost'], rel=1e-6)
 
 
 @pytest.mark.parametrize('lines, line, words', [

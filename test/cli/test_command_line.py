@@ -105,6 +105,12 @@ def test_a_full_disk_is_one_line(graph, arguments):
     assert (done.returncode, done.stderr) == (2, 'l1slam: No space left on device\n')
 
 
+def test_a_notebook_may_draw(graph):
+    inline = os.environ | {'MPLBACKEND': 'of_another_environment'}
+    done = l1slam('plot', graph, '--output', graph.with_suffix('.png'), env=inline)
+    assert (done.returncode, done.stderr) == (0, '')
+
+
 @pytest.mark.parametrize('typed, offered', [
     ('l1slam so', ['solve ']), ('l1slam solve a.g2o --norm ', ['l1', 'group-l1', 'l2', 'huber']),
     ('l1slam solve a.g2o --no-r', ['--no-robust ']),

@@ -168,8 +168,9 @@ def test_a_graph_without_stamps_is_said_to_have_none(tmp_path):
 
 
 def test_the_command_says_over_how_many_poses(capsys, tmp_path, monkeypatch):
-    """`bag` stands for the input, where nothing is called so."""
+    """`bag` stands for an input that is one, whatever else is called so."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / 'bag').mkdir()
     assert main(['simulate', 'world', '--poses', '120', '--edges', '200']) == 0
     ate = []
     for truth in ('world.truth.txt', 'world:/ground_truth', 'bag:/ground_truth'):

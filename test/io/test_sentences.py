@@ -2,6 +2,7 @@
 """What people are told of the loops that were refused, and of the noise."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -92,6 +93,14 @@ NOISY_LOOPS = ('the loops are about {} times as noisy as they say: a false one t
     ((6.25, 20.25), [NOISY_ODOMETRY.format('2.5'), NOISY_LOOPS.format('4.5')])])
 def test_what_is_twice_as_noisy_as_it_says_or_more_is_told_last(record, variance, said):
     assert list(judgement_sentences(record, judgement(suspect=[5], variance=variance)))[2:] == said
+
+
+def test_a_map_of_other_noise_than_is_stated_is_told(record):
+    found = judgement(suspect=[5])
+    said, more = (list(judgement_sentences(record, one))
+                  for one in (found, replace(found, noise=2 * found.noise)))
+    assert more == [*said, 'the loops of a place err together: in the map each place counts as '
+                    'one loop, and all are as noisy as was found']
 
 
 @pytest.mark.parametrize('stamps, when', [

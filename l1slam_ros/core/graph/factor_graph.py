@@ -9,6 +9,8 @@ stays valid while the graph grows. Poses live outside, in (n, p) arrays.
 
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 
@@ -86,16 +88,28 @@ class FactorGraph:
     ----------
     manifold : the module the poses live on, e.g. `se2`
 
+    Attributes
+    ----------
+    n_poses : how many keyframes exist
+    said : how often a person changed what counts, see `say`
+
     """
 
     def __init__(self, manifold: Manifold):
         self.manifold = manifold
-        self.n_poses = 0
+        self.n_poses = self.said = 0
         p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
         self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
                          GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_),
                          GrowingArray((), np.bool_)]
         self._factors: BetweenFactors | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all, the manifold by its name: modules are not pickled, nor deeply copied."""
+        return {**vars(self), 'manifold': vars(self.manifold)['__name__']}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, manifold=import_module(state['manifold']))
 
     def copy(self) -> 'FactorGraph':
         """Return a graph that shares all factors so far; either may grow without the other."""
@@ -194,7 +208,7 @@ class FactorGraph:
             # What was seen of the column before stays as it was.
             self._between[column] = GrowingArray((), np.bool_)
             self._between[column].extend(said)
-        self._factors = None
+        self._factors, self.said = None, self.said + 1
 
 
 def component_labels(graph: FactorGraph) -> Indices:

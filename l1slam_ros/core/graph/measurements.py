@@ -15,6 +15,11 @@ FASTEST, SHORTEST_STEP = 340.0, 0.1
 LONGEST_PAUSE = 60.0
 # Two printed digits stay below; an unset or broken quaternion does not.
 QUATERNION_NORM_ERROR = 0.1
+# [m] No robot's coordinates: beyond, differences of positions lose the millimetre, then overflow.
+FARTHEST = 1e9
+# [ns] As far from 0 the difference of two stamps still has 64 bits.
+_LATEST = 2**62
+_SHAPES = {'pose3': (7,), 'covariance': (6, 6), 'twist_covariance': (6, 6)}
 
 
 @dataclass(frozen=True)
@@ -70,19 +75,23 @@ def require_sound(what: OdometrySample | LoopClosure) -> None:
 
     Raises
     ------
-    MessageError : with the cause `stamp`, `shape`, `not_finite` or `quaternion`.
+    MessageError : with the cause `stamp`, `shape`, `not_finite`, `range` or `quaternion`.
 
     """
     stamps = what.stamps if isinstance(what, LoopClosure) else (what.stamp,)
-    if not all(isinstance(stamp, Integral) for stamp in stamps):
-        raise MessageError('stamp', f'stamp {stamps}; expected whole nanoseconds')
-    shapes = [getattr(array, 'shape', None) for array in (what.pose3, what.covariance)]
-    if shapes != [(7,), (6, 6)]:
-        raise MessageError('shape', f'pose3 of shape {shapes[0]}, covariance of {shapes[1]}; '
-                           'expected arrays (7,) and (6, 6)')
+    if not all(isinstance(stamp, Integral) and -_LATEST <= stamp <= _LATEST
+               for stamp in stamps):
+        raise MessageError('stamp', f'stamp {stamps}; expected whole nanoseconds to 2^62')
+    for name, expected in _SHAPES.items():
+        shape = getattr(getattr(what, name, None), 'shape', None)
+        if hasattr(what, name) and shape != expected:
+            raise MessageError('shape', f'{name} of shape {shape}; expected an array {expected}')
     pose3 = what.pose3.tolist()
     if not all(map(math.isfinite, pose3)):
         raise MessageError('not_finite', f'pose {what.pose3}; expected finite numbers')
+    if max(map(abs, pose3[:3])) > FARTHEST:
+        raise MessageError('range', f'position {what.pose3[:3]}; expected it within '
+                           f'{FARTHEST:g} m')
     norm = math.hypot(*pose3[3:])
     if abs(norm - 1) > QUATERNION_NORM_ERROR:
         raise MessageError('quaternion', f'quaternion {what.pose3[3:]} of norm {norm:g}; '

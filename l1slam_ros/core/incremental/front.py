@@ -80,7 +80,7 @@ class Front:
 
     Attributes
     ----------
-    rows : how many of them it knows
+    rows : how many of them it knows; taken : of these have come since it was made
     closed : it takes no more
 
     Raises
@@ -91,7 +91,7 @@ class Front:
 
     def __init__(self, part: FactorGraph, poses: tuple[Array, Array],
                  choleskys: tuple[BlockCholesky, BlockCholesky], gate: Gate, rows: int):
-        self.rows, self.closed = rows, False
+        self.rows, self.taken, self.closed = rows, 0, False
         system, k = linearise(part, poses[L1]), part.manifold.TANGENT_SIZE
         # What a square stays below, and the log ratio but for what hangs on the factor.
         self._limit = float(chi2_quantile(1 - _REFUSED, np.array([k]))[0])
@@ -121,7 +121,7 @@ class Front:
     @property
     def newest(self) -> Array:
         """The pose of the last keyframe it knows, (1, p)."""
-        return self._map.poses(np.array([self.keyframes - 1]))[:, L1]
+        return self._map.newest
 
     def covariance(self, keyframe: int) -> Array:
         """Return the covariance of a keyframe's step from the L2 map, (k, k)."""
@@ -146,6 +146,7 @@ class Front:
             if look is None:
                 break
             self.rows += 1
+            self.taken += 1
             looks.append(look)
         return looks
 

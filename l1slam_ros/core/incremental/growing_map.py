@@ -106,9 +106,12 @@ class GrowingMap:
         return (View(self._manifold, first[:, L1], self.fixed, self._borders[L1].steps()),
                 View(self._manifold, first[:, L2], self.fixed, self._borders[L2].steps()))
 
-    def poses(self, keyframes: Indices) -> Array:
-        """Return where keyframes are by both weightings, (m, 2, p)."""
-        return self._moved(keyframes)[2]
+    @property
+    def newest(self) -> Array:
+        """The L1 pose of the last keyframe, (1, p)."""
+        last = len(self) - 1
+        step = self._borders[L1].step([max(last - self.fixed, FIXED)])
+        return self._manifold.retract(self._first.view()[last:last + 1, L1], step)
 
     def covariance(self, keyframe: int) -> Array:
         """Return the covariance of the step of a keyframe in the L2 map, (k, k)."""
@@ -132,19 +135,17 @@ class GrowingMap:
         for row in np.flatnonzero((pairs >= len(self._first)).any(axis=1)).tolist():
             if pairs[row].max() == len(self._first):
                 step = Z[row] if pairs[row, 1] == len(self._first) else manifold.inverse(Z[row])
-                self._first.extend(manifold.compose(self.poses(pairs[row].min(keepdims=True)),
-                                                    step))
-        keyframes, at = np.unique(pairs, return_inverse=True)
-        at = at.reshape(pairs.shape).T
-        first, steps, poses = self._moved(keyframes)
+                self._first.extend(manifold.compose(
+                    self._moved(pairs[row].min(keepdims=True))[2], step))
+        first, steps, poses = self._moved(pairs.T.ravel())
         p, k = first.shape[2], steps.shape[2]
         Z, root = np.repeat(Z, 2, axis=0), factors.sqrt_information[rows][:len(pairs), None]
-        J = manifold.residual_jacobians(Z, *first[at].reshape(2, -1, p))
-        e = manifold.residual(Z, *poses[at].reshape(2, -1, p)).reshape(-1, 2, k)
+        J = manifold.residual_jacobians(Z, *first.reshape(2, -1, p))
+        e = manifold.residual(Z, *poses.reshape(2, -1, p)).reshape(-1, 2, k)
         sides = [root @ side.reshape(-1, 2, k, k) for side in J]
         residual = (root @ e[..., None])[..., 0]
-        for side, ends in zip(sides, at, strict=True):
-            residual -= (side @ steps[ends][..., None])[..., 0]
+        for side, step in zip(sides, steps.reshape(2, -1, 2, k), strict=True):
+            residual -= (side @ step[..., None])[..., 0]
         return Linearised(np.maximum(pairs - self.fixed, FIXED), np.stack(sides, axis=2), residual)
 
     def begin(self, weighting: int, factors: Linearised, at: int, noise: Array) -> None:

@@ -38,12 +38,13 @@ _QUIET_UPDATES = 5
 @dataclass(frozen=True)
 class Problem:
     """
-    A snapshot to improve: graph, poses (n, p), dual (rows,) and the cost the last update left.
+    A snapshot to improve: graph, poses (n, p), dual (rows,).
 
     map : number of the map that it is of, other after `Backend.reset` and `Backend.restore`;
-    gaps : (g,) keyframes that no odometry joins to the ones before; starts : poses to start from,
-    `poses` the first; judgement : of all factors; robust : loops may be doubted; settled : nothing
-    has come since an update that converged; may_be_far : there is news that no front knows.
+    last_cost : the cost that the last update left, for as many factors as there are now; gaps :
+    (g,) keyframes that no odometry joins to the ones before; starts : poses to start from, `poses`
+    the first; judgement : of all factors; robust : loops may be doubted; settled : nothing has
+    come since an update that converged.
     """
 
     map: int
@@ -55,7 +56,6 @@ class Problem:
     robust: bool
     last_cost: float
     settled: bool
-    may_be_far: bool
 
     @property
     def poses(self) -> Array:
@@ -245,7 +245,7 @@ class Snapshot:
         grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
         settled = not (grown or self.stale) and self.judgement.settled and last.at_rest
         return Problem(self.map, self.graph, self.gaps, starts, dual, self.judgement, self.robust,
-                       last.cost, settled, self.stale or not self.views)
+                       last.cost * rows / max(len(last.dual), 1), settled)
 
     def known(self) -> Optimised:
         """Return what was made, of all keyframes and factors that there are."""

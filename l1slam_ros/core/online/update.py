@@ -30,14 +30,23 @@ from l1slam_ros.core.solvers.nonlinear import (
     is_far,
     minimise,
 )
-from l1slam_ros.core.solvers.optimality import Status, l1_cost, l2_cost, smoothing
+from l1slam_ros.core.solvers.optimality import (
+    Status,
+    fits_exactly,
+    l1_cost,
+    l2_cost,
+    smoothing,
+)
 from l1slam_ros.core.solvers.reweighting import reweighted_step, weighted_least_squares
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 
+# Where the weights of reweighted steps turn over, in mean |e|: at first, from one to the next, and
+# at last.
+_SMOOTHING, _SHARPER, _SHARPEST = 0.1, 0.3, 1e-2
 # Linearisations of one round, and iterations of one where a front carries what is far: more and
 # it is late.
-_OUTER, _INNER = 2, 80
+_OUTER, _INNER = 2, 120
 # Steps of Gauss-Newton that the gate's map gets each time it is made.
 _L2_STEPS = 4
 
@@ -99,10 +108,10 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
 
     exact : to the end instead, where that is done by factorisations
 
-    Without: where no front has, and the cost is far above what the last map left (a loop has
-    closed), reweighted least squares steps carry the long-range part: one factorisation bends the
-    whole chain, where a first-order method moves it a few keyframes per iteration. Then, always,
-    Algorithm 4 from the kept dual.
+    Without: where the cost is far above what the last map left (a loop has closed), reweighted
+    least squares steps carry the long-range part: one factorisation bends the whole chain, where a
+    first-order method moves it a few keyframes per iteration. Then, always, Algorithm 4 from the
+    kept dual.
     """
     start = time.monotonic()
     graph, method, deadline = problem.part, problem.method, start + budget
@@ -111,11 +120,12 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
         solution, _ = minimise_by(method, graph, poses, options, lambda *_: check())
         return _improvement(solution, problem, problem.judgement, before, 0, start)
     dual = _dual_of(problem, poses)
-    steps, far = 0, problem.may_be_far and is_far(cost, problem.last_cost)
+    steps, far = 0, not fits_exactly(cost, len(dual)) and is_far(cost, problem.last_cost)
     while method.cholesky and far and (not steps or time.monotonic() < deadline):
         check()
         system = linearise(graph, poses)
-        step, dual = reweighted_step(system, method.cholesky, system.b, smoothing(system.b))
+        mu = max(_SMOOTHING * _SHARPER**steps, _SHARPEST) * smoothing(system.b)
+        step, dual = reweighted_step(system, method.cholesky, system.b, mu)
         previous = cost
         poses, cost = backtrack(graph, poses, step, cost)
         steps += 1
@@ -212,7 +222,7 @@ def optimise(problem: Problem, options: OptimiserOptions,
 def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
             check: Check) -> Solution:
     check()
-    method = choose(AUTO, graph, options.norm)
+    method = choose(AUTO, graph, options.norm, options.loop_norm)
     return minimise_by(method, graph, poses, options, lambda *_: check())[0]
 
 

@@ -18,15 +18,15 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import bridged, odometry_gaps
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch import Report as OnRound
 from l1slam_ros.core.robust.batch import RobustMap, minimise_robustly
 from l1slam_ros.core.robust.inspection import initial_poses, require_connected
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
-from l1slam_ros.core.solvers.optimality import norm_of
 from l1slam_ros.core.solvers.seed import seed_poses
-from l1slam_ros.core.solvers.solve import AUTO, Method, choose, minimise_by
+from l1slam_ros.core.solvers.solve import AUTO, Method, choose, minimise_by, norm_for
 
 # A graph with more gaps than this part of its steps is none of a robot that kept its odometry.
 _MOST_GAPS = 0.1
@@ -43,6 +43,7 @@ class SolveOptions:
 
     start: str = 'seed'
     norm: str = 'l1'
+    loop_norm: str = SAME
     solver: str = AUTO
     robust: bool | None = None
     options: OptimiserOptions = OptimiserOptions()
@@ -148,7 +149,7 @@ class _Minimiser:
 
     def choose(self, graph: FactorGraph) -> Method:
         """Return what the graph is solved by."""
-        return choose(self._asked.solver, graph, self._asked.norm)
+        return choose(self._asked.solver, graph, self._asked.norm, self._asked.loop_norm)
 
     def minimise(self, graph: FactorGraph, poses: Array) -> Solution:
         """Return the solution from poses (n, p)."""
@@ -166,7 +167,7 @@ class _Minimiser:
 
 def cost_function(graph: FactorGraph, asked: SolveOptions) -> Callable[[Array], float]:
     """Return what is to be minimised, as a function of the poses."""
-    norm = norm_of(asked.norm, graph.manifold.TANGENT_SIZE, asked.least_squares.huber_delta)
+    norm = norm_for(graph, asked.norm, asked.loop_norm, asked.least_squares.huber_delta)
     return lambda poses: norm.cost(whitened_residual(graph, poses))
 
 

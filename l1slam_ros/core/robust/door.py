@@ -9,7 +9,7 @@ from l1slam_ros.core.errors import GraphError, OptionError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.names import NORMS
+from l1slam_ros.core.names import NORMS, SAME
 from l1slam_ros.core.robust import batch_map
 
 
@@ -30,7 +30,7 @@ class Solution:
 
 
 def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
-          start: Array | None = None) -> Solution:
+          start: Array | None = None, loop_norm: str = SAME) -> Solution:
     """
     Return the map of a graph.
 
@@ -42,6 +42,7 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
     robust : refuse loops that cannot be believed; False: believe all
     start : (n, p) poses to begin with; None: a seed computed from the graph alone, as a robust
         solve does in any case
+    loop_norm : of loops and absolute poses; same: as `norm`
 
     Raises
     ------
@@ -52,6 +53,9 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
     """
     if norm not in NORMS:
         raise OptionError(f'norm is {norm!r}, expected one of {", ".join(NORMS)}')
+    if loop_norm not in (SAME, *NORMS):
+        raise OptionError(f'loop_norm is {loop_norm!r}, expected one of '
+                          f'{", ".join((SAME, *NORMS))}')
     expected = (graph.n_poses, graph.manifold.POSE_SIZE)
     if start is not None:
         if np.shape(start) != expected:
@@ -63,7 +67,8 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
         if not (finite := np.isfinite(start).all(axis=1)).all():
             raise GraphError(f'start of keyframe {int(np.argmin(finite))} is no pose; expected '
                              'finite numbers')
-    asked = batch_map.SolveOptions('seed' if start is None else 'file', norm, robust=robust)
+    asked = batch_map.SolveOptions('seed' if start is None else 'file', norm, loop_norm,
+                                   robust=robust)
     outcome = batch_map.solve(graph, start, asked)
     judgement, status = outcome.judgement, outcome.solution.status.value
     if judgement is None:

@@ -131,8 +131,9 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:
         group = strongest_group(growth, rows)
         if len(group.places) < SPANNING:
             break
-        if np.isin(group.rows, left_out).any():
-            common = common_steps(growth, group)
+        common = common_steps(growth, group)
+        common = common[~growth.cut[common]]
+        if len(common) and np.isin(group.rows, left_out).any():
             suspects.append(int(common[np.argmax(odds[common])]))
         rows = np.setdiff1d(rows, group.rows)
     return list(dict.fromkeys(suspects))
@@ -142,7 +143,7 @@ def common_steps(growth: Growth, group: Group) -> Indices:
     """Return the odometry that most of a group span, (k,)."""
     across = spanned(growth.low[group.rows], growth.high[group.rows], growth.graph.n_poses)
     common = np.flatnonzero(across == across.max())
-    steps: Indices = np.flatnonzero(~growth.is_loop & ~growth.cut & np.isin(growth.low, common))
+    steps: Indices = np.flatnonzero(~growth.is_loop & np.isin(growth.low, common))
     return steps
 
 

@@ -19,13 +19,14 @@ from l1slam_ros.core.solvers.nonlinear import Report, Solution
 from l1slam_ros.core.solvers.optimality import Huber, Norm, Status, fits_exactly, l1_cost, l2_cost
 from l1slam_ros.core.solvers.reweighting import weighted_least_squares
 
-# Damping: the first, the least, the most; it falls after a step that lowers the cost by so much of
-# what its linear problem predicts.
+# Damping: the first, the least, the most. A chain's slow bends feel even the least of it.
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 3e-8, 1e6
-_FAITHFUL = 0.9
 # A map to within its noise: Gauss-Newton begins where chi2 is at most so many times what the noise
 # makes of it, and takes so many steps at most.
 _FITS, _NOISE_STEPS = 3, 60
+# Of chi2. What a step was wrong by is to first order in the length of what is left to go, what is
+# left of chi2 to second.
+_SURPRISE = 0.1
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,8 @@ def gauss_newton(
     """
     Minimise a norm, reweighted at each step; arguments as `optimiser.minimise`.
 
-    surprise : a step that lowers the cost by what its linear problem says, but for so much, is the
-    last one
+    surprise : an undamped step that lowers the cost by what its linear problem says, but for so
+    much, is the last one
     """
     residual = whitened_residual(graph, poses)
     history = [norm.cost(residual)]
@@ -91,18 +92,18 @@ def gauss_newton(
         candidate = step_poses(graph, poses, step)
         moved = whitened_residual(graph, candidate)
         cost = norm.cost(moved)
-        decrease, full = history[-1] - cost, damping <= _FIRST_DAMPING
+        decrease = history[-1] - cost
+        full, free = damping <= _FIRST_DAMPING, not damping
         if decrease >= 0:
             poses, residual = candidate, moved
-            if decrease >= _FAITHFUL * predicted:
-                damping = damping / 10 if damping > _LEAST_DAMPING else 0.0
+            damping = damping / 10 if damping > _LEAST_DAMPING else 0.0
         else:
             damping, cost = max(10 * damping, _FIRST_DAMPING), history[-1]
         history.append(cost)
         report(len(history) - 1, cost)
         # By a step as good as undamped; at the optimum rounding may let the cost rise a little.
-        if full and (abs(decrease) <= options.tolerance * cost
-                     or abs(decrease - predicted) < surprise):
+        if (full and abs(decrease) <= options.tolerance * cost) or (
+                free and abs(decrease - predicted) < surprise):
             status = Status.CONVERGED
             break
         if damping > _MOST_DAMPING:
@@ -128,7 +129,7 @@ def l2_map(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
         linear = _two_linear_steps(graph, poses, cholesky)
         poses = linear if _chi2(graph, linear) < chi2 else poses
     options = LeastSquaresOptions(_NOISE_STEPS, 1 / spare)
-    return gauss_newton(graph, poses, Huber(), options, cholesky, report, surprise=1.0).poses
+    return gauss_newton(graph, poses, Huber(), options, cholesky, report, surprise=_SURPRISE).poses
 
 
 def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise, step_poses, whitened_residual
-from l1slam_ros.core.names import NORMS
+from l1slam_ros.core.names import NORMS, SAME
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.optimality import Status, fits_exactly, l1_cost
@@ -41,6 +41,9 @@ class OptimiserOptions(Options):
     norm: str = option(
         NORMS[0], 'what `l1slam` and `~/optimize` minimise; updates on the way minimise l1', '',
         choices=NORMS)
+    loop_norm: str = option(
+        SAME, 'what is minimised of loops and absolute poses; same: as of odometry', '',
+        choices=(SAME, *NORMS))
     outer_iterations: int = option(60, 'most linearisations of one solve', '', 0, 10**6)
     outer_tolerance: float = option(
         1e-6, 'converged when the cost fell by less than this part of itself twice in a row',

@@ -7,14 +7,19 @@ Nothing here trusts what a solver says of its own result.
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
+
+
+# Of the curvature across a length so much is left along it, or rounding would make it negative.
+_CURVED = 1e-9
 
 
 class Status(str, Enum):
@@ -45,6 +50,14 @@ def l2_cost(residual: Array) -> float:
     return float((residual * residual).sum())
 
 
+class Smoothed(NamedTuple):
+    """A norm without corners at e (m, k): cost, gradient (m, k), curvature (m, k, k)."""
+
+    cost: float
+    gradient: Array
+    curvature: Array
+
+
 class Norm(Protocol):
     """
     What is minimised of a whitened residual r (rows,), F(r), and what goes with it.
@@ -68,6 +81,19 @@ class Norm(Protocol):
 
     def gap(self, residual: Array, dual: Array) -> float:
         """Return F(r) + F*(y) - y'r, 0 or more; with A'y = 0 what a linear problem can lose."""
+
+
+class SmoothNorm(Norm, Protocol):
+    """A norm of factors, which Newton's method minimises with their duals y, (m, k)."""
+
+    def smoothed(self, e: Array, y: Array, mu: float) -> Smoothed:
+        """Return F near e (m, k), each corner rounded by mu, to be minimised with the dual y."""
+
+    def reach(self, y: Array, dy: Array) -> float:
+        """Return how far a dual can go along dy until it has left what may be."""
+
+    def slack(self, y: Array) -> Array:
+        """Return how far each row of a dual may move, (rows,)."""
 
 
 @dataclass(frozen=True)
@@ -99,43 +125,147 @@ class Lengths:
         """See `Norm`; F* is 0 for a dual no longer than 1."""
         return self.cost(residual) - float((dual * residual).sum())
 
+    def smoothed(self, e: Array, y: Array, mu: float) -> Smoothed:
+        """See `SmoothNorm`: R = sqrt(|e|^2 + mu^2); (I - (y e' + e y') / 2 R) / R."""
+        groups = e.reshape(-1, self.size)
+        R = np.sqrt((groups * groups).sum(axis=1, keepdims=True) + mu * mu)
+        d = groups / R
+        crossed = (1 - _CURVED) * y.reshape(groups.shape)[:, :, None] * d[:, None, :]
+        W = (np.eye(self.size) - (crossed + crossed.transpose(0, 2, 1)) / 2) / R[:, :, None]
+        if self.size == 1:
+            W = W.reshape(*e.shape, 1) * np.eye(e.shape[1])
+        return Smoothed(float(R.sum()), d.reshape(e.shape), W)
+
+    def reach(self, y: Array, dy: Array) -> float:
+        """See `SmoothNorm`."""
+        y, dy = y.reshape(-1, self.size), dy.reshape(-1, self.size)
+        a, b = (dy * dy).sum(axis=1), (y * dy).sum(axis=1)
+        c = np.maximum(1 - (y * y).sum(axis=1), 0.0)
+        # The larger root of |y + t dy| = 1, without cancellation where dy is small.
+        root = np.sqrt(b * b + a * c)
+        reach = np.where(b > 0, c / np.maximum(b + root, 1e-300),
+                         (root - b) / np.maximum(a, 1e-300))
+        return float(reach.min(initial=np.inf))
+
+    def slack(self, y: Array) -> Array:
+        """See `SmoothNorm`."""
+        return np.repeat(1 - _lengths(y, self.size), self.size)
+
 
 @dataclass(frozen=True)
 class Huber:
     """
-    Sum of rho(s) over the lengths s of the groups, s^2 up to delta, 2 delta s - delta^2 beyond.
+    Sum of scale rho(s) over the lengths s of groups, s^2 up to delta, 2 delta s - delta^2 beyond.
 
     That is g2o's. With delta infinite it is chi2, L2 without a half.
     """
 
     size: int = 1
     delta: float = np.inf
+    scale: float = 1.0
 
     def cost(self, residual: Array) -> float:
         """See `Norm`."""
         length = _lengths(residual, self.size)
         if self.delta == np.inf:
-            return float((length * length).sum())
-        return float(np.where(length <= self.delta, length**2,
-                              2 * self.delta * length - self.delta**2).sum())
+            return self.scale * float((length * length).sum())
+        return self.scale * float(np.where(length <= self.delta, length**2,
+                                           2 * self.delta * length - self.delta**2).sum())
 
     def weights(self, residual: Array) -> Array:
         """See `Norm`."""
         if self.delta == np.inf:
-            return np.ones_like(residual)
+            return np.full_like(residual, self.scale)
         length = np.maximum(_lengths(residual, self.size), self.delta)
-        return np.repeat(self.delta / length, self.size)
+        return np.repeat(self.scale * self.delta / length, self.size)
 
     def resolvent(self, dual: Array, sigma: Array | float) -> Array:
-        """See `Norm`: y / (1 + sigma / 2), no longer than 2 delta."""
-        dual = dual / (1 + np.asarray(sigma) / 2)
-        excess = _lengths(dual, self.size) / (2 * self.delta)
+        """See `Norm`: y / (1 + sigma / 2 scale), no longer than 2 delta scale."""
+        dual = dual / (1 + np.asarray(sigma) / (2 * self.scale))
+        excess = _lengths(dual, self.size) / (2 * self.delta * self.scale)
         nearest: Array = dual / np.repeat(np.maximum(excess, 1.0), self.size)
         return nearest
 
     def gap(self, residual: Array, dual: Array) -> float:
-        """See `Norm`; F* is |y|^2 / 4."""
-        return self.cost(residual) + l2_cost(dual) / 4 - float((dual * residual).sum())
+        """See `Norm`; F* is |y|^2 / 4 scale."""
+        return (self.cost(residual) + l2_cost(dual) / (4 * self.scale)
+                - float((dual * residual).sum()))
+
+    def smoothed(self, e: Array, y: Array, mu: float) -> Smoothed:
+        """See `SmoothNorm`; it has no corner, and is reweighted."""
+        weights = 2 * self.weights(e.ravel()).reshape(e.shape)
+        return Smoothed(self.cost(e.ravel()), weights * e,
+                        weights[:, :, None] * np.eye(e.shape[1]))
+
+    def reach(self, y: Array, dy: Array) -> float:
+        """See `SmoothNorm`; the dual is the derivative, whatever it was before."""
+        return np.inf
+
+    def slack(self, y: Array) -> Array:
+        """See `SmoothNorm`: to its bound, but no further than for a residual of one sigma."""
+        left = 2 * self.delta * self.scale - _lengths(y, self.size)
+        return np.repeat(np.clip(left, 0.0, 2 * self.scale), self.size)
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """
+    One norm of odometry, another one of loops and absolute poses.
+
+    parts : both, and which of the m factors each is of, (m,) bool
+    """
+
+    parts: tuple[tuple[SmoothNorm, Mask], ...]
+
+    @property
+    def size(self) -> int:
+        """See `Norm`."""
+        return max(norm.size for norm, _ in self.parts)
+
+    def cost(self, residual: Array) -> float:
+        """See `Norm`."""
+        return sum(norm.cost(r) for norm, r in self._split(residual))
+
+    def weights(self, residual: Array) -> Array:
+        """See `Norm`."""
+        return self._joined([norm.weights(r) for norm, r in self._split(residual)])
+
+    def resolvent(self, dual: Array, sigma: Array | float) -> Array:
+        """See `Norm`."""
+        sigmas = self._split(np.broadcast_to(sigma, dual.shape))
+        return self._joined([norm.resolvent(y, s) for (norm, y), (_, s) in zip(
+            self._split(dual), sigmas, strict=True)])
+
+    def gap(self, residual: Array, dual: Array) -> float:
+        """See `Norm`."""
+        return sum(norm.gap(r, y) for (norm, r), (_, y) in zip(
+            self._split(residual), self._split(dual), strict=True))
+
+    def smoothed(self, e: Array, y: Array, mu: float) -> Smoothed:
+        """See `SmoothNorm`."""
+        gradient, curvature, cost = np.empty_like(e), np.empty((*e.shape, e.shape[1])), 0.0
+        for norm, own in self.parts:
+            part, gradient[own], curvature[own] = norm.smoothed(e[own], y[own], mu)
+            cost += part
+        return Smoothed(cost, gradient, curvature)
+
+    def reach(self, y: Array, dy: Array) -> float:
+        """See `SmoothNorm`."""
+        return min(norm.reach(y[own], dy[own]) for norm, own in self.parts)
+
+    def slack(self, y: Array) -> Array:
+        """See `SmoothNorm`."""
+        return self._joined([norm.slack(y[own]) for norm, own in self.parts])
+
+    def _split(self, rows: Array) -> list[tuple[SmoothNorm, Array]]:
+        factors = rows.reshape(len(self.parts[0][1]), -1)
+        return [(norm, factors[own].ravel()) for norm, own in self.parts]
+
+    def _joined(self, found: list[Array]) -> Array:
+        rows = np.empty(sum(map(len, found)))
+        for (_, own), part in zip(self.parts, found, strict=True):
+            rows.reshape(len(own), -1)[own] = part.reshape(np.count_nonzero(own), -1)
+        return rows
 
 
 @dataclass(frozen=True)
@@ -169,16 +299,16 @@ class Largest:
 L1 = Lengths()
 
 
-def norm_of(name: str, size: int, delta: float = np.inf) -> Norm:
-    """Return one of `names.NORMS` for factors of so many rows; delta : of Huber."""
-    norms: dict[str, Norm] = {'l1': L1, 'group-l1': Lengths(size), 'l2': Huber(),
-                              'huber': Huber(size, delta)}
+def norm_of(name: str, size: int, delta: float = np.inf, scale: float = 1.0) -> SmoothNorm:
+    """Return one of `names.NORMS` for factors of so many rows; delta, scale : of Huber."""
+    norms: dict[str, SmoothNorm] = {'l1': L1, 'group-l1': Lengths(size), 'l2': Huber(scale=scale),
+                                    'huber': Huber(size, delta, scale)}
     return norms[name]
 
 
 def _lengths(rows: Array, size: int) -> Array:
     if size == 1:
-        return np.abs(rows)
+        return np.abs(rows).ravel()
     groups = rows.reshape(-1, size)
     length: Array = np.sqrt((groups * groups).sum(axis=1))
     return length

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.names import NORMS, SOLVERS
+from l1slam_ros.core.names import NORMS, SAME, SOLVERS
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, cholesky_of
 from l1slam_ros.core.solvers.exact import minimise_interior_point
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, gauss_newton
-from l1slam_ros.core.solvers.group_l1 import minimise_group_l1
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution, minimise
-from l1slam_ros.core.solvers.optimality import Status, norm_of
+from l1slam_ros.core.solvers.optimality import Mixed, SmoothNorm, Status, norm_of
+from l1slam_ros.core.solvers.primal_dual_newton import minimise_norm
 
 AUTO, PRIMAL_DUAL, INTERIOR_POINT = SOLVERS
 L1_NORM, GROUP_L1_NORM, *_ = NORMS
@@ -39,7 +39,7 @@ class Method:
 
     cholesky : of the graph, None where it fills in too much; solver : of `SOLVERS`, not `auto`;
     reason : a clause that says why; falls_back : another solver may go on where it fails; norm :
-    what is minimised.
+    what is minimised of odometry; loop_norm : of all else.
     """
 
     cholesky: BlockCholesky | None
@@ -47,19 +47,37 @@ class Method:
     reason: str
     falls_back: bool = False
     norm: str = L1_NORM
+    loop_norm: str = SAME
 
 
-def choose(solver: str, graph: FactorGraph, norm: str = L1_NORM) -> Method:
+def norm_for(graph: FactorGraph, norm: str, loop_norm: str, delta: float) -> SmoothNorm:
+    """
+    Return what is minimised of the odometry and of all other factors; delta : of Huber.
+
+    L2 and Huber count half where they are mixed with another norm: at one sigma a factor then
+    pulls as hard as in L1, and of normal noise they are the log density.
+    """
+    k, is_odometry = graph.manifold.TANGENT_SIZE, graph.between.is_odometry
+    if loop_norm in (SAME, norm):
+        return norm_of(norm, k, delta)
+    return Mixed(((norm_of(norm, k, delta, 0.5), is_odometry),
+                  (norm_of(loop_norm, k, delta, 0.5), ~is_odometry)))
+
+
+def choose(solver: str, graph: FactorGraph, norm: str = L1_NORM, loop_norm: str = SAME) -> Method:
     """
     Resolve one of `SOLVERS`: `auto` goes by the predicted work of a factorisation.
 
-    Norms other than L1 have one solver each.
+    Norms other than L1 have one solver each, and mixed ones another.
 
     Raises
     ------
     FillError : what was asked for needs a factorisation, and the graph fills in.
 
     """
+    if loop_norm not in (SAME, norm):
+        return Method(cholesky_of(graph), PRIMAL_DUAL_NEWTON,
+                      f'the norm is {norm}, of loops {loop_norm}', False, norm, loop_norm)
     if norm != L1_NORM:
         found_by = PRIMAL_DUAL_NEWTON if norm == GROUP_L1_NORM else GAUSS_NEWTON
         return Method(cholesky_of(graph), found_by, f'the norm is {norm}', norm=norm)
@@ -89,11 +107,11 @@ def minimise_by(
     its best poses.
     """
     cholesky = method.cholesky
+    least_squares = least_squares or LeastSquaresOptions()
+    norm = norm_for(graph, method.norm, method.loop_norm, least_squares.huber_delta)
     if cholesky and method.solver == PRIMAL_DUAL_NEWTON:
-        return minimise_group_l1(graph, poses, options, cholesky, report), method.solver
+        return minimise_norm(graph, poses, norm, options, cholesky, report), method.solver
     if cholesky and method.solver == GAUSS_NEWTON:
-        least_squares = least_squares or LeastSquaresOptions()
-        norm = norm_of(method.norm, graph.manifold.TANGENT_SIZE, least_squares.huber_delta)
         return gauss_newton(graph, poses, norm, least_squares, cholesky, report), method.solver
     if method.solver == PRIMAL_DUAL or cholesky is None:
         return minimise(graph, poses, options, cholesky, report=report), PRIMAL_DUAL

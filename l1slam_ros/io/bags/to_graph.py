@@ -45,6 +45,7 @@ from l1slam_ros.io.trajectory import Reference
 from l1slam_ros.io.wording import counted
 
 _ODOMETRY = 'nav_msgs/msg/Odometry'
+_EVERY = KeyframeOptions(0.0, 0.0, 0.0)
 # What a topic of true poses may be of.
 _POSES = ('geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PoseWithCovarianceStamped',
           'geometry_msgs/msg/TransformStamped', 'nav_msgs/msg/Odometry')
@@ -58,8 +59,8 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
     Parameters
     ----------
     path : a rosbag2 directory, .mcap, .db3 or .bag
-    options : what makes keyframes of messages; None: what the bag's note says, or the node's
-        defaults
+    options : what makes keyframes of messages; None: the node's defaults. Where the bag's note
+        says it otherwise, defaults give way
     topics : where to look
     dimension : of the world; a bag that notes 3 is in space anyway
 
@@ -70,13 +71,14 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
     """
     note = read_note(path)
     in_space = dimension == 3 or note.get('dimension') == SPACE_NOTE['dimension']
-    growing = _Growing(se3 if in_space else se2, options or _noted_options(note), topics,
+    options = _noted_options(options or GraphBuilderOptions(), note)
+    growing = _Growing(se3 if in_space else se2, options, topics,
                        note.get('messages') == VERBATIM_NOTE['messages'])
     damage: list[str] = []
     for message in read_messages(path, topics.types(), damage.append):
         growing.take(message)
     record = growing.record('; '.join(damage))
-    if options is None:
+    if options.keyframe == _EVERY:
         record = replace(record, graph=turned(record.graph, _noted_turns(record.graph, note)))
     if record.graph.n_poses < 2:
         raise FileError(path, '; '.join([
@@ -201,12 +203,13 @@ def read_truth_topic(path: Path, topic: str, manifold: Manifold = se2) -> Refere
     return Reference(stamps, poses, stamped=True, skipped=(*skipped, *damage))
 
 
-def _noted_options(note: dict[str, str]) -> GraphBuilderOptions:
-    options = GraphBuilderOptions()
-    if note.get('keyframes') == GRAPH_NOTE['keyframes']:
-        options = replace(options, keyframe=KeyframeOptions(0.0, 0.0, 0.0))
-    if note.get('covariance') == GRAPH_NOTE['covariance']:
-        options = replace(options, odometry=OdometryOptions(GRAPH_NOTE['covariance']))
+def _noted_options(options: GraphBuilderOptions, note: dict[str, str]) -> GraphBuilderOptions:
+    """Return the options with what the note says in the place of defaults."""
+    every, source = GRAPH_NOTE['keyframes'], GRAPH_NOTE['covariance']
+    if note.get('keyframes') == every and options.keyframe == KeyframeOptions():
+        options = replace(options, keyframe=_EVERY)
+    if note.get('covariance') == source and options.odometry == OdometryOptions():
+        options = replace(options, odometry=OdometryOptions(source))
     return options
 
 

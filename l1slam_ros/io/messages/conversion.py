@@ -28,6 +28,7 @@ from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import silent_components
 from l1slam_ros.core.graph.measurements import (
+    FARTHEST,
     QUATERNION_NORM_ERROR,
     LoopClosure,
     OdometrySample,
@@ -42,8 +43,6 @@ _MAX_SECONDS = 2**31 - 1
 _ORDERS = {0: '>', 1: '<'}
 # Of an Odometry position, orientation, and their covariance; then the twist, and its covariance.
 _DOUBLES = 7 + 36 + 6 + 36
-# [m] No robot's coordinates: beyond, differences of positions lose the millimetre, then overflow.
-_FARTHEST = 1e9
 
 
 def odometry_sample(message: Any) -> OdometrySample:
@@ -215,8 +214,8 @@ def sound_pose3(position: tuple[float, ...], quaternion: tuple[float, ...]) -> A
     """Return a pose (7,) of x y z and qx qy qz qw; see `checked_pose3`."""
     if not all(map(math.isfinite, position + quaternion)):
         raise MessageError('not_finite', f'pose {position} {quaternion}; expected finite numbers')
-    if max(map(abs, position)) > _FARTHEST:
-        raise MessageError('range', f'position {position}; expected it within {_FARTHEST:g} m')
+    if max(map(abs, position)) > FARTHEST:
+        raise MessageError('range', f'position {position}; expected it within {FARTHEST:g} m')
     norm = math.hypot(*quaternion)
     if abs(norm - 1.0) > QUATERNION_NORM_ERROR:
         raise MessageError('quaternion', f'quaternion {quaternion} of norm {norm:g}; expected 1')

@@ -26,8 +26,3 @@ def test_factors_are_sorted_by_keyframe_and_padded_with_the_scratch_slot(rng):
                        keyframe[np.lexsort((keyframe[:, 1], keyframe[:, 0]))])
     assert_array_equal(first[20:], 10)
     assert_array_equal(second[20:], 10)
-
-
-def test_padding_is_zero(rng):
-    tiles = Tiles(rng.integers(0, 3, (5, 2)), 3, 4)
-    assert_array_equal(tiles.pack(np.ones((5, 2)))[1, :, 1:], 0)

@@ -111,6 +111,21 @@ def test_a_solve_to_the_end_is_as_good(world):
     assert_array_equal(backend.poses, solved.poses)
 
 
+def test_a_solve_to_the_end_minimises_the_norms_that_were_asked_for(world):
+    backend = Backend(EVERY)
+    play(backend, world)
+    problem = backend.snapshot().problem()
+    mixed, l1 = (optimise(problem, OptimiserOptions(norm=norm, loop_norm=loop_norm))
+                 for norm, loop_norm in (('l2', 'l1'), ('l1', 'same')))
+
+    def cost_at(poses):
+        rows = whitened_residual(problem.graph, poses).reshape(-1, 3)
+        odometry = problem.graph.between.is_odometry
+        return (rows[odometry] ** 2).sum() / 2 + np.abs(rows[~odometry]).sum()
+
+    assert mixed.cost == pytest.approx(cost_at(mixed.poses)) and mixed.cost < cost_at(l1.poses)
+
+
 def test_nothing_to_do_is_none(world):
     backend = Backend(EVERY)
     assert backend.update(PLENTY) is None
@@ -207,13 +222,6 @@ def test_small_budgets_judge_to_the_end(world):
 
 
 # What is seen from outside
-
-
-def test_before_an_update_the_poses_are_the_odometry(world):
-    backend = Backend(EVERY)
-    play(backend, world, 0, 20)
-    assert_allclose(backend.poses, world.odometry[:20], atol=1e-12)
-    assert_allclose(backend.snapshot().map_to_odom, [[0, 0, 0]], atol=1e-12)
 
 
 def test_map_to_odom_puts_the_last_optimised_keyframe_in_its_place(world):
@@ -380,17 +388,6 @@ def test_at_rest_all_is_judged_from_the_graph_alone(careful, clean_errors):
     assert position_error(backend.poses, careful.truth) < 1.2 * clean_errors[-1] + 0.1
 
 
-def test_who_does_not_doubt_is_led_astray(careful, clean_errors):
-    """The same lies, believed: what the tests above would not survive."""
-    world = spoilt(careful, 'grouped', 130)
-
-    def look(backend):
-        assert (backend.loop_states().state == ACCEPTED).all()
-
-    errors = errors_on_the_way(world, Backend(CREDULOUS), look)
-    assert errors.max() > 1 > 3 * clean_errors.max()
-
-
 def test_a_trusted_loop_is_accepted_however_absurd(careful):
     """And the other loops are judged by the map that it makes."""
     backend = Backend(EVERY)
@@ -427,14 +424,6 @@ def test_a_loop_is_suspect_until_others_vouch_for_it():
     settled(backend)
     assert (backend.loop_states().state == ACCEPTED).all()
     assert position_error(backend.poses, truth) < 0.5 * drifted
-
-
-def test_a_solve_to_the_end_leaves_a_lone_loop_suspect_too():
-    backend, truth = Backend(EVERY), roundabout(220)
-    drive_roundabout(backend, truth)
-    backend.add_loop(seen(truth, 3, 203))
-    backend.settle()
-    assert backend.loop_states().state.tolist() == [SUSPECT]
 
 
 def test_what_is_not_believed_costs_nothing_and_pulls_at_nothing():
@@ -489,26 +478,6 @@ def test_each_loop_has_a_state_and_its_own_stamps(careful):
                       (seconds(2.0), seconds(50.0)): WAITING}
 
 
-def test_a_loop_just_come_is_suspect_and_has_no_sigmas(careful):
-    backend = Backend(EVERY)
-    play(backend, careful, 0, 60)
-    backend.snapshot().problem()
-    states = backend.loop_states()
-    assert len(states.rows) and (states.state == SUSPECT).all()
-    assert np.isnan(states.sigmas).all()
-
-
-def test_who_stops_doubting_believes_the_loops_to_come(careful):
-    backend, world = Backend(EVERY), spoilt(careful, 'random', 130)
-    play(backend, world, 0, 150)
-    settled(backend)
-    assert (backend.loop_states().state == REJECTED).any()
-    backend.set_options(CREDULOUS)
-    play(backend, world, 150, 180)
-    settled(backend)
-    assert (backend.loop_states().state == ACCEPTED).all()
-
-
 # An earlier run
 
 
@@ -519,16 +488,6 @@ def restored(world, n):
     settled(first)
     second.restore(first.saved())
     return first, second
-
-
-def test_a_restored_map_is_the_map_it_was(world):
-    first, second = restored(world, 80)
-    assert_array_equal(second.poses, first.poses)
-    assert_array_equal(second.snapshot().stamps, first.snapshot().stamps)
-    second.update(PLENTY)
-    # Started anew it may end nearer to the optimum, of which a settled map is within 2e-4.
-    before, after = first.snapshot().problem().last_cost, second.snapshot().problem().last_cost
-    assert (1 - 5e-4) * before <= after <= (1 + 1e-4) * before
 
 
 def test_after_a_restore_odometry_may_begin_anywhere(world):
@@ -690,15 +649,6 @@ def test_options_may_change_on_the_way(world):
     assert len(backend.poses) == 40
 
 
-def test_a_variance_of_nearly_zero_does_not_end_the_map():
-    backend = Backend(EVERY)
-    for k in range(5):
-        backend.add_odometry(odometry(k, (k, 0.0, 0.0), 1e-308 * np.eye(6)))
-    backend.add_loop(loop(0.0, 4.0, (4.1, 0.0, 0.0)))
-    with np.errstate(over='ignore', invalid='ignore'):
-        assert backend.update(PLENTY) is not None
-
-
 def test_whether_loops_are_doubted_can_be_changed_while_it_runs():
     backend = Backend(CREDULOUS)
     for k in range(60):
@@ -717,11 +667,13 @@ def test_whether_loops_are_doubted_can_be_changed_while_it_runs():
 
 @pytest.mark.parametrize('dimension', [2, 3])
 @pytest.mark.parametrize('change, words', [
-    ({'pose3': np.zeros(3)}, r'pose3 of shape \(3,\), covariance of \(6, 6\); expected'),
+    ({'pose3': np.zeros(3)}, r'pose3 of shape \(3,\); expected an array \(7,\)'),
     ({'pose3': [0.0, 0, 0, 0, 0, 0, 1]}, 'pose3 of shape None'),
-    ({'covariance': np.eye(3)}, r'covariance of \(3, 3\)'),
+    ({'covariance': np.eye(3)}, r'covariance of shape \(3, 3\)'),
     ({'pose3': np.array([np.nan, 0, 0, 0, 0, 0, 1])}, 'expected finite numbers'),
+    ({'pose3': np.array([1e200, 0, 0, 0, 0, 0, 1])}, 'expected it within 1e'),
     ({'pose3': np.zeros(7)}, 'of norm 0; expected 1'),
+    ({'stamp': 2**70}, 'expected whole nanoseconds to 2.62'),
     ({'stamp': 2.5}, r'stamp \(.*2.5.*\); expected whole nanoseconds'),
 ])
 def test_what_is_no_measurement_is_refused_and_leaves_no_trace(dimension, change, words):

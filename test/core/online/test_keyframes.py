@@ -74,14 +74,6 @@ def test_with_all_off_any_message_is_a_keyframe():
     assert is_keyframe([(0.0, 0, 0)], 0.0)
 
 
-def test_motion_is_the_product_of_its_increments(rng):
-    increments = rng.standard_normal((20, 3))
-    pose = np.zeros((1, 3))
-    for increment in increments:
-        pose = se2.compose(pose, increment[None])
-    assert_allclose(motion_of(increments, MODEL).pose, pose)
-
-
 def test_covariance_of_two_sigmas():
     assert_allclose(diagonal_covariance(se2, 2.0, 3.0), np.diag([4.0, 4.0, 9.0]))
 
@@ -115,12 +107,6 @@ def test_the_model_does_not_listen_to_the_message():
 # What messages say
 
 
-def test_one_increment_keeps_its_covariance(rng):
-    covariance = random_information(1, rng)[0]
-    motion = motion_of([(1.0, 2.0, 0.3)], INCREMENT, [covariance6(covariance)])
-    assert_allclose(motion.covariance(INCREMENT), covariance)
-
-
 def test_the_covariances_of_increments_add_up_to_first_order(rng):
     """Against the Jacobian of the product by differences: sum J_k S_k J_k'."""
     increments = rng.standard_normal((5, 3))
@@ -139,29 +125,6 @@ def test_the_covariances_of_increments_add_up_to_first_order(rng):
                             - se2.local(motion.pose, ends[1]))[0] / (2 * h)
         expected += J @ covariances[k] @ J.T
     assert_allclose(motion.covariance(INCREMENT), expected, rtol=1e-5, atol=1e-12)
-
-
-def test_the_covariances_of_increments_add_up_to_what_noise_does(rng):
-    """Monte Carlo: 100,000 noisy drives of an arc, seen in the axes of its end."""
-    increments = np.array([(1.0, 0.2, 0.4)] * 4)
-    covariance = np.array([[4.0, 1.0, 0.5], [1.0, 2.0, -0.3], [0.5, -0.3, 1.0]]) * 1e-4
-    motion = motion_of(increments, INCREMENT, [covariance6(covariance)] * 4)
-    n = 100_000
-    poses = np.zeros((n, 3))
-    for increment in increments:
-        noise = rng.multivariate_normal(np.zeros(3), covariance, n)
-        poses = se2.compose(poses, se2.retract(np.broadcast_to(increment, (n, 3)), noise))
-    errors = se2.local(np.broadcast_to(motion.pose, (n, 3)), poses)
-    expected = motion.covariance(INCREMENT)
-    sigma = np.sqrt(np.diag(expected))
-    assert_allclose(np.cov(errors.T) / np.outer(sigma, sigma), expected / np.outer(sigma, sigma),
-                    atol=0.02)
-
-
-def test_twist_covariance_is_taken_times_the_time_squared(rng):
-    twist = random_information(1, rng)[0]
-    motion = motion_of([(1.0, 2.0, 0.3)], TWIST, [np.eye(6)], [covariance6(twist)], period=0.5)
-    assert_allclose(motion.covariance(TWIST), twist * 0.25)
 
 
 def test_twist_covariances_add_up_as_increments_do(rng):

@@ -13,7 +13,6 @@ from problems import (
     drive_on,
     grown,
     loop,
-    loops_of,
     odometry,
     seconds,
     true_loop,
@@ -256,16 +255,6 @@ def test_no_recorded_graph_is_taken_for_a_fault(datasets, name):
         for k, pose in enumerate(poses):
             builder.add_odometry(odometry(1.0 + k * period, pose))
         assert not builder.notes.refused and not builder.notes.warned and not builder.stream.held
-
-
-def test_loops_across_a_restart_join_the_right_places():
-    poses = curve(200)
-    moved = se2.between(np.repeat(poses[119:120], 80, axis=0), poses[120:])
-    moved[0] = 0.0
-    builder, _ = fed(timed(np.concatenate((poses[:120], moved))))
-    builder.add_loop(loop(1.7, 1.0 + 150 * PERIOD, se2.between(poses[7:8], poses[150:151])[0]))
-    assert builder.add_due_loops() == 1
-    assert loops_of(builder)[:2] == ([7], [150])
 
 
 @pytest.mark.parametrize('seed', range(30))

@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 import pytest
-from problems import add_absolute
+from problems import add_absolute, retold
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -45,13 +45,7 @@ def world(rng):
 
 def rescaled(graph, odometry, loops):
     """Return the graph with information that says its sigmas are so many times as large."""
-    factors, scaled = graph.between, FactorGraph(se2)
-    roots = factors.sqrt_information
-    sigma = np.where(factors.is_odometry, odometry, loops)[:, None, None]
-    scaled.add_poses(graph.n_poses)
-    scaled.add_between(factors.i, factors.j, factors.measurement,
-                       roots.transpose(0, 2, 1) @ roots / sigma**2)
-    return scaled
+    return retold(graph, times=np.where(graph.between.is_odometry, odometry, loops))
 
 
 def test_repeated_and_parallel_factors():
@@ -147,9 +141,8 @@ def test_noise_is_judged_in_the_largest_part(rng):
     both.add_poses(360)
     for graph, start in (small, 0), (large, 60):
         factors = graph.between
-        roots = factors.sqrt_information
-        both.add_between(factors.i + start, factors.j + start, factors.measurement,
-                         roots.transpose(0, 2, 1) @ roots)
+        both.append_between(factors.i + start, factors.j + start, factors.measurement,
+                            factors.sqrt_information)
     found = noise_scales(both, rng)
     assert (found.first, found.last) == (60, 359)
     assert found.loops == pytest.approx(1, abs=0.15)

@@ -76,11 +76,6 @@ def test_without_a_loop_to_doubt_it_is_settled():
         assert judgement.accepted.all() and judgement.settled
 
 
-def test_where_no_loop_is_doubted_all_are_believed():
-    judgement = Judgement.nothing().extended(graph_of(*LOOPS), False)
-    assert judgement.accepted.all() and not judgement.suspect.any() and judgement.settled
-
-
 def earlier(settled=True):
     """Return a judgement of the chain and the first two loops: one rejected, one suspect."""
     return Judgement(np.array([True] * 5 + [False, False]), np.array([False] * 6 + [True]),

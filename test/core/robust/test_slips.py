@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 from lies import careful_world, spoilt
+from problems import retold
 from test_pairwise_consistency import STEP, grown, moved, slipped
 
 from l1slam_ros.core.geometry import se2
@@ -39,16 +40,26 @@ def test_without_a_slip_nothing_is_left_out(bad):
     assert repaired(bad.graph) is None
 
 
+@pytest.mark.parametrize('steps, offset', [([100, 180], [5.0, 0.0, 0.0]),
+                                           ([150, 230], [0.0, 0.0, 1.5])])
+def test_two_slips_are_found_together(bad, steps, offset):
+    """Each bends what the loops across the other one say."""
+    graph = bad.graph
+    for step in steps:
+        graph = moved(graph, step, offset)
+    judgement, _ = robust_solve(graph)
+    assert graph.between.i[judgement.slips].tolist() == steps
+    assert not judgement.doubts
+
+
 @pytest.mark.parametrize('stated', [1.0, 10.0])
 def test_what_is_within_the_noise_as_stated_is_no_slip(stated):
     """40 sigmas are a slip; 4 are none, though loops that know better all speak against it."""
     world, turn = spoilt(careful_world(400, 800), 'random', 100), np.array([[0.0, 0.0, 0.2]])
-    factors, graph = world.graph.between, FactorGraph(se2)
+    factors = world.graph.between
     row, measurement = factors.is_odometry & (factors.i == STEP), factors.measurement.copy()
     measurement[row] = se2.retract(measurement[row], turn)
-    roots = factors.sqrt_information / stated
-    graph.add_poses(world.graph.n_poses)
-    graph.add_between(factors.i, factors.j, measurement, roots.transpose(0, 2, 1) @ roots)
+    graph = retold(world.graph, measurement, stated)
     assert (repaired(graph) is None) == (stated > 1)
 
 

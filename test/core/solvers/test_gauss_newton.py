@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from problems import drive, graph_of, noisy_graph
-from scipy.optimize import approx_fprime, least_squares
+from scipy.optimize import least_squares
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry import se2
@@ -85,23 +85,6 @@ def test_huber_cost_is_smooth_where_it_turns_linear():
     assert costs[1] == delta**2
 
 
-@pytest.mark.parametrize('delta', [0.1, 0.5, 1.345])
-def test_huber_ends_where_its_gradient_is_zero(delta, world):
-    graph, _ = world
-    options = LeastSquaresOptions(huber_delta=delta, iterations=1000, tolerance=1e-12)
-    solution = solve(minimise_huber, graph, odometry_poses(graph), options)
-
-    def cost(x):
-        moved = step_poses(graph, solution.poses, x)
-        return Huber(3, delta).cost(whitened_residual(graph, moved))
-
-    n = 3 * (graph.n_poses - 1)
-    gradient = approx_fprime(np.zeros(n), cost, 1e-7)
-    assert solution.cost == pytest.approx(cost(np.zeros(n)))
-    assert np.abs(gradient).max() < 0.2
-    assert np.abs(approx_fprime(np.full(n, 0.01), cost, 1e-7)).max() > 10
-
-
 def test_huber_with_a_huge_delta_is_l2(world):
     graph, _ = world
     start = odometry_poses(graph)
@@ -109,23 +92,6 @@ def test_huber_with_a_huge_delta_is_l2(world):
     huber = solve(minimise_huber, graph, start, LeastSquaresOptions(huber_delta=1e9))
     assert_allclose(huber.history, l2.history, rtol=1e-9)
     assert_allclose(huber.poses, l2.poses, atol=1e-9)
-
-
-def test_huber_with_a_tiny_delta_is_a_median():
-    """rho(s) = 2 delta s, almost: three places weigh the same, however far."""
-    graph = parallel([0.0, 1.0, 100.0], [1.0, 1.0, 1.0])
-    options = LeastSquaresOptions(huber_delta=1e-3, iterations=10_000, tolerance=1e-12)
-    solution = solve(minimise_huber, graph, np.zeros((2, 3)), options)
-    assert solution.poses[1, 0] == pytest.approx(1.0, abs=0.01)
-
-
-def test_huber_gives_an_outlier_less_weight_than_l2():
-    graph = parallel([0.0, 0.1, -0.1, 50.0], [1.0] * 4)
-    l2, huber = (solve(minimise, graph, np.zeros((2, 3))).poses[1, 0]
-                 for minimise in (minimise_l2, minimise_huber))
-    assert l2 == pytest.approx(12.5)
-    # The outlier pulls with 2 delta, three good ones with 2 x each.
-    assert huber == pytest.approx(1.345 / 3, abs=1e-3)
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from problems import HAND_SOLVED, chain_and_loops, drive, graph_of, linprog_l1, noisy_graph
-from systems import SHAPES, cholesky_of_system, random_system, system_of
+from problems import chain_and_loops, drive, graph_of, linprog_l1, noisy_graph
+from systems import SHAPES, cholesky_of_system, random_system
 
 from l1slam_ros.core.graph.l1_problem import GraphProblem, LinearProblem
 from l1slam_ros.core.graph.linear_system import whitened_residual
@@ -65,15 +65,6 @@ def test_linear_problems_are_solved_as_by_highs(shape, k, scale, rng):
     best, _ = linprog_l1(system.A, system.b)
     assert optimum.status is Status.CONVERGED
     assert l1_cost(system.A @ optimum.poses - system.b) == pytest.approx(best, rel=1e-7)
-
-
-@pytest.mark.parametrize('make', HAND_SOLVED[:-1], ids=lambda make: make.__name__)
-def test_hand_solved_problems(make):
-    problem = make()
-    optimum = solve_linear(system_of(problem.A, problem.b), np.zeros(problem.A.shape[1]))
-    assert_allclose(optimum.poses, problem.x, atol=1e-6)
-    assert optimum.costs[-1] == pytest.approx(problem.optimum, rel=1e-7)
-    assert problem.b @ -optimum.y == pytest.approx(problem.optimum, rel=1e-6)
 
 
 @pytest.mark.parametrize('iterations', [0, 1, 3, 60])

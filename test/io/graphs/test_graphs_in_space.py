@@ -92,14 +92,6 @@ def test_round_trip(tmp_path, rng, suffix, reading):
     assert_allclose(information_of(record.graph), information_of(back.graph), atol=1e-12)
 
 
-def test_a_file_is_written_back_as_it_was(write, tmp_path):
-    """To the number, whatever its rotation block is taken for."""
-    for reading in (QUATERNION, ANGLE):
-        write_graph_file(tmp_path / 'b.g2o', read_graph_file(write(SQUARE), reading))
-        edge = (tmp_path / 'b.g2o').read_text().splitlines()[-1]
-        assert [float(v) for v in edge.split()[10:]] == [float(v) for v in UNIT.split()]
-
-
 @pytest.mark.parametrize('tags', [('VERTEX_SE3:QUAT', 'EDGE_SE3:QUAT', '0 0 0 1', 7, SQUARE),
                                   ('VERTEX3', 'EDGE3', '0 0 0', 6, TORO_SQUARE)],
                          ids=['g2o', 'toro'])

@@ -22,8 +22,8 @@ from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.optimality import Status
 
-# A map is factored anew from so many rows on that came since: those of ten keyframes.
-_MANY_ROWS = 90
+# A map is factored anew from so many factors on that came since: those of ten keyframes.
+_MANY = 20
 # Factors that a front takes while its lock is held.
 AT_ONCE = 16
 # [s] While loops come none of which fits, they are judged so often.
@@ -80,6 +80,7 @@ class LiveMap:
         self.last: Improvement | None = None
         self.newest: tuple[int, Array]
         self.judge_took = self._judge_began = self._judge_at = 0.0
+        self._heard = builder.graph.said
         self._bound_at = self._factored_at = 0.0
         # What the last proof says, and of which factors.
         self._bound, self._proved = np.nan, np.zeros(0, bool)
@@ -114,7 +115,10 @@ class LiveMap:
 
     def hear(self) -> None:
         """Take over what a person said of factors that were looked at before."""
-        factors, before = self._builder.graph.between, self.accepted
+        graph = self._builder.graph
+        if graph.said == self._heard:
+            return
+        factors, before, self._heard = graph.between, self.accepted, graph.said
         count, judgement = len(before), self.optimised.judgement
         after = (before | factors.trusted[:count]) & ~factors.struck[:count]
         if (after == before).all():
@@ -153,21 +157,26 @@ class LiveMap:
         rows = len(graph.between) * graph.manifold.TANGENT_SIZE
         behind = (len(optimised.poses) < graph.n_poses or len(optimised.dual) < rows
                   or not optimised.at_rest)
-        falls = self.last is not None and self.last.falls
         # The front goes by the noise that was known when it was made.
         other_noise = idle and front is not None and bool(
             (self._noise != optimised.judgement.variance).any())
-        return bool(graph.n_poses) and (self.stale or falls or other_noise
+        return bool(graph.n_poses) and (self.stale or self.falls or other_noise
                                         or (behind and (idle or self.is_late)))
+
+    @property
+    def falls(self) -> bool:
+        """Whether the last round ended on the way down."""
+        return self.last is not None and self.last.falls
 
     @property
     def is_late(self) -> bool:
         """Whether the front has more to carry than it should."""
-        return self.front is None or self.front.closed or self.front.border >= _MANY_ROWS
+        return self.front is None or self.front.closed or self.front.taken >= _MANY
 
     def is_exact_due(self, idle: bool) -> bool:
         """Return whether the next map is to be solved to the end: this one is of all there is."""
-        return idle and self.front is not None and not self.front.border
+        return (idle and self.front is not None and not self.front.taken
+                and not self.stale and not self.falls)
 
     def is_judge_due(self, idle: bool, budget: float) -> bool:
         """Return whether to judge all loops; budget : there is so much time for it now [s]."""

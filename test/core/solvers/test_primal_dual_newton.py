@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Group L1: turned frames, smooth convex references, its proof; and what each norm promises."""
+"""Norms of factors: turned frames, smooth convex references, proofs, what each norm promises."""
 
 import numpy as np
 import pytest
@@ -10,23 +10,28 @@ from scipy.optimize import minimize
 from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise, step_poses, whitened_residual
-from l1slam_ros.core.names import NORMS
+from l1slam_ros.core.names import NORMS, SAME
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.exact import minimise_interior_point
-from l1slam_ros.core.solvers.group_l1 import minimise_group_l1
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
-from l1slam_ros.core.solvers.optimality import Status, norm_of
+from l1slam_ros.core.solvers.optimality import Huber, Lengths, Status
 from l1slam_ros.core.solvers.primal_dual import PrimalDualOptions, minimise_l1
+from l1slam_ros.core.solvers.primal_dual_newton import minimise_norm
 from l1slam_ros.core.solvers.seed import seed_poses
-from l1slam_ros.core.solvers.solve import choose, minimise_by
+from l1slam_ros.core.solvers.solve import choose, minimise_by, norm_for
 from l1slam_ros.io.graphs.graph_file import read_graph_file
 
 DELTA = 1.345
 OPTIONS = OptimiserOptions(outer_iterations=100)
+# Of the odometry, of loops.
+PURE = [(name, SAME) for name in NORMS]
+MIXED = [('l2', 'l1'), ('l2', 'group-l1'), ('l1', 'l2'), ('group-l1', 'l1'), ('group-l1', 'huber'),
+         ('huber', 'l1')]
 
 
 def solve(graph, start):
-    return minimise_group_l1(graph, start, OPTIONS, cholesky_of(graph))
+    norm = Lengths(graph.manifold.TANGENT_SIZE)
+    return minimise_norm(graph, start, norm, OPTIONS, cholesky_of(graph))
 
 
 def space_graph(n, rng):
@@ -83,19 +88,27 @@ def test_turned_frames_in_space(rng):
 
 
 @pytest.mark.parametrize('manifold', ['plane', 'space'])
-@pytest.mark.parametrize('name', NORMS)
-def test_each_norm_ends_where_another_solver_does(name, manifold, rng):
+@pytest.mark.parametrize('names', PURE + MIXED)
+def test_each_norm_ends_where_another_solver_does(names, manifold, rng):
     """SciPy's BFGS on the smoothed cost of a step from there finds nothing lower."""
     graph, truth = noisy_graph(12, 10, rng) if manifold == 'plane' else space_graph(6, rng)
-    norm = norm_of(name, graph.manifold.TANGENT_SIZE, DELTA)
-    found, _ = minimise_by(choose('auto', graph, name), graph, truth, OPTIONS)
+    k, odometry = graph.manifold.TANGENT_SIZE, graph.between.is_odometry
+    norm = norm_for(graph, *names, DELTA)
+    found, _ = minimise_by(choose('auto', graph, *names), graph, truth, OPTIONS)
     assert found.status is Status.CONVERGED
+    name, other_name = (names[0] if name == SAME else name for name in names)
+    half = 1.0 if name == other_name else 0.5
+
+    def smooth_cost(name, r, mu):
+        if name in ('l2', 'huber'):
+            return half * (Huber(k, DELTA) if name == 'huber' else Huber()).cost(r)
+        size = k if name == 'group-l1' else 1
+        return np.sqrt((r.reshape(-1, size) ** 2).sum(axis=1) + mu * mu).sum()
 
     def cost(x, mu):
-        r = whitened_residual(graph, step_poses(graph, found.poses, x))
-        if name in ('l2', 'huber'):
-            return norm.cost(r)
-        return np.sqrt((r.reshape(-1, norm.size) ** 2).sum(axis=1) + mu * mu).sum()
+        r = whitened_residual(graph, step_poses(graph, found.poses, x)).reshape(-1, k)
+        return smooth_cost(name, r[odometry].ravel(), mu) + smooth_cost(
+            other_name, r[~odometry].ravel(), mu)
 
     x = np.zeros((graph.n_poses - 1) * graph.manifold.TANGENT_SIZE)
     for mu in (1e-1, 1e-2, 1e-3):
@@ -105,11 +118,11 @@ def test_each_norm_ends_where_another_solver_does(name, manifold, rng):
     assert other <= found.cost * (1 + 2e-3)
 
 
-@pytest.mark.parametrize('name', ['l1', 'group-l1'])
-def test_the_gap_is_proven_by_a_dual(name, rng):
+@pytest.mark.parametrize('names', [('l1', SAME), ('group-l1', SAME), *MIXED])
+def test_the_gap_is_proven_by_a_dual(names, rng):
     graph, truth = noisy_graph(60, 60, rng)
-    found, _ = minimise_by(choose('auto', graph, name), graph, truth, OPTIONS)
-    norm, system = norm_of(name, 3), linearise(graph, found.poses)
+    found, _ = minimise_by(choose('auto', graph, *names), graph, truth, OPTIONS)
+    norm, system = norm_for(graph, *names, DELTA), linearise(graph, found.poses)
     balance = system.transposed_times(found.dual)
     assert_allclose(balance, 0, atol=1e-8 * np.abs(system.blocks).max())
     assert_allclose(norm.resolvent(found.dual, 0.0), found.dual, atol=1e-12)
@@ -117,10 +130,16 @@ def test_the_gap_is_proven_by_a_dual(name, rng):
     assert 0 <= found.gap < 1e-3 * found.cost
 
 
-@pytest.mark.parametrize('name', NORMS)
-def test_the_promises_of_a_norm(name, rng):
+@pytest.fixture
+def promising(rng):
+    """Return a graph of 20 factors."""
+    return noisy_graph(13, 8, rng)[0]
+
+
+@pytest.mark.parametrize('names', PURE + MIXED)
+def test_the_promises_of_a_norm(names, promising, rng):
     """Fenchel's inequality, tight where the dual is a derivative; the resolvent's own equation."""
-    norm, r = norm_of(name, 3, DELTA), 2 * rng.standard_normal(60)
+    norm, r = norm_for(promising, *names, DELTA), 2 * rng.standard_normal(60)
     dual = norm.resolvent(5 * rng.standard_normal(60), 0.0)
     assert norm.gap(r, dual) >= 0
     h = 1e-6
@@ -132,10 +151,31 @@ def test_the_promises_of_a_norm(name, rng):
     assert (norm.weights(r) > 0).all()
 
 
-@pytest.mark.parametrize('name', NORMS)
-def test_the_primal_dual_method_takes_any_norm(name, rng):
+@pytest.mark.parametrize('names', PURE + MIXED)
+def test_a_smoothed_norm_is_differentiated(names, promising, rng):
+    """Its gradient by differences; and its curvature at the dual that is the gradient, for Huber
+    reweighted, which is no less."""
+    norm, e = norm_for(promising, *names, DELTA), 2 * rng.standard_normal((20, 3))
+    mu, h = 0.3, 1e-5
+    y = norm.smoothed(e, np.zeros((20, 3)), mu).gradient
+    cost, d, W = norm.smoothed(e, y, mu)
+    assert cost >= norm.cost(e.ravel())
+    axes = h * np.eye(60).reshape(60, 20, 3)
+    ahead, behind = ([norm.smoothed(e + sign * axis, y, mu) for axis in axes] for sign in (1, -1))
+    assert_allclose(d.ravel(), [(a.cost - b.cost) / (2 * h) for a, b in zip(
+        ahead, behind, strict=True)], atol=1e-6)
+    H = np.array([(a.gradient - b.gradient).ravel() / (2 * h) for a, b in zip(
+        ahead, behind, strict=True)])
+    W = sum(np.kron(np.diag(row), W[f]) for f, row in enumerate(np.eye(20)))
+    assert np.linalg.eigvalsh(W - H).min() > -1e-6
+    if 'huber' not in names:
+        assert_allclose(W, H, atol=1e-5)
+
+
+@pytest.mark.parametrize('names', PURE + MIXED)
+def test_the_primal_dual_method_takes_any_norm(names, rng):
     graph, truth = noisy_graph(8, 6, rng)
-    system, norm = linearise(graph, truth), norm_of(name, 3, DELTA)
+    system, norm = linearise(graph, truth), norm_for(graph, *names, DELTA)
     found = minimise_l1(system.A, system.b, np.zeros(21), np.zeros(len(system.b)),
                         PrimalDualOptions(20000, 1e-6), norm=norm)
     other = minimize(lambda x: norm.cost(system.A @ x - system.b), found.x, method='Powell',
