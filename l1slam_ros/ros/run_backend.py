@@ -20,6 +20,8 @@ _PATIENCE, _THREADS = 1.2, 0.9
 _SAVING = 4.5
 # [s] What raises each time it is called shall not keep a core busy.
 _BREATH = 0.05
+# [s] How long the interpreter lets the solver's own Python run before a callback may.
+_TURN = 5e-4
 
 
 class Ending:
@@ -76,6 +78,7 @@ def leave(code: int) -> None:
 def main() -> None:
     """Run the node until SIGINT or SIGTERM, and leave the process."""
     ending = Ending()
+    sys.setswitchinterval(_TURN)
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions

@@ -11,9 +11,9 @@ the odometry went back is of the time before. None of it is compiled code.
 """
 
 import math
-import sys
 import threading
 import time
+from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -48,9 +48,6 @@ _AT_ONCE = 100
 _BACKLOG = 10_000
 # Of a backlog so many messages, the newest, are answered with a pose: nobody waits for the others.
 _ANSWERED = 200
-# [s] So long others run Python's code before a message may come in, and so long they wait once one
-# has: by turns of one length a busy machine would hand each message to and fro.
-_OTHERS_TURN, _OWN_TURN = 5e-4, 0.05
 # [s] What raises each time it is called shall not keep a core busy.
 _BREATH = 0.05
 _REPEAT_WARNING = 5.0  # [s]
@@ -108,14 +105,15 @@ class Inputs:
         self._group, self.active, self._closing = _Apart(), False, False
         self.refused: Counter[str] = Counter()
         self._topics: list[_Topic] = []
+        # As they came, and of each topic in its turn.
         self._queue: deque[_Message] = deque()
+        self._new: list[_Message] = []
         self._guard = GuardCondition(None, None, context=node.context)
         self._thread = threading.Thread(target=self._work, name='intake', daemon=True)
         self._subscribe_all()
         self.traffic = {topic.name: topic.traffic for topic in self._topics}
 
     def _subscribe_all(self) -> None:
-        self._subscribe(Odometry, 'odom', self._on_odometry, raw=True)
         for name, read in (
             ('loop_closures', lambda m: conversion.loop_closure(m, self._base_frame.name, False)),
             ('trusted_loop_closures',
@@ -130,6 +128,8 @@ class Inputs:
             with suppress(ImportError):
                 self._subscribe(getattr(import_module(f'{package}.msg'), kind), name,
                                 partial(self._on_pose_graph, PoseGraphs()))
+        # Last: not every DDS says when a message came, and a loop may come before its odometry.
+        self._subscribe(Odometry, 'odom', self._on_odometry, raw=True)
 
     def _subscribe(self, kind: Any, name: str, use: Callable[[Any], None],
                    raw: bool = False) -> None:
@@ -174,16 +174,14 @@ class Inputs:
         return not self._thread.is_alive()
 
     def _work(self) -> None:
-        context, turn = self._node.context, sys.getswitchinterval()
+        context = self._node.context
         with context.handle, self._guard.handle:
             waiting = rclpy_implementation.WaitSet(
                 len(self._topics), 1, 0, 0, 0, 0, context.handle)
             seconds = math.inf
             while not self._closing and context.ok():
                 try:
-                    sys.setswitchinterval(_OTHERS_TURN)
-                    self._wait(waiting, 0.0 if self._queue else seconds)
-                    sys.setswitchinterval(_OWN_TURN)
+                    self._wait(waiting, 0.0 if self._backlog else seconds)
                     self._take()
                     self._use()
                     seconds = self._tick() if self.active else math.inf
@@ -191,7 +189,6 @@ class Inputs:
                 except Exception as error:
                     self._failures.note('intake', error)
                     time.sleep(_BREATH)
-        sys.setswitchinterval(turn)
 
     def _wait(self, waiting: Any, seconds: float) -> None:
         """Wait for messages, for so long."""
@@ -201,27 +198,31 @@ class Inputs:
         waiting.add_guard_condition(self._guard.handle)
         waiting.wait(-1 if math.isinf(seconds) else max(round(seconds * 1e9), 0))
 
+    @property
+    def _backlog(self) -> int:
+        return len(self._queue) + len(self._new)
+
     def _take(self) -> None:
         """Take over what has come of every topic."""
         for topic in self._topics:
             subscription = topic.subscription
             with subscription.handle:
-                while len(self._queue) < _BACKLOG and (taken := subscription.handle.take_message(
+                while self._backlog < _BACKLOG and (taken := subscription.handle.take_message(
                         subscription.msg_type, subscription.raw)) is not None:
                     content, information = taken
-                    self._queue.append(_Message(
+                    self._new.append(_Message(
                         information['received_timestamp'], topic, content, information))
 
     def _use(self) -> None:
         """Use some of the messages in the order they came."""
-        until = max((message.received for message in self._queue), default=0)
-        # While one topic was emptied, older messages may have come of those before.
-        self._take()
-        if len(self._queue) > 1:
-            self._queue = deque(sorted(self._queue, key=itemgetter(0)))
-        for _ in range(_AT_ONCE):
-            if not self._queue or self._queue[0].received > until:
-                return
+        if self._new and not self._queue:
+            until = max(message.received for message in self._new)
+            # While one topic was emptied, older messages may have come of those before.
+            self._take()
+            self._new.sort(key=itemgetter(0))
+            count = bisect_right(self._new, until, key=itemgetter(0))
+            self._queue, self._new = deque(self._new[:count]), self._new[count:]
+        for _ in range(min(_AT_ONCE, len(self._queue))):
             _, topic, content, information = self._queue.popleft()
             topic.traffic.note(information)
             if not self.active:
@@ -243,7 +244,7 @@ class Inputs:
             self._refuse(other)
         for sample in found.ours:
             used = self._backend.add_odometry(sample) is not None
-            if used and len(self._queue) < _ANSWERED:
+            if used and self._backlog < _ANSWERED:
                 self._moved()
 
     def _on_loop(self, read: Callable[[Any], LoopClosure], message: Any) -> None:
