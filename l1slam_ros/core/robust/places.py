@@ -21,7 +21,7 @@ _NEAR, _NEAR_STEPS = 5.0, 10
 # Claims are told apart to this part of it, so that a robot that stands has few different ones.
 _GRAIN = 0.1
 # One in so many maps of loops that err each for itself is taken for one where they share.
-_BY_CHANCE = 1e-6
+_BY_CHANCE = 1e-4
 
 
 def err_together(place: Indices, residual: Array, drawn: Array) -> bool:

@@ -262,14 +262,15 @@ class Growth:
         """
         Return the variance of each factor in a map, (m,), in units of what it states.
 
-        Ones, unless these are wrong beyond doubt: where loops of a place err together, those of a
-        place are worth one, and all are as noisy as was found; odometry is the unit.
+        Ones, unless these are wrong beyond doubt: where loops are noisier than they say and those
+        of a place err together, these are worth one, and all are as noisy as was found; odometry
+        is the unit.
         """
         noise, rows = np.ones(len(self.factors)), np.flatnonzero(self.accepted)
         at = np.flatnonzero((self.is_loop & ~self.factors.is_absolute)[rows])
         loops = rows[at]
-        if len(loops) and err_together(self.place[loops], self.posterior.residual[at],
-                                       self.posterior.left_over(at)):
+        if len(loops) and self.variance[1] > 1 and err_together(
+                self.place[loops], self.posterior.residual[at], self.posterior.left_over(at)):
             noise[self.is_loop] = self.variance[1] / self.variance[0]
             noise[self.factors.is_absolute] = 1 / self.variance[0]
             noise[loops] *= np.bincount(self.place[loops])[self.place[loops]]
