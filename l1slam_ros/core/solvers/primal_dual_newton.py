@@ -108,7 +108,7 @@ def minimise_norm(
 
 def _begin(problem: GraphProblem, poses: Array, norm: SmoothNorm) -> _Iterate:
     residual = problem.residual(poses)
-    e = residual.reshape(len(problem.graph.between), -1)
+    e = residual.reshape(-1, problem.graph.manifold.TANGENT_SIZE)
     mu = _FIRST * smoothing(np.linalg.norm(e, axis=1))
     y = norm.smoothed(e, np.zeros_like(e), mu).gradient
     return _Iterate(poses, problem.linearise(poses, residual), mu, y)
