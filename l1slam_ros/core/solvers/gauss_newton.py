@@ -19,8 +19,9 @@ from l1slam_ros.core.solvers.nonlinear import Report, Solution
 from l1slam_ros.core.solvers.optimality import Huber, Norm, Status, fits_exactly, l1_cost, l2_cost
 from l1slam_ros.core.solvers.reweighting import weighted_least_squares
 
-# Damping: the first, the least, the most. A chain's slow bends feel even the least of it.
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 3e-8, 1e6
+# Damping: the first, the least, the most, and as good as none. Slow bends of a chain feel even the
+# least of it.
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING, _HARDLY = 1e-8, 3e-10, 1e6, 1e-6
 # A map to within its noise: Gauss-Newton begins where chi2 is at most so many times what the noise
 # makes of it, and takes so many steps at most.
 _FITS, _NOISE_STEPS = 3, 60
@@ -93,7 +94,7 @@ def gauss_newton(
         moved = whitened_residual(graph, candidate)
         cost = norm.cost(moved)
         decrease = history[-1] - cost
-        full, free = damping <= _FIRST_DAMPING, not damping
+        full, free = damping <= _HARDLY, not damping
         if decrease >= 0:
             poses, residual = candidate, moved
             damping = damping / 10 if damping > _LEAST_DAMPING else 0.0
