@@ -11,7 +11,6 @@ are of one place, and whether the loops of a place err together.
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.geometry.quantiles import gamma_quantile
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, lowest_of_components
 from l1slam_ros.core.graph.linear_system import with_world
 
@@ -20,8 +19,9 @@ from l1slam_ros.core.graph.linear_system import with_world
 _NEAR, _NEAR_STEPS = 5.0, 10
 # Claims are told apart to this part of it, so that a robot that stands has few different ones.
 _GRAIN = 0.1
-# One in so many maps of loops that err each for itself is taken for one where they share.
-_BY_CHANCE = 1e-4
+# [sigmas] One in ten thousand maps of loops that err each for itself is taken for one where they
+# share.
+_BEYOND_DOUBT = 3.719
 
 
 def err_together(place: Indices, residual: Array, drawn: Array) -> bool:
@@ -48,10 +48,12 @@ def err_together(place: Indices, residual: Array, drawn: Array) -> bool:
         return False
     larger = (found.sum() / (residual**2).sum()
               * (drawn**2).mean(axis=2).sum() / expected.sum())
-    # Of a weighted sum of squares (F. E. Satterthwaite, An approximate distribution of estimates
-    # of variance components, 1946).
+    # A weighted sum of squares is nearly chi2 (F. E. Satterthwaite, An approximate distribution of
+    # estimates of variance components, 1946), the cube root of which is nearly normal (E. B.
+    # Wilson and M. M. Hilferty, The distribution of chi-square, 1931).
     freedom = expected.sum() ** 2 / (expected**2).sum()
-    return bool(larger > 2 * gamma_quantile(freedom / 2, 1 - _BY_CHANCE) / freedom)
+    spread = 2 / (9 * freedom)
+    return bool(np.cbrt(larger) > 1 - spread + _BEYOND_DOUBT * np.sqrt(spread))
 
 
 def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:

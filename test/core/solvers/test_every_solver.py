@@ -22,12 +22,6 @@ from l1slam_ros.core.solvers.optimality import Lengths, Status, l1_cost, norm_of
 from l1slam_ros.core.solvers.primal_dual import CHECK_EVERY, PrimalDualOptions, minimise_l1
 from l1slam_ros.core.solvers.primal_dual_newton import minimise_norm
 from l1slam_ros.core.solvers.restarted_pdhg import minimise_l1_halpern
-from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
-
-
-def minimise_group_l1(graph, start, options, cholesky, report):
-    return minimise_by(choose(AUTO, graph, 'group-l1'), graph, start, options, report)[0]
-
 
 
 def minimise_group_l1(graph, poses, *more, **named):
