@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import peer_environment
+from arguments import shares_of, words_of
 from robust.kinds import GRAPHS, KINDS, MADE, SUITES
 
 if TYPE_CHECKING:
@@ -37,17 +38,17 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=lines[0])
     parser.add_argument('--datasets', type=Path, required=True,
                         help='folder of the public graphs, of NAME.truth.txt, and of real/')
-    parser.add_argument('--suite', type=_words, default=SUITES, metavar='NAME,...',
+    parser.add_argument('--suite', type=words_of, default=SUITES, metavar='NAME,...',
                         help=f'of {", ".join(SUITES)}')
-    parser.add_argument('--kinds', type=_words, default=('',), metavar='WORD,...',
+    parser.add_argument('--kinds', type=words_of, default=('',), metavar='WORD,...',
                         help='those whose names begin with one of these')
-    parser.add_argument('--graphs', type=_words, default=GRAPHS, metavar='NAME,...',
+    parser.add_argument('--graphs', type=words_of, default=GRAPHS, metavar='NAME,...',
                         help=f'of {", ".join(GRAPHS)}')
-    parser.add_argument('--shares', type=_shares, metavar='P,...',
+    parser.add_argument('--shares', type=shares_of, metavar='P,...',
                         help='of all loops that are false; all that a kind has')
     parser.add_argument('--seeds', type=_seeds, default=range(3), metavar='N | A-B',
                         help='each case is drawn so often, or with seeds A to B')
-    parser.add_argument('--solvers', type=_words, default=DEFAULT_SOLVERS, metavar='WORD,...',
+    parser.add_argument('--solvers', type=words_of, default=DEFAULT_SOLVERS, metavar='WORD,...',
                         help='those whose names contain one of these, e.g. ours L2,live,ISAM2')
     parser.add_argument('--limit', type=float, default=120.0,
                         help='processor time of one run [s]; who needs more gets no other seed')
@@ -121,17 +122,6 @@ def write(folder: Path, head: dict[str, Any], runs: Sequence['Run']) -> None:
     recorded = head | {'rows': [asdict(run) for run in everything]}
     write_lines(file, [json.dumps(recorded, indent=1)])
     write_lines(folder / 'FALSE_LOOPS.md', document(recorded, everything))
-
-
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(text.split(','))
-
-
-def _shares(text: str) -> tuple[float, ...]:
-    shares = tuple(float(word) for word in text.split(','))
-    if not all(0 < share < 1 for share in shares):
-        raise argparse.ArgumentTypeError(f'{text!r}, expected shares between 0 and 1')
-    return shares
 
 
 def _seeds(text: str) -> range:

@@ -22,6 +22,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import peer_environment
+from arguments import shares_of, words_of
 
 HERE = Path(__file__).resolve().parent
 
@@ -35,11 +36,11 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
     parser.add_argument('--datasets', type=Path, default=Path(),
                         help='folder of the public graphs, of NAME.truth.txt, and of real/')
-    parser.add_argument('--graphs', type=_words, default=GRAPHS, metavar='NAME,...',
+    parser.add_argument('--graphs', type=words_of, default=GRAPHS, metavar='NAME,...',
                         help=f'{", ".join(GRAPHS)}, or NAME of a file NAME.g2o in the folder')
-    parser.add_argument('--kinds', type=_words, default=kinds, metavar='NAME,...',
+    parser.add_argument('--kinds', type=words_of, default=kinds, metavar='NAME,...',
                         help=f'of {", ".join(kinds)}, which is that of {BICOCCA} alone')
-    parser.add_argument('--shares', type=_shares, default=(), metavar='P,...',
+    parser.add_argument('--shares', type=shares_of, default=(), metavar='P,...',
                         help='of all loops that are false, in place of the usual 0.3')
     parser.add_argument('--poses', type=int, default=0, help='only so many of them')
     parser.add_argument('--rate', type=float, default=200.0, help='keyframes per second')
@@ -105,17 +106,6 @@ def main() -> None:
         write_lines(arguments.output / 'INCREMENTAL.md', lines)
         print('\n'.join(line for line in lines
                         if line.startswith(f'| {cell.graph} | {cell.kind}')), flush=True)
-
-
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(text.split(','))
-
-
-def _shares(text: str) -> tuple[float, ...]:
-    shares = tuple(float(word) for word in text.split(','))
-    if not all(0 < share < 1 for share in shares):
-        raise argparse.ArgumentTypeError(f'{text!r}, expected shares between 0 and 1')
-    return shares
 
 
 if __name__ == '__main__':

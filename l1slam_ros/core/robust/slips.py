@@ -84,8 +84,7 @@ def without_slip(growth: Growth, left_out: Indices) -> Growth | None:
         return None
     motion = usual_motion(growth)
     found, most = None, 0.0
-    for steps, odds, state in _tried(growth, left_out, motion):
-        usual = state is not None and all(_moves_as_usual(state, step, motion) for step in steps)
+    for steps, odds, state, usual in _tried(growth, left_out, motion):
         evidence = odds + _gain(growth, state) if state and usual else odds
         if len(steps) == 1:
             growth.slip_odds[steps[0]] = evidence
@@ -98,22 +97,25 @@ def without_slip(growth: Growth, left_out: Indices) -> Growth | None:
 
 
 def _tried(growth: Growth, left_out: Indices, motion: Motion, more: bool = True
-           ) -> Iterator[tuple[list[int], float, Growth | None]]:
+           ) -> Iterator[tuple[list[int], float, Growth | None, bool]]:
     """
-    Yield steps, their log odds to have slipped, and the state without them; None: it falls apart.
+    Yield steps, their log odds to have slipped, the state without them, and whether that is usual.
 
-    Where the robot does not move as usual without one step, a second one may bend what the loops
-    across the first one say: more : try that, too.
+    None: it falls apart. It is usual if the robot, repaired, moves as elsewhere at each of them.
+    Where it is not, a second step may bend what the loops across the first one say: more : try
+    that, too.
     """
     odds = log_odds_of_slips(growth, motion)
     for step in _suspected(growth, odds, left_out):
         state = _without(growth, step)
         if state and (likeliest := _likeliest(state, step, motion)) != step:
             state, step = _without(growth, likeliest), likeliest
-        yield [step], float(odds[step]), state
-        if more and state and not _moves_as_usual(state, step, motion):
-            for steps, other, both in _tried(state, state.undecided(), motion, False):
-                yield [step, *steps], float(odds[step]) + other, both
+        usual = state is not None and _moves_as_usual(state, step, motion)
+        yield [step], float(odds[step]), state, usual
+        if more and state and not usual:
+            for steps, other, both, fits in _tried(state, state.undecided(), motion, False):
+                fits = fits and both is not None and _moves_as_usual(both, step, motion)
+                yield [step, *steps], float(odds[step]) + other, both, fits
 
 
 def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:
