@@ -189,7 +189,8 @@ def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
 
     system, factors = linearise(graph, poses, fixed=posterior.fixed), graph.between
     k = system.block_size
-    spread = prediction.spreads(system.keyframe, system.blocks, posterior.samples)
+    spread = prediction.left_over(system.keyframe, system.blocks, posterior.samples,
+                                  posterior.noise[:0])
     absolute = np.flatnonzero(factors.is_absolute)
     spread[absolute] += _sagittas(graph.subset(absolute), posterior)
     square, log_det = prediction.normalise(spread + np.eye(k), -system.b.reshape(-1, k))
