@@ -7,10 +7,15 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
-from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry import noise, se2
 from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.online.backend import BackendOptions
 from l1slam_ros.core.online.graph_builder import GraphBuilder
+from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+
+# Every message a keyframe, with the covariance it states: the graph is that of the messages.
+EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 
 
 @dataclass(frozen=True)
@@ -253,18 +258,32 @@ def covariance_of(growth, row):
     return np.linalg.inv(root.T @ root)
 
 
+def messages(graph, poses, first=0, last=None, start=0.0):
+    """
+    Yield samples of a robot at `poses` (n, 3), and behind each the loops that end there.
+
+    Of keyframes first to last of the graph; number k is at `start` [s] + k `PERIOD`.
+    """
+    factors = graph.between
+    stated = noise.covariance_of(factors.sqrt_information)
+    for k in range(first, graph.n_poses if last is None else last):
+        time, rows = start + k * PERIOD, np.flatnonzero(factors.j == k)
+        covariance = stated[rows[factors.is_odometry[rows]]].sum(axis=0)
+        yield odometry(time, poses[k], covariance6(covariance))
+        for row in rows[~factors.is_odometry[rows]]:
+            yield loop(start + factors.i[row] * PERIOD, time, factors.measurement[row],
+                       covariance6(stated[row]))
+
+
+def hear(backend, found):
+    """Add samples and loops."""
+    for message in found:
+        if isinstance(message, LoopClosure):
+            backend.add_loop(message)
+        else:
+            backend.add_odometry(message)
+
+
 def play(backend, world, first=0, last=None):
     """Add keyframes first to last and the loops that end there."""
-    factors = world.graph.between
-    covariance = np.linalg.inv(factors.sqrt_information.transpose(0, 2, 1)
-                               @ factors.sqrt_information)
-    for k in range(first, world.graph.n_poses if last is None else last):
-        for row in np.flatnonzero(factors.j == k):
-            if factors.is_odometry[row]:
-                backend.add_odometry(odometry(k * PERIOD, world.odometry[k],
-                                              covariance6(covariance[row])))
-            else:
-                backend.add_loop(loop(factors.i[row] * PERIOD, k * PERIOD,
-                                      factors.measurement[row], covariance6(covariance[row])))
-        if k == 0:
-            backend.add_odometry(odometry(0.0, world.odometry[0]))
+    hear(backend, messages(world.graph, world.odometry, first, last))

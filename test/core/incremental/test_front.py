@@ -6,20 +6,18 @@ import pytest
 from gps import seen
 from lies import careful_world, is_false, spoilt
 from numpy.testing import assert_allclose
-from problems import covariance6, odometry, play
+from problems import EVERY, covariance6, odometry, play
 from systems import dense_covariance
 
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.online.backend import Backend, BackendOptions
-from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.online.snapshot import Growth, Optimised, SavedMap
 from l1slam_ros.core.online.update import improve
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
-EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 N, KNOWN, LAST = 180, 140, 150
 
 

@@ -14,15 +14,13 @@ from lies import (
     spoilt,
 )
 from numpy.testing import assert_array_equal
+from problems import EVERY
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.online.backend import Backend, BackendOptions
-from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.robust.batch import judge
 from l1slam_ros.core.robust.judgement import Judgement
-
-EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 
 
 def graph_of_pairs(pairs, trusted):
