@@ -14,6 +14,7 @@ from lies import (
     position_error,
     roundabout,
     seen,
+    slipped,
     spoilt,
 )
 from numpy.testing import assert_allclose, assert_array_equal
@@ -23,6 +24,7 @@ from l1slam_ros.core.errors import Interrupted, L1SlamError, OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.online.loop_states import (
@@ -354,17 +356,12 @@ def test_no_lie_is_believed_at_any_time(careful, clean_errors, kind):
 
 def test_at_rest_all_is_judged_from_the_graph_alone(careful, clean_errors):
     """While driving a slip is not looked for, and what was believed of it stays."""
-    step, turn = 150, np.array([[0.0, 0.0, 0.8]])
-    before, after = careful.odometry[:step + 1], careful.odometry[step + 1:]
-    pivot = before[-1:]
-    turned = se2.compose(np.broadcast_to(pivot, after.shape), se2.compose(
-        np.broadcast_to(turn, after.shape), se2.between(
-            np.broadcast_to(pivot, after.shape), after)))
-    world, backend = replace(careful, odometry=np.vstack((before, turned))), Backend(EVERY)
+    graph = slipped(careful.graph, 150, (0.0, 0.0, 0.8))
+    world, backend = replace(careful, odometry=odometry_poses(graph)), Backend(EVERY)
     drive(world, backend, lambda backend: None)
     settled(backend)
     now = backend.snapshot()
-    assert now.graph.between.i[now.optimised.judgement.slips].tolist() == [step]
+    assert now.graph.between.i[now.optimised.judgement.slips].tolist() == [150]
     assert position_error(backend.poses, careful.truth) < 1.2 * clean_errors[-1] + 0.1
 
 
@@ -599,14 +596,10 @@ def test_whether_loops_are_doubted_can_be_changed_while_it_runs():
         backend.add_odometry(odometry(k * PERIOD, (float(k), 0.1 * (k % 3), 0.01 * (k % 5)),
                                       1e-4 * np.eye(6)))
     backend.add_loop(loop(5 * PERIOD, 50 * PERIOD, (0.0, 0.0, 0.0), 1e-4 * np.eye(6)))
-    settled(backend)
-    assert LOOP_STATES[backend.loop_states().state[0]] == 'accepted'
-    backend.set_options(EVERY)
-    settled(backend)
-    assert LOOP_STATES[backend.loop_states().state[0]] == 'rejected'
-    backend.set_options(CREDULOUS)
-    settled(backend)
-    assert LOOP_STATES[backend.loop_states().state[0]] == 'accepted'
+    for options, state in ((CREDULOUS, ACCEPTED), (EVERY, REJECTED), (CREDULOUS, ACCEPTED)):
+        backend.set_options(options)
+        settled(backend)
+        assert backend.loop_states().state.tolist() == [state]
 
 
 @pytest.mark.parametrize('dimension', [2, 3])
