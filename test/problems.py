@@ -230,14 +230,19 @@ def true_loop(poses, reference, sample, covariance=UNKNOWN):
 def grown(poses, options, covariance=UNKNOWN):
     """Return the growth after the samples of `poses` (n, 3), one every .1 s from 0."""
     growth = GraphBuilder(se2, options)
-    drive_on(growth, poses, 0, covariance)
+    drive_on(growth, poses, covariance=covariance)
     return growth
 
 
-def drive_on(growth, poses, first, covariance=UNKNOWN):
-    """Add the samples of `poses` (n, 3) from `first` on."""
+def drive_on(growth, poses, first=0, covariance=UNKNOWN, start=0.0, period=PERIOD):
+    """Add the samples of `poses` (n, 3) from `first` on, number k at `start` + k `period`."""
     for k in range(first, len(poses)):
-        growth.add_odometry(odometry(k * PERIOD, poses[k], covariance))
+        growth.add_odometry(odometry(start + k * period, poses[k], covariance))
+
+
+def straight(n, step=1.0):
+    """Return a drive straight ahead, (n, 3)."""
+    return np.arange(n)[:, None] * np.array([step, 0.0, 0.0])
 
 
 def keyframe_samples(growth):

@@ -7,7 +7,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from problems import EVERY, covariance6, loop, odometry
+from problems import EVERY, covariance6, drive_on, loop, odometry, straight
 
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry import se2
@@ -49,9 +49,7 @@ class Meeting:
 
 
 def drive(backend, first, last):
-    for k in range(first, last):
-        backend.add_odometry(odometry(float(k + 1), (float(k), 0.0, 0.0),
-                                      covariance6(1e-4 * np.eye(3))))
+    drive_on(backend, straight(last), first, covariance6(1e-4 * np.eye(3)), 1.0, 1.0)
 
 
 def meanwhile(work):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where odometry does not go on from where it was, a part of the map begins that loops join."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +12,14 @@ from problems import (
     EVERY,
     PERIOD,
     curve,
+    drive_on,
     hear,
     loop,
     loops_of,
     messages,
     odometry,
     seconds,
+    straight,
 )
 
 from l1slam_ros.core.errors import MessageError
@@ -103,10 +106,8 @@ def test_played_twice_it_is_one_map_with_twice_the_odometry(world, recording, un
 def test_until_loops_join_it_a_part_begins_where_the_last_one_ends():
     poses = curve(60)
     builder = GraphBuilder(se2, EVERY)
-    for k, pose in enumerate(poses[:40]):
-        builder.add_odometry(odometry(100.0 + k * PERIOD, pose))
-    for k, pose in enumerate(poses[40:]):
-        builder.add_odometry(odometry(101.0 + k * PERIOD, pose))
+    drive_on(builder, poses[:40], start=100.0)
+    drive_on(builder, poses[40:], start=101.0)
     assert builder.notes.warned == {'new_part': 1} and not +builder.notes.refused
     assert builder.track.gaps.tolist() == [40] and builder.graph.n_poses == 60
     assert len(builder.graph.between) == 58
@@ -120,9 +121,8 @@ def test_until_loops_join_it_a_part_begins_where_the_last_one_ends():
 def test_a_stamp_is_of_the_part_that_the_robot_is_in_if_that_goes_back_so_far(
         reference, stamp, ends):
     builder = GraphBuilder(se2, EVERY)
-    for first in (100.0, 101.0):
-        for k, pose in enumerate(curve(40)[: 40 if first == 100 else 20]):
-            builder.add_odometry(odometry(first + k * PERIOD, pose))
+    drive_on(builder, curve(40), start=100.0)
+    drive_on(builder, curve(20), start=101.0)
     builder.add_loop(loop(reference, stamp, (1.0, 0.0, 0.0)))
     assert builder.add_due_loops() == 1
     assert loops_of(builder)[:2] == ([ends[0]], [ends[1]])
@@ -131,12 +131,10 @@ def test_a_stamp_is_of_the_part_that_the_robot_is_in_if_that_goes_back_so_far(
 def test_loops_that_came_before_the_clock_was_set_back_are_of_their_time():
     """Also one that waits then for a time that never comes, until the second part has it."""
     builder = GraphBuilder(se2, EVERY)
-    for k, pose in enumerate(curve(20)):
-        builder.add_odometry(odometry(100.0 + k * PERIOD, pose))
+    drive_on(builder, curve(20), start=100.0)
     builder.add_loop(loop(100.1, 101.5, (1.0, 0.0, 0.0)))
     builder.add_loop(loop(100.1, 102.5, (1.0, 0.0, 0.0)))
-    for k, pose in enumerate(curve(30)):
-        builder.add_odometry(odometry(100.0 + k * PERIOD, pose))
+    drive_on(builder, curve(30), start=100.0)
     builder.add_due_loops()
     assert loops_of(builder)[:2] == ([1, 21], [15, 45])
 
@@ -144,10 +142,9 @@ def test_loops_that_came_before_the_clock_was_set_back_are_of_their_time():
 def test_near_a_gap_nothing_is_carried_across_it():
     """The time is nearer to the first keyframe of the second part than to its own."""
     builder = GraphBuilder(se2, replace(EVERY, keyframe=KeyframeOptions(0.5, 0.0, 0.0)))
-    for k in range(14):
-        builder.add_odometry(odometry(1.0 + k * PERIOD, (0.1 * k, 0.0, 0.0)))
-    for k in range(14, 30):
-        builder.add_odometry(odometry(1.0 + k * PERIOD, (1e6 + 0.1 * k, 0.0, 0.0)))
+    poses = straight(30, 0.1)
+    poses[14:, 0] += 1e6
+    drive_on(builder, poses, start=1.0)
     builder.add_loop(loop(1.0, 2.3, (1.3, 0.0, 0.0)))
     builder.add_due_loops()
     assert builder.track.keyframe_stamps[[2, 3]].tolist() == [seconds(2.0), seconds(2.4)]
@@ -174,12 +171,11 @@ def test_one_old_stamp_is_dropped_and_two_near_ones_too():
     ('new_segment', 60, 39.0), ('reset', 20, 0.0), ('ignore', 40, None)])
 def test_what_becomes_of_the_map_is_the_users_to_say(choice, poses, x):
     backend = Backend(replace(EVERY, on_time_jump=choice))
-    for first, count in ((100.0, 40), (100.0, 20)):
-        for k in range(count):
-            try:
-                backend.add_odometry(odometry(first + k * PERIOD, (float(k), 0.0, 0.0)))
-            except MessageError:
-                assert choice == 'ignore' and first == 100.0
+    for count in 40, 20:
+        for k, pose in enumerate(straight(count)):
+            refused = choice == 'ignore' and count == 20
+            with pytest.raises(MessageError) if refused else nullcontext():
+                backend.add_odometry(odometry(100.0 + k * PERIOD, pose))
         backend.settle()
     assert len(backend.poses) == poses
     if x is not None:
@@ -195,8 +191,7 @@ def test_a_saved_map_keeps_its_parts(recording):
     assert second.snapshot().gaps.tolist() == [HALF]
     assert_array_equal(second.snapshot().stamps, first.stamps)
     # Another recording, made earlier, is a part of its own.
-    for k in range(5):
-        second.add_odometry(odometry(0.5 + k * PERIOD, (7.0 + k, 0.0, 0.0)))
+    drive_on(second, straight(5), start=0.5)
     assert second.snapshot().gaps.tolist() == [HALF, N]
     assert_allclose(second.poses[N], first.poses[-1], atol=1e-9)
 
