@@ -133,22 +133,32 @@ def drive(n, rng):
     return poses
 
 
-def graph_of(truth, pairs, noise=None, information=None):
-    """
-    Return the graph that measures the pairs (m, 2) of the poses `truth` (n, 3).
+# The information that factors state where nothing else is said.
+USUAL = np.diag([100.0, 100.0, 400.0])
 
-    noise : (m, 3) steps applied to the measurements; information : (m, 3, 3), else diagonal.
-    """
-    i, j = np.array(pairs).T
-    measurement = se2.between(truth[i], truth[j])
-    if noise is not None:
-        measurement = se2.retract(measurement, noise)
-    if information is None:
-        information = np.broadcast_to(np.diag([100.0, 100.0, 400.0]), (len(i), 3, 3))
+
+def chain_of(n):
+    """Return the pairs of a chain, (n - 1, 2)."""
+    return np.column_stack((np.arange(n - 1), np.arange(1, n)))
+
+
+def graph_of(truth, pairs, noise=0.0, information=USUAL):
+    """Return the graph that measures the pairs (m, 2) of the poses `truth` (n, 3)."""
     graph = FactorGraph(se2)
     graph.add_poses(len(truth))
-    graph.add_between(i, j, measurement, information)
+    measure(graph, truth, *np.array(pairs).T, noise, information)
     return graph
+
+
+def measure(graph, truth, i, j, noise=0.0, information=USUAL):
+    """
+    Append what sees keyframes j from keyframes i, (m,), where they are in truth (n, 3).
+
+    noise : (m, 3) steps applied to the measurements; information : (m, 3, 3); or one for all
+    """
+    exact = se2.between(truth[i], truth[j])
+    graph.add_between(i, j, se2.retract(exact, np.broadcast_to(noise, exact.shape)),
+                      np.broadcast_to(information, (*exact.shape, 3)))
 
 
 def retold(graph, measurement=None, times=1.0, trusted=None):

@@ -4,11 +4,10 @@
 import numpy as np
 import pytest
 from lies import careful_world, slipped, spoilt
-from problems import retold
+from problems import chain_of, graph_of, retold, straight
 from test_pairwise_consistency import STEP, TURN, grown
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.motion import log_odds_of_slips, usual_motion
@@ -88,10 +87,6 @@ def test_a_robot_does_not_jump_because_lies_say_so(bad):
 
 
 def test_steps_all_alike_leave_no_tail():
-    graph = FactorGraph(se2)
-    graph.add_poses(31)
-    graph.add_between(np.arange(30), np.arange(1, 31), np.tile([[1.0, 0, 0]], (30, 1)),
-                      np.tile(np.eye(3), (30, 1, 1)))
-    motion = usual_motion(grown(graph))
+    motion = usual_motion(grown(graph_of(straight(31), chain_of(31), 0.0, np.eye(3))))
     like, jump = motion.log_density(np.array([[1.0, 0, 0], [9.0, 0, 0]]))
     assert np.isfinite([like, jump]).all() and like > jump + 10
