@@ -4,6 +4,7 @@
 import time
 
 import numpy as np
+import problems
 import pytest
 from lies import (
     careful_world,
@@ -14,7 +15,7 @@ from lies import (
     spoilt,
 )
 from numpy.testing import assert_array_equal
-from problems import EVERY
+from problems import EVERY, chain_of, retold, straight
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -22,22 +23,14 @@ from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.robust.batch import judge
 from l1slam_ros.core.robust.judgement import Judgement
 
-
-def graph_of_pairs(pairs, trusted):
-    """Return a graph on a line; trusted : the pairs that are vouched for."""
-    graph = FactorGraph(se2)
-    graph.add_poses(6)
-    for i, j in pairs:
-        graph.add_between(i, j, np.array([[j - i, 0.0, 0.0]]), np.eye(3)[None], (i, j) in trusted)
-    return graph
-
-
-CHAIN = [(k, k + 1) for k in range(5)]
 LOOPS = [(0, 2), (1, 4), (0, 1)]
 
 
 def graph_of(*loops, trusted=()):
-    return graph_of_pairs([*CHAIN, *loops], trusted)
+    """Return a chain of six on a line with loops; trusted : those that are vouched for."""
+    pairs = [*chain_of(6).tolist(), *map(list, loops)]
+    return retold(problems.graph_of(straight(6), pairs, 0.0, np.eye(3)),
+                  trusted=np.array([tuple(pair) in trusted for pair in pairs]))
 
 
 @pytest.fixture(scope='module')
