@@ -16,7 +16,6 @@ A message that cannot be used raises `MessageError` with one of these causes:
 Covariances pass as they come: `graph_builder` decides what they are worth.
 """
 
-import math
 import re
 import struct
 from types import SimpleNamespace
@@ -27,12 +26,7 @@ import numpy as np
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import silent_components
-from l1slam_ros.core.graph.measurements import (
-    FARTHEST,
-    QUATERNION_NORM_ERROR,
-    LoopClosure,
-    OdometrySample,
-)
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, sound_pose3
 from l1slam_ros.io.files import NANOSECONDS, quoted, stamp_text
 
 _REFERENCE_FRAME = re.compile(
@@ -208,18 +202,6 @@ def checked_pose3(t: Any, q: Any) -> Array:
 
     """
     return sound_pose3((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
-
-
-def sound_pose3(position: tuple[float, ...], quaternion: tuple[float, ...]) -> Array:
-    """Return a pose (7,) of x y z and qx qy qz qw; see `checked_pose3`."""
-    if not all(map(math.isfinite, position + quaternion)):
-        raise MessageError('not_finite', f'pose {position} {quaternion}; expected finite numbers')
-    if max(map(abs, position)) > FARTHEST:
-        raise MessageError('range', f'position {position}; expected it within {FARTHEST:g} m')
-    norm = math.hypot(*quaternion)
-    if abs(norm - 1.0) > QUATERNION_NORM_ERROR:
-        raise MessageError('quaternion', f'quaternion {quaternion} of norm {norm:g}; expected 1')
-    return np.array((*position, *(component / norm for component in quaternion)))
 
 
 def _ends(message: Any, base_frame: str) -> tuple[int, int]:
