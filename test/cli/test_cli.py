@@ -8,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag2 import StoragePlugin
 from torn import torn_graph
 
+from bags import NOTE, recording_of, rosbag2_directory
 from l1slam_ros.cli.main import main
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
@@ -103,18 +101,24 @@ def test_the_names_of_a_report_stay(capsys, world, more):
 # Robust
 
 
+def renumbered(path):
+    """Return the lines of a graph with the ids 10, 13, 16, ..."""
+    lines = [line.split() for line in path.read_text().splitlines()]
+    for fields in lines:
+        for k in (1,) if fields[0] == 'VERTEX_SE2' else (1, 2):
+            fields[k] = str(10 + 3 * int(fields[k]))
+    return [' '.join(fields) for fields in lines]
+
+
 @pytest.fixture(params=['random', 'identity', 'grouped'])
 def lies(tmp_path, request):
     """A world with 100 false loops, its edges in no order, and its ids 10, 13, 16, ..."""
     path = tmp_path / 'lies.g2o'
     assert main(['simulate', str(path), '--poses', '300', '--edges', '600', '--seed', '4',
                  '--false-loops', '100', '--kind', request.param]) == 0
-    lines = [line.split() for line in path.read_text().splitlines()]
-    for fields in lines:
-        for k in (1,) if fields[0] == 'VERTEX_SE2' else (1, 2):
-            fields[k] = str(10 + 3 * int(fields[k]))
+    lines = renumbered(path)
     np.random.default_rng(0).shuffle(lines)
-    path.write_text('\n'.join(' '.join(fields) for fields in lines) + '\n')
+    path.write_text('\n'.join(lines) + '\n')
     false = Path(f'{path}.false.txt')
     pairs = 10 + 3 * np.loadtxt(false, dtype=int)
     false.write_text('\n'.join(f'{i} {j}' for i, j in pairs))
@@ -359,21 +363,10 @@ def test_every_start_leads_every_norm_to_one_cost(capsys, world, start, norm):
     assert (report['seed_cost'] is None) == (start != 'seed')
 
 
-def copied_bag(bag, copy, renamed=None, note=True):
+def copied_bag(bag, copy, names=None, note=NOTE):
     """Copy a bag into an sqlite one by rosbags' own reader and writer."""
-    writer = Writer(copy, version=9, storage_plugin=StoragePlugin.SQLITE3)
-    metadata = yaml.safe_load((bag / 'metadata.yaml').read_text())
-    for key, text in metadata['rosbag2_bagfile_information']['custom_data'].items():
-        if note:
-            writer.set_custom_data(key, text)
-    typestore = get_typestore(Stores.ROS2_JAZZY)
-    with AnyReader([bag]) as reader, writer:
-        connections = {c.id: writer.add_connection(
-            (renamed or {}).get(c.topic, c.topic), c.msgtype, typestore=typestore)
-            for c in reader.connections}
-        for connection, time, data in reader.messages():
-            writer.write(connections[connection.id], time, data)
-    return copy
+    recording = [((names or {}).get(topic, topic), *rest) for topic, *rest in recording_of(bag)]
+    return rosbag2_directory(copy, recording, StoragePlugin.SQLITE3, note=note)
 
 
 @pytest.fixture
@@ -402,7 +395,7 @@ def test_every_door_leads_to_the_same_costs_and_poses(capsys, doors, tmp_path, n
 
 def test_a_bag_without_our_note_goes_by_the_parameters(capsys, world, tmp_path):
     run(capsys, 'convert', world, tmp_path / 'bag')
-    plain = copied_bag(tmp_path / 'bag', tmp_path / 'plain', note=False)
+    plain = copied_bag(tmp_path / 'bag', tmp_path / 'plain', note=None)
     params = tmp_path / 'params.yaml'
     params.write_text('/**: {ros__parameters: {odometry: {covariance_source: increment}, '
                       'keyframe: {translation: 0.0, rotation: 0.0, period: 0.0}}}')
@@ -547,11 +540,7 @@ def test_solve_draws_the_costs_beside_the_map(capsys, world, tmp_path):
 def odd(world, tmp_path):
     """The world with stamps and with ids 10, 13, 16, ..."""
     path = tmp_path / 'odd.g2o'
-    lines = [line.split() for line in world.read_text().splitlines()]
-    for fields in lines:
-        for k in (1,) if fields[0] == 'VERTEX_SE2' else (1, 2):
-            fields[k] = str(10 + 3 * int(fields[k]))
-    path.write_text('\n'.join(' '.join(fields) for fields in lines) + '\n')
+    path.write_text('\n'.join(renumbered(world)) + '\n')
     Path(f'{path}.stamps.txt').write_text(
         ''.join(f'{10 + 3 * k} {5 + k}.25\n' for k in range(150)))
     return path
