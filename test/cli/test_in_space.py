@@ -57,15 +57,6 @@ def test_each_norm_is_named_and_lowest_at_its_own_map(capsys, building, tmp_path
             assert there >= costs[norm] * (1 - 1e-4)
 
 
-def test_a_parameter_file_names_the_norm(capsys, building, tmp_path):
-    params = tmp_path / 'params.yaml'
-    params.write_text('/**: {ros__parameters: {solver: {norm: group-l1}}}')
-    report = solved(capsys, building, '--no-robust', '--params-file', params)
-    assert report['solver'] == 'primal-dual-newton'
-    report = solved(capsys, building, '--no-robust', '--params-file', params, '--norm', 'l2')
-    assert report['solver'] == 'gauss-newton'
-
-
 def test_the_reading_of_the_rotation_is_kept_and_weighs(capsys, building, tmp_path):
     reading = ('--rotation-information', 'angle')
     run('convert', building, tmp_path / 'same.g2o', *reading)

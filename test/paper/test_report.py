@@ -160,10 +160,3 @@ def test_figure_6_has_every_method_and_what_was_refused():
         ['Good', '0', '4', '2', '1.00 m', '8 of 8', '0'],
         ['Bad', '0', '4', '2', '1.00 m', '6 of 8', '4']]
     assert figures.best_huber(good) == NARROW
-
-
-def test_numbers_are_printed_as_in_the_paper():
-    assert report.cost(52064000.0) == '5.2064e7' and report.cost(982.0514) == '982.051'
-    assert report.metres(0.126) == '0.13 m'
-    assert [report.milliseconds(s) for s in (0.0003, 2.31, None)] == [
-        '0.3', '2310', 'did not finish']

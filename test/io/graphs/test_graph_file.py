@@ -10,7 +10,6 @@ from problems import add_absolute, retold
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.noise import square_root_information
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.io.graphs.graph_file import (
     GraphRecord,
@@ -64,14 +63,6 @@ def test_a_small_graph(write):
                                [[4, 0.5, 0.25], [0.5, 5, 0.125], [0.25, 0.125, 6]], rtol=1e-15)
     assert record.stamps is None
     assert record.skipped == ()
-
-
-def test_toro_orders_the_information_otherwise(write):
-    g2o = 'EDGE_SE2 0 1 1 2 0.5 10 1 2 20 3 30\n'
-    toro = 'EDGE2 0 1 1 2 0.5 10 1 20 30 2 3\n'
-    first, second = (read_graph_file(write(text)).graph.between for text in (g2o, toro))
-    assert (first.sqrt_information == second.sqrt_information).all()
-    assert (first.measurement == second.measurement).all()
 
 
 def test_edges_alone_name_the_vertices(write):
@@ -305,18 +296,6 @@ def test_the_papers_graphs_come_back_number_by_number(datasets, tmp_path, name):
 
     assert rows(copy, 'VERTEX_SE2') == sorted(rows(source, 'VERTEX_SE2'))
     assert rows(copy, 'EDGE_SE2') == rows(source, 'EDGE_SE2')
-
-
-@pytest.mark.parametrize('exponent', [-30, -8, 0, 8, 25])
-def test_information_of_many_digits_keeps_them(tmp_path, rng, exponent):
-    information = np.diag(rng.uniform(1, 10, 3) * 10.0**exponent)[None]
-    graph = FactorGraph(se2)
-    graph.add_poses(2)
-    graph.add_between(np.array([0]), np.array([1]), np.ones((1, 3)), information)
-    write_graph_file(tmp_path / 'a.g2o', GraphRecord(graph, None, np.array([0, 1])))
-    back = read_graph_file(tmp_path / 'a.g2o')
-    np.testing.assert_allclose(back.graph.between.sqrt_information,
-                               square_root_information(information), rtol=1e-15, atol=0)
 
 
 def with_trust(record, rows):
