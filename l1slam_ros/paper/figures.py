@@ -36,7 +36,7 @@ from l1slam_ros.paper.runs import (
     run_false_loops,
     run_noisy_starts,
 )
-from l1slam_ros.paper.updates import Growth, measure_growth, spread
+from l1slam_ros.paper.updates import Updates, measure_growth, spread
 
 # Within this of the lowest cost of a diagram, a method has arrived.
 _ARRIVED = 0.001
@@ -163,15 +163,16 @@ def figure_5(study: Study, folder: Path) -> list[str]:
     if not keyframes:
         return ['Not run: no keyframes.']
     with Progress(keyframes, 'keyframe') as progress:
-        growth = measure_growth(keyframes, rate, np.random.default_rng(WORLD_SEED),
-                                progress.advance)
-    updates = growth.updates
+        updates, batch = measure_growth(keyframes, rate, np.random.default_rng(WORLD_SEED),
+                                        progress.advance)
+    sizes = np.array([now.graph.n_poses for now in updates.on_the_way])
     curves = [*_windows('ours', updates.ours), *_windows('ISAM2', updates.peer),
-              Curve('batch L2', growth.sizes, 1e3 * growth.batch)]
+              Curve('batch L2', sizes, 1e3 * batch)]
     plot_curves(folder / 'figure_5.png', curves, 'time per update', ('keyframes', 'ms'))
     said = _UPDATES.format(seed=WORLD_SEED, poses=keyframes, rate=keyframes / updates.elapsed)
     return [said, *([] if updates.peer else ['', _NO_PEER]), '',
-            '![time per update over keyframes](figure_5.png)', '', *table_of_updates(growth)]
+            '![time per update over keyframes](figure_5.png)', '',
+            *table_of_updates(updates, batch)]
 
 
 def _windows(name: str, seconds: Sequence[float]) -> list[Curve]:
@@ -184,14 +185,13 @@ def _windows(name: str, seconds: Sequence[float]) -> list[Curve]:
             for word, q in (('median', 50), ('95%', 95))]
 
 
-def table_of_updates(growth: Growth) -> list[str]:
-    """Return what updates cost, of each method."""
+def table_of_updates(updates: Updates, batch: Array) -> list[str]:
+    """Return what updates cost, of each method; batch : (k,) [s]."""
     header = ['ms per update', 'median', '95%', '99%', 'most', '95% of the second quarter',
               'of the last', 'all [s]', 'behind [s]']
     rows = []
-    for name, seconds, behind in (('ours', growth.updates.ours, f'{growth.updates.behind:.1f}'),
-                                  ('ISAM2', growth.updates.peer, ''),
-                                  ('batch L2', growth.batch.tolist(), '')):
+    for name, seconds, behind in (('ours', updates.ours, f'{updates.behind:.1f}'),
+                                  ('ISAM2', updates.peer, ''), ('batch L2', batch.tolist(), '')):
         if len(seconds):
             of = spread(seconds)
             rows.append([name, *(f'{of[key]:.2f}' for key in (

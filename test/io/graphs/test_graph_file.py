@@ -16,7 +16,7 @@ from l1slam_ros.io.graphs.graph_file import (
     read_graph_file,
     write_graph_file,
 )
-from l1slam_ros.io.graphs.side_files import stamps_path, trusted_path
+from l1slam_ros.io.graphs.side_files import beside
 
 SQUARE = """\
 # a comment
@@ -318,7 +318,7 @@ def test_trust_comes_back_with_the_graph(tmp_path, rng, name):
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         name, f'{name}.stamps.txt', f'{name}.trusted.txt']
     assert sorted(tuple(map(int, line.split()))
-                  for line in trusted_path(path).read_text().splitlines()) == sorted(
+                  for line in beside(path, 'trusted').read_text().splitlines()) == sorted(
         map(tuple, record.ids[pairs[rows]].tolist()))
     back = read_graph_file(path)
     assert sorted(rows) == np.flatnonzero(back.graph.between.trusted).tolist()
@@ -327,12 +327,12 @@ def test_trust_comes_back_with_the_graph(tmp_path, rng, name):
 
 def test_trust_joins_loops_either_way_round_and_leaves_odometry(write):
     path = write(SQUARE + 'EDGE_SE2 7 3 1 0 0 1 0 0 1 0 1\nEDGE_SE2 3 9 1 0 0 1 0 0 1 0 1\n')
-    trusted_path(path).write_text('3 7\n7 9\n')
+    beside(path, 'trusted').write_text('3 7\n7 9\n')
     assert read_graph_file(path).graph.between.trusted.tolist() == [False] * 3 + [True, False]
-    trusted_path(path).write_text('3 9\n')
+    beside(path, 'trusted').write_text('3 9\n')
     assert read_graph_file(path).graph.between.trusted.tolist() == [
         False, False, True, False, True]
-    trusted_path(path).write_text('# nobody vouched\n\n')
+    beside(path, 'trusted').write_text('# nobody vouched\n\n')
     assert not read_graph_file(path).graph.between.trusted.any()
 
 
@@ -346,14 +346,14 @@ def test_trust_joins_loops_either_way_round_and_leaves_odometry(write):
 ])
 def test_damaged_trust_is_named(write, text, message):
     path = write(SQUARE)
-    trusted_path(path).write_text(text)
+    beside(path, 'trusted').write_text(text)
     assert message_of(path).startswith(f'.trusted.txt{message}')
 
 
 def test_a_graph_is_not_lent_the_stamps_or_the_trust_of_its_predecessor(tmp_path, rng):
     path, record = tmp_path / 'a.g2o', random_record(rng)
     write_graph_file(path, with_trust(record, [50, 60]))
-    assert trusted_path(path).exists() and stamps_path(path).exists()
+    assert beside(path, 'trusted').exists() and beside(path, 'stamps').exists()
     write_graph_file(path, replace(record, stamps=None))
     assert list(tmp_path.iterdir()) == [path]
     back = read_graph_file(path)
@@ -364,10 +364,10 @@ def test_graph_stamps_and_trust_are_replaced_together_or_not_at_all(tmp_path, rn
     path, record = tmp_path / 'a.g2o', random_record(rng)
     other = replace(record, poses=record.poses + 1, stamps=record.stamps + 1)
     write_graph_file(path, record)
-    trusted_path(path).mkdir()
+    beside(path, 'trusted').mkdir()
     before = {p: p.is_dir() or p.read_bytes() for p in tmp_path.iterdir()}
     for changed, word in (with_trust(other, [50]), 'written'), (other, 'removed'):
-        with pytest.raises(FileError, match=f'{trusted_path(path)}: cannot be {word}'):
+        with pytest.raises(FileError, match=f'{beside(path, "trusted")}: cannot be {word}'):
             write_graph_file(path, changed)
         assert {p: p.is_dir() or p.read_bytes() for p in tmp_path.iterdir()} == before
 
@@ -395,15 +395,15 @@ def test_the_graph_survives_a_failing_replacement(tmp_path, rng):
 ])
 def test_damaged_stamps_are_named(write, text, message):
     path = write(SQUARE)
-    stamps_path(path).write_text(text)
+    beside(path, 'stamps').write_text(text)
     with pytest.raises(FileError) as caught:
         read_graph_file(path)
-    assert str(caught.value).startswith(f'{stamps_path(path)}{message}')
+    assert str(caught.value).startswith(f'{beside(path, "stamps")}{message}')
 
 
 def test_stamps_of_any_order(write):
     path = write(SQUARE)
-    stamps_path(path).write_text('9 3\n# c\n3 1.25\n7 2.000000001\n')
+    beside(path, 'stamps').write_text('9 3\n# c\n3 1.25\n7 2.000000001\n')
     assert read_graph_file(path).stamps.tolist() == [1250000000, 2000000001, 3000000000]
-    stamps_path(path).write_text('# seconds\n 3.25\n1 \n2.5\n')
+    beside(path, 'stamps').write_text('# seconds\n 3.25\n1 \n2.5\n')
     assert read_graph_file(path).stamps.tolist() == [3250000000, 1000000000, 2500000000]
