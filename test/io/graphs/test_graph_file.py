@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Graph files: g2o and TORO in, the same numbers out, every malformed line named."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -124,50 +123,6 @@ def test_the_same_square_in_toro(write):
     assert_same(a, b)
 
 
-# As g2o has them; in TORO the tags are others, and so is the order of the information.
-MALFORMED = [
-    ('EDGE 3 7 1 0 0 1 0 0 1 0', 'EDGE: 10 fields; expected 2 whole and 9 finite numbers'),
-    ('EDGE 3 7 1 0 0 1 0 0 1 0 1 1', 'EDGE: 12 fields; expected 2 whole'),
-    ('EDGE 3 7 # 1 0 0 1 0 0 1 0 1', 'EDGE: 2 fields; expected 2 whole'),
-    ('VERTEX 5 0 0', 'VERTEX: 3 fields; expected 1 whole and 3 finite numbers'),
-    ('VERTEX 5 0 nan 0', "VERTEX: 'nan' is not a finite number; expected"),
-    ('VERTEX 5 0 0x10 0', "VERTEX: '0x10' is not a finite number; expected"),
-    ('VERTEX 5 0 1_0 0', "VERTEX: '1_0' is not a finite number; expected"),
-    ('VERTEX 5 0 1e999 0', "VERTEX: '1e999' is not a finite number; expected"),
-    ('VERTEX 5 0 1,5 0', "VERTEX: '1,5' is not a finite number; expected"),
-    ('VERTEX 5 0 1e31 0', "VERTEX: '1e31' is beyond 1e+30; expected"),
-    ('VERTEX 5.0 0 0 0', "VERTEX: '5.0' is not a whole number of 64 bits; expected"),
-    ('VERTEX 9223372036854775808 0 0 0',
-     "VERTEX: '9223372036854775808' is not a whole number of 64 bits; expected"),
-    ('EDGE 3 7.5 1 0 0 1 0 0 1 0 1', "EDGE: '7.5' is not a whole number of 64 bits"),
-    ('EDGE 3 7 1 inf 0 1 0 0 1 0 1', "EDGE: 'inf' is not a finite number; expected"),
-    ('EDGE 3 7 1 0 0 -1e99 0 0 1 0 1', "EDGE: '-1e99' is beyond 1e+30; expected"),
-    ('EDGE 3 7 1 0 0 0 0 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected a positive'),
-    ('EDGE 3 8 1 0 0 1 0 0 1 0 1', 'vertex 8 is unknown; expected one of the 3 vertices'),
-    ('EDGE 100 3 1 0 0 1 0 0 1 0 1', 'vertex 100 is unknown; expected one of the 3 vertices'),
-    ('VERTEX 7 0 0 0', 'vertex 7 stands twice, before at line 2; expected each once'),
-    ('EGDE_SE2 3 7 1 0 0 1 0 0 1 0 1', "unknown tag 'EGDE_SE2'; expected VERTEX_SE2, EDGE_SE2, "),
-    ('VERTEX_SE3:QUAT 5 0 0 0 0 0 0 1', 'VERTEX_SE3:QUAT: a line of SE3 beside VERTEX at line 2; '
-     'expected all poses in the plane, or all in space'),
-    ('EDGE3 5 6', 'EDGE3: a line of SE3 beside VERTEX at line 2; expected all poses in'),
-    ('VERTEX_SE3:EXPMAP 5 6', "unknown tag 'VERTEX_SE3:EXPMAP'; expected VERTEX_SE2, "),
-]
-
-
-def with_tags(text, tags):
-    return re.sub(r'\b(VERTEX|EDGE)\b', lambda word: tags[word[0]], text)
-
-
-@pytest.mark.parametrize(('square', 'tags'), [
-    (SQUARE, {'VERTEX': 'VERTEX_SE2', 'EDGE': 'EDGE_SE2'}),
-    (TORO_SQUARE, {'VERTEX': 'VERTEX2', 'EDGE': 'EDGE2'})], ids=['g2o', 'toro'])
-@pytest.mark.parametrize(('line', 'message'), MALFORMED)
-def test_each_malformed_line_is_named(write, square, tags, line, message):
-    # A good line follows: it is not the last one that is named, nor the first of its tag.
-    text = square + with_tags(line, tags) + '\n' + square.splitlines()[4] + '\n'
-    assert message_of(write(text)).startswith(f':9: {with_tags(message, tags)}')
-
-
 @pytest.mark.parametrize(('line', 'message'), [
     ('EDGE_SE2 3 7 1 0 0 1 2 0 1 0 1',
      'information [1 2 0 2 1 0 0 0 1]; expected a positive definite matrix'),
@@ -178,6 +133,7 @@ def test_each_malformed_line_is_named(write, square, tags, line, message):
     ('EDGE_PRIOR_SE2 3 1 0 0 1 0 0 1 0 -1', 'information [1 0 0 0 1 0 0 0 -1]; expected'),
     ('EDGE_PRIOR_SE2_XY 3 1 0 1 0 -1', 'information [1 0 0 0 -1 0 0 0 0]; expected'),
     ('EDGE_PRIOR_SE2_XY 3 1 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected'),
+    ('EDGE_SE2 3 7 1 0 0 0 0 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected a positive'),
     ('EDGE_SE2 3 7 1 0 0 1 .1 0 0 0 1', 'information [1 0.1 0 0.1 0 0 0 0 1]; expected'),
     ('EDGE_PRIOR_SE2_XY 3 1 0 0 1 0 1', 'EDGE_PRIOR_SE2_XY: 7 fields; expected 1 whole and 5'),
     ('EDGE_PRIOR_SE2 -1 1 0 0 1 0 0 1 0 1', 'vertex -1 is unknown; expected one of the 3'),
