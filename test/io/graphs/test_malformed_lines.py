@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each malformed line of a graph file is named, with what was found and expected, in any format."""
+"""Each malformed line of a graph file is named, found and expected beside it, in any format."""
 
 import re
 from typing import NamedTuple
