@@ -11,16 +11,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from l1slam_ros.core import names
 from l1slam_ros.core.errors import L1SlamError
-from l1slam_ros.core.names import (
-    KINDS_OF_FALSE_LOOPS,
-    NORMS,
-    ROTATION_INFORMATION,
-    SAME,
-    SOLVERS,
-    STARTS,
-    WORLDS,
-)
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS
 from l1slam_ros.paper import printed as paper
 
@@ -126,7 +118,8 @@ def _forget_output() -> None:
 
 def _add_reading(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group('how to read a 3D g2o file, or a bag').add_argument
-    add('--rotation-information', choices=ROTATION_INFORMATION, default=ROTATION_INFORMATION[0],
+    add('--rotation-information', choices=names.ROTATION_INFORMATION,
+        default=names.ROTATION_INFORMATION[0],
         help="in and out: what the information's rotation block is of, the vector part of the "
         'quaternion, as g2o has it, or the angle (default: %(default)s)')
     for name, default, what in (
@@ -147,16 +140,16 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
 def _add_solve(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('input', type=Path, metavar='INPUT', help=_INPUT)
-    add('--start', choices=STARTS, default=STARTS[0],
+    add('--start', choices=names.STARTS, default=names.STARTS[0],
         help='where from: first poses from the graph alone, the stored poses, or the odometry; '
         'where loops are doubted, always from the graph alone (default: %(default)s)')
-    add('--norm', choices=NORMS,
+    add('--norm', choices=names.NORMS,
         help='what is minimised: l1, of each component; group-l1, of the length of each factor, '
         'whatever axes it is written in; l2; huber (default: as of solver.norm, l1)')
-    add('--loop-norm', choices=(SAME, *NORMS),
+    add('--loop-norm', choices=(names.SAME, *names.NORMS),
         help='what is minimised of loops and absolute poses (default: as of solver.loop_norm, '
         'same)')
-    add('--solver', choices=SOLVERS, default=SOLVERS[0],
+    add('--solver', choices=names.SOLVERS, default=names.SOLVERS[0],
         help='for l1; auto: interior-point on sparse graphs (default: %(default)s)')
     add('--robust', action=argparse.BooleanOptionalAction,
         help='refuse loops that cannot be believed, and say which, or believe all; by default '
@@ -184,7 +177,7 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('output', type=Path, metavar='OUTPUT',
         help=f'{_GRAPH_OUTPUT}; beside it OUTPUT.truth.txt and OUTPUT.false.txt')
-    add('--world', choices=WORLDS, default=WORLDS[0],
+    add('--world', choices=names.WORLDS, default=names.WORLDS[0],
         help='streets in the plane; in space a building of several floors, with ramps, or a drive '
         'on a sphere or a torus (default: %(default)s)')
     add('--poses', type=int, required=True, metavar='N')
@@ -205,8 +198,8 @@ def _add_corrupt(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_randomness(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--kind', choices=KINDS_OF_FALSE_LOOPS,
-                        default=KINDS_OF_FALSE_LOOPS[0], help=_KIND)
+    parser.add_argument('--kind', choices=names.KINDS_OF_FALSE_LOOPS,
+                        default=names.KINDS_OF_FALSE_LOOPS[0], help=_KIND)
     parser.add_argument('--seed', type=int, default=0, metavar='S',
                         help='another one, another draw (default: %(default)s)')
 

@@ -77,7 +77,7 @@ def leaf_rows(path: Path) -> Iterator[Row]:
             database.execute('PRAGMA journal_mode = OFF')
             for number in leaves:
                 database.execute('PRAGMA writable_schema = ON')
-                database.execute("UPDATE sqlite_schema SET rootpage = ? WHERE name = 'messages'",
+                database.execute("UPDATE sqlite_master SET rootpage = ? WHERE name = 'messages'",
                                  (number,))
                 database.execute('PRAGMA writable_schema = RESET')
                 # Rows of other tables have no blob there.
