@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import run
 from PIL import Image
 from problems import linprog_l1
 from scipy.optimize import linprog
 
-from l1slam_ros.cli.main import main
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.geometry.se2 import wrap
@@ -265,7 +265,7 @@ def test_a_report_replaces_its_former_self_and_nothing_else(tmp_path):
 def arguments(folder, **changes):
     options = {'datasets': folder, 'worlds': 'none', 'output': folder / 'out', **changes}
     return [word for name, value in options.items() if value is not None
-            for word in (f'--{name}', str(value))]
+            for word in (f'--{name}', value)]
 
 
 @pytest.mark.parametrize(('changes', 'says'), [
@@ -278,8 +278,7 @@ def arguments(folder, **changes):
     ({'output': Path('/proc/out')}, '/proc/out: cannot be written'),
 ])
 def test_what_cannot_be_is_refused_at_once_in_one_line(capsys, tmp_path, changes, says):
-    assert main(['reproduce', *arguments(tmp_path, **changes)]) == 2
-    out, err = capsys.readouterr()
+    out, err = run(capsys, 'reproduce', *arguments(tmp_path, **changes), code=2)
     assert out == '' and says in err and err.count('\n') == 1
     assert not list(tmp_path.iterdir())
 
@@ -290,7 +289,6 @@ def test_what_cannot_be_is_refused_at_once_in_one_line(capsys, tmp_path, changes
      'EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n', 'intel.g2o: the graph is not connected: vertex 2')])
 def test_a_graph_that_cannot_be_used_is_named(capsys, tmp_path, text, says):
     (tmp_path / 'intel.g2o').write_text(text)
-    assert main(['reproduce', *arguments(tmp_path)]) == 2
-    out, err = capsys.readouterr()
+    out, err = run(capsys, 'reproduce', *arguments(tmp_path), code=2)
     assert out == '' and says in err and err.count('\n') == 1
     assert [p.name for p in tmp_path.iterdir()] == ['intel.g2o']
