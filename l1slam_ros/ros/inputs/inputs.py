@@ -46,8 +46,9 @@ _DEPTH = 1000
 _AT_ONCE = 100
 # More are left to DDS, to drop: ten seconds of a fast topic, some megabytes.
 _BACKLOG = 10_000
-# Of a backlog so many messages, the newest, are answered with a pose: nobody waits for the others.
-_ANSWERED = 200
+# A message behind which so many wait is not answered: there is no time for it, a publication gives
+# Python up and waits for its turn, and the robot is elsewhere by now.
+_ANSWERED = 5
 # [s] What raises each time it is called shall not keep a core busy.
 _BREATH = 0.05
 _REPEAT_WARNING = 5.0  # [s]
