@@ -73,15 +73,6 @@ class Updates:
     at_rest: Kept | None = None
 
 
-@dataclass(frozen=True)
-class Growth:
-    """Of Figure 5: the updates, and keyframes (k,) and seconds (k,) of each batch L2 solve."""
-
-    updates: Updates
-    sizes: Array
-    batch: Array
-
-
 class Isam2:
     """
     The peer: L2, every loop of the graph believed.
@@ -206,19 +197,19 @@ def dimension_of(graph: FactorGraph) -> int:
 
 
 def measure_growth(keyframes: int, rate: float, rng: np.random.Generator,
-                   advance: Callable[[], None] = lambda: None) -> Growth:
+                   advance: Callable[[], None] = lambda: None) -> tuple[Updates, Array]:
     """
-    Return what updates and batch solves cost in a world in the proportions of City10k.
+    Return what updates cost in a world in the proportions of City10k, and batch solves on the way.
 
-    The batch is Gauss-Newton on all that has come, from the map as it is, ordered anew.
+    The batch, in seconds (k,) at each of the snapshots, is Gauss-Newton on all that has come, from
+    the map as it is, ordered anew.
     """
     load()
     run_updates(_world(_WARM_UP, rng), None, np.inf, 1)
     graph = _world(keyframes, rng)
     peer = Isam2(graph) if importlib.util.find_spec('gtsam') else None
     updates = run_updates(graph, peer, rate, _BATCHES, advance=advance)
-    sizes = np.array([now.graph.n_poses for now in updates.on_the_way])
-    return Growth(updates, sizes, np.array([_batch_seconds(now) for now in updates.on_the_way]))
+    return updates, np.array([_batch_seconds(now) for now in updates.on_the_way])
 
 
 def _world(keyframes: int, rng: np.random.Generator) -> FactorGraph:

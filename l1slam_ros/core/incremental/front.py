@@ -52,7 +52,7 @@ class Gate:
     def of(manifold: Manifold, poses: Array, variance: Array, accepted: int,
            refused: int) -> 'Gate':
         """Return the gate of a map, poses (n, p), that so many loops were believed for or not."""
-        volume = claimed_volume(manifold, poses, np.random.default_rng(0))
+        volume = claimed_volume(manifold, poses)
         return Gate(variance, max(0.0, float(np.log((refused + 1) / (accepted + 1)))),
                     float(volume.sum()))
 

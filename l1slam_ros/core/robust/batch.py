@@ -44,7 +44,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.judgement import Judgement, doubts, judgement_of
@@ -112,13 +112,13 @@ def minimise_robustly(
 
 
 def rounds(
-    growth: Growth, repaired: Callable[[Growth, Indices], Growth | None]
+    growth: Growth, repaired: Callable[[Growth, Growth], Growth | None]
 ) -> Iterator[Growth]:
     """
     Yield the state after each round, until there is nothing more to accept.
 
     repaired : asked in the end for another state, from the one with the noise as it was found and
-    the loops that are left out though all may be as noisy as they say; None: there is none.
+    the one where all may be as noisy as they say; None: there is none.
     """
     found = None
     for _ in range(_MOST_ROUNDS):
@@ -132,7 +132,7 @@ def rounds(
                 growth.take_at_their_word()
                 growth.solve()
             else:
-                other = repaired(found, growth.undecided())
+                other = repaired(found, growth)
                 growth.slip_odds = found.slip_odds
                 if not other:
                     break

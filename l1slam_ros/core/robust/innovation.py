@@ -6,7 +6,7 @@ In: a graph at its L2 optimum. Out: for any factor the covariance of its residua
 it is to be true. Covariances come from samples of the posterior: solutions of `H y = A' xi` for
 white noise xi have the covariance H^-1. So the second moment of `J_i y_i + J_j y_j` is what the
 map's uncertainty adds to the residual of a factor outside the graph, and that of `xi - J y` is
-the covariance of the residual of one inside. Two dozen samples cost a few ordinary solutions.
+the covariance of the residual of one inside. All samples together cost a few ordinary solutions.
 """
 
 from collections.abc import Callable
@@ -20,14 +20,18 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask, filled
 from l1slam_ros.core.geometry.quantiles import beta_quantile, gamma_quantile
+from l1slam_ros.core.graph.draws import keys, signs
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, linearise
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
 _beta_quantile, _gamma_quantile = cache(beta_quantile), cache(gamma_quantile)
-# So many samples for each number of a step, in all q: then standard deviations are right to 15% in
-# the plane (1 / sqrt(2 q)), and of two factors together there are far more samples than rows.
-SAMPLES = 8
+# Standard deviations of so many samples are right to 10% (1 / sqrt(2 q)), and of two factors
+# together there are far more samples than rows.
+SAMPLES = 48
+# Noise has the tail of Student's distribution with so many degrees of freedom for each number of a
+# step: nobody knows its covariance any better.
+TAIL = 8
 # A factor whose residual has a variance below this part of its noise is checked by no other.
 _REDUNDANT = 1e-6
 
@@ -80,9 +84,7 @@ class Posterior:
         return np.where(alone | ~np.isfinite(square), 0.0, square)
 
 
-def sample_posterior(
-    graph: FactorGraph, poses: Array, cholesky: BlockCholesky, rng: np.random.Generator
-) -> Posterior:
+def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Posterior:
     """
     Return the posterior of a graph about its optimum, poses (n, p).
 
@@ -97,10 +99,9 @@ def sample_posterior(
     if not cholesky.factorise(system, np.ones_like(system.b)):
         raise GraphError('the normal matrix is singular: a part of the graph is not tied to '
                          'the anchor, or weights differ beyond double precision')
-    m, k = len(system.blocks), system.block_size
-    q = SAMPLES * k
+    k, q = system.block_size, SAMPLES
     # Signs have the covariance of white noise, and are quicker to draw.
-    noise = 2 * rng.integers(0, 2, (m, k, q), dtype=np.int8) - np.int8(1)
+    noise = signs(keys(graph.between.i, graph.between.j), k, q)
     speaks = graph.between.speaks
     noise[~speaks] = 0
     samples = np.zeros((system.size + 1, k, q))
@@ -116,10 +117,10 @@ def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array,
     """
     Return ln p(residual) + ln(volume of a false one's), (m,); freedom : (m,) of the residuals.
 
-    p is Student's: what a covariance from samples, of steps of k numbers, says of one more
-    (Jeffreys' prior). Where nothing but the noise speaks, that is a little generous.
+    p is Student's, with `TAIL` degrees of freedom for each of the k numbers of a step: what a
+    covariance from as many samples says of one more (Jeffreys' prior).
     """
-    q = SAMPLES * k
+    q = TAIL * k
     constant = by_freedom(lambda size: lgamma((q + 1) / 2) - lgamma((q + 1 - size) / 2)
                           - size * np.log(np.pi * q) / 2, freedom)
     density = constant - (log_det + (q + 1) * np.log1p(square / q)) / 2
@@ -189,7 +190,8 @@ def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
 
     system, factors = linearise(graph, poses, fixed=posterior.fixed), graph.between
     k = system.block_size
-    spread = prediction.spreads(system.keyframe, system.blocks, posterior.samples)
+    spread = prediction.left_over(system.keyframe, system.blocks, posterior.samples,
+                                  posterior.noise[:0])
     absolute = np.flatnonzero(factors.is_absolute)
     spread[absolute] += _sagittas(graph.subset(absolute), posterior)
     square, log_det = prediction.normalise(spread + np.eye(k), -system.b.reshape(-1, k))
@@ -223,14 +225,15 @@ def log_claims(factors: BetweenFactors, log_volume: Array) -> Array:
     return claims
 
 
-def claimed_volume(manifold: Manifold, poses: Array, rng: np.random.Generator) -> Array:
+def claimed_volume(manifold: Manifold, poses: Array) -> Array:
     """
     Return the logarithm of the volume that the claims of false factors fill, (k,) its factors.
 
     That of a Gaussian, (2 pi)^(k/2) sqrt(det M), as wide in each direction as the positions of
     random pairs lie apart (a false factor need not know of the corridor), with any rotation.
     """
-    apart = manifold.local(poses, poses[rng.permutation(len(poses))])
+    others = np.random.default_rng(0).permutation(len(poses))
+    apart = manifold.local(poses, poses[others])
     variance = np.full(manifold.TANGENT_SIZE, np.pi**2 / 3)
     variance[manifold.TRANSLATION] = (apart[:, manifold.TRANSLATION] ** 2).mean()
     with np.errstate(divide='ignore'):
@@ -243,14 +246,15 @@ def chi2_quantile(probability: float, freedom: Indices) -> Array:
     return by_freedom(lambda k: 2 * _gamma_quantile(k / 2, probability), freedom)
 
 
-def sampled_quantile(probability: float, freedom: Indices, k: int) -> Array:
+def student_quantile(probability: float, freedom: Indices, k: int) -> Array:
     """
-    Return what r'C^-1 r of normal numbers stays below, (m,), by how many they are: freedom (m,).
+    Return what r'C^-1 r of n numbers stays below, (m,), by how many they are: freedom (m,).
 
-    C is the covariance of q samples of steps of k numbers, so that has Hotelling's distribution:
-    T^2 (q - n + 1) / (q n) of n is Fisher's F of n and q - n + 1 degrees of freedom.
+    As if C were the covariance of q samples, `TAIL` for each of the k numbers of a step, it has
+    Hotelling's distribution: T^2 (q - n + 1) / (q n) is Fisher's F of n and q - n + 1 degrees of
+    freedom.
     """
-    q = SAMPLES * k
+    q = TAIL * k
 
     def quantile(n: int) -> float:
         x = _beta_quantile(n / 2, (q - n + 1) / 2, probability)

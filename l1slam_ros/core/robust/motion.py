@@ -119,7 +119,7 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     start = manifold.identity(len(rows))
     moved = manifold.retract(growth.forward[rows], (root @ innovation)[:, :, 0])
     J = manifold.local_jacobian(start, moved)
-    claims = claimed_volume(manifold, growth.poses, np.random.default_rng(0)).sum()
+    claims = claimed_volume(manifold, growth.poses).sum()
     motions = motion.log_density(manifold.local(start, moved), J @ spread @ J.transpose(0, 2, 1))
     odds[rows] = motions - motion.log_density(steps_of(growth, rows)) - measured - (
         claims + np.log(len(rows)))

@@ -52,7 +52,8 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     place, first = np.unique(growth.place[rows], return_index=True, return_inverse=True)[2:0:-1]
     evidence = _evidence(place, one, other, log_ratio)
     best, needed = int(np.argmax(evidence)), np.log(len(rows) / DOUBT)
-    if evidence[best] < needed or evidence[best] < needed + _by_chance(growth, rows[first]):
+    one_each = rows[np.sort(first)]
+    if evidence[best] < needed or evidence[best] < needed + _by_chance(growth, one_each):
         return NO_GROUP
     found = rows[np.concatenate(([best], other[one == best]))]
     return Group(found, np.unique(growth.place[found]))
@@ -76,7 +77,7 @@ def _by_chance(growth: Growth, rows: Indices) -> float:
     """
     shuffled = growth.copy()
     shuffled.high = growth.high.copy()
-    shuffled.high[rows] = growth.rng.permutation(growth.high[rows])
+    shuffled.high[rows] = np.random.default_rng(0).permutation(growth.high[rows])
     return float(_evidence(np.arange(len(rows)), *agreement(shuffled, rows)).max(initial=0.0))
 
 
@@ -121,7 +122,7 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
     change = _changes(growth, ends, a, b, roots)
     covariance = 2 * np.eye(k) + change @ change.transpose(0, 2, 1) / change.shape[2]
     square, log_det = normalise(covariance, whiten(roots, error))
-    volume = claimed_volume(manifold, poses, np.random.default_rng(0))
+    volume = claimed_volume(manifold, poses)
     freedom = factors.freedom[b]
     log_ratio = log_likelihood_ratio(square, log_det, log_claims(factors, volume)[b], freedom,
                                      k)

@@ -13,6 +13,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, ends_in_time
 from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.parts import bridged, vague_odometry
@@ -31,16 +32,14 @@ from l1slam_ros.core.robust.innovation import (
     claimed_volume,
     innovations,
     sample_posterior,
-    sampled_quantile,
+    student_quantile,
 )
 from l1slam_ros.core.robust.inspection import repeated_factors
 from l1slam_ros.core.robust.places import err_together, places
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 
-# The same samples each time: the answer is that of the graph, not of chance.
-_SEED = 2014
-# One in so many true loops may be refused for its noise alone; and of accepted ones, dropped.
+# At most one in so many true loops is refused for its noise alone; and of accepted ones, dropped.
 REFUSED = 1e-3
 _DROPPED = 2e-5
 # Probability that any true factor of a round is doubted for what the others say.
@@ -86,7 +85,6 @@ class Growth:
         self._check = check
         self.graph, self.size = bridged(graph), len(graph.between)
         self.factors, self.trusted = self.graph.between, self.graph.between.trusted
-        self.rng = np.random.default_rng(_SEED)
         self.low, self.high, self.forward = ends_in_time(self.graph)
         self.is_loop: Mask = ~self.factors.is_odometry
         self.gap: Mask = vague_odometry(self.graph) | (np.arange(len(self.factors)) >= self.size)
@@ -229,7 +227,7 @@ class Growth:
 
     def gate(self, freedom: Indices, refused: float = REFUSED) -> Array:
         """Return what squared innovations of true factors stay below, (m,); freedom : theirs."""
-        return sampled_quantile(1 - refused, freedom, self.graph.manifold.TANGENT_SIZE)
+        return student_quantile(1 - refused, freedom, self.graph.manifold.TANGENT_SIZE)
 
     def solve(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
@@ -243,7 +241,7 @@ class Growth:
             self._check()
             self.poses = l2_map(subgraph, self.poses, cholesky, lambda *_: self._check())
             self._check()
-            self.posterior = sample_posterior(subgraph, self.poses, cholesky, self.rng)
+            self.posterior = sample_posterior(subgraph, self.poses, cholesky)
             if self._is_noisier(rows):
                 continue
             drop = self._misfits(rows)
@@ -321,7 +319,7 @@ class Growth:
 
     def innovations(self, rows: Indices) -> Innovations:
         """Return how factors that are not accepted fit the map."""
-        widths = claimed_volume(self.graph.manifold, self.poses, self.rng)
+        widths = claimed_volume(self.graph.manifold, self.poses)
         return innovations(self.subgraph(rows), self.poses, self.posterior, widths)
 
     def believable(self, rows: Indices) -> Indices:
@@ -343,6 +341,6 @@ class Growth:
         return believed
 
     def some(self, rows: Indices, count: int) -> Indices:
-        """Return so many of some factors, at random, or all, (k,)."""
-        chosen: Indices = self.rng.permutation(rows)[:count]
+        """Return so many of some factors, as if at random, or all, (k,)."""
+        chosen: Indices = rows[np.argsort(keys(self.low[rows], self.high[rows]))[:count]]
         return chosen

@@ -6,11 +6,11 @@ A gap is a slip whose place is known. Where both sides of a step are parts of th
 in itself, the true loops across agree with each other (`pairwise_consistency`): parts are joined
 where loops of two places or more do. A slip is suspected where the odds of one are not small
 (`motion`), or where loops that are left out agree. Then slip and lies are compared: the step is
-cut, the loops across are asked anew, and the rounds go on from there. To the odds comes a gate
-for each place that is won, less one for each that is lost. A slip is believed if that makes it
-likelier than not, and if three places span it where it is only places that say so. Loops do not
-make a robot jump: the slip repaired, it has to move as at some other step, or rather so than as
-measured.
+cut, the loops across are asked anew, and the rounds go on from there. To the odds comes half a
+gate for each place that is won and that nothing else explains, less one for each that is lost. A
+slip is believed if that makes it likelier than not, and if three places span it where it is only
+places that say so. Loops do not make a robot jump: the slip repaired, it has to move as at some
+other step, or rather so than as measured.
 """
 
 from collections.abc import Iterator
@@ -73,19 +73,19 @@ def _join_by(growth: Growth, group: Group) -> None:
     growth.solve()
 
 
-def without_slip(growth: Growth, left_out: Indices) -> Growth | None:
+def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     """
     Return a state in which an odometry factor is cut that slipped; None: there is none.
 
-    left_out : (k,) loops that nothing else explains
+    as_stated : the state where all may be as noisy as they say; what that explains needs no slip
     """
     growth.slip_odds = {step: odds for step, odds in growth.slip_odds.items() if growth.cut[step]}
     if np.count_nonzero(~growth.is_loop & ~growth.cut) < _FEWEST_STEPS:
         return None
     motion = usual_motion(growth)
     found, most = None, 0.0
-    for steps, odds, state, usual in _tried(growth, left_out, motion):
-        evidence = odds + _gain(growth, state) if state and usual else odds
+    for steps, odds, state, usual in _tried(growth, as_stated, motion):
+        evidence = odds + _gain(growth, as_stated, state) if state and usual else odds
         if len(steps) == 1:
             growth.slip_odds[steps[0]] = evidence
         if state and evidence > most and (
@@ -96,7 +96,7 @@ def without_slip(growth: Growth, left_out: Indices) -> Growth | None:
     return found
 
 
-def _tried(growth: Growth, left_out: Indices, motion: Motion, more: bool = True
+def _tried(growth: Growth, as_stated: Growth, motion: Motion, more: bool = True
            ) -> Iterator[tuple[list[int], float, Growth | None, bool]]:
     """
     Yield steps, their log odds to have slipped, the state without them, and whether that is usual.
@@ -106,16 +106,19 @@ def _tried(growth: Growth, left_out: Indices, motion: Motion, more: bool = True
     that, too.
     """
     odds = log_odds_of_slips(growth, motion)
-    for step in _suspected(growth, odds, left_out):
-        state = _without(growth, step)
-        if state and (likeliest := _likeliest(state, step, motion)) != step:
-            state, step = _without(growth, likeliest), likeliest
-        usual = state is not None and _moves_as_usual(state, step, motion)
+    for step in _suspected(growth, odds, as_stated.undecided()):
+        state, usual = _without(growth, step), False
+        if state:
+            state, step = _cut_where_likeliest(state, step, motion)
+            usual = _moves_as_usual(state, step, motion)
         yield [step], float(odds[step]), state, usual
         if more and state and not usual:
-            for steps, other, both, fits in _tried(state, state.undecided(), motion, False):
-                fits = fits and both is not None and _moves_as_usual(both, step, motion)
-                yield [step, *steps], float(odds[step]) + other, both, fits
+            for (second,), other, both, usual in _tried(state, state, motion, False):
+                first = step
+                if both:
+                    both, first = _cut_where_likeliest(both, step, motion)
+                    usual = usual and _moves_as_usual(both, first, motion)
+                yield [first, second], float(odds[first]) + other, both, usual
 
 
 def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:
@@ -125,19 +128,19 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:
     across = spanned(growth.low[tell], growth.high[tell], growth.graph.n_poses)
     # Where no loop can tell, an unusual motion is no more than that.
     told = np.where(across[growth.low] > 0, odds, -np.inf)
-    order, rows = np.argsort(-told, kind='stable')[:_TRIED], growth.undecided()
+    order = np.argsort(-told, kind='stable')[:_TRIED]
     # Where loops are left out, one more place may be won.
     least = max(SURE, _place(growth)) if len(left_out) else SURE
     suspects = order[told[order] > -least].tolist()
-    for _ in range(_TRIED if len(left_out) else 0):
-        group = strongest_group(growth, rows)
+    for _ in range(_TRIED):
+        group = strongest_group(growth, left_out)
         if len(group.places) < SPANNING:
             break
         common = common_steps(growth, group)
         common = common[~growth.cut[common]]
-        if len(common) and np.isin(group.rows, left_out).any():
+        if len(common):
             suspects.append(int(common[np.argmax(odds[common])]))
-        rows = np.setdiff1d(rows, group.rows)
+        left_out = np.setdiff1d(left_out, group.rows)
     return list(dict.fromkeys(suspects))
 
 
@@ -158,10 +161,15 @@ def _without(growth: Growth, step: int) -> Growth | None:
     state.solve()
     if not join(state) or state.part[state.low[step]] != state.part[state.high[step]]:
         return None
+    _accept_more(state)
+    return state
+
+
+def _accept_more(state: Growth) -> None:
+    """Go through the rounds until there is nothing more to accept."""
     while len(news := state.believable(state.undecided())):
         state.accepted[news] = True
         state.solve()
-    return state
 
 
 def spanning(growth: Growth, step: int) -> Mask:
@@ -177,12 +185,12 @@ def _spans(state: Growth, step: int) -> bool:
     return len(np.unique(places)) >= SPANNING
 
 
-def _gain(growth: Growth, cut: Growth) -> float:
+def _gain(growth: Growth, as_stated: Growth, cut: Growth) -> float:
     """Return what the places say that are won and lost by a cut, ln of odds."""
-    with_, without = (np.unique(growth.place[state.accepted & growth.is_loop])
-                      for state in (cut, growth))
-    won, lost = len(np.setdiff1d(with_, without)), len(np.setdiff1d(without, with_))
-    return _place(growth) * (won - lost)
+    before, explained, after = (np.unique(growth.place[state.accepted & growth.is_loop])
+                                for state in (growth, as_stated, cut))
+    won = len(np.setdiff1d(after, np.union1d(before, explained)))
+    return _place(growth) * (won - len(np.setdiff1d(before, after)))
 
 
 def _place(growth: Growth) -> float:
@@ -190,8 +198,8 @@ def _place(growth: Growth) -> float:
     return float(growth.gate(np.array([growth.graph.manifold.TANGENT_SIZE]))[0] / 2)
 
 
-def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
-    """Return the step that slipped, by how the robot moves, of those that no loop tells apart."""
+def _cut_where_likeliest(state: Growth, cut: int, motion: Motion) -> tuple[Growth, int]:
+    """Return a state cut at the likeliest of the steps that no loop tells apart, and that step."""
     loops = state.is_loop & state.accepted
     ends = np.unique((state.low[loops], state.high[loops]))
     stretch = np.searchsorted(ends, state.low, side='right')
@@ -199,7 +207,24 @@ def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
     steps = np.flatnonzero(odometry & (stretch == stretch[cut]))
     gain = motion.log_density(*_repaired(state, cut, steps)) - motion.log_density(
         steps_of(state, steps))
-    return int(steps[np.argmax(gain)])
+    step = int(steps[np.argmax(gain)])
+    if step == cut:
+        return state, cut
+    state = state.copy()
+    state.cut[[cut, step]] = False, True
+    # What lies between goes over to the other side.
+    side, first, last = ((state.low[cut], state.high[cut], state.low[step])
+                         if state.low[step] > state.low[cut] else
+                         (state.high[cut], state.high[step], state.low[cut]))
+    between = np.arange(first, last + 1)
+    chain, manifold = odometry_poses(state.graph), state.graph.manifold
+    state.poses = state.poses.copy()
+    state.poses[between] = manifold.compose(
+        np.tile(state.poses[side], (len(between), 1)),
+        manifold.between(np.tile(chain[side], (len(between), 1)), chain[between]))
+    state.solve()
+    _accept_more(state)
+    return state, step
 
 
 def _moves_as_usual(state: Growth, cut: int, motion: Motion) -> bool:

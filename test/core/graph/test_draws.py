@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+
+from l1slam_ros.core.graph.draws import keys, signs
+
+N, K, Q = 4000, 3, 24
+ONE = np.arange(N)
+
+
+def test_signs_look_like_independent_tosses_of_a_coin():
+    drawn = signs(keys(ONE, ONE + 1), K, Q).reshape(N, K * Q).astype(float)
+    assert set(np.unique(drawn)) == {-1.0, 1.0}
+    assert np.abs(drawn.mean(axis=0)).max() < 5 / np.sqrt(N)
+    between = drawn.T @ drawn / N - np.eye(K * Q)
+    assert np.abs(between).max() < 5 / np.sqrt(N)
+    neighbours = (drawn[1:] * drawn[:-1]).mean(axis=0)
+    assert np.abs(neighbours).max() < 5 / np.sqrt(N)
+
+
+def test_they_hang_on_the_keyframes_alone():
+    shuffled = np.random.default_rng(0).permutation(N)
+    expected = keys(ONE, ONE + 1)
+    assert np.array_equal(keys(ONE[shuffled], ONE[shuffled] + 1), expected[shuffled])
+    assert np.array_equal(keys(ONE + 1, ONE), expected)
+    assert np.array_equal(keys(ONE[5:9], ONE[5:9] + 1), expected[5:9])
+
+
+def test_factors_of_the_same_keyframes_draw_for_themselves():
+    twice = keys(np.array([3, 5, 3, -1, -1]), np.array([4, 9, 4, 7, 7]))
+    assert len(np.unique(twice)) == 5
