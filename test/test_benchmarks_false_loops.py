@@ -72,6 +72,33 @@ def test_odometry_factors_slip(place, what, metres, radians, count):
     assert np.abs(moved[changed, 2]) == pytest.approx(radians, abs=1e-9)
 
 
+@pytest.mark.parametrize(('part', 'is_odometry'), [('odometry', True), ('loops', False)])
+def test_information_is_stated_wrong_of_one_part_alone(place, part, is_odometry):
+    case = cases.false_case(place, kind(f'{part}-1e4'), 0.0, 0)
+    before, after = (one.graph.between.sqrt_information[:, 0, 0] for one in (place, case))
+    of_part = case.graph.between.is_odometry == is_odometry
+    assert after / before == pytest.approx(np.where(of_part, 100, 1))
+
+
+@pytest.mark.parametrize(('streets', 'same'), [(3, False), (2, True)])
+def test_an_aliased_street_is_moved_by_one_transform(place, streets, same):
+    lies = aliasing.aliased_loops(place.graph, place.best, streets, same,
+                                  np.random.default_rng(3), length=10)
+    # Z = Xi^-1 W Xj, and where the street is the earlier end, Z = Xi^-1 W^-1 Xj.
+    wrong = se2.compose(se2.compose(place.best[lies.i], lies.measurement),
+                        se2.inverse(place.best[lies.j]))
+    found = np.where(wrong[:, 2:] < 0, se2.inverse(wrong), wrong)
+    assert len(found) == 10 * streets
+    assert len(np.unique(found.round(6), axis=0)) == (1 if same else streets)
+
+
+@pytest.mark.parametrize(('name', 'parts'), [('sessions', 1), ('apart', 2)])
+def test_a_session_begins_anywhere(place, name, parts):
+    case, half = cases.false_case(place, kind(name), 0.3, 0), place.graph.n_poses // 2
+    assert component_labels(case.graph).max() + 1 == parts == case.session.max() + 1
+    assert np.hypot(*se2.between(case.start[half - 1], case.start[half])[:2]) > 2
+
+
 def run_of(place, name, share, found):
     case = cases.false_case(place, kind(name), share, 0)
     return runs.run_of(case, solvers.RobustSolver('x', 'l2', 'odometry',

@@ -154,17 +154,6 @@ def test_the_installed_command_runs(installed, tmp_path):
     assert Path(installed.run('python', '-c', code, cwd=tmp_path)).is_relative_to(installed.prefix)
 
 
-def test_the_installed_package_is_complete(installed):
-    share = installed.prefix / 'share' / 'l1slam_ros'
-    for path in ('package.xml', 'config/backend.yaml'):
-        assert (share / path).read_bytes() == (ROOT / path).read_bytes()
-    index = installed.prefix / 'share' / 'ament_index' / 'resource_index' / 'packages'
-    assert (index / 'l1slam_ros').is_file()
-    executables = list((installed.prefix / 'lib' / 'l1slam_ros').iterdir())
-    assert {path.name for path in executables} == EXECUTABLES
-    assert all(os.access(path, os.X_OK) for path in executables)
-
-
 def test_the_installed_node_runs_where_there_is_ros(installed, tmp_path):
     pytest.importorskip('rclpy')
     starter = installed.prefix / 'lib' / 'l1slam_ros' / 'backend'

@@ -6,9 +6,8 @@ import zipfile
 
 import numpy as np
 import pytest
+from command import run, solve_json
 from environments import environment
-
-from l1slam_ros.cli.main import main
 
 # Before Python 3.11 there are only wheels of gtsam that were built for NumPy 1.
 GTSAM = ('gtsam>=4.2,<4.4', 'numpy<2; python_version < "3.11"')
@@ -47,15 +46,6 @@ print(json.dumps([*counts, [2 * graph.error(poses), 2 * graph.error(optimised)]]
 """
 
 
-def run(capsys, *arguments):
-    assert main([str(argument) for argument in arguments]) == 0
-    return capsys.readouterr().out
-
-
-def solve(capsys, *arguments):
-    return json.loads(run(capsys, 'solve', *arguments, '--json'))
-
-
 @pytest.fixture
 def bag(capsys, tmp_path):
     run(capsys, 'simulate', tmp_path / 'world', '--poses', 300, '--edges', 500, '--seed', 3)
@@ -82,7 +72,7 @@ def test_evo_finds_the_error_that_we_find(capsys, bag, evo, tmp_path):
     run(capsys, 'solve', bag, '--output', tmp_path / 'ours.tum')
     evo('evo_traj', 'bag2', bag, '/ground_truth', '--save_as_tum')
     evo('evo_ape', 'tum', 'ground_truth.tum', 'ours.tum', '--align', '--save_results', 'ape.zip')
-    ours = solve(capsys, bag, '--reference', tmp_path / 'ground_truth.tum')
+    ours = solve_json(capsys, bag, '--reference', tmp_path / 'ground_truth.tum')
     assert ours['ate'] == pytest.approx(rmse(tmp_path / 'ape.zip'), rel=1e-6)
     assert 0 < ours['ate'] < 0.2
 
@@ -97,7 +87,7 @@ def test_evo_reads_our_bags(capsys, bag, evo, tmp_path):
     assert np.abs(truth[:, 1:3] - positions[:, 1:3]).max() < 1e-9
 
     evo('evo_ape', 'bag2', bag, '/ground_truth', '/odom', '--align', '--save_results', 'ape.zip')
-    odometry = solve(capsys, bag, '--no-robust', '--start', 'odometry', '--outer', 0,
+    odometry = solve_json(capsys, bag, '--no-robust', '--start', 'odometry', '--outer', 0,
                      '--reference', f'{bag}.truth.txt')
     assert odometry['ate'] == pytest.approx(rmse(tmp_path / 'ape.zip'), rel=1e-6)
 
@@ -116,7 +106,7 @@ def solved(capsys, tmp_path):
                                [*vertices, *(edge[:-6] + other for edge in edges)]))
     run(capsys, 'solve', world, '--norm', 'l2', '--output', tmp_path / 'map.g2o')
     run(capsys, 'convert', tmp_path / 'map.g2o', tmp_path / 'map.graph')
-    return tmp_path, solve(capsys, tmp_path / 'map.g2o', '--norm', 'l2', '--start', 'file',
+    return tmp_path, solve_json(capsys, tmp_path / 'map.g2o', '--norm', 'l2', '--start', 'file',
                            '--outer', 0)
 
 

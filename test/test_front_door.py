@@ -4,7 +4,6 @@
 import ast
 import copy
 import inspect
-import json
 import pickle
 import re
 import subprocess
@@ -13,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command import solve_json
 
 import l1slam_ros as l1
 from l1slam_ros.cli.main import main
@@ -81,8 +81,7 @@ def test_every_door_takes_a_norm_of_loops_alone(world, tmp_path, capsys):
     costs = []
     for asked in (('--norm', 'l2', '--loop-norm', 'group-l1'), ('--params-file', str(params)),
                   ('--norm', 'group-l1', '--params-file', str(params))):
-        assert main(['solve', str(world), '--no-robust', '--json', '--quiet', *asked]) == 0
-        report = json.loads(capsys.readouterr().out)
+        report = solve_json(capsys, world, '--no-robust', '--quiet', *asked)
         assert report['status'] == 'converged'
         costs.append(report['final_cost'])
     # The last is group L1 of all: a norm of the odometry that is that of the loops.

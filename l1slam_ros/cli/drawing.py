@@ -15,7 +15,7 @@ from l1slam_ros.core.robust.batch_map import Outcome
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.io import formats
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.graphs.side_files import truth_path
+from l1slam_ros.io.graphs.side_files import beside
 from l1slam_ros.io.plot import Curve, MapDrawing, check_picture, plot_maps, plot_solution
 
 
@@ -27,7 +27,7 @@ def plot(arguments: argparse.Namespace) -> Ending:
         record = read(arguments, path)
         with formats.named(path):
             poses = formats.stored_poses(record)
-        known = truth_path(path)
+        known = beside(path, 'truth')
         truth = read_truth(str(known), record, path) if known.exists() else None
         drawings.append(_drawing(path, record, poses, truth, 'poses'))
         damages.append(record.damage)
@@ -36,12 +36,12 @@ def plot(arguments: argparse.Namespace) -> Ending:
 
 
 def plot_outcome(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
-                 truth: Truth | None) -> None:
+                 truth: Truth | None, cost_name: str) -> None:
     """Draw the map of a solve, and beside it its costs."""
-    note = f'{arguments.norm} cost {outcome.solution.cost:.6g}'
+    note = f'{cost_name} {outcome.solution.cost:.6g}'
     plot_solution(arguments.plot, _drawing(
         arguments.input, record, outcome.solution.poses, truth, 'optimised', note,
-        outcome.judgement), _cost_curve(arguments.norm, outcome))
+        outcome.judgement), _cost_curve(cost_name, outcome))
 
 
 def _drawing(path: Path, record: GraphRecord, poses: Array, truth: Truth | None,
@@ -73,7 +73,7 @@ def _drawing(path: Path, record: GraphRecord, poses: Array, truth: Truth | None,
         false=pairs[false & kept], name=name, note=note)
 
 
-def _cost_curve(norm: str, outcome: Outcome) -> Curve:
+def _cost_curve(cost_name: str, outcome: Outcome) -> Curve:
     """Return the costs of a solve, iteration by iteration, its beginning and end named."""
     costs = outcome.solution.history
     iterations = np.arange(len(costs), dtype=float)
@@ -82,4 +82,4 @@ def _cost_curve(norm: str, outcome: Outcome) -> Curve:
         marks.append((0.0, outcome.seed_cost, 'seed'))
     if len(costs) > 1:
         marks.append((iterations[-1], float(costs[-1]), 'final'))
-    return Curve(f'{norm} cost', iterations, costs, tuple(marks))
+    return Curve(cost_name, iterations, costs, tuple(marks))

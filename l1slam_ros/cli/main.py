@@ -5,30 +5,18 @@
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from l1slam_ros.core import names
 from l1slam_ros.core.errors import L1SlamError
-from l1slam_ros.core.names import (
-    KINDS_OF_FALSE_LOOPS,
-    NORMS,
-    ROTATION_INFORMATION,
-    SAME,
-    SOLVERS,
-    STARTS,
-    WORLDS,
-)
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS
 from l1slam_ros.paper import printed as paper
 
 BAD_INPUT, READ_IN_PART, DOUBTFUL, INTERRUPTED, BROKEN_PIPE = 2, 3, 4, 130, 141
-# By command: the module that runs it, imported only then.
-_MODULES = {'solve': 'solving', 'convert': 'commands', 'info': 'commands', 'simulate': 'worlds',
-            'corrupt': 'worlds', 'plot': 'drawing', 'reproduce': 'reproducing'}
-
 _INPUT = '.g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1'
 _OUTPUT = '.g2o, .graph, .tum, or a name without a suffix for a bag directory'
 _GRAPH_OUTPUT = '.g2o, .graph, or a name without a suffix for a bag directory'
@@ -85,6 +73,11 @@ def _answer(arguments: Sequence[str] | None) -> int:
 
         argcomplete.autocomplete(parser)
     options = parser.parse_args(arguments)
+    if options.version:
+        from importlib.metadata import version
+
+        print(f'l1slam {version("l1slam_ros")}')
+        return 0
     if options.command is None:
         parser.print_help(sys.stderr)
         return BAD_INPUT
@@ -99,7 +92,7 @@ def _answer(arguments: Sequence[str] | None) -> int:
 def _run(options: argparse.Namespace) -> Any:
     # That of a notebook, which its children get too, may not be installed here.
     os.environ.pop('MPLBACKEND', None)
-    module = import_module(f'l1slam_ros.cli.{_MODULES[options.command]}')
+    module = import_module(f'l1slam_ros.cli.{_COMMANDS[options.command][0]}')
     import numpy as np
 
     # Numbers beyond all measure end in an error that says so, not in NumPy's warnings.
@@ -123,59 +116,12 @@ def _forget_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-class _Version(argparse.Action):
-    """Prints the version; what knows it takes time to import."""
-
-    def __init__(self, option_strings: Sequence[str], dest: str, **_: Any):
-        super().__init__(option_strings, dest, nargs=0, help='print the version and end')
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        from importlib.metadata import version
-
-        print(f'{parser.prog} {version("l1slam_ros")}')
-        parser.exit()
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='l1slam', description='Pose-graph SLAM by the L1 norm, from files; needs no ROS.',
-        epilog=f'{_FIRST_STEPS}\n{_MORE}', formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--version', action=_Version)
-    commands_of = parser.add_subparsers(metavar='COMMAND', dest='command')
-
-    def add(name: str, text: str, example: str) -> argparse.ArgumentParser:
-        return commands_of.add_parser(name, help=text, description=f'{text[0].upper()}{text[1:]}.',
-                                      epilog=f'example:\n  l1slam {name} {example}',
-                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-
-    _add_solve(add('solve', 'optimise a graph or a bag',
-                   'graph.g2o --output solved.g2o --plot map.png'))
-    _add_convert(add('convert', 'turn a graph file into a bag, or back', 'graph.g2o bag'))
-    _add_simulate(add('simulate', 'make a world of streets, its truth known',
-                      'world.g2o --poses 1000 --edges 2000 --seed 1'))
-    _add_corrupt(add('corrupt', 'add false loops to a graph',
-                     'graph.g2o spoiled.g2o --false-loops 20 --kind grouped'))
-    _add_input(add('info', 'say what is in a graph or a bag, and what looks wrong', 'graph.g2o'))
-    _add_plot(add('plot', 'draw maps beside each other, known false loops black',
-                  'graph.g2o solved.g2o --output maps.png'))
-    _add_reproduce(add('reproduce',
-                       "run the paper's experiments and report them beside what it printed",
-                       '--datasets datasets --worlds 10k --output reproduction'))
-    return parser
-
-
-def _add_input(parser: argparse.ArgumentParser) -> None:
-    """Add the input, and how a bag of other origin is read."""
-    parser.add_argument('input', type=Path, metavar='INPUT', help=_INPUT)
-    _add_bag_options(parser)
-
-
-def _add_bag_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        '--rotation-information', choices=ROTATION_INFORMATION, default=ROTATION_INFORMATION[0],
-        help="3D g2o files, in and out: what the information's rotation block is of, the vector "
-        'part of the quaternion, as g2o has it, or the angle (default: %(default)s)')
-    add = parser.add_argument_group('how to read a bag').add_argument
+def _add_reading(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group('how to read a 3D g2o file, or a bag').add_argument
+    add('--rotation-information', choices=names.ROTATION_INFORMATION,
+        default=names.ROTATION_INFORMATION[0],
+        help="in and out: what the information's rotation block is of, the vector part of the "
+        'quaternion, as g2o has it, or the angle (default: %(default)s)')
     for name, default, what in (
         ('odom', DEFAULT_TOPICS.odometry, 'nav_msgs/Odometry; or, as a whole, the pose graph of '
          'an rtabmap_msgs/MapGraph or pose_graph_tools_msgs/PoseGraph'),
@@ -185,25 +131,25 @@ def _add_bag_options(parser: argparse.ArgumentParser) -> None:
         ('absolute', DEFAULT_TOPICS.absolute, 'the same, poses in the map frame'),
     ):
         add(f'--{name}-topic', default=default, metavar='TOPIC',
-            help=f'{what} (default: {default})')
+            help=f'{what} (default: %(default)s)')
     add('--params-file', type=Path, metavar='YAML',
         help="the node's parameter file: what makes keyframes, their noise, and the solver; what "
         'a bag of l1slam notes of itself comes before defaults')
 
 
 def _add_solve(parser: argparse.ArgumentParser) -> None:
-    _add_input(parser)
     add = parser.add_argument
-    add('--start', choices=STARTS, default=STARTS[0],
+    add('input', type=Path, metavar='INPUT', help=_INPUT)
+    add('--start', choices=names.STARTS, default=names.STARTS[0],
         help='where from: first poses from the graph alone, the stored poses, or the odometry; '
         'where loops are doubted, always from the graph alone (default: %(default)s)')
-    add('--norm', choices=NORMS,
+    add('--norm', choices=names.NORMS,
         help='what is minimised: l1, of each component; group-l1, of the length of each factor, '
         'whatever axes it is written in; l2; huber (default: as of solver.norm, l1)')
-    add('--loop-norm', choices=(SAME, *NORMS),
+    add('--loop-norm', choices=(names.SAME, *names.NORMS),
         help='what is minimised of loops and absolute poses (default: as of solver.loop_norm, '
         'same)')
-    add('--solver', choices=SOLVERS, default=SOLVERS[0],
+    add('--solver', choices=names.SOLVERS, default=names.SOLVERS[0],
         help='for l1; auto: interior-point on sparse graphs (default: %(default)s)')
     add('--robust', action=argparse.BooleanOptionalAction,
         help='refuse loops that cannot be believed, and say which, or believe all; by default '
@@ -218,18 +164,20 @@ def _add_solve(parser: argparse.ArgumentParser) -> None:
     add('--plot', type=Path, metavar='PNG', help='draw the map and its cost; .svg and .pdf too')
     add('--json', action='store_true', help='one object on standard output')
     add('--quiet', action='store_true', help='no progress, no summary, no warning')
+    _add_reading(parser)
 
 
 def _add_convert(parser: argparse.ArgumentParser) -> None:
-    _add_input(parser)
+    parser.add_argument('input', type=Path, metavar='INPUT', help=_INPUT)
     parser.add_argument('output', type=Path, metavar='OUTPUT', help=_OUTPUT)
+    _add_reading(parser)
 
 
 def _add_simulate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('output', type=Path, metavar='OUTPUT',
         help=f'{_GRAPH_OUTPUT}; beside it OUTPUT.truth.txt and OUTPUT.false.txt')
-    add('--world', choices=WORLDS, default=WORLDS[0],
+    add('--world', choices=names.WORLDS, default=names.WORLDS[0],
         help='streets in the plane; in space a building of several floors, with ramps, or a drive '
         'on a sphere or a torus (default: %(default)s)')
     add('--poses', type=int, required=True, metavar='N')
@@ -240,19 +188,25 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_corrupt(parser: argparse.ArgumentParser) -> None:
-    _add_input(parser)
     add = parser.add_argument
+    add('input', type=Path, metavar='INPUT', help=_INPUT)
     add('output', type=Path, metavar='OUTPUT',
         help=f'{_GRAPH_OUTPUT}; beside it OUTPUT.false.txt, the vertex ids of the false loops')
     add('--false-loops', type=int, required=True, metavar='K', help='how many')
     _add_randomness(parser)
+    _add_reading(parser)
 
 
 def _add_randomness(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--kind', choices=KINDS_OF_FALSE_LOOPS,
-                        default=KINDS_OF_FALSE_LOOPS[0], help=_KIND)
+    parser.add_argument('--kind', choices=names.KINDS_OF_FALSE_LOOPS,
+                        default=names.KINDS_OF_FALSE_LOOPS[0], help=_KIND)
     parser.add_argument('--seed', type=int, default=0, metavar='S',
                         help='another one, another draw (default: %(default)s)')
+
+
+def _add_info(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('input', type=Path, metavar='INPUT', help=_INPUT)
+    _add_reading(parser)
 
 
 def _add_plot(parser: argparse.ArgumentParser) -> None:
@@ -260,7 +214,7 @@ def _add_plot(parser: argparse.ArgumentParser) -> None:
                         help=f'{_INPUT}; INPUT.truth.txt and INPUT.false.txt are drawn, if there')
     parser.add_argument('--output', type=Path, required=True, metavar='PNG',
                         help='.png, .svg or .pdf')
-    _add_bag_options(parser)
+    _add_reading(parser)
 
 
 def _add_reproduce(parser: argparse.ArgumentParser) -> None:
@@ -273,3 +227,36 @@ def _add_reproduce(parser: argparse.ArgumentParser) -> None:
         '50,000 with 700,000, which takes minutes (default: %(default)s)')
     add('--output', type=Path, default=Path('reproduction'), metavar='DIR',
         help='the folder for report.md and its pictures (default: %(default)s)')
+
+
+# By name: the module that runs a command, imported only then; what it does; an example; options.
+_COMMANDS: dict[str, tuple[str, str, str, Callable[[argparse.ArgumentParser], None]]] = {
+    'solve': ('solving', 'optimise a graph or a bag',
+              'graph.g2o --output solved.g2o --plot map.png', _add_solve),
+    'convert': ('commands', 'turn a graph file into a bag, or back', 'graph.g2o bag',
+                _add_convert),
+    'simulate': ('worlds', 'make a world, its truth known',
+                 'world.g2o --poses 1000 --edges 2000 --seed 1', _add_simulate),
+    'corrupt': ('worlds', 'add false loops to a graph',
+                'graph.g2o spoiled.g2o --false-loops 20 --kind grouped', _add_corrupt),
+    'info': ('commands', 'say what is in a graph or a bag, and what looks wrong', 'graph.g2o',
+             _add_info),
+    'plot': ('drawing', 'draw maps beside each other, known false loops black',
+             'graph.g2o solved.g2o --output maps.png', _add_plot),
+    'reproduce': ('reproducing',
+                  "run the paper's experiments and report them beside what it printed",
+                  '--datasets datasets --worlds 10k --output reproduction', _add_reproduce)}
+
+
+def _parser() -> argparse.ArgumentParser:
+    as_written = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(
+        prog='l1slam', description='Pose-graph SLAM by the L1 norm, from files; needs no ROS.',
+        epilog=f'{_FIRST_STEPS}\n{_MORE}', formatter_class=as_written)
+    parser.add_argument('--version', action='store_true', help='print the version and end')
+    commands_of = parser.add_subparsers(metavar='COMMAND', dest='command')
+    for name, (_, text, example, add_options) in _COMMANDS.items():
+        add_options(commands_of.add_parser(
+            name, help=text, description=f'{text[0].upper()}{text[1:]}.',
+            epilog=f'example:\n  l1slam {name} {example}', formatter_class=as_written))
+    return parser

@@ -13,7 +13,7 @@ from l1slam_ros.core.graph.spanning_tree import pair_key
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.formats import is_bag, stamps_of
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.graphs.side_files import false_loops_path, read_false_loops
+from l1slam_ros.io.graphs.side_files import beside, read_false_loops
 from l1slam_ros.io.trajectory import Reference, read_reference
 from l1slam_ros.io.wording import counted
 
@@ -119,7 +119,7 @@ def known_false(path: Path, record: GraphRecord) -> np.ndarray:
     FileError : that file is damaged, or names an edge that the graph does not have.
 
     """
-    side, factors, n = false_loops_path(path), record.graph.between, record.graph.n_poses
+    side, factors, n = beside(path, 'false'), record.graph.between, record.graph.n_poses
     ids = read_false_loops(side)
     index = np.minimum(np.searchsorted(record.ids, ids), n - 1)
     false = pair_key(index[:, 0], index[:, 1], n)

@@ -57,7 +57,7 @@ def solve(arguments: argparse.Namespace) -> Ending:
     if arguments.plot:
         from l1slam_ros.cli.drawing import plot_outcome
 
-        plot_outcome(arguments, record, outcome, truth)
+        plot_outcome(arguments, record, outcome, truth, _cost_name(asked))
     if arguments.output:
         formats.write_output(arguments.output, replace(record, poses=outcome.solution.poses))
     if arguments.json:
@@ -65,7 +65,7 @@ def solve(arguments: argparse.Namespace) -> Ending:
         print(json.dumps({name: None if isinstance(value, float) and not math.isfinite(value)
                           else value for name, value in report.items()}))
     elif not arguments.quiet:
-        _print_report(report, record, arguments.norm, outcome)
+        _print_report(report, record, _cost_name(asked), outcome)
         for sentence in judgement_sentences(record, judgement) if judgement else ():
             print(sentence)
     return ending
@@ -114,9 +114,14 @@ def _asked(arguments: argparse.Namespace) -> SolveOptions:
     if arguments.inner is not None:
         solver = replace(solver, inner=replace(solver.inner, iterations=arguments.inner))
     norm, loop_norm = arguments.norm or solver.norm, arguments.loop_norm or solver.loop_norm
-    arguments.norm = norm if loop_norm in (SAME, norm) else f'{norm}, of loops {loop_norm},'
     return SolveOptions(arguments.start, norm, loop_norm, arguments.solver, robust, solver,
                         least_squares)
+
+
+def _cost_name(asked: SolveOptions) -> str:
+    if asked.loop_norm in (SAME, asked.norm):
+        return f'{asked.norm} cost'
+    return f'{asked.norm} cost, of loops {asked.loop_norm}'
 
 
 def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
@@ -144,14 +149,14 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
     }
 
 
-def _print_report(report: dict[str, object], record: GraphRecord, norm: str,
+def _print_report(report: dict[str, object], record: GraphRecord, cost_name: str,
                   outcome: Outcome) -> None:
     solution = outcome.solution
     seed = f'seed {outcome.seed_cost:.6g}, ' if outcome.seed_cost is not None else ''
     factors = record.graph.between
     print(f'{counted(len(solution.poses), "pose")}, {counted(len(factors), "factor")}, '
           f'{doubted(factors)}')
-    print(f'{norm} cost: initial {outcome.initial_cost:.6g}, {seed}final {solution.cost:.6g}')
+    print(f'{cost_name}: initial {outcome.initial_cost:.6g}, {seed}final {solution.cost:.6g}')
     inner = f', {counted(solution.inner_iterations, "inner one")}' if (
         solution.inner_iterations) else ''
     print(f'{solution.status.value.replace("_", " ")} ({SENTENCES[solution.status]}): '

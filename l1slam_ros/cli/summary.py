@@ -11,16 +11,7 @@ from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.names import ANGLE, QUATERNION
-from l1slam_ros.core.robust.inspection import (
-    connected_parts,
-    cost_at,
-    information_range,
-    long_steps,
-    noise_scales,
-    parallel_factors,
-    repeated_factors,
-    step_lengths,
-)
+from l1slam_ros.core.robust import inspection
 from l1slam_ros.io.files import NANOSECONDS, stamp_text
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.wording import counted
@@ -57,19 +48,20 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
     factors = graph.between
     absolute = int(factors.is_absolute.sum())
     is_loop = ~factors.is_odometry & ~factors.is_absolute
-    parallel = int(is_loop[parallel_factors(graph)].sum())
+    parallel = int(is_loop[inspection.parallel_factors(graph)].sum())
     beside = f', {parallel:,} of them beside another edge' if parallel else ''
+    length = inspection.step_lengths(graph).sum()
     rows = [
         ('poses', f'{graph.n_poses:,} in {graph.manifold.NAME}, ids {ids[0]} to {ids[-1]}'),
-        ('odometry', f'{int(factors.is_odometry.sum()):,}, {step_lengths(graph).sum():,.1f} m'),
+        ('odometry', f'{int(factors.is_odometry.sum()):,}, {length:,.1f} m'),
         ('loops', f'{int(is_loop.sum()):,}{beside}'),
-        ('components', f'{len(connected_parts(graph)):,}')]
+        ('components', f'{len(inspection.connected_parts(graph)):,}')]
     if absolute:
         rows.insert(3, ('absolute', f'{absolute:,}'))
     if record.stamps is not None:
         rows.append(('time', f'{(record.stamps[-1] - record.stamps[0]) / NANOSECONDS:,.1f} s'))
     if record.poses is not None:
-        cost = cost_at(graph, record.poses)
+        cost = inspection.cost_at(graph, record.poses)
         rows.append(('l1 cost', f'{cost:.6g} at the stored poses'))
     return rows
 
@@ -90,7 +82,7 @@ def _on_ids(record: GraphRecord) -> Iterator[str]:
 
 
 def _on_parts(record: GraphRecord) -> Iterator[str]:
-    parts = connected_parts(record.graph)
+    parts = inspection.connected_parts(record.graph)
     if len(parts) == 1:
         return
     lonely = [part[0] for part in parts if len(part) == 1]
@@ -116,14 +108,14 @@ def _on_gaps(record: GraphRecord) -> Iterator[str]:
 
 
 def _on_repetitions(record: GraphRecord) -> Iterator[str]:
-    repeated = repeated_factors(record.graph)
+    repeated = inspection.repeated_factors(record.graph)
     if len(repeated):
         yield (f'{_listed("edge", _edges(record, repeated), len(repeated))}: given before with '
                'the same measurement, so counted twice')
 
 
 def _on_steps(record: GraphRecord) -> Iterator[str]:
-    long = long_steps(record.graph)
+    long = inspection.long_steps(record.graph)
     if len(long.factors):
         longest = np.argsort(-long.lengths)[:_NAMED]
         steps = [f'{length:.4g} m from {edge}' for length, edge in zip(
@@ -135,7 +127,7 @@ def _on_steps(record: GraphRecord) -> Iterator[str]:
 def _on_information(record: GraphRecord) -> Iterator[str]:
     manifold = record.graph.manifold
     for name, part in (('position', manifold.TRANSLATION), ('rotation', manifold.ROTATION)):
-        found = information_range(record.graph, part)
+        found = inspection.information_range(record.graph, part)
         if found.most > _WIDE_RANGE * found.least:
             least, most = _edges(record, np.array([found.least_factor, found.most_factor]))
             yield (f'the information on {name} differs by {found.most / found.least:.1g} between '
@@ -145,7 +137,7 @@ def _on_information(record: GraphRecord) -> Iterator[str]:
 def _on_noise(record: GraphRecord) -> Iterator[str]:
     # Any seed does: the draws stand for thousands of measurements.
     try:
-        scales = noise_scales(record.graph, np.random.default_rng(0))
+        scales = inspection.noise_scales(record.graph, np.random.default_rng(0))
     except L1SlamError as error:
         yield f'the noise cannot be judged: {error}'
         return

@@ -21,7 +21,7 @@ from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import SPARSE, compile_now, with_space
 from l1slam_ros.io.files import put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.graphs.side_files import false_loops_path, pair_lines, truth_path
+from l1slam_ros.io.graphs.side_files import beside, pair_lines
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.trajectory import truth_lines
 
@@ -36,7 +36,7 @@ def simulate(arguments: argparse.Namespace) -> Ending:
         world = with_false_loops(world, make(world.graph, world.truth, arguments.false_loops, rng))
     ids = np.arange(world.graph.n_poses)
     record = GraphRecord(world.graph, world.odometry, ids)
-    with replacing(truth_path(output)) as temporary:
+    with replacing(beside(output, 'truth')) as temporary:
         put_lines(temporary, truth_lines(ids, world.truth))
         _write(output, world.false_loops,
                lambda: formats.write_output(output, record, world.truth))
@@ -85,6 +85,6 @@ def _check(arguments: argparse.Namespace) -> None:
 
 def _write(output: Path, pairs: Indices, write_graph: Callable[[], None]) -> None:
     """Write a graph and its file of false loops, pairs (k, 2) of ids, both or neither."""
-    with replacing(false_loops_path(output)) as temporary:
+    with replacing(beside(output, 'false')) as temporary:
         put_lines(temporary, pair_lines(pairs))
         write_graph()

@@ -10,20 +10,20 @@ knows without numba that nothing is to be done. The note counts only for the ver
 numba and processor that it was made with, and while the files it names are there.
 """
 
+import gc
 import hashlib
 import importlib
 import importlib.util
 import json
 import os
 import platform
-import queue
+import select
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
 
 from l1slam_ros.core.geometry.manifold import Manifold
@@ -100,62 +100,53 @@ def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
 
 def _compiled(steps: list[str], stopped: Callable[[], bool]) -> Iterator[tuple[str, list[str]]]:
     """Yield each step and the files that keep it, as processes are done with them."""
-    done: queue.Queue[tuple[str, list[str]] | None] = queue.Queue()
-    waiting = iter(steps)
-    workers = [_start() for _ in range(min(_cores(), len(steps)))]
-    for worker in workers:
-        threading.Thread(target=_drive, args=(worker, waiting, done), daemon=True).start()
-    busy = len(workers)
+    count = min(_cores(), len(steps))
+    workers = [_start(steps[first::count]) for first in range(count)]
+    busy = {worker.stdout for worker in workers if worker.stdout}
     try:
         while busy and not stopped():
-            with suppress(queue.Empty):
-                answer = done.get(timeout=_LOOK)
-                if answer is None:
-                    busy -= 1
+            for answers in select.select(busy, [], [], _LOOK)[0]:
+                # A process that is done, or broke, says nothing more; the others go on.
+                if line := answers.readline():
+                    step, files = json.loads(line)
+                    yield step, files
                 else:
-                    yield answer
+                    busy.remove(answers)
     finally:
         for worker in workers:
-            worker.kill()
-            worker.wait()
+            with worker:
+                worker.kill()
 
 
-def _drive(worker: 'subprocess.Popen[str]', waiting: Iterator[str],
-           done: 'queue.Queue[tuple[str, list[str]] | None]') -> None:
-    """Give a process one step after the other, until none waits or it breaks; then say None."""
-    assert worker.stdin is not None and worker.stdout is not None
-    with suppress(OSError, ValueError), worker.stdin, worker.stdout:
-        # The next of a list's iterator is never given to two threads.
-        for step in waiting:
-            worker.stdin.write(f'{step}\n')
-            worker.stdin.flush()
-            # A process that broke says nothing, which is no JSON; the others go on.
-            done.put((step, json.loads(worker.stdout.readline())))
-    done.put(None)
-
-
-def _start() -> 'subprocess.Popen[str]':
+def _start(steps: list[str]) -> 'subprocess.Popen[str]':
     """Start a process that finds its modules where this one does."""
     code = (f'import sys; sys.path[:] = {sys.path!r}; '
-            'from l1slam_ros.io.compilation import work; work()')
+            f'from l1slam_ros.io.compilation import work; work({steps!r})')
     return subprocess.Popen([sys.executable, '-c', code], stdin=subprocess.PIPE,
                             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
 
 
-def work() -> None:
-    """Make ready the steps named on standard input; end with it, as when the parent dies."""
+def work(steps: list[str]) -> None:
+    """Make some steps ready, each said on standard output; end when the parent does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a person's Ctrl-C is for the parent
     os.nice(_NICE)
-    steps: queue.Queue[str] = queue.Queue()
 
-    def read() -> None:
-        for line in sys.stdin:
-            steps.put(line.strip())
+    def end_with_parent() -> None:
+        sys.stdin.read()
         os._exit(0)
 
-    threading.Thread(target=read, daemon=True).start()
-    while True:
-        print(json.dumps(make_ready(steps.get())), flush=True)
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    for step in steps:
+        print(json.dumps([step, make_ready(step)]), flush=True)
+
+
+def load(steps: Sequence[str] = STEPS) -> None:
+    """Read the loops of some steps, and let no collection of garbage look at them any more."""
+    for step in steps:
+        make_ready(step)
+    # They are some 100,000 objects that stay, and take a tenth of a second each time.
+    gc.collect()
+    gc.freeze()
 
 
 def make_ready(step: str) -> list[str]:

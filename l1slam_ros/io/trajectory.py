@@ -97,22 +97,21 @@ def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2,
                           [text.replace(',', ' ') for text in lines.texts[in_words:]])
     elif in_words:
         return _read_vertices(path, manifold, by_stamps)
-    columns = len(lines.texts[0].split()) if lines.texts else 0
-    if columns == _TUM_COLUMNS:
-        # Poses in space have as many numbers as TUM's; a stamp has a point there, an id has none.
-        stamped = (is_csv or columns != 1 + manifold.POSE_SIZE
-                   or not lines.texts[0].split()[0].isdecimal())
-        rows = _whole_stamps(path, lines) if stamped else lines
-        keys, pose3 = parse_rows(path, 'TUM pose', rows, 1, _TUM_COLUMNS - 1)
-        refuse_quaternions(path, pose3[:, 3:], lines.numbers)
-        return _sorted(path, lines, keys[:, 0], manifold.from_pose3(pose3), stamped=stamped)
-    if columns == 1 + manifold.POSE_SIZE:
-        rows = _whole_stamps(path, lines) if is_csv else lines
-        keys, poses = parse_rows(path, 'pose', rows, 1, manifold.POSE_SIZE)
-        return _sorted(path, lines, keys[:, 0], poses, stamped=is_csv)
-    others = ' or {} (stamp and pose)' if is_csv else ', {} (id and pose) or a graph file'
-    raise FileError(path, f'{counted(columns, "column")}; expected {_TUM_COLUMNS} (TUM)'
-                    f'{others.format(1 + manifold.POSE_SIZE)}', number)
+    fields = lines.texts[0].split() if lines.texts else []
+    is_tum, size = len(fields) == _TUM_COLUMNS, 1 + manifold.POSE_SIZE
+    if not is_tum and len(fields) != size:
+        others = f' or {size} (stamp and pose)' if is_csv else (
+            f', {size} (id and pose) or a graph file')
+        raise FileError(path, f'{counted(len(fields), "column")}; expected {_TUM_COLUMNS} (TUM)'
+                        f'{others}', number)
+    # Poses in space have as many numbers as TUM's; a stamp has a point there, an id has none.
+    stamped = is_csv or (is_tum and (len(fields) != size or not fields[0].isdecimal()))
+    rows = _whole_stamps(path, lines) if stamped else lines
+    keys, poses = parse_rows(path, 'TUM pose' if is_tum else 'pose', rows, 1, len(fields) - 1)
+    if is_tum:
+        refuse_quaternions(path, poses[:, 3:], lines.numbers)
+        poses = manifold.from_pose3(poses)
+    return _sorted(path, lines, keys[:, 0], poses, stamped=stamped)
 
 
 def _read_vertices(path: str | os.PathLike[str], manifold: Manifold, by_stamps: bool) -> Reference:

@@ -1,19 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The figures of the report: each draws its pictures into a folder and returns the section's lines.
+The figures of the report: each runs its experiment, draws into a folder and returns its lines.
 
-In: what was measured. Out: .png files, and Markdown that shows them, their numbers in a table.
+In: the graphs that there are. Out: .png files, and Markdown that shows them, their numbers in a
+table.
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.io.formats import named
 from l1slam_ros.io.plot import Curve, MapDrawing, plot_curves, plot_maps
+from l1slam_ros.io.progress import Progress
 from l1slam_ros.paper import printed as paper
-from l1slam_ros.paper.report import WORLD_SEED, Results, cost, metres, table
+from l1slam_ros.paper.experiments import measure_convergence
+from l1slam_ros.paper.report import WORLD_SEED, Study, cost, metres, table
 from l1slam_ros.paper.runs import (
     HUBER_OF_G2O,
     HUBERS,
@@ -27,8 +32,11 @@ from l1slam_ros.paper.runs import (
     LoopRuns,
     Map,
     StartRuns,
+    loops_of,
+    run_false_loops,
+    run_noisy_starts,
 )
-from l1slam_ros.paper.updates import Growth, spread
+from l1slam_ros.paper.updates import Updates, measure_growth, spread
 
 # Within this of the lowest cost of a diagram, a method has arrived.
 _ARRIVED = 0.001
@@ -51,25 +59,38 @@ _LIES = ('False loops at random between far poses, as sure as true ones; the pic
          f'without them, aligned. {_SHAPE}')
 
 
-def figure_2(results: Results, folder: Path) -> list[str]:
+def figure_2(study: Study, folder: Path) -> list[str]:
     """Draw cost against iterations, one picture for each problem."""
-    if not results.convergence:
-        return [f'Not run: it is of {paper.MANHATTAN_10K.name}, which `--worlds 10k` makes.']
-    lines, rows = [_CURVES, ''], []
-    for problem, methods in results.convergence.items():
-        name = f'figure_2_{problem}.png'
-        plot_curves(folder / name, [Curve(method, history[:, 0], history[:, 1])
-                                    for method, history in methods.items()],
+    name = paper.MANHATTAN_10K.name
+    if name not in study.graphs:
+        return [f'Not run: it is of {name}, which `--worlds 10k` makes.']
+    world = study.graphs[name]
+    curves = measure_convergence(world.graph, world.start, world.seed, study.effort.iterations)
+    steps = {'as printed': world.costs.printed,
+             f'ours, {world.costs.solver}': world.costs.solution.history}
+    curves['global'] = {method: np.stack((np.arange(len(costs)), costs), axis=1)
+                        for method, costs in steps.items()}
+    lines = [_CURVES, '']
+    for problem, methods in curves.items():
+        picture = f'figure_2_{problem}.png'
+        plot_curves(folder / picture, [Curve(method, history[:, 0], history[:, 1])
+                                       for method, history in methods.items()],
                     f'{problem} problem, L1 cost')
-        lines.append(f'![cost against iterations of the {problem} problem]({name})')
+        lines.append(f'![cost against iterations of the {problem} problem]({picture})')
+    return [*lines, '', *table_of_curves(curves)]
+
+
+def table_of_curves(curves: dict[str, dict[str, Array]]) -> list[str]:
+    """Return where each method begins, ends and arrives; by problem and method."""
+    rows = []
+    for problem, methods in curves.items():
         lowest = min(history[:, 1].min() for history in methods.values())
         rows += [[problem, method, f'{history[-1, 0]:,.0f}', cost(history[0, 1]),
                   cost(history[-1, 1]), f'{history[-1, 1] / lowest - 1:.2%}',
                   _arrival(history, (1 + _ARRIVED) * lowest)]
                  for method, history in methods.items()]
-    return [*lines, '', *table(
-        ['problem', 'method', 'iterations', 'cost at first', 'at last', 'above the lowest',
-         f'within {_ARRIVED:.1%} of it from'], rows, words=2)]
+    return table(['problem', 'method', 'iterations', 'cost at first', 'at last',
+                  'above the lowest', f'within {_ARRIVED:.1%} of it from'], rows, words=2)
 
 
 def _arrival(history: Array, bound: float) -> str:
@@ -79,17 +100,24 @@ def _arrival(history: Array, bound: float) -> str:
     return f'{history[first, 0]:,.0f}' if first < len(history) else 'not reached'
 
 
-def figure_3(results: Results, folder: Path) -> list[str]:
+def figure_3(study: Study, folder: Path) -> list[str]:
     """Draw the maps that our default solver ended with."""
-    plot_maps(folder / 'figure_3.png', [r.drawing for r in results.graphs])
+    plot_maps(folder / 'figure_3.png', [MapDrawing(
+        name, found.graph.manifold.positions(found.costs.solution.poses),
+        loops=loops_of(found.graph), note=f'L1 cost {found.costs.solution.cost:.6g}')
+        for name, found in study.graphs.items()])
     return ['The maps that our default solver ended with.', '', '![maps](figure_3.png)']
 
 
-def figure_4(results: Results, folder: Path) -> list[str]:
+def figure_4(study: Study, folder: Path) -> list[str]:
     """Draw the first start that L2 does not recover from, and what came of it."""
-    runs = results.starts
-    if runs is None:
+    if paper.NOISY.name not in study.graphs:
         return [f'Not run: it is of {paper.NOISY.name}.']
+    found, effort = study.graphs[paper.NOISY.name], study.effort
+    as_in_paper = replace(effort, outer=paper.NOISY_OUTER, inner=paper.NOISY_INNER)
+    with Progress(len(NOISES) * effort.draws, 'start') as progress:
+        runs = run_noisy_starts(found.graph, found.start, effort, as_in_paper,
+                                np.random.default_rng(WORLD_SEED), progress.advance)
     noise = drawn_noise(runs)
     maps = runs.noisy[noise][0]
     panels = {(f'Start: noise of {noise:g} m, {noise:g} rad', 'start'): maps[START],
@@ -97,7 +125,7 @@ def figure_4(results: Results, folder: Path) -> list[str]:
               ('Seed (reads no start)', 'seed'): runs.from_seed[START],
               ('Seed, then L1', 'optimised'): runs.from_seed[L1]}
     plot_maps(folder / 'figure_4.png', [
-        MapDrawing(title, shown.positions, loops=runs.loops, name=word,
+        MapDrawing(title, shown.positions, loops=loops_of(found.graph), name=word,
                    note=f'L1 cost {shown.cost:.6g}') for (title, word), shown in panels.items()])
     return [_STARTS, '', '![a noisy start, and the maps made of it](figure_4.png)', '',
             *table_of_starts(runs)]
@@ -129,19 +157,22 @@ def table_of_starts(runs: StartRuns) -> list[str]:
     return table(header, rows)
 
 
-def figure_5(results: Results, folder: Path) -> list[str]:
+def figure_5(study: Study, folder: Path) -> list[str]:
     """Draw the time of an update over the keyframes that there are, with a table."""
-    growth = results.growth
-    if growth is None:
+    keyframes, rate = study.effort.keyframes, study.effort.rate
+    if not keyframes:
         return ['Not run: no keyframes.']
-    updates = growth.updates
+    with Progress(keyframes, 'keyframe') as progress:
+        updates, batch = measure_growth(keyframes, rate, np.random.default_rng(WORLD_SEED),
+                                        progress.advance)
+    sizes = np.array([now.graph.n_poses for now in updates.on_the_way])
     curves = [*_windows('ours', updates.ours), *_windows('ISAM2', updates.peer),
-              Curve('batch L2', growth.sizes, 1e3 * growth.batch)]
+              Curve('batch L2', sizes, 1e3 * batch)]
     plot_curves(folder / 'figure_5.png', curves, 'time per update', ('keyframes', 'ms'))
-    said = _UPDATES.format(seed=WORLD_SEED, poses=len(updates.ours),
-                           rate=len(updates.ours) / updates.elapsed)
+    said = _UPDATES.format(seed=WORLD_SEED, poses=keyframes, rate=keyframes / updates.elapsed)
     return [said, *([] if updates.peer else ['', _NO_PEER]), '',
-            '![time per update over keyframes](figure_5.png)', '', *table_of_updates(growth)]
+            '![time per update over keyframes](figure_5.png)', '',
+            *table_of_updates(updates, batch)]
 
 
 def _windows(name: str, seconds: Sequence[float]) -> list[Curve]:
@@ -154,14 +185,13 @@ def _windows(name: str, seconds: Sequence[float]) -> list[Curve]:
             for word, q in (('median', 50), ('95%', 95))]
 
 
-def table_of_updates(growth: Growth) -> list[str]:
-    """Return what updates cost, of each method."""
+def table_of_updates(updates: Updates, batch: Array) -> list[str]:
+    """Return what updates cost, of each method; batch : (k,) [s]."""
     header = ['ms per update', 'median', '95%', '99%', 'most', '95% of the second quarter',
               'of the last', 'all [s]', 'behind [s]']
     rows = []
-    for name, seconds, behind in (('ours', growth.updates.ours, f'{growth.updates.behind:.1f}'),
-                                  ('ISAM2', growth.updates.peer, ''),
-                                  ('batch L2', growth.batch.tolist(), '')):
+    for name, seconds, behind in (('ours', updates.ours, f'{updates.behind:.1f}'),
+                                  ('ISAM2', updates.peer, ''), ('batch L2', batch.tolist(), '')):
         if len(seconds):
             of = spread(seconds)
             rows.append([name, *(f'{of[key]:.2f}' for key in (
@@ -169,17 +199,23 @@ def table_of_updates(growth: Growth) -> list[str]:
     return table(header, rows)
 
 
-def figure_6(results: Results, folder: Path) -> list[str]:
+def figure_6(study: Study, folder: Path) -> list[str]:
     """Draw the maps of the first draw, one picture for each graph."""
-    if not results.false_loops:
+    lines, found = [_LIES, ''], {}
+    for graph, count in paper.FALSE_LOOPS.items():
+        if graph.name not in study.graphs:
+            continue
+        of, effort = study.graphs[graph.name], study.effort
+        with named(graph.file), Progress(1 + effort.draws, 'draw') as progress:
+            runs = run_false_loops(of.graph, of.start, count, effort,
+                                   np.random.default_rng(WORLD_SEED), progress.advance)
+        found[graph.name] = runs
+        picture = f'figure_6_{graph.name.lower()}.png'
+        plot_maps(folder / picture, _false_loop_panels(graph.name, runs))
+        lines += [f'![{graph.name} with false loops]({picture})', '']
+    if not found:
         return [f'Not run: it is of {" and ".join(graph.name for graph in paper.FALSE_LOOPS)}.']
-    lines = [_LIES, '']
-    for name, runs in results.false_loops.items():
-        picture = f'figure_6_{name.lower()}.png'
-        plot_maps(folder / picture, _false_loop_panels(name, runs))
-        lines += [f'![{name} with false loops]({picture})', '']
-    return [*lines, *table_of_methods(results.false_loops), '',
-            *table_of_refused(results.false_loops)]
+    return [*lines, *table_of_methods(found), '', *table_of_refused(found)]
 
 
 def _false_loop_panels(name: str, runs: LoopRuns) -> list[MapDrawing]:

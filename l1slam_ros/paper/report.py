@@ -1,23 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What there is to report of the paper's experiments, and its tables in Markdown.
+What is measured of every graph of the paper, and the report's tables of it in Markdown.
 
 In: what was measured. Out: lines; what comes of it, the numbers say.
 """
 
 import platform
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import scipy
 
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.io.plot import MapDrawing
-from l1slam_ros.paper.experiments import PROBLEMS, Costs, Seconds
-from l1slam_ros.paper.printed import NOISY, PaperGraph
-from l1slam_ros.paper.runs import LoopRuns, StartRuns
-from l1slam_ros.paper.updates import Growth
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.paper import printed as paper
+from l1slam_ros.paper.experiments import (
+    PROBLEMS,
+    TIMED,
+    Costs,
+    Effort,
+    Seconds,
+    measure_largest,
+)
+from l1slam_ros.paper.printed import PaperGraph
 
 WORLD_SEED = 0
 _SOURCE_OF_FILES = 'https://github.com/OpenSLAM-org/openslam_vertigo'
@@ -36,52 +43,36 @@ _LARGEST = ('Algorithm 2 with the projection onto the L1 ball as the resolvent o
 @dataclass(frozen=True)
 class GraphResult:
     """
-    What was measured on one graph of the paper, or on a world of its size.
+    A graph of the paper, or a world of its size, and what was measured on it.
 
-    poses, edges : its size; truth_cost : the L1 cost of the true poses, where they are known.
+    start, seed : (n, p) poses; truth_cost : L1 cost of the true poses, where they are known.
     """
 
     paper: PaperGraph
-    poses: int
-    edges: int
+    graph: FactorGraph
+    start: Array
+    seed: Array
     costs: Costs
     seconds: Seconds
-    drawing: MapDrawing
     truth_cost: float | None = None
-
-    @property
-    def title(self) -> str:
-        """The paper's name of the graph, with a star where it was simulated anew."""
-        return self.paper.name + ('' if self.paper.file else ' (*)')
 
 
 @dataclass(frozen=True)
-class Results:
-    """
-    Everything there is to report.
+class Study:
+    """What a section reports on: the graphs that there are, by name; how long it may run."""
 
-    missing : graphs of the paper that were not run; convergence : of Figure 2, problem -> method
-    -> (k, 2) rows (iteration, cost), empty where its graph was not run; starts : of Figure 4;
-    growth : of Figure 5; false_loops : of Figure 6, by the name of the graph; largest : see
-    `measure_largest`.
-    """
-
-    graphs: Sequence[GraphResult]
-    missing: Sequence[PaperGraph] = ()
-    convergence: dict[str, dict[str, Array]] = field(default_factory=dict)
-    starts: StartRuns | None = None
-    growth: Growth | None = None
-    false_loops: dict[str, LoopRuns] = field(default_factory=dict)
-    largest: dict[str, Array] = field(default_factory=dict)
+    graphs: dict[str, GraphResult]
+    effort: Effort
 
 
-def head(results: Results) -> list[str]:
+def head(study: Study) -> list[str]:
     """Return the title, on what it was run, and what is not in the report and why."""
     lines = ['# The experiments of "L1 Factor Graph SLAM", run again', '', _HEAD, '',
              f'Run with Python {platform.python_version()}, NumPy {np.__version__}, '
              f'SciPy {scipy.__version__}, {platform.system()} {platform.machine()}.']
-    files = [graph for graph in results.missing if graph.file]
-    worlds = [graph for graph in results.missing if not graph.file]
+    missing = [graph for graph in paper.GRAPHS if graph.name not in study.graphs]
+    files = [graph for graph in missing if graph.file]
+    worlds = [graph for graph in missing if not graph.file]
     if files:
         lines += ['', f'**Not run: {_names(files)}**. They come with Vertigo '
                   f'({_SOURCE_OF_FILES}; its `manhattanOlson3500.g2o` is `manhattan3500.g2o` '
@@ -96,41 +87,47 @@ def _names(graphs: Iterable[PaperGraph]) -> str:
     return ', '.join(graph.name for graph in graphs)
 
 
-def table_1(results: Results) -> list[str]:
+def table_1(study: Study, _: Path) -> list[str]:
     """Return Table I, the L1 costs."""
     header = ['L1 cost', 'poses, edges', 'start: paper', 'start: ours', 'seed: ours',
               'final: paper', 'final: as printed', 'final: ours', 'solver', 'of the L2 map',
               'of the true poses']
-    rows = [[r.title, f'{r.poses:,}, {r.edges:,}', cost(r.paper.initial), cost(r.costs.initial),
-             cost(r.costs.seed), cost(r.paper.final),
+    rows = [[_title(r), f'{r.graph.n_poses:,}, {len(r.graph.between):,}', cost(r.paper.initial),
+             cost(r.costs.initial), cost(r.costs.seed), cost(r.paper.final),
              cost(r.costs.printed[-1]) + (' (+)' if r.costs.cut_short else ''),
              f'**{cost(r.costs.solution.cost)}**', r.costs.solver, cost(r.costs.l2),
-             '' if r.truth_cost is None else cost(r.truth_cost)] for r in results.graphs]
+             '' if r.truth_cost is None else cost(r.truth_cost)] for r in study.graphs.values()]
     return [*table(header, rows), '', _COSTS]
 
 
-def table_2(results: Results) -> list[str]:
+def table_2(study: Study, _: Path) -> list[str]:
     """Return Table II, the time per iteration."""
-    methods = list(results.graphs[0].seconds.methods)
-    header = ['ms per iteration']
-    for problem in PROBLEMS:
-        header += [f'{problem}: {method}' for method in ('paper', *methods)]
+    header = ['ms per iteration', *(f'{problem}: {method}' for problem in PROBLEMS
+                                    for method in ('paper', *TIMED))]
     rows = []
-    for r in results.graphs:
+    for r in study.graphs.values():
         times: list[float | None] = []
         for k in range(len(PROBLEMS)):
-            times += [r.paper.seconds[k], *(r.seconds.methods[m][k] for m in methods)]
-        rows.append([r.title, *map(milliseconds, [*times, r.paper.l2_seconds, r.seconds.l2])])
+            times += [r.paper.seconds[k], *(r.seconds.methods[method][k] for method in TIMED)]
+        rows.append([_title(r), *map(milliseconds, [*times, r.paper.l2_seconds, r.seconds.l2])])
     return [*table([*header, 'L2: paper (g2o)', 'L2: ours'], rows), '', _SECONDS]
 
 
-def future_work(results: Results) -> list[str]:
+def future_work(study: Study, _: Path) -> list[str]:
     """Return what the paper left for later: the map of the smallest largest residual."""
-    if not results.largest:
-        return [f'It is of {NOISY.name}, which was not run.']
-    rows = [[name, *map(cost, values)] for name, values in results.largest.items()]
-    return [*table([f'{NOISY.name}: the map of', 'largest residual [sigmas]', 'L1 cost', 'chi2'],
-                   rows), '', _LARGEST]
+    name = paper.NOISY.name
+    if name not in study.graphs:
+        return [f'It is of {name}, which was not run.']
+    noisy = study.graphs[name]
+    found = measure_largest(noisy.graph, noisy.start, study.effort)
+    rows = [[norm, *map(cost, values)] for norm, values in found.items()]
+    return [*table([f'{name}: the map of', 'largest residual [sigmas]', 'L1 cost', 'chi2'], rows),
+            '', _LARGEST]
+
+
+def _title(result: GraphResult) -> str:
+    """Return the paper's name of a graph, with a star where it was simulated anew."""
+    return result.paper.name + ('' if result.paper.file else ' (*)')
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> list[str]:

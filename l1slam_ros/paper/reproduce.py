@@ -5,7 +5,6 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,28 +24,12 @@ from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import STEPS, compile_now
 from l1slam_ros.io.files import new_folder_beside, put_lines, reported, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.plot import MapDrawing
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.paper import figures, report
 from l1slam_ros.paper import printed as paper
-from l1slam_ros.paper.experiments import (
-    Costs,
-    Effort,
-    measure_convergence,
-    measure_costs,
-    measure_largest,
-    measure_seconds,
-)
+from l1slam_ros.paper.experiments import Effort, measure_costs, measure_seconds
 from l1slam_ros.paper.printed import PaperGraph
-from l1slam_ros.paper.report import WORLD_SEED, GraphResult, Results
-from l1slam_ros.paper.runs import (
-    NOISES,
-    LoopRuns,
-    StartRuns,
-    run_false_loops,
-    run_noisy_starts,
-)
-from l1slam_ros.paper.updates import Growth, measure_growth
+from l1slam_ros.paper.report import WORLD_SEED, GraphResult, Study
 
 REPORT = 'report.md'
 
@@ -75,11 +58,12 @@ def reproduce(datasets: Path | None, worlds: Sequence[PaperGraph], output: Path,
     _check_folder(output)
     records = read_datasets(datasets) if datasets else {}
     compile_now(STEPS)
-    results = run(records, worlds, effort)
+    study = Study(measured(records, worlds, effort), effort)
     with _filling(output) as folder:
-        lines = report.head(results)
+        lines = report.head(study)
         for title, section in SECTIONS.items():
-            lines += ['', f'## {title}', '', *section(results, folder)]
+            _say(title)
+            lines += ['', f'## {title}', '', *section(study, folder)]
         put_lines(folder / REPORT, lines)
 
 
@@ -107,123 +91,50 @@ def _read(path: Path) -> GraphRecord:
     return record
 
 
-def run(records: dict[str, GraphRecord], worlds: Sequence[PaperGraph], effort: Effort) -> Results:
-    """Measure every graph, in the order of the paper; records as of `read_datasets`."""
+def measured(records: dict[str, GraphRecord], worlds: Sequence[PaperGraph],
+             effort: Effort) -> dict[str, GraphResult]:
+    """Return what is measured of every graph, in the order of the paper, by name."""
     simulated = {world.name: world for world in worlds}
-    graphs, convergence, missing = [], {}, []
+    found = {}
     for graph in paper.GRAPHS:
         if graph.name in records:
-            _say(graph.name)
-            graphs.append(_run_record(graph, records[graph.name], effort))
+            record = records[graph.name]
+            found[graph.name] = _measured(graph, record.graph, formats.stored_poses(record),
+                                          effort)
         elif graph.name in simulated:
-            _say(graph.name)
-            result, curves = _run_world(simulated[graph.name], effort)
-            graphs.append(result)
-            convergence.update(curves)
-        else:
-            missing.append(graph)
-    return Results(graphs, missing, convergence, _run_starts(records, effort),
-                   _run_growth(effort), _run_false_loops(records, effort),
-                   _run_largest(records, effort))
+            size = simulated[graph.name]
+            world = simulate_world(size.poses, size.edges, WorldOptions(),
+                                   np.random.default_rng(WORLD_SEED))
+            truth_cost = l1_cost(whitened_residual(world.graph, world.truth))
+            found[graph.name] = _measured(graph, world.graph, world.odometry, effort, truth_cost)
+    return found
+
+
+def _measured(printed: PaperGraph, graph: FactorGraph, start: Array, effort: Effort,
+              truth_cost: float | None = None) -> GraphResult:
+    _say(printed.name)
+    seed = seed_poses(graph, cholesky_of(graph))
+    steps = OptimiserOptions().outer_iterations + effort.outer + LeastSquaresOptions().iterations
+    with Progress(steps, 'step') as progress:
+        costs = measure_costs(graph, start, seed, effort, progress.report)
+    return GraphResult(printed, graph, start, seed, costs, measure_seconds(graph, seed, effort),
+                       truth_cost)
 
 
 def _say(work: str) -> None:
     print(f'l1slam: {work}', file=sys.stderr)
 
 
-def _run_starts(records: dict[str, GraphRecord], effort: Effort) -> StartRuns | None:
-    record = records.get(paper.NOISY.name)
-    if record is None:
-        return None
-    _say(f'{paper.NOISY.name} from noisy starts')
-    as_in_paper = replace(effort, outer=paper.NOISY_OUTER, inner=paper.NOISY_INNER)
-    with Progress(len(NOISES) * effort.draws, 'start') as progress:
-        return run_noisy_starts(record.graph, formats.stored_poses(record), effort, as_in_paper,
-                                np.random.default_rng(WORLD_SEED), progress.advance)
-
-
-def _run_growth(effort: Effort) -> Growth | None:
-    if not effort.keyframes:
-        return None
-    _say('a world, pose by pose')
-    with Progress(effort.keyframes, 'keyframe') as progress:
-        return measure_growth(effort.keyframes, effort.rate, np.random.default_rng(WORLD_SEED),
-                              progress.advance)
-
-
-def _run_false_loops(records: dict[str, GraphRecord], effort: Effort) -> dict[str, LoopRuns]:
-    runs = {}
-    for graph, count in paper.FALSE_LOOPS.items():
-        record = records.get(graph.name)
-        if record is None:
-            continue
-        _say(f'{graph.name} with false loops')
-        with formats.named(graph.file), Progress(1 + effort.draws, 'draw') as progress:
-            runs[graph.name] = run_false_loops(
-                record.graph, formats.stored_poses(record), count, effort,
-                np.random.default_rng(WORLD_SEED), progress.advance)
-    return runs
-
-
-def _run_largest(records: dict[str, GraphRecord], effort: Effort) -> dict[str, Array]:
-    record = records.get(paper.NOISY.name)
-    if record is None:
-        return {}
-    _say(f'{paper.NOISY.name} in L-infinity')
-    return measure_largest(record.graph, formats.stored_poses(record), effort)
-
-
-def _run_record(graph: PaperGraph, record: GraphRecord, effort: Effort) -> GraphResult:
-    seed = seed_poses(record.graph, cholesky_of(record.graph))
-    return _measured(graph, record.graph, formats.stored_poses(record), seed, effort)
-
-
-def _run_world(graph: PaperGraph,
-               effort: Effort) -> tuple[GraphResult, dict[str, dict[str, Array]]]:
-    """Return what a world of the graph's size gives, with the curves if they are shown of it."""
-    world = simulate_world(graph.poses, graph.edges, WorldOptions(),
-                           np.random.default_rng(WORLD_SEED))
-    seed = seed_poses(world.graph, cholesky_of(world.graph))
-    truth_cost = l1_cost(whitened_residual(world.graph, world.truth))
-    result = _measured(graph, world.graph, world.odometry, seed, effort, truth_cost)
-    if graph.name != paper.MANHATTAN_10K.name:
-        return result, {}
-    curves = measure_convergence(world.graph, world.odometry, seed, effort.iterations)
-    return result, {**curves, 'global': _global_curves(result.costs)}
-
-
-def _measured(paper_graph: PaperGraph, graph: FactorGraph, start: Array, seed: Array,
-              effort: Effort, truth_cost: float | None = None) -> GraphResult:
-    steps = (OptimiserOptions().outer_iterations + effort.outer + LeastSquaresOptions().iterations)
-    with Progress(steps, 'step') as progress:
-        costs = measure_costs(graph, start, seed, effort, progress.report)
-    seconds = measure_seconds(graph, seed, effort)
-    return GraphResult(paper_graph, graph.n_poses, len(graph.between), costs, seconds,
-                       _map(paper_graph, graph, costs), truth_cost)
-
-
-def _map(paper_graph: PaperGraph, graph: FactorGraph, costs: Costs) -> MapDrawing:
-    factors, solution = graph.between, costs.solution
-    loops = factors.pairs[~factors.is_odometry]
-    return MapDrawing(paper_graph.name, graph.manifold.positions(solution.poses), loops=loops,
-                      note=f'L1 cost {solution.cost:.6g}')
-
-
-def _global_curves(costs: Costs) -> dict[str, Array]:
-    histories = {'as printed': costs.printed, f'ours, {costs.solver}': costs.solution.history}
-    return {method: np.stack((np.arange(len(history)), history), axis=1)
-            for method, history in histories.items()}
-
-
-# Title -> what draws the section's pictures into a folder and returns its lines.
-SECTIONS: dict[str, Callable[[Results, Path], list[str]]] = {
-    'Table I: the cost': lambda results, _: report.table_1(results),
-    'Table II: the time per iteration': lambda results, _: report.table_2(results),
-    'Figure 2: cost against iterations': figures.figure_2, 'Figure 3: the maps': figures.figure_3,
+# Title -> what runs the section's experiment, draws into a folder and returns the lines.
+SECTIONS: dict[str, Callable[[Study, Path], list[str]]] = {
+    'Table I: the cost': report.table_1,
+    'Table II: the time per iteration': report.table_2,
+    'Figure 2: cost against iterations': figures.figure_2,
+    'Figure 3: the maps': figures.figure_3,
     'Figure 4: a start that is mostly noise': figures.figure_4,
     'Figure 5: the time per update': figures.figure_5,
     'Figure 6: loops that lie': figures.figure_6,
-    'Left for later: L-infinity': lambda results, _: report.future_work(results)}
+    'Left for later: L-infinity': report.future_work}
 
 
 def _check_folder(output: Path) -> None:

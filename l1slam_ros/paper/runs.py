@@ -58,13 +58,12 @@ class StartRuns:
 
     from_seed : of no start at all, the seed as START; its L1 map is what all are compared with;
     noisy : by noise, of each draw; printed : (k,) costs of Algorithm 4 as printed, from the seed;
-    loops : (m, 2); bent : [m] error from which on a map has lost its shape.
+    bent : [m] error from which on a map has lost its shape.
     """
 
     from_seed: Maps
     noisy: dict[float, Sequence[Maps]]
     printed: Array
-    loops: Indices
     bent: float
 
 
@@ -121,7 +120,7 @@ def run_noisy_starts(graph: FactorGraph, stored: Array, effort: Effort, printed:
         noisy[noise].append(maps(start, _minimise_l1(graph, start).poses))
         advance()
     return StartRuns(maps(seed, ours), dict(noisy), printed_costs(graph, seed, printed),
-                     _loops(graph), _bent(graph, ours))
+                     _bent(graph, ours))
 
 
 def with_noise(graph: FactorGraph, poses: Array, sigma: float, rng: np.random.Generator) -> Array:
@@ -152,7 +151,7 @@ def run_false_loops(graph: FactorGraph, stored: Array, count: int, effort: Effor
         loops = identity_false_loops(graph, poses[JOINT], count, rng)
         runs.append(_run_loops(graph, stored, loops, clean))
         advance()
-    return LoopRuns(clean, _loops(graph), runs, _bent(graph, poses[JOINT]))
+    return LoopRuns(clean, loops_of(graph), runs, _bent(graph, poses[JOINT]))
 
 
 def _run_loops(graph: FactorGraph, stored: Array, loops: Loops, clean: Maps) -> LoopRun:
@@ -177,7 +176,8 @@ def _poses(graph: FactorGraph, stored: Array) -> tuple[dict[str, Array], Mask]:
             ROBUST: robust.solution.poses}, robust.judgement.accepted
 
 
-def _loops(graph: FactorGraph) -> Indices:
+def loops_of(graph: FactorGraph) -> Indices:
+    """Return the pairs that the loops of a graph join, (m, 2)."""
     loops: Indices = graph.between.pairs[~graph.between.is_odometry]
     return loops
 

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from command import run, solve_json
+from rosbags.rosbag2 import StoragePlugin
 from torn import torn_graph
 
+from bags import NOTE, recording_of, rosbag2_directory
 from l1slam_ros.cli.main import main
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
@@ -50,18 +49,6 @@ def world(tmp_path):
     path = tmp_path / 'world.g2o'
     assert main(['simulate', str(path), '--poses', '150', '--edges', '250', '--seed', '7']) == 0
     return path
-
-
-def run(capsys, *arguments):
-    """Run a command that must succeed; return its standard output and error."""
-    code = main([str(a) for a in arguments])
-    out, err = capsys.readouterr()
-    assert code == 0, err
-    return out, err
-
-
-def solve_json(capsys, *arguments):
-    return json.loads(run(capsys, 'solve', *arguments, '--json')[0])
 
 
 def test_solve_reports_what_it_wrote(capsys, world, tmp_path):
@@ -103,18 +90,24 @@ def test_the_names_of_a_report_stay(capsys, world, more):
 # Robust
 
 
+def renumbered(path):
+    """Return the lines of a graph with the ids 10, 13, 16, ..."""
+    lines = [line.split() for line in path.read_text().splitlines()]
+    for fields in lines:
+        for k in (1,) if fields[0] == 'VERTEX_SE2' else (1, 2):
+            fields[k] = str(10 + 3 * int(fields[k]))
+    return [' '.join(fields) for fields in lines]
+
+
 @pytest.fixture(params=['random', 'identity', 'grouped'])
 def lies(tmp_path, request):
     """A world with 100 false loops, its edges in no order, and its ids 10, 13, 16, ..."""
     path = tmp_path / 'lies.g2o'
     assert main(['simulate', str(path), '--poses', '300', '--edges', '600', '--seed', '4',
                  '--false-loops', '100', '--kind', request.param]) == 0
-    lines = [line.split() for line in path.read_text().splitlines()]
-    for fields in lines:
-        for k in (1,) if fields[0] == 'VERTEX_SE2' else (1, 2):
-            fields[k] = str(10 + 3 * int(fields[k]))
+    lines = renumbered(path)
     np.random.default_rng(0).shuffle(lines)
-    path.write_text('\n'.join(' '.join(fields) for fields in lines) + '\n')
+    path.write_text('\n'.join(lines) + '\n')
     false = Path(f'{path}.false.txt')
     pairs = 10 + 3 * np.loadtxt(false, dtype=int)
     false.write_text('\n'.join(f'{i} {j}' for i, j in pairs))
@@ -233,9 +226,8 @@ def torn(tmp_path):
 def test_a_map_that_loops_agree_is_wrong_is_given_as_doubtful(capsys, torn, tmp_path, norm):
     path, ends = torn
     output, picture = tmp_path / 'out.g2o', tmp_path / 'map.png'
-    assert main(['solve', str(path), '--norm', norm, '--json', '--output', str(output),
-                 '--plot', str(picture)]) == 4
-    out, err = capsys.readouterr()
+    out, err = run(capsys, 'solve', path, '--norm', norm, '--json', '--output', output, '--plot',
+                   picture, code=4)
     report = json.loads(out)
     said = DOUBT.fullmatch(err.removeprefix('l1slam: ').rstrip('\n'))
     loops, first, last = map(int, said.groups()[:3])
@@ -256,8 +248,7 @@ def test_a_doubt_is_said_even_quietly_with_the_times_of_a_bag_and_beside_its_dam
     run(capsys, 'convert', torn[0], bag)
     cut.write_bytes((bag / 'bag.mcap').read_bytes()[:-20])
     for path, damages in (bag, 0), (cut, 1):
-        assert main(['solve', str(path), '--quiet']) == 4
-        out, err = capsys.readouterr()
+        out, err = run(capsys, 'solve', path, '--quiet', code=4)
         *damage, doubt = err.splitlines()
         said = DOUBT.fullmatch(doubt.removeprefix('l1slam: '))
         first, last = int(said[2]), int(said[3])
@@ -270,8 +261,7 @@ def test_most_loops_refused_is_a_doubt(capsys, world, tmp_path):
     """Three false loops to two true ones: the map is right, but who could know."""
     bad = tmp_path / 'bad.g2o'
     run(capsys, 'corrupt', world, bad, '--false-loops', 150)
-    assert main(['solve', str(bad), '--json']) == 4
-    out, err = capsys.readouterr()
+    out, err = run(capsys, 'solve', bad, '--json', code=4)
     report = json.loads(out)
     left_out = len(report['rejected'] + report['suspect'])
     assert report['status'] == 'doubtful' and left_out >= 150
@@ -285,20 +275,16 @@ GAP = 'no edge between the consecutive vertices 1 and 2, so no chain of odometry
 @pytest.mark.parametrize('start', ['seed', 'file'])
 def test_where_the_odometry_is_full_of_gaps_nothing_is_there_to_judge_by(capsys, tmp_path, start):
     path = graph_file(tmp_path, [*VERTICES, EDGES[0], EDGES[2]])
-    output = str(tmp_path / 'out.g2o')
-    asked = ['solve', str(path), '--start', start, '--json', '--output', output]
-    assert main([*asked, '--robust']) == 0
-    out, err = capsys.readouterr()
+    asked = ['solve', path, '--start', start, '--json', '--output', tmp_path / 'out.g2o']
+    out, err = run(capsys, *asked, '--robust')
     report, warning = json.loads(out), ('2 parts that nothing accepted joins: where one lies from '
                                         'another is a guess')
     assert report['parts'] == 2 and report['warnings'] == [warning] and warning in err
     assert report['suspect'] == [[0, 2]] and not report['rejected']
-    assert main(asked) == 0
-    out, err = capsys.readouterr()
+    out, err = run(capsys, *asked)
     warning = f'no loop was doubted: {GAP} to judge loops by'
     assert err == f'l1slam: {warning}\n' and json.loads(out)['warnings'] == [warning]
-    assert main([*asked, '--quiet', '--no-robust']) == 0
-    assert capsys.readouterr().err == ''
+    assert run(capsys, *asked, '--quiet', '--no-robust')[1] == ''
 
 
 def test_a_graph_too_dense_to_judge_is_solved_all_the_same(capsys, world, monkeypatch):
@@ -311,8 +297,8 @@ def test_a_graph_too_dense_to_judge_is_solved_all_the_same(capsys, world, monkey
     (warning,) = report['warnings']
     assert re.fullmatch('no loop was doubted: the factor of 149 keyframes and [0-9]+ factors '
                         'would have more than 400 blocks: too many far places are joined', warning)
-    assert main(['solve', str(world), '--robust']) == 2
-    assert 'too many far places are joined' in capsys.readouterr().err
+    err = run(capsys, 'solve', world, '--robust', code=2)[1]
+    assert 'too many far places are joined' in err
 
 
 def test_absolute_poses_are_no_loops_but_doubted_too(capsys, world):
@@ -359,21 +345,10 @@ def test_every_start_leads_every_norm_to_one_cost(capsys, world, start, norm):
     assert (report['seed_cost'] is None) == (start != 'seed')
 
 
-def copied_bag(bag, copy, renamed=None, note=True):
+def copied_bag(bag, copy, names=None, note=NOTE):
     """Copy a bag into an sqlite one by rosbags' own reader and writer."""
-    writer = Writer(copy, version=9, storage_plugin=StoragePlugin.SQLITE3)
-    metadata = yaml.safe_load((bag / 'metadata.yaml').read_text())
-    for key, text in metadata['rosbag2_bagfile_information']['custom_data'].items():
-        if note:
-            writer.set_custom_data(key, text)
-    typestore = get_typestore(Stores.ROS2_JAZZY)
-    with AnyReader([bag]) as reader, writer:
-        connections = {c.id: writer.add_connection(
-            (renamed or {}).get(c.topic, c.topic), c.msgtype, typestore=typestore)
-            for c in reader.connections}
-        for connection, time, data in reader.messages():
-            writer.write(connections[connection.id], time, data)
-    return copy
+    recording = [((names or {}).get(topic, topic), *rest) for topic, *rest in recording_of(bag)]
+    return rosbag2_directory(copy, recording, StoragePlugin.SQLITE3, note=note)
 
 
 @pytest.fixture
@@ -402,7 +377,7 @@ def test_every_door_leads_to_the_same_costs_and_poses(capsys, doors, tmp_path, n
 
 def test_a_bag_without_our_note_goes_by_the_parameters(capsys, world, tmp_path):
     run(capsys, 'convert', world, tmp_path / 'bag')
-    plain = copied_bag(tmp_path / 'bag', tmp_path / 'plain', note=False)
+    plain = copied_bag(tmp_path / 'bag', tmp_path / 'plain', note=None)
     params = tmp_path / 'params.yaml'
     params.write_text('/**: {ros__parameters: {odometry: {covariance_source: increment}, '
                       'keyframe: {translation: 0.0, rotation: 0.0, period: 0.0}}}')
@@ -421,9 +396,8 @@ def test_other_topics(capsys, world, tmp_path):
     run(capsys, 'convert', world, tmp_path / 'bag')
     other = copied_bag(tmp_path / 'bag', tmp_path / 'other', {
         '/odom': '/wheels/odom', '/loop_closures': '/places'})
-    code = main(['info', str(other)])
-    out, err = capsys.readouterr()
-    assert code == 2 and '/wheels/odom: 150 of nav_msgs/msg/Odometry' in out
+    out, err = run(capsys, 'info', other, code=2)
+    assert '/wheels/odom: 150 of nav_msgs/msg/Odometry' in out
     assert err.startswith('l1slam: ') and err.count('\n') == 1 and '/wheels/odom' in err
     topics = ('--odom-topic', '/wheels/odom', '--loop-topic', '/places')
     assert solve_json(capsys, other, *topics)['loops'] == 101
@@ -441,14 +415,12 @@ def test_a_cut_bag_is_read_in_part_and_exits_with_3(capsys, world, tmp_path):
                       ['convert', cut, tmp_path / 'out.graph'],
                       ['corrupt', cut, tmp_path / 'bad.g2o', '--false-loops', 1],
                       ['plot', cut, world, '--output', tmp_path / 'map.png']):
-        assert main([str(a) for a in arguments]) == 3
-        out, err = capsys.readouterr()
+        out, err = run(capsys, *arguments, code=3)
         assert err.startswith(f'l1slam: {cut}') and err.count('\n') == 1 and 'damaged' in err
         assert 'nothing looks wrong' not in out
     assert read_graph_file(tmp_path / 'out.g2o').graph.n_poses > 20
     cut.write_bytes(whole[:100])
-    assert main(['solve', str(cut), '--json']) == 2
-    out, err = capsys.readouterr()
+    out, err = run(capsys, 'solve', cut, '--json', code=2)
     assert out == '' and err.startswith(f'l1slam: {cut}') and err.count('\n') == 1
 
 
@@ -528,8 +500,7 @@ def test_a_file_of_other_false_loops_is_refused(capsys, tmp_path, line, words, c
     """Before the work, at whose end it would be too late: this graph cannot be solved."""
     path = graph_file(tmp_path, [*VERTICES, 'VERTEX_SE2 9 0 0 0', *EDGES])
     (tmp_path / 'graph.g2o.false.txt').write_text(f'0 2\n{line}\n')
-    assert main([command, str(path), output, str(tmp_path / 'map.png')]) == 2
-    _, err = capsys.readouterr()
+    err = run(capsys, command, path, output, tmp_path / 'map.png', code=2)[1]
     assert err.startswith(f'l1slam: {path}.false.txt') and words in err and err.count('\n') == 1
 
 
@@ -547,11 +518,7 @@ def test_solve_draws_the_costs_beside_the_map(capsys, world, tmp_path):
 def odd(world, tmp_path):
     """The world with stamps and with ids 10, 13, 16, ..."""
     path = tmp_path / 'odd.g2o'
-    lines = [line.split() for line in world.read_text().splitlines()]
-    for fields in lines:
-        for k in (1,) if fields[0] == 'VERTEX_SE2' else (1, 2):
-            fields[k] = str(10 + 3 * int(fields[k]))
-    path.write_text('\n'.join(' '.join(fields) for fields in lines) + '\n')
+    path.write_text('\n'.join(renumbered(world)) + '\n')
     Path(f'{path}.stamps.txt').write_text(
         ''.join(f'{10 + 3 * k} {5 + k}.25\n' for k in range(150)))
     return path
@@ -634,9 +601,8 @@ def test_a_graph_that_cannot_be_written_leaves_no_file_of_false_loops(capsys, wo
     path = tmp_path / 'prior.g2o'
     path.write_text(world.read_text() + 'EDGE_PRIOR_SE2 0 0 0 0 1 0 0 1 0 1\n')
     there = sorted(tmp_path.iterdir())
-    assert main(['corrupt', str(path), str(tmp_path / 'bad.graph'), '--false-loops', '3']) == 2
-    assert sorted(tmp_path.iterdir()) == there
-    assert capsys.readouterr().err.count('\n') == 1
+    err = run(capsys, 'corrupt', path, tmp_path / 'bad.graph', '--false-loops', 3, code=2)[1]
+    assert sorted(tmp_path.iterdir()) == there and err.count('\n') == 1
 
 
 def test_a_parameter_file_speaks_to_both_growth_and_solver(capsys, world, tmp_path):
@@ -661,8 +627,7 @@ def test_a_parameter_file_speaks_to_both_growth_and_solver(capsys, world, tmp_pa
 ])
 def test_bad_input_is_one_line_exit_code_2_and_no_output(capsys, tmp_path, lines, line, words):
     path, output = graph_file(tmp_path, lines), tmp_path / 'out.g2o'
-    assert main(['solve', str(path), '--output', str(output)]) == 2
-    out, err = capsys.readouterr()
+    out, err = run(capsys, 'solve', path, '--output', output, code=2)
     assert out == '' and err.count('\n') == 1 and err.startswith(f'l1slam: {path}:')
     assert words.lower() in err.lower()
     if line is not None:
@@ -709,8 +674,7 @@ def test_bad_arguments_are_one_line_and_exit_code_2(
     for name in ('other', 'taken.g2o', 'taken.png'):
         (tmp_path / name).mkdir()
     (tmp_path / 'gap.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 0 5 1 '))
-    assert main([*arguments]) == 2
-    _, err = capsys.readouterr()
+    err = run(capsys, *arguments, code=2)[1]
     assert err.count('\n') == 1 and words in err, err
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         'gap.g2o', 'graph.g2o', 'graph.txt', 'other', 'taken.g2o', 'taken.png']
@@ -757,6 +721,5 @@ def test_the_examples_of_the_help_work(capsys, tmp_path, monkeypatch):
 
 
 def test_without_a_command_there_is_help(capsys):
-    assert main([]) == 2
-    out, err = capsys.readouterr()
+    out, err = run(capsys, code=2)
     assert out == '' and all(f'    {command} ' in err for command in COMMANDS)

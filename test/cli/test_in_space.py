@@ -1,79 +1,57 @@
 # SPDX-License-Identifier: Apache-2.0
 """`l1slam` on worlds in space, and its norms: every command, in both readings of the rotation."""
 
-import json
-
 import numpy as np
 import pytest
+from command import run, solve_json
 
-from l1slam_ros.cli.main import main
 from l1slam_ros.core.names import NORMS
 
 
-def run(*arguments):
-    assert main(list(map(str, arguments))) == 0
-
-
-def solved(capsys, *arguments):
-    capsys.readouterr()
-    run('solve', *arguments, '--json')
-    return json.loads(capsys.readouterr().out)
-
-
 @pytest.fixture
-def building(tmp_path):
+def building(capsys, tmp_path):
     path = tmp_path / 'building.g2o'
-    run('simulate', path, '--world', 'building', '--poses', 150, '--edges', 330)
+    run(capsys, 'simulate', path, '--world', 'building', '--poses', 150, '--edges', 330)
     return path
 
 
 def test_a_building_is_made_spoiled_recorded_and_mapped(capsys, building, tmp_path):
     truth = ('--reference', f'{building}.truth.txt')
-    clean = solved(capsys, building, *truth)
+    clean = solve_json(capsys, building, *truth)
     assert clean['rejected'] == [] and clean['ate'] < 0.5 and clean['ate_poses'] == 150
-    run('corrupt', building, tmp_path / 'bad.g2o', '--false-loops', 20)
-    run('convert', tmp_path / 'bad.g2o', tmp_path / 'bag')
-    spoiled = solved(capsys, tmp_path / 'bag', *truth, '--output', tmp_path / 'map.tum')
+    run(capsys, 'corrupt', building, tmp_path / 'bad.g2o', '--false-loops', 20)
+    run(capsys, 'convert', tmp_path / 'bad.g2o', tmp_path / 'bag')
+    spoiled = solve_json(capsys, tmp_path / 'bag', *truth, '--output', tmp_path / 'map.tum')
     assert len(spoiled['rejected']) == 20
     assert spoiled['ate'] == pytest.approx(clean['ate'], rel=0.02)
-    run('plot', building, '--output', tmp_path / 'maps.png')
-    run('info', building, '--rotation-information', 'angle')
-    assert 'expected --rotation-information quaternion' in capsys.readouterr().out
-    run('info', building)
-    assert 'in SE3' in capsys.readouterr().out
+    run(capsys, 'plot', building, '--output', tmp_path / 'maps.png')
+    said = run(capsys, 'info', building, '--rotation-information', 'angle')[0]
+    assert 'expected --rotation-information quaternion' in said
+    assert 'in SE3' in run(capsys, 'info', building)[0]
 
 
 def test_each_norm_is_named_and_lowest_at_its_own_map(capsys, building, tmp_path):
     costs = {}
     for norm in NORMS:
         out = tmp_path / f'{norm}.g2o'
-        report = solved(capsys, building, '--no-robust', '--norm', norm, '--output', out)
+        report = solve_json(capsys, building, '--no-robust', '--norm', norm, '--output', out)
         assert report['status'] == 'converged'
         costs[norm] = report['final_cost']
     for norm in NORMS:
         for other in NORMS:
-            there = solved(capsys, tmp_path / f'{other}.g2o', '--no-robust', '--norm', norm,
+            there = solve_json(capsys, tmp_path / f'{other}.g2o', '--no-robust', '--norm', norm,
                            '--start', 'file', '--outer', 0)['final_cost']
             assert there >= costs[norm] * (1 - 1e-4)
 
 
-def test_a_parameter_file_names_the_norm(capsys, building, tmp_path):
-    params = tmp_path / 'params.yaml'
-    params.write_text('/**: {ros__parameters: {solver: {norm: group-l1}}}')
-    report = solved(capsys, building, '--no-robust', '--params-file', params)
-    assert report['solver'] == 'primal-dual-newton'
-    report = solved(capsys, building, '--no-robust', '--params-file', params, '--norm', 'l2')
-    assert report['solver'] == 'gauss-newton'
-
-
 def test_the_reading_of_the_rotation_is_kept_and_weighs(capsys, building, tmp_path):
     reading = ('--rotation-information', 'angle')
-    run('convert', building, tmp_path / 'same.g2o', *reading)
+    run(capsys, 'convert', building, tmp_path / 'same.g2o', *reading)
     edges = [[line for line in path.read_text().splitlines() if line.startswith('EDGE')]
              for path in (building, tmp_path / 'same.g2o')]
     np.testing.assert_allclose(*([[float(v) for v in line.split()[1:]] for line in lines]
                                  for lines in edges), rtol=1e-12)
-    costs = [solved(capsys, building, '--no-robust', '--norm', 'l2', *more)['final_cost']
+    costs = [solve_json(capsys, building, '--no-robust', '--norm', 'l2', *more)['final_cost']
              for more in ((), reading)]
     # The file is g2o's; read as of the angle its rotations weigh four times as much.
     assert costs[1] > 1.5 * costs[0]

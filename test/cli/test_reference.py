@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Truth at the times of keyframes: between true poses, never beyond them, and not across gaps."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from command import run, solve_json
+from messages import TYPES, header, numbers, odometry, of_rosbags, pose, pose_with_covariance
+from rosbags.rosbag2 import StoragePlugin
 
-from l1slam_ros.cli.main import main
+from bags import rosbag2_directory
 from l1slam_ros.cli.reference import position_error, read_truth, true_path
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
@@ -19,11 +19,6 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.trajectory import write_tum
 
 SECOND = 10**9
-TYPES = get_typestore(Stores.ROS2_JAZZY)
-_ = TYPES.types
-Time, Header = _['builtin_interfaces/msg/Time'], _['std_msgs/msg/Header']
-Point, Quaternion = _['geometry_msgs/msg/Point'], _['geometry_msgs/msg/Quaternion']
-Vector3, Pose = _['geometry_msgs/msg/Vector3'], _['geometry_msgs/msg/Pose']
 
 
 def test_between_true_poses_the_position_is_on_the_line_and_the_heading_on_the_shorter_arc():
@@ -92,38 +87,24 @@ def test_a_truth_that_is_slow_throughout_has_no_gaps(tmp_path):
     assert len(truth.rows) == np.count_nonzero(slow[-1] >= KEYFRAMES)
 
 
-def write_bag(path, topics):
-    """Write messages, topic -> list of (msgtype, message), recorded at 1 s."""
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        for topic, messages in topics.items():
-            kind = messages[0][0]
-            connection = writer.add_connection(topic, kind, typestore=TYPES)
-            for _, message in messages:
-                writer.write(connection, SECOND, TYPES.serialize_cdr(message, kind))
-    return path
+def recorded(topic, messages):
+    """Return pairs of type and message as a recording, all of 1 s."""
+    return [(topic, kind, SECOND, bytes(TYPES.serialize_cdr(message, kind)))
+            for kind, message in messages]
 
 
-def message_of(kind, stamp, pose):
-    sec, nanosec = divmod(int(stamp), SECOND)
-    header = Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id='map')
-    x, y, z, *q = se2.to_pose3(pose[None])[0].tolist()
-    name = f'geometry_msgs/msg/{kind}'
+def message_of(kind, stamp, pose3):
+    x, y, z, *q = se2.to_pose3(pose3[None])[0].tolist()
+    new, name = of_rosbags, f'geometry_msgs/msg/{kind}'
+    head = header(new, *divmod(int(stamp), SECOND), 'map')
+    if kind == 'Odometry':
+        return 'nav_msgs/msg/Odometry', odometry(new, head, position=(x, y, z), quaternion=q)
     if kind == 'TransformStamped':
-        transform = TYPES.types['geometry_msgs/msg/Transform'](
-            translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(*q))
-        return name, TYPES.types[name](header=header, child_frame_id='b', transform=transform)
-    pose = Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(*q))
-    if kind == 'PoseStamped':
-        return name, TYPES.types[name](header=header, pose=pose)
-    uncertain = TYPES.types['geometry_msgs/msg/PoseWithCovariance'](
-        pose=pose, covariance=np.zeros(36))
-    if kind == 'PoseWithCovarianceStamped':
-        return name, TYPES.types[name](header=header, pose=uncertain)
-    name, still = 'nav_msgs/msg/Odometry', Vector3(x=0.0, y=0.0, z=0.0)
-    twist = TYPES.types['geometry_msgs/msg/TwistWithCovariance'](
-        twist=TYPES.types['geometry_msgs/msg/Twist'](linear=still, angular=still),
-        covariance=np.zeros(36))
-    return name, TYPES.types[name](header=header, child_frame_id='b', pose=uncertain, twist=twist)
+        transform = new('geometry_msgs/msg/Transform', rotation=numbers(new, 'Quaternion', q),
+                        translation=numbers(new, 'Vector3', (x, y, z)))
+        return name, new(name, header=head, child_frame_id='b', transform=transform)
+    make = pose if kind == 'PoseStamped' else pose_with_covariance
+    return name, new(name, header=head, pose=make(new, (x, y, z), q))
 
 
 @pytest.mark.parametrize('kind', [
@@ -134,7 +115,7 @@ def test_a_topic_is_a_truth(tmp_path, kind):
                 for stamp, pose in zip(TRUE, true_at(TRUE), strict=True)]
     lost = message_of(kind, TRUE[3], np.array([np.nan, 0.0, 0.0]))
     late = messages[::-1] + messages[:5] + [lost]
-    write_bag(tmp_path / 'mocap', {'/robot/truth': late})
+    rosbag2_directory(tmp_path / 'mocap', recorded('/robot/truth', late), StoragePlugin.MCAP)
     truth = read_truth(f'{tmp_path}/mocap:/robot/truth', record, Path('graph.g2o'))
     assert truth.rows.tolist() == np.flatnonzero(SCORED).tolist()
     assert position_error(record, poses, truth) < 5e-4
@@ -151,9 +132,10 @@ def test_a_topic_is_a_truth(tmp_path, kind):
 def test_a_topic_that_is_none_is_one_line(tmp_path, monkeypatch, source, said):
     monkeypatch.chdir(tmp_path)
     record, _ = drive(KEYFRAMES)
-    write_bag(tmp_path / 'bag', {
-        '/pose': [message_of('PoseStamped', SECOND, np.zeros(3))],
-        '/time': [('builtin_interfaces/msg/Time', Time(sec=1, nanosec=0))]})
+    time = ('builtin_interfaces/msg/Time', header(of_rosbags).stamp)
+    rosbag2_directory(tmp_path / 'bag', [
+        *recorded('/pose', [message_of('PoseStamped', SECOND, np.zeros(3))]),
+        *recorded('/time', [time])], StoragePlugin.MCAP)
     with pytest.raises(FileError, match=said):
         read_truth(source, record, Path('graph.g2o'))
 
@@ -171,18 +153,17 @@ def test_the_command_says_over_how_many_poses(capsys, tmp_path, monkeypatch):
     """`bag` stands for an input that is one, whatever else is called so."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'bag').mkdir()
-    assert main(['simulate', 'world', '--poses', '120', '--edges', '200']) == 0
+    run(capsys, 'simulate', 'world', '--poses', 120, '--edges', 200)
     ate = []
     for truth in ('world.truth.txt', 'world:/ground_truth', 'bag:/ground_truth'):
-        assert main(['solve', 'world', '--json', '--reference', truth]) == 0
-        report = json.loads(capsys.readouterr().out)
+        report = solve_json(capsys, 'world', '--reference', truth)
         assert report['ate_poses'] == 120 and report['warnings'] == []
         ate.append(report['ate'])
     assert ate == pytest.approx([ate[0]] * 3, rel=1e-9) and 0 < ate[0] < 0.3
     lines = Path('world.truth.txt').read_text().splitlines()
     Path('half.txt').write_text('\n'.join(lines[::2]))
-    assert main(['solve', 'world', '--reference', 'half.txt']) == 0
-    assert ' m over 60 of 120 poses (RMSE after rigid alignment)' in capsys.readouterr().out
+    said = run(capsys, 'solve', 'world', '--reference', 'half.txt')[0]
+    assert ' m over 60 of 120 poses (RMSE after rigid alignment)' in said
 
 
 def test_bicocca_by_its_stamps(capsys, datasets, tmp_path):
@@ -190,8 +171,7 @@ def test_bicocca_by_its_stamps(capsys, datasets, tmp_path):
     real, graph = datasets / 'real', tmp_path / 'bicocca.g2o'
     graph.write_bytes((real / 'bicocca25b_0.150.g2o').read_bytes())
     Path(f'{graph}.stamps.txt').write_bytes((real / 'bicocca25b.stamps.txt').read_bytes())
-    assert main(['solve', str(graph), '--no-robust', '--start', 'odometry', '--outer', '0',
-                 '--json', '--reference', str(real / 'bicocca25b.truth.csv')]) == 0
-    report = json.loads(capsys.readouterr().out)
+    report = solve_json(capsys, graph, '--no-robust', '--start', 'odometry', '--outer', 0,
+                        '--reference', real / 'bicocca25b.truth.csv')
     assert report['ate'] == pytest.approx(4.36, abs=0.02)
     assert 7000 < report['ate_poses'] < report['poses'] == 8358

@@ -14,7 +14,6 @@ from l1slam_ros.io.plot import Curve, MapDrawing, plot_curves, plot_maps, plot_s
 
 ROOT = Path(__file__).parents[2]
 SQUARE = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0], [0.0, 1.0]])
-RED = (0xD5, 0x37, 0x0E)
 
 
 def pixels(path):

@@ -123,6 +123,7 @@ def test_what_a_solve_finds_of_the_noise_is_told():
     graph = retold(world.graph, times=np.where(world.graph.between.is_odometry, 0.2, 1.0))
     found = minimise_robustly(graph, lambda part, poses: minimise_l2(
         part, poses, LeastSquaresOptions(), cholesky_of(part)))
-    said = list(judgement_sentences(GraphRecord(graph, None, np.arange(200)), found.judgement))[-1]
-    times = re.fullmatch(re.escape(NOISY_ODOMETRY).replace(r'\{\}', r'(\d+\.\d)'), said)
+    said = '\n'.join(judgement_sentences(GraphRecord(graph, None, np.arange(200)),
+                                         found.judgement))
+    times = re.search(re.escape(NOISY_ODOMETRY).replace(r'\{\}', r'(\d+\.\d)'), said)
     assert 3 < float(times[1]) < 6

@@ -16,12 +16,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import (
-    Mask,
-    covariance_of,
-    root_of_inverse,
-    square_root_information,
-)
+from l1slam_ros.core.geometry.noise import Mask, square_root_information
 from l1slam_ros.core.graph.growable_array import GrowingArray
 
 # The first end of an absolute factor: the map frame, a keyframe that never moves. As an index into
@@ -264,10 +259,12 @@ def turned(graph: FactorGraph, rows: Indices | Mask) -> FactorGraph:
     """
     factors, manifold = graph.between, graph.manifold
     i, j, Z = factors.i.copy(), factors.j.copy(), factors.measurement.copy()
-    roots, adjoint = factors.sqrt_information.copy(), manifold.adjoint(Z[rows])
     i[rows], j[rows], Z[rows] = factors.j[rows], factors.i[rows], manifold.inverse(Z[rows])
-    roots[rows] = root_of_inverse(
-        adjoint @ covariance_of(roots[rows]) @ adjoint.transpose(0, 2, 1))
+    roots = factors.sqrt_information.copy()
+    # Of the root, without squaring it: far ends make covariances that no Cholesky bears.
+    upper = np.linalg.qr(roots[rows] @ manifold.adjoint(Z[rows]), mode='r')
+    signs = np.where(np.diagonal(upper, axis1=1, axis2=2) < 0, -1.0, 1.0)
+    roots[rows] = signs[:, :, None] * upper
     other = FactorGraph(manifold)
     other.add_poses(graph.n_poses)
     other.append_between(i, j, Z, roots, factors.trusted, factors.struck)

@@ -28,7 +28,7 @@ def gather(keyframe, blocks, y, product):
 
 @loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i4[::1], f8[:, :, ::1])')
 def solve_many(panels, first, start, pattern, offset, position, right):
-    """Return the solutions of L L' x = right, (n, k, q) in the order of the keyframes."""
+    """Turn right hand sides, (n, k, q) in the order of the keyframes, into L'^-1 L^-1 right."""
     n, k, q = right.shape
     x = np.empty((n * k, q))
     for f in range(n):
@@ -47,10 +47,8 @@ def solve_many(panels, first, start, pattern, offset, position, right):
             for r in range(c + 3, len(panel), 3):
                 _add(x, rows[r // k] * k + r % k, panel[r:r + 3, c:c + 3].T, -1.0, x, own)
             _solve_three_transposed(panel[c:c + 3, c:c + 3], x, own)
-    solution = np.empty((n, k, q))
     for f in range(n):
-        solution[f] = x[position[f] * k:(position[f] + 1) * k]
-    return solution
+        right[f] = x[position[f] * k:(position[f] + 1) * k]
 
 
 @compiled

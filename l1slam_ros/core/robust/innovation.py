@@ -104,10 +104,10 @@ def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) 
     noise = signs(keys(graph.between.i, graph.between.j), k, q)
     speaks = graph.between.speaks
     noise[~speaks] = 0
-    right = np.zeros((system.size + 1, k, q))
-    gather(system.keyframe, system.blocks, noise, right)
-    samples = np.zeros_like(right)
-    samples[:-1] = cholesky.solve_many(right[:-1])
+    samples = np.zeros((system.size + 1, k, q))
+    gather(system.keyframe, system.blocks, noise, samples)
+    samples[-1] = 0.0
+    cholesky.solve_many(samples[:-1])
     moment = left_over(system.keyframe, system.blocks, samples, noise)
     return Posterior(system, noise, samples, moment, speaks, anchor(graph))
 

@@ -19,7 +19,6 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import WORLDS
-from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.worlds.false_loops import Loops, insert_loops
 from l1slam_ros.core.worlds.in_space import DRIVES
 
@@ -32,22 +31,21 @@ _RADIUS_GROWTH = 1.25
 
 
 @dataclass(frozen=True)
-class WorldOptions(Options):
+class WorldOptions:
     """
     The streets the robot drives, and the standard deviations of what it measures.
 
-    None may be 0: a measurement without noise would have infinite information.
+    step : from one keyframe to the next [m]; block : keyframes from one crossing to the next;
+    sigmas : of one measurement, along and across [m], and of its rotation [rad]. None may be 0: a
+    measurement without noise would have infinite information.
     """
 
-    step: float = option(1.0, 'distance from one keyframe to the next', 'm', 1e-6, 1e6)
-    block: int = option(5, 'keyframes from one crossing to the next', '', 1, 10**6)
-    odometry_sigma_translation: float = option(
-        0.05, 'noise of one step, along and across', 'm', 1e-9, 1e6)
-    odometry_sigma_rotation: float = option(
-        0.01, "noise of one step's rotation", 'rad', 1e-9, 1e6)
-    loop_sigma_translation: float = option(
-        0.05, 'noise of one loop, along and across', 'm', 1e-9, 1e6)
-    loop_sigma_rotation: float = option(0.01, "noise of one loop's rotation", 'rad', 1e-9, 1e6)
+    step: float = 1.0
+    block: int = 5
+    odometry_sigma_translation: float = 0.05
+    odometry_sigma_rotation: float = 0.01
+    loop_sigma_translation: float = 0.05
+    loop_sigma_rotation: float = 0.01
 
 
 @dataclass(frozen=True)
@@ -80,13 +78,13 @@ def simulate_world(
 
     Raises
     ------
-    GraphError : fewer edges than the odometry has, or more than there are pairs of poses.
+    GraphError : fewer than two poses, fewer edges than the odometry has, or more than pairs.
 
     """
     n_loops = n_edges - (n_poses - 1)
     most = n_poses * (n_poses - 1) // 2
-    if n_poses < 1:
-        raise GraphError(f'a world of {n_poses} poses, expected 1 or more')
+    if n_poses < 2:
+        raise GraphError(f'a world of {n_poses} poses, expected 2 or more')
     if not 0 <= n_loops <= most - (n_poses - 1):
         raise GraphError(f'{n_edges} edges between {n_poses} poses, '
                          f'expected {n_poses - 1} to {most}')

@@ -28,10 +28,9 @@ from l1slam_ros.io.bags.damaged.salvage import (
     directory_metadata,
     storage_files,
 )
-from l1slam_ros.io.bags.damaged.sqlite_pages import is_cut
 from l1slam_ros.io.bags.damaged.walk import BagMessage, ros1_types
 from l1slam_ros.io.bags.damaged.walk_mcap import is_indexed, mcap_metadata
-from l1slam_ros.io.bags.damaged.walk_sqlite import has_journal, sqlite_metadata
+from l1slam_ros.io.bags.damaged.walk_sqlite import has_journal, is_cut, sqlite_metadata
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES
 from l1slam_ros.io.bags.writer import NOTE_KEY
 

@@ -32,24 +32,9 @@ from l1slam_ros.io.files import (
 )
 
 
-def stamps_path(path: str | os.PathLike[str]) -> Path:
-    """Return the name of the file with the stamps of a graph."""
-    return _beside(path, 'stamps')
-
-
-def trusted_path(path: str | os.PathLike[str]) -> Path:
-    """Return the name of the file with the trusted loops of a graph."""
-    return _beside(path, 'trusted')
-
-
-def truth_path(path: str | os.PathLike[str]) -> Path:
-    """Return the name of the file with the true poses of a graph or a bag."""
-    return _beside(path, 'truth')
-
-
-def false_loops_path(path: str | os.PathLike[str]) -> Path:
-    """Return the name of the file with the false loops of a graph or a bag."""
-    return _beside(path, 'false')
+def beside(path: str | os.PathLike[str], what: str) -> Path:
+    """Return the name of the file that has `what`, as stamps, of a graph or a bag."""
+    return Path(f'{os.fspath(path)}.{what}.txt')
 
 
 def write_beside(path: str | os.PathLike[str], ids: Indices, stamps: Indices | None,
@@ -67,8 +52,8 @@ def write_beside(path: str | os.PathLike[str], ids: Indices, stamps: Indices | N
     """
     stamp_lines = [] if stamps is None else _stamp_lines(ids, stamps)
     trusted = ids[factors.pairs][factors.trusted & ~factors.is_odometry]
-    with (_replaced(stamps_path(path), stamp_lines),
-          _replaced(trusted_path(path), pair_lines(trusted))):
+    with (_replaced(beside(path, 'stamps'), stamp_lines),
+          _replaced(beside(path, 'trusted'), pair_lines(trusted))):
         pass  # both are on the disk before either takes its place
 
 
@@ -98,7 +83,7 @@ def read_stamps(path: str | os.PathLike[str], ids: Indices) -> Indices | None:
     FileError : the file is damaged, or is not about these vertices.
 
     """
-    side = stamps_path(path)
+    side = beside(path, 'stamps')
     if not side.exists():
         return None
     lines = read_lines(side)
@@ -130,7 +115,7 @@ def read_trusted(path: str | os.PathLike[str], ids: Indices, factors: BetweenFac
     FileError : naming the line, when the file is damaged or names vertices without an edge.
 
     """
-    side = trusted_path(path)
+    side = beside(path, 'trusted')
     if not side.exists():
         return np.zeros(len(factors), bool)
     lines = read_lines(side)
@@ -164,7 +149,3 @@ def read_false_loops(path: Path) -> Indices:
     if not path.exists():
         return np.zeros((0, 2), np.int64)
     return parse_rows(path, 'false loop', read_lines(path), ids=2, values=0)[0]
-
-
-def _beside(path: str | os.PathLike[str], what: str) -> Path:
-    return Path(f'{os.fspath(path)}.{what}.txt')

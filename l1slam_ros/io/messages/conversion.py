@@ -17,11 +17,12 @@ Covariances pass as they come: `graph_builder` decides what they are worth.
 """
 
 import re
-import struct
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
@@ -33,10 +34,6 @@ _REFERENCE_FRAME = re.compile(
     r'/?(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
 # builtin_interfaces/Time holds its seconds in 32 bits.
 _MAX_SECONDS = 2**31 - 1
-# The second byte of CDR: most or least significant byte first.
-_ORDERS = {0: '>', 1: '<'}
-# Of an Odometry position, orientation, and their covariance; then the twist, and its covariance.
-_DOUBLES = 7 + 36 + 6 + 36
 
 
 def odometry_sample(message: Any) -> OdometrySample:
@@ -59,32 +56,24 @@ def odometry_in(data: bytes) -> tuple[str, OdometrySample]:
     """
     Return whose odometry a serialised message is, by its `child_frame_id`, and what it says.
 
-    In a tenth of the time that rclpy takes for it. CDR, as ROS 2 puts messages on the wire: four
-    bytes say the byte order, then each number stands at a multiple of its size, a string behind
-    its length, with a closing zero.
+    By the bag library, in a third of the time that rclpy takes for it.
 
     Raises
     ------
     MessageError : it breaks off, or is no CDR, or cannot be used.
 
     """
-    order = _ORDERS.get(data[1]) if len(data) > 4 and not data[0] else None
-    if order is None:
-        raise MessageError('encoding', f'odometry that begins with {data[:4].hex()}; expected CDR')
     try:
-        seconds, nanoseconds, length = struct.unpack_from(order + 'iII', data, 4)
-        child_at = 16 + length + -length % 4
-        (length,) = struct.unpack_from(order + 'I', data, child_at)
-        end = child_at + 4 + length
-        child = data[child_at + 4 : end - 1].decode(errors='replace')
-        # Eight bytes count from behind the first four.
-        numbers = np.frombuffer(data, order + 'f8', _DOUBLES, end + (4 - end) % 8).astype(float)
-    except (struct.error, ValueError) as error:
-        raise MessageError('encoding', f'odometry of {len(data)} bytes; expected more') from error
-    x, y, z, *quaternion = numbers[:7].tolist()
-    return child, OdometrySample(
-        sound_stamp(seconds, nanoseconds), sound_pose3((x, y, z), tuple(quaternion)),
-        numbers[7:43].reshape(6, 6), numbers[49:].reshape(6, 6))
+        message = _types().deserialize_cdr(data, 'nav_msgs/msg/Odometry')
+    except Exception as error:  # bytes that are no message make the library raise anything
+        raise MessageError('encoding', f'odometry of {len(data)} bytes that begin with '
+                           f'{data[:4].hex()}; expected CDR') from error
+    return message.child_frame_id, odometry_sample(message)
+
+
+@cache
+def _types() -> Any:
+    return get_typestore(Stores.ROS2_JAZZY)
 
 
 def loop_closure(message: Any, base_frame: str, trusted: bool) -> LoopClosure:
@@ -180,11 +169,7 @@ def stamp_of(header: Any) -> int:
     MessageError : it is zero, negative or no time.
 
     """
-    return sound_stamp(int(header.stamp.sec), int(header.stamp.nanosec))
-
-
-def sound_stamp(seconds: int, nanoseconds: int) -> int:
-    """Return a stamp [ns]; see `stamp_of`."""
+    seconds, nanoseconds = int(header.stamp.sec), int(header.stamp.nanosec)
     stamp = seconds * NANOSECONDS + nanoseconds
     if seconds < 0 or not 0 <= nanoseconds < NANOSECONDS or stamp == 0:
         raise MessageError('stamp', f'stamp {seconds} s {nanoseconds} ns; '

@@ -126,8 +126,8 @@ def test_it_ends_its_processes_when_it_is_stopped(tmp_path, monkeypatch):
     monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path))
     started, start = [], compilation._start
 
-    def noted():
-        started.append(start())
+    def noted(steps):
+        started.append(start(steps))
         return started[-1]
 
     monkeypatch.setattr(compilation, '_start', noted)

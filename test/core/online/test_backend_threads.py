@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Threads that meet at the back end: what one of them sees is whole, whatever the others do."""
 
+import os
 import threading
 import time
 from dataclasses import fields
@@ -273,6 +274,33 @@ def test_the_background_makes_way(monkeypatch, end):
         assert not ended.is_alive()
         assert len(of_threads()) == (end != 'close')
     assert not of_threads()
+
+
+def test_a_process_that_is_forked_has_a_back_end_at_rest(monkeypatch):
+    """Threads do not come along, what they have locked does: numba's lock, for one."""
+    begun, numba = threading.Event(), threading.Lock()
+
+    def improve(*arguments):
+        with numba:
+            begun.set()
+            patient(*arguments)
+
+    monkeypatch.setattr(upkeep, 'improve', improve)
+    with Backend(OPTIONS, background=True) as backend:
+        drive(backend, 0, 5)
+        assert begun.wait(DEADLINE)
+        begun.clear()
+        child = os.fork()
+        if not child:
+            try:
+                drive(backend, 5, 6)
+                backend.settle()
+                backend.close()
+            finally:
+                os._exit(numba.acquire(blocking=False) and len(backend.poses))
+        wait_until(lambda: os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT))
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 6
+        assert begun.wait(DEADLINE)
 
 
 def test_what_fails_in_the_background_is_raised_at_the_end(monkeypatch):

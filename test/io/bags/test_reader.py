@@ -9,14 +9,6 @@ from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note, rea
 from l1slam_ros.io.bags.writer import new_bag
 
 
-def test_a_directory_of_several_bags_is_none(tmp_path):
-    folder = write_strings(tmp_path / 'bag')
-    (folder / 'metadata.yaml').unlink()
-    (folder / 'other_0.mcap').write_bytes((folder / 'bag.mcap').read_bytes())
-    for call in (read_messages, bag_summary, read_note):
-        assert 'without metadata.yaml and with the files of 2 bags' in error_of(call, folder)
-
-
 @pytest.fixture
 def bag(tmp_path):
     return write_strings(tmp_path / 'bag')
@@ -71,12 +63,16 @@ def error_of(call, *arguments):
 def test_what_is_no_bag_is_told(tmp_path, bag):
     (tmp_path / 'a.txt').write_text('x')
     (tmp_path / 'empty').mkdir()
-    (tmp_path / 'a.db3').mkdir()
+    (tmp_path / 'two').mkdir()
+    for name in 'a_0.mcap', 'b_0.mcap':
+        (tmp_path / 'two' / name).write_bytes((bag / 'bag.mcap').read_bytes())
     for call in (read_messages, read_raw, bag_summary, read_note):
         assert error_of(call, tmp_path / 'none').endswith(': no such file or directory; '
                                                           'expected a bag')
         assert 'no bag by its name; expected .mcap, .db3' in error_of(call, tmp_path / 'a.txt')
-        assert 'a directory without metadata.yaml' in error_of(call, tmp_path / 'empty')
+        for name, count in ('empty', 0), ('two', 2):
+            assert (f'without metadata.yaml and with the files of {count} bags'
+                    in error_of(call, tmp_path / name))
     assert list(read_messages(bag, ['/odom'])) == []
 
 

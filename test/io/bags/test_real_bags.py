@@ -145,14 +145,18 @@ def test_duplicates_and_a_clock_set_back_are_counted_and_told(tmp_path, world):
     assert len(record.graph.between) == len(world[2].graph.between) + len(again) - 1
 
 
+def changed(message, change):
+    topic, msgtype, time, data = message
+    decoded = TYPES.deserialize_cdr(data, msgtype)
+    change(decoded)
+    return topic, msgtype, time, bytes(TYPES.serialize_cdr(decoded, msgtype))
+
+
 def test_what_cannot_be_used_is_counted_by_its_cause(tmp_path, world):
     recording = list(world[1])
 
     def broken(k, change):
-        topic, msgtype, time, data = recording[k]
-        message = TYPES.deserialize_cdr(data, msgtype)
-        change(message)
-        recording[k] = (topic, msgtype, time, bytes(TYPES.serialize_cdr(message, msgtype)))
+        recording[k] = changed(recording[k], change)
 
     odometry = [k for k, m in enumerate(recording) if m[0] == '/odom']
     loops = [k for k, m in enumerate(recording) if m[0] == '/loop_closures']
@@ -177,13 +181,6 @@ def test_messages_come_in_order_of_time_even_from_a_file_without_order(tmp_path,
         path = mcap_file(tmp_path / 'a.mcap', shuffled, **options)
         times = [m.time for m in read_messages(path)]
         assert times == [m[2] for m in world[1]]
-
-
-def changed(message, change):
-    topic, msgtype, time, data = message
-    decoded = TYPES.deserialize_cdr(data, msgtype)
-    change(decoded)
-    return topic, msgtype, time, bytes(TYPES.serialize_cdr(decoded, msgtype))
 
 
 def test_a_stray_base_frame_in_the_beginning_is_dropped(tmp_path, world):

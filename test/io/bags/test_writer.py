@@ -11,7 +11,7 @@ from disk import Disk
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.stream_reader import StreamReader
 
-from bags import NOTED, STRING, write_strings
+from bags import NOTE, NOTED, STRING, write_strings
 from l1slam_ros.core.errors import FileError, GraphError
 from l1slam_ros.io.bags.reader import read_messages
 from l1slam_ros.io.bags.writer import new_bag
@@ -45,6 +45,12 @@ def test_the_file_is_what_rosbag2_and_mcap_tools_want(tmp_path):
     document = yaml.safe_load((path.parent / 'metadata.yaml').read_text())
     inside = yaml.safe_load(metadata['rosbag2']['serialized_metadata'])
     assert inside == document['rosbag2_bagfile_information']
+    assert (inside['version'], inside['storage_identifier']) == (9, 'mcap')
+    assert inside['relative_file_paths'] == ['bag.mcap']
+    assert inside['custom_data'] == {'l1slam': NOTE}
+    assert (inside['message_count'], inside['duration']['nanoseconds']) == (501, 998 * 10**9)
+    assert {topic['topic_metadata']['name']: topic['message_count']
+            for topic in inside['topics_with_message_count']} == {'/a': 500, '/b': 1}
     assert metadata['l1slam'] == NOTED
 
 
@@ -82,6 +88,8 @@ def test_every_topic_has_its_type_and_all_qos_keys(bag):
         assert metadata['serialization_format'] == 'cdr' and metadata['type'] == STRING
         qos, = metadata['offered_qos_profiles']
         assert set(qos) == qos_keys
+        assert (qos['history'], qos['depth']) == ('keep_last', 1000)
+        assert (qos['reliability'], qos['durability']) == ('reliable', 'volatile')
         inside = channels[metadata['name']].metadata
         assert yaml.safe_load(inside['offered_qos_profiles']) == [qos]
         assert inside['topic_type_hash'] == metadata['type_description_hash']

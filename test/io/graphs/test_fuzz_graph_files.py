@@ -7,12 +7,17 @@ import tempfile
 import warnings
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.testing import assert_allclose, assert_array_equal
 
 from l1slam_ros.cli.main import main
-from l1slam_ros.io.graphs.graph_file import read_graph_file
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 
 VALID = {
     '.g2o': """\
@@ -126,6 +131,43 @@ def test_arbitrary_bytes(suffix, content, command):
 @given(file=mutations(), command=COMMANDS)
 def test_mutated_files(file, command):
     answer(*file, *command)
+
+
+@st.composite
+def records(draw):
+    """A random graph: any ids, edges either way, numbers of any size, with stamps or not."""
+    ids = np.array(sorted(draw(st.sets(st.integers(-2**63, 2**63 - 1), min_size=2, max_size=6))))
+    n, rng = len(ids), np.random.default_rng(draw(st.integers(0, 2**32)))
+    i = np.append(np.arange(n), rng.integers(n, size=4))  # every vertex has an edge
+    number = st.floats(-1e30, 1e30) | st.sampled_from([0.0, -0.0, 1 / 3])
+    A = rng.normal(size=(len(i), 3, 3))
+    information = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    graph = FactorGraph(se2)
+    graph.add_poses(n)
+    graph.add_between(i, (i + rng.integers(1, n, len(i))) % n,
+                      draw(arrays(float, (len(i), 3), elements=number)),
+                      information * 10.0 ** rng.integers(-20, 20, (len(i), 1, 1)))
+    stamps = draw(st.none() | arrays(np.int64, n, elements=st.integers(0, 2**62)))
+    return GraphRecord(graph, draw(arrays(float, (n, 3), elements=number)), ids, stamps)
+
+
+@settings(BOUNDED, max_examples=30)
+@given(record=records())
+def test_what_is_written_is_read_to_the_last_bit_and_converted(record):
+    with tempfile.TemporaryDirectory() as name:
+        for suffix in VALID:
+            path = Path(name) / f'a{suffix}'
+            write_graph_file(path, record)
+            back = read_graph_file(path)
+            mine, theirs = record.graph.between, back.graph.between
+            for x, y in ((record.ids, back.ids), (record.poses, back.poses),
+                         (mine.pairs, theirs.pairs), (mine.measurement, theirs.measurement)):
+                assert x.tobytes() == y.tobytes()
+            assert_array_equal(record.stamps, back.stamps)
+            scale = np.abs(mine.sqrt_information).max(axis=(1, 2), keepdims=True)
+            assert_allclose(theirs.sqrt_information / scale, mine.sqrt_information / scale,
+                            atol=1e-13)
+            answer(suffix, path.read_bytes(), 'convert', ('out',))
 
 
 @pytest.mark.parametrize('suffix', sorted(VALID))

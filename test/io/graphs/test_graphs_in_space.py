@@ -92,32 +92,6 @@ def test_round_trip(tmp_path, rng, suffix, reading):
     assert_allclose(information_of(record.graph), information_of(back.graph), atol=1e-12)
 
 
-@pytest.mark.parametrize('tags', [('VERTEX_SE3:QUAT', 'EDGE_SE3:QUAT', '0 0 0 1', 7, SQUARE),
-                                  ('VERTEX3', 'EDGE3', '0 0 0', 6, TORO_SQUARE)],
-                         ids=['g2o', 'toro'])
-@pytest.mark.parametrize(('line', 'message'), [
-    ('VERTEX 5 1 2', 'VERTEX: 3 fields; expected 1 whole and {pose} finite numbers'),
-    ('VERTEX 5 1 2 x TURN', "VERTEX: 'x' is not a finite number"),
-    ('VERTEX 7 1 2 3 TURN', 'vertex 7 stands twice, before at line 1'),
-    ('EDGE 3 7 1 2 3 TURN 1 0', 'EDGE: {fields} fields; expected 2 whole and {edge} finite'),
-    ('EDGE 3 7.5 1 2 3 TURN UNIT', "EDGE: '7.5' is not a whole number of 64 bits"),
-    ('EDGE 3 8 1 2 3 TURN UNIT', 'vertex 8 is unknown; expected one of the 2 vertices'),
-    ('EDGE 3 7 1 2 nan TURN UNIT', "EDGE: 'nan' is not a finite number"),
-    ('EDGE 3 7 1 2 3 TURN -UNIT', 'information [-1 0 0 0 0 0 0 1 0'),
-    ('EDGE_SE2 3 7 1 0 0 1 0 0 1 0 1', 'EDGE_SE2: a line of SE2 beside VERTEX at line 1'),
-])
-def test_each_malformed_line_is_named(write, tags, line, message):
-    vertex, edge, turn, pose, square = tags
-    text = line.replace('TURN', turn).replace('UNIT', UNIT)
-    message = message.format(pose=pose, fields=4 + pose, edge=pose + 21)
-    for word, tag in (('VERTEX', vertex), ('EDGE ', f'{edge} '), ('EDGE:', f'{edge}:')):
-        text, message = text.replace(word, tag), message.replace(word, tag)
-    with pytest.raises(FileError) as caught:
-        read_graph_file(write(square + text + '\n' + square.splitlines()[2] + '\n'))
-    assert '\n' not in str(caught.value)
-    assert str(caught.value).split('a.g2o', 1)[1].startswith(f':5: {message}')
-
-
 @pytest.mark.parametrize('turn', ['0 0 0 0', '0 0 0 1.2', '3 0 0 1'])
 def test_a_quaternion_that_is_none_is_named(write, turn):
     with pytest.raises(FileError, match=r'a\.g2o:5: quaternion \[.*\]; expected one of norm 1'):

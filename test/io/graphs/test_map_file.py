@@ -12,7 +12,7 @@ from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.io.graphs.map_file import MapFile
 from l1slam_ros.io.graphs.saved_map import is_map, load_map
-from l1slam_ros.io.graphs.side_files import stamps_path
+from l1slam_ros.io.graphs.side_files import beside
 from l1slam_ros.io.node_options import NodeOptions
 
 HOUR = 3600.0
@@ -161,7 +161,7 @@ def test_a_map_of_another_dimension_is_refused(tmp_path):
     path, robot = tmp_path / 'map.g2o', Robot(tmp_path / 'map.g2o')
     path.write_text('VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\n'
                     'EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n')
-    stamps_path(path).write_text('1\n2\n')
+    beside(path, 'stamps').write_text('1\n2\n')
     with pytest.raises(FileError, match='map.g2o: is a map of SE3; expected one of SE2'):
         robot.map_file.load()
 

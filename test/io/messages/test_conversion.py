@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
+from messages import header, odometry, of_rosbags, pose_with_covariance
 
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.io.messages.conversion import (
@@ -19,43 +19,15 @@ from l1slam_ros.io.messages.conversion import (
 NS = 10**9
 
 
-def rosbags_class(name):
-    return get_typestore(Stores.ROS2_JAZZY).types[name]
-
-
-def rclpy_class(name):
+def of_rclpy(name, **fields):
     package, _, leaf = name.split('/')
-    module = pytest.importorskip(f'{package}.msg')
-    return getattr(module, leaf)
+    return getattr(pytest.importorskip(f'{package}.msg'), leaf)(**fields)
 
 
-@pytest.fixture(params=[rosbags_class, rclpy_class], ids=['rosbags', 'rclpy'])
+@pytest.fixture(params=[of_rosbags, of_rclpy])
 def new(request):
     """Return a function that makes a message of either library from its fields."""
-    return lambda name, **fields: request.param(name)(**fields)
-
-
-def pose_with_covariance(new, position=(1.0, 2.0, 0.0), quaternion=(0.0, 0.0, 0.0, 1.0)):
-    return new('geometry_msgs/msg/PoseWithCovariance', covariance=np.arange(36.0), pose=new(
-        'geometry_msgs/msg/Pose',
-        position=new('geometry_msgs/msg/Point', **dict(zip('xyz', position, strict=True))),
-        orientation=new('geometry_msgs/msg/Quaternion',
-                        **dict(zip('xyzw', quaternion, strict=True)))))
-
-
-def header(new, sec=12, nanosec=5, frame='odom'):
-    return new('std_msgs/msg/Header', frame_id=frame,
-               stamp=new('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec))
-
-
-def odometry(new, head=None, **pose):
-    def vector():
-        return new('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=0.0)
-
-    return new('nav_msgs/msg/Odometry', header=head or header(new), child_frame_id='base_link',
-               pose=pose_with_covariance(new, **pose),
-               twist=new('geometry_msgs/msg/TwistWithCovariance', covariance=-np.arange(36.0),
-                         twist=new('geometry_msgs/msg/Twist', linear=vector(), angular=vector())))
+    return request.param
 
 
 def loop(new, frame='base_link@10.000000007', **pose):

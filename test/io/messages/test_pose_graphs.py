@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from messages import odometry, of_rosbags
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from l1slam_ros.core.errors import FileError, MessageError
@@ -173,15 +174,12 @@ def bag(tmp_path, truth):
         writer.add_topic('/odom', 'nav_msgs/msg/Odometry')
         writer.add_topic('/rtabmap/mapGraph', MAP_GRAPH)
         writer.add_topic('/kimera/pose_graph', POSE_GRAPH)
-        zeros = np.zeros(36)
         closing = [link(6, 1, GLOBAL, truth)]
         for k, message in enumerate(growing(truth, closing)):
-            pose = pose_message(se2.between(truth[:1], truth[k : k + 1]))
-            writer.write('/odom', (10 + k) * SECOND, M['nav_msgs/msg/Odometry'](
-                header(10 + k), 'base_link',
-                M['geometry_msgs/msg/PoseWithCovariance'](pose, zeros),
-                M['geometry_msgs/msg/TwistWithCovariance'](M['geometry_msgs/msg/Twist'](
-                    *[M['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)] * 2), zeros)))
+            numbers = se2.to_pose3(se2.between(truth[:1], truth[k : k + 1]))[0].tolist()
+            writer.write('/odom', (10 + k) * SECOND, odometry(
+                of_rosbags, header(10 + k), position=numbers[:3], quaternion=numbers[3:],
+                covariance=np.zeros(36)))
             writer.write('/rtabmap/mapGraph', (10 + k) * SECOND, message)
         writer.write('/kimera/pose_graph', 20 * SECOND, pose_graph(
             20, [(k, 9.0 + k) for k in range(1, 7)],

@@ -18,7 +18,7 @@ from typing import Any
 import yaml
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError, zstd_decoder
+from l1slam_ros.io.bags.damaged.walk import DECODERS, BagMessage, BrokenRecordError
 from l1slam_ros.io.bags.damaged.walk_mcap import walk_mcap
 from l1slam_ros.io.bags.damaged.walk_rosbag1 import walk_rosbag1
 from l1slam_ros.io.bags.damaged.walk_sqlite import walk_sqlite
@@ -189,7 +189,7 @@ def _decompressed(file: Path) -> Iterator[Path]:
         yield file
         return
     with TemporaryDirectory() as folder:
-        readable, decoder = Path(folder, file.stem), zstd_decoder()
+        readable, decoder = Path(folder, file.stem), DECODERS['zstd']()
         with file.open('rb') as source, readable.open('wb') as target, suppress(Exception):
             while piece := source.read(_PIECE):
                 target.write(decoder.decompress(piece))
@@ -200,4 +200,4 @@ def _unpacked(message: BagMessage) -> BagMessage:
     """Return a message, decompressed where it was compressed by itself."""
     if not message.data.startswith(_ZSTD_MAGIC):
         return message
-    return message._replace(data=zstd_decoder().decompress(message.data))
+    return message._replace(data=DECODERS['zstd']().decompress(message.data))

@@ -3,6 +3,7 @@
 
 import bz2
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]  # comes with both bag libraries
@@ -10,7 +11,8 @@ import zstandard  # comes with the mcap library
 from rosbags.typesys import Stores, get_typestore
 
 _BASIC = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
-_PIECE = 4096  # [bytes] a decoder is given at a time
+# [bytes] A decoder is given so much at a time: when it fails, what it made of that is lost.
+_PIECE = 64
 
 
 class BagMessage(NamedTuple):
@@ -47,38 +49,18 @@ def ros1_types(fields: Mapping[str, Any]) -> Any:
     return types
 
 
-def zstd_decoder() -> Any:
-    """Return a decoder of zstd for one use."""
-    return zstandard.ZstdDecompressor().decompressobj()
-
-
-def lz4_decoder() -> Any:
-    """Return a decoder of lz4 for one use."""
-    return lz4.frame.LZ4FrameDecompressor()
-
-
-# By their names in MCAP and in bags of ROS 1.
-_DECODERS = {'zstd': zstd_decoder, 'lz4': lz4_decoder, 'bz2': bz2.BZ2Decompressor}
+# By their names in MCAP and in bags of ROS 1, each for one use.
+DECODERS: dict[str, Callable[[], Any]] = {
+    'zstd': lambda: zstandard.ZstdDecompressor().decompressobj(),
+    'lz4': lz4.frame.LZ4FrameDecompressor, 'bz2': bz2.BZ2Decompressor}
 
 
 def uncompressed(data: bytes, compression: str) -> bytes:
-    """Return the content of a chunk, as far as it goes."""
+    """Return the content of a chunk as far as it goes: up to a piece before it is damaged."""
     if compression in ('', 'none'):
         return data
-    return decoded(_DECODERS[compression], data)
-
-
-def decoded(make_decoder: Callable[[], Any], data: bytes, sure: int = 0,
-            piece: int = _PIECE) -> bytes:
-    """Return what a decoder makes of `data` before it fails; the first `sure` bytes never fail."""
-    decoder = make_decoder()
-    parts = [decoder.decompress(data[:sure])]
-    for start in range(sure, len(data), piece):
-        try:
-            parts.append(decoder.decompress(data[start:start + piece]))
-        except Exception:  # the decoders have no exception in common
-            if piece == 1:
-                break
-            # A failure takes along what this piece held before it: once more, byte by byte.
-            return decoded(make_decoder, data[:start + piece], start, 1)
+    decoder, parts = DECODERS[compression](), []
+    with suppress(Exception):  # the decoders have no exception in common
+        for start in range(0, len(data), _PIECE):
+            parts.append(decoder.decompress(data[start:start + _PIECE]))
     return b''.join(parts)

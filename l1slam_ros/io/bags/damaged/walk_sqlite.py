@@ -8,8 +8,13 @@ from pathlib import Path
 from shutil import copyfile
 from tempfile import TemporaryDirectory
 
-from l1slam_ros.io.bags.damaged.sqlite_pages import Row, is_cut, leaf_rows
 from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError
+
+_FILE_HEADER = 100  # [bytes] "Database File Format", sqlite.org/fileformat2.html
+_TABLE_LEAF = b'\x0d'  # the first byte of a page with rows of a table
+
+# Topic id, time [ns], data.
+Row = tuple[int, int, bytes]
 
 
 def walk_sqlite(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
@@ -21,21 +26,63 @@ def walk_sqlite(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]
                 "WHERE encoding = 'ros2msg'"))
         topics = {key: (name, msgtype) for key, name, msgtype in database.execute(
             "SELECT id, name, type FROM topics WHERE serialization_format = 'cdr'")}
-        for _, key, time, data in _rows(database, path):
+        # Of a page that is lost in part SQLite would take the lost part for zeros.
+        rows = leaf_rows(path) if is_cut(path) else database.execute(
+            'SELECT topic_id, CAST(timestamp AS INTEGER), CAST(data AS BLOB) FROM messages '
+            'ORDER BY id')
+        for key, time, data in rows:
             if key in topics:
                 yield BagMessage(*topics[key], time, data)
+    if is_cut(path):
+        raise BrokenRecordError(path.stat().st_size)
 
 
-def _rows(database: sqlite3.Connection, path: Path) -> Iterator[Row]:
-    """Yield the rows of the messages as the database has them; of a cut one, all that are left."""
-    if not is_cut(path):
-        yield from database.execute('SELECT id, topic_id, CAST(timestamp AS INTEGER), '
-                                    'CAST(data AS BLOB) FROM messages ORDER BY id')
-        return
-    # SQLite would take the lost part of a page for zeros.
-    with suppress(IndexError):  # damaged inside as well
-        yield from leaf_rows(path)
-    raise BrokenRecordError(path.stat().st_size)
+def is_cut(path: Path) -> bool:
+    """Tell whether a database is shorter than its first page says."""
+    with path.open('rb') as file:
+        header = file.read(_FILE_HEADER)
+    return path.stat().st_size < int.from_bytes(header[28:32], 'big') * _page_size(header)
+
+
+def _page_size(header: bytes) -> int:
+    size = int.from_bytes(header[16:18], 'big')
+    return 65536 if size == 1 else size
+
+
+def leaf_rows(path: Path) -> Iterator[Row]:
+    """
+    Yield the messages of a database that is cut, page by page, up to the first that is not whole.
+
+    SQLite finds the leaves of a table from its root down. A table that outgrows a level gets its
+    new inner pages at the end of the file, and without these a file that is cut has no way to
+    leaves that are all there. So in a copy each leaf in turn is made the root.
+    """
+    with TemporaryDirectory() as folder:
+        copy = Path(copyfile(path, Path(folder, path.name)))
+        with copy.open('r+b') as file:
+            header = file.read(_FILE_HEADER)
+            size = _page_size(header)
+            pages = path.stat().st_size // size
+            leaves = []
+            for number in range(2, pages + 1):  # the first page has the schema
+                file.seek((number - 1) * size)
+                if file.read(1) == _TABLE_LEAF:
+                    leaves.append(number)
+            # Without a journal, of so many pages.
+            file.seek(0)
+            file.write(header[:18] + b'\1\1' + header[20:28] + pages.to_bytes(4, 'big'))
+            file.truncate(pages * size)
+        with (suppress(sqlite3.DatabaseError),
+              closing(sqlite3.connect(copy, isolation_level=None)) as database):
+            database.execute('PRAGMA journal_mode = OFF')
+            for number in leaves:
+                database.execute('PRAGMA writable_schema = ON')
+                database.execute("UPDATE sqlite_master SET rootpage = ? WHERE name = 'messages'",
+                                 (number,))
+                database.execute('PRAGMA writable_schema = RESET')
+                # Rows of other tables have no blob there.
+                yield from database.execute(
+                    "SELECT topic_id, timestamp, data FROM messages WHERE typeof(data) = 'blob'")
 
 
 def has_journal(path: Path) -> bool:

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each malformed line of a graph file is named, found and expected beside it, in any format."""
+
+import re
+from typing import NamedTuple
+
+import pytest
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.io.graphs.graph_file import read_graph_file
+
+UNIT = ' '.join('1' if row == column else '0' for row in range(6) for column in range(row, 6))
+
+
+class Format(NamedTuple):
+    """Tags of vertices and edges, a pose and an information in it, a tag of the other manifold."""
+
+    vertex: str
+    edge: str
+    pose: str
+    information: str
+    other: str
+
+
+FORMATS = {
+    'g2o': Format('VERTEX_SE2', 'EDGE_SE2', '0 0 0', '1 0 0 1 0 1', 'EDGE3'),
+    'toro': Format('VERTEX2', 'EDGE2', '0 0 0', '1 0 1 1 0 0', 'VERTEX_SE3:QUAT'),
+    'g2o in space': Format('VERTEX_SE3:QUAT', 'EDGE_SE3:QUAT', '0 0 0 0 0 0 1', UNIT, 'EDGE_SE2'),
+    'toro in space': Format('VERTEX3', 'EDGE3', '0 0 0 0 0 0', UNIT, 'VERTEX2')}
+SOUND = ['V 7 POSE', 'V 3 POSE', 'E 3 7 POSE INFO', 'V 9 POSE', 'E 7 9 POSE INFO']
+
+
+@pytest.mark.parametrize('name', FORMATS)
+@pytest.mark.parametrize(('line', 'message'), [
+    ('E 3 7 POSE', 'E: {few} fields; expected 2 whole and {edge} finite numbers'),
+    ('E 3 7 POSE INFO 1', 'E: {many} fields; expected 2 whole and {edge} finite numbers'),
+    ('E 3 7 # POSE INFO', 'E: 2 fields; expected 2 whole'),
+    ('V 5 0 0', 'V: 3 fields; expected 1 whole and {vertex} finite numbers'),
+    *((f'V 5 {word} TAIL', f'V: {word!r} is not a finite number; expected')
+      for word in ('nan', 'x', '0x10', '1_0', '1e999', '1,5')),
+    ('V 5 1e31 TAIL', "V: '1e31' is beyond 1e+30; expected"),
+    *((f'V {word} POSE', f'V: {word!r} is not a whole number of 64 bits; expected')
+      for word in ('5.0', '9223372036854775808')),
+    ('E 3 7.5 POSE INFO', "E: '7.5' is not a whole number of 64 bits"),
+    ('E 3 7 inf TAIL INFO', "E: 'inf' is not a finite number; expected"),
+    ('E 3 7 -1e99 TAIL INFO', "E: '-1e99' is beyond 1e+30; expected"),
+    ('E 3 7 POSE -INFO', 'information [-1 0 0'),
+    ('E 3 8 POSE INFO', 'vertex 8 is unknown; expected one of the 3 vertices'),
+    ('E 100 3 POSE INFO', 'vertex 100 is unknown; expected one of the 3 vertices'),
+    ('V 7 POSE', 'vertex 7 stands twice, before at line 1; expected each once'),
+    ('OTHER 5 6', 'OTHER: a line of SE{beside} beside V at line 1; expected all poses in the '
+     'plane, or all in space'),
+    *((f'{tag} 5 6', f'unknown tag {tag!r}; expected VERTEX_SE2, EDGE_SE2, ')
+      for tag in ('EGDE_SE2', 'VERTEX_SE3:EXPMAP'))])
+def test_each_malformed_line_is_named(tmp_path, name, line, message):
+    of, path = FORMATS[name], tmp_path / 'a.g2o'
+    words = {'V': of.vertex, 'E': of.edge, 'POSE': of.pose, 'TAIL': of.pose[2:],
+             'INFO': of.information, 'OTHER': of.other}
+    pose, edge = len(of.pose.split()), len((of.pose + ' ' + of.information).split())
+
+    def written(text):
+        return re.sub(r'\b(V|E|POSE|TAIL|INFO|OTHER)\b', lambda word: words[word[0]], text)
+
+    # A good line follows: it is not the last one that is named, nor the first of its tag.
+    path.write_text(written('\n'.join([*SOUND, line, 'E 9 3 POSE INFO\n'])))
+    with pytest.raises(FileError) as caught:
+        read_graph_file(path)
+    said = written(message).format(few=2 + pose, many=3 + edge, edge=edge, vertex=pose,
+                                   beside=2 if 'space' in name else 3)
+    assert str(caught.value).startswith(f'{path}:6: {said}') and '\n' not in str(caught.value)
