@@ -128,6 +128,17 @@ def test_a_look_finds_the_next_point_and_its_residual(k, rng):
 
 
 @pytest.mark.parametrize('k', BLOCK_SIZES)
+def test_the_first_step_is_from_the_dual_that_is_given(k, rng):
+    system, weight = chain_with_loops(k, rng), 0.4
+    scaled, inverse = scaled_system(system)
+    y = rng.uniform(-1, 1, len(system.b))
+    found = minimise_l1_halpern(system, zeros(system)[0], y, PrimalDualOptions(1, 0.0), weight)
+    x, y = halpern_step(scaled.A, system.b, zeros(system)[0], y, y, weight, 0)
+    expected = inverse @ (x - scaled.A.T @ y / weight).reshape(-1, k, 1)
+    assert_allclose(found.x, expected.ravel(), atol=1e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize('k', BLOCK_SIZES)
 def test_it_agrees_with_highs(k, rng):
     for _ in range(3):
         system = chain_with_loops(k, rng)
