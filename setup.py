@@ -70,8 +70,8 @@ setup(
     },
     entry_points={
         'console_scripts': [
-            'backend = l1slam_ros.ros.run_backend:main',
-            'replay = l1slam_ros.ros.replay:main',
+            'backend = l1slam_ros.ros.executables:backend',
+            'replay = l1slam_ros.ros.executables:replay',
             'l1slam = l1slam_ros.cli.main:main',
         ],
     },

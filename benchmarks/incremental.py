@@ -78,12 +78,11 @@ def main() -> None:
     from updates.cells import Row, commit, is_done, measure
     from updates.tables import document
 
-    from l1slam_ros.io.compilation import STEPS, make_ready
+    from l1slam_ros.io.compilation import load
     from l1slam_ros.io.files import write_lines
 
     # Each cell is a copy of this process, which has all loops compiled.
-    for step in STEPS:
-        make_ready(step)
+    load()
     file = arguments.output / 'results' / 'incremental.json'
     file.parent.mkdir(parents=True, exist_ok=True)
     before = json.loads(file.read_text())['rows'] if file.exists() else []

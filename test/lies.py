@@ -2,7 +2,7 @@
 """Worlds with false loops in them, and a drive on which nothing is known until a loop says it."""
 
 import numpy as np
-from problems import PERIOD, covariance6, loop, odometry
+from problems import PERIOD, covariance6, loop, odometry, retold
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
@@ -29,6 +29,14 @@ def is_false(world, factors):
     """Tell which between factors are false loops of the world, (m,) bool."""
     n = world.graph.n_poses
     return np.isin(pair_key(factors.i, factors.j, n), pair_key(*world.false_loops.T, n))
+
+
+def slipped(graph, steps, more):
+    """Return the graph, its odometry wrong at each of some steps (s,) by more, (3,) or (s, 3)."""
+    factors, Z = graph.between, graph.between.measurement.copy()
+    rows = np.flatnonzero(factors.is_odometry & np.isin(factors.i, steps))
+    Z[rows] = se2.retract(Z[rows], np.broadcast_to(np.asarray(more, float), (len(rows), 3)))
+    return retold(graph, Z)
 
 
 def position_error(poses, truth):

@@ -7,10 +7,15 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
-from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry import noise, se2
 from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.online.backend import BackendOptions
 from l1slam_ros.core.online.graph_builder import GraphBuilder
+from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+
+# Every message a keyframe, with the covariance it states: the graph is that of the messages.
+EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 
 
 @dataclass(frozen=True)
@@ -128,22 +133,32 @@ def drive(n, rng):
     return poses
 
 
-def graph_of(truth, pairs, noise=None, information=None):
-    """
-    Return the graph that measures the pairs (m, 2) of the poses `truth` (n, 3).
+# The information that factors state where nothing else is said.
+USUAL = np.diag([100.0, 100.0, 400.0])
 
-    noise : (m, 3) steps applied to the measurements; information : (m, 3, 3), else diagonal.
-    """
-    i, j = np.array(pairs).T
-    measurement = se2.between(truth[i], truth[j])
-    if noise is not None:
-        measurement = se2.retract(measurement, noise)
-    if information is None:
-        information = np.broadcast_to(np.diag([100.0, 100.0, 400.0]), (len(i), 3, 3))
+
+def chain_of(n):
+    """Return the pairs of a chain, (n - 1, 2)."""
+    return np.column_stack((np.arange(n - 1), np.arange(1, n)))
+
+
+def graph_of(truth, pairs, noise=0.0, information=USUAL):
+    """Return the graph that measures the pairs (m, 2) of the poses `truth` (n, 3)."""
     graph = FactorGraph(se2)
     graph.add_poses(len(truth))
-    graph.add_between(i, j, measurement, information)
+    measure(graph, truth, *np.array(pairs).T, noise, information)
     return graph
+
+
+def measure(graph, truth, i, j, noise=0.0, information=USUAL):
+    """
+    Append what sees keyframes j from keyframes i, (m,), where they are in truth (n, 3).
+
+    noise : (m, 3) steps applied to the measurements; information : (m, 3, 3); or one for all
+    """
+    exact = se2.between(truth[i], truth[j])
+    graph.add_between(i, j, se2.retract(exact, np.broadcast_to(noise, exact.shape)),
+                      np.broadcast_to(information, (*exact.shape, 3)))
 
 
 def retold(graph, measurement=None, times=1.0, trusted=None):
@@ -225,14 +240,19 @@ def true_loop(poses, reference, sample, covariance=UNKNOWN):
 def grown(poses, options, covariance=UNKNOWN):
     """Return the growth after the samples of `poses` (n, 3), one every .1 s from 0."""
     growth = GraphBuilder(se2, options)
-    drive_on(growth, poses, 0, covariance)
+    drive_on(growth, poses, covariance=covariance)
     return growth
 
 
-def drive_on(growth, poses, first, covariance=UNKNOWN):
-    """Add the samples of `poses` (n, 3) from `first` on."""
+def drive_on(growth, poses, first=0, covariance=UNKNOWN, start=0.0, period=PERIOD):
+    """Add the samples of `poses` (n, 3) from `first` on, number k at `start` + k `period`."""
     for k in range(first, len(poses)):
-        growth.add_odometry(odometry(k * PERIOD, poses[k], covariance))
+        growth.add_odometry(odometry(start + k * period, poses[k], covariance))
+
+
+def straight(n, step=1.0):
+    """Return a drive straight ahead, (n, 3)."""
+    return np.arange(n)[:, None] * np.array([step, 0.0, 0.0])
 
 
 def keyframe_samples(growth):
@@ -253,18 +273,32 @@ def covariance_of(growth, row):
     return np.linalg.inv(root.T @ root)
 
 
+def messages(graph, poses, first=0, last=None, start=0.0):
+    """
+    Yield samples of a robot at `poses` (n, 3), and behind each the loops that end there.
+
+    Of keyframes first to last of the graph; number k is at `start` [s] + k `PERIOD`.
+    """
+    factors = graph.between
+    stated = noise.covariance_of(factors.sqrt_information)
+    for k in range(first, graph.n_poses if last is None else last):
+        time, rows = start + k * PERIOD, np.flatnonzero(factors.j == k)
+        covariance = stated[rows[factors.is_odometry[rows]]].sum(axis=0)
+        yield odometry(time, poses[k], covariance6(covariance))
+        for row in rows[~factors.is_odometry[rows]]:
+            yield loop(start + factors.i[row] * PERIOD, time, factors.measurement[row],
+                       covariance6(stated[row]))
+
+
+def hear(backend, found):
+    """Add samples and loops."""
+    for message in found:
+        if isinstance(message, LoopClosure):
+            backend.add_loop(message)
+        else:
+            backend.add_odometry(message)
+
+
 def play(backend, world, first=0, last=None):
     """Add keyframes first to last and the loops that end there."""
-    factors = world.graph.between
-    covariance = np.linalg.inv(factors.sqrt_information.transpose(0, 2, 1)
-                               @ factors.sqrt_information)
-    for k in range(first, world.graph.n_poses if last is None else last):
-        for row in np.flatnonzero(factors.j == k):
-            if factors.is_odometry[row]:
-                backend.add_odometry(odometry(k * PERIOD, world.odometry[k],
-                                              covariance6(covariance[row])))
-            else:
-                backend.add_loop(loop(factors.i[row] * PERIOD, k * PERIOD,
-                                      factors.measurement[row], covariance6(covariance[row])))
-        if k == 0:
-            backend.add_odometry(odometry(0.0, world.odometry[0]))
+    hear(backend, messages(world.graph, world.odometry, first, last))

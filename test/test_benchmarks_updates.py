@@ -6,10 +6,11 @@ import json
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
+from l1slam_ros.paper.updates import Kept
 
 FOLDER = Path(__file__).parents[1] / 'benchmarks'
 sys.path.append(str(FOLDER))
@@ -68,7 +69,7 @@ def test_false_loops_that_are_held_and_true_ones_that_are_not_are_counted(tiny):
             (case.graph, odometry, (0, case.is_true.sum())),
             (half, half.between.is_odometry,
              (0, (case.is_true & (case.graph.between.pairs < 50).all(axis=1)).sum()))):
-        now = SimpleNamespace(graph=graph, judgement=SimpleNamespace(accepted=accepted))
+        now = Kept(graph, accepted, None)
         assert cells.held(now, case) == expected
     assert (case.graph.between.pairs[np.flatnonzero(case.is_false)] < 100).all()
 

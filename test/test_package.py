@@ -155,6 +155,15 @@ def test_entry_points_exist(wheel):
         assert callable(getattr(importlib.import_module(module), function)), entry
 
 
+@pytest.mark.parametrize('name', ['backend', 'replay'])
+def test_what_needs_ros_says_so_in_one_line(name):
+    code = WITHOUT_ROS + f'import l1slam_ros.ros.executables as e; sys.exit(e.{name}())'
+    ran = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True,
+                         timeout=60)
+    assert ran.returncode == 1 and ran.stderr.count('\n') == 1, ran.stderr
+    assert ran.stderr.startswith(f'{name}: ') and 'behind the wall; expected ROS 2' in ran.stderr
+
+
 def test_the_core_and_the_command_need_no_ros():
     code = WITHOUT_ROS + """
 import importlib, pkgutil

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-gtsam and g2o on whole pose graphs.
+gtsam and g2o on whole pose graphs, g2o in the plane alone.
 
 Their graphs are built before the clock starts; ordering and everything else of the optimisation
 is counted. All stop at the same relative decrease. gtsam's residual is Log(e), ours and g2o's is
@@ -20,6 +20,7 @@ from measuring import Answer, clock, timed
 from solvers.cases import Case
 from solvers.graph_solvers import MOST_ITERATIONS, SAME_TOLERANCE, GraphSolver
 
+from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 
@@ -41,20 +42,35 @@ def _gtsam_graph(graph: FactorGraph, poses: Array, kernel: float | None = None) 
     """Return gtsam's graph; kernel : Huber's k, on each whitened component."""
     import gtsam
 
-    kernels = gtsam.noiseModel.mEstimator
+    kernels, manifold = gtsam.noiseModel.mEstimator, graph.manifold
+    # Its steps in space have the rotation first.
+    order = np.arange(manifold.TANGENT_SIZE)
+    if manifold is se3:
+        order = np.concatenate((order[manifold.ROTATION], order[manifold.TRANSLATION]))
+    between = gtsam.BetweenFactorPose3 if manifold is se3 else gtsam.BetweenFactorPose2
+    prior = gtsam.PriorFactorPose3 if manifold is se3 else gtsam.PriorFactorPose2
     factors, built = graph.between, gtsam.NonlinearFactorGraph()
     scalar = kernels.Base.ReweightScheme.Scalar
     robust = kernels.Huber.Create(kernel, scalar) if kernel else None
     for i, j, z, information in zip(factors.i.tolist(), factors.j.tolist(),
                                     factors.measurement.tolist(), information_of(graph),
                                     strict=True):
-        noise = gtsam.noiseModel.Gaussian.Information(information)
+        noise = gtsam.noiseModel.Gaussian.Information(information[np.ix_(order, order)])
         if robust:
             noise = gtsam.noiseModel.Robust.Create(robust, noise)
-        built.add(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*z), noise))
-    tight = gtsam.noiseModel.Isotropic.Sigma(3, PRIOR_SIGMA)
-    built.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*poses[0]), tight))
+        built.add(between(i, j, _gtsam_pose(z), noise))
+    tight = gtsam.noiseModel.Isotropic.Sigma(len(order), PRIOR_SIGMA)
+    built.add(prior(0, _gtsam_pose(poses[0].tolist()), tight))
     return built
+
+
+def _gtsam_pose(pose: list[float]) -> Any:
+    import gtsam
+
+    if len(pose) == se2.POSE_SIZE:
+        return gtsam.Pose2(*pose)
+    x, y, z, w = pose[3:]
+    return gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), pose[:3])
 
 
 def gtsam_values(poses: Array) -> Any:
@@ -63,7 +79,7 @@ def gtsam_values(poses: Array) -> Any:
 
     values = gtsam.Values()
     for k, pose in enumerate(poses.tolist()):
-        values.insert(k, gtsam.Pose2(*pose))
+        values.insert(k, _gtsam_pose(pose))
     return values
 
 
@@ -74,7 +90,11 @@ def _gtsam_answer(work: Callable[[], Any]) -> Answer:
     began = clock()
     values = work()
     seconds = clock() - began
-    return Answer(np.array(gtsam.utilities.extractPose2(values)), seconds)
+    poses = np.array(gtsam.utilities.extractPose2(values))
+    if not len(poses):
+        R, t = np.split(np.array(gtsam.utilities.extractPose3(values)), [9], axis=1)
+        poses = se3.from_rotation(R.reshape(-1, 3, 3), t)
+    return Answer(poses, seconds)
 
 
 def _gtsam_by(optimiser: str, parameters: str) -> Callable[[Case, Array], Callable[[], Answer]]:
@@ -182,12 +202,15 @@ def _g2o_graph(graph: FactorGraph, poses: Array, algorithm: str) -> tuple[Any, A
 # What the ratios of the whole solves are to.
 GAUSS_NEWTON = GraphSolver(
     'gtsam, L2 Gauss-Newton', _gtsam_by('GaussNewtonOptimizer', 'GaussNewtonParams'))
-PEERS = (
+IN_SPACE = (
     GAUSS_NEWTON,
     GraphSolver('gtsam, L2 Levenberg-Marquardt',
                 _gtsam_by('LevenbergMarquardtOptimizer', 'LevenbergMarquardtParams')),
     GraphSolver('gtsam, L1 by reweighting', _gtsam_l1(*_CONVERGED)),
     GraphSolver('gtsam, L1 by reweighting, quick', _gtsam_l1(*_QUICK)),
+)
+PEERS = (
+    *IN_SPACE,
     GraphSolver('g2o, L2 Gauss-Newton', _g2o_by('GaussNewton')),
     GraphSolver('g2o, L2 Levenberg-Marquardt', _g2o_by('Levenberg')),
 )

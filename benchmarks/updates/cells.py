@@ -24,13 +24,12 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import pair_key
-from l1slam_ros.core.online.snapshot import Snapshot
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.paper.updates import Isam2, run_updates, spread
+from l1slam_ros.paper.updates import Isam2, Kept, run_updates, spread
 
 CHECKPOINTS = 20
 # Simulated: keyframes and edges of the paper's Manhattan10k, and of a large sparse world.
@@ -69,7 +68,7 @@ class Row:
 
     commit : of the package; n, edges : of the graph; reached : keyframes per second; ours, peer :
     of `spread`; beside : ours, of the updates that the peer had time for, `peer_poses`; behind :
-    [s] of our other threads; memory : the most that the process held [MiB].
+    [s] of our other threads; memory : the most that the process held then [MiB].
 
     At the checkpoints, after `keyframes` (c,), and last a second after the end: excess over the
     L1 optimum of what is believed [%]; position error [m] of the map, of the L1 map of all true
@@ -165,6 +164,8 @@ def _measured(place: Place, cell: Cell, patience: float) -> Row:
     graph = case.graph
     run_updates(prefix(graph, min(_WARM_UP, graph.n_poses)), None, 1e6, 1, cell.robust)
     peer = Isam2(case.clean, patience) if patience else None
+    # Until here the most was of what made the graph.
+    Path('/proc/self/clear_refs').write_text('5')
     found = run_updates(graph, peer, cell.rate, CHECKPOINTS, cell.robust)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     row = Row(cell, commit(), graph.n_poses, len(graph.between), graph.n_poses / found.elapsed,
@@ -176,7 +177,7 @@ def _measured(place: Place, cell: Cell, patience: float) -> Row:
     return _judged(row, case, [*found.on_the_way, found.at_rest])
 
 
-def _judged(row: Row, case: FalseCase, maps: list[Snapshot]) -> Row:
+def _judged(row: Row, case: FalseCase, maps: list[Kept]) -> Row:
     """Return the row with what the maps were worth."""
     place = case.place
     positions = case.graph.manifold.positions
@@ -196,7 +197,7 @@ def _judged(row: Row, case: FalseCase, maps: list[Snapshot]) -> Row:
         false=int(case.is_false.sum()), true=int(case.is_true.sum()),
         batch=error(positions(batch.solution.poses)),
         differs=len(_believed(case.graph, believed)
-                    ^ _believed(maps[-1].graph, maps[-1].judgement.accepted)))
+                    ^ _believed(maps[-1].graph, maps[-1].accepted)))
 
 
 def _optimum(graph: FactorGraph, poses: Array) -> Array:
@@ -204,20 +205,20 @@ def _optimum(graph: FactorGraph, poses: Array) -> Array:
     return minimise_by(choose(AUTO, graph), graph, poses, OptimiserOptions())[0].poses
 
 
-def excess(now: Snapshot) -> float:
+def excess(now: Kept) -> float:
     """Return by how much [%] the cost is above the L1 optimum of what is believed."""
-    part = now.graph.subset(now.judgement.accepted)
+    part = now.graph.subset(now.accepted)
     cost, best = (l1_cost(whitened_residual(part, poses))
                   for poses in (now.poses, _optimum(part, now.poses)))
     return 100 * (cost / best - 1) if best > 1e-6 else 0.0
 
 
-def held(now: Snapshot, case: FalseCase) -> tuple[int, int]:
+def held(now: Kept, case: FalseCase) -> tuple[int, int]:
     """Return how many false loops are believed, and how many true ones are not."""
     here, all_pairs = (_pairs(graph, case.graph.n_poses) for graph in (now.graph, case.graph))
     false, true = (np.isin(here, all_pairs[rows]) & ~now.graph.between.is_odometry
                    for rows in (case.is_false, case.is_true))
-    accepted = now.judgement.accepted
+    accepted = now.accepted
     return int((false & accepted).sum()), int((true & ~false & ~accepted).sum())
 
 

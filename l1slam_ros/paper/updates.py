@@ -16,15 +16,16 @@ from typing import Any
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.online.snapshot import Snapshot
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.compilation import load
 from l1slam_ros.io.trajectory import invented_stamps
 
 # [m or rad] ISAM2 linearises again what has moved by more, after each pose.
@@ -39,22 +40,37 @@ _WARM_UP = 200
 _BATCHES = 40
 
 
+@dataclass(frozen=True)
+class Kept:
+    """The graph at one moment, what is believed of it, (m,) bool, and its map, (n, p)."""
+
+    graph: FactorGraph
+    accepted: Mask
+    poses: Array
+
+    @staticmethod
+    def of(backend: Backend) -> 'Kept':
+        """Return what a back end has; its snapshot would hold the factors of its front, too."""
+        now = backend.snapshot()
+        return Kept(now.graph, now.judgement.accepted, now.poses)
+
+
 @dataclass
 class Updates:
     """
     What was measured of one graph.
 
     ours, peer : seconds of each update; the peer's time may have been up before the end; behind :
-    seconds of our other threads; elapsed : wall time [s]; on_the_way : snapshots at regular
-    distances, the last one at the last keyframe; at_rest : a second later.
+    seconds of our other threads; elapsed : wall time [s]; on_the_way : maps at regular distances,
+    the last one at the last keyframe; at_rest : a second later.
     """
 
     ours: list[float] = field(default_factory=list)
     peer: list[float] = field(default_factory=list)
     behind: float = 0.0
     elapsed: float = 0.0
-    on_the_way: list[Snapshot] = field(default_factory=list)
-    at_rest: Snapshot | None = None
+    on_the_way: list[Kept] = field(default_factory=list)
+    at_rest: Kept | None = None
 
 
 class Isam2:
@@ -137,17 +153,17 @@ def measurements(graph: FactorGraph) -> Iterator[tuple[OdometrySample, list[Loop
         yield OdometrySample(int(stamps[k]), chain[k], motion, none), loops.get(k, [])
 
 
-def run_updates(graph: FactorGraph, peer: Isam2 | None, rate: float, snapshots: int,
+def run_updates(graph: FactorGraph, peer: Isam2 | None, rate: float, maps: int,
                 robust: bool = True, advance: Callable[[], None] = lambda: None) -> Updates:
     """
     Feed the back end with a graph, an update after each keyframe, and the peer in turn.
 
-    rate : keyframes per second, fewer where the updates of both take longer; snapshots : how many
-    are kept; advance : called after each keyframe
+    rate : keyframes per second, fewer where the updates of both take longer; maps : how many are
+    kept; advance : called after each keyframe
     """
     options = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'),
                              robust=RobustOptions(robust))
-    kept = set(np.linspace(graph.n_poses / snapshots, graph.n_poses, snapshots).astype(int))
+    kept = set(np.linspace(graph.n_poses / maps, graph.n_poses, maps).astype(int))
     found = Updates()
     with Backend(options, dimension_of(graph)) as backend:
         began, whole, alone = time.perf_counter(), time.process_time(), time.thread_time()
@@ -162,7 +178,7 @@ def run_updates(graph: FactorGraph, peer: Isam2 | None, rate: float, snapshots: 
             if peer:
                 found.peer += peer.update(k)
             if k + 1 in kept:
-                found.on_the_way.append(backend.snapshot())
+                found.on_the_way.append(Kept.of(backend))
             advance()
             due = max(due + 1 / rate, time.perf_counter() - _LAG)
             time.sleep(max(due - time.perf_counter(), 0.0))
@@ -171,7 +187,7 @@ def run_updates(graph: FactorGraph, peer: Isam2 | None, rate: float, snapshots: 
         end = time.perf_counter() + IDLE
         while backend.update(0.1) is not None and time.perf_counter() < end:
             pass
-        found.at_rest = backend.snapshot()
+        found.at_rest = Kept.of(backend)
     return found
 
 
@@ -188,6 +204,7 @@ def measure_growth(keyframes: int, rate: float, rng: np.random.Generator,
     The batch, in seconds (k,) at each of the snapshots, is Gauss-Newton on all that has come, from
     the map as it is, ordered anew.
     """
+    load()
     run_updates(_world(_WARM_UP, rng), None, np.inf, 1)
     graph = _world(keyframes, rng)
     peer = Isam2(graph) if importlib.util.find_spec('gtsam') else None
@@ -199,7 +216,7 @@ def _world(keyframes: int, rng: np.random.Generator) -> FactorGraph:
     return simulate_world(keyframes, round(_EDGES_PER_POSE * keyframes), WorldOptions(), rng).graph
 
 
-def _batch_seconds(now: Snapshot) -> float:
+def _batch_seconds(now: Kept) -> float:
     began = time.process_time()
     minimise_l2(now.graph, now.poses, LeastSquaresOptions(), cholesky_of(now.graph))
     return time.process_time() - began

@@ -14,14 +14,16 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Path
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.update import Improvement
-from l1slam_ros.io.graphs.map_file import MapFile
+from l1slam_ros.io.graphs.map_file import MapFile, missing_folder
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.diagnostics import Diagnostics
 from l1slam_ros.ros.inputs.inputs import Inputs
@@ -75,7 +77,7 @@ class BackendNode(LifecycleNode):
         self._make_publishers()
         self._map_file = MapFile(self._backend, lambda: self.options, self.get_logger().warning)
         if options.load_on_start:
-            self.get_logger().info(self._map_file.load_at_start())
+            self._map_file.load_at_start(self.get_logger().info)
         self._inputs = Inputs(self, self._backend, options, self.failures, self._on_moved,
                               self._transform.tick)
         self._diagnostics = Diagnostics(self, self._inputs.traffic, self._solver, self.failures)
@@ -83,8 +85,10 @@ class BackendNode(LifecycleNode):
             self, self._backend, self._jobs, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
         guarded = self.failures.guarded
-        for sentence in self._declared.unknown():
-            self.get_logger().warning(sentence)
+        for sentence in *self._declared.unknown(), missing_folder(options.save_path):
+            if sentence:
+                self.get_logger().warning(sentence)
+        self.add_on_set_parameters_callback(self._on_set)
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
                           on_clock_change=False),
@@ -150,6 +154,12 @@ class BackendNode(LifecycleNode):
         self._markers = GraphMarkers(self)
         self._transform = MapToOdom(self, self._backend, lambda: self.options)
         self._loop_status = LoopStatus(self)
+
+    def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Refuse a folder that is not there; at start it may be mounted later."""
+        wrong = ''.join(missing_folder(str(parameter.value)) for parameter in parameters
+                        if parameter.name == 'save_path')
+        return SetParametersResult(successful=not wrong, reason=wrong)
 
     def _on_options(self, options: NodeOptions) -> None:
         self._backend.set_options(options)

@@ -35,12 +35,6 @@ class Cart(Options):
     rear: Wheel = Wheel(radius=0.5)
 
 
-def test_defaults_are_those_of_the_fields():
-    cart = Cart()
-    assert (cart.name, cart.drive, cart.lights) == ('cart', 'front', True)
-    assert (cart.front.radius, cart.rear.radius, cart.rear.spokes) == (0.3, 0.5, 8)
-
-
 @pytest.mark.parametrize('values', [
     {'radius': 0.0}, {'radius': 2.0}, {'spokes': 1}, {'spokes': 99}, {'radius': 5e-324}])
 def test_the_ends_of_a_range_are_in_it(values):
@@ -91,11 +85,6 @@ def test_values_are_set_by_dotted_names():
     changed = with_values(cart, {'rear.spokes': 12, 'lights': False, 'rear.radius': 1})
     assert changed == Cart(lights=False, rear=Wheel(1.0, 12))
     assert cart == Cart() and with_values(cart, {}) == cart
-
-
-def test_flatten_and_with_values_undo_each_other():
-    cart = Cart('other', 'rear', False, Wheel(1.5, 3), Wheel(0.25, 4))
-    assert with_values(Cart(), {name: value for name, (value, _) in flatten(cart).items()}) == cart
 
 
 @pytest.mark.parametrize('values, said', [

@@ -123,6 +123,17 @@ used = [kernel for module in MODULES for kernel in vars(module).values()
 assert len(used) > 25, 'are the kernels not where this test looks for them?'
 """
 
+# Prints how many objects a collection of garbage looks at before and after loops are loaded.
+LOAD = """
+import gc
+import numba
+from l1slam_ros.io.compilation import load
+
+print(len(gc.get_objects()))
+load()
+print(len(gc.get_objects()))
+"""
+
 # What somebody does with a file first; prints what it imports, and how many loops it reads.
 LOOK = """
 import sys
@@ -150,6 +161,13 @@ def test_nothing_is_compiled_once_the_cache_is_full():
                           timeout=240, cwd=Path(__file__).parents[1])
     assert done.returncode == 0, done.stderr
     assert done.stdout == ''
+
+
+def test_loops_once_loaded_are_no_burden_on_collections_of_garbage():
+    done = subprocess.run([sys.executable, '-c', LOAD], capture_output=True, text=True,
+                          timeout=240)
+    before, after = map(int, done.stdout.split())
+    assert after < before / 10, done.stderr
 
 
 @pytest.fixture(scope='module')

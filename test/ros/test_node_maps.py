@@ -79,6 +79,9 @@ def test_a_damaged_map_is_said_and_the_one_before_taken(bench, tmp_path, capfd):
         b.until(lambda count=count: len(b.path().poses) == count, 'a map')
         assert call(b, 'save').success
     path.write_bytes(path.read_bytes()[:-100])
+    capfd.readouterr()
+    bench(save_path=str(path), load_on_start=True)
+    assert capfd.readouterr().err.count('3 keyframes loaded from') == 1
     answer = call(b, 'load')
     assert answer.success
     assert answer.message.startswith(f'3 keyframes loaded from {path}.1, the map before: {path}: ')
@@ -86,9 +89,13 @@ def test_a_damaged_map_is_said_and_the_one_before_taken(bench, tmp_path, capfd):
     b.until(lambda: len(b.path().poses) == 3, 'the map before')
 
 
-def test_a_map_that_cannot_be_saved_is_an_error_until_it_can(bench, tmp_path):
+def test_a_map_that_cannot_be_saved_is_an_error_until_it_can(bench, tmp_path, capfd):
     path = tmp_path / 'none' / 'map.g2o'
     b = bench(save_path=str(path), autosave_period=0.2)
+    said = f'save_path is {str(path)!r}, but there is no folder {path.parent}'
+    assert said in capfd.readouterr().err
+    answer, = b.backend.set_parameters([Parameter('save_path', value=str(path))])
+    assert (answer.successful, answer.reason) == (False, said)
     drive(b, 0, 3)
     b.until(lambda: b.status()[0] == DiagnosticStatus.ERROR
             and f'autosave failed: {path}: cannot be written: ' in b.status()[1], 'it says so')

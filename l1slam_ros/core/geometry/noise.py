@@ -52,16 +52,16 @@ def square_root_information(information: Array) -> Array:
     """
     information = np.asarray(information, float)
     silent = np.asarray((information == 0).all(axis=2))
-    _refuse(np.asarray(silent.all(axis=1)), information, 'positive definite')
     whole = filled(information, silent)
-    finite = np.isfinite(information).all(axis=(1, 2))
-    _refuse(np.logical_not(finite), information, 'finite')
-    scale = np.abs(information).max(axis=(1, 2), initial=0.0)
-    skew = np.abs(information - information.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
-    _refuse(skew > _ASYMMETRY * scale, information, 'symmetric')
-    _refuse(np.logical_not(_is_definite(whole)), information, 'positive definite')
-    _refuse(np.logical_not(_is_representable(whole)), information,
-            f'within {_SMALLEST:g} to {_LARGEST:g} on its diagonal')
+    variances = np.diagonal(whole, axis1=1, axis2=2)
+    extreme = ((variances < _SMALLEST) | (variances > _LARGEST)).any(axis=1)
+    for bad, expected in (
+            (silent.all(axis=1), 'positive definite'), *_flaws(information, silent),
+            (extreme, f'within {_SMALLEST:g} to {_LARGEST:g} on its diagonal')):
+        if bad.any():
+            index = int(np.argmax(bad))
+            rows = '; '.join(' '.join(f'{v:g}' for v in row) for row in information[index])
+            raise NoiseError(f'matrix {index} is not {expected}: [{rows}]')
     root = np.linalg.cholesky(whole).transpose(0, 2, 1)
     return silenced(root.astype(np.float64, copy=False), silent)
 
@@ -94,12 +94,9 @@ def silent_components(covariance: Array, absolute: bool) -> Mask:
 
 def usable(covariance: Array) -> Mask:
     """Tell which of (m, d, d) matrices are covariances, (m,): messages carry zeros and worse."""
-    with np.errstate(over='ignore', invalid='ignore'):
-        finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
-        safe = covariance if finite.all() else np.where(finite[:, None, None], covariance, 0.0)
-        skew = np.abs(safe - safe.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
-        symmetric = skew <= _ASYMMETRY * np.abs(safe).max(axis=(1, 2), initial=0.0)
-    return np.asarray(finite & symmetric & _is_definite(safe))
+    none = np.zeros(covariance.shape[:2], bool)
+    flawed = np.any([bad for bad, _ in _flaws(covariance, none)], axis=0)
+    return np.asarray(np.logical_not(flawed))
 
 
 def at_most(covariance: Array, most: float) -> tuple[Array, Mask]:
@@ -174,6 +171,18 @@ def _without_variance(matrices: Array) -> Mask:
     return np.asarray(np.diagonal(matrices, axis1=1, axis2=2) == 0)
 
 
+def _flaws(matrices: Array, silent: Mask) -> list[tuple[Mask, str]]:
+    """Return which of (m, d, d) matrices are not finite, which not symmetric, not definite."""
+    finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
+    safe = matrices if finite.all() else np.where(finite[:, None, None], matrices, 0.0)
+    with np.errstate(over='ignore'):
+        skew = np.abs(safe - safe.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
+    scale = np.abs(safe).max(axis=(1, 2), initial=0.0)
+    return [(np.logical_not(finite), 'finite'),
+            (np.asarray(skew > _ASYMMETRY * scale), 'symmetric'),
+            (np.logical_not(_is_definite(filled(safe, silent))), 'positive definite')]
+
+
 def _is_definite(matrices: Array) -> Mask:
     """Tell which matrices are positive definite beyond rounding, whatever the units, (m,)."""
     variances = np.diagonal(matrices, axis1=1, axis2=2)
@@ -186,12 +195,6 @@ def _is_definite(matrices: Array) -> Mask:
     return positive & np.asarray(smallest > _SINGULAR)
 
 
-def _is_representable(matrices: Array) -> Mask:
-    variances = np.diagonal(matrices, axis1=1, axis2=2)
-    inside = (variances >= _SMALLEST) & (variances <= _LARGEST)
-    return np.asarray(inside.all(axis=1))
-
-
 def whiten(sqrt_information: Array, vectors: Array) -> Array:
     """Return L' e for stacked roots (m, d, d) and vectors (m, d) or Jacobians (m, d, k)."""
     if vectors.ndim == 2:
@@ -199,10 +202,3 @@ def whiten(sqrt_information: Array, vectors: Array) -> Array:
     else:
         product = sqrt_information @ vectors
     return product
-
-
-def _refuse(bad: Mask, matrices: Array, expected: str) -> None:
-    if bad.any():
-        index = int(np.argmax(bad))
-        rows = '; '.join(' '.join(f'{v:g}' for v in row) for row in matrices[index])
-        raise NoiseError(f'matrix {index} is not {expected}: [{rows}]')

@@ -16,7 +16,7 @@ import numpy as np
 from l1slam_ros.core.geometry.alignment import align
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask, covariance_of
-from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph, ends_in_time
+from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, lowest_of_components
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 
 # So many windows at most are looked at, of so many fixes; and so many for the noise alone.
@@ -92,13 +92,8 @@ def _windows(count: int, size: int, most: int) -> Indices:
 
 def _largest_group(count: int, windows: Indices, good: Mask) -> Indices:
     """Return which of so many things hang together by what is good in windows, the most, (k,)."""
-    lowest = np.arange(count)
-    while True:
-        least = np.where(good, lowest[windows], count).min(axis=1)
-        before = lowest.copy()
-        np.minimum.at(lowest, windows[good], np.repeat(least, good.sum(axis=1)))
-        if (lowest == before).all():
-            break
+    first = windows[np.arange(len(windows)), np.argmax(good, axis=1)]
+    lowest = lowest_of_components(np.repeat(first, good.sum(axis=1)), windows[good], count)
     largest: Indices = np.flatnonzero(lowest == np.argmax(np.bincount(lowest)))
     return largest
 
@@ -114,9 +109,7 @@ class _Samples:
         manifold, factors = graph.manifold, graph.between
         rng, d = np.random.default_rng(_SEED), manifold.TANGENT_SIZE
         poses, keyframe = odometry_poses(graph), factors.j[rows]
-        self._manifold, self._fixes = manifold, BetweenFactors(
-            factors.i[rows], keyframe, factors.measurement[rows],
-            factors.sqrt_information[rows], factors.trusted[rows], factors.struck[rows])
+        self._manifold, self._fixes = manifold, graph.subset(rows).between
         self._way = manifold.between(poses[keyframe[:-1]], poses[keyframe[1:]])
         self._drift = _samples(_drift(graph, poses, keyframe), rng)
         self._noise = _samples(covariance_of(self._fixes.sqrt_information), rng)

@@ -10,7 +10,6 @@ that leave a component unsaid may tie a part of the graph by less than it takes:
 fix leaves the map free to turn. What nothing determines stays as it is: see `loose_keyframes`.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -86,11 +85,12 @@ class LinearSystem:
 
     def weighted(self, roots: Array) -> 'LinearSystem':
         """Return the system with the rows of each factor multiplied by its root (m, k, k)."""
-        from l1slam_ros.core.kernels.blocks import whiten
+        from l1slam_ros.core.kernels.blocks import whiten, whiten_blocks
 
         k, roots = self.block_size, np.ascontiguousarray(roots)
-        b: Array = whiten(roots, self.b.reshape(-1, k), (0,) * k).ravel()
-        return replace(self, blocks=_whitened(roots, self.blocks.transpose(1, 0, 2, 3)), b=b)
+        pair = np.ascontiguousarray(self.blocks.transpose(1, 0, 2, 3))
+        return replace(self, blocks=whiten_blocks(roots, *pair, (0,) * k),
+                       b=whiten(roots, self.b.reshape(-1, k), (0,) * k).ravel())
 
     def part(self, entries: slice) -> 'LinearSystem':
         """Return the system of only these rows of each factor and columns of each keyframe."""
@@ -159,24 +159,15 @@ def linearise(graph: FactorGraph, poses: Array, residual: Array | None = None,
     fixed : how many keyframes are held in the gauge of another graph; None: see `anchor`
 
     """
+    from l1slam_ros.core.kernels.blocks import whiten_blocks
+
     factors = graph.between
     pair = graph.manifold.residual_jacobians(factors.measurement, *ends(graph, poses))
+    blocks = whiten_blocks(factors.sqrt_information, *pair, (0,) * graph.manifold.TANGENT_SIZE)
     if residual is None:
         residual = whitened_residual(graph, poses)
     fixed = anchor(graph) if fixed is None else fixed
-    return LinearSystem(keyframes_of(graph, fixed), _whitened(factors.sqrt_information, pair),
-                        -residual, graph.n_poses - fixed)
-
-
-def _whitened(roots: Array, pair: Iterable[Array]) -> Array:
-    """Return both blocks of each factor, (m, k, k) each, multiplied by its root, (m, 2, k, k)."""
-    from l1slam_ros.core.kernels.blocks import whiten_blocks
-
-    m, k, _ = roots.shape
-    blocks = np.empty((m, 2, k, k))
-    for side, J in enumerate(pair):
-        whiten_blocks(roots, np.ascontiguousarray(J), side, blocks, (0,) * k)
-    return blocks
+    return LinearSystem(keyframes_of(graph, fixed), blocks, -residual, graph.n_poses - fixed)
 
 
 def keyframes_of(graph: FactorGraph, fixed: int) -> Indices:

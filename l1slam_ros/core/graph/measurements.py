@@ -5,6 +5,8 @@ import math
 from dataclasses import dataclass
 from numbers import Integral
 
+import numpy as np
+
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 
@@ -87,12 +89,23 @@ def require_sound(what: OdometrySample | LoopClosure) -> None:
         if hasattr(what, name) and shape != expected:
             raise MessageError('shape', f'{name} of shape {shape}; expected an array {expected}')
     pose3 = what.pose3.tolist()
-    if not all(map(math.isfinite, pose3)):
-        raise MessageError('not_finite', f'pose {what.pose3}; expected finite numbers')
-    if max(map(abs, pose3[:3])) > FARTHEST:
-        raise MessageError('range', f'position {what.pose3[:3]}; expected it within '
-                           f'{FARTHEST:g} m')
-    norm = math.hypot(*pose3[3:])
-    if abs(norm - 1) > QUATERNION_NORM_ERROR:
-        raise MessageError('quaternion', f'quaternion {what.pose3[3:]} of norm {norm:g}; '
-                           'expected 1')
+    sound_pose3(tuple(pose3[:3]), tuple(pose3[3:]))
+
+
+def sound_pose3(position: tuple[float, ...], quaternion: tuple[float, ...]) -> Array:
+    """
+    Return a pose (7,) of x y z and qx qy qz qw, the quaternion normalised.
+
+    Raises
+    ------
+    MessageError : it is none, with the cause `not_finite`, `range` or `quaternion`.
+
+    """
+    if not all(map(math.isfinite, position + quaternion)):
+        raise MessageError('not_finite', f'pose {position} {quaternion}; expected finite numbers')
+    if max(map(abs, position)) > FARTHEST:
+        raise MessageError('range', f'position {position}; expected it within {FARTHEST:g} m')
+    norm = math.hypot(*quaternion)
+    if abs(norm - 1.0) > QUATERNION_NORM_ERROR:
+        raise MessageError('quaternion', f'quaternion {quaternion} of norm {norm:g}; expected 1')
+    return np.array((*position, *(component / norm for component in quaternion)))

@@ -23,25 +23,25 @@ class Tiles:
     """
 
     def __init__(self, keyframe: Indices, size: int, lanes: int):
-        self._lanes, self._count = lanes, -(-len(keyframe) // lanes)
+        self._lanes = lanes
         self._order = np.argsort(keyframe[:, 0] * (size + 1) + keyframe[:, 1], kind='stable')
-        padded = np.full((self._count * lanes, 2), size, np.uint32)
-        padded[: len(keyframe)] = keyframe[self._order]
-        side_by_side = padded.reshape(self._count, lanes, 2).transpose(0, 2, 1)
-        self.keyframes = np.ascontiguousarray(side_by_side).reshape(self._count, 2 * lanes)
+        self._place = np.argsort(self._order)
+        keyframes = self._side_by_side(keyframe, np.uint32, size)
+        self.keyframes = keyframes.reshape(-1, 2 * lanes)
 
     def pack(self, values: Array) -> Single:
         """Return the values of all factors, (m, c), as tiles (t, c, lanes)."""
-        from l1slam_ros.core.kernels import halpern
-
-        tiles = np.zeros((self._count, values.shape[1], self._lanes), np.float32)
-        halpern.pack(values, self._order, tiles)
-        return tiles
+        return self._side_by_side(values, np.float32, 0)
 
     def unpack(self, tiles: Single) -> Array:
         """Return the values of all factors, (m, c), from tiles (t, c, lanes)."""
-        from l1slam_ros.core.kernels import halpern
+        rows = tiles.transpose(0, 2, 1).reshape(-1, tiles.shape[1])
+        return rows.take(self._place, axis=0).astype(float)
 
-        values = np.empty((len(self._order), tiles.shape[1]))
-        halpern.unpack(tiles, self._order, values)
-        return values
+    def _side_by_side(self, values: np.ndarray, dtype: type, rest: int) -> np.ndarray:
+        """Return values (m, c) as tiles (t, c, lanes), the last one filled up with `rest`."""
+        (m, columns), count = values.shape, -(-len(values) // self._lanes)
+        padded: np.ndarray = np.full((count * self._lanes, columns), rest, dtype)
+        padded[:m] = values.take(self._order, axis=0)
+        tiles = padded.reshape(count, self._lanes, columns).transpose(0, 2, 1)
+        return np.ascontiguousarray(tiles)

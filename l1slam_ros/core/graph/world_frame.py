@@ -9,7 +9,7 @@ each part moved as one. It is a start: nothing is bent, and a few false fixes do
 import numpy as np
 
 from l1slam_ros.core.geometry.alignment import align
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.factor_graph import FactorGraph, lowest_joined
 
@@ -67,11 +67,7 @@ def _motions_of_positions(graph: FactorGraph, poses: Array) -> Array:
     size, m = here.shape[1], len(rows)
     if m < 2:
         return manifold.identity(0)
-    tuples = np.concatenate([_tuples(m, size, stride) for stride in {1, max(m // size, 1)}])
+    # Each of them with those so many strides on, round in a circle.
+    tuples = np.concatenate([(np.arange(m)[:, None] + stride * np.arange(size)) % m
+                             for stride in {1, max(m // size, 1)}])
     return manifold.from_rotation(*align(here[tuples], there[tuples]))
-
-
-def _tuples(m: int, size: int, stride: int) -> Indices:
-    """Return of each of m rows itself and those so many strides on, round in a circle."""
-    tuples: Indices = (np.arange(m)[:, None] + stride * np.arange(size)) % m
-    return tuples

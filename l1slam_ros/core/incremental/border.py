@@ -171,15 +171,12 @@ class Border:
         LinAlgError : beyond double precision; nothing is appended.
 
         """
-        from l1slam_ros.core.kernels import border
-
-        n, k = self.rows, self._k
-        lines, right = np.empty(k * n + k * (k + 1) // 2), np.empty(k)
-        if not border.append(predicted.rows, predicted.covariance + np.diag(noise),
-                             predicted.residual, lines, right):
-            raise np.linalg.LinAlgError
-        self._factor.extend(lines)
-        self._right.extend(right)
+        pivot = np.linalg.cholesky(predicted.covariance + np.diag(noise))
+        lines = np.concatenate((predicted.rows, pivot), axis=1)
+        # Row r ends at its diagonal.
+        k, columns = lines.shape
+        self._factor.extend(lines[np.tri(k, columns, columns - k, dtype=bool)])
+        self._right.extend(-np.linalg.solve(pivot, predicted.residual))
         self._ends.extend(predicted.points[None])
         self._blocks.extend(predicted.blocks[None])
         self._pulled = self._pulled[:0]

@@ -39,20 +39,6 @@ def multiply_transposed(keyframe, blocks, y, product, size):
 
 
 @for_sizes('f8[:, :, ::1], f8[:, ::1]')
-def unwhiten(roots, y, size):
-    """Return the dual of the residual itself, L y for each factor, (m, k); roots : L'."""
-    k = len(size)
-    product = np.empty((len(roots), k))
-    for f in range(len(roots)):
-        for c in range(k):
-            total = 0.0
-            for r in range(k):
-                total += roots[f, r, c] * y[f, r]
-            product[f, c] = total
-    return product
-
-
-@for_sizes('f8[:, :, ::1], f8[:, ::1]')
 def whiten(roots, vectors, size):
     """Return L' e for each factor, (m, k); roots : (m, k, k)."""
     k = len(size)
@@ -66,14 +52,18 @@ def whiten(roots, vectors, size):
     return product
 
 
-@for_sizes('f8[:, :, ::1], f8[:, :, ::1], i8, f8[:, :, :, ::1]')
-def whiten_blocks(roots, J, side, blocks, size):
-    """Write L'J to blocks[:, side] for each factor; J : (m, k, k), blocks : (m, 2, k, k)."""
+@for_sizes('f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1]')
+def whiten_blocks(roots, J_i, J_j, size):
+    """Return L'J_i and L'J_j for each factor, (m, 2, k, k); roots, J_i, J_j : (m, k, k)."""
     k = len(size)
-    for f in range(len(roots)):
-        for r in range(k):
-            for c in range(k):
-                total = 0.0
-                for a in range(k):
-                    total += roots[f, r, a] * J[f, a, c]
-                blocks[f, side, r, c] = total
+    blocks = np.empty((len(roots), 2, k, k))
+    for side in range(2):
+        J = J_j if side else J_i
+        for f in range(len(roots)):
+            for r in range(k):
+                for c in range(k):
+                    total = 0.0
+                    for a in range(k):
+                        total += roots[f, r, a] * J[f, a, c]
+                    blocks[f, side, r, c] = total
+    return blocks

@@ -232,39 +232,6 @@ def _reduce(factor, rows):
             row[r] = total / line[r]
 
 
-@loop('(f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[::1])')
-def append(rows, pivot, residual, lines, values):
-    """
-    Write the rows of F, and of F^-1 times the right hand side, of a factor just predicted.
-
-    rows, pivot : (k, n), (k, k), see `predict`, with its noise; residual : (k,) as expected
-
-    Returns
-    -------
-    Whether it is definite beyond rounding.
-
-    """
-    k, n = rows.shape
-    for r in range(k):
-        line = lines[r * n + r * (r + 1) // 2:]
-        line[:n] = rows[r]
-        values[r] = -residual[r]
-        for c in range(r + 1):
-            above = lines[c * n + c * (c + 1) // 2 + n:]
-            entry = pivot[r, c]
-            for e in range(c):
-                entry -= line[n + e] * above[e]
-            if c < r:
-                line[n + c] = entry / above[c]
-                values[r] -= line[n + c] * values[c]
-            elif entry > 0:
-                line[n + c] = np.sqrt(entry)
-                values[r] /= line[n + c]
-            else:
-                return False
-    return True
-
-
 @loop('(f8[::1], f8[::1], i8[:, ::1], f8[:, :, :, ::1], f8[:, ::1])')
 def pull(factor, right, ends, blocks, gradient):
     """Add to the gradient (t, k) what factors pull at points: A'lambda, F'lambda = right."""

@@ -16,7 +16,7 @@ overlap. K is a tuple of k zeros; its length is a constant to the compiler, an a
 
 import numpy as np
 
-from l1slam_ros.core.kernels.compiled import compiled, for_sizes, loop
+from l1slam_ros.core.kernels.compiled import compiled, for_sizes
 
 # One cache line of single precision. Below 16 the loop vectoriser takes a loop for a short one,
 # where it does not check that arrays are apart, and gives up.
@@ -140,21 +140,6 @@ def look(tiles, keyframes, x, g, weight, x_bar, g_bar, y_bar, K):
     return weight * moved + turned / weight + 2 * crossed, cost, value
 
 
-@for_sizes('f4[:, ::1], u4[:, ::1], f4[:, ::1]', plane=_SIZES)
-def adjoint(tiles, keyframes, g, K):
-    """Set g = A'y for the y of the tiles."""
-    k = len(K)
-    local = np.empty(3 * k * LANES, tiles.dtype)
-    for v in range(len(g)):
-        for c in range(k):
-            g[v, c] = 0
-    for t in range(len(tiles)):
-        row = (2 * k * k + k) * LANES
-        for at in range(k * LANES):
-            local[2 * k * LANES + at] = tiles[t, row + at]
-        _scatter(local, tiles[t], g, keyframes[t], K)
-
-
 @compiled
 def _reflect(x, z, g, twice, a):
     """Set z = x - twice g, x = a z, and clear g."""
@@ -193,21 +178,3 @@ def _scatter(local, tile, g, keyframes, K):
             v = keyframes[side * LANES + lane]
             for c in range(k):
                 g[v, c] += local[(side * k + c) * LANES + lane]
-
-
-@loop('(f8[:, ::1], i8[::1], f4[:, :, ::1])')
-def pack(values, order, tiles):
-    """Write values (m, c), taken in `order` (m,), to tiles (t, c, lanes)."""
-    lanes = tiles.shape[2]
-    for place in range(len(order)):
-        for c in range(values.shape[1]):
-            tiles[place // lanes, c, place % lanes] = values[order[place], c]
-
-
-@loop('(f4[:, :, ::1], i8[::1], f8[:, ::1])')
-def unpack(tiles, order, values):
-    """Undo `pack`: write the tiles to values (m, c)."""
-    lanes = tiles.shape[2]
-    for place in range(len(order)):
-        for c in range(values.shape[1]):
-            values[order[place], c] = tiles[place // lanes, c, place % lanes]

@@ -44,9 +44,7 @@ def minimum_degree(start, adjacent, limit, stage):
 
     """
     n = len(start) - 1
-    lists = np.empty_like(adjacent)  # of each node: variables, then elements
-    for at in range(len(adjacent)):
-        lists[at] = adjacent[at]
+    lists = adjacent.copy()  # of each node: variables, then elements
     n_variables, n_elements = np.empty(n, np.int32), np.empty(n, np.int32)
     # The lists of nodes by stage and degree.
     stages = 1 + (stage.max() if n else 0)

@@ -28,7 +28,7 @@ def gather(keyframe, blocks, y, product):
 
 @loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i4[::1], f8[:, :, ::1])')
 def solve_many(panels, first, start, pattern, offset, position, right):
-    """Return the solutions of L L' x = right, (n, k, q) in the order of the keyframes."""
+    """Turn right hand sides, (n, k, q) in the order of the keyframes, into L'^-1 L^-1 right."""
     n, k, q = right.shape
     x = np.empty((n * k, q))
     for f in range(n):
@@ -47,10 +47,8 @@ def solve_many(panels, first, start, pattern, offset, position, right):
             for r in range(c + 3, len(panel), 3):
                 _add(x, rows[r // k] * k + r % k, panel[r:r + 3, c:c + 3].T, -1.0, x, own)
             _solve_three_transposed(panel[c:c + 3, c:c + 3], x, own)
-    solution = np.empty((n, k, q))
     for f in range(n):
-        solution[f] = x[position[f] * k:(position[f] + 1) * k]
-    return solution
+        right[f] = x[position[f] * k:(position[f] + 1) * k]
 
 
 @compiled
@@ -93,25 +91,24 @@ def _solve_three_transposed(L, x, at):
 
 @loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1], i1[:, :, ::1])')
 def left_over(keyframe, blocks, x, y):
-    """Return the second moment of y - A x for each factor, (m, k, k); y as above."""
-    k, q = x.shape[1:]
-    moment, d = np.empty((len(blocks), k, k)), np.empty((k, q))
-    for f in range(len(blocks)):
-        d[:] = y[f]
-        _add_moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], -1.0, d)
-        _second_moment(d, moment[f])
-    return moment
+    """
+    Return the second moment of y - A x for each factor, (m, k, k).
 
-
-@loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1])')
-def spreads(keyframe, blocks, x):
-    """Return the second moment of A x for each factor, (m, k, k)."""
+    y : as of `gather`, of the first factors; zero of the others
+    """
     k, q = x.shape[1:]
     moment, d = np.empty((len(blocks), k, k)), np.empty((k, q))
     for f in range(len(blocks)):
         d[:] = 0.0
-        _add_moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], 1.0, d)
-        _second_moment(d, moment[f])
+        if f < len(y):
+            d[:] = y[f]
+        _add_moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], -1.0, d)
+        for r in range(k):
+            for c in range(r + 1):
+                total = 0.0
+                for t in range(q):
+                    total += d[r, t] * d[c, t]
+                moment[f, r, c] = moment[f, c, r] = total / q
     return moment
 
 
@@ -131,16 +128,6 @@ def _add_moved(pair, x_i, x_j, sign, d):
         for c in range(0, len(d), 3):
             _add(x_i, c, pair[0, r:r + 3, c:c + 3], sign, d, r)
             _add(x_j, c, pair[1, r:r + 3, c:c + 3], sign, d, r)
-
-
-@compiled
-def _second_moment(d, moment):
-    for r in range(len(d)):
-        for c in range(r + 1):
-            total = 0.0
-            for t in range(d.shape[1]):
-                total += d[r, t] * d[c, t]
-            moment[r, c] = moment[c, r] = total / d.shape[1]
 
 
 @loop('(f8[:, :, ::1], f8[:, ::1])')

@@ -118,10 +118,7 @@ def supernodes(parent, below):
             count -= 1
             zeros[count - 1] = total
     first[count] = n
-    shorter = np.empty(count + 1, np.int32)
-    for s in range(count + 1):
-        shorter[s] = first[s]
-    return shorter
+    return first[:count + 1].copy()
 
 
 @compiled
@@ -135,9 +132,7 @@ def panel_rows(first, column, rows, old, position):
     start, end = np.empty(count + 1, np.int64), np.empty(count, np.int64)
     start[0] = 0
     # Sorted by going through all rows in order: each is in the lower part of these supernodes.
-    member = np.empty(n + 1, np.int64)
-    for k in range(n + 1):
-        member[k] = 0
+    member = np.zeros(n + 1, np.int64)
     for s in range(count):
         last, end[s] = old[first[s + 1] - 1], start[s] + first[s + 1] - first[s]
         start[s + 1] = end[s] + column[last + 1] - column[last]

@@ -5,7 +5,10 @@ The incremental back end: samples and loops in, optimised poses out, from many t
 It owns the growing graph; how its map is kept is told in `upkeep`.
 """
 
+import os
+from contextlib import ExitStack
 from dataclasses import dataclass
+from weakref import WeakSet
 
 from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry import se2, se3
@@ -56,7 +59,7 @@ class Backend(Upkeep):
     options : see `BackendOptions`
     dimension : of the world, 2 or 3
     background : update in a thread of its own whenever there is something new, until `close` or
-        the end of the `with` block
+        the end of the `with` block; not in a process that is forked from this one
 
     Attributes
     ----------
@@ -82,6 +85,7 @@ class Backend(Upkeep):
         if background:
             self._background = Background(
                 lambda idle, stopped: self._update(0.0, stopped, idle), _PAUSE)
+        _ALL.add(self)
 
     def __enter__(self) -> 'Backend':
         """Return the back end; the end of the block closes it."""
@@ -237,3 +241,23 @@ class Backend(Upkeep):
         """Tell the background that there may be something to do."""
         if self._background is not None:
             self._background.wake()
+
+
+_ALL: WeakSet[Backend] = WeakSet()
+_at_rest = ExitStack()
+
+
+def _before_fork() -> None:
+    for backend in tuple(_ALL):
+        _at_rest.enter_context(backend._alone())
+
+
+def _in_child() -> None:
+    for backend in tuple(_ALL):
+        backend._background = None
+    _at_rest.close()
+
+
+# Threads do not come along into a process that is forked, but what they have locked does, of ours,
+# numba's and Python's: so nothing is at work meanwhile.
+os.register_at_fork(before=_before_fork, after_in_parent=_at_rest.close, after_in_child=_in_child)

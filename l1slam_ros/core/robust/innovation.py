@@ -104,10 +104,10 @@ def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) 
     noise = signs(keys(graph.between.i, graph.between.j), k, q)
     speaks = graph.between.speaks
     noise[~speaks] = 0
-    right = np.zeros((system.size + 1, k, q))
-    gather(system.keyframe, system.blocks, noise, right)
-    samples = np.zeros_like(right)
-    samples[:-1] = cholesky.solve_many(right[:-1])
+    samples = np.zeros((system.size + 1, k, q))
+    gather(system.keyframe, system.blocks, noise, samples)
+    samples[-1] = 0.0
+    cholesky.solve_many(samples[:-1])
     moment = left_over(system.keyframe, system.blocks, samples, noise)
     return Posterior(system, noise, samples, moment, speaks, anchor(graph))
 
@@ -190,7 +190,8 @@ def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
 
     system, factors = linearise(graph, poses, fixed=posterior.fixed), graph.between
     k = system.block_size
-    spread = prediction.spreads(system.keyframe, system.blocks, posterior.samples)
+    spread = prediction.left_over(system.keyframe, system.blocks, posterior.samples,
+                                  posterior.noise[:0])
     absolute = np.flatnonzero(factors.is_absolute)
     spread[absolute] += _sagittas(graph.subset(absolute), posterior)
     square, log_det = prediction.normalise(spread + np.eye(k), -system.b.reshape(-1, k))

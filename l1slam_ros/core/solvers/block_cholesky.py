@@ -204,14 +204,13 @@ class BlockCholesky:
                          right.reshape(-1, len(layout.size)))
         return x.ravel()
 
-    def solve_many(self, right: Array) -> Array:
-        """Return the solutions for q right hand sides (free keyframes, k, q), of that shape."""
+    def solve_many(self, right: Array) -> None:
+        """Turn q right hand sides (free keyframes, k, q) into their solutions, in place."""
         from l1slam_ros.core.kernels.prediction import solve_many
 
         layout = self._factored
         assert layout is not None, 'solve before factorise'
-        x: Array = solve_many(layout.panels, *layout.shape, self.pattern.position, right)
-        return x
+        solve_many(layout.panels, *layout.shape, self.pattern.position, right)
 
     def climb(self, keyframe: int) -> tuple[Places, Array]:
         """

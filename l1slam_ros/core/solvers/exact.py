@@ -20,10 +20,6 @@ from l1slam_ros.core.solvers.optimality import Status, l1_cost
 # It leaves the cost 10^-6 above the optimum, 3 10^-6 in Manhattan's flat valley.
 _TOLERANCE = 3e-5
 _ROUGH_L2 = LeastSquaresOptions(iterations=30, tolerance=1e-3)
-# A run whose proof leaves more than this part of the cost open is followed by another one from
-# its end: on a long way with few loops (KITTI 00) mu is at zero before the poses are at rest.
-_OPEN = 2e-3
-_MOST_RUNS = 6
 
 
 def minimise_interior_point(
@@ -37,9 +33,8 @@ def minimise_interior_point(
     Minimise the L1 norm of the whitened residuals in `options.outer_iterations` steps at most.
 
     From the L2 map that poses (n, p) lead to, which lies in the middle of the valley; should that
-    end above the poses' own cost (false loops bend it), from the poses themselves. From where a
-    run comes to rest without a proof the next begins, with as many steps. The result is the best
-    poses met, never worse than the start. The L2 map counts as one step.
+    end above the poses' own cost (false loops bend it), from the poses themselves. The result is
+    the best poses met, never worse than the start. The L2 map counts as one step.
     """
     residual = whitened_residual(graph, poses)
     start = l1_cost(residual)
@@ -52,16 +47,7 @@ def minimise_interior_point(
     optimum = interior_point(problem, rough, cholesky, steps, _TOLERANCE, report)
     if optimum.costs[-1] > start:
         optimum = interior_point(problem, poses, cholesky, steps, _TOLERANCE, report)
-    costs, proof = [start, *optimum.costs], prove(optimum, cholesky)
-    for _ in range(_MOST_RUNS - 1):
-        cost = optimum.costs[-1]
-        if optimum.status is not Status.CONVERGED or proof.gap <= _OPEN * cost:
-            break
-        again = interior_point(problem, optimum.poses, cholesky, steps, _TOLERANCE, report)
-        if again.costs[-1] > (1 - _TOLERANCE) * cost:
-            break
-        costs += again.costs[1:]
-        optimum, proof = again, prove(again, cholesky)
-    history = np.minimum.accumulate(costs)
+    proof = prove(optimum, cholesky)
+    history = np.minimum.accumulate([start, *optimum.costs])
     return Solution(optimum.poses, optimum.costs[-1], proof.status, len(history) - 1, 0, history,
                     proof.dual, proof.gap)

@@ -7,15 +7,15 @@ has no derivative at zero, where many end, so |e| becomes R = sqrt(|e|^2 + mu^2)
 zero. The dual y of each factor, |y| <= 1, is a variable of its own: what is solved is R y = e,
 J'y = 0. A step linearises that,
 
-    (J'W J + kappa C + D I) dx = -J'(e / R),    W = (I - (y e' + e y') / 2 R) / R,
+    (J'W J + kappa C) dx = -J'(e / R),    W = (I - (y e' + e y') / 2 R) / R,
     y + dy = e / R + W J dx,
 
 which is Newton's method on a system that stays nearly linear, however small mu is: with y = e / R
-put in, steps would shrink with mu. C, kappa and D as in `interior_point`. In the place of e / R
-and W a norm without corners has its derivative and its weights (`optimality.SmoothNorm`).
+put in, steps would shrink with mu. C and kappa as in `interior_point`. In the place of e / R and W
+a norm without corners has its derivative and its weights (`optimality.SmoothNorm`).
 
 Source: Chan, Golub and Mulet, "A nonlinear primal-dual method for total variation-based image
-restoration" (1999), sections 3 and 4; curvature and damping are ours, defended by
+restoration" (1999), sections 3 and 4; the curvature is ours, defended by
 `test_primal_dual_newton.py`.
 """
 
@@ -29,7 +29,7 @@ from l1slam_ros.core.graph.l1_problem import GraphProblem
 from l1slam_ros.core.graph.linear_system import LinearSystem, whitened_residual
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.solvers.interior_point import Regularisation, feasible_dual
+from l1slam_ros.core.solvers.interior_point import Curvature, feasible_dual, proven
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
 from l1slam_ros.core.solvers.optimality import SmoothNorm, Status, fits_exactly, smoothing
 
@@ -40,8 +40,6 @@ _TOLERANCE = 1e-6
 _FALLS, _FALLS_SLOWLY, _FIRST = 0.1, 0.7, 0.5
 # How far to go towards the bound of the dual, and how often a step is halved.
 _FRACTION, _HALVINGS = 0.99, 12
-# The proof: a gap above this part of the cost proves nothing.
-_PROVEN = 1e-2
 
 
 @dataclass
@@ -79,14 +77,14 @@ def minimise_norm(
                         np.zeros(rows))
     poses = minimise_l2(graph, poses, LeastSquaresOptions(), cholesky).poses
     problem = GraphProblem(graph)
-    at, regularisation = _begin(problem, poses, norm), Regularisation()
+    at, curvature = _begin(problem, poses, norm), Curvature()
     history.append(norm.cost(-at.system.b))
     best, status = at, Status.ITERATION_LIMIT
     for iteration in range(1, options.outer_iterations):
         if fits_exactly(history[-1], rows):
             status = Status.CONVERGED
             break
-        open_, moved = _step(problem, at, norm, cholesky, regularisation)
+        open_, moved = _step(problem, at, norm, cholesky, curvature)
         if moved is None:
             status = Status.STALLED
             break
@@ -99,9 +97,7 @@ def minimise_norm(
             status = Status.CONVERGED
             break
     y, gap = feasible_dual(best.system, best.y.ravel(), norm.slack(best.y), norm, cholesky)
-    if status is Status.CONVERGED and gap > _PROVEN * history[-1] and not fits_exactly(
-            history[-1], rows):
-        status = Status.STALLED
+    status = proven(status, gap, history[-1], rows)
     return Solution(best.poses, history[-1], status, len(history) - 1, 0, np.array(history), y,
                     gap)
 
@@ -115,14 +111,14 @@ def _begin(problem: GraphProblem, poses: Array, norm: SmoothNorm) -> _Iterate:
 
 
 def _step(problem: GraphProblem, at: _Iterate, norm: SmoothNorm, cholesky: BlockCholesky,
-          regularisation: Regularisation) -> tuple[float, _Iterate | None]:
+          curvature: Curvature) -> tuple[float, _Iterate | None]:
     """Return what a step and what is rounded add to the cost, and what it led to or None."""
     e = at.residual
     smooth, d, W = norm.smoothed(e, at.y, at.mu)
     roots = np.linalg.cholesky(W).transpose(0, 2, 1).astype(np.float64, copy=False)
     rooted = at.system.weighted(roots)
-    curvature = problem.curvature(at.poses, at.y.ravel())
-    if not regularisation.factorise(rooted, np.ones(e.size), curvature, cholesky):
+    C = problem.curvature(at.poses, at.y.ravel())
+    if not curvature.factorise(rooted, np.ones(e.size), C, cholesky):
         return 0.0, None
     gradient = at.system.transposed_times(d.ravel())
     x = cholesky.solve(-gradient)
@@ -136,9 +132,7 @@ def _step(problem: GraphProblem, at: _Iterate, norm: SmoothNorm, cholesky: Block
         if norm.smoothed(residual.reshape(e.shape), at.y, at.mu).cost <= smooth:
             break
     else:
-        regularisation.learn(0.0)
         return open_, replace(at, mu=at.mu * _FALLS_SLOWLY)
-    regularisation.learn(length)
     Jx = at.system.times(x).reshape(e.shape)
     dy = d + (W @ Jx[:, :, None])[..., 0] - at.y
     dual = min(1.0, _FRACTION * norm.reach(at.y, dy))

@@ -169,7 +169,7 @@ class _Run:
         self._origin, self._offset = np.array(x, float), np.zeros((system.size, k))
         self.cost = self._set_origin()
         self.weight = weight or self._typical_weight(self.cost)
-        self._call(kernels.adjoint, self._g)
+        self._g[:-1] = scaled.transposed_times(dual.ravel()).reshape(-1, k)
 
     def advance(self, count: int) -> tuple[float, float, float]:
         """Return the fixed-point residual, the cost and the gap after `count` more iterations."""

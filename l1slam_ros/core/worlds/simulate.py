@@ -78,13 +78,13 @@ def simulate_world(
 
     Raises
     ------
-    GraphError : fewer edges than the odometry has, or more than there are pairs of poses.
+    GraphError : fewer than two poses, fewer edges than the odometry has, or more than pairs.
 
     """
     n_loops = n_edges - (n_poses - 1)
     most = n_poses * (n_poses - 1) // 2
-    if n_poses < 1:
-        raise GraphError(f'a world of {n_poses} poses, expected 1 or more')
+    if n_poses < 2:
+        raise GraphError(f'a world of {n_poses} poses, expected 2 or more')
     if not 0 <= n_loops <= most - (n_poses - 1):
         raise GraphError(f'{n_edges} edges between {n_poses} poses, '
                          f'expected {n_poses - 1} to {most}')

@@ -52,26 +52,28 @@ class MapFile:
 
     def load(self) -> str:
         """Load the map; return a sentence that says from where."""
+        sentence, whole = self._loaded()
+        if not whole:
+            self._warn(sentence)
+        return sentence
+
+    def _loaded(self) -> tuple[str, bool]:
         path = self._path()
         saved, sentence, whole = load_map(path)
         found, expected = saved.growth.graph.manifold, self._backend.manifold
         if found is not expected:
             raise FileError(path, f'is a map of {found.NAME}; expected one of {expected.NAME}')
-        if not whole:
-            self._warn(sentence)
         self._backend.restore(saved)
         self._version, self._ours = self._backend.version, path
-        return sentence
+        return sentence, whole
 
-    def load_at_start(self) -> str:
-        """Load the map if there is one; return a sentence that says so."""
+    def load_at_start(self, tell: Callable[[str], object]) -> None:
+        """Load the map if there is one; tell so, or warn where there is a damaged one."""
         try:
-            return self.load()
+            sentence, well = self._loaded()
         except FileError as error:
-            sentence = f'the map begins empty: {error}'
-            if self._path().exists():
-                self._warn(sentence)
-            return sentence
+            sentence, well = f'the map begins empty: {error}', not self._path().exists()
+        (tell if well else self._warn)(sentence)
 
     def seconds_left(self) -> float:
         """Return in how many seconds `autosave` is due, or when to ask again."""
@@ -103,6 +105,13 @@ class MapFile:
         if not path:
             raise OptionError('the parameter save_path is empty, expected the name of a .g2o file')
         return Path(path).expanduser().absolute()
+
+
+def missing_folder(save_path: str) -> str:
+    """Return what is wrong with a `save_path` whose folder is not there; else nothing."""
+    folder = Path(save_path).expanduser().absolute().parent
+    there = not save_path or folder.is_dir()
+    return '' if there else f'save_path is {save_path!r}, but there is no folder {folder}'
 
 
 def _time_of(path: Path) -> str:

@@ -16,7 +16,6 @@ A message that cannot be used raises `MessageError` with one of these causes:
 Covariances pass as they come: `graph_builder` decides what they are worth.
 """
 
-import math
 import re
 from functools import cache
 from types import SimpleNamespace
@@ -28,12 +27,7 @@ from rosbags.typesys import Stores, get_typestore
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import silent_components
-from l1slam_ros.core.graph.measurements import (
-    FARTHEST,
-    QUATERNION_NORM_ERROR,
-    LoopClosure,
-    OdometrySample,
-)
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, sound_pose3
 from l1slam_ros.io.files import NANOSECONDS, quoted, stamp_text
 
 _REFERENCE_FRAME = re.compile(
@@ -192,15 +186,7 @@ def checked_pose3(t: Any, q: Any) -> Array:
     MessageError : they are no pose.
 
     """
-    position, quaternion = (t.x, t.y, t.z), (q.x, q.y, q.z, q.w)
-    if not all(map(math.isfinite, position + quaternion)):
-        raise MessageError('not_finite', f'pose {position} {quaternion}; expected finite numbers')
-    if max(map(abs, position)) > FARTHEST:
-        raise MessageError('range', f'position {position}; expected it within {FARTHEST:g} m')
-    norm = math.hypot(*quaternion)
-    if abs(norm - 1.0) > QUATERNION_NORM_ERROR:
-        raise MessageError('quaternion', f'quaternion {quaternion} of norm {norm:g}; expected 1')
-    return np.array((*position, *(component / norm for component in quaternion)))
+    return sound_pose3((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
 
 
 def _ends(message: Any, base_frame: str) -> tuple[int, int]:

@@ -46,8 +46,9 @@ _DEPTH = 1000
 _AT_ONCE = 100
 # More are left to DDS, to drop: ten seconds of a fast topic, some megabytes.
 _BACKLOG = 10_000
-# Of a backlog so many messages, the newest, are answered with a pose: nobody waits for the others.
-_ANSWERED = 200
+# Odometry behind which so much waits is not answered, but for the last: there is no time for it, a
+# publication gives Python up and waits for its turn, and the robot is elsewhere by now.
+_ANSWERED = 5
 # [s] What raises each time it is called shall not keep a core busy.
 _BREATH = 0.05
 _REPEAT_WARNING = 5.0  # [s]
@@ -86,7 +87,7 @@ class Inputs:
     backend : to append to
     options : of the node
     failures : where to tell what nobody foresaw
-    moved : called after a sample of the odometry that is used, but not if many more wait behind it
+    moved : called after a sample of the odometry that is used, but not if more wait behind it
     tick : called after messages, and again after as many seconds as it returns
 
     Attributes
@@ -102,7 +103,8 @@ class Inputs:
         self._node, self._backend, self._failures = node, backend, failures
         self._moved, self._tick = moved, tick
         self._base_frame, self._map_frame = BaseFrame(options.base_frame), options.map_frame
-        self._group, self.active, self._closing = _Apart(), False, False
+        self._group, self.active = _Apart(), False
+        self._closing = self._unanswered = False
         self.refused: Counter[str] = Counter()
         self._topics: list[_Topic] = []
         # As they came, and of each topic in its turn.
@@ -235,6 +237,8 @@ class Inputs:
                 self._failures.note(topic.name, error)
                 continue
             self._failures.over(topic.name)
+        if not self._backlog:
+            self._answer()
 
     def _on_odometry(self, data: bytes) -> None:
         found = self._base_frame.take(*conversion.odometry_in(data))
@@ -243,9 +247,14 @@ class Inputs:
         for other in found.others:
             self._refuse(other)
         for sample in found.ours:
-            used = self._backend.add_odometry(sample) is not None
-            if used and self._backlog < _ANSWERED:
-                self._moved()
+            self._unanswered |= self._backend.add_odometry(sample) is not None
+            if self._backlog < _ANSWERED:
+                self._answer()
+
+    def _answer(self) -> None:
+        if self._unanswered:
+            self._unanswered = False
+            self._moved()
 
     def _on_loop(self, read: Callable[[Any], LoopClosure], message: Any) -> None:
         self._backend.add_loop(read(message))

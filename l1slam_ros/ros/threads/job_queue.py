@@ -2,7 +2,6 @@
 """Work that services ask for, done one after the other by a thread of its own."""
 
 import queue
-import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from l1slam_ros.core.errors import Interrupted, L1SlamError
+from l1slam_ros.ros.threads.background import background
 from l1slam_ros.ros.threads.failures import Failures, reason
 
 # [s] A service that failed may not be called again: its failure is told for so long.
@@ -51,7 +51,7 @@ class JobQueue:
         self._node, self._failures, self._done = node, failures, done
         self._queue: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._idle: Callable[[], float]
-        self._thread = threading.Thread(target=self._work, name='services', daemon=True)
+        self._thread = background('services', self._work)
 
     def start(self, idle: Callable[[], float]) -> None:
         """Begin; idle : called where nothing is queued, again after so many seconds."""

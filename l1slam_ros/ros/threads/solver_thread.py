@@ -9,8 +9,9 @@ from typing import Any
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.update import Improvement
-from l1slam_ros.io.compilation import STEPS, fill_cache, with_space
+from l1slam_ros.io.compilation import STEPS, fill_cache, load, with_space
 from l1slam_ros.io.node_options import UpdateOptions
+from l1slam_ros.ros.threads.background import background
 from l1slam_ros.ros.threads.failures import Failures
 
 # [s] After a failed update the next one waits; twice as long after each more, up to this.
@@ -42,7 +43,7 @@ class SolverThread:
         self._pause, self._not_before = _FIRST_PAUSE, 0.0
         self._behind_since = 0.0
         self.compiling = ''
-        self._thread = threading.Thread(target=self._work, name='solver', daemon=True)
+        self._thread = background('solver', self._work)
 
     def start(self) -> None:
         """Begin; before the first update, what is not in the cache is compiled."""
@@ -121,7 +122,9 @@ class SolverThread:
 
         try:
             steps = with_space(STEPS, self._backend.manifold)
-            if not self._backend.alone(lambda: fill_cache(report, self.is_closing, steps)):
+            if self._backend.alone(lambda: fill_cache(report, self.is_closing, steps)):
+                load(steps)
+            else:
                 self._logger.debug('not all is compiled yet: the rest is when it is first called')
         except Exception as error:
             # Not the end: what is missing is compiled when it is first called.

@@ -6,21 +6,20 @@ import pytest
 from gps import seen
 from lies import careful_world, is_false, spoilt
 from numpy.testing import assert_allclose
-from problems import covariance6, odometry, play
+from problems import EVERY, covariance6, drive_on, play, straight
 from systems import dense_covariance
 
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.online.backend import Backend, BackendOptions
-from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.online.snapshot import Growth, Optimised, SavedMap
 from l1slam_ros.core.online.update import improve
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
-EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 N, KNOWN, LAST = 180, 140, 150
+SURE = covariance6(1e-4 * np.eye(3))
 
 
 @pytest.fixture(scope='module')
@@ -99,9 +98,7 @@ def test_of_a_part_that_nothing_joins_hardly_anything_is_known():
     backend = Backend(EVERY)
 
     def drive(first, count):
-        for k in range(count):
-            backend.add_odometry(odometry(first + k, (k, 0.0, 0.0),
-                                          covariance6(1e-4 * np.eye(3))))
+        drive_on(backend, straight(count), 0, SURE, first, 1.0)
         backend.settle()
         return backend.marginal_covariance(len(backend.poses) - 1)
 
@@ -144,15 +141,11 @@ def test_a_front_that_fails_is_closed_and_moves_nothing(world, monkeypatch):
 
 def test_what_no_odometry_ties_to_the_map_is_for_the_next_one():
     backend = Backend(EVERY)
-
-    def drive(count):
-        for k in range(count):
-            backend.add_odometry(odometry(k + 1.0, (k, 0.0, 0.0), covariance6(1e-4 * np.eye(3))))
-
-    drive(5)
+    drive_on(backend, straight(5), 0, SURE, 1.0, 1.0)
     backend.settle()
     backend._begin_due = lambda *_: False
-    drive(4)  # the clock is set back: a part of its own begins
+    # The clock is set back: a part of its own begins.
+    drive_on(backend, straight(4), 0, SURE, 1.0, 1.0)
     assert backend.update(10.0) is not None and backend._live.front.closed
     assert len(backend.poses) == 9 and np.isfinite(backend.poses).all()
 

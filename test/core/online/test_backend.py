@@ -7,23 +7,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from lies import (
+    ROUND,
     careful_world,
     drive_roundabout,
     is_false,
     position_error,
     roundabout,
     seen,
+    slipped,
     spoilt,
 )
 from numpy.testing import assert_allclose, assert_array_equal
-from problems import PERIOD, loop, odometry, play, seconds
+from problems import EVERY, PERIOD, loop, odometry, play, seconds
 
 from l1slam_ros.core.errors import Interrupted, L1SlamError, OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
-from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.online.loop_states import (
     ACCEPTED,
     EXPIRED,
@@ -41,8 +44,6 @@ from l1slam_ros.core.solvers.primal_dual import PrimalDualOptions
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
-# Every message a keyframe, with the covariance it states: the graph is that of the world.
-EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 # Every loop is used, however far off.
 CREDULOUS = replace(EVERY, robust=RobustOptions(enabled=False))
 PLENTY = 60.0  # [s] of budget: an update then ends by its own tests, on any machine
@@ -62,6 +63,13 @@ def batch_of(graph):
     return minimise(graph, seed_poses(graph, cholesky), OptimiserOptions(), cholesky)
 
 
+def played(world, first=0, last=None, options=EVERY):
+    """Return a back end that has heard of some keyframes."""
+    backend = Backend(options)
+    play(backend, world, first, last)
+    return backend
+
+
 def settled(backend):
     """Update until there is nothing left to do; return how often."""
     for count in range(100):
@@ -71,8 +79,7 @@ def settled(backend):
 
 
 def test_played_back_the_graph_is_that_of_the_world(world):
-    backend = Backend(EVERY)
-    play(backend, world)
+    backend = played(world)
     ours, theirs = backend.snapshot().problem().graph.between, world.graph.between
 
     def rows(factors):
@@ -99,21 +106,22 @@ def test_incremental_ends_at_the_cost_of_batch(world):
     assert cost(world.graph, backend.poses) == pytest.approx(batch.cost, rel=2e-4)
 
 
-def test_a_solve_to_the_end_is_as_good(world):
-    backend = Backend(EVERY)
-    play(backend, world)
+@pytest.mark.parametrize('solve, within', [
+    (lambda problem: improve(problem, EVERY.solver, PLENTY), 1e-2),
+    (lambda problem: optimise(problem, EVERY.solver), 2e-4)], ids=['update', 'to the end'])
+def test_the_account_of_a_solve_is_true_and_it_is_as_good_as_batch(world, solve, within):
+    backend = played(world, options=CREDULOUS)
     problem = backend.snapshot().problem()
-    solved = optimise(problem, EVERY.solver)
-    batch = batch_of(world.graph)
-    assert solved.cost == cost(problem.graph, solved.poses) == pytest.approx(batch.cost, rel=2e-4)
+    solved, best = solve(problem), batch_of(world.graph).cost
+    assert solved.cost == cost(problem.graph, solved.poses) == pytest.approx(best, rel=within)
     assert solved.cost_before == cost(problem.graph, problem.poses)
     backend.adopt(solved)
     assert_array_equal(backend.poses, solved.poses)
+    assert backend.snapshot().problem().last_cost == pytest.approx(solved.cost, rel=1e-12)
 
 
 def test_a_solve_to_the_end_minimises_the_norms_that_were_asked_for(world):
-    backend = Backend(EVERY)
-    play(backend, world)
+    backend = played(world)
     problem = backend.snapshot().problem()
     mixed, l1 = (optimise(problem, OptimiserOptions(norm=norm, loop_norm=loop_norm))
                  for norm, loop_norm in (('l2', 'l1'), ('l1', 'same')))
@@ -134,6 +142,9 @@ def test_nothing_to_do_is_none(world):
     poses = backend.poses
     assert backend.snapshot().problem().settled and backend.update(PLENTY) is None
     assert_array_equal(backend.poses, poses)
+    # Nor for a loop that still waits.
+    backend.add_loop(loop(0.0, 100.0, (1.0, 0.0, 0.0)))
+    assert backend.update(PLENTY) is None and len(backend._builder.loops.waiting) == 1
     play(backend, world, 60, 61)
     assert not backend.snapshot().problem().settled
     assert backend.update(PLENTY) is not None
@@ -164,16 +175,6 @@ def test_one_keyframe_is_no_trouble():
     assert (improvement.status, improvement.cost) == (Status.CONVERGED, 0.0)
     assert_allclose(backend.poses, [[3.0, 4.0, 0.5]])
     assert_allclose(backend.snapshot().map_to_odom, [[0.0, 0.0, 0.0]], atol=1e-15)
-
-
-def test_a_loop_alone_settles_nothing_new(world):
-    """A loop that still waits is no reason to work."""
-    backend = Backend(EVERY)
-    play(backend, world, 0, 30)
-    settled(backend)
-    backend.add_loop(loop(0.0, 100.0, (1.0, 0.0, 0.0)))
-    assert backend.update(PLENTY) is None
-    assert len(backend._builder.loops.waiting) == 1
 
 
 # Time
@@ -208,7 +209,7 @@ def test_small_budgets_add_up(world):
         costs += [improvement.cost] if improvement.cost else []
     assert (np.diff(costs) <= 1e-9).all()
     batch = batch_of(world.graph)
-    assert costs[-1] == pytest.approx(batch.cost, rel=1e-3)
+    assert costs[-1] == pytest.approx(batch.cost, rel=2e-3)
 
 
 def test_small_budgets_judge_to_the_end(world):
@@ -224,31 +225,22 @@ def test_small_budgets_judge_to_the_end(world):
 # What is seen from outside
 
 
-def test_map_to_odom_puts_the_last_optimised_keyframe_in_its_place(world):
-    backend = Backend(EVERY)
-    play(backend, world, 0, 140)
-    settled(backend)
-    there = se2.compose(backend.snapshot().map_to_odom, world.odometry[139:140])
-    assert_allclose(se2.local(backend.poses[139:], there), 0, atol=1e-9)
-    assert np.abs(backend.snapshot().map_to_odom).max() > 0.05
-
-
 def test_keyframes_after_an_update_follow_the_map(world):
-    backend = Backend(EVERY)
-    play(backend, world, 0, 100)
+    """By the transform that puts the last optimised one in its place."""
+    backend = played(world, 0, 130)
     settled(backend)
     before, transform = backend.poses, backend.snapshot().map_to_odom
-    play(backend, world, 100, 120)
-    assert_array_equal(backend.poses[:100], before)
+    play(backend, world, 130, 150)
+    assert_array_equal(backend.poses[:130], before)
     assert_array_equal(backend.snapshot().map_to_odom, transform)
-    expected = se2.compose(np.broadcast_to(transform, (20, 3)), world.odometry[100:120])
-    assert_allclose(se2.local(backend.poses[100:], expected), 0, atol=1e-12)
+    expected = se2.compose(np.broadcast_to(transform, (21, 3)), world.odometry[129:150])
+    assert_allclose(se2.local(backend.poses[129:], expected), 0, atol=1e-9)
+    assert np.abs(transform).max() > 0.05
 
 
 def test_keyframes_during_an_update_follow_the_map(world):
     """Between problem() and adopt(), as with the node's worker."""
-    backend = Backend(EVERY)
-    play(backend, world, 0, 100)
+    backend = played(world, 0, 100)
     problem = backend.snapshot().problem()
     frozen = problem.poses.copy(), len(problem.graph.between), problem.graph.n_poses
     play(backend, world, 100, 125)
@@ -282,29 +274,19 @@ def test_poses_are_always_finite(world, rng):
 
 
 def test_several_loops_at_once_bring_a_drifted_drive_back():
-    """Two rounds of a square, drifting by .02 rad a step; loops from the second to the first."""
-    n, side = 80, 10
-    truth, drifted = np.zeros((n, 3)), np.zeros((n, 3))
-    for k in range(1, n):
-        step = np.array([[1.0, 0.0, np.pi / 2 if k % side == 0 else 0.0]])
-        truth[k] = se2.compose(truth[k - 1 : k], step)[0]
-        drifted[k] = se2.compose(drifted[k - 1 : k], step + [[0.0, 0.0, 0.02]])[0]
-    backend = Backend(CREDULOUS)
-    for k in range(n):
-        backend.add_odometry(odometry(k * PERIOD, drifted[k], np.diag([1e-3] * 6)))
-    assert np.abs(se2.positions(drifted - truth)).max() > 5
-    loops = [(k, k + 4 * side) for k in range(0, 40, 5)]
-    for i, j in loops:
-        seen = se2.between(truth[i : i + 1], truth[j : j + 1])[0]
-        backend.add_loop(loop(i * PERIOD, j * PERIOD, seen, 1e-4 * np.eye(6)))
+    """Two rounds, loops from the second to the first."""
+    backend, truth = Backend(CREDULOUS), roundabout(2 * ROUND)
+    drive_roundabout(backend, truth)
+    drifted, i = backend.poses, np.arange(0, ROUND, 25)
+    for k in i.tolist():
+        backend.add_loop(seen(truth, k, k + ROUND))
     problem = backend.snapshot().problem()
     assert improve(problem, CREDULOUS.solver, PLENTY).reweighted_steps > 0
     backend.update(PLENTY)
-    i, j = np.array(loops).T
-    error = se2.local(se2.between(truth[i], truth[j]), se2.between(backend.poses[i],
-                                                                   backend.poses[j]))
-    assert np.abs(error).max() < 0.05
-    assert_allclose(backend.poses[0], drifted[0], atol=1e-12)
+    before, error = (np.abs(se2.local(se2.between(truth[i], truth[i + ROUND]), se2.between(
+        poses[i], poses[i + ROUND]))).max() for poses in (drifted, backend.poses))
+    assert before > 5 and error < 0.3
+    assert_array_equal(backend.poses[0], drifted[0])
 
 
 # Lies
@@ -374,17 +356,12 @@ def test_no_lie_is_believed_at_any_time(careful, clean_errors, kind):
 
 def test_at_rest_all_is_judged_from_the_graph_alone(careful, clean_errors):
     """While driving a slip is not looked for, and what was believed of it stays."""
-    step, turn = 150, np.array([[0.0, 0.0, 0.8]])
-    before, after = careful.odometry[:step + 1], careful.odometry[step + 1:]
-    pivot = before[-1:]
-    turned = se2.compose(np.broadcast_to(pivot, after.shape), se2.compose(
-        np.broadcast_to(turn, after.shape), se2.between(
-            np.broadcast_to(pivot, after.shape), after)))
-    world, backend = replace(careful, odometry=np.vstack((before, turned))), Backend(EVERY)
+    graph = slipped(careful.graph, 150, (0.0, 0.0, 0.8))
+    world, backend = replace(careful, odometry=odometry_poses(graph)), Backend(EVERY)
     drive(world, backend, lambda backend: None)
     settled(backend)
     now = backend.snapshot()
-    assert now.graph.between.i[now.optimised.judgement.slips].tolist() == [step]
+    assert now.graph.between.i[now.optimised.judgement.slips].tolist() == [150]
     assert position_error(backend.poses, careful.truth) < 1.2 * clean_errors[-1] + 0.1
 
 
@@ -426,17 +403,6 @@ def test_a_loop_is_suspect_until_others_vouch_for_it():
     assert position_error(backend.poses, truth) < 0.5 * drifted
 
 
-def test_what_is_not_believed_costs_nothing_and_pulls_at_nothing():
-    backend, truth = Backend(EVERY), roundabout(220)
-    drive_roundabout(backend, truth)
-    backend.add_loop(seen(truth, 3, 203))
-    improvement = backend.update(PLENTY)
-    assert improvement.cost == pytest.approx(0.0, abs=1e-6)
-    rows = backend.loop_states().rows
-    assert_array_equal(improvement.dual.reshape(-1, 3)[rows], 0)
-    assert len(improvement.dual) == 3 * len(backend.snapshot().graph.between)
-
-
 def test_the_dual_of_each_factor_is_at_its_own_rows(careful):
     """What is believed pulls this way or that, wherever lies stand between it."""
     backend, world = Backend(EVERY), spoilt(careful, 'random', 130)
@@ -447,6 +413,7 @@ def test_the_dual_of_each_factor_is_at_its_own_rows(careful):
     dual = improvement.dual.reshape(-1, 3)
     residual = whitened_residual(graph, backend.poses).reshape(-1, 3)
     assert_array_equal(dual[~accepted], 0)
+    assert improvement.cost == pytest.approx(np.abs(residual[accepted]).sum())
     clear = np.abs(residual[accepted]) > 0.2
     assert (np.sign(dual) == np.sign(residual))[accepted][clear].mean() > 0.95
 
@@ -481,18 +448,11 @@ def test_each_loop_has_a_state_and_its_own_stamps(careful):
 # An earlier run
 
 
-def restored(world, n):
-    """Return the first n keyframes as one run left them, and a run that goes on from there."""
-    first, second = Backend(EVERY), Backend(EVERY)
-    play(first, world, 0, n)
-    settled(first)
-    second.restore(first.saved())
-    return first, second
-
-
 def test_after_a_restore_odometry_may_begin_anywhere(world):
     """The robot stands where the first run ended; a loop then ties the new to the old."""
-    _, backend = restored(world, 80)
+    first, backend = played(world, 0, 80), Backend(EVERY)
+    settled(first)
+    backend.restore(first.saved())
     end = backend.poses[79:80]
     for k in range(5):
         raw = np.array([[50.0, 60.0 + k, np.pi / 2]])  # 1 m ahead each
@@ -515,8 +475,7 @@ def test_after_a_restore_odometry_may_begin_anywhere(world):
 
 
 def test_the_dual_of_old_rows_is_kept_and_new_rows_start_at_zero(world):
-    backend = Backend(CREDULOUS)
-    play(backend, world, 0, 100)
+    backend = played(world, 0, 100, options=CREDULOUS)
     improvement = improve(backend.snapshot().problem(), EVERY.solver, PLENTY)
     backend.adopt(improvement)
     rows = len(improvement.dual)
@@ -530,11 +489,9 @@ def test_the_dual_of_old_rows_is_kept_and_new_rows_start_at_zero(world):
 
 
 def test_a_warm_update_does_more_with_little_work_than_a_cold_one(world):
-    warm, cold = Backend(CREDULOUS), Backend(CREDULOUS)
-    play(warm, world, 0, 149)
+    warm, cold = (played(world, 0, last, CREDULOUS) for last in (149, None))
     settled(warm)
     play(warm, world, 149)
-    play(cold, world)
     options = OptimiserOptions(outer_iterations=2, inner=PrimalDualOptions(iterations=100))
     first, second = (improve(backend.snapshot().problem(), options, PLENTY)
                      for backend in (warm, cold))
@@ -542,19 +499,6 @@ def test_a_warm_update_does_more_with_little_work_than_a_cold_one(world):
     assert first.cost_before < 0.2 * second.cost_before
     assert first.reweighted_steps == 0 < second.reweighted_steps
     assert first.cost / best - 1 < 0.5 * (second.cost / best - 1)
-
-
-def test_the_account_of_an_update_is_true(world):
-    backend = Backend(CREDULOUS)
-    play(backend, world, 0, 80)
-    problem = backend.snapshot().problem()
-    improvement = improve(problem, EVERY.solver, PLENTY)
-    assert improvement.cost_before == cost(problem.graph, problem.poses)
-    assert improvement.cost == cost(problem.graph, improvement.poses)
-    assert improvement.cost <= improvement.cost_before
-    assert improvement.reweighted_steps >= 1
-    backend.adopt(improvement)
-    assert backend.snapshot().problem().last_cost == improvement.cost
 
 
 # Options and errors
@@ -575,8 +519,7 @@ def test_what_was_judged_by_other_options_is_not_adopted(careful):
 
 @pytest.mark.parametrize('name', ['poses', 'dual', 'cost'])
 def test_what_is_not_finite_is_not_adopted(world, name):
-    backend = Backend(EVERY)
-    play(backend, world, 0, 40)
+    backend = played(world, 0, 40)
     settled(backend)
     before = backend.poses
     play(backend, world, 40, 60)
@@ -626,8 +569,7 @@ def test_work_can_be_stopped_at_many_moments(careful, work):
 def test_a_large_map_comes_to_rest_though_no_update_ends_by_its_tests(world):
     """As where the budget is over after one linearisation, update after update."""
     options = replace(EVERY, solver=OptimiserOptions(outer_iterations=1))
-    backend = Backend(options)
-    play(backend, world)
+    backend = played(world, options=options)
     settled(backend)
     assert backend.snapshot().problem().settled
     assert backend.snapshot().optimised.quiet_updates >= 5
@@ -637,8 +579,7 @@ def test_a_large_map_comes_to_rest_though_no_update_ends_by_its_tests(world):
 
 
 def test_options_may_change_on_the_way(world):
-    backend = Backend(EVERY)
-    play(backend, world, 0, 40)
+    backend = played(world, 0, 40)
     settled(backend)
     poses = backend.poses
     backend.set_options(BackendOptions(
@@ -655,14 +596,10 @@ def test_whether_loops_are_doubted_can_be_changed_while_it_runs():
         backend.add_odometry(odometry(k * PERIOD, (float(k), 0.1 * (k % 3), 0.01 * (k % 5)),
                                       1e-4 * np.eye(6)))
     backend.add_loop(loop(5 * PERIOD, 50 * PERIOD, (0.0, 0.0, 0.0), 1e-4 * np.eye(6)))
-    settled(backend)
-    assert LOOP_STATES[backend.loop_states().state[0]] == 'accepted'
-    backend.set_options(EVERY)
-    settled(backend)
-    assert LOOP_STATES[backend.loop_states().state[0]] == 'rejected'
-    backend.set_options(CREDULOUS)
-    settled(backend)
-    assert LOOP_STATES[backend.loop_states().state[0]] == 'accepted'
+    for options, state in ((CREDULOUS, ACCEPTED), (EVERY, REJECTED), (CREDULOUS, ACCEPTED)):
+        backend.set_options(options)
+        settled(backend)
+        assert backend.loop_states().state.tolist() == [state]
 
 
 @pytest.mark.parametrize('dimension', [2, 3])

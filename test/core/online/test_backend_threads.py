@@ -1,27 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Threads that meet at the back end: what one of them sees is whole, whatever the others do."""
 
+import os
 import threading
 import time
 from dataclasses import fields
 
 import numpy as np
 import pytest
-from problems import covariance6, loop, odometry
+from problems import EVERY, covariance6, drive_on, loop, odometry, straight
 
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.online.backend import Backend, BackendOptions
-from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED
 from l1slam_ros.core.online.update import Improvement, improve
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.core.online.upkeep.threads import Background
 from l1slam_ros.core.solvers.optimality import l1_cost
 
-OPTIONS = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 DEADLINE = 30.0
 # [s] What another thread would do at once if nothing held it up.
 MOMENT = 0.3
@@ -50,9 +50,7 @@ class Meeting:
 
 
 def drive(backend, first, last):
-    for k in range(first, last):
-        backend.add_odometry(odometry(float(k + 1), (float(k), 0.0, 0.0),
-                                      covariance6(1e-4 * np.eye(3))))
+    drive_on(backend, straight(last), first, covariance6(1e-4 * np.eye(3)), 1.0, 1.0)
 
 
 def meanwhile(work):
@@ -62,7 +60,7 @@ def meanwhile(work):
 
 
 def test_nobody_sees_a_keyframe_without_its_odometry(monkeypatch):
-    backend, meeting, add_poses = Backend(OPTIONS), Meeting(), FactorGraph.add_poses
+    backend, meeting, add_poses = Backend(EVERY), Meeting(), FactorGraph.add_poses
     drive(backend, 0, 1)
 
     def slowly(graph, count=1):
@@ -78,7 +76,7 @@ def test_nobody_sees_a_keyframe_without_its_odometry(monkeypatch):
 
 
 def test_nobody_sees_the_front_of_one_map_with_the_poses_of_another(monkeypatch):
-    backend, meeting = Backend(OPTIONS), Meeting()
+    backend, meeting = Backend(EVERY), Meeting()
     drive(backend, 0, 30)
     backend.update(DEADLINE, go_on)
     backend.add_loop(loop(1.0, 30.0, (28.9, 0.0, 0.0), 1e-8 * np.eye(6)))
@@ -105,7 +103,7 @@ def test_nobody_sees_the_front_of_one_map_with_the_poses_of_another(monkeypatch)
 
 
 def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):
-    backend, meeting = Backend(OPTIONS), Meeting()
+    backend, meeting = Backend(EVERY), Meeting()
     drive(backend, 0, 5)
     ended = []
 
@@ -137,7 +135,7 @@ def patient(problem, options, budget, check, exact):
 
 @pytest.mark.parametrize('interrupt', ['reset', 'restore', 'settle', 'stopped'])
 def test_an_update_is_interrupted_at_once(monkeypatch, interrupt):
-    backend, stopped, begun = Backend(OPTIONS), threading.Event(), threading.Event()
+    backend, stopped, begun = Backend(EVERY), threading.Event(), threading.Event()
     drive(backend, 0, 5)
     now = backend.saved()
 
@@ -165,7 +163,7 @@ def test_an_update_is_interrupted_at_once(monkeypatch, interrupt):
 
 
 def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
-    backend = Backend(OPTIONS)
+    backend = Backend(EVERY)
     drive(backend, 0, 30)
 
     def settle():
@@ -190,7 +188,7 @@ def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
     drive(backend, 30, 31)
     assert settle() > 0 and len(backend.snapshot().poses) == 31
     # A loop that waits for odometry which makes no keyframe.
-    backend.set_options(BackendOptions(KeyframeOptions(1e6, 0.0, 0.0), OPTIONS.odometry))
+    backend.set_options(BackendOptions(KeyframeOptions(1e6, 0.0, 0.0), EVERY.odometry))
     backend.add_loop(loop(2.0, 33.0, (30.9, 0.0, 0.0), 1e-4 * np.eye(6)))
     assert settle() == 0
     drive(backend, 32, 33)
@@ -212,7 +210,7 @@ def of_threads():
 
 
 def test_in_the_background_what_comes_is_judged_and_the_thread_ends():
-    with Backend(OPTIONS, background=True) as backend:
+    with Backend(EVERY, background=True) as backend:
         drive(backend, 0, 30)
         backend.add_loop(loop(1.0, 30.0, (28.9, 0.0, 0.0), 1e-4 * np.eye(6)))
         wait_until(lambda: backend.loop_states().state.tolist() == [ACCEPTED])
@@ -251,7 +249,7 @@ def drive_square(backend, side, more, rng):
 
 
 def test_a_square_that_closes_after_3000_keyframes_is_right_soon(rng):
-    with Backend(OPTIONS, background=True) as backend:
+    with Backend(EVERY, background=True) as backend:
         drive_square(backend, 750, 20, rng)
         wait_until(lambda: (backend.loop_states().state == ACCEPTED).sum() == 20)
         wait_until(lambda: backend.update(0.0) is None)
@@ -268,7 +266,7 @@ def test_a_square_that_closes_after_3000_keyframes_is_right_soon(rng):
 def test_the_background_makes_way(monkeypatch, end):
     begun = threading.Event()
     monkeypatch.setattr(upkeep, 'improve', lambda *a: begun.set() or patient(*a))
-    with Backend(OPTIONS, background=True) as backend:
+    with Backend(EVERY, background=True) as backend:
         drive(backend, 0, 5)
         assert begun.wait(DEADLINE)
         ended = meanwhile(getattr(backend, end))
@@ -276,6 +274,33 @@ def test_the_background_makes_way(monkeypatch, end):
         assert not ended.is_alive()
         assert len(of_threads()) == (end != 'close')
     assert not of_threads()
+
+
+def test_a_process_that_is_forked_has_a_back_end_at_rest(monkeypatch):
+    """Threads do not come along, what they have locked does: numba's lock, for one."""
+    begun, numba = threading.Event(), threading.Lock()
+
+    def improve(*arguments):
+        with numba:
+            begun.set()
+            patient(*arguments)
+
+    monkeypatch.setattr(upkeep, 'improve', improve)
+    with Backend(OPTIONS, background=True) as backend:
+        drive(backend, 0, 5)
+        assert begun.wait(DEADLINE)
+        begun.clear()
+        child = os.fork()
+        if not child:
+            try:
+                drive(backend, 5, 6)
+                backend.settle()
+                backend.close()
+            finally:
+                os._exit(numba.acquire(blocking=False) and len(backend.poses))
+        wait_until(lambda: os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT))
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 6
+        assert begun.wait(DEADLINE)
 
 
 def test_what_fails_in_the_background_is_raised_at_the_end(monkeypatch):
@@ -286,7 +311,7 @@ def test_what_fails_in_the_background_is_raised_at_the_end(monkeypatch):
         raise MemoryError('no more')
 
     monkeypatch.setattr(upkeep, 'improve', fail)
-    with pytest.raises(MemoryError, match='no more'), Backend(OPTIONS, background=True) as backend:
+    with pytest.raises(MemoryError, match='no more'), Backend(EVERY, background=True) as backend:
         drive(backend, 0, 5)
         assert failed.wait(DEADLINE)
     assert not of_threads()

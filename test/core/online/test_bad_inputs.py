@@ -1,11 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """What drivers and simulators really send, through the whole back end: the map goes on."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from problems import PERIOD, covariance6, loop, odometry, retold
+from problems import (
+    EVERY,
+    PERIOD,
+    covariance6,
+    hear,
+    loop,
+    messages,
+    odometry,
+    retold,
+    seconds,
+)
 
 from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
@@ -15,25 +28,18 @@ from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import read_graph_file
 
-EVERY = KeyframeOptions(0.0, 0.0, 0.0)
-
 
 def backend_after(graph, options, every=50, copies=1, spoil=lambda k, covariance: covariance):
     """Return the back end that heard a graph pose by pose and was updated, then settled."""
-    backend, factors = Backend(options), graph.between
-    roots = np.linalg.inv(factors.sqrt_information)
-    covariances = roots @ roots.transpose(0, 2, 1)
-    odometry_rows = np.flatnonzero(factors.is_odometry)
-    step = dict(zip(factors.j[odometry_rows].tolist(), odometry_rows.tolist(), strict=True))
-    for k, pose in enumerate(odometry_poses(graph)):
-        covariance = covariances[step[k]] if k else np.zeros((3, 3))
-        backend.add_odometry(odometry(k * PERIOD, pose, covariance6(spoil(k, covariance))))
-        for row in np.flatnonzero((factors.j == k) & ~factors.is_odometry).tolist():
-            for _ in range(copies):
-                backend.add_loop(loop(factors.i[row] * PERIOD, k * PERIOD,
-                                      factors.measurement[row], covariance6(covariances[row])))
+    backend = Backend(options)
+    for message in messages(graph, odometry_poses(graph)):
+        if isinstance(message, LoopClosure):
+            hear(backend, copies * [message])
+            continue
+        k = round(message.stamp / seconds(PERIOD))
         if k % every == 0:
             backend.update(0.1)
+        backend.add_odometry(replace(message, covariance=spoil(k, message.covariance)))
     backend.settle()
     return backend
 
@@ -41,10 +47,10 @@ def backend_after(graph, options, every=50, copies=1, spoil=lambda k, covariance
 @pytest.mark.parametrize('robust', [True, False])
 def test_intel_with_absurd_variances_and_every_loop_five_times(datasets, robust):
     graph = read_graph_file(datasets / 'intel.g2o').graph
-    options = BackendOptions(EVERY, OdometryOptions('increment'), robust=RobustOptions(robust))
+    options = replace(EVERY, robust=RobustOptions(robust))
     rng = np.random.default_rng(0)
     absurd = dict(zip(rng.permutation(np.arange(1, 943))[:80].tolist(),
-                      40 * [1e12 * np.eye(3), 1e-20 * np.eye(3)], strict=True))
+                      40 * [covariance6(v * np.eye(3)) for v in (1e12, 1e-20)], strict=True))
     clean = backend_after(graph, options)
     spoiled = backend_after(graph, options, 30, 5, lambda k, sound: absurd.get(k, sound))
     assert len(spoiled.poses) == 943
@@ -126,7 +132,7 @@ def test_loops_without_noise_are_believed(lies, rng):
 @pytest.mark.parametrize('lies', [1001])
 def test_loops_without_noise_while_the_map_grows(lies, rng):
     graph, truth = exact_world(600, 1600, rng, lies)
-    backend = backend_after(graph, BackendOptions(EVERY, OdometryOptions('increment')), 5)
+    backend = backend_after(graph, EVERY, 5)
     off = np.hypot(*(se2.between(backend.poses[:1], backend.poses)
                      - se2.between(truth[:1], truth))[:, :2].T)
     assert off.max() < 0.5

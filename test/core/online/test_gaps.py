@@ -1,25 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where odometry does not go on from where it was, a part of the map begins that loops join."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from lies import position_error
 from numpy.testing import assert_allclose, assert_array_equal
-from problems import PERIOD, covariance6, curve, loop, loops_of, odometry, seconds
+from problems import (
+    EVERY,
+    PERIOD,
+    curve,
+    drive_on,
+    hear,
+    loop,
+    loops_of,
+    messages,
+    odometry,
+    seconds,
+    straight,
+)
 
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.graph.parts import odometry_gaps
-from l1slam_ros.core.online.backend import Backend, BackendOptions
+from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.graph_builder import GraphBuilder
-from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
-EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 N, HALF = 200, 100
 
 
@@ -28,26 +40,14 @@ def world():
     return simulate_world(N, 420, WorldOptions(), np.random.default_rng(3))
 
 
-def messages(world):
-    """Return samples and loops of a world, in order: keyframe k is at 1 s + k PERIOD."""
-    factors = world.graph.between
-    covariance = np.linalg.inv(factors.sqrt_information.transpose(0, 2, 1)
-                               @ factors.sqrt_information)
-    found = [(0, odometry(1.0, world.odometry[0]))]
-    for row in range(len(factors)):
-        i, j = factors.i[row], factors.j[row]
-        time, stated = 1.0 + j * PERIOD, covariance6(covariance[row])
-        found.append((j, odometry(time, world.odometry[j], stated) if factors.is_odometry[row]
-                      else loop(1.0 + i * PERIOD, time, factors.measurement[row], stated)))
-    return [message for _, message in sorted(found, key=lambda one: one[0])]
+@pytest.fixture(scope='module')
+def recording(world):
+    """Samples and loops of the world, keyframe k at 1 s + k `PERIOD`."""
+    return [*messages(world.graph, world.odometry, start=1.0)]
 
 
 def fed(backend, found):
-    for message in found:
-        if isinstance(message, LoopClosure):
-            backend.add_loop(message)
-        else:
-            backend.add_odometry(message)
+    hear(backend, found)
     backend.update(0.01)
     backend.settle()
     return backend
@@ -72,15 +72,15 @@ def moved(found, frame, back=0.0):
 
 
 @pytest.fixture(scope='module')
-def undisturbed(world):
-    return fed(Backend(EVERY), messages(world)).poses
+def undisturbed(recording):
+    return fed(Backend(EVERY), recording).poses
 
 
 @pytest.mark.parametrize('frame, back', [((0.0, 0, 0), 0.0), ((5e8, 1e5, 1.0), 0.0),
                                          ((0.0, 0, 0), 5.0)],
                          ids=['restart', 'teleport', 'clock'])
-def test_the_map_is_that_of_an_undisturbed_drive(world, undisturbed, frame, back):
-    backend = fed(Backend(EVERY), moved(messages(world), frame, back))
+def test_the_map_is_that_of_an_undisturbed_drive(world, recording, undisturbed, frame, back):
+    backend = fed(Backend(EVERY), moved(recording, frame, back))
     now = backend.snapshot()
     assert now.gaps.tolist() == [HALF] and odometry_gaps(now.graph).tolist() == [HALF - 1]
     assert len(now.poses) == N and (np.diff(now.stamps) < 0).sum() == (back > 0)
@@ -90,10 +90,9 @@ def test_the_map_is_that_of_an_undisturbed_drive(world, undisturbed, frame, back
     assert error < 1.3 * least + 0.02
 
 
-def test_played_twice_it_is_one_map_with_twice_the_odometry(world, undisturbed):
+def test_played_twice_it_is_one_map_with_twice_the_odometry(world, recording, undisturbed):
     """The loops are known, and what they say is in the first part; the second is odometry."""
-    twice = messages(world)
-    backend = fed(Backend(EVERY), twice + twice)
+    backend = fed(Backend(EVERY), recording + recording)
     now, loops = backend.snapshot(), len(world.graph.between) - N + 1
     assert now.gaps.tolist() == [N] and len(now.graph.between) == 2 * (N - 1) + loops
     assert backend.counts()[1] == {'repeated': loops}
@@ -107,10 +106,8 @@ def test_played_twice_it_is_one_map_with_twice_the_odometry(world, undisturbed):
 def test_until_loops_join_it_a_part_begins_where_the_last_one_ends():
     poses = curve(60)
     builder = GraphBuilder(se2, EVERY)
-    for k, pose in enumerate(poses[:40]):
-        builder.add_odometry(odometry(100.0 + k * PERIOD, pose))
-    for k, pose in enumerate(poses[40:]):
-        builder.add_odometry(odometry(101.0 + k * PERIOD, pose))
+    drive_on(builder, poses[:40], start=100.0)
+    drive_on(builder, poses[40:], start=101.0)
     assert builder.notes.warned == {'new_part': 1} and not +builder.notes.refused
     assert builder.track.gaps.tolist() == [40] and builder.graph.n_poses == 60
     assert len(builder.graph.between) == 58
@@ -124,9 +121,8 @@ def test_until_loops_join_it_a_part_begins_where_the_last_one_ends():
 def test_a_stamp_is_of_the_part_that_the_robot_is_in_if_that_goes_back_so_far(
         reference, stamp, ends):
     builder = GraphBuilder(se2, EVERY)
-    for first in (100.0, 101.0):
-        for k, pose in enumerate(curve(40)[: 40 if first == 100 else 20]):
-            builder.add_odometry(odometry(first + k * PERIOD, pose))
+    drive_on(builder, curve(40), start=100.0)
+    drive_on(builder, curve(20), start=101.0)
     builder.add_loop(loop(reference, stamp, (1.0, 0.0, 0.0)))
     assert builder.add_due_loops() == 1
     assert loops_of(builder)[:2] == ([ends[0]], [ends[1]])
@@ -135,12 +131,10 @@ def test_a_stamp_is_of_the_part_that_the_robot_is_in_if_that_goes_back_so_far(
 def test_loops_that_came_before_the_clock_was_set_back_are_of_their_time():
     """Also one that waits then for a time that never comes, until the second part has it."""
     builder = GraphBuilder(se2, EVERY)
-    for k, pose in enumerate(curve(20)):
-        builder.add_odometry(odometry(100.0 + k * PERIOD, pose))
+    drive_on(builder, curve(20), start=100.0)
     builder.add_loop(loop(100.1, 101.5, (1.0, 0.0, 0.0)))
     builder.add_loop(loop(100.1, 102.5, (1.0, 0.0, 0.0)))
-    for k, pose in enumerate(curve(30)):
-        builder.add_odometry(odometry(100.0 + k * PERIOD, pose))
+    drive_on(builder, curve(30), start=100.0)
     builder.add_due_loops()
     assert loops_of(builder)[:2] == ([1, 21], [15, 45])
 
@@ -148,10 +142,9 @@ def test_loops_that_came_before_the_clock_was_set_back_are_of_their_time():
 def test_near_a_gap_nothing_is_carried_across_it():
     """The time is nearer to the first keyframe of the second part than to its own."""
     builder = GraphBuilder(se2, replace(EVERY, keyframe=KeyframeOptions(0.5, 0.0, 0.0)))
-    for k in range(14):
-        builder.add_odometry(odometry(1.0 + k * PERIOD, (0.1 * k, 0.0, 0.0)))
-    for k in range(14, 30):
-        builder.add_odometry(odometry(1.0 + k * PERIOD, (1e6 + 0.1 * k, 0.0, 0.0)))
+    poses = straight(30, 0.1)
+    poses[14:, 0] += 1e6
+    drive_on(builder, poses, start=1.0)
     builder.add_loop(loop(1.0, 2.3, (1.3, 0.0, 0.0)))
     builder.add_due_loops()
     assert builder.track.keyframe_stamps[[2, 3]].tolist() == [seconds(2.0), seconds(2.4)]
@@ -178,12 +171,11 @@ def test_one_old_stamp_is_dropped_and_two_near_ones_too():
     ('new_segment', 60, 39.0), ('reset', 20, 0.0), ('ignore', 40, None)])
 def test_what_becomes_of_the_map_is_the_users_to_say(choice, poses, x):
     backend = Backend(replace(EVERY, on_time_jump=choice))
-    for first, count in ((100.0, 40), (100.0, 20)):
-        for k in range(count):
-            try:
-                backend.add_odometry(odometry(first + k * PERIOD, (float(k), 0.0, 0.0)))
-            except MessageError:
-                assert choice == 'ignore' and first == 100.0
+    for count in 40, 20:
+        for k, pose in enumerate(straight(count)):
+            refused = choice == 'ignore' and count == 20
+            with pytest.raises(MessageError) if refused else nullcontext():
+                backend.add_odometry(odometry(100.0 + k * PERIOD, pose))
         backend.settle()
     assert len(backend.poses) == poses
     if x is not None:
@@ -192,24 +184,24 @@ def test_what_becomes_of_the_map_is_the_users_to_say(choice, poses, x):
         assert_allclose(se2.compose(robot.map_to_odom, robot.odometry)[0, 0], x + 19, atol=1e-9)
 
 
-def test_a_saved_map_keeps_its_parts(world):
-    one, second = fed(Backend(EVERY), moved(messages(world), (0.0, 0.0, 0.0), 5.0)), Backend(EVERY)
+def test_a_saved_map_keeps_its_parts(recording):
+    one, second = fed(Backend(EVERY), moved(recording, (0.0, 0.0, 0.0), 5.0)), Backend(EVERY)
     first = one.snapshot()
     second.restore(one.saved())
     assert second.snapshot().gaps.tolist() == [HALF]
     assert_array_equal(second.snapshot().stamps, first.stamps)
     # Another recording, made earlier, is a part of its own.
-    for k in range(5):
-        second.add_odometry(odometry(0.5 + k * PERIOD, (7.0 + k, 0.0, 0.0)))
+    drive_on(second, straight(5), start=0.5)
     assert second.snapshot().gaps.tolist() == [HALF, N]
     assert_allclose(second.poses[N], first.poses[-1], atol=1e-9)
 
 
 @pytest.mark.parametrize('choice, gaps', [
     ('new_segment', [HALF]), ('reset', []), ('ignore', [])])
-def test_a_robot_carried_off_while_its_map_was_saved_is_where_loops_say(world, choice, gaps):
+def test_a_robot_carried_off_while_its_map_was_saved_is_where_loops_say(
+        world, recording, choice, gaps):
     """What begins elsewhere begins a part; or, by the user's word, where the robot was."""
-    unseen, found = 40, list(moved(messages(world), (50.0, 60.0, 1.0)))
+    unseen, found = 40, list(moved(recording, (50.0, 60.0, 1.0)))
     first, last = seconds(1.0 + HALF * PERIOD), seconds(1.0 + (HALF + unseen) * PERIOD)
     # Times that nobody saw no loop can be of.
     def seen(message):
@@ -236,14 +228,13 @@ def struck(one):
 
 @pytest.mark.parametrize('when', ['before', 'after'])
 @pytest.mark.parametrize('robust', [True, False])
-def test_a_loop_that_is_struck_out_is_never_used(world, when, robust):
-    found = messages(world)
+def test_a_loop_that_is_struck_out_is_never_used(recording, when, robust):
     backend = Backend(replace(EVERY, robust=replace(EVERY.robust, enabled=robust)))
-    loops = [one for one in found if isinstance(one, LoopClosure)]
+    loops = [one for one in recording if isinstance(one, LoopClosure)]
     victim = loops[40]
     if when == 'before':
         backend.add_loop(struck(victim))
-    fed(backend, found)
+    fed(backend, recording)
     if when == 'after':
         before = backend.poses
         backend.add_loop(struck(victim))
@@ -261,10 +252,9 @@ def test_a_loop_that_is_struck_out_is_never_used(world, when, robust):
     assert backend.loop_states().state[row] == ACCEPTED
 
 
-def test_whoever_vouches_after_the_fact_adds_no_second_factor(world):
-    found = messages(world)
+def test_whoever_vouches_after_the_fact_adds_no_second_factor(recording):
     absurd = loop(2.0, 9.0, (50.0, 0.0, 0.0), 1e-2 * np.eye(6))
-    backend = fed(Backend(EVERY), [*found[:200], absurd])
+    backend = fed(Backend(EVERY), [*recording[:200], absurd])
     count = len(backend.snapshot().graph.between)
     assert backend.loop_states().state[-1] == REJECTED
     backend.add_loop(replace(absurd, trusted=True))

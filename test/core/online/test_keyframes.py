@@ -87,21 +87,14 @@ def test_the_plane_takes_rows_x_y_and_yaw(rng):
 # The model
 
 
-def test_the_model_grows_with_the_way_and_the_turn():
-    """3 + 4 m and .5 + .25 rad travelled, not the 1 m and .25 rad between the ends."""
-    motion = motion_of([(3.0, 0, 0.5), (-4.0, 0, -0.25)], MODEL)
+@pytest.mark.parametrize('increments, way, turn', [
+    # 3 + 4 m and .5 + .25 rad travelled, not the 1 m and .25 rad between the ends.
+    ([(3.0, 0, 0.5), (-4.0, 0, -0.25)], 0.7, 0.15), ([(0.0, 0, 0)] * 3, 0.0, 0.0)])
+def test_the_model_grows_with_the_way_and_the_turn_whatever_messages_say(increments, way, turn):
+    stated = [np.eye(6)] * len(increments)
+    motion = motion_of(increments, MODEL, stated, stated)
     assert_allclose(motion.covariance(MODEL), np.diag(
-        [0.7**2 + 0.03**2] * 2 + [0.15**2 + 0.04**2]))
-
-
-def test_the_model_of_a_robot_at_rest_is_its_floor():
-    motion = motion_of([(0.0, 0, 0)] * 3, MODEL)
-    assert_allclose(motion.covariance(MODEL), np.diag([0.03**2, 0.03**2, 0.04**2]))
-
-
-def test_the_model_does_not_listen_to_the_message():
-    motion = motion_of([(1.0, 0, 0)], MODEL, [np.eye(6)], [np.eye(6)])
-    assert_allclose(motion.covariance(MODEL)[0, 0], 0.1**2 + 0.03**2)
+        [way**2 + 0.03**2] * 2 + [turn**2 + 0.04**2]))
 
 
 # What messages say

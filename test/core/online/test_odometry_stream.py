@@ -21,6 +21,8 @@ from problems import (
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import FASTEST, LONGEST_PAUSE
+from l1slam_ros.core.graph.parts import bridged
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.io.bags.from_graph import write_graph_bag
@@ -184,13 +186,11 @@ def test_the_last_sample_is_held_and_said_not_lost_in_silence():
 @pytest.mark.parametrize('period', [1.0, 2.5, 30.0])
 def test_slow_odometry_passes(period):
     """Messages are confirmed one by the other; the last of a recording needs none."""
-    poses = curve(21)
-    builder, _ = fed([(1.0 + k * period, pose) for k, pose in enumerate(poses[:20])])
-    builder.finish()
-    assert builder.graph.n_poses == 20 and not builder.notes.refused and not builder.stream.held
-    builder, _ = fed([(1.0 + k * period, pose) for k, pose in enumerate(poses)])
-    builder.finish()
-    assert builder.graph.n_poses == 21 and not builder.notes.refused and not builder.stream.held
+    for n in 20, 21:
+        builder, _ = fed([(1.0 + k * period, pose) for k, pose in enumerate(curve(n))])
+        builder.finish()
+        assert builder.graph.n_poses == n
+        assert not builder.notes.refused and not builder.stream.held
 
 
 def test_one_old_header_is_dropped_while_another_sample_is_held():
@@ -244,12 +244,7 @@ def test_a_graph_of_odd_messages_comes_back_from_a_bag_exactly(tmp_path):
 def test_no_recorded_graph_is_taken_for_a_fault(datasets, name):
     """Its chain, a pose every .1 s and as fast as stamps can follow each other."""
     graph = read_graph_file(datasets / name).graph
-    factors = graph.between
-    rows = np.flatnonzero(factors.is_odometry)
-    steps = factors.measurement[rows[np.argsort(factors.i[rows])]]
-    poses = np.zeros((len(steps) + 1, 3))
-    for k, step in enumerate(steps):
-        poses[k + 1] = se2.compose(poses[k : k + 1], step[None])[0]
+    poses = odometry_poses(bridged(graph))
     for period in (0.1, 0.001):
         builder = GraphBuilder(se2, GraphBuilderOptions(KeyframeOptions(1e6, 0.0, 0.0)))
         for k, pose in enumerate(poses):

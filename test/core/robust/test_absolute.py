@@ -5,7 +5,16 @@ import numpy as np
 import pytest
 from gps import FRAME, seen
 from numpy.testing import assert_allclose
-from problems import PERIOD, add_absolute, covariance6, drive, graph_of, odometry, seconds
+from problems import (
+    PERIOD,
+    add_absolute,
+    covariance6,
+    drive,
+    drive_on,
+    graph_of,
+    seconds,
+    straight,
+)
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.first_fixes import first_fixes
@@ -113,8 +122,7 @@ def test_a_trusted_pose_stays_whatever_the_others_say(world):
 @pytest.mark.parametrize('trusted', [True, False])
 def test_a_running_map_comes_to_the_world_with_the_first_absolute_pose(robust, trusted):
     backend = Backend(BackendOptions.from_mapping({'robust': {'enabled': robust}}))
-    for k in range(20):
-        backend.add_odometry(odometry(k * PERIOD, (k, 0.0, 0.0)))
+    drive_on(backend, straight(20))
     backend.update()
     there = se2.compose(np.array([FRAME]), np.array([[10.0, 0.0, 0.0]]))
     backend.add_loop(LoopClosure(None, seconds(10 * PERIOD), se2.to_pose3(there)[0],

@@ -3,8 +3,7 @@
 
 import numpy as np
 import pytest
-from lies import careful_world, is_false, spoilt
-from problems import retold
+from lies import careful_world, is_false, slipped, spoilt
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import ends_in_time
@@ -13,26 +12,13 @@ from l1slam_ros.core.robust.pairwise_consistency import spanned, strongest_group
 from l1slam_ros.core.robust.rounds import Growth
 from l1slam_ros.core.robust.slips import SPANNING, common_steps
 
-STEP = 200
+# The robot turned by 90 degrees more, there.
+STEP, TURN = 200, (0, 0, np.pi / 2)
 
 
 @pytest.fixture(scope='module')
 def bad():
     return spoilt(careful_world(400, 800), 'random', 100)
-
-
-def slipped(graph, step):
-    """Return the graph, the robot turned by 90 degrees more at a step."""
-    return moved(graph, step, [0, 0, np.pi / 2])
-
-
-def moved(graph, step, more):
-    """Return the graph, its odometry wrong at a step."""
-    factors = graph.between
-    row = int(np.flatnonzero(factors.is_odometry & (factors.i == step))[0])
-    measurement = factors.measurement.copy()
-    measurement[row] = se2.retract(measurement[row][None], np.array([more], float))[0]
-    return retold(graph, measurement)
 
 
 def grown(graph):
@@ -46,7 +32,7 @@ def grown(graph):
 
 
 def test_loops_across_a_slip_agree(bad):
-    growth = grown(slipped(bad.graph, STEP))
+    growth = grown(slipped(bad.graph, STEP, TURN))
     group = strongest_group(growth, growth.undecided())
     assert len(group.places) >= SPANNING
     assert not is_false(bad, growth.factors)[group.rows].any()

@@ -4,23 +4,18 @@
 import numpy as np
 import pytest
 from lies import careful_world
+from problems import chain_of, graph_of, measure, straight
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust.places import neighbours_agree, places
 
 
-def straight(step, pairs, off):
+def corridor(step, pairs, off):
     """Return a drive along a line with loops that are wrong by so much [m], and its chain."""
     n = 1 + max(max(pair) for pair in pairs)
-    chain = np.column_stack((step * np.arange(n), np.zeros(n), np.zeros(n)))
-    graph, (i, j) = FactorGraph(se2), np.array(pairs).T
-    i, j = np.concatenate((np.arange(n - 1), i)), np.concatenate((np.arange(1, n), j))
-    Z = se2.between(chain[i], chain[j])
-    Z[n - 1:, 1] += off
-    graph.add_poses(n)
-    graph.add_between(i, j, Z, np.tile(np.eye(3), (len(i), 1, 1)))
-    return graph, chain
+    poses = straight(n, step)
+    graph = graph_of(poses, chain_of(n), 0.0, np.eye(3))
+    measure(graph, poses, *np.array(pairs).T, np.outer(off, [0.0, 1.0, 0.0]), np.eye(3))
+    return graph, poses
 
 
 @pytest.mark.parametrize('step, apart, same', [(0.1, 20, True), (0.1, 30, False), (2.0, 5, True),
@@ -28,7 +23,7 @@ def straight(step, pairs, off):
 def test_near_is_within_metres_or_within_ordinary_steps(step, apart, same):
     """5 m in sum where keyframes are dense, ten steps where they are far apart."""
     pairs = [(0, 300), (apart, 300 + apart)]
-    graph, chain = straight(step, pairs, np.zeros(2))
+    graph, chain = corridor(step, pairs, np.zeros(2))
     place, _ = places(graph, chain)
     assert (place[-1] == place[-2]) == same
 
@@ -36,7 +31,7 @@ def test_near_is_within_metres_or_within_ordinary_steps(step, apart, same):
 def test_a_run_is_one_place_and_what_claims_something_else_is_another():
     pairs = [(k, 200 + k) for k in range(50)] + [(25, 226)]
     off = np.concatenate((np.full(50, 3.0), [30.0]))
-    graph, chain = straight(1.0, pairs, off)
+    graph, chain = corridor(1.0, pairs, off)
     place = places(graph, chain)[0][-51:]
     assert len(set(place[:50].tolist())) == 1 and place[50] not in place[:50]
 

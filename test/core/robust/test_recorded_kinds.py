@@ -6,11 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from lies import careful_world, is_false, position_error, spoilt
-from problems import retold
+from problems import chain_of, graph_of, retold
 from torn import shifted_runs
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.robust.batch import judge, robust_solve
 from l1slam_ros.core.robust.batch_map import SolveOptions
@@ -32,7 +30,7 @@ def test_a_corridor_taken_for_another_does_not_pass_for_a_slip(world, runs):
 
 
 @pytest.mark.parametrize('odometry, loops', [(1e-4, 1), (1e4, 1), (1, 1e-4), (1, 1e4),
-                                             (1e-6, 1e-6), (1e6, 1e6)])
+                                             (1e-6, 1e-6), (0.01, 0.01), (1e6, 1e6)])
 def test_misstated_information_changes_no_decision(world, odometry, loops):
     bad = spoilt(world, 'random', 401)
     factors = bad.graph.between
@@ -42,7 +40,8 @@ def test_misstated_information_changes_no_decision(world, odometry, loops):
     assert not found.accepted[false].any()
     assert np.count_nonzero(~found.accepted[~false]) <= 8
     # In hundreds: how noisy the odometry is shows only where loops check it.
-    np.testing.assert_allclose(np.log10(found.variance / [odometry, loops]), 0, atol=1.0)
+    within = 0.15 if odometry == loops else 1.0
+    np.testing.assert_allclose(np.log10(found.variance / [odometry, loops]), 0, atol=within)
 
 
 def test_a_graph_that_says_all_twice_is_believed(world):
@@ -74,16 +73,13 @@ def test_one_place_that_carries_all_is_doubtful_and_a_few_loops_are_not():
     n, loops = 600, 20
     angle = 2 * np.pi * np.arange(n + loops) / n
     truth = np.column_stack((95 * np.cos(angle), 95 * np.sin(angle), angle))
-    k, back = np.arange(n + loops - 1), np.arange(loops)
-    i, j = np.concatenate((k, back)), np.concatenate((k + 1, back + n))
-    noise = np.random.default_rng(0).standard_normal((len(i), 3)) * [0.05, 0.05, 0.005]
-    graph = FactorGraph(se2)
-    graph.add_poses(len(truth))
-    graph.add_between(i, j, se2.retract(se2.between(truth[i], truth[j]), noise),
-                      np.tile(np.diag([400.0, 400.0, 4e4]), (len(i), 1, 1)))
+    chain, back = chain_of(n + loops), np.arange(loops)
+    pairs = np.concatenate((chain, np.column_stack((back, back + n))))
+    noise = np.random.default_rng(0).standard_normal((len(pairs), 3)) * [0.05, 0.05, 0.005]
+    graph = graph_of(truth, pairs, noise, np.diag([400.0, 400.0, 4e4]))
     found, _ = robust_solve(graph)
     assert ONE_PLACE in [doubt.kind for doubt in found.doubts]
-    few, _ = robust_solve(graph.subset(np.arange(len(k) + 3)))
+    few, _ = robust_solve(graph.subset(np.arange(len(chain) + 3)))
     assert not few.doubts
 
 

@@ -4,10 +4,9 @@
 import numpy as np
 import pytest
 from lies import careful_world
+from problems import chain_of, graph_of, measure, straight
 
-from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.draws import keys
-from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust import innovation
 from l1slam_ros.core.robust.rounds import Growth
 
@@ -31,6 +30,7 @@ def test_few_true_loops_are_beyond_the_gate(monkeypatch):
     assert asked / 10_000 < refused < asked / 1000
 
 
+SURE = np.diag([1e4, 1e4, 1e6])
 ROUND = 4000  # keyframes of a round so wide that one loop back to its start could be chance
 
 
@@ -39,15 +39,9 @@ def two_loops(apart):
     n = ROUND + 100
     angle, radius = 2 * np.pi * np.arange(n) / ROUND, ROUND / (2 * np.pi)
     truth = np.column_stack((radius * np.sin(angle), radius * (1 - np.cos(angle)), angle))
-    graph, i = FactorGraph(se2), np.arange(n - 1)
-    graph.add_poses(n)
-    information = np.diag(np.array([0.085, 0.085, 0.0085]) ** -2)
-    graph.add_between(i, i + 1, se2.between(truth[:-1], truth[1:]),
-                      np.tile(information, (n - 1, 1, 1)))
+    graph = graph_of(truth, chain_of(n), 0.0, np.diag(np.array([0.085, 0.085, 0.0085]) ** -2))
     start = np.array([10, 31])
-    seen = se2.between(truth[start], truth[start + ROUND])
-    seen = se2.retract(seen, np.array([[0.0, 0.0, 0.0], [apart, 0.0, 0.0]]))
-    graph.add_between(start, start + ROUND, seen, np.tile(np.diag([1e4, 1e4, 1e6]), (2, 1, 1)))
+    measure(graph, truth, start, start + ROUND, [[0.0, 0, 0], [apart, 0, 0]], SURE)
     return graph
 
 
@@ -67,15 +61,9 @@ def test_two_loops_vouch_for_each_other_only_within_the_gate_of_both(apart, beli
 
 def test_lies_of_one_place_do_not_teach_their_noise():
     """Ten loops, all off by the same 8 m, where the odometry is sure of a decimetre."""
-    n = 60
-    graph, i = FactorGraph(se2), np.arange(n - 1)
-    truth = np.column_stack((np.arange(n), np.zeros((n, 2)))).astype(float)
-    graph.add_poses(n)
-    graph.add_between(i, i + 1, se2.between(truth[:-1], truth[1:]),
-                      np.tile(np.diag([1e4, 1e4, 1e6]), (n - 1, 1, 1)))
-    start = np.arange(10)
-    seen = se2.between(truth[start], truth[start + 50]) - [8.0, 0.0, 0.0]
-    graph.add_between(start, start + 50, seen, np.tile(np.diag([1e4, 1e4, 1e6]), (10, 1, 1)))
+    truth, start = straight(60), np.arange(10)
+    graph = graph_of(truth, chain_of(60), 0.0, SURE)
+    measure(graph, truth, start, start + 50, [-8.0, 0.0, 0.0], SURE)
     growth = Growth(graph)
     growth.begin()
     assert growth.variance[1] <= 1

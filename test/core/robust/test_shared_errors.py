@@ -3,11 +3,9 @@
 
 import numpy as np
 import pytest
-from lies import roundabout
+from lies import position_error, roundabout
+from problems import chain_of, graph_of, measure
 
-from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
-from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust import batch_map
 from l1slam_ros.core.robust.batch import judge, robust_solve
 from l1slam_ros.core.robust.places import err_together
@@ -38,22 +36,15 @@ COUNTS = np.array([50, *[8] * 7])
 
 def rounds_of(seed, shared, stated=1.0):
     """Return two rounds with loops that share a part of their error by place, and the truth."""
-    rng, truth, graph = np.random.default_rng(seed), roundabout(400), FactorGraph(se2)
-    graph.add_poses(len(truth))
+    rng, truth = np.random.default_rng(seed), roundabout(400)
     first = np.concatenate([start + np.arange(count) for start, count in zip(
         (0, *range(64, 190, 18)), COUNTS, strict=True)])
     own, common = (rng.standard_normal((m, 3)) for m in (COUNTS.sum(), len(COUNTS)))
     error = LOOP * (np.sqrt(1 - shared) * own + np.sqrt(shared) * common.repeat(COUNTS, axis=0))
-    k = np.arange(len(truth) - 1)
-    for i, j, e, sigma in ((k, k + 1, STEP * rng.standard_normal((len(k), 3)), STEP),
-                           (first, first + 200, error, stated * LOOP)):
-        graph.add_between(i, j, se2.retract(se2.between(truth[i], truth[j]), e),
-                          np.tile(np.diag(sigma**-2), (len(i), 1, 1)))
+    noise = STEP * rng.standard_normal((399, 3))
+    graph = graph_of(truth, chain_of(400), noise, np.diag(STEP**-2))
+    measure(graph, truth, first, first + 200, error, np.diag((stated * LOOP) ** -2))
     return graph, truth
-
-
-def ate(poses, truth):
-    return absolute_trajectory_error(se2.positions(poses), se2.positions(truth))
 
 
 def solved(graph, robust):
@@ -68,7 +59,7 @@ def test_loops_that_err_together_are_worth_one_in_the_map():
         all_said, judged = solved(graph, False), solved(graph, True)
         assert judged.judgement.accepted.all() and not judged.judgement.is_noise_stated
         assert judged.solution.cost > all_said.solution.cost
-        errors += [ate(map_.solution.poses, truth) for map_ in (judged, all_said)]
+        errors += [position_error(map_.solution.poses, truth) for map_ in (judged, all_said)]
     assert errors[0] < 0.9 * errors[1]
 
 

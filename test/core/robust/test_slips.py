@@ -3,12 +3,11 @@
 
 import numpy as np
 import pytest
-from lies import careful_world, spoilt
-from problems import retold
-from test_pairwise_consistency import STEP, grown, moved, slipped
+from lies import careful_world, slipped, spoilt
+from problems import chain_of, graph_of, retold, straight
+from test_pairwise_consistency import STEP, TURN, grown
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.motion import log_odds_of_slips, usual_motion
@@ -27,7 +26,7 @@ def repaired(graph):
 
 
 def test_a_slip_is_cut_and_loops_come_in(bad):
-    growth = grown(slipped(bad.graph, STEP))
+    growth = grown(slipped(bad.graph, STEP, TURN))
     before, loops = growth.cut.copy(), np.count_nonzero(growth.accepted & growth.is_loop)
     found = without_slip(growth, growth)
     (cut,) = np.flatnonzero(found.cut)
@@ -44,29 +43,23 @@ def test_without_a_slip_nothing_is_left_out(bad):
                                            ([150, 230], [0.0, 0.0, 1.5])])
 def test_two_slips_are_found_together(bad, steps, offset):
     """Each bends what the loops across the other one say."""
-    graph = bad.graph
-    for step in steps:
-        graph = moved(graph, step, offset)
+    graph = slipped(bad.graph, steps, offset)
     judgement, _ = robust_solve(graph)
     assert graph.between.i[judgement.slips].tolist() == steps
     assert not judgement.doubts
 
 
 @pytest.mark.parametrize('stated', [1.0, 10.0])
-def test_what_is_within_the_noise_as_stated_is_no_slip(stated):
+def test_what_is_within_the_noise_as_stated_is_no_slip(bad, stated):
     """40 sigmas are a slip; 4 are none, though loops that know better all speak against it."""
-    world, turn = spoilt(careful_world(400, 800), 'random', 100), np.array([[0.0, 0.0, 0.2]])
-    factors = world.graph.between
-    row, measurement = factors.is_odometry & (factors.i == STEP), factors.measurement.copy()
-    measurement[row] = se2.retract(measurement[row], turn)
-    graph = retold(world.graph, measurement, stated)
+    graph = retold(slipped(bad.graph, STEP, (0.0, 0.0, 0.2)), times=stated)
     slips = robust_solve(graph)[0].slips
     assert graph.between.i[slips].tolist() == ([] if stated > 1 else [STEP])
 
 
 def test_where_the_odometry_jumped_it_slipped(bad):
     """Nothing else tells: no loop is left that spans the step."""
-    growth = grown(moved(bad.graph, STEP, [5.0, 0.0, 0.0]))
+    growth = grown(slipped(bad.graph, STEP, (5.0, 0.0, 0.0)))
     odds = log_odds_of_slips(growth, usual_motion(growth))
     assert growth.low[np.argmax(odds)] == STEP and odds.max() > 0
     assert np.sort(odds)[-2] < -SURE
@@ -94,10 +87,6 @@ def test_a_robot_does_not_jump_because_lies_say_so(bad):
 
 
 def test_steps_all_alike_leave_no_tail():
-    graph = FactorGraph(se2)
-    graph.add_poses(31)
-    graph.add_between(np.arange(30), np.arange(1, 31), np.tile([[1.0, 0, 0]], (30, 1)),
-                      np.tile(np.eye(3), (30, 1, 1)))
-    motion = usual_motion(grown(graph))
+    motion = usual_motion(grown(graph_of(straight(31), chain_of(31), 0.0, np.eye(3))))
     like, jump = motion.log_density(np.array([[1.0, 0, 0], [9.0, 0, 0]]))
     assert np.isfinite([like, jump]).all() and like > jump + 10

@@ -92,7 +92,7 @@ def test_converged_means_that_little_is_left(world):
     """A hundred times as loose, a hundred times as far from the best, but for luck."""
     graph, truth = world
     best = solve_graph(graph, truth, tolerance=1e-10).costs[-1]
-    for tolerance in (1e-2, 1e-4, 1e-6):
+    for tolerance in (1e-3, 1e-5, 1e-7):
         optimum = solve_graph(graph, truth, tolerance=tolerance)
         assert optimum.status is Status.CONVERGED
         assert 0 <= optimum.costs[-1] / best - 1 <= tolerance + 1e-10
@@ -106,19 +106,6 @@ def test_an_exact_start_is_the_end(iterations, rng):
     assert optimum.status is Status.CONVERGED and len(optimum.costs) == 1
     assert_array_equal(optimum.poses, truth)
     assert optimum.gap <= optimum.costs[0]
-
-
-def test_a_loose_keyframe_stays_and_nothing_is_claimed(rng):
-    """The damping holds it, the rest is solved; there is no dual to prove it by."""
-    truth = drive(4, rng)
-    noise = 0.1 * rng.standard_normal((3, 3))
-    pairs = [(0, 1), (1, 2), (0, 2)]
-    optimum = solve_graph(graph_of(truth, pairs, noise), truth)
-    tied = solve_graph(graph_of(truth[:3], pairs, noise), truth[:3])
-    assert_array_equal(optimum.poses[3], truth[3])
-    assert optimum.costs[-1] == pytest.approx(tied.costs[-1], rel=1e-6)
-    assert_array_equal(optimum.y, 0)
-    assert optimum.gap == optimum.costs[-1]
 
 
 def test_where_there_is_no_direction_it_stalls_at_its_start(world):

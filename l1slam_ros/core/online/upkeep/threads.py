@@ -36,8 +36,8 @@ class Worker:
         self.busy = False
 
     def start(self, work: Callable[[], None]) -> None:
-        """Begin some work, unless some is under way."""
-        if self.busy:
+        """Begin some work, unless some is under way, or what the last one raised is not told."""
+        if self.busy or self._error is not None:
             return
         self.busy = True
         # Not a daemon: those are torn down within a compiled loop when the process ends.
