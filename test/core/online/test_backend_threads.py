@@ -286,7 +286,7 @@ def test_a_process_that_is_forked_has_a_back_end_at_rest(monkeypatch):
             patient(*arguments)
 
     monkeypatch.setattr(upkeep, 'improve', improve)
-    with Backend(OPTIONS, background=True) as backend:
+    with Backend(EVERY, background=True) as backend:
         drive(backend, 0, 5)
         assert begun.wait(DEADLINE)
         begun.clear()

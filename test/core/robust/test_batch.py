@@ -90,12 +90,13 @@ def test_a_trusted_loop_is_never_refused(world):
     assert robust_solve(retold(bad.graph, trusted=trusted))[0].accepted[lie]
 
 
-def test_the_same_graph_gives_the_same_answer(world):
+def test_the_same_graph_gives_the_same_answer_in_whatever_order_its_factors_came(world):
     graph = spoilt(world, 'grouped', 401).graph
-    (one, poses), (other, again) = robust_solve(graph), robust_solve(graph)
-    np.testing.assert_array_equal(poses, again)
-    np.testing.assert_array_equal(one.accepted, other.accepted)
-    np.testing.assert_array_equal(one.sigmas, other.sigmas)
+    order = np.random.default_rng(0).permutation(len(graph.between))
+    (one, poses), (other, again) = robust_solve(graph), robust_solve(graph.subset(order))
+    np.testing.assert_allclose(poses, again, atol=1e-6)
+    np.testing.assert_array_equal(one.accepted[order], other.accepted)
+    np.testing.assert_allclose(one.sigmas[order], other.sigmas, atol=1e-3)
 
 
 def test_odometry_may_be_noisier_than_it_says(world):
