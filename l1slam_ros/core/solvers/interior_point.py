@@ -23,7 +23,6 @@ predictor hardly a step (Cartis, "Some disadvantages of a Mehrotra-type primal-d
 interior point algorithm", 2009); the rest is ours, defended by `test_interior_point.py`.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -33,6 +32,7 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.l1_problem import Problem
 from l1slam_ros.core.graph.linear_system import LinearSystem
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
+from l1slam_ros.core.solvers.nonlinear import Report
 from l1slam_ros.core.solvers.optimality import L1, Norm, Status, fits_exactly, l1_cost, smoothing
 
 # How far to go towards the nearest bound.
@@ -58,8 +58,6 @@ _PROJECTIONS, _CLOSE = 10, 1e-4
 # A row at its bound still gives way a little, or there might be no feasible dual nearby. With a
 # tenth of it the proof misses by percents on the torus in space; in the plane it costs nothing.
 _LEAST_WEIGHT = 1e-2
-
-Report = Callable[[int, float], None]
 
 
 @dataclass
