@@ -12,9 +12,17 @@ from l1slam_ros.core.graph.tiles import Tiles
 from l1slam_ros.core.kernels import halpern as kernels
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
 from l1slam_ros.core.solvers.primal_dual import PrimalDualOptions, minimise_l1
-from l1slam_ros.core.solvers.restarted_pdhg import halpern_step, minimise_l1_halpern, scaled_system
+from l1slam_ros.core.solvers.restarted_pdhg import minimise_l1_halpern, scaled_system
 
 BLOCK_SIZES = [1, 2, 3, 6]
+
+
+def halpern_step(A, b, x, y, y0, weight, k):
+    """Return the next (x, y), k iterations after the restart, as the solver's page has it."""
+    d = A.T @ y / weight
+    y_bar = np.clip(y + weight * (A @ (x - 2 * d) - b), -1, 1)
+    a = (k + 1) / (k + 2)
+    return a * (x - 2 * d), a * (2 * y_bar - y) + (1 - a) * y0
 
 
 def chain_with_loops(k, rng, size=12, loops=20, absolute=2):
