@@ -13,12 +13,19 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.bags.from_graph import write_graph_bag
+from l1slam_ros.io.bags.reader import read_raw
+from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.ros.node import BackendNode
 from l1slam_ros.ros.publishing import header
 
 DEADLINE = 60.0
-TYPES = {'/odom': Odometry, '/loop_closures': PoseWithCovarianceStamped,
-         '/absolute_poses': PoseWithCovarianceStamped}
+TYPES = {'/odom': Odometry, **dict.fromkeys(
+    ('/loop_closures', '/trusted_loop_closures', '/false_loop_closures', '/absolute_poses'),
+    PoseWithCovarianceStamped)}
+EVERY_MESSAGE = {'keyframe.translation': 0.0, 'keyframe.rotation': 0.0,
+                 'odometry.covariance_source': 'increment'}
 
 
 class Bench:
@@ -55,6 +62,20 @@ class Bench:
         self.publishers[topic].publish(message)
         self.executor.spin_once(timeout_sec=0.0)
 
+    def drive(self, first, last):
+        """Drive along x, a metre and a keyframe a second."""
+        for k in range(first, last):
+            self.send('/odom', odometry((k + 1) * 10**9, 1.0 * k))
+
+    def play(self, bag):
+        """Play a bag as fast as it is used: a burst is more than DDS holds on a busy machine."""
+        sent, heard = 0, self.backend._inputs.traffic['odom']
+        for message in read_raw(bag):
+            self.send(message.topic, message.data)
+            sent += message.topic == '/odom'
+            if sent % 20 == 0:
+                self.until(lambda n=sent: heard.received >= n, 'they are used')
+
     def path(self):
         return self.received['path'][-1] if self.received['path'] else Path()
 
@@ -75,6 +96,20 @@ def odometry(stamp, x, frame='base_link'):
     message = Odometry(header=header('odom', stamp), child_frame_id=frame)
     message.pose.pose.position.x = x
     return message
+
+
+def loop(stamp, x=0.0, frame='base_link@1.000000000', variance=0.0):
+    message = PoseWithCovarianceStamped(header=header(frame, stamp))
+    message.pose.pose.position.x, message.pose.pose.orientation.w = x, 1.0
+    message.pose.covariance = (variance * np.eye(6)).ravel()
+    return message
+
+
+def recorded(bag, poses, edges, rng):
+    """Write the bag of a simulated world; return its graph."""
+    graph = simulate_world(poses, edges, WorldOptions(), rng).graph
+    write_graph_bag(bag, GraphRecord(graph, None, np.arange(poses)))
+    return graph
 
 
 def poses_of(path):

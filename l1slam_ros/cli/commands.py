@@ -2,7 +2,6 @@
 """The commands of `l1slam` that only read: convert and info, and what all have in common."""
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +10,7 @@ from l1slam_ros.cli import summary
 from l1slam_ros.io import formats
 from l1slam_ros.io.bags.topics import Topics
 from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.progress import say
 
 
 class Ending(NamedTuple):
@@ -69,4 +69,4 @@ def read(arguments: argparse.Namespace, path: Path, quiet: bool = False) -> Grap
 def warn(sentences: Sequence[str], quiet: bool = False) -> None:
     """Print warnings to standard error."""
     for sentence in () if quiet else sentences:
-        print(f'l1slam: {sentence}', file=sys.stderr)
+        say(sentence)

@@ -14,6 +14,7 @@ from typing import Any
 from l1slam_ros.core import names
 from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS
+from l1slam_ros.io.progress import say
 from l1slam_ros.paper import printed as paper
 
 BAD_INPUT, READ_IN_PART, DOUBTFUL, INTERRUPTED, BROKEN_PIPE = 2, 3, 4, 130, 141
@@ -83,7 +84,7 @@ def _answer(arguments: Sequence[str] | None) -> int:
         return BAD_INPUT
     ending = _run(options)
     for sentence in filter(None, ending):
-        _say(sentence)
+        say(sentence)
     if ending.doubt:
         return DOUBTFUL
     return READ_IN_PART if ending.damage else 0
@@ -100,13 +101,8 @@ def _run(options: argparse.Namespace) -> Any:
         return getattr(module, options.command)(options)
 
 
-def _say(sentence: str) -> None:
-    with suppress(BrokenPipeError):
-        print(f'l1slam: {sentence}', file=sys.stderr)
-
-
 def _refuse(sentence: str) -> int:
-    _say(sentence)
+    say(sentence)
     return BAD_INPUT
 
 

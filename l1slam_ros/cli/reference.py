@@ -9,11 +9,11 @@ import numpy as np
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, align, poses_at
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.graph.spanning_tree import pair_key
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.formats import is_bag, stamps_of
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.graphs.side_files import beside, read_false_loops
+from l1slam_ros.io.graphs.side_files import named_loops
 from l1slam_ros.io.trajectory import Reference, read_reference
 from l1slam_ros.io.wording import counted
 
@@ -110,7 +110,7 @@ def true_path(record: GraphRecord, poses: Array, truth: Truth) -> Array:
     return path
 
 
-def known_false(path: Path, record: GraphRecord) -> np.ndarray:
+def known_false(path: Path, record: GraphRecord) -> Mask:
     """
     Return which factors are false loops, (m,) bool, by the file beside the input `path`, if any.
 
@@ -119,14 +119,4 @@ def known_false(path: Path, record: GraphRecord) -> np.ndarray:
     FileError : that file is damaged, or names an edge that the graph does not have.
 
     """
-    side, factors, n = beside(path, 'false'), record.graph.between, record.graph.n_poses
-    ids = read_false_loops(side)
-    index = np.minimum(np.searchsorted(record.ids, ids), n - 1)
-    false = pair_key(index[:, 0], index[:, 1], n)
-    pairs = pair_key(factors.pairs[:, 0], factors.pairs[:, 1], n)
-    unknown = (record.ids[index] != ids).any(axis=1) | ~np.isin(false, pairs)
-    if unknown.any():
-        i, j = ids[np.argmax(unknown)]
-        raise FileError(side, f'no edge between {i} and {j} in {path}; expected its false loops, '
-                        'or no such file')
-    return ~factors.is_odometry & np.isin(pairs, false)
+    return named_loops(path, 'false', record.ids, record.graph.between)

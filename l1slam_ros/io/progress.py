@@ -3,11 +3,18 @@
 
 import sys
 import time
+from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
 # [s] What takes less is not worth a line in a log; the next ones are so far apart.
 _PATIENCE, _APART = 3.0, 5.0
+
+
+def say(sentence: str) -> None:
+    """Print a line to standard error; who read there may have gone."""
+    with suppress(BrokenPipeError):
+        print(f'l1slam: {sentence}', file=sys.stderr, flush=True)
 
 
 class Progress:
@@ -52,8 +59,8 @@ class Progress:
             # Another solver may go on where one came no further.
             within = self._total is not None and self._done <= self._total
             of_all = f' of {self._total:,.0f}' if within else ''
-            print(f'l1slam: {self._label}: {self._unit} {self._done:,.0f}{of_all}'
-                  f'{", " if note else ""}{note}', file=sys.stderr, flush=True)
+            say(f'{self._label}: {self._unit} {self._done:,.0f}{of_all}'
+                f'{", " if note else ""}{note}')
 
     def _advance_bar(self, steps: float, note: str) -> None:
         if self._bar is None:

@@ -2,7 +2,6 @@
 """`l1slam reproduce`: runs the paper's experiments and writes the report, its pictures beside."""
 
 import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,7 +23,7 @@ from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import STEPS, compile_now
 from l1slam_ros.io.files import new_folder_beside, put_lines, reported, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.progress import Progress
+from l1slam_ros.io.progress import Progress, say
 from l1slam_ros.paper import figures, report
 from l1slam_ros.paper import printed as paper
 from l1slam_ros.paper.experiments import Effort, measure_costs, measure_seconds
@@ -62,7 +61,7 @@ def reproduce(datasets: Path | None, worlds: Sequence[PaperGraph], output: Path,
     with _filling(output) as folder:
         lines = report.head(study)
         for title, section in SECTIONS.items():
-            _say(title)
+            say(title)
             lines += ['', f'## {title}', '', *section(study, folder)]
         put_lines(folder / REPORT, lines)
 
@@ -112,17 +111,13 @@ def measured(records: dict[str, GraphRecord], worlds: Sequence[PaperGraph],
 
 def _measured(printed: PaperGraph, graph: FactorGraph, start: Array, effort: Effort,
               truth_cost: float | None = None) -> GraphResult:
-    _say(printed.name)
+    say(printed.name)
     seed = seed_poses(graph, cholesky_of(graph))
     steps = OptimiserOptions().outer_iterations + effort.outer + LeastSquaresOptions().iterations
     with Progress(steps, 'step') as progress:
         costs = measure_costs(graph, start, seed, effort, progress.report)
     return GraphResult(printed, graph, start, seed, costs, measure_seconds(graph, seed, effort),
                        truth_cost)
-
-
-def _say(work: str) -> None:
-    print(f'l1slam: {work}', file=sys.stderr)
 
 
 # Title -> what runs the section's experiment, draws into a folder and returns the lines.

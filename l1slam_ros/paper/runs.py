@@ -19,9 +19,9 @@ from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import pair_key
 from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
-from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_huber, minimise_l2
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, gauss_newton, minimise_l2
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Solution
-from l1slam_ros.core.solvers.optimality import l1_cost
+from l1slam_ros.core.solvers.optimality import Huber, l1_cost
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 from l1slam_ros.core.worlds.false_loops import Loops, identity_false_loops, insert_loops
@@ -170,8 +170,9 @@ def _poses(graph: FactorGraph, stored: Array) -> tuple[dict[str, Array], Mask]:
     """Return the poses by every method, and which factors the robust one accepted."""
     cholesky = cholesky_of(graph)
     seed, robust = seed_poses(graph, cholesky), minimise_robustly(graph, _minimise_l1)
-    hubers = {name: minimise_huber(graph, stored, LeastSquaresOptions(huber_delta=width),
-                                   cholesky).poses for name, width in HUBERS.items()}
+    hubers = {name: gauss_newton(graph, stored, Huber(graph.manifold.TANGENT_SIZE, width),
+                                 LeastSquaresOptions(), cholesky).poses
+              for name, width in HUBERS.items()}
     return {SEED: seed, JOINT: _minimise_l1(graph, seed).poses, **hubers,
             ROBUST: robust.solution.poses}, robust.judgement.accepted
 

@@ -37,7 +37,7 @@ from l1slam_ros.io.bags.to_graph import read_truth_topic
 from l1slam_ros.io.bags.topics import TRUTH_TOPIC
 from l1slam_ros.io.files import stamp_from_text
 from l1slam_ros.io.formats import read_input, stamps_of
-from l1slam_ros.io.graphs.side_files import beside, read_false_loops
+from l1slam_ros.io.graphs.side_files import read_pairs
 from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.io.plot import MapDrawing, plot_maps
 
@@ -87,7 +87,7 @@ def read_recording(path: Path) -> Recording:
     record, truth = read_input(path), read_truth_topic(path, TRUTH_TOPIC)
     graph = record.graph
     positions, loops = graph.manifold.positions, graph.between.pairs[~graph.between.is_odometry]
-    false = read_false_loops(beside(path, 'false'))
+    false, _ = read_pairs(path, 'false')
     is_false = (loops[:, None] == false).all(axis=2).any(axis=1)
     return Recording(stamps_of(record), positions(odometry_poses(graph)), positions(truth.poses),
                      loops, is_false)

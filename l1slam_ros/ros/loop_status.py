@@ -11,7 +11,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.online.loop_states import ACCEPTED, LOOP_STATES, WAITING, LoopStates
 from l1slam_ros.io.files import stamp_text
-from l1slam_ros.ros.publishing import ENCAPSULATION, header_bytes, string_bytes
+from l1slam_ros.ros.publishing import cdr, header_bytes, string_bytes
 
 # Who comes late still gets the last changes.
 _DEPTH = 1000
@@ -58,19 +58,15 @@ def states_bytes(name: str, stamp: int, states: LoopStates, rows: list[int]) -> 
 
     name : of the node; stamp : of the message [ns]; rows : of the states
     """
-    data = bytearray(header_bytes('', stamp))
-
-    def add(*parts: bytes) -> None:
-        for part in parts:  # numbers and lengths stand at multiples of four
-            data.extend(b'\0' * (-len(data) % 4) + part)
-
-    add(struct.pack('<I', len(rows)))
+    parts = [(4, header_bytes('', stamp)), (4, struct.pack('<I', len(rows)))]
     for row in rows:
         reference, end = (stamp_text(int(value)) for value in states.stamps[row])
         state, sigmas = int(states.state[row]), float(states.sigmas[row])
+        level = DiagnosticStatus.OK if state in (ACCEPTED, WAITING) else DiagnosticStatus.WARN
         values = ('reference_stamp', reference, 'stamp', end, 'state', LOOP_STATES[state],
                   'sigmas', '' if np.isnan(sigmas) else f'{sigmas:.2f}')
-        data += DiagnosticStatus.OK if state in (ACCEPTED, WAITING) else DiagnosticStatus.WARN
-        add(*map(string_bytes, (f'{name}: loop {reference} - {end}', LOOP_STATES[state], name)),
-            struct.pack('<I', len(values) // 2), *map(string_bytes, values))
-    return ENCAPSULATION + bytes(data)
+        texts = f'{name}: loop {reference} - {end}', LOOP_STATES[state], name
+        parts += ((1, level), *((4, string_bytes(text)) for text in texts),
+                  (4, struct.pack('<I', len(values) // 2)),
+                  *((4, string_bytes(text)) for text in values))
+    return cdr(*parts)

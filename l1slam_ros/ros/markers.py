@@ -21,7 +21,7 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import WORLD
 from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED, SUSPECT
 from l1slam_ros.core.online.snapshot import Snapshot
-from l1slam_ros.ros.publishing import ENCAPSULATION, header_bytes, string_bytes
+from l1slam_ros.ros.publishing import cdr, header_bytes, string_bytes
 
 # Okabe and Ito's colours, as in the pictures.
 _BLUE, _GREY = (0.0, 0.447, 0.698), (0.5, 0.5, 0.5)
@@ -122,24 +122,13 @@ def _colours(rgb: Any, count: int) -> np.ndarray:
 
 def _array_bytes(header: bytes, markers: list[tuple[Any, ...]]) -> bytes:
     """Return a serialised visualization_msgs/MarkerArray; all markers have one header."""
-    parts = [struct.pack('<I', len(markers))]
-    length = 4
-
-    def add(data: bytes, alignment: int) -> None:
-        nonlocal length
-        padding = -length % alignment
-        parts.append(b'\0' * padding + data)
-        length += padding + len(data)
-
+    parts = [(4, struct.pack('<I', len(markers)))]
     for name, number, kind, action, size, points, colours in markers:
-        add(header, 4)
-        add(string_bytes(name), 4)
-        add(struct.pack('<iii', number, kind, action), 4)
-        add(struct.pack('<10d', 0, 0, 0, 0, 0, 0, 1, size, size, size), 8)
-        add(struct.pack('<4f', 1, 1, 1, 1) + _FOR_EVER, 4)
-        add(struct.pack('<I', len(points)), 4)
-        if len(points):
-            add(points.tobytes(), 8)
-        add(struct.pack('<I', len(colours)) + colours.tobytes(), 4)
-        add(_NOTHING_ELSE, 4)
-    return ENCAPSULATION + b''.join(parts)
+        parts += ((4, header), (4, string_bytes(name)),
+                  (4, struct.pack('<iii', number, kind, action)),
+                  (8, struct.pack('<10d', 0, 0, 0, 0, 0, 0, 1, size, size, size)),
+                  (4, struct.pack('<4f', 1, 1, 1, 1) + _FOR_EVER),
+                  (4, struct.pack('<I', len(points))),
+                  (8 if len(points) else 4, points.tobytes()),
+                  (4, struct.pack('<I', len(colours)) + colours.tobytes()), (4, _NOTHING_ELSE))
+    return cdr(*parts)

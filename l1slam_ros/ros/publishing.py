@@ -11,8 +11,17 @@ from std_msgs.msg import Header
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 
 _SECOND = 1_000_000_000
-# CDR, little endian; what follows is aligned relative to the end of these four bytes.
-ENCAPSULATION = b'\x00\x01\x00\x00'
+# CDR, little endian.
+_ENCAPSULATION = b'\x00\x01\x00\x00'
+
+
+def cdr(*parts: tuple[int, bytes | memoryview]) -> bytes:
+    """Return a serialised message of parts, each at a multiple of so many bytes from the start."""
+    data = bytearray()
+    for multiple, part in parts:
+        data += bytes(-len(data) % multiple)
+        data += part
+    return _ENCAPSULATION + data
 
 
 def path_bytes(frame: str, stamp: int, stamps: Indices, pose3: Array) -> bytes:
@@ -33,12 +42,9 @@ def path_bytes(frame: str, stamp: int, stamps: Indices, pose3: Array) -> bytes:
     pose3 : (n, 7) x y z qx qy qz qw
 
     """
-    start: bytes = header_bytes(frame, stamp)
-    start += b'\0' * (-len(start) % 4) + struct.pack('<I', len(stamps))
+    start = (4, header_bytes(frame, stamp)), (4, struct.pack('<I', len(stamps)))
     if not len(stamps):
-        return ENCAPSULATION + start
-    start += header_bytes(frame, int(stamps[0]))
-    start += b'\0' * (-len(start) % 8)
+        return cdr(*start)
     name = string_bytes(frame)
     record = np.dtype([('pose', '<f8', 7), ('seconds', '<i4'), ('nanoseconds', '<u4'),
                        ('frame', f'V{len(name) + (-len(name) - 8) % 8}')])
@@ -48,14 +54,13 @@ def path_bytes(frame: str, stamp: int, stamps: Indices, pose3: Array) -> bytes:
     records['seconds'][:-1] = seconds[1:]
     records['nanoseconds'][:-1] = nanoseconds[1:]
     records['frame'] = np.void(name.ljust(record['frame'].itemsize, b'\0'))
-    body: bytes = records.tobytes()
-    return ENCAPSULATION + start + body[: -(record.itemsize - 56)]
+    body = memoryview(records.tobytes())[: -(record.itemsize - 56)]
+    return cdr(*start, (4, header_bytes(frame, int(stamps[0]))), (8, body))
 
 
 def pose_bytes(frame: str, stamp: int, pose3: Array) -> bytes:
     """Return a serialised geometry_msgs/PoseStamped: one pose (7,) at one time [ns]."""
-    start = header_bytes(frame, stamp)
-    return b''.join((ENCAPSULATION, start, b'\0' * (-len(start) % 8), pose3.tobytes()))
+    return cdr((4, header_bytes(frame, stamp)), (8, pose3.tobytes()))
 
 
 def transform_bytes(parent: str, child: str, stamp: int, pose3: Array,
@@ -65,10 +70,8 @@ def transform_bytes(parent: str, child: str, stamp: int, pose3: Array,
 
     in_sequence : as the only one of a sequence, which is a tf2_msgs/TFMessage
     """
-    start: bytes = struct.pack('<I', 1) if in_sequence else b''
-    start += header_bytes(parent, stamp)
-    start += b'\0' * (-len(start) % 4) + string_bytes(child)
-    return b''.join((ENCAPSULATION, start, b'\0' * (-len(start) % 8), pose3.tobytes()))
+    return cdr((4, struct.pack('<I', 1) if in_sequence else b''), (4, header_bytes(parent, stamp)),
+               (4, string_bytes(child)), (8, pose3.tobytes()))
 
 
 def pose_with_covariance(frame: str, stamp: int, manifold: Manifold, pose: Array,

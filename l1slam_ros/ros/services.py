@@ -83,8 +83,9 @@ class MapServices:
                     raise
 
     def reset(self) -> str:
-        """Empty the map; the thread of the jobs calls it."""
+        """Empty the map, not its file; the thread of the jobs calls it."""
         self._backend.reset()
+        self._map_file.disown()
         return 'the map is empty'
 
     def autosave(self) -> float:

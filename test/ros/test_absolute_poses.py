@@ -8,8 +8,7 @@ pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from gps import seen
-from node_bench import call, odometry, poses_of
-from test_node import EVERY_MESSAGE, play
+from node_bench import EVERY_MESSAGE, call, odometry, poses_of
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.online.loop_states import ACCEPTED
@@ -32,7 +31,7 @@ def test_a_world_seen_by_gps_is_saved_and_goes_on(bench, tmp_path):
     world = seen(made.graph, made.truth, 10, rng, 0.1, sigma=0.2)
     write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(200)))
     b = bench(save_path=str(tmp_path / 'map.g2o'), **EVERY_MESSAGE)
-    play(b, tmp_path / 'bag')
+    b.play(tmp_path / 'bag')
     b.until(lambda: len(b.path().poses) == 200, 'all keyframes')
     node = b.backend._backend
 

@@ -11,14 +11,12 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_bench import call, odometry
+from node_bench import call, loop
 
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs import saved_map
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.ros import node
-from l1slam_ros.ros.publishing import header
 
 FAULTS = ['ValueError', 'MemoryError', 'nan']
 
@@ -50,11 +48,6 @@ class Fault:
             self.kind, self.kind)
 
 
-def drive(b, first, last):
-    for k in range(first, last):
-        b.send('/odom', odometry((k + 1) * 10**9, 1.0 * k))
-
-
 def is_error(b, *words):
     level, sentence, _ = b.status()
     return level == DiagnosticStatus.ERROR and all(word in sentence for word in words)
@@ -77,16 +70,16 @@ def assert_all_finite(b):
 def test_an_update_that_fails(bench, monkeypatch, tmp_path, kind):
     fault = Fault(monkeypatch, upkeep, 'improve', kind)
     b = bench(save_path=str(tmp_path / 'map.g2o'))
-    drive(b, 0, 3)
+    b.drive(0, 3)
     b.until(lambda: len(b.path().poses) == 3 and is_ok(b), 'a map')
     fault.on = True
-    drive(b, 3, 5)
+    b.drive(3, 5)
     b.until(lambda: is_error(b, 'update failed', fault.said), 'it says so')
     b.until(lambda: len(b.received['pose']) == 5, 'odometry is answered')
     b.until(lambda: len(b.path().poses) == 5, 'the map that there is takes what comes')
     assert call(b, 'save').success and call(b, 'optimize').success
     fault.on = False
-    drive(b, 5, 6)
+    b.drive(5, 6)
     b.until(lambda: len(b.path().poses) == 6 and is_ok(b), 'it is over')
     assert_all_finite(b)
 
@@ -95,7 +88,7 @@ def test_an_update_that_always_fails_is_not_tried_all_the_time(bench, monkeypatc
     fault = Fault(monkeypatch, upkeep, 'improve', 'ValueError')
     fault.on = True
     b = bench(**{'update.period': 0.001})
-    drive(b, 0, 3)
+    b.drive(0, 3)
     b.until(lambda: fault.calls, 'a first update')
     began = time.monotonic()
     b.until(lambda: time.monotonic() > began + 2.0, 'two seconds later')
@@ -115,14 +108,14 @@ def test_an_update_that_always_fails_is_not_tried_all_the_time(bench, monkeypatc
 def test_a_service_that_fails(bench, monkeypatch, tmp_path, kind, service, module, function):
     fault = Fault(monkeypatch, module, function, kind)
     b = bench(save_path=str(tmp_path / 'map.g2o'))
-    drive(b, 0, 3)
+    b.drive(0, 3)
     b.until(lambda: len(b.path().poses) == 3, 'a map')
     assert call(b, 'save').success
     fault.on = True
     answer = call(b, service)
     assert not answer.success and fault.said in answer.message
     b.until(lambda: is_error(b, f'~/{service} failed', fault.said), 'it says so')
-    drive(b, 3, 4)
+    b.drive(3, 4)
     b.until(lambda: len(b.path().poses) == 4, 'updates go on')
     fault.on = False
     assert call(b, service).success
@@ -134,13 +127,13 @@ def test_a_service_that_fails(bench, monkeypatch, tmp_path, kind, service, modul
 def test_a_callback_that_fails(bench, monkeypatch, kind):
     fault = Fault(monkeypatch, conversion, 'odometry_in', kind)
     b = bench()
-    drive(b, 0, 3)
+    b.drive(0, 3)
     b.until(lambda: len(b.path().poses) == 3, 'a map')
     fault.on = True
-    drive(b, 3, 5)
+    b.drive(3, 5)
     b.until(lambda: is_error(b, 'odom failed', fault.said), 'it says so')
     fault.on = False
-    drive(b, 5, 7)
+    b.drive(5, 7)
     b.until(lambda: len(b.path().poses) == 5 and is_ok(b), 'it is over')
     assert_all_finite(b)
 
@@ -149,7 +142,7 @@ def test_a_publisher_that_fails(bench, monkeypatch):
     fault = Fault(monkeypatch, node, 'path_bytes', 'ValueError')
     fault.on = True
     b = bench()
-    drive(b, 0, 3)
+    b.drive(0, 3)
     b.until(lambda: is_error(b, 'update failed', fault.said), 'it says so')
     fault.on = False
     b.until(lambda: len(b.path().poses) == 3 and is_ok(b), 'the map is published after all')
@@ -159,18 +152,16 @@ def test_each_kind_of_failure_is_logged_once_in_full(bench, monkeypatch, capfd):
     fault = Fault(monkeypatch, upkeep, 'improve', 'ValueError')
     fault.on = True
     b = bench()
-    drive(b, 0, 3)
+    b.drive(0, 3)
     b.until(lambda: fault.calls >= 3, 'three failures')
     assert capfd.readouterr().err.count('Traceback') == 1
 
 
 def test_a_refused_message_is_a_warning_and_counted(bench):
     b = bench()
-    drive(b, 0, 2)
+    b.drive(0, 2)
     b.until(lambda: len(b.path().poses) == 2, 'a map')
-    message = PoseWithCovarianceStamped(header=header('base_link@1.000000000', 2 * 10**9))
-    message.pose.pose.position.x = math.inf
-    b.send('/loop_closures', message)
+    b.send('/loop_closures', loop(2 * 10**9, math.inf))
     b.until(lambda: b.status()[2].get('refused.not_finite') == '1', 'it is counted')
     level, sentence, values = b.status()
     assert level == DiagnosticStatus.WARN and '1 not_finite' in sentence

@@ -25,11 +25,6 @@ from l1slam_ros.ros.demo import executable
 DEADLINE = 60.0
 
 
-def drive(b, first, last):
-    for k in range(first, last):
-        b.send('/odom', odometry((k + 1) * 10**9, 1.0 * k))
-
-
 def keyframes(path):
     return len(load_map(path)[0].optimised.poses) if path.exists() else 0
 
@@ -37,9 +32,9 @@ def keyframes(path):
 def test_the_map_is_saved_while_it_grows_and_at_the_end(bench, tmp_path, monkeypatch):
     path = tmp_path / 'map.g2o'
     b = bench(save_path=str(path), autosave_period=0.2)
-    drive(b, 0, 3)
+    b.drive(0, 3)
     b.until(lambda: keyframes(path) == 3, 'the map is saved')
-    drive(b, 3, 5)
+    b.drive(3, 5)
     b.until(lambda: keyframes(path) == 5, 'it is saved again')
     other = tmp_path / 'other.g2o'
     assert b.backend.set_parameters([Parameter('save_path', value=str(other))])[0].successful
@@ -47,7 +42,7 @@ def test_the_map_is_saved_while_it_grows_and_at_the_end(bench, tmp_path, monkeyp
     b.until(lambda: len(b.path().poses) == 5, 'the map')
     now = b.path()
     assert b.backend.set_parameters([Parameter('autosave_period', value=1e6)])[0].successful
-    drive(b, 5, 6)
+    b.drive(5, 6)
     b.until(lambda: len(b.path().poses) == 6, 'a keyframe more')
     assert b.backend.close(DEADLINE) and keyframes(other) == 6 and len(now.poses) == 5
     b.peer.destroy_node()
@@ -56,7 +51,7 @@ def test_the_map_is_saved_while_it_grows_and_at_the_end(bench, tmp_path, monkeyp
 def test_a_settled_map_is_loaded_at_start_and_published_at_once(bench, tmp_path, monkeypatch):
     path = tmp_path / 'map.g2o'
     first = bench(save_path=str(path))
-    drive(first, 0, 4)
+    first.drive(0, 4)
     first.until(lambda: len(first.path().poses) == 4, 'a map')
     first.until(lambda: first.backend._backend.snapshot().problem().settled, 'it settles')
     assert call(first, 'save').success
@@ -75,7 +70,7 @@ def test_a_damaged_map_is_said_and_the_one_before_taken(bench, tmp_path, capfd):
     b = bench(save_path=str(path), autosave_period=0.0, load_on_start=True)
     assert 'the map begins empty: ' in capfd.readouterr().err
     for count in 3, 5:
-        drive(b, 0 if count == 3 else 3, count)
+        b.drive(0 if count == 3 else 3, count)
         b.until(lambda count=count: len(b.path().poses) == count, 'a map')
         assert call(b, 'save').success
     path.write_bytes(path.read_bytes()[:-100])
@@ -96,7 +91,7 @@ def test_a_map_that_cannot_be_saved_is_an_error_until_it_can(bench, tmp_path, ca
     assert said in capfd.readouterr().err
     answer, = b.backend.set_parameters([Parameter('save_path', value=str(path))])
     assert (answer.successful, answer.reason) == (False, said)
-    drive(b, 0, 3)
+    b.drive(0, 3)
     b.until(lambda: b.status()[0] == DiagnosticStatus.ERROR
             and f'autosave failed: {path}: cannot be written: ' in b.status()[1], 'it says so')
     path.parent.mkdir()

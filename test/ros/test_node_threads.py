@@ -12,23 +12,16 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_bench import call, odometry, poses_of
+from node_bench import call, loop, odometry, poses_of
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.messages import conversion
-from l1slam_ros.ros.publishing import header
 from l1slam_ros.ros.threads import solver_thread
 
 DEADLINE = 60.0
-
-
-def drive(b, first, last):
-    for k in range(first, last):
-        b.send('/odom', odometry((k + 1) * 10**9, 1.0 * k))
 
 
 @pytest.fixture
@@ -47,7 +40,7 @@ def compiling(monkeypatch):
 
 def test_while_the_solver_is_compiled_all_else_is_served(bench, compiling, tmp_path):
     b = bench(save_path=str(tmp_path / 'map.g2o'))
-    drive(b, 0, 4)
+    b.drive(0, 4)
     b.until(lambda: len(b.received['pose']) == 4, 'odometry is answered')
     assert call(b, 'save').message.startswith('4 keyframes saved')
     assert call(b, 'pause', SetBool.Request(data=False)).success
@@ -56,7 +49,7 @@ def test_while_the_solver_is_compiled_all_else_is_served(bench, compiling, tmp_p
     client = b.peer.create_client(Trigger, '/backend/optimize')
     b.until(client.service_is_ready, 'optimize is offered')
     waiting = client.call_async(Trigger.Request())
-    drive(b, 4, 6)
+    b.drive(4, 6)
     b.until(lambda: b.status()[2]['odom.received'] == '6', 'odometry is taken in')
     assert not waiting.done() and not b.received['path']
     compiling.set()
@@ -115,11 +108,11 @@ def patient(problem, options, budget, check, exact):
 
 def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
     b = bench(save_path=str(tmp_path / 'map.g2o'))
-    drive(b, 0, 3)
+    b.drive(0, 3)
     b.until(lambda: len(b.path().poses) == 3, 'a map')
     began, improve = threading.Event(), upkeep.improve
     monkeypatch.setattr(upkeep, 'improve', lambda *a: began.set() or patient(*a))
-    drive(b, 3, 5)
+    b.drive(3, 5)
     b.until(began.is_set, 'an update that takes for ever')
     assert call(b, 'save').message.startswith('5 keyframes')
     assert call(b, 'optimize').success
@@ -132,7 +125,7 @@ def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
     b.until(lambda: not b.backend._backend._updating.locked(), 'the update stops')
     monkeypatch.setattr(upkeep, 'improve', improve)
     assert call(b, 'pause', SetBool.Request(data=False)).success
-    drive(b, 5, 8)
+    b.drive(5, 8)
     b.until(lambda: len(b.path().poses) == 8, 'updates go on')
 
 
@@ -172,13 +165,13 @@ def test_messages_of_all_topics_are_used_in_the_order_they_came(bench, monkeypat
     b = bench()
     go_on, used, backend = threading.Event(), [], b.backend._backend
     monkeypatch.setattr(backend, 'add_odometry', lambda s: used.append(s.stamp) or go_on.wait())
-    monkeypatch.setattr(backend, 'add_loop', lambda loop: used.append(loop.stamp))
+    monkeypatch.setattr(backend, 'add_loop', lambda one: used.append(one.stamp))
     sent = [10**9 * k for k in range(1, 41)]
     for k, stamp in enumerate(sent):
-        loop = PoseWithCovarianceStamped(header=header('base_link@0.500000000', stamp))
-        loop.pose.pose.orientation.w = 1.0
-        b.send('/loop_closures' if k % 3 == 2 else '/odom',
-               loop if k % 3 == 2 else odometry(stamp, 0.0))
+        if k % 3 == 2:
+            b.send('/loop_closures', loop(stamp, frame='base_link@0.500000000'))
+        else:
+            b.send('/odom', odometry(stamp, 0.0))
     go_on.set()
     b.until(lambda: len(used) == len(sent), 'all are used')
     assert used == sent
@@ -187,7 +180,7 @@ def test_messages_of_all_topics_are_used_in_the_order_they_came(bench, monkeypat
 def test_optimize_is_done_though_the_map_is_replaced_meanwhile(bench, monkeypatch):
     """By a parameter that lets all loops be judged anew: it is no end of the node."""
     b = bench()
-    drive(b, 0, 3)
+    b.drive(0, 3)
     b.until(lambda: len(b.path().poses) == 3, 'a map')
     began, optimise = threading.Event(), upkeep.optimise
 
@@ -211,7 +204,7 @@ def test_optimize_is_done_though_the_map_is_replaced_meanwhile(bench, monkeypatc
 def test_after_a_load_the_pose_is_right_at_once(bench, tmp_path):
     """Not only from the next keyframe on."""
     b = bench(save_path=str(tmp_path / 'map.g2o'))
-    drive(b, 0, 3)
+    b.drive(0, 3)
     b.until(lambda: len(b.path().poses) == 3, 'a map')
     assert call(b, 'save').success and call(b, 'load').success
     # The robot was switched off meanwhile: its odometry begins at 50 m.
@@ -239,7 +232,7 @@ def test_when_the_clock_jumps_back(bench, choice):
                 f'it is {seconds}')
 
     tell(100)
-    drive(b, 0, 3)
+    b.drive(0, 3)
     b.until(lambda: len(b.path().poses) == 3, 'a map, though the clock stands still')
     tell(101)
     tell(50)
@@ -252,9 +245,9 @@ def test_when_the_clock_jumps_back(bench, choice):
     assert choice != 'new_segment' or quiet
     if choice == 'reset':
         b.until(lambda: len(b.path().poses) == 0, 'the map begins anew')
-        drive(b, 0, 2)
+        b.drive(0, 2)
     else:
-        drive(b, *((3, 5) if choice == 'ignore' else (0, 2)))
+        b.drive(*((3, 5) if choice == 'ignore' else (0, 2)))
     # A part that begins where the last one ends begins with a keyframe there.
     expected, end = {'new_segment': (5, 3.0), 'reset': (2, 1.0), 'ignore': (5, 4.0)}[choice]
     b.until(lambda: len(b.path().poses) == expected, f'the map has {expected} keyframes')
@@ -282,14 +275,9 @@ def test_the_jump_of_the_transform_is_said(bench):
     The front takes the most of that step at once, the map behind it the rest.
     """
     b = bench()
-    vouch = b.peer.create_publisher(PoseWithCovarianceStamped, 'trusted_loop_closures', 10)
-    b.until(vouch.get_subscription_count, 'the node listens')
-    drive(b, 0, 6)
+    b.drive(0, 6)
     b.until(lambda: len(b.path().poses) == 6, 'a map')
-    loop = PoseWithCovarianceStamped(header=header('base_link@1.000000000', 6 * 10**9))
-    loop.pose.pose.position.x, loop.pose.pose.orientation.w = 4.0, 1.0
-    loop.pose.covariance = (1e-8 * np.eye(6)).ravel()
-    vouch.publish(loop)
+    b.send('/trusted_loop_closures', loop(6 * 10**9, 4.0, variance=1e-8))
     b.until(lambda: 0.01 < float(b.status()[2].get('jump.translation', 0)) < 1.01, 'a jump')
     b.until(lambda: b.path().poses[-1].pose.position.x == pytest.approx(4.0, abs=0.01),
             'a metre in all')

@@ -7,20 +7,15 @@ import pytest
 pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_bench import odometry
+from node_bench import EVERY_MESSAGE, loop, recorded
 from rclpy.serialization import deserialize_message
 from systems import dense_covariance
-from test_node import EVERY_MESSAGE, play
 from visualization_msgs.msg import Marker, MarkerArray
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.bags.from_graph import write_graph_bag
-from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.messages.conversion import reference_frame_id
 from l1slam_ros.ros.markers import _array_bytes
-from l1slam_ros.ros.publishing import header, header_bytes, pose_with_covariance
+from l1slam_ros.ros.publishing import header_bytes, pose_with_covariance
 
 
 class Drawing:
@@ -46,11 +41,10 @@ class Drawing:
 
 
 def test_the_graph_is_drawn_for_who_looks_also_for_who_comes_late(bench, tmp_path, rng):
-    world = simulate_world(40, 60, WorldOptions(), rng)
-    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(40)))
+    recorded(tmp_path / 'bag', 40, 60, rng)
     b = bench(**EVERY_MESSAGE)
     early = Drawing(b)
-    play(b, tmp_path / 'bag')
+    b.play(tmp_path / 'bag')
 
     def all_are_drawn(drawing, believed=0):
         points = drawing.sizes()
@@ -93,13 +87,12 @@ def test_markers_are_what_their_bytes_say(frame, rng):
 
 
 def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path, rng):
-    world = simulate_world(60, 130, WorldOptions(), rng)
-    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(60)))
+    recorded(tmp_path / 'bag', 60, 130, rng)
     b = bench(**EVERY_MESSAGE)
     heard = []
     b.peer.create_subscription(PoseWithCovarianceStamped, 'pose_with_covariance', heard.append, 10)
     b.until(lambda: b.backend._covariance.get_subscription_count(), 'somebody listens')
-    play(b, tmp_path / 'bag')
+    b.play(tmp_path / 'bag')
     b.until(lambda: heard and heard[-1].header.stamp == b.path().poses[-1].header.stamp
             and b.backend._backend.update(0.0) is None, 'the map is done')
     now = b.backend._backend.snapshot()
@@ -120,16 +113,9 @@ def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path, rng):
 
 def test_a_person_strikes_a_loop_out_and_vouches_for_it_after_all(bench):
     b = bench(**{'robust.enabled': False})
-    hand = {topic: b.peer.create_publisher(PoseWithCovarianceStamped, topic, 10)
-            for topic in ('false_loop_closures', 'trusted_loop_closures')}
-    b.until(lambda: all(p.get_subscription_count() for p in hand.values()), 'the node listens')
-    for k in range(6):
-        b.send('/odom', odometry((k + 1) * 10**9, 1.0 * k))
-    frame = reference_frame_id('base_link', 10**9)
-    loop = PoseWithCovarianceStamped(header=header(frame, 6 * 10**9))
-    loop.pose.pose.position.x, loop.pose.pose.orientation.w = 3.0, 1.0
-    loop.pose.covariance = (1e-6 * np.eye(6)).ravel()
-    b.send('/loop_closures', loop)
+    b.drive(0, 6)
+    seen = loop(6 * 10**9, 3.0, variance=1e-6)
+    b.send('/loop_closures', seen)
 
     def states():
         return b.backend._backend.loop_states().state.tolist()
@@ -139,7 +125,7 @@ def test_a_person_strikes_a_loop_out_and_vouches_for_it_after_all(bench):
 
     b.until(lambda: states() == [ACCEPTED] and end() and end() < 4.9, 'the loop is believed')
     # Only the stamps count; what else is in the message may be nothing.
-    hand['false_loop_closures'].publish(PoseWithCovarianceStamped(header=header(frame, 6 * 10**9)))
+    b.send('/false_loop_closures', PoseWithCovarianceStamped(header=seen.header))
     b.until(lambda: states() == [REJECTED] and end() and abs(end() - 5) < 1e-6, 'struck out')
-    hand['trusted_loop_closures'].publish(loop)
+    b.send('/trusted_loop_closures', seen)
     b.until(lambda: states() == [ACCEPTED] and end() and end() < 4.9, 'vouched for')

@@ -13,10 +13,12 @@ import pytest
 
 rclpy = pytest.importorskip('rclpy')
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import Trigger
 
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bags.from_graph import write_graph_bag
@@ -106,6 +108,22 @@ def test_a_part_of_a_bag_on_other_topics(backend, bag, paths):
     assert played.returncode == 0
     path = paths(lambda path: len(path.poses) == 30)
     assert path.poses[0].header.stamp.sec == 1002
+
+
+def test_services_are_answered_when_they_are_done(backend, ros):
+    """Not when a timer of the node wakes its executor, once a second, the next time."""
+    node, seconds = ros.create_node('caller'), []
+    node.create_subscription(DiagnosticArray, '/diagnostics', seconds.append, 10)
+    client = node.create_client(Trigger, '/backend/reset')
+    assert client.wait_for_service(DEADLINE)
+    rclpy.spin_until_future_complete(node, client.call_async(Trigger.Request()), None, DEADLINE)
+    seconds.clear()
+    for _ in range(10):
+        answer = client.call_async(Trigger.Request())
+        rclpy.spin_until_future_complete(node, answer, None, DEADLINE)
+        assert answer.result().success
+    assert len(seconds) < 5
+    node.destroy_node()
 
 
 @pytest.mark.parametrize('name', ['SIGINT', 'SIGTERM'])

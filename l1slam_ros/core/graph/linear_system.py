@@ -181,3 +181,10 @@ def step_poses(graph: FactorGraph, poses: Array, x: Array) -> Array:
     fixed = anchor(graph)
     step = np.asarray(x).reshape(-1, graph.manifold.TANGENT_SIZE)
     return np.concatenate((poses[:fixed], graph.manifold.retract(poses[fixed:], step)))
+
+
+def step_part(graph: FactorGraph, poses: Array, x: Array, part: slice) -> Array:
+    """Return the poses after a step of this part of the tangent alone, x (columns of it,)."""
+    step = np.zeros((graph.n_poses - anchor(graph), graph.manifold.TANGENT_SIZE))
+    step[:, part] = x.reshape(len(step), -1)
+    return step_poses(graph, poses, step)

@@ -19,6 +19,7 @@ from l1slam_ros.core.graph.linear_system import (
     anchor,
     ends,
     keyframes_of,
+    step_part,
     step_poses,
 )
 from l1slam_ros.core.graph.parts import odometry_gaps
@@ -230,9 +231,7 @@ def _l2_poses(graph: FactorGraph) -> Array:
     manifold, poses = graph.manifold, tree_poses(graph, 0)
     for part in (manifold.ROTATION, manifold.TRANSLATION):
         system = _system(graph, poses).part(part)
-        step = np.zeros((system.size, manifold.TANGENT_SIZE))
-        step[:, part] = _least_squares(system, system.b).reshape(system.size, -1)
-        poses = step_poses(graph, poses, step)
+        poses = step_part(graph, poses, _least_squares(system, system.b), part)
     system = _system(graph, poses)
     for _ in range(_STEPS):
         step, chi2 = _least_squares(system, system.b), l2_cost(system.b)

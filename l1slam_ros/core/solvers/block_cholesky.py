@@ -194,12 +194,16 @@ class BlockCholesky:
 
         return min(*_at_once(share), share(2)) if shared else share(0)
 
+    @property
+    def _last(self) -> '_Layout':
+        assert self._factored is not None, 'nothing was factored'
+        return self._factored
+
     def solve(self, right: Array) -> Array:
         """Return the solution for a right hand side (columns,) by the last factorisation."""
         from l1slam_ros.core.kernels.substitution import solve
 
-        layout = self._factored
-        assert layout is not None, 'solve before factorise'
+        layout = self._last
         x: Array = solve(layout.panels, *layout.shape, self.pattern.position,
                          right.reshape(-1, len(layout.size)))
         return x.ravel()
@@ -208,8 +212,7 @@ class BlockCholesky:
         """Turn q right hand sides (free keyframes, k, q) into their solutions, in place."""
         from l1slam_ros.core.kernels.prediction import solve_many
 
-        layout = self._factored
-        assert layout is not None, 'solve before factorise'
+        layout = self._last
         solve_many(layout.panels, *layout.shape, self.pattern.position, right)
 
     def climb(self, keyframe: int) -> tuple[Places, Array]:
@@ -220,8 +223,7 @@ class BlockCholesky:
         """
         from l1slam_ros.core.kernels.border import climb
 
-        layout = self._factored
-        assert layout is not None, 'climb before factorise'
+        layout = self._last
         found: tuple[Places, Array] = climb(
             layout.panels, *layout.shape, self.pattern.owner, self.pattern.position[keyframe],
             len(layout.size))

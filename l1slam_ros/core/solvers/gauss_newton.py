@@ -12,7 +12,13 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.linear_system import anchor, linearise, step_poses, whitened_residual
+from l1slam_ros.core.graph.linear_system import (
+    anchor,
+    linearise,
+    step_part,
+    step_poses,
+    whitened_residual,
+)
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.nonlinear import Report, Solution
@@ -51,18 +57,6 @@ def minimise_l2(
 ) -> Solution:
     """Minimise chi2, the sum of squared whitened residuals; arguments as `optimiser.minimise`."""
     return gauss_newton(graph, poses, Huber(), options, cholesky, report)
-
-
-def minimise_huber(
-    graph: FactorGraph,
-    poses: Array,
-    options: LeastSquaresOptions,
-    cholesky: BlockCholesky,
-    report: Report = lambda iteration, cost: None,
-) -> Solution:
-    """Minimise Huber's norm of each factor, odometry included; arguments as above."""
-    norm = Huber(graph.manifold.TANGENT_SIZE, options.huber_delta)
-    return gauss_newton(graph, poses, norm, options, cholesky, report)
 
 
 def gauss_newton(
@@ -138,9 +132,7 @@ def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky)
     for part in (manifold.ROTATION, manifold.TRANSLATION):
         system = linearise(graph, poses).part(part)
         x = weighted_least_squares(system, cholesky, np.ones_like(system.b))
-        step = np.zeros((graph.n_poses - anchor(graph), manifold.TANGENT_SIZE))
-        step[:, part] = x.reshape(len(step), -1)
-        poses = step_poses(graph, poses, step)
+        poses = step_part(graph, poses, x, part)
     return poses
 
 

@@ -23,7 +23,6 @@ predictor hardly a step (Cartis, "Some disadvantages of a Mehrotra-type primal-d
 interior point algorithm", 2009); the rest is ours, defended by `test_interior_point.py`.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -33,13 +32,14 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.l1_problem import Problem
 from l1slam_ros.core.graph.linear_system import LinearSystem
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
+from l1slam_ros.core.solvers.nonlinear import Report
 from l1slam_ros.core.solvers.optimality import L1, Norm, Status, fits_exactly, l1_cost, smoothing
 
 # How far to go towards the nearest bound.
 _FRACTION = 0.9995
 # Converged must also mean that no step of the last linear problem would lower the cost by more
 # than this part: with many false loops it can come to rest where one would.
-_PROVEN = 2e-3
+_PROVEN = 1e-2
 # A step cut to less by the bounds has run into them: the next does no more than to leave them.
 _SHORT = 0.1
 # Slacks are kept above this and never recomputed as 1 -+ y, which would cancel.
@@ -50,16 +50,14 @@ _DEPARTURE, _SHORTEST = 0.5, 1e-4
 # Of the curvature: how much of it is wanted, and how fast that is taken up again once refused.
 _CURVATURE, _RECOVERY = 0.7, 1.3
 # Part of its diagonal that J'QJ gets where rounding leaves it indefinite: ten times what is taken
-# for rounding there.
-_ROUNDING = 1e-12
+# for rounding there, and so many times more each time that it is so again.
+_ROUNDING, _MORE = 1e-12, 100.0
 # Of the dual at the end: most projections to make it feasible (each costs a solution, none a
 # factorisation), and the part of the cost that is a gap small enough.
 _PROJECTIONS, _CLOSE = 10, 1e-4
 # A row at its bound still gives way a little, or there might be no feasible dual nearby. With a
 # tenth of it the proof misses by percents on the torus in space; in the plane it costs nothing.
 _LEAST_WEIGHT = 1e-2
-
-Report = Callable[[int, float], None]
 
 
 @dataclass
@@ -149,7 +147,7 @@ class Curvature:
     """How much curvature kappa the next factorisation gets."""
 
     def __init__(self) -> None:
-        self._kappa = _CURVATURE
+        self._kappa, self._rounding = _CURVATURE, _ROUNDING
 
     def factorise(self, system: LinearSystem, weights: Array, C: Array | None,
                   cholesky: BlockCholesky) -> bool:
@@ -160,8 +158,11 @@ class Curvature:
             if cholesky.factorise(system, weights, 0.0, C, self._kappa):
                 if share == 1:
                     self._kappa = min(_CURVATURE, _RECOVERY * max(wanted, _CURVATURE / 10))
+                self._rounding = _ROUNDING
                 return True
-        return cholesky.factorise(system, weights, _ROUNDING * system.diagonal(weights))
+        added = self._rounding * system.diagonal(weights)
+        self._rounding *= _MORE
+        return cholesky.factorise(system, weights, added)
 
 
 def interior_point(

@@ -30,7 +30,7 @@ restarts Applegate et al. (2021), see `primal_dual`. Scaling and refinement are 
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -39,9 +39,6 @@ from l1slam_ros.core.graph.linear_system import LinearSystem
 from l1slam_ros.core.graph.tiles import Single, Tiles
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
 from l1slam_ros.core.solvers.primal_dual import CHECK_EVERY, PrimalDualOptions, PrimalDualSolution
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 # Restart when the residual fell to this part of what it was at the first look, ...
 _ENOUGH = 0.2
@@ -59,20 +56,6 @@ _WEIGHT_RANGE = 3.0
 _EXACT = 1e-6
 # Part of a keyframe's scale by which a direction that no factor measures is held.
 _UNMEASURED = 1e-12
-
-
-def halpern_step(
-    A: 'csr_array', b: Array, x: Array, y: Array, y0: Array, weight: float, k: int
-) -> tuple[Array, Array]:
-    """
-    Return the next (x, y): one iteration as the page above has it, k after the restart.
-
-    The compiled loop is tested against this.
-    """
-    d = A.T @ y / weight
-    y_bar = np.clip(y + weight * (A @ (x - 2 * d) - b), -1, 1)
-    a = (k + 1) / (k + 2)
-    return a * (x - 2 * d), a * (2 * y_bar - y) + (1 - a) * y0
 
 
 def scaled_system(system: LinearSystem) -> tuple[LinearSystem, Array]:

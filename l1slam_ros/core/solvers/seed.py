@@ -28,7 +28,7 @@ from l1slam_ros.core.graph.linear_system import (
     anchor,
     keyframes_of,
     linearise,
-    step_poses,
+    step_part,
     whitened_residual,
 )
 from l1slam_ros.core.graph.spanning_tree import odometry_poses, tree_poses
@@ -78,7 +78,7 @@ def seed_poses(
     poses = min(candidates, key=lambda poses: _rotation_cost(graph, poses))
     system = translation_system(graph, poses)
     x = _minimise(system, cholesky, options, check)
-    return _moved(graph, poses, x, graph.manifold.TRANSLATION)
+    return step_part(graph, poses, x, graph.manifold.TRANSLATION)
 
 
 def _references(graph: FactorGraph, cholesky: BlockCholesky | None) -> list[Array]:
@@ -153,7 +153,7 @@ def _lowered(graph: FactorGraph, poses: Array, x: Array,
              cost: float) -> tuple[Array, float, float]:
     """Return poses, cost and length of the longest of x, x/2, ... that lowers it; 0: none."""
     for halvings in range(_HALVINGS):
-        candidate = _moved(graph, poses, x / 2**halvings, graph.manifold.ROTATION)
+        candidate = step_part(graph, poses, x / 2**halvings, graph.manifold.ROTATION)
         candidate_cost = _rotation_cost(graph, candidate)
         if candidate_cost < cost:
             return candidate, candidate_cost, 0.5**halvings
@@ -182,13 +182,6 @@ def _unwrap_alike(graph: FactorGraph, poses: Array, others: Array) -> bool:
 
 def _is_same(predicted: Array, residual: Array) -> bool:
     return float(np.abs(predicted - residual).max(initial=0.0)) < _SAME
-
-
-def _moved(graph: FactorGraph, poses: Array, x: Array, part: slice) -> Array:
-    """Return the poses after a step of this part of the tangent alone."""
-    step = np.zeros((graph.n_poses - anchor(graph), graph.manifold.TANGENT_SIZE))
-    step[:, part] = x.reshape(len(step), -1)
-    return step_poses(graph, poses, step)
 
 
 def _rotation_residual(graph: FactorGraph, poses: Array) -> Array:

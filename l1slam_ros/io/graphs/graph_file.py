@@ -36,7 +36,7 @@ from l1slam_ros.io.graphs.rows import (
     vertices_of,
     without_circles,
 )
-from l1slam_ros.io.graphs.side_files import read_stamps, read_trusted, write_beside
+from l1slam_ros.io.graphs.side_files import named_loops, read_stamps, write_beside
 from l1slam_ros.io.graphs.tags import (
     FACTORS,
     FORMAT_OF_SUFFIX,
@@ -157,7 +157,8 @@ def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, e
     i, j = _index(path, ids, edges).T
     i, none = np.where(edges.alone, WORLD, i), np.zeros(len(edges), bool)
     doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), none, none)
-    trusted = remarks['trusted'] if remarks else read_trusted(path, ids, doubted)
+    trusted = remarks['trusted'] if remarks else (
+        named_loops(path, 'trusted', ids, doubted))
     graph.add_between(i, j, edges.pose, edges.scaled, trusted)
     if remarks:
         graph.say(np.flatnonzero(remarks['struck']), trusted=False)

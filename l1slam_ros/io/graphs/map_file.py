@@ -75,6 +75,10 @@ class MapFile:
             sentence, well = f'the map begins empty: {error}', not self._path().exists()
         (tell if well else self._warn)(sentence)
 
+    def disown(self) -> None:
+        """Let what is in the file be another map than that of the back end from now on."""
+        self._ours = Path()
+
     def seconds_left(self) -> float:
         """Return in how many seconds `autosave` is due, or when to ask again."""
         options = self._options()
@@ -92,7 +96,7 @@ class MapFile:
         if path != self._ours and path.exists():
             kept = path.with_name(f'{path.stem}.{_time_of(path)}{path.suffix}')
             keep_as(path, kept)
-            self._warn(f'{path} held a map that was not loaded: it is kept as {kept}')
+            self._warn(f'{path} held another map: it is kept as {kept}')
         self.save()
 
     def _is_to_be_saved(self) -> bool:

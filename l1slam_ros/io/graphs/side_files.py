@@ -103,49 +103,52 @@ def read_stamps(path: str | os.PathLike[str], ids: Indices) -> Indices | None:
     return np.array([stamp_of[k] for k in ids.tolist()], np.int64)
 
 
-def read_trusted(path: str | os.PathLike[str], ids: Indices, factors: BetweenFactors) -> Mask:
+def named_loops(path: str | os.PathLike[str], what: str, ids: Indices,
+                factors: BetweenFactors) -> Mask:
     """
-    Return which factors of a graph are trusted loops, (m,) bool; none without a file of them.
+    Return which factors of a graph are loops that a file beside it names, (m,) bool.
 
-    All loops between two vertices that the file names are, either way round; ids : (n,) of the
-    keyframes.
+    All loops between two vertices that it names are, either way round. what : `trusted` or
+    `false`; ids : (n,) of the keyframes.
 
     Raises
     ------
     FileError : naming the line, when the file is damaged or names vertices without an edge.
 
     """
-    side = beside(path, 'trusted')
-    if not side.exists():
+    named, numbers = read_pairs(path, what)
+    if not len(named):
         return np.zeros(len(factors), bool)
-    lines = read_lines(side)
-    named = parse_rows(side, 'trusted loop', lines, ids=2, values=0)[0]
     # Ids may be any 64 bits, so pairs of them are numbered anew.
     both = np.sort(np.concatenate((ids[factors.pairs], named)), axis=1)
     number = np.unique(both, axis=0, return_inverse=True)[1].ravel()  # NumPy 2.0: (m, 1)
-    edges, trusted = number[:len(factors)], number[len(factors):]
-    unknown = ~np.isin(trusted, edges)
+    edges, chosen = number[:len(factors)], number[len(factors):]
+    unknown = ~np.isin(chosen, edges)
     if unknown.any():
         k = int(np.argmax(unknown))
-        raise FileError(side, f'no edge between {named[k, 0]} and {named[k, 1]} in {path}; '
-                        'expected its trusted loops, or no such file', lines.numbers[k])
-    return np.asarray(np.isin(edges, trusted) & ~factors.is_odometry)
+        raise FileError(beside(path, what), f'no edge between {named[k, 0]} and {named[k, 1]} in '
+                        f'{path}; expected its {what} loops, or no such file', numbers[k])
+    return np.asarray(np.isin(edges, chosen) & ~factors.is_odometry)
 
 
-def pair_lines(pairs: Indices) -> list[str]:
-    """Return the lines of a file of loops, false or trusted: pairs (k, 2) of vertex ids."""
-    return [f'{i} {j}' for i, j in pairs.tolist()]
-
-
-def read_false_loops(path: Path) -> Indices:
+def read_pairs(path: str | os.PathLike[str], what: str) -> tuple[Indices, list[int]]:
     """
-    Return the vertex ids i, j of each false loop, (k, 2); none where there is no such file.
+    Return the vertex ids (k, 2) that a file beside a graph or a bag names, and their lines.
+
+    None where there is no such file.
 
     Raises
     ------
     FileError : naming the line, when the file is damaged.
 
     """
-    if not path.exists():
-        return np.zeros((0, 2), np.int64)
-    return parse_rows(path, 'false loop', read_lines(path), ids=2, values=0)[0]
+    side = beside(path, what)
+    if not side.exists():
+        return np.zeros((0, 2), np.int64), []
+    lines = read_lines(side)
+    return parse_rows(side, f'{what} loop', lines, ids=2, values=0)[0], lines.numbers
+
+
+def pair_lines(pairs: Indices) -> list[str]:
+    """Return the lines of a file of loops, false or trusted: pairs (k, 2) of vertex ids."""
+    return [f'{i} {j}' for i, j in pairs.tolist()]

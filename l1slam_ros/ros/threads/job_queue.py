@@ -73,6 +73,8 @@ class JobQueue:
     def _work(self) -> None:
         while (job := self._next()) is not None:
             job.future.set_result(self._carry_out(job))
+            if (executor := self._node.executor) is not None:
+                executor.wake()  # it looks whether the answer is there only when it is up
 
     def _next(self) -> _Job | None:
         while True:

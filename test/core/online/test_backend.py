@@ -533,35 +533,34 @@ def test_what_is_not_finite_is_not_adopted(world, name):
     assert_array_equal(backend.poses, good.poses)
 
 
-@pytest.mark.parametrize('work', ['improve', 'optimise', 'optimise all'])
-def test_work_can_be_stopped_at_many_moments(careful, work):
-    world = spoilt(careful, 'random', 130)
-    backend = Backend(EVERY if work == 'optimise' else CREDULOUS)
-    play(backend, world)
-    problem = backend.snapshot().problem()
-    kept = problem.poses.copy(), problem.judgement.accepted.copy()
-    limit, count = 10**9, 0
+class Stop:
+    """Interrupts whoever asks more often than this."""
 
-    def check():
-        nonlocal count
-        count += 1
-        if count > limit:
+    def __init__(self, limit):
+        self.limit, self.asked = limit, 0
+
+    def __call__(self):
+        self.asked += 1
+        if self.asked > self.limit:
             raise Interrupted
 
-    def run():
-        nonlocal count
-        count = 0
-        if work == 'improve':
-            improve(problem, EVERY.solver, PLENTY, check)
-        else:
-            optimise(problem, EVERY.solver, check)
 
-    run()
-    assert count > 10
-    for limit in np.linspace(0, count - 1, 8).astype(int):
+@pytest.mark.parametrize('options, work', [
+    (CREDULOUS, lambda problem, check: improve(problem, EVERY.solver, PLENTY, check)),
+    (EVERY, lambda problem, check: optimise(problem, EVERY.solver, check)),
+    (CREDULOUS, lambda problem, check: optimise(problem, EVERY.solver, check)),
+], ids=['improve', 'optimise', 'optimise all'])
+def test_work_can_be_stopped_at_many_moments(careful, options, work):
+    problem = played(spoilt(careful, 'random', 130), options=options).snapshot().problem()
+    kept = problem.poses.copy(), problem.judgement.accepted.copy()
+    whole = Stop(np.inf)
+    work(problem, whole)
+    assert whole.asked > 10
+    for limit in np.linspace(0, whole.asked - 1, 8).astype(int):
+        stop = Stop(limit)
         with pytest.raises(Interrupted):
-            run()
-        assert count == limit + 1, 'it went on after it was stopped'
+            work(problem, stop)
+        assert stop.asked == limit + 1, 'it went on after it was stopped'
     assert_array_equal(problem.poses, kept[0])
     assert_array_equal(problem.judgement.accepted, kept[1])
 

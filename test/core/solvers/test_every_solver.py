@@ -16,22 +16,23 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import NORMS
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.exact import minimise_interior_point
-from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_huber, minimise_l2
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, gauss_newton, minimise_l2
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, minimise
-from l1slam_ros.core.solvers.optimality import Lengths, Status, l1_cost, norm_of
+from l1slam_ros.core.solvers.optimality import Huber, Lengths, Status, l1_cost, norm_of
 from l1slam_ros.core.solvers.primal_dual import CHECK_EVERY, PrimalDualOptions, minimise_l1
 from l1slam_ros.core.solvers.primal_dual_newton import minimise_norm
 from l1slam_ros.core.solvers.restarted_pdhg import minimise_l1_halpern
 
 
-def minimise_group_l1(graph, poses, *more, **named):
-    return minimise_norm(graph, poses, Lengths(3), *more, **named)
+def of(minimise, norm):
+    """Return a solver of one norm."""
+    return lambda graph, poses, *more, **named: minimise(graph, poses, norm, *more, **named)
 
 
 # By the norm that each minimises.
 WHOLE = {'algorithm 4': (minimise, 'l1'), 'interior point': (minimise_interior_point, 'l1'),
-         'group L1': (minimise_group_l1, 'group-l1'), 'L2': (minimise_l2, 'l2'),
-         'Huber': (minimise_huber, 'huber')}
+         'group L1': (of(minimise_norm, Lengths(3)), 'group-l1'), 'L2': (minimise_l2, 'l2'),
+         'Huber': (of(gauss_newton, Huber(3, 1.345)), 'huber')}
 MOST = 200
 
 

@@ -92,7 +92,7 @@ def test_converged_means_that_little_is_left(world):
     """A hundred times as loose, a hundred times as far from the best, but for luck."""
     graph, truth = world
     best = solve_graph(graph, truth, tolerance=1e-10).costs[-1]
-    for tolerance in (1e-3, 1e-5, 1e-7):
+    for tolerance in (1e-2, 1e-4, 1e-6):
         optimum = solve_graph(graph, truth, tolerance=tolerance)
         assert optimum.status is Status.CONVERGED
         assert 0 <= optimum.costs[-1] / best - 1 <= tolerance + 1e-10

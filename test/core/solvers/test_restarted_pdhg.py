@@ -12,9 +12,17 @@ from l1slam_ros.core.graph.tiles import Tiles
 from l1slam_ros.core.kernels import halpern as kernels
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
 from l1slam_ros.core.solvers.primal_dual import PrimalDualOptions, minimise_l1
-from l1slam_ros.core.solvers.restarted_pdhg import halpern_step, minimise_l1_halpern, scaled_system
+from l1slam_ros.core.solvers.restarted_pdhg import minimise_l1_halpern, scaled_system
 
 BLOCK_SIZES = [1, 2, 3, 6]
+
+
+def halpern_step(A, b, x, y, y0, weight, k):
+    """Return the next (x, y), k iterations after the restart, as the solver's page has it."""
+    d = A.T @ y / weight
+    y_bar = np.clip(y + weight * (A @ (x - 2 * d) - b), -1, 1)
+    a = (k + 1) / (k + 2)
+    return a * (x - 2 * d), a * (2 * y_bar - y) + (1 - a) * y0
 
 
 def chain_with_loops(k, rng, size=12, loops=20, absolute=2):
@@ -125,6 +133,17 @@ def test_a_look_finds_the_next_point_and_its_residual(k, rng):
 
 
 # The solver
+
+
+@pytest.mark.parametrize('k', BLOCK_SIZES)
+def test_the_first_step_is_from_the_dual_that_is_given(k, rng):
+    system, weight = chain_with_loops(k, rng), 0.4
+    scaled, inverse = scaled_system(system)
+    y = rng.uniform(-1, 1, len(system.b))
+    found = minimise_l1_halpern(system, zeros(system)[0], y, PrimalDualOptions(1, 0.0), weight)
+    x, y = halpern_step(scaled.A, system.b, zeros(system)[0], y, y, weight, 0)
+    expected = inverse @ (x - scaled.A.T @ y / weight).reshape(-1, k, 1)
+    assert_allclose(found.x, expected.ravel(), atol=1e-4 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize('k', BLOCK_SIZES)
