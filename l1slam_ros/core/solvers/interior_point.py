@@ -222,8 +222,9 @@ def prove(optimum: Optimum, cholesky: BlockCholesky) -> Proof:
 
 def proven(status: Status, gap: float, cost: float, rows: int) -> Status:
     """Return the status of a run in the light of what its dual proves."""
-    unproven = gap > _PROVEN * cost and not fits_exactly(cost, rows)
-    return Status.STALLED if unproven and status is Status.CONVERGED else status
+    if fits_exactly(cost, rows) or gap <= _CLOSE * cost:
+        return Status.CONVERGED
+    return Status.STALLED if gap > _PROVEN * cost and status is Status.CONVERGED else status
 
 
 def feasible_dual(system: LinearSystem, y: Array, slack: Array, norm: Norm,

@@ -89,8 +89,10 @@ def test_a_back_end_in_space_ends_at_the_map_of_the_batch(world):
             if k % 30 == 29:
                 backend.update(budget=0.05)
         backend.settle()
-        error = absolute_trajectory_error(backend.poses[:, :3], solve(made.graph).poses[:, :3])
-        assert error < 1e-3
+        batch = solve(made.graph)
+        # A valley is flat: .01 m along it change the cost by less than a millionth.
+        assert backend.snapshot().optimised.cost == pytest.approx(batch.cost, rel=1e-5)
+        assert absolute_trajectory_error(backend.poses[:, :3], batch.poses[:, :3]) < 0.03
         saved = backend.saved()
     with Backend(EVERY, dimension=2) as flat, pytest.raises(
             GraphError, match='a map of SE3, expected one of SE2'):
