@@ -13,6 +13,7 @@ from l1slam_ros.core.robust.judgement import (
     ONE_PLACE,
     OTHER_MAP,
     SLIP,
+    UNFINISHED,
     Doubt,
     Judgement,
 )
@@ -50,6 +51,8 @@ _REASONS = {
                '{where}',
     SLIP: 'whether the odometry slipped or not {where}, the {loops} loops across that are used '
           'do not say for sure',
+    UNFINISHED: 'the judgement did not come to an end: the {loops} loops that are left out, '
+                '{where}, were still coming in a few at a time',
 }
 _REMEDY = 'Vouch for a loop that is right, strike out one that is false, or state the noise'
 

@@ -76,9 +76,10 @@ def robust_solve(
     """
     first = growth = Growth(graph, check)
     first.begin()
+    number = 0
     for number, growth in enumerate(rounds(first, without_slip), 1):
         report(number, int(np.count_nonzero(growth.accepted & growth.is_loop)))
-    return judgement_of(growth, doubts(growth)), growth.poses
+    return judgement_of(growth, doubts(growth, number < _MOST_ROUNDS)), growth.poses
 
 
 @dataclass(frozen=True)

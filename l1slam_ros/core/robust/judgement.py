@@ -26,9 +26,10 @@ from l1slam_ros.core.robust.slips import SPANNING, SURE, common_steps, spanning
 
 # Most loops are refused; all that are accepted are of one place; loops of one place alone say how
 # two parts lie to each other; refused loops of several places agree on another map; an odometry
-# factor may have slipped, and it was not believed.
-MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP = (
-    'mostly refused', 'one place', 'one place joins', 'another map', 'a slip suspected')
+# factor may have slipped, and it was not believed; there were more rounds to come.
+MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP, UNFINISHED = (
+    'mostly refused', 'one place', 'one place joins', 'another map', 'a slip suspected',
+    'not at an end')
 
 # Of fewer loops most may well be refused, and be of one place; most are more than half by some.
 _HANDFUL, _MOST = 5, 0.55
@@ -151,14 +152,16 @@ def fits(growth: Growth) -> tuple[Array, Mask]:
     return square, ~accepted & ~far & growth.is_loop
 
 
-def doubts(growth: Growth) -> tuple[Doubt, ...]:
-    """Return the reasons to doubt a map in which nothing more can be accepted; none: ()."""
+def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
+    """Return the reasons to doubt a map; none: (); ended : nothing more can be accepted."""
     loops = growth.is_loop[: growth.size]
     left_out = np.flatnonzero(loops & ~growth.accepted[: growth.size])
     accepted = np.flatnonzero(loops & growth.accepted[: growth.size])
     reasons = []
     if np.count_nonzero(loops) >= _HANDFUL and len(left_out) > _MOST * np.count_nonzero(loops):
         reasons.append(_doubt(growth, MOSTLY_REFUSED, left_out))
+    if not ended and len(left_out):
+        reasons.append(_doubt(growth, UNFINISHED, left_out))
     if _carries_all(growth, accepted):
         reasons.append(_doubt(growth, ONE_PLACE, accepted))
     if growth.cut.any():

@@ -9,8 +9,9 @@ from problems import add_absolute, retold
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.robust import batch
 from l1slam_ros.core.robust.batch import judge, robust_solve
-from l1slam_ros.core.robust.judgement import OTHER_MAP, SLIP, Judgement
+from l1slam_ros.core.robust.judgement import OTHER_MAP, SLIP, UNFINISHED, Judgement
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
@@ -129,3 +130,11 @@ def test_one_absolute_pose_fixes_the_gauge_and_nothing_else():
     found, _ = robust_solve(graph)
     assert len(found.accepted) == len(graph.between)
     assert found.accepted.tolist() == [*without.accepted, True]
+
+
+def test_a_judgement_that_came_to_no_end_is_doubtful(world, monkeypatch):
+    graph = spoilt(world, 'random', 170).graph
+    assert robust_solve(graph)[0].doubts == ()
+    monkeypatch.setattr(batch, '_MOST_ROUNDS', 2)
+    (doubt,) = robust_solve(graph)[0].doubts
+    assert doubt.kind == UNFINISHED and doubt.loops >= 170
