@@ -98,10 +98,8 @@ class Front:
         self._volume = (gate.log_volume - k * np.log(2 * np.pi) / 2
                         - np.log(_SURE - 1) - gate.log_odds)
         self._variance = np.repeat(gate.variance[:, None], k, axis=1)
-        # What is new is expected to be as far off in the L1 map as all else is in the mean.
-        self._usual = smoothing(system.b)
-        weights = 1 / np.hypot(system.b, _SMOOTHING * self._usual)
-        if not choleskys[L1].factorise(system, weights):
+        self._mu = _SMOOTHING * smoothing(system.b)
+        if not choleskys[L1].factorise(system, 1 / np.hypot(system.b, self._mu)):
             raise GraphError('a part of the graph is not tied to the anchor')
         self._map = GrowingMap(part, poses, choleskys)
 
@@ -172,13 +170,13 @@ class Front:
         try:
             if first_seen:
                 self._map.begin(L2, new, at, self._variance[0])
-                self._map.begin(L1, new, at, np.full(len(own), self._usual))
+                self._map.begin(L1, new, at, np.full(len(own), self._mu))
                 return Look(True, False, 0.0)
             variance, predicted = self._variance[1], self._map.predict(L2, new, at)
             look, left = self._test(predicted, own, variance, known == 1)
             if look.accepted:
                 self._map.add(L2, predicted, variance)
-                self._map.add(L1, self._map.predict(L1, new, at), np.hypot(left, self._usual))
+                self._map.add(L1, self._map.predict(L1, new, at), np.hypot(left, self._mu))
         except np.linalg.LinAlgError:
             # Beyond double precision: the next map may be able to.
             return None

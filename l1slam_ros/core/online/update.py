@@ -46,7 +46,7 @@ from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 _SMOOTHING, _SHARPER, _SHARPEST = 0.1, 0.3, 1e-2
 # Linearisations of one round, and iterations of one where a front carries what is far: more and
 # it is late.
-_OUTER, _INNER = 2, 240
+_OUTER, _INNER = 2, 120
 # Steps of Gauss-Newton that the gate's map gets each time it is made.
 _L2_STEPS = 4
 

@@ -22,8 +22,8 @@ from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.optimality import Status
 
-# A map is factored anew from so many factors on that came since: those of five keyframes.
-_MANY = 10
+# A map is factored anew from so many factors on that came since: those of ten keyframes.
+_MANY = 20
 # Factors that a front takes while its lock is held.
 AT_ONCE = 16
 # [s] While loops come none of which fits, they are judged so often.
