@@ -10,7 +10,6 @@ knows without numba that nothing is to be done. The note counts only for the ver
 numba and processor that it was made with, and while the files it names are there.
 """
 
-import ctypes
 import gc
 import hashlib
 import importlib
@@ -25,7 +24,6 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
 
 from l1slam_ros.core.geometry.manifold import Manifold
@@ -48,8 +46,6 @@ STEPS_IN_SPACE = tuple(_IN_SPACE.values())
 _KERNELS = Path(__file__).parents[1] / 'core' / 'kernels'
 # [s] How often the caller is asked whether to stop.
 _LOOK = 0.1
-# Of glibc's `mallopt`: how many heaps there may be.
-_ARENA_MAX = -8
 # Other processes go first, though not by far: whoever waits for the loops waits for these.
 _NICE = 5
 # What a processor is known by, of all that the kernel of Linux says of it.
@@ -151,9 +147,6 @@ def load(steps: Sequence[str] = STEPS) -> None:
     # Some 100,000 objects that stay: to look at them for garbage takes a tenth of a second.
     gc.collect()
     gc.freeze()
-    # With a heap for each thread a quarter more is held, of what each once needed.
-    with suppress(AttributeError):
-        ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
 
 
 def make_ready(step: str) -> list[str]:
