@@ -10,7 +10,10 @@ looked at twice.
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.graph.spanning_tree import pair_key
 
+# More keyframes than any graph has: what belongs to a pair stays while the graph grows.
+_MANY = 2**32
 _MIXED = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 
@@ -21,9 +24,7 @@ def keys(one: Indices, other: Indices) -> np.ndarray:
 
     Factors of the same two keyframes are told apart by which comes first.
     """
-    low, high = (end.astype(np.uint64) for end in
-                 (np.minimum(one, other), np.maximum(one, other)))
-    pair = _mixed((low << np.uint64(32)) ^ high)
+    pair = _mixed(pair_key(one, other, _MANY).astype(np.uint64))
     order = np.argsort(pair, kind='stable')
     first = np.concatenate(([True], pair[order][1:] != pair[order][:-1]))[: len(pair)]
     place = np.arange(len(pair))

@@ -52,7 +52,7 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     place, first = np.unique(growth.place[rows], return_index=True, return_inverse=True)[2:0:-1]
     evidence = _evidence(place, one, other, log_ratio)
     best, needed = int(np.argmax(evidence)), np.log(len(rows) / DOUBT)
-    one_each = rows[np.sort(first)]
+    one_each = rows[np.sort(first)]  # in the order of `Growth.some`, whatever places are called
     if evidence[best] < needed or evidence[best] < needed + _by_chance(growth, one_each):
         return NO_GROUP
     found = rows[np.concatenate(([best], other[one == best]))]

@@ -109,14 +109,14 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, more: bool = True
     for step in _suspected(growth, odds, as_stated.undecided()):
         state, usual = _without(growth, step), False
         if state:
-            state, step = _cut_where_likeliest(state, step, motion)
+            state, step = _cut_rather(state, step, _likeliest(state, step, motion))
             usual = _moves_as_usual(state, step, motion)
         yield [step], float(odds[step]), state, usual
         if more and state and not usual:
             for (second,), other, both, usual in _tried(state, state, motion, False):
                 first = step
                 if both:
-                    both, first = _cut_where_likeliest(both, step, motion)
+                    both, first = _cut_rather(both, step, _likeliest(both, step, motion))
                     usual = usual and _moves_as_usual(both, first, motion)
                 yield [first, second], float(odds[first]) + other, both, usual
 
@@ -198,8 +198,8 @@ def _place(growth: Growth) -> float:
     return float(growth.gate(np.array([growth.graph.manifold.TANGENT_SIZE]))[0] / 2)
 
 
-def _cut_where_likeliest(state: Growth, cut: int, motion: Motion) -> tuple[Growth, int]:
-    """Return a state cut at the likeliest of the steps that no loop tells apart, and that step."""
+def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
+    """Return the step that slipped, by how the robot moves, of those that no loop tells apart."""
     loops = state.is_loop & state.accepted
     ends = np.unique((state.low[loops], state.high[loops]))
     stretch = np.searchsorted(ends, state.low, side='right')
@@ -207,7 +207,11 @@ def _cut_where_likeliest(state: Growth, cut: int, motion: Motion) -> tuple[Growt
     steps = np.flatnonzero(odometry & (stretch == stretch[cut]))
     gain = motion.log_density(*_repaired(state, cut, steps)) - motion.log_density(
         steps_of(state, steps))
-    step = int(steps[np.argmax(gain)])
+    return int(steps[np.argmax(gain)])
+
+
+def _cut_rather(state: Growth, cut: int, step: int) -> tuple[Growth, int]:
+    """Return the state that is cut at a step and not where it is, between the same loops; step."""
     if step == cut:
         return state, cut
     state = state.copy()

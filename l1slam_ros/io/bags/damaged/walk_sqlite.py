@@ -26,14 +26,15 @@ def walk_sqlite(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]
                 "WHERE encoding = 'ros2msg'"))
         topics = {key: (name, msgtype) for key, name, msgtype in database.execute(
             "SELECT id, name, type FROM topics WHERE serialization_format = 'cdr'")}
+        cut = is_cut(path)
         # Of a page that is lost in part SQLite would take the lost part for zeros.
-        rows = leaf_rows(path) if is_cut(path) else database.execute(
+        rows = leaf_rows(path) if cut else database.execute(
             'SELECT topic_id, CAST(timestamp AS INTEGER), CAST(data AS BLOB) FROM messages '
             'ORDER BY id')
         for key, time, data in rows:
             if key in topics:
                 yield BagMessage(*topics[key], time, data)
-    if is_cut(path):
+    if cut:
         raise BrokenRecordError(path.stat().st_size)
 
 
