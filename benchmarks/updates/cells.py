@@ -8,6 +8,7 @@ ISAM2's, and what the map was at checkpoints; that is worked out after the run.
 
 import resource
 import subprocess
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.paper.updates import Isam2, Kept, run_updates, spread
+from l1slam_ros.paper.updates import Isam2, Kept, run_updates
 
 CHECKPOINTS = 20
 # Simulated: keyframes and edges of the paper's Manhattan10k, and of a large sparse world.
@@ -242,3 +243,13 @@ def prefix(graph: FactorGraph, poses: int) -> FactorGraph:
     part.append_between(factors.i[rows], factors.j[rows], factors.measurement[rows],
                         factors.sqrt_information[rows])
     return part
+
+
+def spread(seconds: Sequence[float]) -> dict[str, float]:
+    """Return what updates cost: [ms], `second` and `last` the p95 of a quarter; total [s]."""
+    ms = 1e3 * np.array(seconds)
+    _, second, _, last = np.array_split(ms, 4)
+    return {'median': float(np.median(ms)), 'p95': float(np.percentile(ms, 95)),
+            'p99': float(np.percentile(ms, 99)), 'max': float(ms.max()),
+            'second': float(np.percentile(second, 95)), 'last': float(np.percentile(last, 95)),
+            'total': float(ms.sum() / 1e3)}

@@ -64,15 +64,14 @@ class Effort:
     How long the experiments run; the defaults are those of the report.
 
     outer : most linearisations of Algorithm 4 as printed, inner : iterations of each; iterations :
-    of the angle and translation problems of Figure 2; timed : what one time is taken of; draws :
-    of what is random in Figures 4 and 6; keyframes : of Figure 5, at `rate` per second.
+    of the angle and translation problems of Figure 2; timed : what one time is taken of;
+    keyframes : of Figure 5, at `rate` per second.
     """
 
     outer: int = 30
     inner: int = 400
     iterations: int = 10_000
     timed: int = 40
-    draws: int = 5
     keyframes: int = 3000
     rate: float = 200.0
 

@@ -130,20 +130,15 @@ def _title(result: GraphResult) -> str:
     return result.paper.name + ('' if result.paper.file else ' (*)')
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> list[str]:
-    """Return a table whose first columns hold words, the others numbers."""
-    lines = [header, ['---'] * words + ['---:'] * (len(header) - words), *rows]
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return a table whose first column holds words, the others numbers."""
+    lines = [header, ['---'] + ['---:'] * (len(header) - 1), *rows]
     return [f'| {" | ".join(cells)} |' for cells in lines]
 
 
 def cost(value: float) -> str:
     """Return a cost in six digits, as the paper prints them."""
     return f'{value:.6g}'.replace('e+0', 'e')
-
-
-def metres(length: float) -> str:
-    """Return a length [m] with its unit, to the centimetre."""
-    return f'{length:.2f} m'
 
 
 def milliseconds(seconds: float | None) -> str:

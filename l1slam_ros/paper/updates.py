@@ -9,7 +9,7 @@ time: others on the machine do not lengthen them, and what goes on behind is cou
 
 import importlib.util
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -220,13 +220,3 @@ def _batch_seconds(now: Kept) -> float:
     began = time.process_time()
     minimise_l2(now.graph, now.poses, LeastSquaresOptions(), cholesky_of(now.graph))
     return time.process_time() - began
-
-
-def spread(seconds: Sequence[float]) -> dict[str, float]:
-    """Return what updates cost: [ms], `second` and `last` the p95 of a quarter; total [s]."""
-    ms = 1e3 * np.array(seconds)
-    _, second, _, last = np.array_split(ms, 4)
-    return {'median': float(np.median(ms)), 'p95': float(np.percentile(ms, 95)),
-            'p99': float(np.percentile(ms, 99)), 'max': float(ms.max()),
-            'second': float(np.percentile(second, 95)), 'last': float(np.percentile(last, 95)),
-            'total': float(ms.sum() / 1e3)}
