@@ -17,7 +17,6 @@ from l1slam_ros.core.solvers.optimality import Status, l1_cost
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.worlds.false_loops import random_false_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
-from l1slam_ros.io.graphs.graph_file import read_graph_file
 
 DEFAULTS = OptimiserOptions()
 
@@ -77,17 +76,28 @@ def test_a_long_way_that_closes_at_its_end_is_solved_to_its_end(side, more, seed
     assert warm.cost > (1 - 1e-3) * solution.cost
 
 
-def test_a_map_that_hardly_hangs_together_is_solved_to_rounding(datasets):
-    """With a tenth of its loops its normal matrix is indefinite in the end, but for rounding."""
-    graph = read_graph_file(datasets / 'manhattan3500.g2o').graph
-    loops = np.random.default_rng(0).permutation(np.flatnonzero(~graph.between.is_odometry))
-    kept = graph.between.is_odometry.copy()
-    kept[loops[:len(loops) // 10]] = True
-    few = graph.subset(kept)
-    solution = solve(few, seed_poses(few, cholesky_of(few)))
-    # How many steps rounding takes hangs on the machine; that there is a direction does not.
-    assert solution.status is not Status.STALLED
-    assert solution.gap < 1e-2 * solution.cost
+def stiff_part_on_soft_ties(rng):
+    """Return six ties that contradict each other, on a part whose factors say far more."""
+    along = np.arange(6)
+    pairs = np.array([*[(0, 1)] * 6, (1, 2), (2, 3), (3, 4), (4, 5), (1, 5)])
+    ties, step = np.column_stack((along, 0.5 * along, 0.1 * along)), [1.0, 0.0, 0.0]
+    measured = np.concatenate((ties, [step] * 4, [[4.001, 0.0, 0.0]]))
+    graph = FactorGraph(se2)
+    graph.add_poses(6)
+    graph.add_between(*pairs.T, measured + 1e-9 * rng.standard_normal(measured.shape),
+                      np.where(pairs[:, 0] > 0, 3e5, 1.0)[:, None, None] * np.eye(3))
+    return graph
+
+
+def test_what_rounding_leaves_indefinite_is_solved_to_its_end():
+    """
+    Where no tie is kept exactly, all of them give way to a push so much more than the part does,
+    in the end, that the normal matrix has no factor. With nothing added to it the run stalls 10%
+    above the optimum. Five times, moved a little: at such a point a run now and then goes astray.
+    """
+    graphs = [stiff_part_on_soft_ties(np.random.default_rng(seed)) for seed in range(5)]
+    solutions = [solve(graph, odometry_poses(graph)) for graph in graphs]
+    assert np.median([solution.gap / solution.cost for solution in solutions]) < 1e-3
 
 
 def test_no_small_step_is_better_by_highs(world):
