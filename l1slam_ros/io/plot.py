@@ -17,7 +17,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from matplotlib.transforms import ScaledTranslation
-from PIL import Image
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
@@ -166,13 +165,9 @@ def _new_figure(path: str | Path, columns: float, rows: float) -> Figure:
 
 
 def _save(figure: Figure, path: str | Path) -> None:
-    kind = Path(path).suffix[1:].lower()
     with replacing(path) as temporary:
-        figure.savefig(temporary, format=kind, bbox_inches='tight', pad_inches=0.15)
-        if kind == 'png':
-            # Of few colours anyway; with a palette it takes a third of the room.
-            Image.open(temporary).convert('RGB').quantize(64, dither=Image.Dither.NONE).save(
-                temporary, kind, optimize=True)
+        figure.savefig(temporary, format=Path(path).suffix[1:].lower(), bbox_inches='tight',
+                       pad_inches=0.15)
 
 
 def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str) -> None:

@@ -19,10 +19,16 @@ from l1slam_ros.core.graph.linear_system import (
     step_poses,
     whitened_residual,
 )
-from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.nonlinear import Report, Solution
-from l1slam_ros.core.solvers.optimality import Huber, Norm, Status, fits_exactly, l1_cost, l2_cost
+from l1slam_ros.core.solvers.optimality import (
+    Huber,
+    SmoothNorm,
+    Status,
+    fits_exactly,
+    l1_cost,
+    l2_cost,
+)
 from l1slam_ros.core.solvers.reweighting import weighted_least_squares
 
 # Damping: the first, the least, the most, and as good as none. Slow bends of a chain feel even the
@@ -37,15 +43,18 @@ _SURPRISE = 0.1
 
 
 @dataclass(frozen=True)
-class LeastSquaresOptions(Options):
-    """How long Gauss-Newton runs and when it is content."""
+class LeastSquaresOptions:
+    """
+    How long Gauss-Newton runs and when it is content.
 
-    iterations: int = option(100, 'most linearisations', '', 0, 10**6)
-    tolerance: float = option(
-        1e-9, 'converged when the cost fell by no more than this part of itself', '1', 0, 1)
-    huber_delta: float = option(
-        1.345, "length of a factor's whitened residual where Huber turns linear", 'sigmas',
-        1e-9, 1e9)
+    iterations : most linearisations; tolerance : converged when the cost fell by no more than this
+    part of itself; huber_delta : length of a factor's whitened residual where Huber turns linear
+    [sigmas].
+    """
+
+    iterations: int = 100
+    tolerance: float = 1e-9
+    huber_delta: float = 1.345
 
 
 def minimise_l2(
@@ -62,7 +71,7 @@ def minimise_l2(
 def gauss_newton(
     graph: FactorGraph,
     poses: Array,
-    norm: Norm,
+    norm: SmoothNorm,
     options: LeastSquaresOptions,
     cholesky: BlockCholesky,
     report: Report = lambda iteration, cost: None,

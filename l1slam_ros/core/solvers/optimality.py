@@ -73,9 +73,6 @@ class Norm(Protocol):
     def cost(self, residual: Array) -> float:
         """Return F(r)."""
 
-    def weights(self, residual: Array) -> Array:
-        """Return the weights w (rows,) by which w r^2 is like F near r, but for a factor."""
-
     def resolvent(self, dual: Array, sigma: Array | float) -> Array:
         """Return (I + sigma dF*)^-1 of a dual (rows,); with sigma 0 the nearest that may be."""
 
@@ -85,6 +82,9 @@ class Norm(Protocol):
 
 class SmoothNorm(Norm, Protocol):
     """A norm of factors, which Newton's method minimises with their duals y, (m, k)."""
+
+    def weights(self, residual: Array) -> Array:
+        """Return the weights w (rows,) by which w r^2 is like F near r, but for a factor."""
 
     def smoothed(self, e: Array, y: Array, mu: float) -> Smoothed:
         """Return F near e (m, k), each corner rounded by mu, to be minimised with the dual y."""
@@ -112,7 +112,7 @@ class Lengths:
         return float(_lengths(residual, self.size).sum())
 
     def weights(self, residual: Array) -> Array:
-        """See `Norm`; smoothed, where a group is shorter than usual."""
+        """See `SmoothNorm`; smoothed, where a group is shorter than usual."""
         length = _lengths(residual, self.size)
         return np.repeat(1 / np.hypot(length, smoothing(length)), self.size)
 
@@ -173,7 +173,7 @@ class Huber:
                                            2 * self.delta * length - self.delta**2).sum())
 
     def weights(self, residual: Array) -> Array:
-        """See `Norm`."""
+        """See `SmoothNorm`."""
         if self.delta == np.inf:
             return np.full_like(residual, self.scale)
         length = np.maximum(_lengths(residual, self.size), self.delta)
@@ -227,7 +227,7 @@ class Mixed:
         return sum(norm.cost(r) for norm, r in self._split(residual))
 
     def weights(self, residual: Array) -> Array:
-        """See `Norm`."""
+        """See `SmoothNorm`."""
         return self._joined([norm.weights(r) for norm, r in self._split(residual)])
 
     def resolvent(self, dual: Array, sigma: Array | float) -> Array:
@@ -277,11 +277,6 @@ class Largest:
     def cost(self, residual: Array) -> float:
         """See `Norm`."""
         return float(np.abs(residual).max(initial=0.0))
-
-    def weights(self, residual: Array) -> Array:
-        """See `Norm`; of the largest rows alone."""
-        largest: Array = (np.abs(residual) == self.cost(residual)).astype(np.float64)
-        return largest
 
     def resolvent(self, dual: Array, sigma: Array | float) -> Array:
         """See `Norm`: the nearest dual whose |y| sum up to 1 at most; sigma is one number."""

@@ -16,7 +16,6 @@ Pock and Chambolle (2011), lemma 2 with alpha = 1, for the diagonal step sizes. 
 2021) scales sigma against tau and leaves their product, so the theorem, alone.
 """
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -126,8 +125,6 @@ def minimise_l1(
     x: Array,
     y: Array,
     options: PrimalDualOptions,
-    deadline: float = np.inf,
-    theta: float = 1.0,
     norm: Norm = L1,
 ) -> PrimalDualSolution:
     """
@@ -141,8 +138,6 @@ def minimise_l1(
     A, b : (rows, columns), (rows,)
     x, y : (columns,), (rows,), where to start
     options : see `PrimalDualOptions`
-    deadline : `time.monotonic()` [s] after which to stop at the next look
-    theta : over-relaxation of the primal in [0, 1]; convergence is proved for 1
     norm : rows of one group share the smallest step size of them
 
     """
@@ -152,7 +147,7 @@ def minimise_l1(
     sigma = np.repeat(sigma.reshape(-1, norm.size).min(axis=1), norm.size)
     sigma_b = sigma * b
     iterates = primal_dual(A, lambda v: norm.resolvent(v - sigma_b, sigma), lambda v: v,
-                           x, y, tau, sigma, theta)
+                           x, y, tau, sigma)
     history = [(0.0, norm.cost(A @ x - b))]
     gap, status = np.inf, Status.ITERATION_LIMIT
     for k in range(1, options.iterations + 1):
@@ -163,9 +158,6 @@ def minimise_l1(
         gap = duality_gap(A, b, x, y, np.abs(x), norm)
         if gap <= options.tolerance * history[-1][1]:
             status = Status.CONVERGED
-            break
-        if time.monotonic() > deadline:
-            status = Status.OUT_OF_TIME
             break
     return PrimalDualSolution(x, y, history[-1][1], gap, status, k, np.array(history),
                               omega)

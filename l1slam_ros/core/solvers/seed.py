@@ -41,7 +41,7 @@ from l1slam_ros.core.solvers.restarted_pdhg import minimise_l1_halpern
 from l1slam_ros.core.solvers.reweighting import weighted_least_squares
 
 # The paper takes 1,000 iterations or more of each; by factorisations it is some ten steps.
-SEED_OPTIONS = PrimalDualOptions(iterations=2000, tolerance=1e-3)
+_OPTIONS = PrimalDualOptions(iterations=2000, tolerance=1e-3)
 # Rounds until the cost stops falling; measured: 1 to 6. A step is halved so often.
 _MOST_ROUNDS, _HALVINGS = 10, 6
 # A reference whose cost is that much above the best one's leads nowhere else.
@@ -50,10 +50,8 @@ _NEAR = 1.5
 _SAME = 1e-6
 
 
-def seed_poses(
-    graph: FactorGraph, cholesky: BlockCholesky | None,
-    options: PrimalDualOptions = SEED_OPTIONS, check: Callable[[], None] = lambda: None,
-) -> Array:
+def seed_poses(graph: FactorGraph, cholesky: BlockCholesky | None,
+               check: Callable[[], None] = lambda: None) -> Array:
     """
     Return the poses of Algorithm 3, (n, p).
 
@@ -74,10 +72,10 @@ def seed_poses(
         # Two references that unwrap every factor alike lead to one and the same problem.
         if not any(_unwrap_alike(graph, references[k], references[other])
                    for other in order[:place]):
-            candidates.append(_solve_rotations(graph, references[k], cholesky, options, check))
+            candidates.append(_solve_rotations(graph, references[k], cholesky, check))
     poses = min(candidates, key=lambda poses: _rotation_cost(graph, poses))
     system = translation_system(graph, poses)
-    x = _minimise(system, cholesky, options, check)
+    x = _minimise(system, cholesky, check)
     return step_part(graph, poses, x, graph.manifold.TRANSLATION)
 
 
@@ -134,16 +132,16 @@ def translation_system(graph: FactorGraph, poses: Array) -> LinearSystem:
 
 
 def _solve_rotations(graph: FactorGraph, poses: Array, cholesky: BlockCholesky | None,
-                     options: PrimalDualOptions, check: Callable[[], None]) -> Array:
+                     check: Callable[[], None]) -> Array:
     """Solve for the rotations, from the last solution anew while the cost falls."""
     cost = _rotation_cost(graph, poses)
     for _ in range(_MOST_ROUNDS):
         system = rotation_system(graph, poses)
-        x = _minimise(system, cholesky, options, check)
+        x = _minimise(system, cholesky, check)
         before = cost
         poses, cost, length = _lowered(graph, poses, x, cost)
         # Where rotations wrap and are else linear, a solution may be exact.
-        if not length or before - cost <= options.tolerance * cost or _is_same(
+        if not length or before - cost <= _OPTIONS.tolerance * cost or _is_same(
                 length * system.times(x) - system.b, _rotation_residual(graph, poses)):
             break
     return poses
@@ -161,15 +159,15 @@ def _lowered(graph: FactorGraph, poses: Array, x: Array,
 
 
 def _minimise(system: LinearSystem, cholesky: BlockCholesky | None,
-              options: PrimalDualOptions, check: Callable[[], None]) -> Array:
+              check: Callable[[], None]) -> Array:
     """Return argmin |A x - b|_1 of one of the two convex problems."""
     check()
     if cholesky is None:
         start = np.zeros(system.size * system.block_size), np.zeros(len(system.b))
-        return minimise_l1_halpern(system, *start, options).x
+        return minimise_l1_halpern(system, *start, _OPTIONS).x
     x = weighted_least_squares(system, cholesky, np.ones(len(system.b)))
-    return interior_point(LinearProblem(system), x, cholesky, options.iterations,
-                          options.tolerance, lambda *_: check()).poses
+    return interior_point(LinearProblem(system), x, cholesky, _OPTIONS.iterations,
+                          _OPTIONS.tolerance, lambda *_: check()).poses
 
 
 def _unwrap_alike(graph: FactorGraph, poses: Array, others: Array) -> bool:

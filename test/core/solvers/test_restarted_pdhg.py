@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fast primal-dual method: kernel against NumPy, answers against HiGHS, starts, deadlines."""
 
+import time
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from l1slam_ros.core.graph.linear_system import LinearSystem, linearise
 from l1slam_ros.core.graph.tiles import Tiles
 from l1slam_ros.core.kernels import halpern as kernels
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
-from l1slam_ros.core.solvers.primal_dual import PrimalDualOptions, minimise_l1
+from l1slam_ros.core.solvers.primal_dual import CHECK_EVERY, PrimalDualOptions, minimise_l1
 from l1slam_ros.core.solvers.restarted_pdhg import minimise_l1_halpern, scaled_system
 
 BLOCK_SIZES = [1, 2, 3, 6]
@@ -196,6 +197,16 @@ def test_the_gap_bounds_the_error_within_its_box(k, rng):
         z = np.linalg.solve(inverse, solution.x.reshape(-1, k, 1)).ravel()
         best, _ = linprog_l1(scaled.A, scaled.b, np.abs(z) + 1 / solution.weight)
         assert solution.objective - solution.gap <= best * (1 + 1e-5)
+
+
+@pytest.mark.parametrize('left', [0.0, 0.05])
+def test_a_deadline_is_kept(left, rng):
+    system, start = chain_with_loops(3, rng), time.monotonic()
+    found = minimise_l1_halpern(system, *zeros(system), PrimalDualOptions(10**7, 0.0),
+                                deadline=start + left)
+    assert found.status is Status.OUT_OF_TIME
+    assert left <= time.monotonic() - start < 1
+    assert left or found.iterations == CHECK_EVERY
 
 
 def test_a_system_without_factors_or_without_keyframes():
