@@ -38,10 +38,13 @@ def plot(arguments: argparse.Namespace) -> Ending:
 def plot_outcome(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
                  truth: Truth | None, cost_name: str) -> None:
     """Draw the map of a solve, and beside it its costs."""
-    note = f'{cost_name} {outcome.solution.cost:.6g}'
-    plot_solution(arguments.plot, _drawing(
-        arguments.input, record, outcome.solution.poses, truth, 'optimised', note,
-        outcome.judgement), _cost_curve(cost_name, outcome))
+    costs = outcome.solution.history
+    named = {'initial': outcome.initial_cost, 'seed': outcome.seed_cost, 'final': costs[-1]}
+    plot_solution(
+        arguments.plot, _drawing(arguments.input, record, outcome.solution.poses, truth,
+                                 'optimised', f'{cost_name} {costs[-1]:.6g}', outcome.judgement),
+        Curve(cost_name, np.arange(len(costs), dtype=float), costs),
+        ', '.join(f'{name} {cost:.6g}' for name, cost in named.items() if cost is not None))
 
 
 def _drawing(path: Path, record: GraphRecord, poses: Array, truth: Truth | None,
@@ -71,15 +74,3 @@ def _drawing(path: Path, record: GraphRecord, poses: Array, truth: Truth | None,
         true_path(record, poses, truth) if truth else None, pairs[is_loop & kept & ~false],
         suspect=pairs[suspect], rejected=pairs[is_loop & ~kept & ~suspect],
         false=pairs[false & kept], name=name, note=note)
-
-
-def _cost_curve(cost_name: str, outcome: Outcome) -> Curve:
-    """Return the costs of a solve, iteration by iteration, its beginning and end named."""
-    costs = outcome.solution.history
-    iterations = np.arange(len(costs), dtype=float)
-    marks = [(0.0, outcome.initial_cost, 'initial')]
-    if outcome.seed_cost is not None:
-        marks.append((0.0, outcome.seed_cost, 'seed'))
-    if len(costs) > 1:
-        marks.append((iterations[-1], float(costs[-1]), 'final'))
-    return Curve(cost_name, iterations, costs, tuple(marks))

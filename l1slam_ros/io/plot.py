@@ -9,6 +9,7 @@ Okabe and Ito, which people who see red and green alike can tell apart.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -88,16 +89,11 @@ class MapDrawing:
 
 @dataclass(frozen=True)
 class Curve:
-    """
-    One line of a diagram: costs (k,), above 0, after so many iterations (k,).
-
-    marks : (iteration, cost, word) of points that are named.
-    """
+    """One line of a diagram: costs (k,), above 0, after so many iterations (k,)."""
 
     label: str
     iterations: Array
     costs: Array
-    marks: tuple[tuple[float, float, str], ...] = ()
 
 
 def check_picture(path: str | Path) -> None:
@@ -141,8 +137,8 @@ def plot_curves(path: str | Path, curves: Sequence[Curve], title: str = '',
     _save(figure, path)
 
 
-def plot_solution(path: str | Path, drawing: MapDrawing, curve: Curve) -> None:
-    """Draw a map, and beside it the costs on the way there; errors as for `plot_maps`."""
+def plot_solution(path: str | Path, drawing: MapDrawing, curve: Curve, note: str) -> None:
+    """Draw a map, and beside it the costs on the way, a note above; errors as for `plot_maps`."""
     views = drawing.views()
     columns = len(views) + 1
     figure = _new_figure(path, columns, 1)
@@ -150,7 +146,7 @@ def plot_solution(path: str | Path, drawing: MapDrawing, curve: Curve) -> None:
         beside = figure.add_subplot(1, columns, k)
         _draw_map(beside, view)
     axes = figure.add_subplot(1, columns, columns)
-    _draw_curves(axes, [curve], curve.label)
+    _draw_curves(axes, [curve], curve.label, note)
     # As high as the map, unless that is a long corridor.
     (left, right), (low, high) = beside.get_xlim(), beside.get_ylim()
     axes.set_box_aspect(float(np.clip((high - low) / (right - left), *_ASPECTS)))
@@ -170,14 +166,9 @@ def _save(figure: Figure, path: str | Path) -> None:
                        pad_inches=0.15)
 
 
-def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str) -> None:
-    for k, curve in enumerate(curves):
-        colour = _CURVE_COLOURS[k % len(_CURVE_COLOURS)]
+def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str, note: str = '') -> None:
+    for curve, colour in zip(curves, cycle(_CURVE_COLOURS), strict=False):
         axes.plot(curve.iterations, curve.costs, label=curve.label, linewidth=1.6, color=colour)
-        # Where they can be: on a logarithmic scale there is no 0.
-        marks = [mark for mark in curve.marks if mark[1] > 0]
-        axes.plot([mark[0] for mark in marks], [mark[1] for mark in marks], 'o', color=colour,
-                  markersize=5)
     if any((curve.costs > 0).any() for curve in curves):
         axes.set_yscale('log')
     low, high = axes.get_ylim()
@@ -190,8 +181,7 @@ def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str) -> None:
     axes.margins(0.06, 0.08)
     axes.set_xlim(right=max(1.0, axes.get_xlim()[1]))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    _write_title(axes, title, ', '.join(f'{word} {cost:.6g}' for curve in curves
-                                        for _, cost, word in curve.marks))
+    _write_title(axes, title, note)
     axes.set_xlabel('iteration')
     axes.set_ylabel('cost')
     _tidy(axes)

@@ -118,7 +118,8 @@ SHAPES = [(1, 1), (1000, 1), (1, 1000)]
 @pytest.mark.parametrize('draw', [
     lambda path, drawing: plot_maps(path, [drawing]),
     lambda path, drawing: plot_maps(path, [drawing, MapDrawing('', SQUARE), drawing]),
-    lambda path, drawing: plot_solution(path, drawing, CURVE)], ids=['one', 'three', 'solution'])
+    lambda path, drawing: plot_solution(path, drawing, CURVE, '')],
+    ids=['one', 'three', 'solution'])
 def test_whatever_the_shape_the_legend_is_in_order_below_the_axis(tmp_path, shape, draw):
     path = tmp_path / 'map.svg'
     world = SQUARE * shape
@@ -199,17 +200,17 @@ def test_curves_are_drawn_on_a_logarithmic_scale(tmp_path):
 
 
 def curve_of(costs):
-    return Curve('l1 cost', np.arange(len(costs), dtype=float), np.array(costs),
-                 ((0.0, 5940.0, 'initial'), (len(costs) - 1.0, costs[-1], 'final')))
+    return Curve('l1 cost', np.arange(len(costs), dtype=float), np.array(costs))
 
 
 def test_a_solution_is_a_map_and_the_way_there(tmp_path):
     plot_maps(tmp_path / 'alone.png', [MapDrawing('square', SQUARE)])
-    plot_solution(tmp_path / 'both.png', MapDrawing('square', SQUARE), curve_of([1158.0, 972.0]))
+    curve, note = curve_of([1158.0, 972.0]), 'initial 5940, final 972'
+    plot_solution(tmp_path / 'both.png', MapDrawing('square', SQUARE), curve, note)
     alone, both = (pixels(tmp_path / f'{name}.png').shape for name in ('alone', 'both'))
     assert both[1] > 1.6 * alone[1] and both[0] < 1.2 * alone[0]
-    plot_solution(tmp_path / 'both.svg', MapDrawing('square', SQUARE), curve_of([1158.0, 972.0]))
-    for word in 'square', 'l1 cost', 'iteration', 'initial 5940, final 972', '3000':
+    plot_solution(tmp_path / 'both.svg', MapDrawing('square', SQUARE), curve, note)
+    for word in 'square', 'l1 cost', 'iteration', note, '1000':
         assert word in words(tmp_path / 'both.svg')
 
 
@@ -217,7 +218,7 @@ def test_a_solution_is_a_map_and_the_way_there(tmp_path):
                                    [2.7e6, 3772.0], [5.0, 0.0], np.linspace(9e3, 1e3, 1000)])
 @pytest.mark.filterwarnings('error')
 def test_any_costs_are_drawn_without_a_warning(tmp_path, costs):
-    plot_solution(tmp_path / 'a.png', MapDrawing('', SQUARE * [30, 1]), curve_of(list(costs)))
+    plot_solution(tmp_path / 'a.png', MapDrawing('', SQUARE * [30, 1]), curve_of(costs), '')
     assert pixels(tmp_path / 'a.png').min() < 100
 
 

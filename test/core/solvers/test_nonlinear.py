@@ -70,12 +70,6 @@ def test_without_a_factorisation_it_ends_there_too(world):
         assert minimise(graph, start, DEFAULTS).cost == pytest.approx(best, rel=2e-3)
 
 
-def test_parallel_factors_meet_at_their_median():
-    solution = solve(parallel(0.0, 1.0, 5.0), np.zeros((2, 3)), DEFAULTS)
-    assert_allclose(solution.poses, [[0, 0, 0], [1, 0, 0]], atol=1e-3)
-    assert solution.cost == pytest.approx(5.0, abs=1e-3)
-
-
 # How it ends
 
 
