@@ -137,8 +137,9 @@ def test_folders_are_neither_crowded_nor_of_one():
         assert len(modules) in MODULES_OF_A_FOLDER, folder
 
 
-@pytest.mark.parametrize('package', PACKAGES)
+@pytest.mark.parametrize('package', [name for name in PACKAGES if 'kernels' not in name])
 def test_packages_are_empty(package):
+    """All but one, whose modules wait until they are called."""
     assert not tree(package).body
 
 

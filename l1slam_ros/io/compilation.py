@@ -12,7 +12,6 @@ numba and processor that it was made with, and while the files it names are ther
 
 import gc
 import hashlib
-import importlib
 import importlib.util
 import json
 import os
@@ -26,6 +25,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Manifold
 from l1slam_ros.io.progress import Progress
 
@@ -151,12 +151,9 @@ def load(steps: Sequence[str] = STEPS) -> None:
 
 def make_ready(step: str) -> list[str]:
     """Compile the loops of one step, or read them; return the files that keep them, if any."""
-    from l1slam_ros.core.kernels import compiled
-
     name = step.removesuffix(_SPACE)
-    module = importlib.import_module(f'l1slam_ros.core.kernels.{name}')
-    folders = {compiled.make_ready(kernel, step != name) for kernel in list(vars(module).values())
-               if hasattr(kernel, 'takes')} - {''}
+    loops = [value for value in vars(getattr(kernels, name)).values() if hasattr(value, 'takes')]
+    folders = {kernels.compiled.make_ready(loop, step != name) for loop in loops} - {''}
     return sorted(str(file) for folder in folders for file in Path(folder).glob(f'{name}.*.nbi'))
 
 

@@ -34,19 +34,12 @@ Indices = NDArray[np.int64]
 class Manifold(Protocol):
     """The verbs of a pose manifold; every array is stacked along its first axis."""
 
-    # Attributes of a module: constants, so read-only here.
-    @property
-    def NAME(self) -> str: ...  # noqa: D102
-    @property
-    def POSE_SIZE(self) -> int: ...  # noqa: D102
-    @property
-    def TANGENT_SIZE(self) -> int: ...  # noqa: D102
-    @property
-    def TRANSLATION(self) -> slice: ...  # noqa: D102
-    @property
-    def ROTATION(self) -> slice: ...  # noqa: D102
-    @property
-    def COVARIANCE_ROWS(self) -> tuple[int, ...]: ...  # noqa: D102
+    NAME: str
+    POSE_SIZE: int
+    TANGENT_SIZE: int
+    TRANSLATION: slice
+    ROTATION: slice
+    COVARIANCE_ROWS: tuple[int, ...]
 
     def identity(self, n: int) -> Array:
         """Return n identity poses, (n, p)."""

@@ -8,6 +8,7 @@ al., "A Tutorial on Graph-Based SLAM" (2010), sections IV and V, with the step o
 
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array
 
 NAME = 'SE2'
@@ -16,7 +17,7 @@ TANGENT_SIZE = 3
 TRANSLATION = slice(0, 2)
 ROTATION = slice(2, 3)
 # Where x, y and yaw stand in the 6x6 covariance of a ROS message (x y z rx ry rz).
-COVARIANCE_ROWS = (0, 1, 5)
+COVARIANCE_ROWS: tuple[int, ...] = (0, 1, 5)
 
 
 def wrap(angle: Array) -> Array:
@@ -86,9 +87,7 @@ def adjoint(pose: Array) -> Array:
 
 def residual(measurement: Array, pose_i: Array, pose_j: Array) -> Array:
     """Return t2v(Z^-1 Xi^-1 Xj), (n, 3)."""
-    from l1slam_ros.core.kernels import se2
-
-    e: Array = se2.residual(measurement, pose_i, pose_j)
+    e: Array = kernels.se2.residual(measurement, pose_i, pose_j)
     e[:, 2] = wrap(e[:, 2])
     return e
 
@@ -100,9 +99,7 @@ def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> tupl
     With t = Ri'(tj - ti): `J_r_i = [[-Rz', Rz'(t_y, -t_x)'], [0, -1]]` and
     `J_r_j = [[Rz' Ri' Rj, 0], [0, 1]]`.
     """
-    from l1slam_ros.core.kernels import se2
-
-    J_r_i, J_r_j = se2.jacobians(measurement, pose_i, pose_j)
+    J_r_i, J_r_j = kernels.se2.jacobians(measurement, pose_i, pose_j)
     return J_r_i, J_r_j
 
 
@@ -115,9 +112,7 @@ def residual_curvature(measurement: Array, pose_i: Array, pose_j: Array, dual: A
     (theta_i, y_i) = -m_x, (theta_i, theta_i) = -m.t, (theta_i, x_j) = -h_y,
     (theta_i, y_j) = h_x. The residual is linear in all else.
     """
-    from l1slam_ros.core.kernels import se2
-
-    H: Array = se2.curvature(measurement, pose_i, pose_j, dual)
+    H: Array = kernels.se2.curvature(measurement, pose_i, pose_j, dual)
     return H
 
 

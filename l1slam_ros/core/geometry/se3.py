@@ -10,6 +10,7 @@ kinematics for the error-state Kalman filter" (2017).
 
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array
 
 NAME = 'SE3'
@@ -17,7 +18,7 @@ POSE_SIZE = 7
 TANGENT_SIZE = 6
 TRANSLATION = slice(0, 3)
 ROTATION = slice(3, 6)
-COVARIANCE_ROWS = (0, 1, 2, 3, 4, 5)
+COVARIANCE_ROWS: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
 
 # A quaternion whose squared norm is that near to 1 is left as it is: what was normalised once and
 # written to a file reads back the same.
@@ -138,9 +139,7 @@ def adjoint(pose: Array) -> Array:
 
 def residual(measurement: Array, pose_i: Array, pose_j: Array) -> Array:
     """Return (t, 2 q_v) of Z^-1 Xi^-1 Xj, (n, 6)."""
-    from l1slam_ros.core.kernels import se3
-
-    e: Array = se3.residual(measurement, pose_i, pose_j)
+    e: Array = kernels.se3.residual(measurement, pose_i, pose_j)
     return e
 
 
@@ -151,9 +150,7 @@ def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> tupl
     With p = Ri'(tj - ti), Rij = Ri'Rj, q the quaternion of the error and M = q_w I + [q_v]x:
     `J_r_i = [[-Rz', Rz'[p]x], [0, -M Rij']]` and `J_r_j = [[Rz' Rij, 0], [0, M]]`.
     """
-    from l1slam_ros.core.kernels import se3
-
-    J_r_i, J_r_j = se3.jacobians(measurement, pose_i, pose_j)
+    J_r_i, J_r_j = kernels.se3.jacobians(measurement, pose_i, pose_j)
     return J_r_i, J_r_j
 
 
@@ -166,9 +163,7 @@ def residual_curvature(measurement: Array, pose_i: Array, pose_j: Array, dual: A
     `(om_i, om_i) = (m p' + p m')/2 - (m.p + q_v.y/2) I`, `(om_j, om_j) = -(q_v.y)/2 I`,
     `(om_i, om_j) = Rij ((q_v.y) I + [q_w y - q_v x y]x)/2`. The residual is linear in all else.
     """
-    from l1slam_ros.core.kernels import se3
-
-    H: Array = se3.curvature(measurement, pose_i, pose_j, dual)
+    H: Array = kernels.se3.curvature(measurement, pose_i, pose_j, dual)
     return H
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import (
@@ -40,13 +41,11 @@ class GraphProblem:
 
     def curvature(self, poses: Array, dual: Array) -> Array:
         """Return the Hessian of dual'e for each factor, (m, 2 k, 2 k)."""
-        from l1slam_ros.core.kernels.blocks import whiten
-
         manifold, factors = self.graph.manifold, self.graph.between
         k = manifold.TANGENT_SIZE
         # That of the residual before it is whitened: L y.
         roots = np.ascontiguousarray(factors.sqrt_information.transpose(0, 2, 1))
-        dual = whiten(roots, dual.reshape(-1, k), (0,) * k)
+        dual = kernels.blocks.whiten(roots, dual.reshape(-1, k), (0,) * k)
         return manifold.residual_curvature(factors.measurement, *ends(self.graph, poses), dual)
 
 

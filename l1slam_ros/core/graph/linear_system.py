@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import FactorGraph, lowest_joined
 
@@ -60,23 +61,19 @@ class LinearSystem:
 
     def times(self, x: Array) -> Array:
         """Return A x, (rows,)."""
-        from l1slam_ros.core.kernels.blocks import multiply
-
         k = self.block_size
         padded = np.zeros((self.size + 1, k))
         padded[:-1] = x.reshape(-1, k)
         product = np.empty((len(self.blocks), k))
-        multiply(self.keyframe, self.blocks, padded, product, size_of_blocks(k))
+        kernels.blocks.multiply(self.keyframe, self.blocks, padded, product, size_of_blocks(k))
         return product.ravel()
 
     def transposed_times(self, y: Array) -> Array:
         """Return A'y, (columns,)."""
-        from l1slam_ros.core.kernels.blocks import multiply_transposed
-
         k = self.block_size
         product = np.zeros((self.size + 1, k))
-        multiply_transposed(self.keyframe, self.blocks, y.reshape(-1, k), product,
-                            size_of_blocks(k))
+        kernels.blocks.multiply_transposed(self.keyframe, self.blocks, y.reshape(-1, k), product,
+                                           size_of_blocks(k))
         return product[:-1].ravel()
 
     def diagonal(self, weights: Array) -> Array:
@@ -85,12 +82,10 @@ class LinearSystem:
 
     def weighted(self, roots: Array) -> 'LinearSystem':
         """Return the system with the rows of each factor multiplied by its root (m, k, k)."""
-        from l1slam_ros.core.kernels.blocks import whiten, whiten_blocks
-
         k, roots = self.block_size, np.ascontiguousarray(roots)
         pair = np.ascontiguousarray(self.blocks.transpose(1, 0, 2, 3))
-        return replace(self, blocks=whiten_blocks(roots, *pair, (0,) * k),
-                       b=whiten(roots, self.b.reshape(-1, k), (0,) * k).ravel())
+        return replace(self, blocks=kernels.blocks.whiten_blocks(roots, *pair, (0,) * k),
+                       b=kernels.blocks.whiten(roots, self.b.reshape(-1, k), (0,) * k).ravel())
 
     def part(self, entries: slice) -> 'LinearSystem':
         """Return the system of only these rows of each factor and columns of each keyframe."""
@@ -140,11 +135,10 @@ def ends(graph: FactorGraph, poses: Array) -> tuple[Array, Array]:
 
 def whitened_residual(graph: FactorGraph, poses: Array) -> Array:
     """Return the whitened residual of every row, (rows,), in the order of `LinearSystem`."""
-    from l1slam_ros.core.kernels.blocks import whiten
-
     manifold, factors = graph.manifold, graph.between
     e = manifold.residual(factors.measurement, *ends(graph, poses))
-    whitened: Array = whiten(factors.sqrt_information, e, (0,) * manifold.TANGENT_SIZE)
+    whitened: Array = kernels.blocks.whiten(
+        factors.sqrt_information, e, (0,) * manifold.TANGENT_SIZE)
     return whitened.ravel()
 
 
@@ -159,11 +153,10 @@ def linearise(graph: FactorGraph, poses: Array, residual: Array | None = None,
     fixed : how many keyframes are held in the gauge of another graph; None: see `anchor`
 
     """
-    from l1slam_ros.core.kernels.blocks import whiten_blocks
-
     factors = graph.between
     pair = graph.manifold.residual_jacobians(factors.measurement, *ends(graph, poses))
-    blocks = whiten_blocks(factors.sqrt_information, *pair, (0,) * graph.manifold.TANGENT_SIZE)
+    blocks = kernels.blocks.whiten_blocks(
+        factors.sqrt_information, *pair, (0,) * graph.manifold.TANGENT_SIZE)
     if residual is None:
         residual = whitened_residual(graph, poses)
     fixed = anchor(graph) if fixed is None else fixed

@@ -2,10 +2,9 @@
 """
 The decorators of every compiled loop.
 
-The modules beside this one import numba, which takes a third of a second, so the core imports
-them where it calls them. A loop is compiled once per machine: numba keeps the result beside the
-package, or where that is read-only in the user's cache folder. Reading one back takes some 4 ms,
-however small it is, so loops that follow each other are one loop.
+A loop is compiled once per machine: numba keeps the result beside the package, or where that is
+read-only in the user's cache folder. Reading one back takes some 4 ms, however small it is, so
+loops that follow each other are one loop.
 
 A loop may call only functions of its own module: of others numba would not see that they changed.
 """

@@ -17,6 +17,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -102,19 +103,18 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1) -> 
     FillError : the factor would have more than `most_blocks`.
 
     """
-    from l1slam_ros.core.kernels.ordering import dissect, minimum_degree
-    from l1slam_ros.core.kernels.symbolic import lay_out
-
     graph = neighbours(keyframe, size)
-    found = minimum_degree(*graph, most_blocks, np.zeros(size, np.int32))
+    found = kernels.ordering.minimum_degree(*graph, most_blocks, np.zeros(size, np.int32))
     if len(found[0]) < size:
         raise FillError(f'the factor of {size} keyframes and {len(keyframe)} factors would have '
                         f'more than {most_blocks} blocks: too many far places are joined')
-    pattern = Pattern(*lay_out(*found))
+    pattern = Pattern(*kernels.symbolic.lay_out(*found))
     if pattern.work * k**3 > _LONG * len(found[2]):
-        found = minimum_degree(*graph, most_blocks, dissect(*graph))
+        stage = kernels.ordering.dissect(*graph)
+        found = kernels.ordering.minimum_degree(*graph, most_blocks, stage)
         if len(found[0]) == size:
-            return min(pattern, Pattern(*lay_out(*found)), key=lambda pattern: pattern.work)
+            dissected = Pattern(*kernels.symbolic.lay_out(*found))
+            return min(pattern, dissected, key=lambda pattern: pattern.work)
     return pattern
 
 
@@ -161,8 +161,6 @@ class BlockCholesky:
         weights : (rows,); diagonal : (columns,) or one number; curvature : (m, 2 k, 2 k) of each
         factor, C their sum
         """
-        from l1slam_ros.core.kernels import cholesky
-
         k = system.block_size
         layout = self._layouts.get(k)
         if layout is None:
@@ -173,23 +171,22 @@ class BlockCholesky:
         if len(self._loose):
             own = system.diagonal(weights).reshape(-1, k)[self._loose]
             added[self._loose] += np.where(own > 0, _LOOSE * own, 1.0)
-        cholesky.assemble(layout.panels, *layout.places, system.blocks, weights.reshape(-1, k),
-                          added, curvature, share, layout.size)
+        kernels.cholesky.assemble(layout.panels, *layout.places, system.blocks,
+                                  weights.reshape(-1, k), added, curvature, share, layout.size)
         self._factored = layout
         return self._factorise(layout) == system.size
 
     def _factorise(self, layout: '_Layout') -> int:
         """Return how many positions have a positive pivot before the first that has not."""
-        from l1slam_ros.core.kernels.cholesky import factorise
-
         pattern, shared = self.pattern, self.pattern.work * len(layout.size) ** 3 > _SHARED
         count = len(pattern.first) - 1
         shares = pattern.halves if shared else np.zeros(count, np.int8)
         lists, reach = np.full((2, count), -1, np.int32), np.zeros(count, np.int64)
 
         def share(mine: int) -> int:
-            end: int = factorise(layout.panels, *layout.shape, pattern.owner, shares, mine, lists,
-                                 reach, layout.size)
+            end: int = kernels.cholesky.factorise(
+                layout.panels, *layout.shape, pattern.owner, shares, mine, lists, reach,
+                layout.size)
             return end
 
         return min(*_at_once(share), share(2)) if shared else share(0)
@@ -201,19 +198,15 @@ class BlockCholesky:
 
     def solve(self, right: Array) -> Array:
         """Return the solution for a right hand side (columns,) by the last factorisation."""
-        from l1slam_ros.core.kernels.substitution import solve
-
         layout = self._last
-        x: Array = solve(layout.panels, *layout.shape, self.pattern.position,
-                         right.reshape(-1, len(layout.size)))
+        x: Array = kernels.substitution.solve(layout.panels, *layout.shape, self.pattern.position,
+                                              right.reshape(-1, len(layout.size)))
         return x.ravel()
 
     def solve_many(self, right: Array) -> None:
         """Turn q right hand sides (free keyframes, k, q) into their solutions, in place."""
-        from l1slam_ros.core.kernels.prediction import solve_many
-
         layout = self._last
-        solve_many(layout.panels, *layout.shape, self.pattern.position, right)
+        kernels.prediction.solve_many(layout.panels, *layout.shape, self.pattern.position, right)
 
     def climb(self, keyframe: int) -> tuple[Places, Array]:
         """
@@ -221,10 +214,8 @@ class BlockCholesky:
 
         Positions (p,), ascending, where it is not zero, and the columns, (k, p k).
         """
-        from l1slam_ros.core.kernels.border import climb
-
         layout = self._last
-        found: tuple[Places, Array] = climb(
+        found: tuple[Places, Array] = kernels.border.climb(
             layout.panels, *layout.shape, self.pattern.owner, self.pattern.position[keyframe],
             len(layout.size))
         return found
@@ -253,14 +244,13 @@ class _Layout:
     """
 
     def __init__(self, pattern: Pattern, keyframe: Indices, block_size: int):
-        from l1slam_ros.core.kernels.symbolic import block_addresses
-
         self.size = size_of_blocks(block_size)
         areas = np.diff(pattern.first) * np.diff(pattern.start) * block_size**2
         offset = np.concatenate(([0], np.cumsum(areas))).astype(np.int64)
         self.panels = np.empty(offset[-1])
         self.shape = (pattern.first, pattern.start, pattern.rows, offset)
-        self.places = block_addresses(keyframe, pattern.position, *self.shape, block_size)
+        self.places = kernels.symbolic.block_addresses(
+            keyframe, pattern.position, *self.shape, block_size)
 
 
 def cholesky_of(graph: FactorGraph) -> BlockCholesky:

@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.l1_problem import Problem
 from l1slam_ros.core.graph.linear_system import LinearSystem
@@ -290,13 +291,12 @@ def _step(problem: Problem, at: _Iterate, cholesky: BlockCholesky, curvature: Cu
 def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, c1: Array,
                c2: Array) -> _Direction:
     """Solve for the step whose complementarity products become c1, c2 to first order."""
-    from l1slam_ros.core.kernels.interior_point import complete
-
     # e - (u - v) - (c1/s - u) + (c2/t - v)
     g = at.residual - c1 / at.s + c2 / at.t
     x = cholesky.solve(-at.system.transposed_times(at.y + Q * g))
     moved = at.system.times(x)
-    y, u, v, primal, dual, gap = complete(*at.bounded, Q, c1, c2, g, moved, _FRACTION)
+    y, u, v, primal, dual, gap = kernels.interior_point.complete(
+        *at.bounded, Q, c1, c2, g, moved, _FRACTION)
     return _Direction(x, moved, y, u, v, primal, dual, gap)
 
 

@@ -34,6 +34,7 @@ from typing import Any
 
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.linear_system import LinearSystem
 from l1slam_ros.core.graph.tiles import Single, Tiles
@@ -64,18 +65,16 @@ def scaled_system(system: LinearSystem) -> tuple[LinearSystem, Array]:
 
     x = R_v^-1 x_scaled of each keyframe; one without factors keeps its own scale.
     """
-    from l1slam_ros.core.kernels import halpern as kernels
-
     k, size, K = system.block_size, system.size, (0,) * system.block_size
     summed = np.zeros((size + 1, k, k))
-    kernels.add_squares(system.keyframe, system.blocks, summed, K)
+    kernels.halpern.add_squares(system.keyframe, system.blocks, summed, K)
     gram = summed[:size]
     trace = np.trace(gram, axis1=1, axis2=2)[:, None, None]
     gram += np.where(trace > 0, _UNMEASURED * trace, 1.0) * np.eye(k)
     # Factors reach for the keyframe that is held fixed too; it has no columns.
     inverse, scaled = np.zeros((size + 1, k, k)), np.empty(system.blocks.shape)
     inverse[:size] = np.linalg.inv(np.linalg.cholesky(gram)).transpose(0, 2, 1)
-    kernels.scale(system.keyframe, system.blocks, inverse, scaled, K)
+    kernels.halpern.scale(system.keyframe, system.blocks, inverse, scaled, K)
     return replace(system, blocks=scaled), inverse[:size]
 
 
@@ -132,11 +131,9 @@ class _Run:
     """One solve: the arrays of the compiled loop, and where in the problem its origin is."""
 
     def __init__(self, system: LinearSystem, x: Array, y: Array, weight: float | None):
-        from l1slam_ros.core.kernels import halpern as kernels
-
-        self._kernels, self._system, k = kernels, system, system.block_size
+        self._system, k = system, system.block_size
         scaled, self._inverse = scaled_system(system)
-        self._layout = Tiles(system.keyframe, system.size, kernels.LANES)
+        self._layout = Tiles(system.keyframe, system.size, kernels.halpern.LANES)
         columns = scaled.blocks.reshape(-1, 2 * k * k)
         dual = np.clip(y, -1, 1).reshape(-1, k)
         self._tiles = self._layout.pack(np.concatenate((columns, dual, dual, dual), axis=1))
@@ -144,7 +141,7 @@ class _Run:
             self._tiles[:, row: row + k] for row in range(2 * k * k, 2 * k * k + 3 * k, k))
         self._x, self._z, self._g, self._x_bar, self._g_bar = np.zeros(
             (5, system.size + 1, k), np.float32)
-        self._y_bar = np.empty((len(self._tiles), k, kernels.LANES), np.float32)
+        self._y_bar = np.empty((len(self._tiles), k, kernels.halpern.LANES), np.float32)
         # Iterations since the restart, and the residuals of its first and its latest look.
         self._since = 0
         self._residuals: tuple[float, ...] = ()
@@ -156,11 +153,11 @@ class _Run:
 
     def advance(self, count: int) -> tuple[float, float, float]:
         """Return the fixed-point residual, the cost and the gap after `count` more iterations."""
-        self._call(self._kernels.iterate, self._x, self._z, self._g, self.weight, self._since,
+        self._call(kernels.halpern.iterate, self._x, self._z, self._g, self.weight, self._since,
                    count)
         self._since += count
         squared, cost, dual = self._call(
-            self._kernels.look, self._x, self._g, self.weight, self._x_bar, self._g_bar,
+            kernels.halpern.look, self._x, self._g, self.weight, self._x_bar, self._g_bar,
             self._flat(self._y_bar))
         box = np.abs(self._offset + self._x_bar[:-1]) + 1 / self.weight
         g = self._g_bar[:-1]
