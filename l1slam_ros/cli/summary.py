@@ -18,8 +18,6 @@ from l1slam_ros.io.wording import counted
 
 # Errors that many times as large, or as small, as their information says are worth a sentence.
 _OFF_SCALE = 3.0
-# So is information that differs that much from edge to edge.
-_WIDE_RANGE = 1e6
 # A reading of the rotations' information fits where their errors are as large as it says, to this
 # logarithm: half of what it is to the other reading.
 _FITS = math.log(2) / 2
@@ -69,7 +67,7 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
 def complaints(record: GraphRecord) -> list[str]:
     """Return one sentence on each thing that looks wrong with a graph."""
     checks: tuple[Callable[[GraphRecord], Iterator[str]], ...] = (
-        _on_ids, _on_parts, _on_gaps, _on_repetitions, _on_steps, _on_information, _on_noise)
+        _on_ids, _on_parts, _on_gaps, _on_repetitions, _on_steps, _on_noise)
     return [sentence for check in checks for sentence in check(record)]
 
 
@@ -122,16 +120,6 @@ def _on_steps(record: GraphRecord) -> Iterator[str]:
             long.lengths[longest], _edges(record, long.factors[longest]), strict=True)]
         yield (f'odometry that jumps: {_listed("step", steps, len(long.factors))}; nine in ten '
                f'are no longer than {long.ordinary:.4g} m')
-
-
-def _on_information(record: GraphRecord) -> Iterator[str]:
-    manifold = record.graph.manifold
-    for name, part in (('position', manifold.TRANSLATION), ('rotation', manifold.ROTATION)):
-        found = inspection.information_range(record.graph, part)
-        if found.most > _WIDE_RANGE * found.least:
-            least, most = _edges(record, np.array([found.least_factor, found.most_factor]))
-            yield (f'the information on {name} differs by {found.most / found.least:.1g} between '
-                   f'edges: {found.least:.3g} from {least}, {found.most:.3g} from {most}')
 
 
 def _on_noise(record: GraphRecord) -> Iterator[str]:

@@ -6,7 +6,7 @@ In: what was measured. Out: lines; what comes of it, the numbers say.
 """
 
 import platform
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +27,10 @@ from l1slam_ros.paper.experiments import (
 from l1slam_ros.paper.printed import PaperGraph
 
 WORLD_SEED = 0
-_SOURCE_OF_FILES = 'https://github.com/OpenSLAM-org/openslam_vertigo'
+_MISSING = ('The files come with Vertigo (https://github.com/OpenSLAM-org/openslam_vertigo; its '
+            '`manhattanOlson3500.g2o` is `manhattan3500.g2o` here); `--datasets` names the folder '
+            f'of {", ".join(f"`{name}`" for name in paper.FILES)}, `--worlds all` simulates the '
+            'others.')
 _HEAD = ('J. J. Casafranca, L. M. Paz and P. Pinies, "L1 Factor Graph SLAM: going beyond the L2 '
          'norm" (2013): what it printed, beside what `l1slam reproduce` makes of the same. *As '
          'printed* is the algorithm without the primal weight, the shortened steps and the warm '
@@ -70,21 +73,8 @@ def head(study: Study) -> list[str]:
     lines = ['# The experiments of "L1 Factor Graph SLAM", run again', '', _HEAD, '',
              f'Run with Python {platform.python_version()}, NumPy {np.__version__}, '
              f'SciPy {scipy.__version__}, {platform.system()} {platform.machine()}.']
-    missing = [graph for graph in paper.GRAPHS if graph.name not in study.graphs]
-    files = [graph for graph in missing if graph.file]
-    worlds = [graph for graph in missing if not graph.file]
-    if files:
-        lines += ['', f'**Not run: {_names(files)}**. They come with Vertigo '
-                  f'({_SOURCE_OF_FILES}; its `manhattanOlson3500.g2o` is `manhattan3500.g2o` '
-                  f'here); `--datasets` names the folder of '
-                  f'{", ".join(f"`{graph.file}`" for graph in files)}.']
-    if worlds:
-        lines += ['', f'**Not run: {_names(worlds)}**; `--worlds all` simulates all.']
-    return lines
-
-
-def _names(graphs: Iterable[PaperGraph]) -> str:
-    return ', '.join(graph.name for graph in graphs)
+    missing = [graph.name for graph in paper.GRAPHS if graph.name not in study.graphs]
+    return lines + ['', f'**Not run: {", ".join(missing)}**. {_MISSING}'] * bool(missing)
 
 
 def table_1(study: Study, _: Path) -> list[str]:

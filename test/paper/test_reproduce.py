@@ -156,7 +156,6 @@ def test_a_report_is_whole_and_its_pictures_are_there(tmp_path):
     assert 'It is of Intel, which was not run.' in text
     assert 'Not run: Manhattan3500, Intel, City10k' in text
     assert all(name in text for name in (*paper.FILES, '--datasets'))
-    assert '--worlds' not in text
     assert 'Not run: it is of Intel.' in text
     assert re.search(r'proportions of City10k \(seed 0\), 120 keyframes, .* at [0-9]+ keyframes '
                      'per second', text)

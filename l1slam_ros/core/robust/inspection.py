@@ -103,30 +103,6 @@ def step_lengths(graph: FactorGraph) -> Array:
 
 
 @dataclass(frozen=True)
-class InformationRange:
-    """The factors with the least and with the most information, and how much it is."""
-
-    least_factor: int
-    least: float
-    most_factor: int
-    most: float
-
-
-def information_range(graph: FactorGraph, part: slice) -> InformationRange:
-    """
-    Return the range of the diagonal entries of the information in `part` of the tangent.
-
-    Of what keyframes say of each other; absolute factors are measurements of another sort.
-    """
-    diagonal = (graph.between.sqrt_information**2).sum(axis=1)[:, part]
-    silent = ~graph.between.speaks[:, part] | graph.between.is_absolute[:, None]
-    least = np.where(silent, np.inf, diagonal).min(axis=1)
-    most = np.where(silent, 0.0, diagonal).max(axis=1)
-    low, high = int(np.argmin(least)), int(np.argmax(most))
-    return InformationRange(low, float(least[low]), high, float(most[high]))
-
-
-@dataclass(frozen=True)
 class NoiseScales:
     """
     How many times as large as their information says the errors of factors are.

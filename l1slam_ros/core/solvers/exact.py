@@ -47,7 +47,7 @@ def minimise_interior_point(
     optimum = interior_point(problem, rough, cholesky, steps, _TOLERANCE, report)
     if optimum.costs[-1] > start:
         optimum = interior_point(problem, poses, cholesky, steps, _TOLERANCE, report)
-    proof = prove(optimum, cholesky)
+    dual, gap, status = prove(optimum, cholesky)
     history = np.minimum.accumulate([start, *optimum.costs])
-    return Solution(optimum.poses, optimum.costs[-1], proof.status, len(history) - 1, 0, history,
-                    proof.dual, proof.gap)
+    return Solution(optimum.poses, optimum.costs[-1], status, len(history) - 1, 0, history, dual,
+                    gap)

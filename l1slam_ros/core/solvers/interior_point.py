@@ -24,7 +24,6 @@ interior point algorithm", 2009); the rest is ours, defended by `test_interior_p
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -201,24 +200,16 @@ def interior_point(
     return Optimum(best.poses, costs, status, replace(at, system=best.system))
 
 
-class Proof(NamedTuple):
-    """A dual y (rows,) with A'y = 0, |y| <= 1, what it proves, and the status in its light."""
-
-    dual: Array
-    gap: float
-    status: Status
-
-
-def prove(optimum: Optimum, cholesky: BlockCholesky) -> Proof:
+def prove(optimum: Optimum, cholesky: BlockCholesky) -> tuple[Array, float, Status]:
     """
-    Return what is known of an optimum.
+    Return a dual y (rows,) with A'y = 0, |y| <= 1, what it proves, and the status in its light.
 
     No step of the linear problem at the poses can lower their cost by more than the gap,
     |b|_1 + b'y. A run that came to rest where one might lower it has not converged.
     """
-    end, cost = optimum.end, optimum.costs[-1]
+    end = optimum.end
     y, gap = feasible_dual(end.system, end.y, np.minimum(end.s, end.t), L1, cholesky)
-    return Proof(y, gap, proven(optimum.status, gap, cost, len(y)))
+    return y, gap, proven(optimum.status, gap, optimum.costs[-1], len(y))
 
 
 def proven(status: Status, gap: float, cost: float, rows: int) -> Status:

@@ -15,7 +15,6 @@ from l1slam_ros.core.robust.inspection import (
     _system,
     connected_parts,
     cost_at,
-    information_range,
     long_steps,
     noise_scales,
     parallel_factors,
@@ -91,17 +90,6 @@ def test_a_robot_that_stands_has_no_long_steps():
     z = np.zeros((30, 3))
     z[4] = [1, 0, 0]
     assert not len(long_steps(graph_of(31, [(k, k + 1) for k in range(30)], z)).factors)
-
-
-def test_information_range():
-    information = np.stack([np.diag([4, 5, 1e4]), np.diag([3e8, 2, 1e4]), np.diag([1e-1, 4, 9])])
-    graph = graph_of(4, [(0, 1), (1, 2), (2, 3)], information=information)
-    position = information_range(graph, se2.TRANSLATION)
-    assert (position.least_factor, position.most_factor) == (2, 1)
-    assert (position.least, position.most) == pytest.approx((0.1, 3e8))
-    rotation = information_range(graph, se2.ROTATION)
-    assert (rotation.least_factor, rotation.most_factor) == (2, 0)
-    assert (rotation.least, rotation.most) == pytest.approx((9, 1e4))
 
 
 @pytest.mark.parametrize('odometry, loops', [
