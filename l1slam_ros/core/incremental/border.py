@@ -23,6 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
@@ -69,16 +70,14 @@ class Steps:
 
     def all(self) -> Array:
         """Return the steps of all keyframes, (n + b, k)."""
-        from l1slam_ros.core.kernels import border
-
         gradient, (points, keyframes) = self.gradient.copy(), self.old
-        border.pull_parents(self.parent, self.turn, gradient)
+        kernels.border.pull_parents(self.parent, self.turn, gradient)
         right = np.zeros((self.size, gradient.shape[1]))
         right[keyframes] = gradient[points]
         old = self.cholesky.solve(right.ravel()) if len(points) else right
         moved = np.zeros_like(gradient)
         moved[points] = old.reshape(right.shape)[keyframes]
-        border.move_children(self.parent, self.turn, self.noise, gradient, moved)
+        kernels.border.move_children(self.parent, self.turn, self.noise, gradient, moved)
         return np.concatenate((old.reshape(right.shape), (self.mean + moved)[self.new]))
 
 
@@ -134,8 +133,6 @@ class Border:
         LinAlgError : that does not say where it is; nothing is appended.
 
         """
-        from l1slam_ros.core.kernels import border
-
         own = ends.index(self.keyframes)
         parent, inverse = self._point(ends[1 - own]), np.linalg.inv(blocks[own])
         turn, mean = -inverse @ blocks[1 - own], -inverse @ residual
@@ -143,7 +140,7 @@ class Border:
             mean += turn @ self._mean.view()[parent]
         spread = inverse * noise @ inverse.T
         product = np.empty((self.points + 1, self._k, self._k))
-        border.follow(self._covariance.view(), parent, turn, spread, product)
+        kernels.border.follow(self._covariance.view(), parent, turn, spread, product)
         self._new.append(self._append(product, mean, parent, turn, spread))
 
     def predict(self, ends: tuple[int, int], blocks: Array, residual: Array) -> Prediction:
@@ -152,12 +149,10 @@ class Border:
 
         ends : the keyframes i and j, `FIXED` for none; blocks : (2, k, k); residual : r, (k,)
         """
-        from l1slam_ros.core.kernels import border
-
         points = np.array([self._point(end) for end in ends])
         rows, expected = np.empty((self._k, self.rows)), residual.copy()
         covariance = np.empty((self._k, self._k))
-        border.predict(
+        kernels.border.predict(
             self._covariance.view(), self._mean.view(), self._ends.view(), self._blocks.view(),
             self._factor.view(), self._right.view(), points, blocks, rows, covariance, expected)
         return Prediction(expected, covariance, rows, points, blocks)
@@ -183,12 +178,10 @@ class Border:
 
     def step(self, keyframes: list[int]) -> Array:
         """Return the steps of some keyframes, (m, k); zero of those that are not here yet."""
-        from l1slam_ros.core.kernels import border
-
         points = np.array([self._point(keyframe) if keyframe < self.keyframes else FIXED
                            for keyframe in keyframes])
-        steps: Array = border.move(self._covariance.view(), self._mean.view(), self._gradient(),
-                                   points)
+        steps: Array = kernels.border.move(
+            self._covariance.view(), self._mean.view(), self._gradient(), points)
         return steps
 
     def steps(self) -> Steps:
@@ -207,16 +200,14 @@ class Border:
         return self._touch(keyframe)
 
     def _touch(self, keyframe: int) -> int:
-        from l1slam_ros.core.kernels import border
-
         places, values = self._cholesky.climb(keyframe)
         self._places.extend(places)
         self._values.extend(values.ravel())
         t, k = self.points, self._k
         product, none = np.empty((t + 1, k, k)), np.zeros((k, k))
         begin = np.append(self._begin.view(), len(self._places))
-        border.meet(begin, self._places.view(), self._values.view(),
-                    np.append(self._parent.view(), FIXED), self._turn.view(), product)
+        kernels.border.meet(begin, self._places.view(), self._values.view(),
+                            np.append(self._parent.view(), FIXED), self._turn.view(), product)
         self._touched[keyframe] = self._append(product, np.zeros(k), FIXED, none, none)
         return t
 
@@ -233,13 +224,11 @@ class Border:
 
     def _gradient(self) -> Array:
         """Return A' lambda at all points, (t, k)."""
-        from l1slam_ros.core.kernels import border
-
         known = len(self._pulled)
         if known < self.points:
             before, self._pulled = self._pulled, np.zeros((self.points, self._k))
             self._pulled[:known] = before
             if not known:
-                border.pull(self._factor.view(), self._right.view(), self._ends.view(),
-                            self._blocks.view(), self._pulled)
+                kernels.border.pull(self._factor.view(), self._right.view(), self._ends.view(),
+                                    self._blocks.view(), self._pulled)
         return self._pulled

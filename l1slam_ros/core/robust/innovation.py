@@ -16,6 +16,7 @@ from math import lgamma
 
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask, filled
@@ -61,11 +62,9 @@ class Posterior:
 
     def left_over(self, rows: Indices) -> Array:
         """Return what the noise makes of the residuals of some factors, (l, k, q)."""
-        from l1slam_ros.core.kernels.prediction import moved
-
         system = self.system
-        drawn: Array = self.noise[rows] - moved(system.keyframe[rows], system.blocks[rows],
-                                                self.samples)
+        drawn: Array = self.noise[rows] - kernels.prediction.moved(
+            system.keyframe[rows], system.blocks[rows], self.samples)
         return drawn
 
     def left_out(self) -> Array:
@@ -76,10 +75,8 @@ class Posterior:
         left out and R^-1 its covariance, so the square is r'R^-1 r. Where no other factor says
         anything of it, that is 0.
         """
-        from l1slam_ros.core.kernels.prediction import normalise
-
         moment = filled(self.moment, ~self.speaks).copy()
-        square: Array = normalise(moment, self.residual)[0]
+        square: Array = kernels.prediction.normalise(moment, self.residual)[0]
         alone = np.trace(self.moment, axis1=1, axis2=2) < _REDUNDANT
         return np.where(alone | ~np.isfinite(square), 0.0, square)
 
@@ -93,8 +90,6 @@ def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) 
     GraphError : some keyframe is not tied to the anchor.
 
     """
-    from l1slam_ros.core.kernels.prediction import gather, left_over
-
     system = linearise(graph, poses)
     if not cholesky.factorise(system, np.ones_like(system.b)):
         raise GraphError('the normal matrix is singular: a part of the graph is not tied to '
@@ -105,10 +100,10 @@ def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) 
     speaks = graph.between.speaks
     noise[~speaks] = 0
     samples = np.zeros((system.size + 1, k, q))
-    gather(system.keyframe, system.blocks, noise, samples)
+    kernels.prediction.gather(system.keyframe, system.blocks, noise, samples)
     samples[-1] = 0.0
     cholesky.solve_many(samples[:-1])
-    moment = left_over(system.keyframe, system.blocks, samples, noise)
+    moment = kernels.prediction.left_over(system.keyframe, system.blocks, samples, noise)
     return Posterior(system, noise, samples, moment, speaks, anchor(graph))
 
 
@@ -163,16 +158,15 @@ class Innovations:
 
         first, second : (pairs,) factors
         """
-        from l1slam_ros.core.kernels import prediction
-
         system, k = self.system, self.system.block_size
         rows, place = np.unique(np.concatenate((first, second)), return_inverse=True)
-        moved = prediction.moved(system.keyframe[rows], system.blocks[rows], posterior.samples)
+        moved = kernels.prediction.moved(system.keyframe[rows], system.blocks[rows],
+                                         posterior.samples)
         residual = -system.b.reshape(-1, k)[rows]
         pairs = place.reshape(2, -1)
         both = np.concatenate((moved[pairs[0]], moved[pairs[1]]), axis=1)
         covariance = both @ both.transpose(0, 2, 1) / both.shape[2] + np.eye(2 * k)
-        square, log_det = prediction.normalise(
+        square, log_det = kernels.prediction.normalise(
             covariance, np.concatenate((residual[pairs[0]], residual[pairs[1]]), axis=1))
         claim = self.log_claim[first] + self.log_claim[second]
         freedom = self.freedom[first] + self.freedom[second]
@@ -186,15 +180,13 @@ def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
 
     log_volume : (k,) of `claimed_volume`
     """
-    from l1slam_ros.core.kernels import prediction
-
     system, factors = linearise(graph, poses, fixed=posterior.fixed), graph.between
     k = system.block_size
-    spread = prediction.left_over(system.keyframe, system.blocks, posterior.samples,
-                                  posterior.noise[:0])
+    spread = kernels.prediction.left_over(system.keyframe, system.blocks, posterior.samples,
+                                          posterior.noise[:0])
     absolute = np.flatnonzero(factors.is_absolute)
     spread[absolute] += _sagittas(graph.subset(absolute), posterior)
-    square, log_det = prediction.normalise(spread + np.eye(k), -system.b.reshape(-1, k))
+    square, log_det = kernels.prediction.normalise(spread + np.eye(k), -system.b.reshape(-1, k))
     return Innovations(system, spread, square, log_det, log_claims(factors, log_volume),
                        factors.freedom)
 

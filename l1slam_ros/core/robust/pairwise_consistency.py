@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import whiten
 from l1slam_ros.core.graph.linear_system import with_world
@@ -100,8 +101,6 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
     From the one loop follows the other, if the map is right about how their first ends lie to
     each other, and their second ends; whatever it says of the loops themselves.
     """
-    from l1slam_ros.core.kernels.prediction import normalise
-
     manifold, poses = growth.graph.manifold, growth.poses
     first, second, Z = _ends_by_part(growth, rows)
     same_way = growth.part[first] * (growth.part.max() + 1) + growth.part[second]
@@ -121,7 +120,7 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
     roots = factors.sqrt_information[b]
     change = _changes(growth, ends, a, b, roots)
     covariance = 2 * np.eye(k) + change @ change.transpose(0, 2, 1) / change.shape[2]
-    square, log_det = normalise(covariance, whiten(roots, error))
+    square, log_det = kernels.prediction.normalise(covariance, whiten(roots, error))
     volume = claimed_volume(manifold, poses)
     freedom = factors.freedom[b]
     log_ratio = log_likelihood_ratio(square, log_det, log_claims(factors, volume)[b], freedom,
@@ -156,8 +155,6 @@ def _changes(growth: Growth, ends: Ends, a: Indices, b: Indices, roots: Array) -
     To first order Ad (Za S)^-1 and -Ad (F Za S)^-1 times the steps of the first ends of a and b,
     -Ad S^-1 and the identity times those of the second ends.
     """
-    from l1slam_ros.core.kernels.prediction import moved
-
     manifold, (low, high, _) = growth.graph.manifold, ends
     samples, fixed = growth.posterior.samples, growth.posterior.fixed
     F, onward, S = _follows(manifold, ends, growth.poses, a, b)
@@ -167,6 +164,6 @@ def _changes(growth: Growth, ends: Ends, a: Indices, b: Indices, roots: Array) -
     for end, J_a, J_b in pairs:
         keyframe = np.stack((end[a], end[b]), axis=1) - fixed
         keyframe[keyframe < 0] = len(samples) - 1
-        changes.append(moved(keyframe, np.stack((J_a, J_b), axis=1), samples))
+        changes.append(kernels.prediction.moved(keyframe, np.stack((J_a, J_b), axis=1), samples))
     total: Array = changes[0] + changes[1]
     return total
