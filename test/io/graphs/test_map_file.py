@@ -22,7 +22,8 @@ class Robot:
     """A back end with a map file, its options, and what it warned of."""
 
     def __init__(self, path, period=1e-9):
-        self.options = NodeOptions(save_path=str(path), autosave_period=period)
+        self.options = NodeOptions(save_path=str(path), autosave_period=period,
+                                   on_time_jump='reset')
         self.backend, self.warnings, self.seconds = Backend(self.options), [], 0
         self.map_file = MapFile(self.backend, lambda: self.options, self.warnings.append)
 
@@ -104,17 +105,17 @@ def test_a_save_that_fails_is_tried_again_in_the_next_period(tmp_path):
     assert is_map(tmp_path / 'none' / 'map.g2o')
 
 
-@pytest.mark.parametrize('reset', [False, True])
-def test_a_map_that_was_not_loaded_is_kept_for_ever(tmp_path, reset):
+@pytest.mark.parametrize('why', ['not loaded', 'reset', 'odometry'])
+def test_a_map_that_was_not_loaded_is_kept_for_ever(tmp_path, why):
     """Also where the one who starts the node forgets to load it; or the map began anew."""
     path, first = tmp_path / 'map.g2o', Robot(tmp_path / 'map.g2o')
     first.drive(9)
     first.map_file.save()
     os.utime(path, (0, 0))
-    if reset:
+    if why == 'reset':
         first.backend.reset()
-        first.map_file.disown()
-    second = first if reset else Robot(path)
+    first.seconds = 0 if why == 'odometry' else 9
+    second = Robot(path) if why == 'not loaded' else first
     for _ in range(4):
         second.drive(3)
         assert second.autosave()
@@ -130,6 +131,30 @@ def test_a_map_that_was_not_loaded_is_kept_for_ever(tmp_path, reset):
     assert len(list(tmp_path.iterdir())) == 3 and not third.warnings
 
 
+@pytest.mark.parametrize('newer', [False, True])
+def test_what_is_not_its_own_any_more_is_kept(tmp_path, newer):
+    """A person copies a map to where the node saves; or it is damaged, or too new to be read."""
+    path, robot = tmp_path / 'map.g2o', Robot(tmp_path / 'map.g2o')
+    for _ in range(2):
+        robot.drive(3)
+        robot.map_file.save()
+    if newer:
+        content = path.read_bytes()[:-100]
+        path.write_bytes(content)
+        robot = Robot(path)
+        assert not robot.load_at_start() and len(robot.warnings) == 1
+        robot.seconds = 6
+    else:
+        content = path.read_bytes()
+        (tmp_path / 'another.g2o').write_bytes(content)
+        os.replace(tmp_path / 'another.g2o', path)
+    for _ in range(3):
+        robot.drive(1)
+        assert robot.autosave()
+    kept = [p for p in tmp_path.iterdir() if p.read_bytes() == content]
+    assert len(kept) == 1 and robot.warnings[-1].endswith(f'it is kept as {kept[0]}')
+
+
 def test_what_was_loaded_is_its_own(tmp_path):
     path, first = tmp_path / 'map.g2o', Robot(tmp_path / 'map.g2o')
     first.drive(9)
@@ -143,7 +168,8 @@ def test_what_was_loaded_is_its_own(tmp_path):
     assert {p.name for p in tmp_path.iterdir()} == {'map.g2o', 'map.g2o.1'}
     # Elsewhere, it is saved elsewhere; there may be another map.
     second.options = replace(second.options, save_path=str(tmp_path / 'other.g2o'))
-    assert second.map_file.save() == f'10 keyframes saved to {tmp_path / "other.g2o"}'
+    assert second.autosave() and keyframes(tmp_path / 'other.g2o') == 10
+    assert not second.autosave() and not second.warnings
 
 
 def test_at_start_a_missing_map_is_no_error_and_a_damaged_one_is_kept(tmp_path):
