@@ -17,6 +17,8 @@ from rcl_interfaces.srv import DescribeParameters, ListParameters
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosbags.typesys import Stores, get_typestore
 
+from l1slam_ros.io.graphs.saved_map import load_map
+
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / 'config'
 INPUTS = {
@@ -183,23 +185,30 @@ def state(b):
     return asked(b, GetState, 'get_state', GetState.Request()).current_state.label
 
 
-def test_a_node_that_is_managed_waits_to_be_told(bench):
-    b = bench(autostart=False)
+def test_a_node_that_is_managed_does_as_it_is_told(bench, tmp_path):
+    path = tmp_path / 'map.g2o'
+    b = bench(autostart=False, save_path=str(path))
     assert state(b) == 'unconfigured'
     b.send('/odom', odometry(10**9, 0.0))
     b.until(lambda: b.status()[2].get('odom.received') == '1', 'it has come')
     assert not b.received['pose'] and not b.received['map_to_odom']
     assert change(b, Transition.TRANSITION_CONFIGURE) and state(b) == 'inactive'
     assert change(b, Transition.TRANSITION_ACTIVATE) and state(b) == 'active'
-    b.send('/odom', odometry(2 * 10**9, 0.0))
-    b.until(lambda: len(b.path().poses) == 1 and b.received['map_to_odom'], 'a map')
-    assert len(b.received['pose']) == 1
+    b.drive(1, 3)
+    b.until(lambda: len(b.path().poses) == 2 and b.received['map_to_odom'], 'a map')
+    assert len(b.received['pose']) == 2
     assert change(b, Transition.TRANSITION_DEACTIVATE)
-    b.send('/odom', odometry(3 * 10**9, 0.0))
-    b.until(lambda: b.status()[2].get('odom.received') == '3', 'it has come')
-    assert len(b.received['pose']) == 1 and len(b.path().poses) == 1
+    b.drive(3, 4)
+    b.until(lambda: b.status()[2].get('odom.received') == '4', 'it has come')
     assert change(b, Transition.TRANSITION_CLEANUP) and state(b) == 'unconfigured'
     b.until(lambda: not b.path().poses, 'the map is empty')
+    # The next autosave would have been a minute later.
+    assert load_map(path)[1] == f'2 keyframes loaded from {path}'
+    assert change(b, Transition.TRANSITION_CONFIGURE) and change(b, Transition.TRANSITION_ACTIVATE)
+    assert change(b, Transition.TRANSITION_ACTIVE_SHUTDOWN) and state(b) == 'finalized'
+    b.drive(4, 5)
+    b.until(lambda: b.status()[2].get('odom.received') == '5', 'it has come')
+    assert len(b.received['pose']) == 2
 
 
 def test_unless_it_is_managed_it_is_active_at_once(bench):

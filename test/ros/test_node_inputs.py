@@ -44,6 +44,12 @@ def test_odometry_in_a_frame_that_is_not_odom_frame_is_told_of(bench, capfd):
     assert len(told) == 1 and "odometry in frame 'odom' is used, but m -> r/odom is pub" in told[0]
 
 
+def test_the_last_stamp_that_there_is_has_a_transform_too(bench):
+    b = bench(**NO_DOUBT)
+    b.send('/odom', odometry(2**31 * NS - 1, 0.0))
+    b.until(lambda: b.received['map_to_odom'], 'a transform that is no later')
+
+
 def test_strays_do_not_stop_the_map(bench, capfd):
     """A first message of another robot, a stamp of tomorrow, a teleport, loops five times."""
     b = bench(**NO_DOUBT)

@@ -4,13 +4,14 @@
 import os
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from problems import odometry
 
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.io.graphs.map_file import MapFile
+from l1slam_ros.io.graphs.map_file import MapFile, unusable_path
 from l1slam_ros.io.graphs.saved_map import is_map, load_map
 from l1slam_ros.io.graphs.side_files import beside
 from l1slam_ros.io.node_options import NodeOptions
@@ -200,6 +201,13 @@ def test_a_map_of_another_dimension_is_refused(tmp_path):
     beside(path, 'stamps').write_text('1\n2\n')
     with pytest.raises(FileError, match='map.g2o: is a map of SE3; expected one of SE2'):
         robot.map_file.load()
+
+
+def test_where_no_file_can_be_is_said(tmp_path):
+    assert not unusable_path('') and not unusable_path(f'{tmp_path}/map.g2o')
+    assert unusable_path('~no one/map.g2o').endswith('there is no folder ' + str(
+        Path('~no one').absolute()))
+    assert unusable_path(str(tmp_path)) == f"save_path is '{tmp_path}', which is a folder"
 
 
 def test_without_a_name_nothing_is_loaded(tmp_path):
