@@ -9,6 +9,7 @@ other.
 
 import time
 from collections import Counter
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from nav_msgs.msg import Path
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -89,6 +91,8 @@ class BackendNode(LifecycleNode):
             if sentence:
                 self.get_logger().warning(sentence)
         self.add_on_set_parameters_callback(self._on_set)
+        change = self._service_change_state
+        change.callback = partial(self._on_change_state, change.callback)
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
                           on_clock_change=False),
@@ -125,6 +129,17 @@ class BackendNode(LifecycleNode):
         """Leave messages alone for good; the map is saved when the process ends."""
         return self.on_deactivate(state)
 
+    def _on_change_state(self, change: Any, request: Any, response: Any) -> Any:
+        """Answer also where there is no such transition: rclpy would raise."""
+        try:
+            return change(request, response)
+        except rclpy_implementation.RCLError:
+            self.get_logger().warning(
+                f'there is no transition {request.transition.id} from '
+                f'{self._state_machine.current_state[1]!r}; expected another, or, where a manager '
+                'configures and activates the node, autostart: false')
+            return response
+
     @property
     def options(self) -> NodeOptions:
         """The options as they are now."""
@@ -142,7 +157,7 @@ class BackendNode(LifecycleNode):
         if ended:
             self.destroy_node()
             # It holds the node in the graph of ROS, and rclpy forgets it.
-            self._state_machine = None
+            self._state_machine: Any = None
         return ended
 
     def is_saving(self) -> bool:

@@ -188,7 +188,7 @@ def state(b):
 def test_a_node_that_is_managed_does_as_it_is_told(bench, tmp_path):
     path = tmp_path / 'map.g2o'
     b = bench(autostart=False, save_path=str(path))
-    assert state(b) == 'unconfigured'
+    assert not change(b, Transition.TRANSITION_ACTIVATE) and state(b) == 'unconfigured'
     b.send('/odom', odometry(10**9, 0.0))
     b.until(lambda: b.status()[2].get('odom.received') == '1', 'it has come')
     assert not b.received['pose'] and not b.received['map_to_odom']

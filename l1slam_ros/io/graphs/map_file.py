@@ -144,10 +144,9 @@ def _absolute(path: str) -> Path:
 
 def _mark(path: Path) -> tuple[int, int] | None:
     """Return what tells a file from all that stood in its place before; None: there is none."""
-    try:
-        status = path.stat()
-    except OSError:
+    if not path.is_file():
         return None
+    status = path.stat()
     return status.st_ino, status.st_mtime_ns
 
 
