@@ -16,6 +16,8 @@ from l1slam_ros.io.node_options import NodeOptions
 # An autosave begins after such a part of its period: a busy machine comes late to it, and odometry
 # on its way is not in it yet.
 _PART = 0.8
+# [bytes] Enough of the end of a file to tell a map from another: its checksum is in it.
+_END = 128
 
 
 class MapFile:
@@ -41,7 +43,7 @@ class MapFile:
         self._began, self._took = time.monotonic(), 0.0
         # What was saved or loaded last: where, and the version of the map.
         self._known: tuple[object, ...] = options().save_path, backend.version
-        # The file that we wrote or loaded, as it was then, and the graph whose map it holds.
+        # The file that we wrote or loaded, its end, and the graph whose map it holds.
         self._ours: tuple[object, ...] = ()
 
     def save(self) -> str:
@@ -58,8 +60,8 @@ class MapFile:
             if saved is None:
                 return
             path = self._path()
-            there = _mark(path)
-            if there and self._ours != (path, there, saved.number):
+            end = _end_of(path)
+            if end and self._ours != (path, end, saved.number):
                 kept = path.with_name(f'{path.stem}.{_time_of(path)}{path.suffix}')
                 keep_as(path, kept)
                 self._warn(f'{path} held another map: it is kept as {kept}')
@@ -76,7 +78,7 @@ class MapFile:
     def _write(self, path: Path, saved: SavedMap | None, version: object) -> str:
         sentence = save_map(path, saved)
         self._known = self._options().save_path, version
-        self._ours = path, _mark(path), saved.number if saved else 0
+        self._ours = path, _end_of(path), saved.number if saved else 0
         return sentence
 
     def load(self) -> str:
@@ -88,7 +90,7 @@ class MapFile:
 
     def _loaded(self) -> tuple[str, bool]:
         path = self._path()
-        there = _mark(path)
+        end = _end_of(path)
         saved, sentence, whole = load_map(path)
         found, expected = saved.growth.graph.manifold, self._backend.manifold
         if found is not expected:
@@ -96,7 +98,7 @@ class MapFile:
         number = self._backend.restore(saved)
         self._known = self._options().save_path, self._backend.version
         # What could not be read may be of use to somebody yet.
-        self._ours = (path, there, number) if whole else ()
+        self._ours = (path, end, number) if whole else ()
         return sentence, whole
 
     def load_at_start(self, tell: Callable[[str], object]) -> None:
@@ -142,12 +144,13 @@ def _absolute(path: str) -> Path:
     return Path(os.path.expanduser(path)).absolute()
 
 
-def _mark(path: Path) -> tuple[int, int] | None:
-    """Return what tells a file from all that stood in its place before; None: there is none."""
+def _end_of(path: Path) -> bytes:
+    """Return the last bytes of a file, of a saved map its checksum; none: there is no file."""
     if not path.is_file():
-        return None
-    status = path.stat()
-    return status.st_ino, status.st_mtime_ns
+        return b''
+    with path.open('rb') as file:
+        file.seek(max(file.seek(0, os.SEEK_END) - _END, 0))
+        return file.read()
 
 
 def _time_of(path: Path) -> str:

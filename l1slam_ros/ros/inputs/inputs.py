@@ -31,7 +31,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from l1slam_ros.core.errors import L1SlamError, MessageError
+from l1slam_ros.core.errors import L1SlamError, MessageError, OptionError
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.io.files import quoted
@@ -40,7 +40,7 @@ from l1slam_ros.io.messages.base_frame import BaseFrame
 from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.inputs.traffic import Traffic
-from l1slam_ros.ros.threads.failures import Failures
+from l1slam_ros.ros.threads.failures import Failures, reason
 
 _DEPTH = 1000
 # So many are used before DDS is asked for more.
@@ -138,9 +138,12 @@ class Inputs:
     def _subscribe(self, kind: Any, name: str, use: Callable[[Any], None],
                    raw: bool = False) -> None:
         """Subscribe to a topic; raw : its messages are used as bytes."""
-        subscription = self._node.create_subscription(
-            kind, name, use, QoSProfile(depth=_DEPTH), raw=raw, callback_group=self._group,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        try:
+            subscription = self._node.create_subscription(
+                kind, name, use, QoSProfile(depth=_DEPTH), raw=raw, callback_group=self._group,
+                qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        except Exception as error:  # by what is said of its QoS, rclpy raises anything
+            raise OptionError(f'{name} cannot be subscribed to: {reason(error)}') from error
         traffic = Traffic(subscription.get_publisher_count)
         self._topics.append(_Topic(name, subscription, traffic, use))
 
