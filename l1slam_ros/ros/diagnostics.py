@@ -99,6 +99,9 @@ class Diagnostics:
             return DiagnosticStatus.ERROR, '; '.join(
                 f'{what} failed: {why}' for what, why in failures.items())
         wrong = [twins] if twins else []
+        sources = self._topics['odom'].publishers()
+        if sources > 1:
+            wrong.append(f'odom has {sources} publishers; expected one')
         if lately:
             wrong.append('refused in the last minute: ' + ', '.join(
                 f'{count} {cause}' for cause, count in sorted(lately.items())))

@@ -9,6 +9,7 @@ other.
 
 import time
 from collections import Counter
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,13 +18,14 @@ from nav_msgs.msg import Path
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.update import Improvement
-from l1slam_ros.io.graphs.map_file import MapFile, missing_folder
+from l1slam_ros.io.graphs.map_file import MapFile, unusable_path
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.diagnostics import Diagnostics
 from l1slam_ros.ros.inputs.inputs import Inputs
@@ -85,10 +87,12 @@ class BackendNode(LifecycleNode):
             self, self._backend, self._jobs, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
         guarded = self.failures.guarded
-        for sentence in *self._declared.unknown(), missing_folder(options.save_path):
+        for sentence in *self._declared.unknown(), unusable_path(options.save_path):
             if sentence:
                 self.get_logger().warning(sentence)
         self.add_on_set_parameters_callback(self._on_set)
+        change = self._service_change_state
+        change.callback = partial(self._on_change_state, change.callback)
         self._jumps = self.get_clock().create_jump_callback(
             JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
                           on_clock_change=False),
@@ -117,9 +121,24 @@ class BackendNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Empty the map."""
-        self._jobs.put('clean up', self._map_services.reset)
+        """Empty the map, not its file."""
+        self._begin_anew('clean up')
         return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Leave messages alone for good; the map is saved when the process ends."""
+        return self.on_deactivate(state)
+
+    def _on_change_state(self, change: Any, request: Any, response: Any) -> Any:
+        """Answer also where there is no such transition: rclpy would raise."""
+        try:
+            return change(request, response)
+        except rclpy_implementation.RCLError:
+            self.get_logger().warning(
+                f'there is no transition {request.transition.id} from '
+                f'{self._state_machine.current_state[1]!r}; expected another, or, where a manager '
+                'configures and activates the node, autostart: false')
+            return response
 
     @property
     def options(self) -> NodeOptions:
@@ -131,14 +150,14 @@ class BackendNode(LifecycleNode):
         deadline = time.monotonic() + seconds
         self._solver.close(0.0)  # what it works at for a job stops
         ended = self._inputs.close(seconds)
-        self._map_services.save_at_end()
+        self._map_services.save_changes()
         ended &= self._jobs.close(seconds) or (
             self._map_file.is_saving and self._jobs.close(_SAVING))
         ended &= self._solver.close(max(deadline - time.monotonic(), 0.0))
         if ended:
             self.destroy_node()
             # It holds the node in the graph of ROS, and rclpy forgets it.
-            self._state_machine = None
+            self._state_machine: Any = None
         return ended
 
     def is_saving(self) -> bool:
@@ -156,8 +175,8 @@ class BackendNode(LifecycleNode):
         self._loop_status = LoopStatus(self)
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuse a folder that is not there; at start it may be mounted later."""
-        wrong = ''.join(missing_folder(str(parameter.value)) for parameter in parameters
+        """Refuse a file that cannot be; at start its folder may be mounted later."""
+        wrong = ''.join(unusable_path(str(parameter.value)) for parameter in parameters
                         if parameter.name == 'save_path')
         return SetParametersResult(successful=not wrong, reason=wrong)
 
@@ -168,7 +187,12 @@ class BackendNode(LifecycleNode):
         self._transform.forget()
         if self.options.on_time_jump == 'reset':
             self.get_logger().warning('the clock jumped back: the map begins anew')
-            self._jobs.put('time jump', self._map_services.reset)
+            self._begin_anew('time jump')
+
+    def _begin_anew(self, why: str) -> None:
+        """Empty the map, which nobody asked for: what is new in it is saved before."""
+        self._map_services.save_changes()
+        self._jobs.put(why, self._map_services.reset)
 
     def _on_moved(self) -> None:
         robot, manifold = self._backend.robot(), self._manifold

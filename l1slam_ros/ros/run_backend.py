@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The process of `backend`: SIGINT and SIGTERM end it within two seconds, whatever it is doing.
+The process of `backend`: SIGINT, SIGTERM and SIGHUP end it within two seconds, whatever it does.
 
 Imported and run before anything heavy, so that this holds while the rest is being imported, too.
 """
@@ -42,8 +42,10 @@ class Ending:
         self._read, write = os.pipe()
         os.set_blocking(write, False)
         signal.set_wakeup_fd(write, warn_on_full_buffer=False)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: None)
+        for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
+            # The terminal may go, unless `nohup` says that this is nothing to the node.
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, lambda *_: None)
         threading.Thread(target=self._wait, name='signals', daemon=True).start()
 
     def orderly(self, wake: Callable[[], None]) -> None:
@@ -69,8 +71,8 @@ class Ending:
 def leave(code: int) -> None:
     """End the process now, whatever its threads are doing."""
     for stream in (sys.stdout, sys.stderr):
-        # Nobody may be listening any more.
-        with suppress(OSError, ValueError):
+        # Nobody may be listening any more, or ever have been: then it is None.
+        with suppress(OSError, ValueError, AttributeError):
             stream.flush()
     os._exit(code)
 

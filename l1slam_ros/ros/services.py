@@ -85,7 +85,6 @@ class MapServices:
     def reset(self) -> str:
         """Empty the map, not its file; the thread of the jobs calls it."""
         self._backend.reset()
-        self._map_file.disown()
         return 'the map is empty'
 
     def autosave(self) -> float:
@@ -96,8 +95,8 @@ class MapServices:
         self._autosave()
         return time.monotonic() - began  # no more than half of the time
 
-    def save_at_end(self) -> None:
-        """Let the map be saved if it has changed."""
+    def save_changes(self) -> None:
+        """Let the map be saved if it has changed, before what is queued from now on."""
         self._jobs.put('the map file', self._autosave)
 
     def _autosave(self) -> str:

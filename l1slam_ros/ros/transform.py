@@ -18,6 +18,8 @@ except ImportError:  # the ROS wheels on PyPI have none
     TFMessage = None
 
 _SECOND = 1_000_000_000
+# [ns] No stamp of ROS says a later time.
+_LATEST = 2**31 * _SECOND - 1
 
 
 class MapToOdom:
@@ -70,8 +72,8 @@ class MapToOdom:
             self._stamp = 0  # time itself went back
         self._newest = robot.stamp
         # tf2 ignores a second transform of one time, and warns of it.
-        self._stamp = max(robot.stamp + int(options.transform_tolerance * _SECOND),
-                          self._stamp + 1)
+        self._stamp = min(max(robot.stamp + int(options.transform_tolerance * _SECOND),
+                              self._stamp + 1), _LATEST)
         if robot.map_to_odom is not self._last[0]:
             self._last = (robot.map_to_odom,
                           self._backend.manifold.to_pose3(robot.map_to_odom)[0])

@@ -17,7 +17,10 @@ from rcl_interfaces.srv import DescribeParameters, ListParameters
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosbags.typesys import Stores, get_typestore
 
-CONFIG = Path(__file__).parents[2] / 'config'
+from l1slam_ros.io.graphs.saved_map import load_map
+
+ROOT = Path(__file__).parents[2]
+CONFIG = ROOT / 'config'
 INPUTS = {
     '/odom': 'nav_msgs/msg/Odometry',
     '/loop_closures': 'geometry_msgs/msg/PoseWithCovarianceStamped',
@@ -38,10 +41,12 @@ SERVICES = {
     **{f'/backend/{name}': 'std_srvs/srv/Trigger' for name in ('optimize', 'reset', 'save',
                                                                'load')},
     '/backend/pause': 'std_srvs/srv/SetBool',
-    '/backend/change_state': 'lifecycle_msgs/srv/ChangeState',
-    '/backend/get_state': 'lifecycle_msgs/srv/GetState',
 }
 LATCHED = {'/path', '/graph', '/loop_status'}
+# Only where their messages are installed.
+ELSEWHERE = {'/map_graph', '/pose_graph', '/tf'}
+# The types of what every node has, a managed one too.
+OF_ROS = 'lifecycle_msgs/', 'rcl_interfaces/', 'type_description_interfaces/'
 # name -> default, unit; those that only the start can set are marked.
 PARAMETERS = {
     'map_frame': ('map', '', True), 'odom_frame': ('odom', '', True), 'base_frame': ('', '', True),
@@ -69,16 +74,14 @@ def asked(b, kind, name, request):
 def test_topics_and_services_are_those_of_the_interface(bench):
     b = bench()
 
-    def known():
-        named = (dict(call('backend', '/')) for call in (
-            b.peer.get_subscriber_names_and_types_by_node,
-            b.peer.get_publisher_names_and_types_by_node,
-            b.peer.get_service_names_and_types_by_node))
-        return all(expected.keys() <= found.keys() and all(
-            found[name] == [kind] for name, kind in expected.items())
-            for expected, found in zip((INPUTS, OUTPUTS, SERVICES), named, strict=True))
+    def named():
+        return [{name: kind for name, (kind,) in call('backend', '/')
+                 if not kind.startswith(OF_ROS)}
+                for call in (b.peer.get_subscriber_names_and_types_by_node,
+                             b.peer.get_publisher_names_and_types_by_node,
+                             b.peer.get_service_names_and_types_by_node)]
 
-    b.until(known, 'all is found, with its type')
+    b.until(lambda: named() == [INPUTS, OUTPUTS, SERVICES], 'this is found, and nothing else')
     for topic in INPUTS:
         (end,) = b.peer.get_subscriptions_info_by_topic(topic)
         assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
@@ -90,6 +93,18 @@ def test_topics_and_services_are_those_of_the_interface(bench):
         latched = end.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         assert latched == (topic in LATCHED), topic
         assert end.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+
+
+@pytest.mark.parametrize('way, topics', [('in', INPUTS), ('out', OUTPUTS)])
+def test_the_readme_names_each_topic_and_its_type(way, topics):
+    table = (ROOT / 'README.md').read_text().split(f'| {way} | type | meaning |')[1]
+    said, types = {}, ''
+    for row in table.split('\n\n')[0].splitlines()[2:]:
+        names, kinds, _ = row.strip('| ').split(' | ', 2)
+        types = types if kinds == 'the same' else kinds
+        said |= zip(re.findall(r'`/?([a-z_]+)`', names), 2 * types.split(', '), strict=False)
+    assert {f'/{name}': kind.replace('/', '/msg/') for name, kind in said.items()
+            if f'/{name}' not in ELSEWHERE} == topics
 
 
 def test_parameters_are_described_with_unit_and_range(bench):
@@ -170,23 +185,30 @@ def state(b):
     return asked(b, GetState, 'get_state', GetState.Request()).current_state.label
 
 
-def test_a_node_that_is_managed_waits_to_be_told(bench):
-    b = bench(autostart=False)
-    assert state(b) == 'unconfigured'
+def test_a_node_that_is_managed_does_as_it_is_told(bench, tmp_path):
+    path = tmp_path / 'map.g2o'
+    b = bench(autostart=False, save_path=str(path))
+    assert not change(b, Transition.TRANSITION_ACTIVATE) and state(b) == 'unconfigured'
     b.send('/odom', odometry(10**9, 0.0))
     b.until(lambda: b.status()[2].get('odom.received') == '1', 'it has come')
     assert not b.received['pose'] and not b.received['map_to_odom']
     assert change(b, Transition.TRANSITION_CONFIGURE) and state(b) == 'inactive'
     assert change(b, Transition.TRANSITION_ACTIVATE) and state(b) == 'active'
-    b.send('/odom', odometry(2 * 10**9, 0.0))
-    b.until(lambda: len(b.path().poses) == 1 and b.received['map_to_odom'], 'a map')
-    assert len(b.received['pose']) == 1
+    b.drive(1, 3)
+    b.until(lambda: len(b.path().poses) == 2 and b.received['map_to_odom'], 'a map')
+    assert len(b.received['pose']) == 2
     assert change(b, Transition.TRANSITION_DEACTIVATE)
-    b.send('/odom', odometry(3 * 10**9, 0.0))
-    b.until(lambda: b.status()[2].get('odom.received') == '3', 'it has come')
-    assert len(b.received['pose']) == 1 and len(b.path().poses) == 1
+    b.drive(3, 4)
+    b.until(lambda: b.status()[2].get('odom.received') == '4', 'it has come')
     assert change(b, Transition.TRANSITION_CLEANUP) and state(b) == 'unconfigured'
     b.until(lambda: not b.path().poses, 'the map is empty')
+    # The next autosave would have been a minute later.
+    assert load_map(path)[1] == f'2 keyframes loaded from {path}'
+    assert change(b, Transition.TRANSITION_CONFIGURE) and change(b, Transition.TRANSITION_ACTIVATE)
+    assert change(b, Transition.TRANSITION_ACTIVE_SHUTDOWN) and state(b) == 'finalized'
+    b.drive(4, 5)
+    b.until(lambda: b.status()[2].get('odom.received') == '5', 'it has come')
+    assert len(b.received['pose']) == 2
 
 
 def test_unless_it_is_managed_it_is_active_at_once(bench):
@@ -198,5 +220,7 @@ def test_two_nodes_of_one_name_are_noticed(bench):
     b.until(lambda: b.status()[1] == 'ok', 'one is fine')
     other = bench()
     b.until(lambda: '2 nodes are called /backend; expected one' in b.status()[1], 'it is said')
+    # So do two robots that send their odometry there.
     assert b.status()[0] == DiagnosticStatus.WARN
+    b.until(lambda: 'odom has 2 publishers; expected one' in b.status()[1], 'this, too')
     other.close()

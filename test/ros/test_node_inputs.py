@@ -32,6 +32,24 @@ def test_a_slash_before_a_frame_says_nothing(bench, given, of_odometry, of_loops
     assert b.path().header.frame_id == 'map' and not b.backend._inputs.refused
 
 
+def test_odometry_in_a_frame_that_is_not_odom_frame_is_told_of(bench, capfd):
+    """The tree of tf2 would not hang together, without a word."""
+    b = bench(map_frame='m', odom_frame='r/odom', **NO_DOUBT)
+    for k, frame in enumerate(('r/odom', '/r/odom', '', 'odom', 'odom'), 1):
+        message = odometry(k * NS, float(k))
+        message.header.frame_id = frame
+        b.send('/odom', message)
+    b.until(lambda: len(b.path().poses) == 5, 'all are used')
+    told = [line for line in capfd.readouterr().err.splitlines() if 'WARN' in line]
+    assert len(told) == 1 and "odometry in frame 'odom' is used, but m -> r/odom is pub" in told[0]
+
+
+def test_the_last_stamp_that_there_is_has_a_transform_too(bench):
+    b = bench(**NO_DOUBT)
+    b.send('/odom', odometry(2**31 * NS - 1, 0.0))
+    b.until(lambda: b.received['map_to_odom'], 'a transform that is no later')
+
+
 def test_strays_do_not_stop_the_map(bench, capfd):
     """A first message of another robot, a stamp of tomorrow, a teleport, loops five times."""
     b = bench(**NO_DOUBT)

@@ -18,6 +18,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.core.online.upkeep import upkeep
+from l1slam_ros.io.graphs.saved_map import load_map
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.ros.threads import solver_thread
 
@@ -219,8 +220,8 @@ def test_after_a_load_the_pose_is_right_at_once(bench, tmp_path):
 
 
 @pytest.mark.parametrize('choice', ['new_segment', 'reset', 'ignore'])
-def test_when_the_clock_jumps_back(bench, choice):
-    b = bench(use_sim_time=True, on_time_jump=choice)
+def test_when_the_clock_jumps_back(bench, tmp_path, choice):
+    b = bench(use_sim_time=True, on_time_jump=choice, save_path=str(tmp_path / 'map.g2o'))
     publisher = b.peer.create_publisher(Clock, '/clock', 10)
     b.until(publisher.get_subscription_count, 'the node looks at the clock')
 
@@ -245,6 +246,7 @@ def test_when_the_clock_jumps_back(bench, choice):
     assert choice != 'new_segment' or quiet
     if choice == 'reset':
         b.until(lambda: len(b.path().poses) == 0, 'the map begins anew')
+        assert load_map(tmp_path / 'map.g2o')[1].startswith('3 keyframes'), 'what was is saved'
         b.drive(0, 2)
     else:
         b.drive(*((3, 5) if choice == 'ignore' else (0, 2)))

@@ -209,7 +209,8 @@ def test_replay_says_what_it_cannot_be_told(bag, arguments, words):
 
 @pytest.mark.parametrize('arguments, words', [
     (('-p', 'keyframe.translation:=-1.0'), 'keyframe.translation'),
-    (('--params-file', '/no/such.yaml'), '/no/such.yaml')])
+    (('--params-file', '/no/such.yaml'), '/no/such.yaml'),
+    (('-p', 'qos_overrides./odom.subscription.reliability:=best'), 'odom cannot be subscribed')])
 def test_what_is_refused_at_start_is_one_line_and_exit_code_1(arguments, words):
     run = subprocess.run([executable('backend'), '--ros-args', *arguments],
                          capture_output=True, text=True, timeout=DEADLINE)

@@ -21,7 +21,7 @@ from l1slam_ros.ros.demo import executable
 DEADLINE = 60.0
 # [s] Two are promised; a busy machine takes its part.
 SOON = 6.0
-SIGNALS = [signal.SIGINT, signal.SIGTERM]
+SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
 @pytest.fixture
@@ -29,10 +29,12 @@ def start():
     """Return what starts the node in a session of its own, which must be empty afterwards."""
     processes = []
 
-    def begin(*arguments, **environment):
+    def begin(*arguments, first='', **environment):
+        """Start it, after the shell has done something first."""
         processes.append(subprocess.Popen(
-            [executable('backend'), *arguments], stderr=subprocess.PIPE, text=True,
-            start_new_session=True, env={**os.environ, **environment}))
+            ['sh', '-c', f'{first} exec "$@"', 'sh', executable('backend'), *arguments],
+            stderr=subprocess.PIPE, text=True, start_new_session=True,
+            env={**os.environ, **environment}))
         return processes[-1]
 
     yield begin
@@ -79,8 +81,9 @@ def assert_ends(process, number):
 
 
 @pytest.mark.parametrize('number', SIGNALS)
-def test_while_it_is_being_imported(start, number):
-    process = start()
+@pytest.mark.parametrize('first', ['', 'exec >&- 2>&-;'], ids=['', 'silent'])
+def test_while_it_is_being_imported(start, number, first):
+    process = start(first=first)
     until(lambda: catches(process, signal.SIGTERM), 'it takes signals')
     assert_ends(process, number)
 
@@ -131,6 +134,13 @@ def test_while_it_works(start, ros, large, service):
     node.destroy_node()
     assert read_graph_file(large).graph.n_poses == 8000
     assert not list(large.parent.glob('.*'))
+
+
+def test_under_nohup_it_lives_on_without_its_terminal(start):
+    process = start(first='trap "" HUP;')
+    until(lambda: catches(process, signal.SIGTERM), 'it takes signals')
+    assert not catches(process, signal.SIGHUP)
+    assert_ends(process, signal.SIGTERM)
 
 
 def test_when_ros_is_shut_down_already(start):

@@ -80,6 +80,7 @@ class Backend(Upkeep):
         self._counted: tuple[object, dict[str, int]] = (None, {})
         self._background: Background | None = None
         self._graph: object = None
+        self._graphs = 0
         self.reset()
         self.maps = 0
         if background:
@@ -116,23 +117,30 @@ class Backend(Upkeep):
             if now.graph.between.is_absolute.all():
                 return None
             growth = self._builder.grown()
-        return SavedMap(growth, now.known(), now.robust)
+            number = self._graphs
+        return SavedMap(growth, now.known(), now.robust, number)
 
-    def restore(self, saved: SavedMap) -> None:
-        """Go on from what another back end has `saved`, in the place of the map there is."""
+    def restore(self, saved: SavedMap) -> int:
+        """
+        Go on from what another back end has `saved`, in the place of the map there is.
+
+        Return the number of its graph in this one, see `SavedMap`.
+        """
         saved.require(self.manifold)
         builder = GraphBuilder(self.manifold, self._options)
         builder.restore(saved.growth)
-        self._replace(builder, saved.as_judged(self._robust))
+        return self._replace(builder, saved.as_judged(self._robust))
 
-    def _replace(self, builder: GraphBuilder, optimised: Optimised) -> None:
+    def _replace(self, builder: GraphBuilder, optimised: Optimised) -> int:
         """Begin a map with the graph of a builder; what is made for the one before is left."""
         with self._lock:
             # Options may have changed since it was made.
             builder.options = self._options
             self._builder = builder
             self._begin_map(optimised)
+            number = self._graphs
         self._wake()
+        return number
 
     @property
     def poses(self) -> Array:
@@ -222,6 +230,7 @@ class Backend(Upkeep):
         if optimised is None and self._builder.graph is self._graph:
             return
         self.maps += 1
+        self._graphs += 1
         self._graph = self._builder.graph
         self._begin(self._builder, optimised or Optimised.nothing(self.manifold.identity(0)))
 

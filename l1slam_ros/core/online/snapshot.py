@@ -147,11 +147,17 @@ class Optimised:
 
 @dataclass(frozen=True)
 class SavedMap:
-    """All that another back end goes on from; robust : loops were doubted."""
+    """
+    All that another back end goes on from.
+
+    robust : loops were doubted; number : of the graph in its back end, another whenever the map
+    began anew there
+    """
 
     growth: Growth
     optimised: Optimised
     robust: bool
+    number: int = 0
 
     def require(self, manifold: Manifold) -> None:
         """Refuse, by a `GraphError`, a map whose poses are of another manifold."""

@@ -1,18 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a running back end keeps its map: when it is saved, and never over that of another."""
 
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.core.online.snapshot import SavedMap
 from l1slam_ros.io.graphs.saved_map import keep_as, load_map, save_map
 from l1slam_ros.io.node_options import NodeOptions
 
 # An autosave begins after such a part of its period: a busy machine comes late to it, and odometry
 # on its way is not in it yet.
 _PART = 0.8
+# [bytes] Enough of the end of a file to tell a map from another: its checksum is in it.
+_END = 128
 
 
 class MapFile:
@@ -36,18 +41,44 @@ class MapFile:
         self._backend, self._options, self._warn = backend, options, warn
         self.is_saving = False
         self._began, self._took = time.monotonic(), 0.0
-        # The version that is in the file, and the file, if what it held before was ours.
-        self._version, self._ours = backend.version, Path()
+        # What was saved or loaded last: where, and the version of the map.
+        self._known: tuple[object, ...] = options().save_path, backend.version
+        # The file that we wrote or loaded, its end, and the graph whose map it holds.
+        self._ours: tuple[object, ...] = ()
 
     def save(self) -> str:
         """Save the map; return a sentence that says where."""
-        path, self._began, self.is_saving = self._path(), time.monotonic(), True
-        try:
+        with self._at_work():
             version = self._backend.version
-            sentence = save_map(path, self._backend.saved())
-            self._version, self._ours = version, path
+            return self._write(self._path(), self._backend.saved(), version)
+
+    def autosave(self) -> None:
+        """Save the map if it has changed; what stood in its place, if not its own, is kept."""
+        with self._at_work():
+            version = self._backend.version
+            saved = self._backend.saved() if self._is_to_be_saved() else None
+            if saved is None:
+                return
+            path = self._path()
+            end = _end_of(path)
+            if end and self._ours != (path, end, saved.number):
+                kept = path.with_name(f'{path.stem}.{_time_of(path)}{path.suffix}')
+                keep_as(path, kept)
+                self._warn(f'{path} held another map: it is kept as {kept}')
+            self._write(path, saved, version)
+
+    @contextmanager
+    def _at_work(self) -> Iterator[None]:
+        self._began, self.is_saving = time.monotonic(), True
+        try:
+            yield
         finally:
             self._took, self.is_saving = time.monotonic() - self._began, False
+
+    def _write(self, path: Path, saved: SavedMap | None, version: object) -> str:
+        sentence = save_map(path, saved)
+        self._known = self._options().save_path, version
+        self._ours = path, _end_of(path), saved.number if saved else 0
         return sentence
 
     def load(self) -> str:
@@ -59,12 +90,15 @@ class MapFile:
 
     def _loaded(self) -> tuple[str, bool]:
         path = self._path()
+        end = _end_of(path)
         saved, sentence, whole = load_map(path)
         found, expected = saved.growth.graph.manifold, self._backend.manifold
         if found is not expected:
             raise FileError(path, f'is a map of {found.NAME}; expected one of {expected.NAME}')
-        self._backend.restore(saved)
-        self._version, self._ours = self._backend.version, path
+        number = self._backend.restore(saved)
+        self._known = self._options().save_path, self._backend.version
+        # What could not be read may be of use to somebody yet.
+        self._ours = (path, end, number) if whole else ()
         return sentence, whole
 
     def load_at_start(self, tell: Callable[[str], object]) -> None:
@@ -75,10 +109,6 @@ class MapFile:
             sentence, well = f'the map begins empty: {error}', not self._path().exists()
         (tell if well else self._warn)(sentence)
 
-    def disown(self) -> None:
-        """Let what is in the file be another map than that of the back end from now on."""
-        self._ours = Path()
-
     def seconds_left(self) -> float:
         """Return in how many seconds `autosave` is due, or when to ask again."""
         options = self._options()
@@ -87,35 +117,40 @@ class MapFile:
         left = self._began + wait - time.monotonic()
         return max(left, 0.0 if self._is_to_be_saved() else options.update.period)
 
-    def autosave(self) -> None:
-        """Save the map if it has changed; what stood in its place, if not its own, is kept."""
-        self._began = time.monotonic()
-        if not self._is_to_be_saved() or self._backend.saved() is None:
-            return
-        path = self._path()
-        if path != self._ours and path.exists():
-            kept = path.with_name(f'{path.stem}.{_time_of(path)}{path.suffix}')
-            keep_as(path, kept)
-            self._warn(f'{path} held another map: it is kept as {kept}')
-        self.save()
-
     def _is_to_be_saved(self) -> bool:
         options = self._options()
         return (options.save_path != '' and options.autosave_period > 0
-                and self._backend.version != self._version)
+                and self._known != (options.save_path, self._backend.version))
 
     def _path(self) -> Path:
         path = self._options().save_path
         if not path:
             raise OptionError('the parameter save_path is empty, expected the name of a .g2o file')
-        return Path(path).expanduser().absolute()
+        return _absolute(path)
 
 
-def missing_folder(save_path: str) -> str:
-    """Return what is wrong with a `save_path` whose folder is not there; else nothing."""
-    folder = Path(save_path).expanduser().absolute().parent
-    there = not save_path or folder.is_dir()
-    return '' if there else f'save_path is {save_path!r}, but there is no folder {folder}'
+def unusable_path(save_path: str) -> str:
+    """Return what is wrong with a `save_path` where no file can be; else nothing."""
+    if not save_path:
+        return ''
+    path = _absolute(save_path)
+    if not path.parent.is_dir():
+        return f'save_path is {save_path!r}, but there is no folder {path.parent}'
+    return f'save_path is {save_path!r}, which is a folder' if path.is_dir() else ''
+
+
+def _absolute(path: str) -> Path:
+    # Not `Path.expanduser`: that raises where there is no such home.
+    return Path(os.path.expanduser(path)).absolute()
+
+
+def _end_of(path: Path) -> bytes:
+    """Return the last bytes of a file, of a saved map its checksum; none: there is no file."""
+    if not path.is_file():
+        return b''
+    with path.open('rb') as file:
+        file.seek(max(file.seek(0, os.SEEK_END) - _END, 0))
+        return file.read()
 
 
 def _time_of(path: Path) -> str:

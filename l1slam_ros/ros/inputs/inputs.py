@@ -31,15 +31,16 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from l1slam_ros.core.errors import L1SlamError, MessageError
+from l1slam_ros.core.errors import L1SlamError, MessageError, OptionError
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.io.files import quoted
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.io.messages.base_frame import BaseFrame
 from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.inputs.traffic import Traffic
-from l1slam_ros.ros.threads.failures import Failures
+from l1slam_ros.ros.threads.failures import Failures, reason
 
 _DEPTH = 1000
 # So many are used before DDS is asked for more.
@@ -103,6 +104,7 @@ class Inputs:
         self._node, self._backend, self._failures = node, backend, failures
         self._moved, self._tick = moved, tick
         self._base_frame, self._map_frame = BaseFrame(options.base_frame), options.map_frame
+        self._odom_frame = options.odom_frame
         self._group, self.active = _Apart(), False
         self._closing = self._unanswered = False
         self.refused: Counter[str] = Counter()
@@ -136,9 +138,12 @@ class Inputs:
     def _subscribe(self, kind: Any, name: str, use: Callable[[Any], None],
                    raw: bool = False) -> None:
         """Subscribe to a topic; raw : its messages are used as bytes."""
-        subscription = self._node.create_subscription(
-            kind, name, use, QoSProfile(depth=_DEPTH), raw=raw, callback_group=self._group,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        try:
+            subscription = self._node.create_subscription(
+                kind, name, use, QoSProfile(depth=_DEPTH), raw=raw, callback_group=self._group,
+                qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        except Exception as error:  # by what is said of its QoS, rclpy raises anything
+            raise OptionError(f'{name} cannot be subscribed to: {reason(error)}') from error
         traffic = Traffic(subscription.get_publisher_count)
         self._topics.append(_Topic(name, subscription, traffic, use))
 
@@ -241,7 +246,12 @@ class Inputs:
             self._answer()
 
     def _on_odometry(self, data: bytes) -> None:
-        found = self._base_frame.take(*conversion.odometry_in(data))
+        frame, child_frame, sample = conversion.odometry_in(data)
+        if frame.removeprefix('/') not in (self._odom_frame, ''):
+            self._node.get_logger().warning(
+                f'odometry in frame {quoted(frame)} is used, but {self._map_frame} -> '
+                f'{self._odom_frame} is published; expected odom_frame to be its name', once=True)
+        found = self._base_frame.take(child_frame, sample)
         if found.anew:
             self._backend.begin_anew()
         for other in found.others:

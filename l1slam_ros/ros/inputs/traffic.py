@@ -26,7 +26,7 @@ class Traffic:
 
     def __init__(self, publishers: Callable[[], int]):
         self.received = self.lost = 0
-        self._publishers = publishers
+        self.publishers = publishers
         # The last number of each publisher, of who spoke last in front.
         self._numbers: list[int] = []
         self._marks = deque([(time.monotonic(), 0)])
@@ -42,7 +42,7 @@ class Traffic:
             numbers[0] = number
             return
         before = [last for last in numbers if last < number]
-        if number - 1 not in before and len(numbers) < self._publishers():
+        if number - 1 not in before and len(numbers) < self.publishers():
             before = []
         if before:
             nearest = max(before)
@@ -52,7 +52,7 @@ class Traffic:
 
     def values(self) -> dict[str, str]:
         """Return `received`, `rate` [1/s] and `lost`; to be called about once a second."""
-        del self._numbers[max(self._publishers(), 1):]
+        del self._numbers[max(self.publishers(), 1):]
         now = time.monotonic()
         self._marks.append((now, self.received))
         while len(self._marks) > 2 and now - self._marks[1][0] >= _WINDOW:

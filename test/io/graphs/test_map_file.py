@@ -4,13 +4,14 @@
 import os
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from problems import odometry
 
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.io.graphs.map_file import MapFile
+from l1slam_ros.io.graphs.map_file import MapFile, unusable_path
 from l1slam_ros.io.graphs.saved_map import is_map, load_map
 from l1slam_ros.io.graphs.side_files import beside
 from l1slam_ros.io.node_options import NodeOptions
@@ -22,7 +23,8 @@ class Robot:
     """A back end with a map file, its options, and what it warned of."""
 
     def __init__(self, path, period=1e-9):
-        self.options = NodeOptions(save_path=str(path), autosave_period=period)
+        self.options = NodeOptions(save_path=str(path), autosave_period=period,
+                                   on_time_jump='reset')
         self.backend, self.warnings, self.seconds = Backend(self.options), [], 0
         self.map_file = MapFile(self.backend, lambda: self.options, self.warnings.append)
 
@@ -104,17 +106,17 @@ def test_a_save_that_fails_is_tried_again_in_the_next_period(tmp_path):
     assert is_map(tmp_path / 'none' / 'map.g2o')
 
 
-@pytest.mark.parametrize('reset', [False, True])
-def test_a_map_that_was_not_loaded_is_kept_for_ever(tmp_path, reset):
+@pytest.mark.parametrize('why', ['not loaded', 'reset', 'odometry'])
+def test_a_map_that_was_not_loaded_is_kept_for_ever(tmp_path, why):
     """Also where the one who starts the node forgets to load it; or the map began anew."""
     path, first = tmp_path / 'map.g2o', Robot(tmp_path / 'map.g2o')
     first.drive(9)
     first.map_file.save()
     os.utime(path, (0, 0))
-    if reset:
+    if why == 'reset':
         first.backend.reset()
-        first.map_file.disown()
-    second = first if reset else Robot(path)
+    first.seconds = 0 if why == 'odometry' else 9
+    second = Robot(path) if why == 'not loaded' else first
     for _ in range(4):
         second.drive(3)
         assert second.autosave()
@@ -130,6 +132,29 @@ def test_a_map_that_was_not_loaded_is_kept_for_ever(tmp_path, reset):
     assert len(list(tmp_path.iterdir())) == 3 and not third.warnings
 
 
+@pytest.mark.parametrize('newer', [False, True])
+def test_what_is_not_its_own_any_more_is_kept(tmp_path, newer):
+    """A person copies a map to where the node saves; or it is damaged, or too new to be read."""
+    path, robot = tmp_path / 'map.g2o', Robot(tmp_path / 'map.g2o')
+    other = Robot(tmp_path / 'other.g2o')
+    for one in robot, robot, other:
+        one.drive(3)
+        one.map_file.save()
+    content = path.read_bytes()[:-100] if newer else other.map_file._path().read_bytes()
+    path.write_bytes(content)
+    if newer:
+        robot = Robot(path)
+        assert not robot.load_at_start() and len(robot.warnings) == 1
+        robot.seconds = 6
+    else:
+        os.remove(tmp_path / 'other.g2o')
+    for _ in range(3):
+        robot.drive(1)
+        assert robot.autosave()
+    kept = [p for p in tmp_path.iterdir() if p.read_bytes() == content]
+    assert len(kept) == 1 and robot.warnings[-1].endswith(f'it is kept as {kept[0]}')
+
+
 def test_what_was_loaded_is_its_own(tmp_path):
     path, first = tmp_path / 'map.g2o', Robot(tmp_path / 'map.g2o')
     first.drive(9)
@@ -143,7 +168,8 @@ def test_what_was_loaded_is_its_own(tmp_path):
     assert {p.name for p in tmp_path.iterdir()} == {'map.g2o', 'map.g2o.1'}
     # Elsewhere, it is saved elsewhere; there may be another map.
     second.options = replace(second.options, save_path=str(tmp_path / 'other.g2o'))
-    assert second.map_file.save() == f'10 keyframes saved to {tmp_path / "other.g2o"}'
+    assert second.autosave() and keyframes(tmp_path / 'other.g2o') == 10
+    assert not second.autosave() and not second.warnings
 
 
 def test_at_start_a_missing_map_is_no_error_and_a_damaged_one_is_kept(tmp_path):
@@ -174,6 +200,13 @@ def test_a_map_of_another_dimension_is_refused(tmp_path):
     beside(path, 'stamps').write_text('1\n2\n')
     with pytest.raises(FileError, match='map.g2o: is a map of SE3; expected one of SE2'):
         robot.map_file.load()
+
+
+def test_where_no_file_can_be_is_said(tmp_path):
+    assert not unusable_path('') and not unusable_path(f'{tmp_path}/map.g2o')
+    assert unusable_path('~no one/map.g2o').endswith('there is no folder ' + str(
+        Path('~no one').absolute()))
+    assert unusable_path(str(tmp_path)) == f"save_path is '{tmp_path}', which is a folder"
 
 
 def test_without_a_name_nothing_is_loaded(tmp_path):

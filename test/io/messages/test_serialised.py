@@ -30,8 +30,8 @@ def message(rng, frame='odom', child='base_link'):
 @pytest.mark.parametrize('child', ['', 'base_link'])
 def test_it_is_the_message_that_ros_sent(rng, frame, child):
     sent = message(rng, frame, child)
-    (found, ours), theirs = odometry_in(serialize_message(sent)), odometry_sample(sent)
-    assert found == child and ours.stamp == theirs.stamp == 12_000_000_345
+    (*found, ours), theirs = odometry_in(serialize_message(sent)), odometry_sample(sent)
+    assert found == [frame, child] and ours.stamp == theirs.stamp == 12_000_000_345
     for name in ('pose3', 'covariance', 'twist_covariance'):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
 
@@ -51,7 +51,7 @@ def test_nonsense_never_raises_anything_else(rng):
         for place in rng.integers(0, 48, 3):
             spoilt[place] = rng.integers(256)
         try:
-            _, sample = odometry_in(bytes(spoilt))
+            *_, sample = odometry_in(bytes(spoilt))
         except MessageError:
             continue
         assert sample.twist_covariance.shape == (6, 6)
