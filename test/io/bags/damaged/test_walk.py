@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A chunk is decoded up to where its data are damaged, but for little."""
 
+import bz2
+
 import lz4.frame
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ from l1slam_ros.io.bags.damaged.walk import uncompressed
 
 COMPRESS = {
     'zstd': zstandard.compress,
-    'lz4': lambda data: lz4.frame.compress(data, block_linked=False, block_checksum=True)}
+    'lz4': lambda data: lz4.frame.compress(data, block_linked=False, block_checksum=True),
+    'bz2': lambda data: bz2.compress(data, 1)}
 
 
 @pytest.mark.parametrize('kind', COMPRESS)
