@@ -123,8 +123,6 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
          'an rtabmap_msgs/MapGraph or pose_graph_tools_msgs/PoseGraph'),
         ('loop', DEFAULT_TOPICS.loops, 'geometry_msgs/PoseWithCovarianceStamped, or the loops of '
          'such a pose graph'),
-        ('trusted', DEFAULT_TOPICS.trusted, 'the same, loops somebody vouches for'),
-        ('absolute', DEFAULT_TOPICS.absolute, 'the same, poses in the map frame'),
     ):
         add(f'--{name}-topic', default=default, metavar='TOPIC',
             help=f'{what} (default: %(default)s)')

@@ -411,8 +411,6 @@ def test_other_topics(capsys, world, tmp_path):
     assert err.startswith('l1slam: ') and err.count('\n') == 1 and '/wheels/odom' in err
     topics = ('--odom-topic', '/wheels/odom', '--loop-topic', '/places')
     assert solve_json(capsys, other, *topics)['loops'] == 101
-    vouched = ('--odom-topic', '/wheels/odom', '--trusted-topic', '/places')
-    assert solve_json(capsys, other, *vouched)['loops'] == 101
     run(capsys, 'plot', other, *topics, '--output', tmp_path / 'map.png')
 
 
