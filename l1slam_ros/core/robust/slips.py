@@ -78,6 +78,8 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     """
     Return a state in which an odometry factor is cut that slipped; None: there is none.
 
+    Or one that a lie does not bend any more, because an odometry factor was out for a while.
+
     as_stated : the state where all may be as noisy as they say; what that explains needs no slip
     """
     growth.slip_odds = {step: odds for step, odds in growth.slip_odds.items() if growth.cut[step]}
@@ -86,8 +88,10 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     motion = usual_motion(growth)
     found, most = None, 0.0
     for steps, odds, state, usual in _tried(growth, as_stated, motion):
+        fits = state is not None and bool(np.isin(steps, _fitting(state)).all())
+        odds = 0.0 if fits else odds
         evidence = odds + _gain(growth, as_stated, state) if state and usual else odds
-        if len(steps) == 1 and not (state and steps[0] in _fitting(state)):
+        if len(steps) == 1 and not fits:
             growth.slip_odds[steps[0]] = evidence
         if state and evidence > most and (
                 (odds > 0 and len(steps) == 1)
@@ -95,9 +99,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
     if found and len(fitting := _fitting(found)):
-        # It was a lie that had bent the map.
         found.cut[fitting] = False
-        found.slip_odds = {step: odds for step, odds in found.slip_odds.items() if found.cut[step]}
         found.solve()
     return found
 
