@@ -58,8 +58,7 @@ def read(arguments: argparse.Namespace, path: Path, quiet: bool = False) -> Grap
         from l1slam_ros.io.node_options import read_params_file
 
         options = read_params_file(arguments.params_file)
-    topics = Topics(arguments.odom_topic, arguments.loop_topic, arguments.trusted_topic,
-                    arguments.absolute_topic)
+    topics = Topics(arguments.odom_topic, arguments.loop_topic)
     record = formats.read_input(path, options, topics, arguments.rotation_information,
                                 options.dimension if options else 2)
     warn(record.skipped, quiet)

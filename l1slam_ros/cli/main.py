@@ -19,8 +19,8 @@ from l1slam_ros.paper import printed as paper
 
 BAD_INPUT, READ_IN_PART, DOUBTFUL, INTERRUPTED, BROKEN_PIPE = 2, 3, 4, 130, 141
 _INPUT = '.g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1'
-_OUTPUT = '.g2o, .graph, .tum, or a name without a suffix for a bag directory'
-_GRAPH_OUTPUT = '.g2o, .graph, or a name without a suffix for a bag directory'
+_OUTPUT = '.g2o, .tum, or a name without a suffix for a bag directory'
+_GRAPH_OUTPUT = '.g2o, or a name without a suffix for a bag directory'
 _KIND = ('random: far poses said to be near each other; identity: at the very same place; '
          'grouped: 10 to 20 in a row that agree (default: %(default)s)')
 _FIRST_STEPS = """\
@@ -123,8 +123,6 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
          'an rtabmap_msgs/MapGraph or pose_graph_tools_msgs/PoseGraph'),
         ('loop', DEFAULT_TOPICS.loops, 'geometry_msgs/PoseWithCovarianceStamped, or the loops of '
          'such a pose graph'),
-        ('trusted', DEFAULT_TOPICS.trusted, 'the same, loops somebody vouches for'),
-        ('absolute', DEFAULT_TOPICS.absolute, 'the same, poses in the map frame'),
     ):
         add(f'--{name}-topic', default=default, metavar='TOPIC',
             help=f'{what} (default: %(default)s)')

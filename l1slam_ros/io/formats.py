@@ -99,9 +99,8 @@ def stamps_of(record: GraphRecord) -> Indices:
 
 def check_output(path: Path) -> None:
     """Refuse, before any work is done, an output that could not be written in the end."""
-    if path.suffix.lower() not in (*GRAPH_SUFFIXES, '.tum', ''):
-        raise FileError(path, f'unknown suffix; expected {", ".join(GRAPH_SUFFIXES)}, .tum, or '
-                        'none for a bag directory')
+    if path.suffix.lower() not in ('.g2o', '.tum', ''):
+        raise FileError(path, 'unknown suffix; expected .g2o, .tum, or none for a bag directory')
     if path.suffix:
         require_file(path)
     else:
@@ -115,8 +114,8 @@ def check_graph_output(path: Path) -> None:
     """Refuse, as `check_output`, an output that does not hold a graph."""
     check_output(path)
     if path.suffix.lower() == '.tum':
-        raise FileError(path, 'a trajectory has no edges; expected '
-                        f'{", ".join(GRAPH_SUFFIXES)}, or no suffix for a bag directory')
+        raise FileError(path, 'a trajectory has no edges; expected .g2o, or no suffix for a bag '
+                        'directory')
 
 
 def write_output(path: Path, record: GraphRecord, truth: Array | None = None) -> None:
@@ -132,7 +131,7 @@ def write_output(path: Path, record: GraphRecord, truth: Array | None = None) ->
 
     """
     check_output(path)
-    if path.suffix.lower() in GRAPH_SUFFIXES:
+    if path.suffix.lower() == '.g2o':
         write_graph_file(path, record)
     elif path.suffix.lower() == '.tum':
         write_tum(path, stamps_of(record), stored_poses(record), record.graph.manifold)
@@ -177,7 +176,7 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
 
     Parameters
     ----------
-    path : .g2o, .graph, .tum (the poses alone), or a name without a suffix for a bag directory
+    path : .g2o, .tum (the poses alone), or a name without a suffix for a bag directory
     rotation_information : see `read_graph`
 
     Raises

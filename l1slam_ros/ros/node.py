@@ -223,7 +223,7 @@ class BackendNode(LifecycleNode):
     def _tell(self, improvement: Improvement | None) -> None:
         """Publish what is new; the solver's thread calls it."""
         if improvement is not None:
-            self._report(improvement)
+            self._diagnostics.note(improvement)
         maps, version = self._backend.maps, self._backend.version
         if maps != self._told_map:
             self._publish_map()
@@ -261,11 +261,3 @@ class BackendNode(LifecycleNode):
         """Return the stamp of the newest odometry [ns], 0 where there is none."""
         robot = self._backend.robot()
         return robot.stamp if robot is not None else 0
-
-    def _report(self, improvement: Improvement) -> None:
-        self._diagnostics.note(improvement)
-        self.get_logger().debug(
-            f'update: cost {improvement.cost_before:.6g} -> {improvement.cost:.6g}, '
-            f'{improvement.reweighted_steps} reweighted steps, {improvement.outer_iterations} '
-            f'outer and {improvement.inner_iterations} inner iterations, '
-            f'{improvement.seconds * 1e3:.0f} ms, {improvement.status.value}')

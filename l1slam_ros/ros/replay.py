@@ -26,6 +26,7 @@ from l1slam_ros.io.bags.damaged.walk import BagMessage
 from l1slam_ros.io.bags.reader import BagSummary, bag_summary, read_raw
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.threads.failures import reason
 
 _BAD_INPUT = 2
 _DAMAGED = 3
@@ -69,15 +70,17 @@ class Player:
         for topic in summary.topics:
             if topics is not None and topic.name not in topics:
                 continue
-            kind = _message_class(topic.msgtype)
-            if kind is None and topics is not None:
-                raise OptionError(f'{topic.name}: the type {topic.msgtype} is not installed')
-            if kind is None:
-                node.get_logger().warning(f'{topic.name} is left out: the type {topic.msgtype} '
-                                          'is not installed')
-                continue
-            self.publishers[topic.name] = node.create_publisher(
-                kind, remap.get(topic.name, topic.name), QoSProfile(depth=_DEPTH))
+            kind, name = _message_class(topic.msgtype), remap.get(topic.name, topic.name)
+            try:
+                if kind is None:
+                    raise OptionError(f'the type {topic.msgtype} is not installed')
+                self.publishers[topic.name] = node.create_publisher(
+                    kind, name, QoSProfile(depth=_DEPTH))
+            except Exception as error:  # of names, and of two types of one, rclpy raises anything
+                why = f'{topic.name} cannot be played onto {name}: {reason(error)}'
+                if topics is not None or topic.name in remap:
+                    raise OptionError(why) from error
+                node.get_logger().warning(f'{why}; it is left out')
         self._clock = node.create_publisher(Clock, '/clock', 10) if clock else None
 
     def wait_for_subscribers(self, longest: float | None) -> None:
@@ -236,6 +239,13 @@ def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
     return arguments[:at], arguments[at:]
 
 
+def _init(arguments: list[str]) -> None:
+    try:
+        rclpy.init(args=arguments)
+    except Exception as error:  # whatever ROS cannot read of them
+        raise OptionError(reason(error)) from error
+
+
 def main() -> int:
     """Play; return the exit code: 0, 2 for bad input, 3 where only a part could be read."""
     own, ros = _split(sys.argv[1:])
@@ -249,8 +259,8 @@ def main() -> int:
             print(f'replay: {damage}', file=sys.stderr)
             damages.append(damage)
 
-    rclpy.init(args=ros)
     try:
+        _init(ros)
         _play(arguments, tell)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

@@ -62,7 +62,7 @@ def test_what_runs_nothing_imports_nothing(tmp_path, arguments):
 
 
 @pytest.mark.parametrize('arguments, used', [
-    (('convert', 'graph.g2o', 'out.graph'), ('numpy', 'scipy')),
+    (('convert', 'graph.g2o', 'out.g2o'), ('numpy', 'scipy')),
     (('convert', 'graph.g2o', 'out'), ('numpy', 'scipy', 'mcap', 'rosbags', 'yaml')),
     (('plot', 'graph.g2o', '--output', 'map.png'), ('numpy', 'scipy', 'matplotlib')),
     (('info', 'graph.g2o'), ('numpy', 'scipy')),

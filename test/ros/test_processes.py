@@ -201,7 +201,9 @@ def test_replay_of_a_topic_that_is_not_there_names_those_that_are(bag):
 
 @pytest.mark.parametrize('arguments, words', [
     (('--start', '1e9'), '--start is 1e+09, expected at most the 19.9 s of the bag'),
-    (('--rate', 'abc'), 'argument --rate: abc, expected a number above 0')])
+    (('--rate', 'abc'), 'argument --rate: abc, expected a number above 0'),
+    (('--remap', '/odom:=a//b'), 'replay: /odom cannot be played onto a//b: InvalidTopicName'),
+    (('--ros-args', '-r', 'x'), "replay: RCLError: failed to initialize rcl: Couldn't parse")])
 def test_replay_says_what_it_cannot_be_told(bag, arguments, words):
     played = replay(bag, *arguments)
     assert played.returncode == 2 and words in played.stderr

@@ -162,7 +162,7 @@ def judge(
     growth = first
     for growth in rounds(first, lambda *_: None):
         # The end is not put off once it is in sight, or short budgets would never get there.
-        if time.monotonic() > deadline and not growth.takes_at_their_word:
+        if time.monotonic() > deadline and not growth.at_their_word:
             settled = False
             break
     reasons = doubts(growth) if settled else ()

@@ -17,10 +17,12 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, lowest_of_components
 from l1slam_ros.core.robust.pairwise_consistency import (
     ASKED,
+    Group,
     agreement,
     spanned,
     strongest_group,
 )
+from l1slam_ros.core.robust.places import err_together
 from l1slam_ros.core.robust.rounds import Growth
 from l1slam_ros.core.robust.slips import SPANNING, SURE, common_steps, spanning
 
@@ -63,10 +65,10 @@ class Judgement:
     that is neither is rejected; sigmas : (m,) how far off each factor is, in units of its noise,
     as stated or larger if it was found so: the length of the residual, and where it is not
     accepted, of that over the uncertainty of the map, NaN before a loop was looked at; variance :
-    (2,) of odometry and of loops as it was found, in units of what they state; noise : (m,), see
-    `Growth.noise`; slips : (k,) the
-    odometry factors that slipped, not accepted; doubts : reasons not to rely on the map; settled :
-    no more is to be found out from the factors that are there.
+    (2,) of odometry and of loops as it was found, in units of what they state; noise : (m,) that
+    of each in a map, in the same units; slips : (k,) the odometry factors that slipped, not
+    accepted; doubts : reasons not to rely on the map; settled : no more is to be found out from
+    the factors that are there.
     """
 
     accepted: Mask
@@ -129,7 +131,26 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
     size, slip = growth.size, growth.cut & ~growth.gap
     accepted = growth.accepted & ~slip
     return Judgement(accepted[:size], suspect[:size], np.sqrt(square[:size]), growth.variance,
-                     growth.noise()[:size], np.flatnonzero(slip[:size]), reasons, settled)
+                     _noise(growth)[:size], np.flatnonzero(slip[:size]), reasons, settled)
+
+
+def _noise(growth: Growth) -> Array:
+    """
+    Return the variance of each factor in a map, (m,), in units of what it states.
+
+    Ones, unless these are wrong beyond doubt: where loops are noisier than they say and those
+    of a place err together, these are worth one, and all are as noisy as was found; odometry
+    is the unit.
+    """
+    noise, rows = np.ones(len(growth.factors)), np.flatnonzero(growth.accepted)
+    at = np.flatnonzero((growth.is_loop & ~growth.factors.is_absolute)[rows])
+    loops, variance = rows[at], growth.variance
+    if len(loops) and variance[1] > 1 and err_together(
+            growth.place[loops], growth.posterior.residual[at], growth.posterior.left_over(at)):
+        noise[growth.is_loop] = variance[1] / variance[0]
+        noise[growth.factors.is_absolute] = 1 / variance[0]
+        noise[loops] *= np.bincount(growth.place[loops])[growth.place[loops]]
+    return noise
 
 
 def fits(growth: Growth) -> tuple[Array, Mask]:
@@ -145,9 +166,7 @@ def fits(growth: Growth) -> tuple[Array, Mask]:
     # nothing joins two parts, of what leads from one to the other.
     square[~accepted] = np.nan
     outside = np.flatnonzero(~accepted & growth.may_be_predicted & ~growth.across())
-    cut, growth.cut = growth.cut, np.zeros_like(growth.cut)
-    square[outside] = growth.innovations(outside).square
-    growth.cut = cut
+    square[outside] = growth.uncut().innovations(outside).square
     far = square >= growth.gate(growth.factors.freedom)
     return square, ~accepted & ~far & growth.is_loop
 
@@ -228,16 +247,30 @@ def _other_map(growth: Growth) -> list[Doubt]:
         return []
     accepted, size = growth.accepted & growth.is_loop, len(group.rows) * max(
         len(outside) / ASKED, 1.0)
-    trusted, across = (
-        spanned(growth.low[rows], growth.high[rows], growth.graph.n_poses)[
-            growth.low[common_steps(growth, group)]].min()
-        for rows in (accepted & growth.trusted, accepted))
+    trusted, against = (_against(growth, group, rows)
+                        for rows in (accepted & growth.trusted, accepted))
     # What is trusted is right, whatever else speaks against it. Beside a slip, which is a guess of
     # what happened, all of the loops across should agree.
     slipped = (growth.cut & ~growth.gap).any()
-    if trusted or (size < _AGAINST * across and not slipped):
+    if trusted or (size < _AGAINST * against and not slipped):
         return []
     return [_doubt(growth, OTHER_MAP, group.rows)]
+
+
+def _against(growth: Growth, group: Group, rows: Mask) -> int:
+    """
+    Return how many of some loops would lie, at least, if a group of others were right.
+
+    Then the odometry slipped at a step that the group spans, or on either side of its first or
+    its second ends: what lies between is elsewhere as a whole.
+    """
+    low, high = growth.low, growth.high
+    across = spanned(low[rows], high[rows], growth.graph.n_poses)
+    against = [across[low[common_steps(growth, group)]].min()]
+    for ends in (low[group.rows], high[group.rows]):
+        inside = ((end >= ends.min()) & (end <= ends.max()) for end in (low[rows], high[rows]))
+        against.append(np.count_nonzero(np.logical_or(*inside)))
+    return int(min(against))
 
 
 def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:

@@ -16,6 +16,7 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, ends_in_time
 from l1slam_ros.core.graph.first_fixes import first_fixes
+from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import bridged, vague_odometry
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.graph.world_frame import placed
@@ -35,7 +36,7 @@ from l1slam_ros.core.robust.innovation import (
     student_quantile,
 )
 from l1slam_ros.core.robust.inspection import repeated_factors
-from l1slam_ros.core.robust.places import err_together, places
+from l1slam_ros.core.robust.places import places
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 
@@ -44,8 +45,6 @@ REFUSED = 1e-3
 _DROPPED = 2e-5
 # Probability that any true factor of a round is doubted for what the others say.
 _DOUBTED = 0.01
-# A loop that was dropped that often is not tried again.
-_CHANCES = 2
 # What is measured of the noise counts against as many factors on which it was measured before.
 _KNOWN = 20
 # The noise is learnt to be no less than this part of the variance that was found first: factors
@@ -78,7 +77,9 @@ class Growth:
     place : (m,) see `places`; part : (n,) number of the part of each keyframe; poses : (n, p) the
     L2 map of the accepted; posterior : of these; variance : (2,) of odometry and loops in units of
     what they state; slip_odds : ln P(slipped) / P(measured) of the odometry factors that were
-    suspected; check : called before long steps, raises where the work shall stop.
+    suspected; dropped : (m,) bool, loops that did not fit once accepted, not to be tried again;
+    at_their_word : whether factors may be as noisy as they say; check : called before long steps,
+    raises where the work shall stop.
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
@@ -94,10 +95,10 @@ class Growth:
         self.part = np.zeros(graph.n_poses, np.int64)
         self.variance = np.ones(2)
         self._learnt_of = np.zeros(0, bool)
-        self._floor, self._at_their_word = np.full(2, _LEAST_VARIANCE), False
+        self._floor, self.at_their_word = np.full(2, _LEAST_VARIANCE), False
         self.posterior: Posterior
         self.slip_odds: dict[int, float] = {}
-        self._drops = np.zeros(len(self.factors), np.int64)
+        self.dropped = np.zeros(len(self.factors), bool)
 
     @cached_property
     def _places(self) -> tuple[Indices, Array]:
@@ -170,15 +171,21 @@ class Growth:
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
         clone = copy.copy(self)
-        clone.accepted, clone._drops = self.accepted.copy(), self._drops.copy()
+        clone.accepted, clone.dropped = self.accepted.copy(), self.dropped.copy()
         clone.cut, clone.variance = self.cut.copy(), self.variance.copy()
         clone.slip_odds = self.slip_odds.copy()
         return clone
 
+    def uncut(self) -> 'Growth':
+        """Return the state, where all odometry says what it measured."""
+        state = self.copy()
+        state.cut[:] = False
+        return state
+
     def subgraph(self, rows: Indices) -> FactorGraph:
         """Return the graph of some factors, with the noise as it was found."""
         self._check()  # with this, each long step begins
-        noise = self.variance_at_their_word() if self._at_their_word else self.variance
+        noise = self.variance_at_their_word() if self.at_their_word else self.variance
         variance = np.where(self.factors.is_absolute[rows], 1.0,
                             noise[self.is_loop[rows].astype(np.int64)])
         cut = self.cut[rows]
@@ -200,25 +207,21 @@ class Growth:
 
     def take_at_their_word(self) -> None:
         """From now on let factors be as noisy as they say, if they are not noisier."""
-        self._at_their_word = True
-        self._drops[:] = 0
-
-    @property
-    def takes_at_their_word(self) -> bool:
-        """Whether `take_at_their_word` was called."""
-        return self._at_their_word
+        self.at_their_word = True
+        self.dropped[:] = False
 
     def undecided(self) -> Indices:
         """Return the loops within a part that may yet be accepted, (k,)."""
-        may = ~self.accepted & ~self.factors.struck & (self._drops < _CHANCES) & ~self.across()
-        undecided: Indices = np.flatnonzero(may & self.may_be_predicted)
-        return undecided
+        return self._open(~self.across() & self.may_be_predicted)
 
     def joining(self) -> Indices:
         """Return the loops from one part to another that may yet be accepted, (k,)."""
-        may = ~self.accepted & ~self.factors.struck & (self._drops < _CHANCES)
-        joining: Indices = np.flatnonzero(may & self.across())
-        return joining
+        return self._open(self.across())
+
+    def _open(self, some: Mask) -> Indices:
+        still: Indices = np.flatnonzero(
+            some & ~self.accepted & ~self.factors.struck & ~self.dropped)
+        return still
 
     def across(self) -> Mask:
         """Return which factors lead from one part to another, (m,) bool."""
@@ -231,8 +234,8 @@ class Growth:
 
     def solve(self) -> None:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
-        drop = np.zeros(1, np.int64)
-        while len(drop):
+        noise_fits = self._knows_noise
+        while True:
             if self.cut.any():
                 self.part = component_labels(self.graph.subset(self.accepted & ~self.cut))
             rows = np.flatnonzero(self.accepted)
@@ -241,12 +244,18 @@ class Growth:
             self._check()
             self.poses = l2_map(subgraph, self.poses, cholesky, lambda *_: self._check())
             self._check()
-            self.posterior = sample_posterior(subgraph, self.poses, cholesky)
-            if self._is_noisier(rows):
-                continue
-            drop = self._misfits(rows)
-            self.accepted[drop] = False
-            self._drops[drop] += 1
+            # What is far goes by its residual alone: to sample takes longer than to solve.
+            residual = whitened_residual(subgraph, self.poses).reshape(len(rows), -1)
+            misfits = self._misfits(rows, residual) if noise_fits else rows[:0]
+            if not len(misfits):
+                self.posterior = sample_posterior(subgraph, self.poses, cholesky)
+                if self._is_noisier(rows):
+                    continue
+                noise_fits = True
+                misfits = self._misfits(rows, residual, self.posterior.left_out())
+                if not len(misfits):
+                    break
+            self.accepted[misfits], self.dropped[misfits] = False, True
         if not self._knows_noise:
             self._learn_variance(rows)
             self._learnt_of = self.accepted.copy()
@@ -254,25 +263,7 @@ class Growth:
     @property
     def _knows_noise(self) -> bool:
         """Whether there is nothing new to learn it of: what was learnt of, says always more."""
-        return self._at_their_word or np.array_equal(self.accepted, self._learnt_of)
-
-    def noise(self) -> Array:
-        """
-        Return the variance of each factor in a map, (m,), in units of what it states.
-
-        Ones, unless these are wrong beyond doubt: where loops are noisier than they say and those
-        of a place err together, these are worth one, and all are as noisy as was found; odometry
-        is the unit.
-        """
-        noise, rows = np.ones(len(self.factors)), np.flatnonzero(self.accepted)
-        at = np.flatnonzero((self.is_loop & ~self.factors.is_absolute)[rows])
-        loops = rows[at]
-        if len(loops) and self.variance[1] > 1 and err_together(
-                self.place[loops], self.posterior.residual[at], self.posterior.left_over(at)):
-            noise[self.is_loop] = self.variance[1] / self.variance[0]
-            noise[self.factors.is_absolute] = 1 / self.variance[0]
-            noise[loops] *= np.bincount(self.place[loops])[self.place[loops]]
-        return noise
+        return self.at_their_word or np.array_equal(self.accepted, self._learnt_of)
 
     def _is_noisier(self, rows: Indices) -> bool:
         """Raise the variance where half of the factors say that it is far too small."""
@@ -288,21 +279,17 @@ class Growth:
         self.variance = np.where(noisier, scale, 1.0) * self.variance
         return bool(noisier.any())
 
-    def _misfits(self, rows: Indices) -> Indices:
+    def _misfits(self, rows: Indices, residual: Array, against: Array | float = 0.0) -> Indices:
         """Return the accepted loops that do not fit, or that all others speak against."""
         freedom = self.factors.freedom[rows]
         may_go = self.is_loop[rows] & ~self.trusted[rows]
-        far = (self.posterior.residual**2).sum(axis=1) > chi2_quantile(1 - _DROPPED, freedom)
-        against = np.where(may_go, self.posterior.left_out(), 0.0)
+        far = (residual**2).sum(axis=1) > chi2_quantile(1 - _DROPPED, freedom)
+        against = np.where(may_go, against, 0.0)
         # Next to a false loop the true ones look bad too: only the worst go.
-        far |= against > np.maximum(self.doubted(freedom), against.max(initial=0.0) / 2)
+        doubted = self.gate(freedom, _DOUBTED / len(rows))
+        far |= against > np.maximum(doubted, against.max(initial=0.0) / 2)
         misfits: Indices = rows[far & may_go]
         return misfits
-
-    def doubted(self, freedom: Indices) -> Array:
-        """Return what `Posterior.left_out` stays below, (m,), if all accepted ones are true."""
-        accepted = int(np.count_nonzero(self.accepted))
-        return self.gate(freedom, _DOUBTED / accepted)
 
     def _learn_variance(self, rows: Indices) -> None:
         """
@@ -331,7 +318,7 @@ class Growth:
         log_ratio = found.log_ratio()
         # Taken at their word all are noisier than they are, so that more fit by chance: then only
         # the rest says how many of the rest are false.
-        true = 0 if self._at_their_word else np.count_nonzero(self.accepted & self.is_loop)
+        true = 0 if self.at_their_word else np.count_nonzero(self.accepted & self.is_loop)
         odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)), int(true))
         good = np.flatnonzero(fits)[believable(log_ratio[fits], odds)]
         if not len(good):

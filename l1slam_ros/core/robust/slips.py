@@ -10,7 +10,8 @@ cut, the loops across are asked anew, and the rounds go on from there. To the od
 gate for each place that is won and that nothing else explains, less one for each that is lost. A
 slip is believed if that makes it likelier than not, and if three places span it where it is only
 places that say so. Loops do not make a robot jump: the slip repaired, it has to move as at some
-other step, or rather so than as measured.
+other step, or rather so than as measured. What fits the loops that come in without it did not
+slip: a lie among those that went had bent the map.
 """
 
 from collections.abc import Iterator
@@ -77,6 +78,8 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     """
     Return a state in which an odometry factor is cut that slipped; None: there is none.
 
+    Or one that a lie does not bend any more, because an odometry factor was out for a while.
+
     as_stated : the state where all may be as noisy as they say; what that explains needs no slip
     """
     growth.slip_odds = {step: odds for step, odds in growth.slip_odds.items() if growth.cut[step]}
@@ -85,14 +88,19 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     motion = usual_motion(growth)
     found, most = None, 0.0
     for steps, odds, state, usual in _tried(growth, as_stated, motion):
+        fits = state is not None and bool(np.isin(steps, _fitting(state)).all())
+        odds = 0.0 if fits else odds
         evidence = odds + _gain(growth, as_stated, state) if state and usual else odds
-        if len(steps) == 1:
+        if len(steps) == 1 and not fits:
             growth.slip_odds[steps[0]] = evidence
         if state and evidence > most and (
                 (odds > 0 and len(steps) == 1)
                 or (usual and all(_spans(state, step) for step in steps))):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
+    if found and len(fitting := _fitting(found)):
+        found.cut[fitting] = False
+        found.solve()
     return found
 
 
@@ -156,6 +164,7 @@ def _without(growth: Growth, step: int) -> Growth | None:
     """Return the state after the rounds that follow if a step is cut; None: it falls apart."""
     state = growth.copy()
     state.cut[step] = True
+    state.dropped[:] = False
     span = spanning(growth, step)
     state.accepted[span] = state.trusted[span]
     state.solve()
@@ -231,6 +240,14 @@ def _cut_rather(state: Growth, cut: int, step: int) -> tuple[Growth, int]:
     return state, step
 
 
+def _fitting(state: Growth) -> Indices:
+    """Return the odometry that was cut and says what the loops say without it: it did not slip."""
+    steps = np.flatnonzero(state.cut & ~state.gap)
+    found = state.uncut().innovations(steps)
+    fitting: Indices = steps[found.square < state.gate(found.freedom)]
+    return fitting
+
+
 def _moves_as_usual(state: Growth, cut: int, motion: Motion) -> bool:
     """Return whether the robot, repaired, moves as elsewhere, or rather so than as measured."""
     row = np.array([cut])
@@ -249,9 +266,8 @@ def _repaired(state: Growth, cut: int, steps: Indices) -> tuple[Array, Array]:
     """
     manifold, chain = state.graph.manifold, odometry_poses(state.graph)
     row, count = np.array([cut]), len(steps)
-    was_cut, state.cut = state.cut, np.zeros_like(state.cut)
-    root, spread = unwhitening(state, row), state.innovations(row).spread
-    state.cut = was_cut
+    measured = state.uncut()
+    root, spread = unwhitening(measured, row), measured.innovations(row).spread
     low, high = state.low[row], state.high[row]
     moved = manifold.between(state.poses[low], state.poses[high])
     before = manifold.between(chain[state.low[steps]], np.repeat(chain[low], count, axis=0))

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Pose graphs as text: g2o (`.g2o`) and TORO (`.graph`), read and written by one table, `tags`.
+Pose graphs as text: g2o (`.g2o`) and TORO (`.graph`) read, g2o written, by one table, `tags`.
 
 Stamps and trust in loops, which neither format knows: see `side_files`, and `remarks`.
 """
@@ -39,7 +39,6 @@ from l1slam_ros.io.graphs.rows import (
 from l1slam_ros.io.graphs.side_files import named_loops, read_stamps, write_beside
 from l1slam_ros.io.graphs.tags import (
     FACTORS,
-    FORMAT_OF_SUFFIX,
     NO_OFFSET,
     OFFSET,
     SENSORS,
@@ -71,10 +70,6 @@ class GraphRecord:
     damage: str = ''
     rotation_information: str = QUATERNION
     remarks: Remarks = None
-
-
-_NAMES = {'vertex': 'a vertex', 'between': 'an edge', 'absolute': 'an absolute pose',
-          'position': 'an absolute pose'}
 
 
 def read_graph_file(path: str | os.PathLike[str],
@@ -131,14 +126,14 @@ def read_vertices(path: str | os.PathLike[str],
 
 def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
     """
-    Write a graph with its own ids, every number such that it reads back the same.
+    Write a graph as g2o with its own ids, every number such that it reads back the same.
 
-    TORO for the suffix `.graph`, else g2o. Stamps and trusted loops, if any, go to side files;
-    those of a former graph of this name are removed with that graph.
+    Stamps and trusted loops, if any, go to side files; those of a former graph of this name are
+    removed with that graph.
 
     Raises
     ------
-    FileError : the file cannot be written, or its format has no place for a part of the graph.
+    FileError : the file cannot be written, or a number is none that can be read.
 
     """
     path = Path(path)
@@ -241,17 +236,11 @@ def _kinds(graph: FactorGraph) -> np.ndarray:
 def _lines(path: Path, record: GraphRecord, kind: str, ids: Indices, pose: Array,
            roots: Array) -> list[str]:
     """Return the lines of one kind: ids (m, 1 or 2), pose (m, p), roots of information."""
-    file_format = FORMAT_OF_SUFFIX.get(path.suffix.lower(), 'g2o')
-    manifold = record.graph.manifold
-    names = [name for name, tag in TAGS.items() if (tag.file_format, tag.kind, tag.manifold)
-             == (file_format, kind, manifold)]
-    if not names:
-        raise FileError(path, f'{file_format} has no line for {_NAMES[kind]} of '
-                        f'{manifold.NAME}; expected another suffix')
-    tag = TAGS[names[0]]
+    name, tag = next((name, tag) for name, tag in TAGS.items()
+                     if (tag.kind, tag.manifold) == (kind, record.graph.manifold))
     # An absolute pose in space has the number of an offset where others have the second id.
     ids = np.pad(ids[:, :tag.vertices], ((0, 0), (0, tag.ids - tag.vertices)))
-    values = tag.write(pose)[:, :tag.values]
+    values = pose[:, :tag.values]
     if tag.information:
         rows, columns = np.array(tag.information).T
         roots = roots / tag.units(record.rotation_information)
@@ -260,7 +249,7 @@ def _lines(path: Path, record: GraphRecord, kind: str, ids: Indices, pose: Array
     readable = (np.abs(values) <= LARGEST).all(axis=1)
     if not readable.all():
         k = int(np.argmin(readable))
-        line = ' '.join((names[0], *map(str, ids[k]), 'would be', *(f'{v:g}' for v in values[k])))
+        line = ' '.join((name, *map(str, ids[k]), 'would be', *(f'{v:g}' for v in values[k])))
         raise FileError(path, f'{line}; expected numbers to {LARGEST:g}; nothing written')
     # %r: the fewest digits, 17 at most, that read back as the very same number.
-    return formatted(f'{names[0]}{" %d" * ids.shape[1]}{" %r" * values.shape[1]}', ids, values)
+    return formatted(f'{name}{" %d" * ids.shape[1]}{" %r" * values.shape[1]}', ids, values)

@@ -46,15 +46,6 @@ def _from_angles(values: Array) -> Array:
     return se3.compose(se3.compose(yaw, pitch), roll)
 
 
-def _to_angles(poses: Array) -> Array:
-    """Return rows x y z roll pitch yaw (m, 6) of poses."""
-    x, y, z, w = poses[:, 3:].T
-    sine = np.clip(2 * (w * y - z * x), -1, 1)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.column_stack((poses[:, :3], roll, np.arcsin(sine), yaw))
-
-
 @dataclass(frozen=True)
 class Tag:
     """
@@ -62,19 +53,17 @@ class Tag:
 
     kind : vertex, between, absolute or position (absolute, too); ids : how many whole numbers
     lead, of which `vertices` are vertex ids; values : how many numbers of a pose follow, which
-    read and write turn into the first ones of a pose of the manifold and back, the rest is that of
-    the identity; information : row and column of each entry of the upper triangle, in the order of
-    the file; none for a vertex.
+    `read` turns into the first ones of a pose of the manifold, the rest is that of the identity;
+    information : row and column of each entry of the upper triangle, in the order of the file;
+    none for a vertex.
     """
 
-    file_format: str
     kind: str
     manifold: Manifold
     ids: int
     values: int
     information: tuple[tuple[int, int], ...] = ()
     read: Callable[[Array], Array] = field(default=_same)
-    write: Callable[[Array], Array] = field(default=_same)
 
     @property
     def vertices(self) -> int:
@@ -104,28 +93,26 @@ def _triangle(size: int) -> tuple[tuple[int, int], ...]:
 
 
 _TORO_PLANE = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
-_QUATERNION = (se3.from_pose3, se3.to_pose3)
-_ANGLES = (_from_angles, _to_angles)
 
+# Of each kind on each manifold the first is g2o's, which is the one that is written.
 TAGS = {
-    'VERTEX_SE2': Tag('g2o', 'vertex', se2, 1, 3),
-    'EDGE_SE2': Tag('g2o', 'between', se2, 2, 3, _triangle(3)),
-    'EDGE_PRIOR_SE2': Tag('g2o', 'absolute', se2, 1, 3, _triangle(3)),
-    'EDGE_PRIOR_SE2_XY': Tag('g2o', 'position', se2, 1, 2, _triangle(2)),
-    'VERTEX2': Tag('toro', 'vertex', se2, 1, 3),
-    'EDGE2': Tag('toro', 'between', se2, 2, 3, _TORO_PLANE),
-    'VERTEX_SE3:QUAT': Tag('g2o', 'vertex', se3, 1, 7, (), *_QUATERNION),
-    'EDGE_SE3:QUAT': Tag('g2o', 'between', se3, 2, 7, _triangle(6), *_QUATERNION),
-    'EDGE_SE3_PRIOR': Tag('g2o', 'absolute', se3, 2, 7, _triangle(6), *_QUATERNION),
-    'EDGE_SE3_XYZPRIOR': Tag('g2o', 'position', se3, 2, 3, _triangle(3)),
-    'VERTEX3': Tag('toro', 'vertex', se3, 1, 6, (), *_ANGLES),
-    'EDGE3': Tag('toro', 'between', se3, 2, 6, _triangle(6), *_ANGLES),
+    'VERTEX_SE2': Tag('vertex', se2, 1, 3),
+    'EDGE_SE2': Tag('between', se2, 2, 3, _triangle(3)),
+    'EDGE_PRIOR_SE2': Tag('absolute', se2, 1, 3, _triangle(3)),
+    'EDGE_PRIOR_SE2_XY': Tag('position', se2, 1, 2, _triangle(2)),
+    'VERTEX2': Tag('vertex', se2, 1, 3),
+    'EDGE2': Tag('between', se2, 2, 3, _TORO_PLANE),
+    'VERTEX_SE3:QUAT': Tag('vertex', se3, 1, 7, (), se3.from_pose3),
+    'EDGE_SE3:QUAT': Tag('between', se3, 2, 7, _triangle(6), se3.from_pose3),
+    'EDGE_SE3_PRIOR': Tag('absolute', se3, 2, 7, _triangle(6), se3.from_pose3),
+    'EDGE_SE3_XYZPRIOR': Tag('position', se3, 2, 3, _triangle(3)),
+    'VERTEX3': Tag('vertex', se3, 1, 6, (), _from_angles),
+    'EDGE3': Tag('between', se3, 2, 6, _triangle(6), _from_angles),
 }
 FACTORS = 'between', 'absolute', 'position'
 # What g2o measures an absolute pose in space by: its line where there is no offset.
 OFFSET = 'PARAMS_SE3OFFSET'
 NO_OFFSET = f'{OFFSET} 0 0 0 0 0 0 0 1'
-FORMAT_OF_SUFFIX = {'.graph': 'toro'}
 
 _LANDMARKS = 'landmarks are no part of a pose graph'
 SENSORS = 'sensor data and calibration are no part of a pose graph'

@@ -517,6 +517,19 @@ def test_what_was_judged_by_other_options_is_not_adopted(careful):
     assert backend.snapshot().problem().judgement.accepted.all()
 
 
+def test_who_doubts_again_lets_go_of_lies_without_being_told_to(careful):
+    world = spoilt(careful, 'random', 130)
+    backend = played(world, options=CREDULOUS)
+    settled(backend)
+    assert (backend.loop_states().state == ACCEPTED).all()
+    backend.set_options(EVERY)
+    settled(backend)
+    factors = backend.snapshot().graph.between
+    accepted = backend.snapshot().judgement.accepted
+    assert not (accepted & is_false(world, factors)).any()
+    assert accepted.sum() >= (~is_false(world, factors)).sum() - 2
+
+
 @pytest.mark.parametrize('name', ['poses', 'dual', 'cost'])
 def test_what_is_not_finite_is_not_adopted(world, name):
     backend = played(world, 0, 40)

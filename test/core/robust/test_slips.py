@@ -3,15 +3,16 @@
 
 import numpy as np
 import pytest
-from lies import careful_world, slipped, spoilt
+from lies import careful_world, is_false, slipped, spoilt
 from problems import chain_of, graph_of, retold, straight
 from test_pairwise_consistency import STEP, TURN, grown
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import robust_solve
+from l1slam_ros.core.robust.judgement import OTHER_MAP
 from l1slam_ros.core.robust.motion import log_odds_of_slips, usual_motion
-from l1slam_ros.core.robust.slips import SURE, without_slip
+from l1slam_ros.core.robust.slips import SURE, spanning, without_slip
 
 
 @pytest.fixture(scope='module')
@@ -55,6 +56,34 @@ def test_what_is_within_the_noise_as_stated_is_no_slip(bad, stated):
     graph = retold(slipped(bad.graph, STEP, (0.0, 0.0, 0.2)), times=stated)
     slips = robust_solve(graph)[0].slips
     assert graph.between.i[slips].tolist() == ([] if stated > 1 else [STEP])
+
+
+def test_what_fits_the_loops_that_come_in_without_it_did_not_slip(bad):
+    """As if a lie had held the map elsewhere, and all loops across a step were left out for it."""
+    growth = grown(bad.graph)
+    (step,) = np.flatnonzero(~growth.is_loop & (growth.low == STEP))
+    across = growth.accepted & spanning(growth, step)
+    growth.accepted[across] = False
+    growth.solve()
+    found = without_slip(growth, growth)
+    assert not found.cut.any() and found.accepted[across].all()
+    assert not growth.slip_odds
+
+
+def test_a_keyframe_that_only_odometry_holds_where_it_is_is_doubtful(bad):
+    """Two slips that cancel: the loops of one keyframe say that it alone is elsewhere."""
+    factors = bad.graph.between
+    true = ~factors.is_odometry & ~is_false(bad, factors)
+    ends = np.concatenate((factors.i[true], factors.j[true]))
+    keyframe = int(np.argmax(np.bincount(ends)))
+    truth = bad.truth.copy()
+    truth[keyframe] = se2.retract(truth[keyframe], np.array([0.0, 5.0, 0.0]))
+    near = np.arange(keyframe - 1, keyframe + 1)
+    rows = np.flatnonzero(factors.is_odometry & np.isin(factors.i, near))
+    Z = factors.measurement.copy()
+    Z[rows] = se2.between(truth[near], truth[near + 1])
+    (doubt,) = robust_solve(retold(bad.graph, Z))[0].doubts
+    assert doubt.kind == OTHER_MAP and keyframe in (doubt.first, doubt.last)
 
 
 def test_where_the_odometry_jumped_it_slipped(bad):

@@ -52,7 +52,7 @@ NUMBERS = st.sampled_from(
     ['0', '1', '-1', '2', '3', '0.1', '100', '3.14159265358979', '-3.2', '1e-9', '1e9', '1e-40',
      '1e40', '1e-154', '1e154', '-1e154', '1e-300', '1e300', '1e308', '-1e308', '5e-324'])
 COMMANDS = st.sampled_from(
-    [('info', ()), ('convert', ('out.g2o',)), ('convert', ('out.graph',)), ('convert', ('out',)),
+    [('info', ()), ('convert', ('out.g2o',)), ('convert', ('out',)),
      ('convert', ('out.tum',)), ('solve', ('--output', 'out.g2o', '--outer', '2')),
      ('solve', ('--norm', 'l2', '--start', 'odometry', '--output', 'out.tum')),
      ('solve', ('--norm', 'huber', '--start', 'file', '--output', 'out.g2o', '--json')),
@@ -116,8 +116,8 @@ def answer(suffix, content, command, more):
         else:
             assert code == (4 if 'doubtful: ' in err.getvalue() else 0)
             assert all(part.startswith('out') for part in left)
-            for part in left & {'out.g2o', 'out.graph'}:
-                read_graph_file(folder / part)
+            if 'out.g2o' in left:
+                read_graph_file(folder / 'out.g2o')
         return code
 
 
@@ -155,19 +155,18 @@ def records(draw):
 @given(record=records())
 def test_what_is_written_is_read_to_the_last_bit_and_converted(record):
     with tempfile.TemporaryDirectory() as name:
-        for suffix in VALID:
-            path = Path(name) / f'a{suffix}'
-            write_graph_file(path, record)
-            back = read_graph_file(path)
-            mine, theirs = record.graph.between, back.graph.between
-            for x, y in ((record.ids, back.ids), (record.poses, back.poses),
-                         (mine.pairs, theirs.pairs), (mine.measurement, theirs.measurement)):
-                assert x.tobytes() == y.tobytes()
-            assert_array_equal(record.stamps, back.stamps)
-            scale = np.abs(mine.sqrt_information).max(axis=(1, 2), keepdims=True)
-            assert_allclose(theirs.sqrt_information / scale, mine.sqrt_information / scale,
-                            atol=1e-13)
-            answer(suffix, path.read_bytes(), 'convert', ('out',))
+        path = Path(name) / 'a.g2o'
+        write_graph_file(path, record)
+        back = read_graph_file(path)
+        mine, theirs = record.graph.between, back.graph.between
+        for x, y in ((record.ids, back.ids), (record.poses, back.poses),
+                     (mine.pairs, theirs.pairs), (mine.measurement, theirs.measurement)):
+            assert x.tobytes() == y.tobytes()
+        assert_array_equal(record.stamps, back.stamps)
+        scale = np.abs(mine.sqrt_information).max(axis=(1, 2), keepdims=True)
+        assert_allclose(theirs.sqrt_information / scale, mine.sqrt_information / scale,
+                        atol=1e-13)
+        answer('.g2o', path.read_bytes(), 'convert', ('out',))
 
 
 @pytest.mark.parametrize('suffix', sorted(VALID))
