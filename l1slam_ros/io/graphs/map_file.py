@@ -41,8 +41,8 @@ class MapFile:
         self._backend, self._options, self._warn = backend, options, warn
         self.is_saving = False
         self._began, self._took = time.monotonic(), 0.0
-        # What was saved or loaded last: where, and the version of the map.
-        self._known: tuple[object, ...] = options().save_path, backend.version
+        # Where the map was saved or loaded last, and its version then.
+        self._known = _absolute(options().save_path), backend.version
         # The file that we wrote or loaded, its end, and the graph whose map it holds.
         self._ours: tuple[object, ...] = ()
 
@@ -75,9 +75,10 @@ class MapFile:
         finally:
             self._took, self.is_saving = time.monotonic() - self._began, False
 
-    def _write(self, path: Path, saved: SavedMap | None, version: object) -> str:
+    def _write(self, path: Path, saved: SavedMap | None,
+               version: tuple[int, int, int]) -> str:
         sentence = save_map(path, saved)
-        self._known = self._options().save_path, version
+        self._known = path, version
         self._ours = path, _end_of(path), saved.number if saved else 0
         return sentence
 
@@ -96,7 +97,7 @@ class MapFile:
         if found is not expected:
             raise FileError(path, f'is a map of {found.NAME}; expected one of {expected.NAME}')
         number = self._backend.restore(saved)
-        self._known = self._options().save_path, self._backend.version
+        self._known = path, self._backend.version
         # What could not be read may be of use to somebody yet.
         self._ours = (path, end, number) if whole else ()
         return sentence, whole
@@ -120,7 +121,7 @@ class MapFile:
     def _is_to_be_saved(self) -> bool:
         options = self._options()
         return (options.save_path != '' and options.autosave_period > 0
-                and self._known != (options.save_path, self._backend.version))
+                and self._known != (_absolute(options.save_path), self._backend.version))
 
     def _path(self) -> Path:
         path = self._options().save_path
@@ -141,7 +142,7 @@ def unusable_path(save_path: str) -> str:
 
 def _absolute(path: str) -> Path:
     # Not `Path.expanduser`: that raises where there is no such home.
-    return Path(os.path.expanduser(path)).absolute()
+    return Path(os.path.expanduser(path)).absolute() if path else Path()
 
 
 def _end_of(path: Path) -> bytes:
