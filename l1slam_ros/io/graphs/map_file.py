@@ -52,11 +52,16 @@ class MapFile:
             version = self._backend.version
             return self._write(self._path(), self._backend.saved(), version)
 
-    def autosave(self) -> None:
-        """Save the map if it has changed; what stood in its place, if not its own, is kept."""
+    def autosave(self, taken: Callable[[], None] = lambda: None) -> None:
+        """
+        Save the map if it has changed; what stood in its place, if not its own, is kept.
+
+        taken : called before it is written: what becomes of the map from then on does not matter
+        """
         with self._at_work():
             version = self._backend.version
             saved = self._backend.saved() if self._is_to_be_saved() else None
+            taken()
             if saved is None:
                 return
             path = self._path()
