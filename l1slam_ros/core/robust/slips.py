@@ -9,10 +9,10 @@ where loops of two places or more do. A slip is suspected where the odds of one 
 cut, the loops across are asked anew, and the rounds go on from there; so are the two on either
 side of keyframes that odometry alone holds where they are. To the odds comes half a gate for each
 place of loops that are won and that nothing else explains, less one for each that is lost. A slip
-is believed if that makes it likelier than not, and if three places span it where it is only places
-that say so. Loops do not make a robot jump: the slip repaired, it has to move as at some other
-step, or rather so than as measured. What fits the loops that came in without it did not slip: a lie
-had bent the map.
+is believed if that makes it likelier than not, and if three places span it where it is only
+places that say so. Loops do not make a robot jump: the slip repaired, it has to move as at some
+other step, or rather so than as measured. What fits the loops that came in without it did not
+slip: a lie had bent the map.
 """
 
 from collections.abc import Iterator
