@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The demo bag through the real node, with clocks as they are.
+The demo bag through the real node, with clocks and odometry as they are.
 
     python benchmarks/ros/clocks.py [BAG [RATE]]
 
 Played once, by the machine's clock: that map is the yardstick. Then with `use_sim_time` and
 `/clock` as a bag player sends it, with a clock that pauses for some seconds halfway, messages too
 or only the clock, twice in a row, with and without `/clock`, and with a clock, and the messages
-with it, that jump back by 20 s halfway. Said is of each part of the map, one for each time that
-stamps go back, how far its keyframes are at worst from where they are in the undisturbed map, and
-its error to the truth, aligned, beside those of the undisturbed map and of the odometry. Loops
-that are sent again are known: what was played twice is odometry the second time. Where loops join
-two parts, the map is compared, too, with the L1 optimum of the same factors and of what nobody
+with it, that jump back by 20 s halfway. Then with odometry that begins again at the identity
+halfway, or is 5e8 m away from there on, and that with no loop from then on.
+
+Said is of each part of the map, one for each time that stamps go back, how far its keyframes are
+at worst from where they are in the undisturbed map, and its error to the truth, aligned, beside
+those of the undisturbed map and of the odometry. Loops that are sent again are known: what was
+played twice is odometry the second time. Where loops join two parts, the map is compared, too,
+with the L1 optimum of the same factors and of what nobody
 told the node: that each keyframe at which a part begins is where the robot was at that stamp.
 """
 
@@ -35,6 +38,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message, serialize_message
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
@@ -167,6 +171,23 @@ def jumping(messages: list[Event]) -> Iterator[Event]:
     yield from with_clock([one for one in messages if one[0] >= middle - _BACK])
 
 
+def moved(messages: list[Event], frame: tuple[float, float, float],
+          loops: bool = True) -> Iterator[Event]:
+    """Yield messages whose odometry is in another frame from halfway on; loops : then, too."""
+    middle, start = messages[len(messages) // 2][0], None
+    for now, topic, data in messages:
+        if now < middle or (topic == LOOP_TOPIC and loops):
+            yield now, topic, data
+        elif topic == ODOMETRY_TOPIC:
+            message = deserialize_message(data, Odometry)
+            pose = se2.from_pose3(stamped_pose(message)[1][None])
+            start = pose if start is None else start
+            pose3 = se2.to_pose3(se2.compose(np.array([frame]), se2.between(start, pose)))[0]
+            position, turn = message.pose.pose.position, message.pose.pose.orientation
+            position.x, position.y, turn.z, turn.w = pose3[[0, 1, 5, 6]].tolist()
+            yield now, topic, serialize_message(message)
+
+
 def main() -> None:
     """Measure, and print."""
     bag = Path(sys.argv[1]) if len(sys.argv) > 1 else BAG
@@ -183,6 +204,9 @@ def main() -> None:
         'twice, with /clock': (True, lambda: (
             e for _ in range(2) for e in with_clock(messages))),
         'back by 20 s': (True, lambda: jumping(messages)),
+        'odometry restarts': (False, lambda: moved(messages, (0.0, 0.0, 0.0))),
+        'odometry is 5e8 m away': (False, lambda: moved(messages, (5e8, 1e5, 1.0))),
+        'and has no loops': (False, lambda: moved(messages, (5e8, 1e5, 1.0), loops=False)),
     }
     truth = dict(stamped_pose(m.data) for m in read_messages(bag, [TRUTH_TOPIC]))
     measured = {}

@@ -106,8 +106,7 @@ def true_path(record: GraphRecord, poses: Array, truth: Truth) -> Array:
     """Return the positions (l, k) of the true path, moved onto poses (n, p) as for the error."""
     positions = record.graph.manifold.positions
     R, t = align(positions(truth.poses), positions(poses)[truth.rows])
-    path: Array = positions(truth.path) @ R.T + t
-    return path
+    return positions(truth.path) @ R.T + t
 
 
 def known_false(path: Path, record: GraphRecord) -> Mask:

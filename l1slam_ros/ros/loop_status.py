@@ -9,7 +9,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from l1slam_ros.core.geometry.manifold import Indices
-from l1slam_ros.core.online.loop_states import ACCEPTED, LOOP_STATES, WAITING, LoopStates
+from l1slam_ros.core.online.loop_states import ACCEPTED, EXPIRED, LOOP_STATES, WAITING, LoopStates
 from l1slam_ros.io.files import stamp_text
 from l1slam_ros.ros.publishing import cdr, header_bytes, string_bytes
 
@@ -31,22 +31,27 @@ class LoopStatus:
         self._node = node
         latched = QoSProfile(depth=_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._publisher = node.create_publisher(DiagnosticArray, 'loop_status', latched)
+        # States of those in the graph, and stamps of those that have expired: many, in order.
         self._in_graph: Indices = np.zeros(0, np.int64)
-        self._outside: set[tuple[int, int, int]] = set()
+        self._expired: Indices = np.zeros((0, 2), np.int64)
+        self._waiting: set[tuple[int, int]] = set()
 
     def publish(self, states: LoopStates) -> None:
         """Publish the loops whose state is another than at the last call; called by the worker."""
         known, count = len(self._in_graph), len(states.rows)
         if count < known:  # the map began anew
-            known, self._outside = 0, set()
+            known, self._waiting = 0, set()
         now = states.state[:count]
-        changed = np.ones(count, bool)
+        changed = np.ones(len(states.state), bool)
         changed[:known] = now[:known] != self._in_graph[:known]
+        (expired,) = np.nonzero(states.state == EXPIRED)
+        gone, before = states.stamps[expired], len(self._expired)
+        changed[expired[:before]] = not np.array_equal(gone[:before], self._expired)
+        (waits,) = np.nonzero(states.state == WAITING)
+        waiting = [(int(i), int(j)) for i, j in states.stamps[waits]]
+        changed[waits] = [stamps not in self._waiting for stamps in waiting]
         rows = np.flatnonzero(changed).tolist()
-        outside = {(*stamps, state): count + k for k, (stamps, state) in enumerate(zip(
-            states.stamps[count:].tolist(), states.state[count:].tolist(), strict=True))}
-        rows += [row for key, row in outside.items() if key not in self._outside]
-        self._in_graph, self._outside = now.copy(), set(outside)
+        self._in_graph, self._expired, self._waiting = now.copy(), gone, set(waiting)
         if rows:
             name, clock = self._node.get_fully_qualified_name(), self._node.get_clock()
             self._publisher.publish(states_bytes(name, clock.now().nanoseconds, states, rows))

@@ -122,7 +122,7 @@ class BackendNode(LifecycleNode):
 
     def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Empty the map, not its file."""
-        self._begin_anew('clean up')
+        self._map_services.begin_anew('clean up')
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -187,12 +187,7 @@ class BackendNode(LifecycleNode):
         self._transform.forget()
         if self.options.on_time_jump == 'reset':
             self.get_logger().warning('the clock jumped back: the map begins anew')
-            self._begin_anew('time jump')
-
-    def _begin_anew(self, why: str) -> None:
-        """Empty the map, which nobody asked for: what is new in it is saved before."""
-        self._map_services.save_changes()
-        self._jobs.put(why, self._map_services.reset)
+            self._map_services.begin_anew('time jump')
 
     def _on_moved(self) -> None:
         robot, manifold = self._backend.robot(), self._manifold

@@ -40,7 +40,7 @@ class MapServices:
         self._failures, self._pause, self._stopped = failures, pause, stopped
         # A group of their own: a service that awaits its answer would block its whole group.
         group = ReentrantCallbackGroup()
-        for name, work in (('optimize', self._optimise), ('reset', self.reset),
+        for name, work in (('optimize', self._optimise), ('reset', self._reset),
                            ('save', map_file.save), ('load', map_file.load)):
             node.create_service(Trigger, f'~/{name}', self._trigger(name, work),
                                 callback_group=group)
@@ -82,10 +82,13 @@ class MapServices:
                 if self._stopped():
                     raise
 
-    def reset(self) -> str:
-        """Empty the map, not its file; the thread of the jobs calls it."""
+    def _reset(self) -> str:
         self._backend.reset()
         return 'the map is empty'
+
+    def begin_anew(self, why: str) -> None:
+        """Let the map be emptied, which nobody asked for: what is new in it is saved."""
+        self._jobs.put(why, lambda: self._autosave(self._backend.reset))
 
     def autosave(self) -> float:
         """Save the map if it is time; return after how long to ask again [s]."""
@@ -96,12 +99,12 @@ class MapServices:
         return time.monotonic() - began  # no more than half of the time
 
     def save_changes(self) -> None:
-        """Let the map be saved if it has changed, before what is queued from now on."""
+        """Let the map be saved if it has changed."""
         self._jobs.put('the map file', self._autosave)
 
-    def _autosave(self) -> str:
+    def _autosave(self, taken: Callable[[], None] = lambda: None) -> str:
         try:
-            self._map_file.autosave()
+            self._map_file.autosave(taken)
         except Exception as error:
             self._failures.note('autosave', error)
         else:

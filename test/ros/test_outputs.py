@@ -6,6 +6,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from node_bench import EVERY_MESSAGE, loop, recorded
 from rclpy.serialization import deserialize_message
@@ -13,7 +14,14 @@ from systems import dense_covariance
 from visualization_msgs.msg import Marker, MarkerArray
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED
+from l1slam_ros.core.online.loop_states import (
+    ACCEPTED,
+    EXPIRED,
+    REJECTED,
+    WAITING,
+    LoopStates,
+)
+from l1slam_ros.ros.loop_status import LoopStatus
 from l1slam_ros.ros.markers import _array_bytes
 from l1slam_ros.ros.publishing import header_bytes, pose_with_covariance
 
@@ -84,6 +92,26 @@ def test_markers_are_what_their_bytes_say(frame, rng):
         assert [(p.x, p.y, p.z) for p in marker.points] == [tuple(p) for p in points]
         assert [(c.r, c.g, c.b, c.a) for c in marker.colors] == [tuple(c) for c in colours]
         assert not marker.text and not marker.mesh_resource and not marker.texture.data
+
+
+def test_each_loop_is_told_of_when_it_comes_and_when_it_changes(bench):
+    b = bench()
+    told, status = [], LoopStatus(b.peer)
+    b.peer.create_subscription(DiagnosticArray, 'loop_status', lambda message: told.append(
+        [(one.name[-1], one.message) for one in message.status]), 1000)
+    b.until(lambda: status._publisher.get_subscription_count(), 'somebody listens')
+    for *in_graph, outside in (
+            [{5: WAITING, 6: WAITING}], [{5: WAITING, 6: WAITING}],
+            [ACCEPTED, {6: EXPIRED}], [ACCEPTED, {7: WAITING, 6: EXPIRED}],
+            [REJECTED, {6: EXPIRED, 7: EXPIRED}], [REJECTED, {6: EXPIRED, 7: EXPIRED}],
+            [{7: WAITING}]):
+        stamps = [(1, 5) for _ in in_graph] + [(1, end) for end in outside]
+        status.publish(LoopStates(np.arange(len(in_graph)), np.array(stamps), np.array(
+            [*in_graph, *outside.values()]), np.zeros(len(stamps))))
+    b.until(lambda: len(told) == 5, 'all is told')
+    assert told == [[('5', 'waiting'), ('6', 'waiting')], [('5', 'accepted'), ('6', 'expired')],
+                    [('7', 'waiting')], [('5', 'rejected'), ('7', 'expired')],
+                    [('7', 'waiting')]]
 
 
 def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path, rng):

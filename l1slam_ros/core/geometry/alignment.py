@@ -75,8 +75,7 @@ def align(estimate: Array, truth: Array) -> tuple[Array, Array]:
 def aligned_positions(estimate: Array, truth: Array) -> Array:
     """Return the estimated positions (n, k) [m] in the frame of the truth; see `align`."""
     R, t = align(estimate, truth)
-    aligned: Array = estimate @ R.T + t
-    return aligned
+    return estimate @ R.T + t
 
 
 def absolute_trajectory_error(estimate: Array, truth: Array) -> float:

@@ -198,7 +198,5 @@ def _is_definite(matrices: Array) -> Mask:
 def whiten(sqrt_information: Array, vectors: Array) -> Array:
     """Return L' e for stacked roots (m, d, d) and vectors (m, d) or Jacobians (m, d, k)."""
     if vectors.ndim == 2:
-        product: Array = (sqrt_information @ vectors[..., None])[..., 0]
-    else:
-        product = sqrt_information @ vectors
-    return product
+        return (sqrt_information @ vectors[..., None])[..., 0]
+    return sqrt_information @ vectors

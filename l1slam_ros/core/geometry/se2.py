@@ -99,8 +99,7 @@ def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> tupl
     With t = Ri'(tj - ti): `J_r_i = [[-Rz', Rz'(t_y, -t_x)'], [0, -1]]` and
     `J_r_j = [[Rz' Ri' Rj, 0], [0, 1]]`.
     """
-    J_r_i, J_r_j = kernels.se2.jacobians(measurement, pose_i, pose_j)
-    return J_r_i, J_r_j
+    return kernels.se2.jacobians(measurement, pose_i, pose_j)
 
 
 def residual_curvature(measurement: Array, pose_i: Array, pose_j: Array, dual: Array) -> Array:
@@ -112,8 +111,7 @@ def residual_curvature(measurement: Array, pose_i: Array, pose_j: Array, dual: A
     (theta_i, y_i) = -m_x, (theta_i, theta_i) = -m.t, (theta_i, x_j) = -h_y,
     (theta_i, y_j) = h_x. The residual is linear in all else.
     """
-    H: Array = kernels.se2.curvature(measurement, pose_i, pose_j, dual)
-    return H
+    return kernels.se2.curvature(measurement, pose_i, pose_j, dual)
 
 
 def local_jacobian(a: Array, b: Array) -> Array:
@@ -144,8 +142,7 @@ def positions(pose: Array) -> Array:
 
 def rotation(pose: Array) -> Array:
     """Return R(theta), (n, 2, 2)."""
-    R: Array = local_jacobian(identity(len(pose)), pose)[..., :2, :2]
-    return R
+    return local_jacobian(identity(len(pose)), pose)[..., :2, :2]
 
 
 def from_rotation(R: Array, t: Array) -> Array:

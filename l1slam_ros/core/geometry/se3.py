@@ -54,8 +54,7 @@ def _matrix(q: Array) -> Array:
     """Return R(q), (n, 3, 3)."""
     x, w = q[..., :3], q[..., 3, None, None]
     half = w**2 - 0.5
-    R: Array = 2 * (half * np.eye(3) + x[..., :, None] * x[..., None, :] + w * _skew(x))
-    return R
+    return 2 * (half * np.eye(3) + x[..., :, None] * x[..., None, :] + w * _skew(x))
 
 
 def _opposite(q: Array) -> Array:
@@ -88,8 +87,7 @@ def _log(q: Array) -> Array:
     """Return the shortest omega, |omega| <= pi, of a quaternion with qw >= 0."""
     sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
     half = np.arctan2(sine, q[..., 3:])
-    omega: Array = 2 * q[..., :3] / np.sinc(half / np.pi)
-    return omega
+    return 2 * q[..., :3] / np.sinc(half / np.pi)
 
 
 def identity(n: int) -> Array:
@@ -139,8 +137,7 @@ def adjoint(pose: Array) -> Array:
 
 def residual(measurement: Array, pose_i: Array, pose_j: Array) -> Array:
     """Return (t, 2 q_v) of Z^-1 Xi^-1 Xj, (n, 6)."""
-    e: Array = kernels.se3.residual(measurement, pose_i, pose_j)
-    return e
+    return kernels.se3.residual(measurement, pose_i, pose_j)
 
 
 def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> tuple[Array, Array]:
@@ -150,8 +147,7 @@ def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> tupl
     With p = Ri'(tj - ti), Rij = Ri'Rj, q the quaternion of the error and M = q_w I + [q_v]x:
     `J_r_i = [[-Rz', Rz'[p]x], [0, -M Rij']]` and `J_r_j = [[Rz' Rij, 0], [0, M]]`.
     """
-    J_r_i, J_r_j = kernels.se3.jacobians(measurement, pose_i, pose_j)
-    return J_r_i, J_r_j
+    return kernels.se3.jacobians(measurement, pose_i, pose_j)
 
 
 def residual_curvature(measurement: Array, pose_i: Array, pose_j: Array, dual: Array) -> Array:
@@ -163,8 +159,7 @@ def residual_curvature(measurement: Array, pose_i: Array, pose_j: Array, dual: A
     `(om_i, om_i) = (m p' + p m')/2 - (m.p + q_v.y/2) I`, `(om_j, om_j) = -(q_v.y)/2 I`,
     `(om_i, om_j) = Rij ((q_v.y) I + [q_w y - q_v x y]x)/2`. The residual is linear in all else.
     """
-    H: Array = kernels.se3.curvature(measurement, pose_i, pose_j, dual)
-    return H
+    return kernels.se3.curvature(measurement, pose_i, pose_j, dual)
 
 
 def local_jacobian(a: Array, b: Array) -> Array:
@@ -193,9 +188,7 @@ def interpolate(a: Array, b: Array, fraction: Array) -> Array:
 
 def motion(step: Array) -> tuple[Array, Array]:
     """Return the length [m] and the angle [rad] of each relative pose, (n,) and (n,)."""
-    length: Array = np.linalg.norm(step[..., :3], axis=-1)
-    angle: Array = np.linalg.norm(step[..., 3:], axis=-1)
-    return length, angle
+    return np.linalg.norm(step[..., :3], axis=-1), np.linalg.norm(step[..., 3:], axis=-1)
 
 
 def positions(pose: Array) -> Array:

@@ -45,5 +45,4 @@ def _mixed(number: np.ndarray) -> np.ndarray:
     number = number + _STEP
     number = (number ^ (number >> np.uint64(30))) * _MIXED[0]
     number = (number ^ (number >> np.uint64(27))) * _MIXED[1]
-    mixed: np.ndarray = number ^ (number >> np.uint64(31))
-    return mixed
+    return number ^ (number >> np.uint64(31))

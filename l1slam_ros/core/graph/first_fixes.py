@@ -86,16 +86,14 @@ def _likeliest_variance(samples: '_Samples', windows: Indices, leads: list[Indic
 def _windows(count: int, size: int, most: int) -> Indices:
     """Return windows (w, size) of so many things in a row, evenly, all or not more than `most`."""
     starts = np.linspace(0, count - size, min(most, count - size + 1)).astype(int)
-    windows: Indices = starts[:, None] + np.arange(size)
-    return windows
+    return starts[:, None] + np.arange(size)
 
 
 def _largest_group(count: int, windows: Indices, good: Mask) -> Indices:
     """Return which of so many things hang together by what is good in windows, the most, (k,)."""
     first = windows[np.arange(len(windows)), np.argmax(good, axis=1)]
     lowest = lowest_of_components(np.repeat(first, good.sum(axis=1)), windows[good], count)
-    largest: Indices = np.flatnonzero(lowest == np.argmax(np.bincount(lowest)))
-    return largest
+    return np.flatnonzero(lowest == np.argmax(np.bincount(lowest)))
 
 
 class _Samples:

@@ -118,8 +118,7 @@ def loose_keyframes(graph: FactorGraph) -> Indices:
         return np.zeros(0, np.int64)
     lowest, fixed = lowest_joined(graph.subset(whole)), anchor(graph)
     first = np.unique(lowest[:-1])
-    loose: Indices = first[first != lowest[-1]][fixed:] - fixed
-    return loose
+    return first[first != lowest[-1]][fixed:] - fixed
 
 
 def with_world(manifold: Manifold, poses: Array) -> Array:
@@ -137,9 +136,8 @@ def whitened_residual(graph: FactorGraph, poses: Array) -> Array:
     """Return the whitened residual of every row, (rows,), in the order of `LinearSystem`."""
     manifold, factors = graph.manifold, graph.between
     e = manifold.residual(factors.measurement, *ends(graph, poses))
-    whitened: Array = kernels.blocks.whiten(
-        factors.sqrt_information, e, (0,) * manifold.TANGENT_SIZE)
-    return whitened.ravel()
+    return kernels.blocks.whiten(
+        factors.sqrt_information, e, (0,) * manifold.TANGENT_SIZE).ravel()
 
 
 def linearise(graph: FactorGraph, poses: Array, residual: Array | None = None,

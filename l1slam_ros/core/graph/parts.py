@@ -20,8 +20,7 @@ def odometry_gaps(graph: FactorGraph) -> Indices:
     """Return the keyframes k without a factor between k and k + 1, (g,)."""
     factors = graph.between
     first = np.minimum(factors.i, factors.j)[factors.is_odometry]
-    gaps: Indices = np.setdiff1d(np.arange(graph.n_poses - 1), first)
-    return gaps
+    return np.setdiff1d(np.arange(graph.n_poses - 1), first)
 
 
 def vague_odometry(graph: FactorGraph) -> Mask:
@@ -30,9 +29,8 @@ def vague_odometry(graph: FactorGraph) -> Mask:
     diagonal = np.abs(np.diagonal(factors.sqrt_information, axis1=1, axis2=2))
     size = np.where(factors.speaks, np.log(np.maximum(diagonal, _TINY)), 0.0).sum(axis=1)
     odometry = factors.is_odometry
-    vague: Mask = odometry & (size < np.median(size[odometry]) - np.log(_VAGUE)
-                              if odometry.any() else False)
-    return vague
+    return odometry & (size < np.median(size[odometry]) - np.log(_VAGUE)
+                       if odometry.any() else False)
 
 
 def bridged(graph: FactorGraph) -> FactorGraph:

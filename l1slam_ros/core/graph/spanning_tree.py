@@ -113,5 +113,4 @@ def _compose_along(graph: FactorGraph, parent: Indices, candidates: Indices) -> 
 
 def pair_key(i: Indices, j: Indices, n: int) -> Indices:
     """Return one number for each pair of ends, whichever way round, (m,); n : of keyframes."""
-    key: Indices = np.minimum(i, j) * n + np.maximum(i, j)
-    return key
+    return np.minimum(i, j) * n + np.maximum(i, j)

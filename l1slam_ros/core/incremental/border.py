@@ -180,9 +180,8 @@ class Border:
         """Return the steps of some keyframes, (m, k); zero of those that are not here yet."""
         points = np.array([self._point(keyframe) if keyframe < self.keyframes else FIXED
                            for keyframe in keyframes])
-        steps: Array = kernels.border.move(
+        return kernels.border.move(
             self._covariance.view(), self._mean.view(), self._gradient(), points)
-        return steps
 
     def steps(self) -> Steps:
         """Return the steps of all keyframes as they are now."""

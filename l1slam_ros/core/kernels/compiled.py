@@ -48,8 +48,7 @@ def loop(*takes: str, space: tuple[str, ...] = ()) -> Callable[[Kernel], Kernel]
     def decorate(function: Kernel) -> Kernel:
         kernel: Any = compiled(function)
         kernel.takes, kernel.takes_in_space = takes, space
-        ready: Kernel = kernel
-        return ready
+        return kernel
 
     return decorate
 

@@ -128,7 +128,7 @@ class GraphBuilder:
         if gap:
             self.add_due_loops()  # what came before is of that time
             cause, said = _SAID[on_gap]
-            self.notes.warn(cause, f'{gap}; {said}')
+            self.notes.tell(cause, f'{gap}; {said}')
             self._level = Level(self.graph.manifold)
         if point.anew or (gap and on_gap == 'reset'):
             self._forget()

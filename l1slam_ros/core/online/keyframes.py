@@ -65,8 +65,7 @@ def diagonal_covariance(manifold: Manifold, translation: float, rotation: float)
 def reduced_covariance(manifold: Manifold, covariance: Array) -> Array:
     """Return the rows of messages' (..., 6, 6) covariances that the manifold has, (..., d, d)."""
     rows = np.array(manifold.COVARIANCE_ROWS)
-    part: Array = covariance[..., rows[:, None], rows]
-    return part
+    return covariance[..., rows[:, None], rows]
 
 
 class Level:
@@ -219,8 +218,7 @@ class Motion:
             return None
         total = stated.sum(axis=0, keepdims=True)
         if verbatim:
-            exactly: Array = total[0]
-            return exactly
+            return total[0]
         known, out = or_model(total, model, MOST_VARIANCE)
         used, large = at_most(known, MOST_OF_ODOMETRY)
         self.bounded = bounds(total, used, out | large)
@@ -236,8 +234,7 @@ class Motion:
         if len(stated) == 1:
             return stated
         Ad = manifold.adjoint(manifold.between(end, np.concatenate(self._poses)))
-        turned: Array = Ad @ stated @ Ad.transpose(0, 2, 1)
-        return turned
+        return Ad @ stated @ Ad.transpose(0, 2, 1)
 
 
 def _of_message(manifold: Manifold, covariance: Array) -> Array:

@@ -21,7 +21,7 @@ class Notes:
         self.refused: Counter[str] = Counter()
         self.warned: Counter[str] = Counter()
         self._first: dict[str, str] = {}
-        self._unsaid: list[str] = []
+        self._unsaid: dict[str, str] = {}
 
     def refuse(self, cause: str, sentence: str) -> None:
         """Count a message that is not used; the sentence says what was found and expected."""
@@ -33,6 +33,11 @@ class Notes:
         self.warned[cause] += 1
         self._note(cause, sentence)
 
+    def tell(self, cause: str, sentence: str) -> None:
+        """Count what makes another map of all that comes: it is news each time."""
+        self.warn(cause, sentence)
+        self._unsaid[cause] = sentence
+
     def warn_bounds(self, what: str, stamp: int, bounded: list[tuple[float, float]],
                     most: float) -> None:
         """Count variances that are used otherwise than stated: found and used."""
@@ -41,9 +46,9 @@ class Notes:
                       f'{LEAST_VARIANCE:g} to {most:g}; {used:g} is used')
 
     def news(self) -> list[str]:
-        """Return the first sentence of each cause that is new since the last call."""
-        news, self._unsaid = self._unsaid, []
-        return news
+        """Return a sentence of each cause that is new, or was told of, since the last call."""
+        news, self._unsaid = self._unsaid, {}
+        return list(news.values())
 
     def sentences(self) -> list[str]:
         """Return one sentence per cause: how often, and the first of them."""
@@ -54,5 +59,4 @@ class Notes:
 
     def _note(self, cause: str, sentence: str) -> None:
         if cause not in self._first:
-            self._first[cause] = sentence
-            self._unsaid.append(sentence)
+            self._first[cause] = self._unsaid[cause] = sentence

@@ -63,9 +63,8 @@ class Posterior:
     def left_over(self, rows: Indices) -> Array:
         """Return what the noise makes of the residuals of some factors, (l, k, q)."""
         system = self.system
-        drawn: Array = self.noise[rows] - kernels.prediction.moved(
+        return self.noise[rows] - kernels.prediction.moved(
             system.keyframe[rows], system.blocks[rows], self.samples)
-        return drawn
 
     def left_out(self) -> Array:
         """
@@ -119,8 +118,7 @@ def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array,
     constant = by_freedom(lambda size: lgamma((q + 1) / 2) - lgamma((q + 1 - size) / 2)
                           - size * np.log(np.pi * q) / 2, freedom)
     density = constant - (log_det + (q + 1) * np.log1p(square / q)) / 2
-    ratio: Array = log_claim + density
-    return ratio
+    return log_claim + density
 
 
 def by_freedom(value: Callable[[int], float], freedom: Indices) -> Array:
@@ -205,16 +203,14 @@ def _sagittas(graph: FactorGraph, posterior: Posterior) -> Array:
     variance = np.zeros((len(factors), steps.shape[1]))
     variance[:, manifold.TRANSLATION] = (offset * turn).mean(axis=1)[:, None] / 4
     roots = factors.sqrt_information
-    sagittas: Array = roots * variance[:, None, :] @ roots.transpose(0, 2, 1)
-    return sagittas
+    return roots * variance[:, None, :] @ roots.transpose(0, 2, 1)
 
 
 def log_claims(factors: BetweenFactors, log_volume: Array) -> Array:
     """Return the logarithms of the volumes, in sigmas, that false factors fill, (m,)."""
     roots = np.diagonal(factors.sqrt_information, axis1=1, axis2=2)
-    claims: Array = (factors.speaks * log_volume).sum(axis=1) + np.log(
+    return (factors.speaks * log_volume).sum(axis=1) + np.log(
         np.where(factors.speaks, roots, 1.0)).sum(axis=1)
-    return claims
 
 
 def claimed_volume(manifold: Manifold, poses: Array) -> Array:
@@ -229,8 +225,7 @@ def claimed_volume(manifold: Manifold, poses: Array) -> Array:
     variance = np.full(manifold.TANGENT_SIZE, np.pi**2 / 3)
     variance[manifold.TRANSLATION] = (apart[:, manifold.TRANSLATION] ** 2).mean()
     with np.errstate(divide='ignore'):
-        volume: Array = np.log(2 * np.pi * variance) / 2
-        return volume
+        return np.log(2 * np.pi * variance) / 2
 
 
 def chi2_quantile(probability: float, freedom: Indices) -> Array:

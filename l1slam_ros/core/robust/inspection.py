@@ -46,8 +46,7 @@ def repeated_factors(graph: FactorGraph) -> Indices:
     rows = np.flatnonzero(_has_parallel(graph))
     table = np.column_stack((factors.i[rows], factors.j[rows], factors.measurement[rows]))
     _, first = np.unique(table, axis=0, return_index=True)
-    repeated: Indices = np.delete(rows, first)
-    return repeated
+    return np.delete(rows, first)
 
 
 def parallel_factors(graph: FactorGraph) -> Indices:
@@ -59,8 +58,7 @@ def _has_parallel(graph: FactorGraph) -> np.ndarray:
     factors = graph.between
     _, inverse, counts = np.unique(pair_key(factors.i, factors.j, graph.n_poses),
                                    return_inverse=True, return_counts=True)
-    shared: np.ndarray = counts[inverse] > 1
-    return shared
+    return counts[inverse] > 1
 
 
 def connected_parts(graph: FactorGraph) -> list[Indices]:
@@ -98,8 +96,7 @@ def step_lengths(graph: FactorGraph) -> Array:
     """Return how long each step of odometry is [m], in the order of the factors."""
     manifold, factors = graph.manifold, graph.between
     steps = factors.measurement[factors.is_odometry]
-    length: Array = manifold.motion(manifold.local(manifold.identity(len(steps)), steps))[0]
-    return length
+    return manifold.motion(manifold.local(manifold.identity(len(steps)), steps))[0]
 
 
 @dataclass(frozen=True)
@@ -261,8 +258,7 @@ def _least_squares(system: LinearSystem, b: Array, weights: Array | float = 1.0)
                       options={'SymmetricMode': True})
     except RuntimeError as error:
         raise GraphError('the normal matrix is singular') from error
-    x: Array = factor.solve(A.T @ b)
-    return x
+    return factor.solve(A.T @ b)
 
 
 def _densest_part(graph: FactorGraph) -> tuple[FactorGraph, Indices, np.ndarray]:

@@ -65,8 +65,7 @@ def _evidence(place: Indices, one: Indices, other: Indices, log_ratio: Array) ->
     by_place = np.zeros((len(place), place.max() + 1))
     np.maximum.at(by_place, (one, place[other]), log_ratio - np.log(len(place)))
     by_place[np.arange(len(place)), place] = 0.0
-    evidence: Array = by_place.sum(axis=1)
-    return evidence
+    return by_place.sum(axis=1)
 
 
 def _by_chance(growth: Growth, rows: Indices) -> float:
@@ -87,8 +86,7 @@ def spanned(low: Indices, high: Indices, n: int) -> Indices:
     change = np.zeros(n, np.int64)
     np.add.at(change, np.maximum(low, 0), 1)  # the world is before all keyframes
     np.add.at(change, high, -1)
-    count: Indices = np.cumsum(change)[:-1]
-    return count
+    return np.cumsum(change)[:-1]
 
 
 def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
@@ -165,5 +163,4 @@ def _changes(growth: Growth, ends: Ends, a: Indices, b: Indices, roots: Array) -
         keyframe = np.stack((end[a], end[b]), axis=1) - fixed
         keyframe[keyframe < 0] = len(samples) - 1
         changes.append(kernels.prediction.moved(keyframe, np.stack((J_a, J_b), axis=1), samples))
-    total: Array = changes[0] + changes[1]
-    return total
+    return changes[0] + changes[1]

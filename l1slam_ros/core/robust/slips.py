@@ -6,12 +6,13 @@ A gap is a slip whose place is known. Where both sides of a step are parts of th
 in itself, the true loops across agree with each other (`pairwise_consistency`): parts are joined
 where loops of two places or more do. A slip is suspected where the odds of one are not small
 (`motion`), or where loops that are left out agree. Then slip and lies are compared: the step is
-cut, the loops across are asked anew, and the rounds go on from there. To the odds comes half a
-gate for each place that is won and that nothing else explains, less one for each that is lost. A
-slip is believed if that makes it likelier than not, and if three places span it where it is only
+cut, the loops across are asked anew, and the rounds go on from there; so are the two on either
+side of keyframes that odometry alone holds where they are. To the odds comes half a gate for each
+place of loops that are won and that nothing else explains, less one for each that is lost. A slip
+is believed if that makes it likelier than not, and if three places span it where it is only
 places that say so. Loops do not make a robot jump: the slip repaired, it has to move as at some
-other step, or rather so than as measured. What fits the loops that come in without it did not
-slip: a lie among those that went had bent the map.
+other step, or rather so than as measured. What fits the loops that came in without it did not
+slip: a lie had bent the map.
 """
 
 from collections.abc import Iterator
@@ -88,19 +89,18 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     motion = usual_motion(growth)
     found, most = None, 0.0
     for steps, odds, state, usual in _tried(growth, as_stated, motion):
-        fits = state is not None and bool(np.isin(steps, _fitting(state)).all())
-        odds = 0.0 if fits else odds
-        evidence = odds + _gain(growth, as_stated, state) if state and usual else odds
-        if len(steps) == 1 and not fits:
-            growth.slip_odds[steps[0]] = evidence
+        back = _put_back(state, steps, motion) if state else None
+        state, odds = back or (state, odds)
+        gain = _gain(growth, as_stated, state) if state and usual else 0.0
+        # No slip has to be believed where only a lie had bent the map.
+        evidence = gain if back else odds + gain
+        if len(steps) == 1:
+            growth.slip_odds[steps[0]] = odds if back else evidence
         if state and evidence > most and (
                 (odds > 0 and len(steps) == 1)
                 or (usual and all(_spans(state, step) for step in steps))):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
-    if found and len(fitting := _fitting(found)):
-        found.cut[fitting] = False
-        found.solve()
     return found
 
 
@@ -114,23 +114,22 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, more: bool = True
     that, too.
     """
     odds = log_odds_of_slips(growth, motion)
-    for step in _suspected(growth, odds, as_stated.undecided()):
-        state, usual = _without(growth, step), False
+    for steps in _suspected(growth, odds, as_stated.undecided()):
+        state, usual = _without(growth, steps), False
         if state:
-            state, step = _cut_rather(state, step, _likeliest(state, step, motion))
-            usual = _moves_as_usual(state, step, motion)
-        yield [step], float(odds[step]), state, usual
-        if more and state and not usual:
-            for (second,), other, both, usual in _tried(state, state, motion, False):
-                first = step
+            state, steps, usual = _cut_rather(state, steps, motion)
+        yield steps, float(odds[steps].sum()), state, usual
+        if more and state and not usual and len(steps) == 1:
+            for second, other, both, usual in _tried(state, state, motion, False):
+                first = steps
                 if both:
-                    both, first = _cut_rather(both, step, _likeliest(both, step, motion))
-                    usual = usual and _moves_as_usual(both, first, motion)
-                yield [first, second], float(odds[first]) + other, both, usual
+                    both, first, moves = _cut_rather(both, steps, motion)
+                    usual = usual and moves
+                yield first + second, float(odds[first].sum()) + other, both, usual
 
 
-def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:
-    """Return the odometry factors that may have slipped: two by their odds, two by groups."""
+def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[list[int]]:
+    """Return the odometry that may have slipped, at once: two by odds, and for two groups."""
     tell = growth.accepted & growth.is_loop
     tell[left_out] = True
     across = spanned(growth.low[tell], growth.high[tell], growth.graph.n_poses)
@@ -139,7 +138,7 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:
     order = np.argsort(-told, kind='stable')[:_TRIED]
     # Where loops are left out, one more place may be won.
     least = max(SURE, _place(growth)) if len(left_out) else SURE
-    suspects = order[told[order] > -least].tolist()
+    suspects = order[told[order] > -least, None].tolist()
     for _ in range(_TRIED):
         group = strongest_group(growth, left_out)
         if len(group.places) < SPANNING:
@@ -147,9 +146,22 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:
         common = common_steps(growth, group)
         common = common[~growth.cut[common]]
         if len(common):
-            suspects.append(int(common[np.argmax(odds[common])]))
+            suspects.append([int(common[np.argmax(odds[common])])])
+        suspects += [steps for ends in (growth.low, growth.high)
+                     if len(steps := _around(growth, ends[group.rows])) > 1]
         left_out = np.setdiff1d(left_out, group.rows)
-    return list(dict.fromkeys(suspects))
+    return [list(steps) for steps in dict.fromkeys(map(tuple, suspects))]
+
+
+def _around(growth: Growth, ends: Indices) -> list[int]:
+    """Return the odometry on either side of some keyframes, where no accepted loop has an end."""
+    first, last = ends.min(), ends.max()
+    inside = [(end >= first) & (end <= last) for end in (growth.low, growth.high)]
+    if (growth.accepted & growth.is_loop & np.logical_or(*inside)).any():
+        return []
+    steps: list[int] = np.flatnonzero(~growth.is_loop & ~growth.cut & np.logical_xor(*inside)
+                                      ).tolist()
+    return steps
 
 
 def common_steps(growth: Growth, group: Group) -> Indices:
@@ -160,15 +172,16 @@ def common_steps(growth: Growth, group: Group) -> Indices:
     return steps
 
 
-def _without(growth: Growth, step: int) -> Growth | None:
-    """Return the state after the rounds that follow if a step is cut; None: it falls apart."""
+def _without(growth: Growth, steps: list[int]) -> Growth | None:
+    """Return the state after the rounds that follow if steps are cut; None: it falls apart."""
     state = growth.copy()
-    state.cut[step] = True
+    state.cut[steps] = True
     state.dropped[:] = False
-    span = spanning(growth, step)
-    state.accepted[span] = state.trusted[span]
+    for step in steps:
+        span = spanning(growth, step)
+        state.accepted[span] = state.trusted[span]
     state.solve()
-    if not join(state) or state.part[state.low[step]] != state.part[state.high[step]]:
+    if not join(state) or state.across()[steps].any():
         return None
     _accept_more(state)
     return state
@@ -195,11 +208,12 @@ def _spans(state: Growth, step: int) -> bool:
 
 
 def _gain(growth: Growth, as_stated: Growth, cut: Growth) -> float:
-    """Return what the places say that are won and lost by a cut, ln of odds."""
-    before, explained, after = (np.unique(growth.place[state.accepted & growth.is_loop])
+    """Return what the places say whose loops are won and lost by a cut, ln of odds."""
+    before, explained, after = (state.accepted & growth.is_loop
                                 for state in (growth, as_stated, cut))
-    won = len(np.setdiff1d(after, np.union1d(before, explained)))
-    return _place(growth) * (won - len(np.setdiff1d(before, after)))
+    won, lost = (len(np.unique(growth.place[some]))
+                 for some in (after & ~before & ~explained, before & ~after))
+    return _place(growth) * (won - lost)
 
 
 def _place(growth: Growth) -> float:
@@ -219,10 +233,24 @@ def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
     return int(steps[np.argmax(gain)])
 
 
-def _cut_rather(state: Growth, cut: int, step: int) -> tuple[Growth, int]:
-    """Return the state that is cut at a step and not where it is, between the same loops; step."""
+def _cut_rather(state: Growth, steps: list[int], motion: Motion
+                ) -> tuple[Growth, list[int], bool]:
+    """
+    Return the state cut at the likeliest steps between the same loops; these; whether usual.
+
+    That is, whether the robot, repaired, moves at each of them as elsewhere.
+    """
+    rather = []
+    for cut in steps:
+        rather.append(_likeliest(state, cut, motion))
+        state = _cut_at(state, cut, rather[-1])
+    return state, rather, all(_moves_as_usual(state, step, motion) for step in rather)
+
+
+def _cut_at(state: Growth, cut: int, step: int) -> Growth:
+    """Return the state that is cut at a step and not where it is, between the same loops."""
     if step == cut:
-        return state, cut
+        return state
     state = state.copy()
     state.cut[[cut, step]] = False, True
     # What lies between goes over to the other side.
@@ -237,15 +265,19 @@ def _cut_rather(state: Growth, cut: int, step: int) -> tuple[Growth, int]:
         manifold.between(np.tile(chain[side], (len(between), 1)), chain[between]))
     state.solve()
     _accept_more(state)
-    return state, step
+    return state
 
 
-def _fitting(state: Growth) -> Indices:
-    """Return the odometry that was cut and says what the loops say without it: it did not slip."""
-    steps = np.flatnonzero(state.cut & ~state.gap)
-    found = state.uncut().innovations(steps)
-    fitting: Indices = steps[found.square < state.gate(found.freedom)]
-    return fitting
+def _put_back(state: Growth, steps: list[int], motion: Motion) -> tuple[Growth, float] | None:
+    """Return the state where steps say again what they measured, and the odds, if that fits."""
+    found = state.uncut().innovations(np.array(steps))
+    if (found.square >= state.gate(found.freedom)).any():
+        return None
+    back = state.copy()
+    back.cut[steps] = False
+    back.solve()
+    odds = float(log_odds_of_slips(back, motion)[steps].max())
+    return (back, odds) if odds < 0 else None
 
 
 def _moves_as_usual(state: Growth, cut: int, motion: Motion) -> bool:

@@ -184,10 +184,9 @@ class BlockCholesky:
         lists, reach = np.full((2, count), -1, np.int32), np.zeros(count, np.int64)
 
         def share(mine: int) -> int:
-            end: int = kernels.cholesky.factorise(
+            return kernels.cholesky.factorise(
                 layout.panels, *layout.shape, pattern.owner, shares, mine, lists, reach,
                 layout.size)
-            return end
 
         return min(*_at_once(share), share(2)) if shared else share(0)
 
@@ -215,10 +214,9 @@ class BlockCholesky:
         Positions (p,), ascending, where it is not zero, and the columns, (k, p k).
         """
         layout = self._last
-        found: tuple[Places, Array] = kernels.border.climb(
+        return kernels.border.climb(
             layout.panels, *layout.shape, self.pattern.owner, self.pattern.position[keyframe],
             len(layout.size))
-        return found
 
 
 def _at_once(share: Callable[[int], Result]) -> tuple[Result, Result]:

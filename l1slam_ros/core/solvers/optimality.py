@@ -118,8 +118,7 @@ class Lengths:
 
     def resolvent(self, dual: Array, sigma: Array | float) -> Array:
         """See `Norm`: y / max(1, |y|)."""
-        nearest: Array = dual / np.repeat(np.maximum(_lengths(dual, self.size), 1.0), self.size)
-        return nearest
+        return dual / np.repeat(np.maximum(_lengths(dual, self.size), 1.0), self.size)
 
     def gap(self, residual: Array, dual: Array) -> float:
         """See `Norm`; F* is 0 for a dual no longer than 1."""
@@ -183,8 +182,7 @@ class Huber:
         """See `Norm`: y / (1 + sigma / 2 scale), no longer than 2 delta scale."""
         dual = dual / (1 + np.asarray(sigma) / (2 * self.scale))
         excess = _lengths(dual, self.size) / (2 * self.delta * self.scale)
-        nearest: Array = dual / np.repeat(np.maximum(excess, 1.0), self.size)
-        return nearest
+        return dual / np.repeat(np.maximum(excess, 1.0), self.size)
 
     def gap(self, residual: Array, dual: Array) -> float:
         """See `Norm`; F* is |y|^2 / 4 scale."""
@@ -283,8 +281,7 @@ class Largest:
         size = np.sort(np.abs(dual))[::-1]
         excess = np.maximum((np.cumsum(size) - 1) / np.arange(1, len(size) + 1), 0.0)
         threshold = excess.max(initial=0.0)
-        nearest: Array = np.sign(dual) * np.maximum(np.abs(dual) - threshold, 0.0)
-        return nearest
+        return np.sign(dual) * np.maximum(np.abs(dual) - threshold, 0.0)
 
     def gap(self, residual: Array, dual: Array) -> float:
         """See `Norm`; F* is 0 for a dual whose |y| sum up to no more than 1."""
@@ -305,8 +302,7 @@ def _lengths(rows: Array, size: int) -> Array:
     if size == 1:
         return np.abs(rows).ravel()
     groups = rows.reshape(-1, size)
-    length: Array = np.sqrt((groups * groups).sum(axis=1))
-    return length
+    return np.sqrt((groups * groups).sum(axis=1))
 
 
 def smoothing(residual: Array) -> float:

@@ -207,11 +207,9 @@ def _typical_information(graph: FactorGraph) -> Array:
     roots = factors.sqrt_information[loops if loops.any() else factors.is_odometry]
     size = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
     median = np.argsort(size, kind='stable')[(len(size) - 1) // 2]
-    information: Array = _information(roots[median : median + 1])[0]
-    return information
+    return _information(roots[median : median + 1])[0]
 
 
 def _information(roots: Array) -> Array:
     """Return L L' of the stacked roots L', (m, d, d)."""
-    information: Array = roots.transpose(0, 2, 1) @ roots
-    return information
+    return roots.transpose(0, 2, 1) @ roots

@@ -233,8 +233,7 @@ def _stamps(record: GraphRecord) -> list[int]:
         k = bad[0] if len(bad) else -1
         raise GraphError(f'vertex {record.ids[k]} has the stamp {stamps[k]} ns; expected one '
                          'after 0, after that of the vertex before, and before the year 2038')
-    as_list: list[int] = stamps.tolist()
-    return as_list
+    return stamps.tolist()
 
 
 def _chain(graph: FactorGraph, steps: Indices) -> Array:

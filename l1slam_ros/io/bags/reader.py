@@ -168,8 +168,7 @@ def _note_in(file: Path) -> dict[str, str]:
                 return entries
             if name == 'rosbag2':
                 metadata = yaml.safe_load(entries['serialized_metadata'])
-    note: dict[str, str] = yaml.safe_load((metadata.get('custom_data') or {}).get(NOTE_KEY, '{}'))
-    return note
+    return yaml.safe_load((metadata.get('custom_data') or {}).get(NOTE_KEY, '{}'))
 
 
 def _bag_path(path: str | os.PathLike[str]) -> Path:

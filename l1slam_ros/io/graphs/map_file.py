@@ -41,8 +41,8 @@ class MapFile:
         self._backend, self._options, self._warn = backend, options, warn
         self.is_saving = False
         self._began, self._took = time.monotonic(), 0.0
-        # What was saved or loaded last: where, and the version of the map.
-        self._known: tuple[object, ...] = options().save_path, backend.version
+        # Where the map was saved or loaded last, and its version then.
+        self._known = _absolute(options().save_path), backend.version
         # The file that we wrote or loaded, its end, and the graph whose map it holds.
         self._ours: tuple[object, ...] = ()
 
@@ -52,11 +52,16 @@ class MapFile:
             version = self._backend.version
             return self._write(self._path(), self._backend.saved(), version)
 
-    def autosave(self) -> None:
-        """Save the map if it has changed; what stood in its place, if not its own, is kept."""
+    def autosave(self, taken: Callable[[], None] = lambda: None) -> None:
+        """
+        Save the map if it has changed; what stood in its place, if not its own, is kept.
+
+        taken : called before it is written: what becomes of the map from then on does not matter
+        """
         with self._at_work():
             version = self._backend.version
             saved = self._backend.saved() if self._is_to_be_saved() else None
+            taken()
             if saved is None:
                 return
             path = self._path()
@@ -75,9 +80,10 @@ class MapFile:
         finally:
             self._took, self.is_saving = time.monotonic() - self._began, False
 
-    def _write(self, path: Path, saved: SavedMap | None, version: object) -> str:
+    def _write(self, path: Path, saved: SavedMap | None,
+               version: tuple[int, int, int]) -> str:
         sentence = save_map(path, saved)
-        self._known = self._options().save_path, version
+        self._known = path, version
         self._ours = path, _end_of(path), saved.number if saved else 0
         return sentence
 
@@ -96,7 +102,7 @@ class MapFile:
         if found is not expected:
             raise FileError(path, f'is a map of {found.NAME}; expected one of {expected.NAME}')
         number = self._backend.restore(saved)
-        self._known = self._options().save_path, self._backend.version
+        self._known = path, self._backend.version
         # What could not be read may be of use to somebody yet.
         self._ours = (path, end, number) if whole else ()
         return sentence, whole
@@ -120,7 +126,7 @@ class MapFile:
     def _is_to_be_saved(self) -> bool:
         options = self._options()
         return (options.save_path != '' and options.autosave_period > 0
-                and self._known != (options.save_path, self._backend.version))
+                and self._known != (_absolute(options.save_path), self._backend.version))
 
     def _path(self) -> Path:
         path = self._options().save_path
@@ -141,7 +147,7 @@ def unusable_path(save_path: str) -> str:
 
 def _absolute(path: str) -> Path:
     # Not `Path.expanduser`: that raises where there is no such home.
-    return Path(os.path.expanduser(path)).absolute()
+    return Path(os.path.expanduser(path)).absolute() if path else Path()
 
 
 def _end_of(path: Path) -> bytes:

@@ -125,8 +125,7 @@ def _parse(path: object, name: str, lines: TextLines, rotation_information: str,
 def _offsets(path: object, groups: dict[str, TextLines]) -> Indices:
     """Return the numbers of the offsets that are not the identity, (k,)."""
     ids, values = parse_rows(path, OFFSET, groups.get(OFFSET, TextLines([], [])), 1, 7)
-    moved: Indices = ids[(values[:, :6] != 0).any(axis=1), 0]
-    return moved
+    return ids[(values[:, :6] != 0).any(axis=1), 0]
 
 
 def vertices_of(path: object, groups: dict[str, TextLines], manifold: Manifold) -> Rows:

@@ -114,6 +114,10 @@ def test_until_loops_join_it_a_part_begins_where_the_last_one_ends():
     expected = se2.compose(poses[39:40], se2.between(np.repeat(poses[40:41], 20, 0), poses[40:]))
     assert_allclose(builder.track.keyframe_poses[40:], expected, atol=1e-9)
     assert builder.track.keyframe_stamps[40] == seconds(101.0)
+    # Each part is told of, not only the first.
+    assert builder.notes.news()[0].endswith('a new part of the map begins where the last one ends')
+    drive_on(builder, poses[40:], start=101.0)
+    assert len(builder.notes.news()) == 1 and builder.notes.warned == {'new_part': 2}
 
 
 @pytest.mark.parametrize('reference, stamp, ends', [

@@ -212,8 +212,7 @@ class LoopFactors:
             else:
                 self._refuse('same_keyframe', loops[row].loop, 'begins and ends at one keyframe; '
                              'expected two')
-        can: Mask = ~(early | same)
-        return can
+        return ~(early | same)
 
     def _note(self, rows: Indices, stamps: Indices) -> None:
         self._rows.extend(rows)

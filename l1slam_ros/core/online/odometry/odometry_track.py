@@ -77,8 +77,7 @@ class OdometryTrack:
     @property
     def last_pose(self) -> Array:
         """Pose of the last sample, (1, p)."""
-        pose: Array = self._poses.view()[-1:].copy()
-        return pose
+        return self._poses.view()[-1:].copy()
 
     @property
     def keyframe_stamps(self) -> Indices:
@@ -88,14 +87,12 @@ class OdometryTrack:
     @property
     def keyframe_poses(self) -> Array:
         """Poses of the keyframes, (n, p)."""
-        poses: Array = self._poses.view()[self._keyframes.view()]
-        return poses
+        return self._poses.view()[self._keyframes.view()]
 
     def keyframe_pose(self, k: int) -> Array:
         """Return the pose of a keyframe, (1, p)."""
         sample = int(self._keyframes.view()[k])
-        pose: Array = self._poses.view()[sample : sample + 1]
-        return pose
+        return self._poses.view()[sample : sample + 1]
 
     @property
     def gaps(self) -> Indices:
@@ -219,8 +216,7 @@ class OdometryTrack:
         update happens to look for it.
         """
         samples = self._times.view()
-        reached: Indices = np.maximum(arrivals, samples[np.searchsorted(samples, times)])
-        return reached
+        return np.maximum(arrivals, samples[np.searchsorted(samples, times)])
 
     def nearest_keyframe(self, times: Indices, known: Indices) -> Indices:
         """Return the keyframe nearest to each time, of its part and up to `known`, (m,)."""
@@ -230,8 +226,7 @@ class OdometryTrack:
         after = np.clip(np.searchsorted(keyframes, times), first, last)
         before = np.maximum(after - 1, first)
         nearer_before = times - keyframes[before] <= keyframes[after] - times
-        nearest: Indices = np.where(nearer_before, before, after)
-        return nearest
+        return np.where(nearer_before, before, after)
 
     def at(self, times: Indices) -> Array:
         """Return the poses at some times, interpolated between samples of a part, (m, p)."""
