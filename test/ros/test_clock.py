@@ -39,6 +39,7 @@ def test_a_bag_played_twice_by_a_clock_that_stands_is_the_map_and_the_odometry(b
             b.send(message.topic, message.data)
         b.until(lambda turn=turn: b.status()[2].get('keyframes') == str(turn * N), 'all is in')
         assert call(b, 'optimize').success
-        b.until(lambda turn=turn: len(b.path().poses) == turn * N, 'the map is published')
-        assert np.abs(poses_of(b.path())[:N] - once)[:, :2].max() < 0.05
+        # One of before it was optimised may have as many keyframes.
+        b.until(lambda turn=turn: len(b.path().poses) == turn * N and np.abs(
+            poses_of(b.path())[:N] - once)[:, :2].max() < 0.05, 'the map is published')
     assert b.status()[2]['refused.repeated'] == str(len(world.graph.between) - N + 1)

@@ -202,7 +202,7 @@ def test_a_node_that_is_managed_does_as_it_is_told(bench, tmp_path):
     b.until(lambda: b.status()[2].get('odom.received') == '4', 'it has come')
     assert change(b, Transition.TRANSITION_CLEANUP) and state(b) == 'unconfigured'
     b.until(lambda: not b.path().poses, 'the map is empty')
-    # The next autosave would have been a minute later.
+    b.until(path.exists, 'it is saved; the next autosave would be a minute later')
     assert load_map(path)[1] == f'2 keyframes loaded from {path}'
     assert change(b, Transition.TRANSITION_CONFIGURE) and change(b, Transition.TRANSITION_ACTIVATE)
     assert change(b, Transition.TRANSITION_ACTIVE_SHUTDOWN) and state(b) == 'finalized'
