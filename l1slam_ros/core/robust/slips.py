@@ -101,6 +101,11 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
                 or (usual and all(_spans(state, step) for step in steps))):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
+    if not found and growth.cut.any():
+        # In the end more is known than when it was cut.
+        now = log_odds_of_slips(growth, motion)
+        growth.slip_odds |= {step: max(odds, float(now[step]))
+                             for step, odds in growth.slip_odds.items() if growth.cut[step]}
     return found
 
 
@@ -134,7 +139,7 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[list[int]
     tell[left_out] = True
     across = spanned(growth.low[tell], growth.high[tell], growth.graph.n_poses)
     # Where no loop can tell, an unusual motion is no more than that.
-    told = np.where(across[growth.low] > 0, odds, -np.inf)
+    told = np.where((across[growth.low] > 0) & ~growth.cut, odds, -np.inf)
     order = np.argsort(-told, kind='stable')[:_TRIED]
     # Where loops are left out, one more place may be won.
     least = max(SURE, _place(growth)) if len(left_out) else SURE
@@ -269,15 +274,14 @@ def _cut_at(state: Growth, cut: int, step: int) -> Growth:
 
 
 def _put_back(state: Growth, steps: list[int], motion: Motion) -> tuple[Growth, float] | None:
-    """Return the state where steps say again what they measured, and the odds, if that fits."""
-    found = state.uncut().innovations(np.array(steps))
-    if (found.square >= state.gate(found.freedom)).any():
+    """Return the state where steps say what they measured, and the odds, if that is likelier."""
+    odds = float(log_odds_of_slips(state, motion)[steps].max())
+    if odds > 0:
         return None
     back = state.copy()
     back.cut[steps] = False
     back.solve()
-    odds = float(log_odds_of_slips(back, motion)[steps].max())
-    return (back, odds) if odds < 0 else None
+    return back, odds
 
 
 def _moves_as_usual(state: Growth, cut: int, motion: Motion) -> bool:
