@@ -24,7 +24,7 @@ from l1slam_ros.core.robust.pairwise_consistency import (
 )
 from l1slam_ros.core.robust.places import err_together
 from l1slam_ros.core.robust.rounds import Growth
-from l1slam_ros.core.robust.slips import SPANNING, SURE, common_steps, spanning
+from l1slam_ros.core.robust.slips import JOINING, SPANNING, SURE, common_steps, spanning
 
 # Most loops are refused; all that are accepted are of one place; loops of one place alone say how
 # two parts lie to each other; refused loops of several places agree on another map; an odometry
@@ -243,7 +243,7 @@ def _other_map(growth: Growth) -> list[Doubt]:
     """Return a doubt where refused loops of several places agree: they may be right."""
     outside = growth.undecided()
     group = strongest_group(growth, outside)
-    if len(group.places) < SPANNING:
+    if len(group.places) < JOINING:
         return []
     accepted, size = growth.accepted & growth.is_loop, len(group.rows) * max(
         len(outside) / ASKED, 1.0)
@@ -252,7 +252,8 @@ def _other_map(growth: Growth) -> list[Doubt]:
     # What is trusted is right, whatever else speaks against it. Beside a slip, which is a guess of
     # what happened, all of the loops across should agree.
     slipped = (growth.cut & ~growth.gap).any()
-    if trusted or (size < _AGAINST * against and not slipped):
+    few = len(group.places) < SPANNING and against
+    if trusted or few or (size < _AGAINST * against and not slipped):
         return []
     return [_doubt(growth, OTHER_MAP, group.rows)]
 

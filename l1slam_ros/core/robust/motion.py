@@ -95,33 +95,39 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     moved as it does where this factor says so, and all others say what it says:
 
         p(m, C as motion) / (claims n p(z as motion) p(z - m; C))
+
+    Of one that is cut, all others know nothing of it as it is.
     """
     from l1slam_ros.core.kernels.prediction import normalise
 
     odds = np.full(len(growth.factors), -np.inf)
     manifold, factors = growth.graph.manifold, growth.factors
     k = manifold.TANGENT_SIZE
-    rows = np.flatnonzero(~growth.is_loop & ~growth.cut & (factors.freedom == k))
+    rows = np.flatnonzero(~growth.is_loop & ~growth.gap & (factors.freedom == k))
     at = np.searchsorted(np.flatnonzero(growth.accepted), rows)
     R, r = growth.posterior.moment[at], growth.posterior.residual[at]
     inverse = np.linalg.inv(R + _ALONE * np.eye(k))
     # Of what no other says, the residual is rounding.
     innovation = inverse @ R @ inverse @ r[:, :, None]
-    root = unwhitening(growth, rows)
+    measured, cut = growth.uncut(), growth.cut[rows]
+    without = measured.innovations(rows[cut])
+    inverse[cut] = without.spread + np.eye(k)
+    innovation[cut, :, 0] = -without.system.b.reshape(-1, k)
+    root = unwhitening(measured, rows)
     spread = root @ inverse @ root.transpose(0, 2, 1)
     square, log_det = normalise(inverse.copy(), innovation[:, :, 0])
     # All may be as noisy as they turn out, or as they say.
-    found = max((r**2).sum() / np.trace(R, axis1=1, axis2=2).sum(), 1.0)
+    found = max((r[~cut] ** 2).sum() / np.trace(R[~cut], axis1=1, axis2=2).sum(), 1.0)
     said = growth.variance_at_their_word()[0] / growth.variance[0]
-    measured = np.max([log_likelihood_ratio(square / noise, log_det + k * np.log(noise),
-                                            np.zeros(1), factors.freedom[rows], k)
-                       for noise in (found, said)], axis=0) - np.linalg.slogdet(root)[1]
+    fit = np.max([log_likelihood_ratio(square / noise, log_det + k * np.log(noise),
+                                       np.zeros(1), factors.freedom[rows], k)
+                  for noise in (found, said)], axis=0) - np.linalg.slogdet(root)[1]
     start = manifold.identity(len(rows))
     moved = manifold.retract(growth.forward[rows], (root @ innovation)[:, :, 0])
     J = manifold.local_jacobian(start, moved)
     claims = claimed_volume(manifold, growth.poses).sum()
     motions = motion.log_density(manifold.local(start, moved), J @ spread @ J.transpose(0, 2, 1))
-    odds[rows] = motions - motion.log_density(steps_of(growth, rows)) - measured - (
+    odds[rows] = motions - motion.log_density(steps_of(growth, rows)) - fit - (
         claims + np.log(len(rows)))
     return odds
 

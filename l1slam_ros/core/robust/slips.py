@@ -8,7 +8,7 @@ where loops of two places or more do. A slip is suspected where the odds of one 
 (`motion`), or where loops that are left out agree. Then slip and lies are compared: the step is
 cut, the loops across are asked anew, and the rounds go on from there; so are the two on either
 side of keyframes that odometry alone holds where they are. To the odds comes half a gate for each
-place of loops that are won and that nothing else explains, less one for each that is lost. A slip
+place that is won and that nothing else explains, less one for each that is lost. A slip
 is believed if that makes it likelier than not, and if three places span it where it is only
 places that say so. Loops do not make a robot jump: the slip repaired, it has to move as at some
 other step, or rather so than as measured. What fits the loops that came in without it did not
@@ -34,7 +34,7 @@ from l1slam_ros.core.robust.pairwise_consistency import Group, spanned, stronges
 from l1slam_ros.core.robust.rounds import Growth
 
 # Places that join two parts, and that span a slip, at least.
-_JOINING, SPANNING = 2, 3
+JOINING, SPANNING = 2, 3
 # So many steps are tried for each reason.
 _TRIED = 2
 # What is nearly sure: ln of the odds.
@@ -51,7 +51,7 @@ def join(growth: Growth) -> bool:
         pair = np.sort(parts, axis=0).T @ np.array([growth.graph.n_poses, 1])
         groups = [strongest_group(growth, rows[pair == one]) for one in np.unique(pair)]
         group = max(groups, key=lambda group: len(group.places))
-        if len(group.places) < _JOINING:
+        if len(group.places) < JOINING:
             return joined
         _join_by(growth, group)
         joined = True
@@ -101,6 +101,11 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
                 or (usual and all(_spans(state, step) for step in steps))):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
+    if not found and growth.cut.any():
+        # In the end more is known than when it was cut.
+        now = log_odds_of_slips(growth, motion)
+        growth.slip_odds |= {step: max(odds, float(now[step]))
+                             for step, odds in growth.slip_odds.items() if growth.cut[step]}
     return found
 
 
@@ -134,7 +139,7 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[list[int]
     tell[left_out] = True
     across = spanned(growth.low[tell], growth.high[tell], growth.graph.n_poses)
     # Where no loop can tell, an unusual motion is no more than that.
-    told = np.where(across[growth.low] > 0, odds, -np.inf)
+    told = np.where((across[growth.low] > 0) & ~growth.cut, odds, -np.inf)
     order = np.argsort(-told, kind='stable')[:_TRIED]
     # Where loops are left out, one more place may be won.
     least = max(SURE, _place(growth)) if len(left_out) else SURE
@@ -208,12 +213,18 @@ def _spans(state: Growth, step: int) -> bool:
 
 
 def _gain(growth: Growth, as_stated: Growth, cut: Growth) -> float:
-    """Return what the places say whose loops are won and lost by a cut, ln of odds."""
-    before, explained, after = (state.accepted & growth.is_loop
+    """
+    Return what the places say that are won and lost by a cut, ln of odds.
+
+    Loops of a place that span the cut, and those that do not, are not of one mistake.
+    """
+    steps = np.flatnonzero(cut.cut & ~growth.cut).tolist()
+    side = np.sum([spanning(growth, step) for step in steps], axis=0, dtype=np.int64)
+    place = growth.place * (len(steps) + 1) + side
+    before, explained, after = (np.unique(place[state.accepted & growth.is_loop])
                                 for state in (growth, as_stated, cut))
-    won, lost = (len(np.unique(growth.place[some]))
-                 for some in (after & ~before & ~explained, before & ~after))
-    return _place(growth) * (won - lost)
+    won = len(np.setdiff1d(after, np.union1d(before, explained)))
+    return _place(growth) * (won - len(np.setdiff1d(before, after)))
 
 
 def _place(growth: Growth) -> float:
@@ -269,15 +280,15 @@ def _cut_at(state: Growth, cut: int, step: int) -> Growth:
 
 
 def _put_back(state: Growth, steps: list[int], motion: Motion) -> tuple[Growth, float] | None:
-    """Return the state where steps say again what they measured, and the odds, if that fits."""
+    """Return the state where steps say what they measured, and their odds, where that fits."""
+    odds = float(log_odds_of_slips(state, motion)[steps].max())
     found = state.uncut().innovations(np.array(steps))
-    if (found.square >= state.gate(found.freedom)).any():
+    if odds > 0 or (found.square > state.gate(found.freedom)).any():
         return None
     back = state.copy()
     back.cut[steps] = False
     back.solve()
-    odds = float(log_odds_of_slips(back, motion)[steps].max())
-    return (back, odds) if odds < 0 else None
+    return back, odds
 
 
 def _moves_as_usual(state: Growth, cut: int, motion: Motion) -> bool:
