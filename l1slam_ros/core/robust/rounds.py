@@ -241,6 +241,7 @@ class Growth:
             self._check()
             self.poses = l2_map(subgraph, self.poses, cholesky, lambda *_: self._check())
             self._check()
+            vars(self).pop('posterior', None)  # as large as the one that takes its place
             self.posterior = sample_posterior(subgraph, self.poses, cholesky)
             if self._is_noisier(rows):
                 continue
