@@ -113,13 +113,13 @@ def minimise_robustly(
 
 
 def rounds(
-    growth: Growth, repaired: Callable[[Growth, Growth], Growth | None]
+    growth: Growth, repaired: Callable[[Growth, Growth], Growth | None] | None = None
 ) -> Iterator[Growth]:
     """
     Yield the state after each round, until there is nothing more to accept.
 
     repaired : asked in the end for another state, from the one with the noise as it was found and
-    the one where all may be as noisy as they say; None: there is none.
+    the one where all may be as noisy as they say; None: there is none, or nobody looks for one.
     """
     found = None
     for _ in range(_MOST_ROUNDS):
@@ -129,11 +129,11 @@ def rounds(
             growth.solve()
         elif not join(growth):
             if not found:
-                found = growth.copy()
+                found = growth.copy() if repaired else growth
                 growth.take_at_their_word()
                 growth.solve()
             else:
-                other = repaired(found, growth)
+                other = repaired(found, growth) if repaired else None
                 growth.slip_odds = found.slip_odds
                 if not other:
                     break
@@ -160,7 +160,7 @@ def judge(
     first, settled = Growth(graph, check), True
     first.resume(poses, known.accepted, known.variance)
     growth = first
-    for growth in rounds(first, lambda *_: None):
+    for growth in rounds(first):
         # The end is not put off once it is in sight, or short budgets would never get there.
         if time.monotonic() > deadline and not growth.at_their_word:
             settled = False

@@ -248,6 +248,7 @@ class Growth:
             residual = whitened_residual(subgraph, self.poses).reshape(len(rows), -1)
             misfits = self._misfits(rows, residual) if noise_fits else rows[:0]
             if not len(misfits):
+                vars(self).pop('posterior', None)  # as large as the one that takes its place
                 self.posterior = sample_posterior(subgraph, self.poses, cholesky)
                 if self._is_noisier(rows):
                     continue
