@@ -313,10 +313,13 @@ class Growth:
         return innovations(self.subgraph(rows), self.poses, self.posterior, widths)
 
     def news(self) -> Indices:
-        """Return the loops to accept next, (k,); one that was dropped waits for all others."""
+        """Return the loops to accept next, (k,); in the end what was dropped, all at once."""
         news = self.believable(self.undecided())
         fresh = news[self.drops[news] == 0]
-        return fresh if len(fresh) else news
+        if len(fresh):
+            return fresh
+        self.drops[self.drops > 0] += 1
+        return news
 
     def believable(self, rows: Indices) -> Indices:
         """Return which of some loops may be accepted: each by itself, or else together, (k,)."""
