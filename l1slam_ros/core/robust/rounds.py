@@ -315,7 +315,7 @@ class Growth:
     def news(self) -> Indices:
         """Return the loops to accept next, (k,); in the end what was dropped, all at once."""
         news = self.believable(self.undecided())
-        fresh = news[self.drops[news] == 0]
+        fresh: Indices = news[self.drops[news] == 0]
         if len(fresh):
             return fresh
         self.drops[self.drops > 0] += 1
