@@ -45,6 +45,8 @@ REFUSED = 1e-3
 _DROPPED = 2e-5
 # Probability that any true factor of a round is doubted for what the others say.
 _DOUBTED = 0.01
+# A loop that was dropped that often is not tried again.
+_CHANCES = 2
 # What is measured of the noise counts against as many factors on which it was measured before.
 _KNOWN = 20
 # The noise is learnt to be no less than this part of the variance that was found first: factors
@@ -77,7 +79,7 @@ class Growth:
     place : (m,) see `places`; part : (n,) number of the part of each keyframe; poses : (n, p) the
     L2 map of the accepted; posterior : of these; variance : (2,) of odometry and loops in units of
     what they state; slip_odds : ln P(slipped) / P(measured) of the odometry factors that were
-    suspected; dropped : (m,) bool, loops that did not fit once accepted, not to be tried again;
+    suspected; drops : (m,) how often each was accepted and did not fit;
     at_their_word : whether factors may be as noisy as they say; check : called before long steps,
     raises where the work shall stop.
     """
@@ -98,7 +100,7 @@ class Growth:
         self._floor, self.at_their_word = np.full(2, _LEAST_VARIANCE), False
         self.posterior: Posterior
         self.slip_odds: dict[int, float] = {}
-        self.dropped = np.zeros(len(self.factors), bool)
+        self.drops = np.zeros(len(self.factors), np.int64)
 
     @cached_property
     def _places(self) -> tuple[Indices, Array]:
@@ -171,7 +173,7 @@ class Growth:
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
         clone = copy.copy(self)
-        clone.accepted, clone.dropped = self.accepted.copy(), self.dropped.copy()
+        clone.accepted, clone.drops = self.accepted.copy(), self.drops.copy()
         clone.cut, clone.variance = self.cut.copy(), self.variance.copy()
         clone.slip_odds = self.slip_odds.copy()
         return clone
@@ -208,7 +210,7 @@ class Growth:
     def take_at_their_word(self) -> None:
         """From now on let factors be as noisy as they say, if they are not noisier."""
         self.at_their_word = True
-        self.dropped[:] = False
+        self.drops[:] = 0
 
     def undecided(self) -> Indices:
         """Return the loops within a part that may yet be accepted, (k,)."""
@@ -220,7 +222,7 @@ class Growth:
 
     def _open(self, some: Mask) -> Indices:
         still: Indices = np.flatnonzero(
-            some & ~self.accepted & ~self.factors.struck & ~self.dropped)
+            some & ~self.accepted & ~self.factors.struck & (self.drops < _CHANCES))
         return still
 
     def across(self) -> Mask:
@@ -256,7 +258,8 @@ class Growth:
                 misfits = self._misfits(rows, residual, self.posterior.left_out())
                 if not len(misfits):
                     break
-            self.accepted[misfits], self.dropped[misfits] = False, True
+            self.accepted[misfits] = False
+            self.drops[misfits] += 1
         if not self._knows_noise:
             self._learn_variance(rows)
             self._learnt_of = self.accepted.copy()
@@ -309,6 +312,15 @@ class Growth:
         """Return how factors that are not accepted fit the map."""
         widths = claimed_volume(self.graph.manifold, self.poses)
         return innovations(self.subgraph(rows), self.poses, self.posterior, widths)
+
+    def news(self) -> Indices:
+        """Return the loops to accept next, (k,); in the end what was dropped, all at once."""
+        news = self.believable(self.undecided())
+        fresh: Indices = news[self.drops[news] == 0]
+        if len(fresh):
+            return fresh
+        self.drops[self.drops > 0] += 1
+        return news
 
     def believable(self, rows: Indices) -> Indices:
         """Return which of some loops may be accepted: each by itself, or else together, (k,)."""

@@ -181,7 +181,7 @@ def _without(growth: Growth, steps: list[int]) -> Growth | None:
     """Return the state after the rounds that follow if steps are cut; None: it falls apart."""
     state = growth.copy()
     state.cut[steps] = True
-    state.dropped[:] = False
+    state.drops[:] = 0
     for step in steps:
         span = spanning(growth, step)
         state.accepted[span] = state.trusted[span]
@@ -194,7 +194,7 @@ def _without(growth: Growth, steps: list[int]) -> Growth | None:
 
 def _accept_more(state: Growth) -> None:
     """Go through the rounds until there is nothing more to accept."""
-    while len(news := state.believable(state.undecided())):
+    while len(news := state.news()):
         state.accepted[news] = True
         state.solve()
 
