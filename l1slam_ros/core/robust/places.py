@@ -11,6 +11,7 @@ are of one place, and whether the loops of a place err together.
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, lowest_of_components
 from l1slam_ros.core.graph.linear_system import with_world
 
@@ -94,6 +95,32 @@ def neighbours_agree(place: Indices, ends: Array) -> float:
     with_neighbour, first = np.unique(a[nearest_first], return_index=True)
     agree = np.count_nonzero(place[with_neighbour] == place[b[nearest_first[first]]])
     return float((agree + 1) / (len(with_neighbour) + 1))
+
+
+def mates(place: Indices, ends: Array) -> tuple[Indices, Indices]:
+    """Return the pairs of loops of a place within reach, both ways round, (pairs,) each."""
+    one, other = _near(ends, 1.0)
+    same = place[one] == place[other]
+    one, other = one[same], other[same]
+    return np.concatenate((one, other)), np.concatenate((other, one))
+
+
+def beside_refused(pairs: tuple[Indices, Indices], refused: Mask, true: Mask) -> Array:
+    """
+    Return what the other loops of its place speak against each factor, ln of odds, (m,).
+
+    How much likelier it is that most of them are refused if it is false than if it is true, by how
+    often that is so of those that are refused, and of the true ones; see `mates`.
+    """
+    one, other = pairs
+    count, against = (np.bincount(one, weights, len(refused))
+                      for weights in (None, refused[other]))
+    beside = against > count / 2
+    if not beside.any():
+        return np.zeros(len(refused))
+    of_false, of_true = ((np.count_nonzero(beside & some) + 1)
+                         / (np.count_nonzero((count > 0) & some) + 1) for some in (refused, true))
+    return np.where(beside, max(float(np.log(of_false / of_true)), 0.0), 0.0)
 
 
 def _near(points: Array, reach: float) -> tuple[Indices, Indices]:
