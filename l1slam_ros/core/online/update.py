@@ -125,7 +125,10 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
         check()
         system = linearise(graph, poses)
         mu = max(_SMOOTHING * _SHARPER**steps, _SHARPEST) * smoothing(system.b)
-        step, dual = reweighted_step(system, method.cholesky, system.b, mu)
+        try:
+            step, dual = reweighted_step(system, method.cholesky, system.b, mu)
+        except GraphError:  # sharper weights are beyond double precision
+            break
         previous = cost
         poses, cost = backtrack(graph, poses, step, cost)
         steps += 1

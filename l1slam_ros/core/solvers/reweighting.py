@@ -5,6 +5,8 @@ Weighted linear least squares by one sparse factorisation, and the start it give
 In: a linear system. Out: the step that minimises a weighted sum of squares.
 """
 
+from contextlib import suppress
+
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
@@ -66,11 +68,16 @@ def reweighted_start(system: LinearSystem, cholesky: BlockCholesky) -> tuple[Arr
     From the least squares solution, `reweighted_step` with mu halved each time: it follows the
     minimum of sum sqrt(r^2 + mu^2). The optimum of the angles is often not unique (files round
     their numbers, so costs tie): this path leads to the middle of the optimal face, where a
-    first-order method alone ends wherever it came from.
+    first-order method alone ends wherever it came from. It ends early where sharper weights are
+    beyond double precision, as on a straight way of kilometres that one weak factor ties.
     """
     x = weighted_least_squares(system, cholesky, np.ones_like(system.b))
-    mu = smoothing(system.times(x) - system.b)
-    for _ in range(_SMOOTHING_STEPS):
-        x, y = reweighted_step(system, cholesky, system.times(x) - system.b, mu)
-        mu /= 2
+    r = system.times(x) - system.b
+    mu = smoothing(r)
+    y = r / np.hypot(r, mu)
+    with suppress(GraphError):
+        for _ in range(_SMOOTHING_STEPS):
+            x, y = reweighted_step(system, cholesky, r, mu)
+            r = system.times(x) - system.b
+            mu /= 2
     return x, y

@@ -78,3 +78,15 @@ def test_the_start_of_a_problem_that_fits_exactly():
     x, y = reweighted_start(system, cholesky_of_system(system))
     assert_allclose(x, problem.x, atol=1e-9)
     assert np.abs(y).max() <= 1
+
+
+def test_weights_are_sharpened_no_further_than_double_precision_bears():
+    """Two keyframes stiffly joined, that two weak factors which contradict each other tie."""
+    A = csr_array(np.array([[1e-6, 0.0], [1e-6, 0.0], [1.0, -1.0], [1.0, -1.0]]))
+    system = system_of(A, np.array([1.0, -1.0, 0.0, 0.0]))
+    cholesky = cholesky_of_system(system)
+    with pytest.raises(GraphError, match='beyond double precision'):
+        reweighted_step(system, cholesky, -system.b, mu=1e-3)
+    x, y = reweighted_start(system, cholesky)
+    assert l1_cost(A @ x - system.b) == pytest.approx(2.0)
+    assert np.abs(y).max() <= 1
