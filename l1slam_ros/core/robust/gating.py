@@ -14,7 +14,6 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.robust.innovation import Innovations, Posterior, log_likelihood_ratio
-from l1slam_ros.core.robust.places import neighbours_agree
 
 # What squares of true factors stay below, by their freedom.
 Gate = Callable[[Indices], Array]
@@ -61,7 +60,7 @@ def probability(log_odds: Array) -> Array:
 
 def believable(
     found: Innovations, posterior: Posterior, gate: Gate, fits: Mask, believed: int,
-    where: tuple[Indices, Array], beside: Array,
+    place: Indices, beside: Array,
 ) -> Indices:
     """
     Return the factors that may be believed: each by itself, or else together, (k,).
@@ -70,16 +69,16 @@ def believable(
     ----------
     gate : what squares of true factors stay below, by their freedom; fits : (m,) which do
     believed : how many others are true for sure
-    where : their places, see `places`; beside : (m,) what these say, see `beside_refused`
+    place : (m,) see `places`; beside : (m,) what these say, see `beside_refused`
 
     """
     log_ratio = found.log_ratio()
     odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)), believed)
     log_odds = np.logaddexp(
-        odds + beside, rivals(found, posterior, (fits, log_ratio, odds), where[0]))
+        odds + beside, rivals(found, posterior, (fits, log_ratio, odds), place))
     good: Indices = np.flatnonzero(fits)[at_once((log_ratio - log_odds)[fits])]
     if not len(good):
-        good = together(found, posterior, gate, (fits, log_ratio, log_odds), where)
+        good = together(found, posterior, gate, (fits, log_ratio, log_odds), place)
     return good
 
 
@@ -91,42 +90,35 @@ def at_once(log_odds: Array) -> Indices:
     return good
 
 
-def together(
-    found: Innovations, posterior: Posterior, gate: Gate,
-    alone: tuple[Mask, Array, Array], where: tuple[Indices, Array],
-) -> Indices:
+def together(found: Innovations, posterior: Posterior, gate: Gate,
+             alone: tuple[Mask, Array, Array], place: Indices) -> Indices:
     """
     Return which factors may be believed for what others say that fit, (k,).
 
-    To the log ratio of a factor a come that of the best one b of another place, given a, less the
-    odds that b is false by chance too; and of each one b of its own place, but no more than
-    -ln q: q is how often neighbours agree that are refused.
+    To the log ratio of a factor a comes that of the best one b of another place, given a, less the
+    odds that b is false by chance too.
 
     Parameters
     ----------
     gate : what squares of true factors stay below, by their freedom
     alone : which fit (m,), the log ratios and the log odds (m,)
-    where : see `places`
+    place : (m,) see `places`
 
     """
-    (fits, log_ratio, odds), (place, ends) = alone, where
+    fits, log_ratio, odds = alone
     best = np.flatnonzero(fits)
     best = best[np.argsort(-log_ratio[best], kind='stable')[:_CANDIDATES]]
     a, b = (best[side] for side in np.triu_indices(len(best), 1))
+    a, b = (ends[place[a] != place[b]] for ends in (a, b))
     if not len(a):
         return best[:0]
     square, both = found.joint(posterior, a, b)
     agree = np.flatnonzero(square < gate(found.freedom[a] + found.freedom[b]))
     a, b, both = a[agree], b[agree], both[agree]
-    own = place[a] == place[b]
-    most = -np.log(neighbours_agree(place[~fits], ends[~fits]))
-    far, near = np.zeros(len(fits)), np.zeros(len(fits))
+    far = np.zeros(len(fits))
     for one, other in ((a, b), (b, a)):
-        more = both - log_ratio[one]
-        np.maximum.at(far, one[~own], (more - np.maximum(odds[other], 0.0))[~own])
-        np.add.at(near, one[own], np.clip(more[own], 0.0, most))
-    evidence = log_ratio + far + near
-    sure = (evidence > odds + np.log(1 / DOUBT - 1)) & (far + near > 0)
+        np.maximum.at(far, one, both - log_ratio[one] - np.maximum(odds[other], 0.0))
+    sure = (log_ratio + far > odds + np.log(1 / DOUBT - 1)) & (far > 0)
     believed: Indices = best[sure[best]]
     return believed
 

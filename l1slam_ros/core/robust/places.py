@@ -4,8 +4,8 @@ Places: loops that may be one mistake, or have one error.
 
 In: a graph. Out: the number of the place of each loop. Two loops that join the same two stretches
 of the way and claim nearly the same are linked; a place is what links tie together (single
-linkage). Near is measured along the way in metres, never in keyframes. And how often neighbours
-are of one place, and whether the loops of a place err together.
+linkage). Near is measured along the way in metres, never in keyframes. And what neighbours say of
+each other, and whether the loops of a place err together.
 """
 
 import numpy as np
@@ -80,21 +80,6 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
     lowest = lowest_of_components(*_near(cells, 1 / _GRAIN), len(cells))
     place = np.unique(lowest, return_inverse=True)[1]
     return place[cell.ravel()], ends
-
-
-def neighbours_agree(place: Indices, ends: Array) -> float:
-    """
-    Return how often the nearest other loop within reach is of the same place, at least.
-
-    place, ends : of the loops that are asked, see `places`. Where few have neighbours the answer
-    is near 1: nothing is known of how lies come here.
-    """
-    a, b = _near(ends, 1.0)
-    a, b = np.concatenate((a, b)), np.concatenate((b, a))
-    nearest_first = np.lexsort((np.abs(ends[a] - ends[b]).max(axis=1), a))
-    with_neighbour, first = np.unique(a[nearest_first], return_index=True)
-    agree = np.count_nonzero(place[with_neighbour] == place[b[nearest_first[first]]])
-    return float((agree + 1) / (len(with_neighbour) + 1))
 
 
 def mates(place: Indices, ends: Array) -> tuple[Indices, Indices]:

@@ -339,8 +339,7 @@ class Growth:
         # the rest says how many of the rest are false.
         true = 0 if self._at_their_word else np.count_nonzero(loops)
         believed: Indices = rows[believable(
-            found, self.posterior, self.gate, fits, int(true),
-            (self.place[rows], self._places[1][rows]),
+            found, self.posterior, self.gate, fits, int(true), self.place[rows],
             beside_refused(self._mates, refused, loops)[rows])]
         return believed
 

@@ -6,7 +6,7 @@ import pytest
 from lies import careful_world
 from problems import chain_of, graph_of, measure, straight
 
-from l1slam_ros.core.robust.places import beside_refused, mates, neighbours_agree, places
+from l1slam_ros.core.robust.places import beside_refused, mates, places
 
 
 def corridor(step, pairs, off):
@@ -34,14 +34,6 @@ def test_a_run_is_one_place_and_what_claims_something_else_is_another():
     graph, chain = corridor(1.0, pairs, off)
     place = places(graph, chain)[0][-51:]
     assert len(set(place[:50].tolist())) == 1 and place[50] not in place[:50]
-
-
-def test_few_neighbours_tell_nothing_and_many_that_differ_tell_much():
-    ends = np.column_stack((np.arange(100) * 0.1, np.zeros(100)))
-    assert neighbours_agree(np.zeros(1, int), ends[:1]) == 1.0
-    assert neighbours_agree(np.arange(2), 10 * ends[:2] * 100) == 1.0
-    assert neighbours_agree(np.zeros(100, int), ends) == 1.0
-    assert neighbours_agree(np.arange(100), ends) == pytest.approx(1 / 101)
 
 
 def test_every_loop_of_a_world_has_a_place():
