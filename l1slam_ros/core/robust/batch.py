@@ -17,12 +17,13 @@ A true loop
 A lie
     claims anything: its innovation is uniform over as much as the map is wide, with any rotation.
     How many of the loops lie is not assumed: the odds come from the loops (empirical Bayes). A
-    loop is accepted where it and all accepted with it lie with a probability of 1% at most.
+    loop is accepted where it and all accepted with it lie with a probability of 1% at most. Of two
+    that contradict each other one lies, so each has to be the likelier of both by as much.
 A place
     is what loops near each other are of, in metres along the way (`places`). Lies of one place
-    may be one mistake: together they count once, unless the lies that were refused show that
-    neighbours hardly ever agree. The evidence of several places adds up
-    (`pairwise_consistency`).
+    may be one mistake: together they count once. A loop most of whose neighbours there are refused
+    is the less likely, the rarer true ones were found beside such. The evidence of several places
+    adds up (`pairwise_consistency`).
 A slip
     is an odometry factor that says anything, while the robot moved on as ever (`motion`); of all
     of them one is expected to be. A gap, or the seam of two sessions, is one whose place is known.

@@ -14,7 +14,9 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.robust.innovation import Innovations, Posterior, log_likelihood_ratio
-from l1slam_ros.core.robust.places import neighbours_agree
+
+# What squares of true factors stay below, by their freedom.
+Gate = Callable[[Indices], Array]
 
 # Of factors that are believed at one time, any is false with at most this probability.
 DOUBT = 0.01
@@ -56,54 +58,93 @@ def probability(log_odds: Array) -> Array:
     return chance
 
 
-def believable(log_ratio: Array, log_odds: float) -> Indices:
-    """Return the factors that may be believed, all of them at once, the surest first, (k,)."""
-    doubt = probability(log_odds - log_ratio)
-    order = np.argsort(doubt, kind='stable')
-    doubt = doubt[order]
-    good = np.cumsum(doubt) < DOUBT
-    believed: Indices = order[good]
-    return believed
-
-
-def together(
-    found: Innovations, posterior: Posterior, gate: Callable[[Indices], Array],
-    alone: tuple[Mask, Array, float], where: tuple[Indices, Array],
+def believable(
+    found: Innovations, posterior: Posterior, gate: Gate, fits: Mask, believed: int,
+    place: Indices, beside: Array,
 ) -> Indices:
+    """
+    Return the factors that may be believed: each by itself, or else together, (k,).
+
+    Parameters
+    ----------
+    gate : what squares of true factors stay below, by their freedom; fits : (m,) which do
+    believed : how many others are true for sure
+    place : (m,) see `places`; beside : (m,) what these say, see `beside_refused`
+
+    """
+    log_ratio = found.log_ratio()
+    odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)), believed)
+    log_odds = np.logaddexp(
+        odds + beside, rivals(found, posterior, (fits, log_ratio, odds), place))
+    good: Indices = np.flatnonzero(fits)[at_once((log_ratio - log_odds)[fits])]
+    if not len(good):
+        good = together(found, posterior, gate, (fits, log_ratio, log_odds), place)
+    return good
+
+
+def at_once(log_odds: Array) -> Indices:
+    """Return which may be believed, all of them at once, by ln (true / false), surest first."""
+    doubt = probability(-log_odds)
+    order = np.argsort(doubt, kind='stable')
+    good: Indices = order[np.cumsum(doubt[order]) < DOUBT]
+    return good
+
+
+def together(found: Innovations, posterior: Posterior, gate: Gate,
+             alone: tuple[Mask, Array, Array], place: Indices) -> Indices:
     """
     Return which factors may be believed for what others say that fit, (k,).
 
-    To the log ratio of a factor a come that of the best one b of another place, given a, less the
-    odds that b is false by chance too; and of each one b of its own place, but no more than
-    -ln q: q is how often neighbours agree that are refused.
+    To the log ratio of a factor a comes that of the best one b of another place, given a, less the
+    odds that b is false by chance too.
 
     Parameters
     ----------
     gate : what squares of true factors stay below, by their freedom
-    alone : which fit (m,), the log ratios (m,), and the log odds
-    where : see `places`
+    alone : which fit (m,), the log ratios and the log odds (m,)
+    place : (m,) see `places`
 
     """
-    (fits, log_ratio, odds), (place, ends) = alone, where
+    fits, log_ratio, odds = alone
     best = np.flatnonzero(fits)
     best = best[np.argsort(-log_ratio[best], kind='stable')[:_CANDIDATES]]
     a, b = (best[side] for side in np.triu_indices(len(best), 1))
+    a, b = (ends[place[a] != place[b]] for ends in (a, b))
     if not len(a):
         return best[:0]
     square, both = found.joint(posterior, a, b)
     agree = np.flatnonzero(square < gate(found.freedom[a] + found.freedom[b]))
     a, b, both = a[agree], b[agree], both[agree]
-    own = place[a] == place[b]
-    most = -np.log(neighbours_agree(place[~fits], ends[~fits]))
-    far, near = np.zeros(len(fits)), np.zeros(len(fits))
-    for one in (a, b):
-        more = both - log_ratio[one]
-        np.maximum.at(far, one[~own], more[~own] - max(odds, 0.0))
-        np.add.at(near, one[own], np.clip(more[own], 0.0, most))
-    evidence = log_ratio + far + near
-    sure = (evidence > odds + np.log(1 / DOUBT - 1)) & (far + near > 0)
+    far = np.zeros(len(fits))
+    for one, other in ((a, b), (b, a)):
+        np.maximum.at(far, one, both - log_ratio[one] - np.maximum(odds[other], 0.0))
+    sure = (log_ratio + far > odds + np.log(1 / DOUBT - 1)) & (far > 0)
     believed: Indices = best[sure[best]]
     return believed
+
+
+def rivals(found: Innovations, posterior: Posterior, alone: tuple[Mask, Array, float],
+           place: Indices) -> Array:
+    """
+    Return what the best rival of another place speaks against each factor, ln of odds, (m,).
+
+    Where the map knows less than the factors say, two may fit it and contradict each other: if b
+    is true, a is rather false than both are true.
+
+    alone, place : see `together`, but the log odds of all
+    """
+    fits, log_ratio, odds = alone
+    unsure = np.flatnonzero(fits & (found.log_det > found.freedom * np.log(2)))
+    unsure = unsure[np.argsort(-log_ratio[unsure], kind='stable')[:_CANDIDATES]]
+    a, b = (unsure[side] for side in np.triu_indices(len(unsure), 1))
+    a, b = (ends[place[a] != place[b]] for ends in (a, b))
+    best = np.full(len(fits), -np.inf)
+    if len(a):
+        both = found.joint(posterior, a, b)[1] - odds
+        for one, other in ((a, b), (b, a)):
+            np.maximum.at(best, one, log_ratio[other] - np.logaddexp(
+                0.0, both - log_ratio[one]))
+    return best
 
 
 def noise_variance(found: Innovations) -> Array:

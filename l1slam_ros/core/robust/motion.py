@@ -133,8 +133,6 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
 
 
 def unwhitening(growth: Growth, rows: Indices) -> Array:
-    """Return what makes whitened residuals of odometry steps of it, in time, (k, d, d)."""
-    factors = growth.subgraph(rows).between
-    root = np.linalg.inv(factors.sqrt_information)
-    turned = -growth.graph.manifold.adjoint(factors.measurement) @ root
-    return np.where((factors.i < factors.j)[:, None, None], root, turned)
+    """Return what makes whitened residuals of odometry steps of it, (k, d, d)."""
+    roots = growth.subgraph(rows).between.sqrt_information
+    return np.linalg.inv(roots).astype(np.float64, copy=False)

@@ -4,13 +4,14 @@ Places: loops that may be one mistake, or have one error.
 
 In: a graph. Out: the number of the place of each loop. Two loops that join the same two stretches
 of the way and claim nearly the same are linked; a place is what links tie together (single
-linkage). Near is measured along the way in metres, never in keyframes. And how often neighbours
-are of one place, and whether the loops of a place err together.
+linkage). Near is measured along the way in metres, never in keyframes. And what neighbours say of
+each other, and whether the loops of a place err together.
 """
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, lowest_of_components
 from l1slam_ros.core.graph.linear_system import with_world
 
@@ -81,19 +82,30 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
     return place[cell.ravel()], ends
 
 
-def neighbours_agree(place: Indices, ends: Array) -> float:
-    """
-    Return how often the nearest other loop within reach is of the same place, at least.
+def mates(place: Indices, ends: Array) -> tuple[Indices, Indices]:
+    """Return the pairs of loops of a place within reach, both ways round, (pairs,) each."""
+    one, other = _near(ends, 1.0)
+    same = place[one] == place[other]
+    one, other = one[same], other[same]
+    return np.concatenate((one, other)), np.concatenate((other, one))
 
-    place, ends : of the loops that are asked, see `places`. Where few have neighbours the answer
-    is near 1: nothing is known of how lies come here.
+
+def beside_refused(pairs: tuple[Indices, Indices], refused: Mask, true: Mask) -> Array:
     """
-    a, b = _near(ends, 1.0)
-    a, b = np.concatenate((a, b)), np.concatenate((b, a))
-    nearest_first = np.lexsort((np.abs(ends[a] - ends[b]).max(axis=1), a))
-    with_neighbour, first = np.unique(a[nearest_first], return_index=True)
-    agree = np.count_nonzero(place[with_neighbour] == place[b[nearest_first[first]]])
-    return float((agree + 1) / (len(with_neighbour) + 1))
+    Return what the other loops of its place speak against each factor, ln of odds, (m,).
+
+    How much likelier it is that most of them are refused if it is false than if it is true, by how
+    often that is so of those that are refused, and of the true ones; see `mates`.
+    """
+    one, other = pairs
+    count, against = (np.bincount(one, weights, len(refused))
+                      for weights in (None, refused[other]))
+    beside = against > count / 2
+    if not beside.any():
+        return np.zeros(len(refused))
+    of_false, of_true = ((np.count_nonzero(beside & some) + 1)
+                         / (np.count_nonzero((count > 0) & some) + 1) for some in (refused, true))
+    return np.where(beside, max(float(np.log(of_false / of_true)), 0.0), 0.0)
 
 
 def _near(points: Array, reach: float) -> tuple[Indices, Indices]:

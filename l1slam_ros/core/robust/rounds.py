@@ -14,18 +14,13 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.draws import keys
-from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, ends_in_time
+from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, turned
 from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import bridged, vague_odometry
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.robust.gating import (
-    believable,
-    log_odds_of_false,
-    noise_variance,
-    together,
-)
+from l1slam_ros.core.robust.gating import believable, noise_variance
 from l1slam_ros.core.robust.innovation import (
     Innovations,
     Posterior,
@@ -36,7 +31,7 @@ from l1slam_ros.core.robust.innovation import (
     student_quantile,
 )
 from l1slam_ros.core.robust.inspection import repeated_factors
-from l1slam_ros.core.robust.places import places
+from l1slam_ros.core.robust.places import beside_refused, mates, places
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 
@@ -64,7 +59,7 @@ _LATEST = 50
 _WORD = 100.0
 # The variance of an odometry factor that was cut, in units of its own: loops alone decide.
 _CUT = 1e4
-# The noise is learnt before anything is accepted from loops of so many places at least.
+# The noise is learnt of loops of so many places at least: of fewer, errors may be one.
 _FEWEST_PLACES = 3
 
 
@@ -72,7 +67,8 @@ class Growth:
     """
     The state of a robust solve.
 
-    graph : the one given, and an odometry factor for each gap, which is cut; size : factors given;
+    graph : the one given in the order of time, and an odometry factor for each gap, which is cut;
+    size : factors given;
     accepted, is_loop, trusted : (m,) bool of the between factors; gap, cut : (m,) bool, odometry
     that says nothing: where there is none, and there or where it slipped; low, high : (m,) the
     earlier and the later keyframe of each;
@@ -86,9 +82,12 @@ class Growth:
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
         self._check = check
-        self.graph, self.size = bridged(graph), len(graph.between)
+        whole, self.size = bridged(graph), len(graph.between)
+        # Which end is named first is no reason to judge otherwise.
+        self.graph = turned(whole, whole.between.i > whole.between.j)
         self.factors, self.trusted = self.graph.between, self.graph.between.trusted
-        self.low, self.high, self.forward = ends_in_time(self.graph)
+        self.low, self.high = self.factors.i, self.factors.j
+        self.forward = self.factors.measurement
         self.is_loop: Mask = ~self.factors.is_odometry
         self.gap: Mask = vague_odometry(self.graph) | (np.arange(len(self.factors)) >= self.size)
         self.cut: Mask = self.gap.copy()
@@ -105,6 +104,12 @@ class Growth:
     @cached_property
     def _places(self) -> tuple[Indices, Array]:
         return places(self.graph, odometry_poses(self.graph))
+
+    @cached_property
+    def _mates(self) -> tuple[Indices, Indices]:
+        rows = np.flatnonzero(self.is_loop)
+        one, other = mates(self.place[rows], self._places[1][rows])
+        return rows[one], rows[other]
 
     @property
     def place(self) -> Indices:
@@ -272,7 +277,7 @@ class Growth:
     def _is_noisier(self, rows: Indices) -> bool:
         """Raise the variance where half of the factors say that it is far too small."""
         loops = self.is_loop[rows]
-        if self._knows_noise or np.count_nonzero(loops) < _KNOWN:
+        if self._knows_noise or len(np.unique(self.place[rows[loops]])) < _FEWEST_PLACES:
             return False
         square = (self.posterior.residual**2).sum(axis=1)
         stated = np.trace(self.posterior.moment, axis1=1, axis2=2)
@@ -326,18 +331,16 @@ class Growth:
         """Return which of some loops may be accepted: each by itself, or else together, (k,)."""
         if not len(rows):
             return rows
-        found = self.innovations(rows)
+        found, loops = self.innovations(rows), self.accepted & self.is_loop
         fits = found.square < self.gate(found.freedom)
-        log_ratio = found.log_ratio()
+        refused = self.is_loop & ~self.accepted
+        refused[rows[fits]] = False
         # Taken at their word all are noisier than they are, so that more fit by chance: then only
         # the rest says how many of the rest are false.
-        true = 0 if self.at_their_word else np.count_nonzero(self.accepted & self.is_loop)
-        odds = log_odds_of_false(log_ratio[fits], int(np.count_nonzero(~fits)), int(true))
-        good = np.flatnonzero(fits)[believable(log_ratio[fits], odds)]
-        if not len(good):
-            good = together(found, self.posterior, self.gate, (fits, log_ratio, odds),
-                            (self.place[rows], self._places[1][rows]))
-        believed: Indices = rows[good]
+        true = 0 if self.at_their_word else np.count_nonzero(loops)
+        believed: Indices = rows[believable(
+            found, self.posterior, self.gate, fits, int(true), self.place[rows],
+            beside_refused(self._mates, refused, loops)[rows])]
         return believed
 
     def some(self, rows: Indices, count: int) -> Indices:

@@ -7,7 +7,7 @@ from lies import careful_world, is_false, position_error, slipped, spoilt
 from problems import add_absolute, retold
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust import batch
 from l1slam_ros.core.robust.batch import judge, robust_solve
@@ -91,10 +91,13 @@ def test_a_trusted_loop_is_never_refused(world):
     assert robust_solve(retold(bad.graph, trusted=trusted))[0].accepted[lie]
 
 
-def test_the_same_graph_gives_the_same_answer_in_whatever_order_its_factors_came(world):
-    graph = spoilt(world, 'grouped', 401).graph
-    order = np.random.default_rng(0).permutation(len(graph.between))
-    (one, poses), (other, again) = robust_solve(graph), robust_solve(graph.subset(order))
+@pytest.mark.parametrize('part', [0.0, 0.5])
+def test_the_same_graph_gives_the_same_answer_however_its_factors_came(world, part):
+    """In whatever order, and whichever end was named first."""
+    graph, rng = spoilt(world, 'grouped', 401).graph, np.random.default_rng(0)
+    order = rng.permutation(len(graph.between))
+    retold = turned(graph, rng.random(len(order)) < part).subset(order)
+    (one, poses), (other, again) = robust_solve(graph), robust_solve(retold)
     np.testing.assert_allclose(poses, again, atol=1e-6)
     np.testing.assert_array_equal(one.accepted[order], other.accepted)
     np.testing.assert_allclose(one.sigmas[order], other.sigmas, atol=1e-3)
@@ -136,5 +139,5 @@ def test_a_judgement_that_came_to_no_end_is_doubtful(world, monkeypatch):
     graph = spoilt(world, 'random', 170).graph
     assert robust_solve(graph)[0].doubts == ()
     monkeypatch.setattr(batch, '_MOST_ROUNDS', 2)
-    (doubt,) = robust_solve(graph)[0].doubts
-    assert doubt.kind == UNFINISHED and doubt.loops >= 170
+    kinds = {doubt.kind: doubt.loops for doubt in robust_solve(graph)[0].doubts}
+    assert kinds[UNFINISHED] >= 170

@@ -6,7 +6,7 @@ import pytest
 from lies import careful_world
 from problems import chain_of, graph_of, measure, straight
 
-from l1slam_ros.core.robust.places import neighbours_agree, places
+from l1slam_ros.core.robust.places import beside_refused, mates, places
 
 
 def corridor(step, pairs, off):
@@ -36,15 +36,20 @@ def test_a_run_is_one_place_and_what_claims_something_else_is_another():
     assert len(set(place[:50].tolist())) == 1 and place[50] not in place[:50]
 
 
-def test_few_neighbours_tell_nothing_and_many_that_differ_tell_much():
-    ends = np.column_stack((np.arange(100) * 0.1, np.zeros(100)))
-    assert neighbours_agree(np.zeros(1, int), ends[:1]) == 1.0
-    assert neighbours_agree(np.arange(2), 10 * ends[:2] * 100) == 1.0
-    assert neighbours_agree(np.zeros(100, int), ends) == 1.0
-    assert neighbours_agree(np.arange(100), ends) == pytest.approx(1 / 101)
-
-
 def test_every_loop_of_a_world_has_a_place():
     world = careful_world(200, 400)
     place, ends = places(world.graph, world.odometry)
     assert place.shape == (len(world.graph.between),) and np.isfinite(ends).all()
+
+
+def test_what_is_true_beside_refused_ones_has_to_be_the_surer_the_rarer_that_was():
+    """Of a hundred pairs in a row, each loop's neighbours the two or so next to it."""
+    ends = np.column_stack((np.arange(100) * 0.9, np.zeros(100)))
+    pairs = mates(np.zeros(100, int), ends)
+    refused = np.arange(100) < 10
+    refused[5] = False
+    against = beside_refused(pairs, refused, np.arange(100) >= 10)
+    assert np.flatnonzero(against > 0).tolist() == [*range(4), 5, *range(7, 9)]
+    # Of the nine that are refused six stand beside such, of the ninety true ones none.
+    assert against[5] == pytest.approx(np.log(7 / 10 * 91))
+    assert not beside_refused(mates(np.arange(100), ends), refused, ~refused).any()

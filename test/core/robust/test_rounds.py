@@ -68,3 +68,25 @@ def test_lies_of_one_place_do_not_teach_their_noise():
     growth.begin()
     assert growth.variance[1] <= 1
     assert not len(growth.believable(growth.undecided()))
+
+
+def rivals(apart, count):
+    """Return a noise-free lap and loops back to its start, `apart` m apart [x] from each other."""
+    n, lap = 500, 400
+    angle, radius = 2 * np.pi * np.arange(n) / lap, lap / (2 * np.pi)
+    truth = np.column_stack((radius * np.sin(angle), radius * (1 - np.cos(angle)), angle))
+    graph = graph_of(truth, chain_of(n), 0.0, np.diag(np.array([0.1, 0.1, 0.01]) ** -2))
+    start = np.array([10, 30])[:count]
+    measure(graph, truth, start, start + lap, [[0.0, 0, 0], [apart, 0, 0]][:count], SURE)
+    return graph
+
+
+@pytest.mark.parametrize(('apart', 'count', 'believed'), [(6.0, 1, 1), (0.5, 2, 2), (6.0, 2, 0)])
+def test_of_two_that_contradict_each_other_neither_is_believed(apart, count, believed):
+    """Each fits, and is believed if it is alone."""
+    growth = Growth(rivals(apart, count))
+    growth.solve()
+    rows = growth.undecided()
+    found = growth.innovations(rows)
+    assert (found.square < growth.gate(found.freedom)).all()
+    assert len(growth.believable(rows)) == believed

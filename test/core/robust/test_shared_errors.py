@@ -55,7 +55,7 @@ def test_loops_that_err_together_are_worth_one_in_the_map():
     """And the cost is told by what the file says of the noise."""
     errors = np.zeros(2)
     for seed in range(3):
-        graph, truth = rounds_of(seed, 0.9, stated=0.3)
+        graph, truth = rounds_of(seed, 0.9, stated=0.4)
         all_said, judged = solved(graph, False), solved(graph, True)
         assert judged.judgement.accepted.all() and not judged.judgement.is_noise_stated
         assert judged.solution.cost > all_said.solution.cost
