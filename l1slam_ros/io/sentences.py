@@ -9,6 +9,7 @@ from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.graph.factor_graph import BetweenFactors
 from l1slam_ros.core.robust.judgement import (
     MOSTLY_REFUSED,
+    NORM,
     ONE_JOINS,
     ONE_PLACE,
     OTHER_MAP,
@@ -53,6 +54,9 @@ _REASONS = {
           'do not say for sure',
     UNFINISHED: 'the judgement did not come to an end: the {loops} loops that are left out, '
                 '{where}, were still coming in a few at a time',
+    NORM: 'the map is further from the least squares map of the same {loops} loops than noise '
+          'explains, so factors err together or are not what they say; `--norm l2` and `huber` '
+          'make other maps',
 }
 _REMEDY = 'Vouch for a loop that is right, strike out one that is false, or state the noise'
 

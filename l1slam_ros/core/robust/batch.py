@@ -48,8 +48,9 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.parts import tied
-from l1slam_ros.core.robust.judgement import Judgement, doubts, judgement_of
-from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.robust.innovation import chi2_quantile, sample_posterior
+from l1slam_ros.core.robust.judgement import Judgement, doubt_of_norm, doubts, judgement_of
+from l1slam_ros.core.robust.rounds import REFUSED, Growth
 from l1slam_ros.core.robust.slips import join, without_slip
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
@@ -110,7 +111,26 @@ def minimise_robustly(
     seed = l2_map(whole, poses, cholesky_of(whole), lambda *_: check())
     solution = minimise(whole, seed)
     rows = len(accepted.between) * graph.manifold.TANGENT_SIZE
+    check()
+    if _leaves(graph, judgement, seed, solution.poses):
+        judgement = replace(judgement, doubts=(*judgement.doubts, doubt_of_norm(graph, judgement)))
     return RobustMap(replace(solution, dual=solution.dual[:rows]), seed, judgement)
+
+
+def _leaves(graph: FactorGraph, judgement: Judgement, seed: Array, poses: Array) -> bool:
+    """
+    Return whether half of a map is further from the L2 map, (n, p) each, than noise explains.
+
+    Of normal noise, as it was found, the difference has pi/2 - 1 of the covariance of the L2 map
+    at most, which is what L1 pays for it. Of the keyframes of one way all may err together.
+    """
+    rows, manifold = np.flatnonzero(judgement.accepted), graph.manifold
+    kind = ~graph.between.is_odometry[rows]
+    found = tied(graph.subset(rows, judgement.variance[kind.astype(np.int64)]), seed)
+    posterior = sample_posterior(found, seed, cholesky_of(found))
+    square = posterior.squares(manifold.local(seed, poses)[posterior.fixed:])
+    explained = (np.pi / 2 - 1) * chi2_quantile(1 - REFUSED, np.array([manifold.TANGENT_SIZE]))
+    return bool(np.count_nonzero(np.isfinite(square) & (square > explained)) > len(square) / 2)
 
 
 def rounds(

@@ -66,6 +66,13 @@ class Posterior:
         return self.noise[rows] - kernels.prediction.moved(
             system.keyframe[rows], system.blocks[rows], self.samples)
 
+    def squares(self, step: Array) -> Array:
+        """Return the squared length of steps (free keyframes, k) in their covariance, (free,)."""
+        samples = self.samples[:-1]
+        moment = samples @ samples.transpose(0, 2, 1) / samples.shape[2]
+        square: Array = kernels.prediction.normalise(moment, step)[0]
+        return square
+
     def left_out(self) -> Array:
         """
         Return the squared innovation of each factor by all others, (m,).

@@ -28,10 +28,11 @@ from l1slam_ros.core.robust.slips import JOINING, SPANNING, SURE, common_steps, 
 
 # Most loops are refused; all that are accepted are of one place; loops of one place alone say how
 # two parts lie to each other; refused loops of several places agree on another map; an odometry
-# factor may have slipped, and it was not believed; there were more rounds to come.
-MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP, UNFINISHED = (
+# factor may have slipped, and it was not believed; there were more rounds to come; another norm of
+# the same factors has another map.
+MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP, UNFINISHED, NORM = (
     'mostly refused', 'one place', 'one place joins', 'another map', 'a slip suspected',
-    'not at an end')
+    'not at an end', 'another norm')
 
 # Of fewer loops most may well be refused, and be of one place; most are more than half by some.
 _HANDFUL, _MOST = 5, 0.55
@@ -192,6 +193,12 @@ def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
         for step, odds in growth.slip_odds.items()
         if (odds < SURE if growth.cut[step] else odds > -SURE)]
     return tuple(dict.fromkeys(reasons))
+
+
+def doubt_of_norm(graph: FactorGraph, judgement: Judgement) -> Doubt:
+    """Return the doubt that the map hangs on the norm by which it is made of what is accepted."""
+    loops = judgement.accepted & ~graph.between.is_odometry
+    return Doubt(NORM, int(np.count_nonzero(loops)), 0, graph.n_poses - 1)
 
 
 def _carries_all(growth: Growth, accepted: Indices) -> bool:

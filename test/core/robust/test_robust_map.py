@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A robust map: the solver's own, of what is believed, and a true account of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lies import careful_world, is_false, position_error, spoilt
@@ -8,6 +10,7 @@ from numpy.testing import assert_array_equal
 
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.robust.batch import minimise_robustly
+from l1slam_ros.core.robust.judgement import NORM, Doubt
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
@@ -86,6 +89,20 @@ def test_the_seed_is_the_l2_map_of_what_is_accepted(bad, found):
     part = bad.graph.subset(found.judgement.accepted)
     best = in_l2(part, found.seed)
     assert l2_cost(whitened_residual(part, found.seed)) <= best.cost + 1
+
+
+@pytest.mark.parametrize('minimise', [in_l1, in_l2])
+def test_a_map_that_leaves_the_least_squares_map_further_than_noise_explains_is_doubtful(
+        world, minimise):
+    assert not minimise_robustly(world.graph, minimise).judgement.doubts
+
+    def bent(graph, poses):
+        solution, turned = minimise(graph, poses), world.graph.manifold.identity(len(poses))
+        turned[:, 2] = np.linspace(0, 1, len(poses))
+        return replace(solution, poses=world.graph.manifold.compose(turned, solution.poses))
+
+    doubt, = minimise_robustly(world.graph, bent).judgement.doubts
+    assert doubt == Doubt(NORM, int((~world.graph.between.is_odometry).sum()), 0, 199)
 
 
 def test_progress_is_reported(bad):
