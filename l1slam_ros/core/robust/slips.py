@@ -213,15 +213,8 @@ def _spans(state: Growth, step: int) -> bool:
 
 
 def _gain(growth: Growth, as_stated: Growth, cut: Growth) -> float:
-    """
-    Return what the places say that are won and lost by a cut, ln of odds.
-
-    Loops of a place that span the cut, and those that do not, are not of one mistake.
-    """
-    steps = np.flatnonzero(cut.cut & ~growth.cut).tolist()
-    side = np.sum([spanning(growth, step) for step in steps], axis=0, dtype=np.int64)
-    place = growth.place * (len(steps) + 1) + side
-    before, explained, after = (np.unique(place[state.accepted & growth.is_loop])
+    """Return what the places say that are won and lost by a cut, ln of odds."""
+    before, explained, after = (np.unique(growth.place[state.accepted & growth.is_loop])
                                 for state in (growth, as_stated, cut))
     won = len(np.setdiff1d(after, np.union1d(before, explained)))
     return _place(growth) * (won - len(np.setdiff1d(before, after)))

@@ -70,8 +70,8 @@ def test_what_fits_the_loops_that_come_in_without_it_did_not_slip(bad):
     assert max(growth.slip_odds.values()) < -SURE
 
 
-@pytest.mark.parametrize('keyframe, found', [(311, True), (225, False)])
-def test_two_slips_that_cancel_are_found_or_doubted(bad, keyframe, found):
+@pytest.mark.parametrize('keyframe', [106, 276])
+def test_two_slips_that_cancel_are_doubted(bad, keyframe):
     """The loops of one keyframe say, and all others have nothing against it, that it is off."""
     truth, near = bad.truth.copy(), np.array([keyframe - 1, keyframe])
     truth[keyframe] = se2.retract(truth[keyframe], np.array([0.0, 5.0, 0.0]))
@@ -79,9 +79,9 @@ def test_two_slips_that_cancel_are_found_or_doubted(bad, keyframe, found):
     rows = np.flatnonzero(bad.graph.between.is_odometry & np.isin(bad.graph.between.i, near))
     Z[rows] = se2.between(truth[near], truth[near + 1])
     judgement, _ = robust_solve(retold(bad.graph, Z))
-    np.testing.assert_array_equal(judgement.slips, rows if found else [])
-    assert [(doubt.kind, doubt.first) for doubt in judgement.doubts] == (
-        [] if found else [(OTHER_MAP, keyframe)])
+    assert not len(judgement.slips)
+    doubt, = judgement.doubts
+    assert doubt.kind == OTHER_MAP and keyframe in (doubt.first, doubt.last)
 
 
 def test_where_the_odometry_jumped_it_slipped(bad):
