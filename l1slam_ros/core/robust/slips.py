@@ -6,10 +6,9 @@ A gap is a slip whose place is known. Where both sides of a step are parts of th
 in itself, the true loops across agree with each other (`pairwise_consistency`): parts are joined
 where loops of two places or more do. A slip is suspected where the odds of one are not small
 (`motion`), or where loops that are left out agree. Then slip and lies are compared: the step is
-cut, the loops across are asked anew, and the rounds go on from there; so are the two on either
-side of keyframes that odometry alone holds where they are. To the odds comes half a gate for each
-place that is won and that nothing else explains, less one for each that is lost. A slip
-is believed if that makes it likelier than not, and if three places span it where it is only
+cut, the loops across are asked anew, and the rounds go on from there. To the odds comes half a
+gate for each place that is won and that nothing else explains, less one for each that is lost. A
+slip is believed if that makes it likelier than not, and if three places span it where it is only
 places that say so. Loops do not make a robot jump: the slip repaired, it has to move as at some
 other step, or rather so than as measured. What fits the loops that came in without it did not
 slip: a lie had bent the map.
@@ -119,22 +118,22 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, more: bool = True
     that, too.
     """
     odds = log_odds_of_slips(growth, motion)
-    for steps in _suspected(growth, odds, as_stated.undecided()):
-        state, usual = _without(growth, steps), False
+    for step in _suspected(growth, odds, as_stated.undecided()):
+        state, usual = _without(growth, step), False
         if state:
-            state, steps, usual = _cut_rather(state, steps, motion)
-        yield steps, float(odds[steps].sum()), state, usual
-        if more and state and not usual and len(steps) == 1:
+            state, step, usual = _cut_rather(state, step, motion)
+        yield [step], float(odds[step]), state, usual
+        if more and state and not usual:
             for second, other, both, usual in _tried(state, state, motion, False):
-                first = steps
+                first = step
                 if both:
-                    both, first, moves = _cut_rather(both, steps, motion)
+                    both, first, moves = _cut_rather(both, step, motion)
                     usual = usual and moves
-                yield first + second, float(odds[first].sum()) + other, both, usual
+                yield [first, *second], float(odds[first]) + other, both, usual
 
 
-def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[list[int]]:
-    """Return the odometry that may have slipped, at once: two by odds, and for two groups."""
+def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:
+    """Return the odometry factors that may have slipped: two by their odds, two by groups."""
     tell = growth.accepted & growth.is_loop
     tell[left_out] = True
     across = spanned(growth.low[tell], growth.high[tell], growth.graph.n_poses)
@@ -143,7 +142,7 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[list[int]
     order = np.argsort(-told, kind='stable')[:_TRIED]
     # Where loops are left out, one more place may be won.
     least = max(SURE, _place(growth)) if len(left_out) else SURE
-    suspects = order[told[order] > -least, None].tolist()
+    suspects: list[int] = order[told[order] > -least].tolist()
     for _ in range(_TRIED):
         group = strongest_group(growth, left_out)
         if len(group.places) < SPANNING:
@@ -151,22 +150,9 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[list[int]
         common = common_steps(growth, group)
         common = common[~growth.cut[common]]
         if len(common):
-            suspects.append([int(common[np.argmax(odds[common])])])
-        suspects += [steps for ends in (growth.low, growth.high)
-                     if len(steps := _around(growth, ends[group.rows])) > 1]
+            suspects.append(int(common[np.argmax(odds[common])]))
         left_out = np.setdiff1d(left_out, group.rows)
-    return [list(steps) for steps in dict.fromkeys(map(tuple, suspects))]
-
-
-def _around(growth: Growth, ends: Indices) -> list[int]:
-    """Return the odometry on either side of some keyframes, where no accepted loop has an end."""
-    first, last = ends.min(), ends.max()
-    inside = [(end >= first) & (end <= last) for end in (growth.low, growth.high)]
-    if (growth.accepted & growth.is_loop & np.logical_or(*inside)).any():
-        return []
-    steps: list[int] = np.flatnonzero(~growth.is_loop & ~growth.cut & np.logical_xor(*inside)
-                                      ).tolist()
-    return steps
+    return list(dict.fromkeys(suspects))
 
 
 def common_steps(growth: Growth, group: Group) -> Indices:
@@ -177,16 +163,14 @@ def common_steps(growth: Growth, group: Group) -> Indices:
     return steps
 
 
-def _without(growth: Growth, steps: list[int]) -> Growth | None:
-    """Return the state after the rounds that follow if steps are cut; None: it falls apart."""
-    state = growth.copy()
-    state.cut[steps] = True
+def _without(growth: Growth, step: int) -> Growth | None:
+    """Return the state after the rounds that follow if a step is cut; None: it falls apart."""
+    state, span = growth.copy(), spanning(growth, step)
+    state.cut[step] = True
     state.drops[:] = 0
-    for step in steps:
-        span = spanning(growth, step)
-        state.accepted[span] = state.trusted[span]
+    state.accepted[span] = state.trusted[span]
     state.solve()
-    if not join(state) or state.across()[steps].any():
+    if not join(state) or state.across()[step]:
         return None
     _accept_more(state)
     return state
@@ -237,24 +221,20 @@ def _likeliest(state: Growth, cut: int, motion: Motion) -> int:
     return int(steps[np.argmax(gain)])
 
 
-def _cut_rather(state: Growth, steps: list[int], motion: Motion
-                ) -> tuple[Growth, list[int], bool]:
+def _cut_rather(state: Growth, cut: int, motion: Motion) -> tuple[Growth, int, bool]:
     """
-    Return the state cut at the likeliest steps between the same loops; these; whether usual.
+    Return the state cut at the likeliest step between the same loops; that; whether usual.
 
-    That is, whether the robot, repaired, moves at each of them as elsewhere.
+    That is, whether the robot, repaired, moves there as elsewhere.
     """
-    rather = []
-    for cut in steps:
-        rather.append(_likeliest(state, cut, motion))
-        state = _cut_at(state, cut, rather[-1])
-    return state, rather, all(_moves_as_usual(state, step, motion) for step in rather)
+    step = _likeliest(state, cut, motion)
+    if step != cut:
+        state = _cut_at(state, cut, step)
+    return state, step, _moves_as_usual(state, step, motion)
 
 
 def _cut_at(state: Growth, cut: int, step: int) -> Growth:
-    """Return the state that is cut at a step and not where it is, between the same loops."""
-    if step == cut:
-        return state
+    """Return the state that is cut at a step and not where it is."""
     state = state.copy()
     state.cut[[cut, step]] = False, True
     # What lies between goes over to the other side.
