@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.robust.innovation import Innovations, Posterior, log_likelihood_ratio
@@ -156,14 +157,12 @@ def noise_variance(found: Innovations) -> Array:
     several ratios and scales, of which the likeliest wins. Only the best predicted loops are
     asked: their fit tells most.
     """
-    from l1slam_ros.core.kernels.prediction import normalise
-
     best = np.argsort(found.log_det, kind='stable')[:_BEST_PREDICTED]
     k, log_claim, freedom = found.system.block_size, found.log_claim[best], found.freedom[best]
     residual, spread = -found.system.b.reshape(-1, k)[best], found.spread[best]
     fits: list[tuple[float, float, float]] = []
     for ratio in _RATIOS:
-        square, log_det = normalise(spread + ratio * np.eye(k), residual)
+        square, log_det = kernels.prediction.normalise(spread + ratio * np.eye(k), residual)
         log_det -= (k - freedom) * np.log(ratio)  # what says nothing has no noise
         for start in (1.0, *(np.quantile(square, (0.1, 0.5)) / k).tolist()):
             likelihood, scale = _fitted_scale(square, log_det, log_claim, freedom, k, start)

@@ -11,6 +11,7 @@ from math import lgamma
 
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.robust.innovation import claimed_volume, log_likelihood_ratio
 from l1slam_ros.core.robust.rounds import Growth
@@ -39,11 +40,8 @@ class Motion:
 
     def square(self, step: Array, spread: Array | float = 0.0) -> tuple[Array, Array]:
         """Return how unusual steps (m, k) are, squared, and ln det of their covariances, (m,)."""
-        from l1slam_ros.core.kernels.prediction import normalise
-
         covariance = np.zeros((len(step), *self.covariance.shape)) + self.covariance + spread
-        square, log_det = normalise(covariance, step - self.mean)
-        return square, log_det
+        return kernels.prediction.normalise(covariance, step - self.mean)
 
     def log_density(self, step: Array, spread: Array | float = 0.0) -> Array:
         """Return the logarithm of the density of steps (m, k), known to spread (m, k, k), (m,)."""
@@ -53,25 +51,21 @@ class Motion:
         tail = (np.log(self.power / np.sqrt(len(self.step))) + self.power * np.log(self.start)
                 - (self.power + k / 2) * np.log(np.maximum(square, self.start))
                 + lgamma(k / 2) - k / 2 * np.log(np.pi))
-        density: Array = np.maximum(normal, tail) - log_det / 2
-        return density
+        return np.maximum(normal, tail) - log_det / 2
 
     def distance(self, step: Array, spread: Array) -> Array:
         """Return the squared distances of a step (k,), known to spread (k, k), to all, (n,)."""
-        from l1slam_ros.core.kernels.prediction import normalise
-
         n, k = self.step.shape
         # All that there is lies in a cloud of Scott's bandwidth.
         covariance = spread + self.covariance * n ** (-2 / (k + 4))
-        square: Array = normalise(np.tile(covariance, (n, 1, 1)), self.step - step)[0]
-        return square
+        repeated = np.tile(covariance, (n, 1, 1))
+        return kernels.prediction.normalise(repeated, self.step - step)[0]
 
 
 def steps_of(growth: Growth, rows: Indices) -> Array:
     """Return what factors measure, in the order of time, as tangents (k, d)."""
     manifold = growth.graph.manifold
-    steps: Array = manifold.local(manifold.identity(len(rows)), growth.forward[rows])
-    return steps
+    return manifold.local(manifold.identity(len(rows)), growth.factors.measurement[rows])
 
 
 def usual_motion(growth: Growth) -> Motion:
@@ -98,8 +92,6 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
 
     Of one that is cut, all others know nothing of it as it is.
     """
-    from l1slam_ros.core.kernels.prediction import normalise
-
     odds = np.full(len(growth.factors), -np.inf)
     manifold, factors = growth.graph.manifold, growth.factors
     k = manifold.TANGENT_SIZE
@@ -115,7 +107,7 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     innovation[cut, :, 0] = -without.system.b.reshape(-1, k)
     root = unwhitening(measured, rows)
     spread = root @ inverse @ root.transpose(0, 2, 1)
-    square, log_det = normalise(inverse.copy(), innovation[:, :, 0])
+    square, log_det = kernels.prediction.normalise(inverse.copy(), innovation[:, :, 0])
     # All may be as noisy as they turn out, or as they say.
     found = max((r[~cut] ** 2).sum() / np.trace(R[~cut], axis1=1, axis2=2).sum(), 1.0)
     said = growth.variance_at_their_word()[0] / growth.variance[0]
@@ -123,7 +115,7 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
                                        np.zeros(1), factors.freedom[rows], k)
                   for noise in (found, said)], axis=0) - np.linalg.slogdet(root)[1]
     start = manifold.identity(len(rows))
-    moved = manifold.retract(growth.forward[rows], (root @ innovation)[:, :, 0])
+    moved = manifold.retract(growth.factors.measurement[rows], (root @ innovation)[:, :, 0])
     J = manifold.local_jacobian(start, moved)
     claims = claimed_volume(manifold, growth.poses).sum()
     motions = motion.log_density(manifold.local(start, moved), J @ spread @ J.transpose(0, 2, 1))

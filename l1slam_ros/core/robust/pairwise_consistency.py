@@ -130,7 +130,7 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
 
 def _ends_by_part(growth: Growth, rows: Indices) -> Ends:
     """Return loops as from an earlier part to a later one, within a part to the later keyframe."""
-    low, high, Z = growth.low[rows], growth.high[rows], growth.forward[rows]
+    low, high, Z = growth.low[rows], growth.high[rows], growth.factors.measurement[rows]
     turn = growth.part[low] > growth.part[high]
     return (np.where(turn, high, low), np.where(turn, low, high),
             np.where(turn[:, None], growth.graph.manifold.inverse(Z), Z))

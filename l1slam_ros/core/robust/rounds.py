@@ -68,16 +68,14 @@ class Growth:
     The state of a robust solve.
 
     graph : the one given in the order of time, and an odometry factor for each gap, which is cut;
-    size : factors given;
-    accepted, is_loop, trusted : (m,) bool of the between factors; gap, cut : (m,) bool, odometry
-    that says nothing: where there is none, and there or where it slipped; low, high : (m,) the
-    earlier and the later keyframe of each;
-    place : (m,) see `places`; part : (n,) number of the part of each keyframe; poses : (n, p) the
-    L2 map of the accepted; posterior : of these; variance : (2,) of odometry and loops in units of
-    what they state; slip_odds : ln P(slipped) / P(measured) of the odometry factors that were
-    suspected; drops : (m,) how often each was accepted and did not fit;
-    at_their_word : whether factors may be as noisy as they say; check : called before long steps,
-    raises where the work shall stop.
+    size : factors given; accepted, is_loop, trusted : (m,) bool of the between factors; gap, cut :
+    (m,) bool, odometry that says nothing: where there is none, and there or where it slipped; low,
+    high : (m,) the earlier and the later keyframe of each; place : (m,) see `places`; part : (n,)
+    number of the part of each keyframe; poses : (n, p) the L2 map of the accepted; posterior : of
+    these; variance : (2,) of odometry and loops in units of what they state; slip_odds : ln
+    P(slipped) / P(measured) of the odometry factors that were suspected; drops : (m,) how often
+    each was accepted and did not fit; at_their_word : whether factors may be as noisy as they say;
+    check : called before long steps, raises where the work shall stop.
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
@@ -87,7 +85,6 @@ class Growth:
         self.graph = turned(whole, whole.between.i > whole.between.j)
         self.factors, self.trusted = self.graph.between, self.graph.between.trusted
         self.low, self.high = self.factors.i, self.factors.j
-        self.forward = self.factors.measurement
         self.is_loop: Mask = ~self.factors.is_odometry
         self.gap: Mask = vague_odometry(self.graph) | (np.arange(len(self.factors)) >= self.size)
         self.cut: Mask = self.gap.copy()

@@ -61,7 +61,7 @@ def _join_by(growth: Growth, group: Group) -> None:
     """Move the later one of two parts to where the first loop of a group says, accept all."""
     manifold, loop = growth.graph.manifold, group.rows[0]
     fixed, moving = growth.low[loop], growth.high[loop]
-    Z = growth.forward[loop, None]
+    Z = growth.factors.measurement[loop, None]
     if growth.part[fixed] > growth.part[moving]:
         fixed, moving, Z = moving, fixed, manifold.inverse(Z)
     wanted = manifold.compose(growth.poses[fixed, None], Z)
