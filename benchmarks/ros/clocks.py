@@ -212,7 +212,7 @@ def main() -> None:
     measured = {}
     for _, topic, data in messages:
         if topic == ODOMETRY_TOPIC:
-            sample = conversion.odometry_in(data)[2]
+            sample = conversion.odometry_in(data)[1]
             measured[sample.stamp] = sample.pose3[:2], truth[sample.stamp][:2]
     known: dict[int, np.ndarray] = {}
     folder = tempfile.TemporaryDirectory()

@@ -30,13 +30,15 @@ class OdometrySample:
     The pose of the robot in the odometry frame at one time.
 
     stamp : [ns]; pose3 : (7,) x y z qx qy qz qw [m]; covariance, twist_covariance : (6, 6),
-    rows x y z rx ry rz, as they came in the message: `graph_builder` decides what they mean.
+    rows x y z rx ry rz, as they came in the message: `graph_builder` decides what they mean;
+    frame : `child_frame_id`, empty: that of the robot.
     """
 
     stamp: int
     pose3: Array
     covariance: Array
     twist_covariance: Array
+    frame: str = ''
 
 
 @dataclass(frozen=True)

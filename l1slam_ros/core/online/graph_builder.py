@@ -20,7 +20,12 @@ from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.online.keyframes import KeyframeOptions, Level, Motion, OdometryOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
 from l1slam_ros.core.online.notes import Notes
-from l1slam_ros.core.online.odometry.odometry_stream import UNSEEN_TURN, OdometryStream, Point
+from l1slam_ros.core.online.odometry.odometry_stream import (
+    UNSEEN_TURN,
+    BaseFrame,
+    OdometryStream,
+    Point,
+)
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
 from l1slam_ros.core.online.snapshot import Growth
 from l1slam_ros.core.options import Options, option
@@ -43,6 +48,8 @@ class GraphBuilderOptions(Options):
         'further than any robot moves: the map stays and a new part begins, which loops may join '
         'to it; or the map begins anew; or the robot is taken to be where it was, and old stamps '
         'are dropped', '', choices=tuple(_SAID))
+    base_frame: str = option(
+        '', "the robot's frame; empty: the first child_frame_id seen", fixed=True)
 
 
 class GraphBuilder:
@@ -55,10 +62,12 @@ class GraphBuilder:
     options : see `GraphBuilderOptions`; may be replaced at any time
     verbatim : the messages are those of a graph: each is a measurement as it is stated, none a
         loop sent again or odometry that jumps
+    base_frame : tells whose odometry it is; None: by the options alone
 
     Attributes
     ----------
     graph : the factor graph so far; loops enter it in `add_due_loops`
+    base_frame : as far as is known
     stream : passes on what is the robot's motion, and holds what may not be
     track : the odometry so far, its keyframes and gaps
     loops : those in the graph, and those that wait
@@ -68,12 +77,14 @@ class GraphBuilder:
 
     """
 
-    def __init__(self, manifold: Manifold, options: GraphBuilderOptions, verbatim: bool = False):
+    def __init__(self, manifold: Manifold, options: GraphBuilderOptions, verbatim: bool = False,
+                 base_frame: BaseFrame | None = None):
         self.options = options
         self.graph = FactorGraph(manifold)
         self.notes = Notes()
         self._verbatim = verbatim
-        self.stream = OdometryStream(manifold, self.notes)
+        self.base_frame = base_frame or BaseFrame(options.base_frame)
+        self.stream = OdometryStream(manifold, self.notes, self.base_frame)
         self.loops = LoopFactors(manifold, self.notes, verbatim)
         self._motion: Motion
         self._resumed = False
@@ -95,21 +106,23 @@ class GraphBuilder:
 
         Raises
         ------
-        MessageError : `old_stamp`, the stamp is not after the last one; nothing is added.
+        MessageError : `child_frame`, it is another's, or `old_stamp`, the stamp is not after the
+            last one; nothing is added.
 
         """
         ignore, track = self.options.on_time_jump == 'ignore', self.track
         if ignore and not self._glued and sample.stamp <= track.last_stamp:
             raise MessageError('old_stamp', f'odometry stamp {sample.stamp} ns is not after the '
                                f'last one, {track.last_stamp} ns')
-        points = self.stream.take(sample, self._verbatim, not ignore)
-        for point in points:
+        used = False
+        for point in self.stream.take(sample, self._verbatim, not ignore):
             self._add(point)
+            used = True
         track = self.track  # a new one, maybe
         # Loops that are due become factors by the samples as they came.
         if track.may_be_thinned and not self.loops.waiting.is_due(track.last):
             track.thin()
-        return bool(points)
+        return used
 
     def finish(self) -> None:
         """Use the last sample of all, if it is held for a pause alone; see `held`."""
@@ -118,6 +131,10 @@ class GraphBuilder:
 
     def _add(self, point: Point) -> None:
         """Add a sample of the robot's motion."""
+        if point.anew and self._resumed:
+            self._glued = False  # the odometry begins again
+        elif point.anew:
+            self._forget()
         on_gap, pose = self.options.on_time_jump, point.pose
         goes_on = self._glued or self.track.goes_on(point.stamp, pose, self.offset)
         gap = point.gap
@@ -130,7 +147,7 @@ class GraphBuilder:
             cause, said = _SAID[on_gap]
             self.notes.tell(cause, f'{gap}; {said}')
             self._level = Level(self.graph.manifold)
-        if point.anew or (gap and on_gap == 'reset'):
+        if gap and on_gap == 'reset':
             self._forget()
         if not self.graph.n_poses:
             self._begin_part(point.stamp, pose)
@@ -169,14 +186,6 @@ class GraphBuilder:
         self.graph.add_poses(1)
         self._motion = Motion(self.graph.manifold, stamp, pose)
 
-    def begin_anew(self) -> None:
-        """Forget the only sample so far, a stray; of a restored map: let odometry begin again."""
-        self.stream = OdometryStream(self.graph.manifold, self.notes, self._resumed)
-        if self._resumed:
-            self._glued = False
-            return
-        self._forget()
-
     def _forget(self) -> None:
         """Begin anew; loops that came may yet find odometry of their times."""
         self._begin(FactorGraph(self.graph.manifold))
@@ -206,7 +215,8 @@ class GraphBuilder:
             self._motion.add_known(
                 growth.end, growth.end_pose, growth.end_covariance, self.options.odometry)
         self._glued, self._moved, self._resumed = False, True, True
-        self.stream = OdometryStream(self.graph.manifold, self.notes, resumed=True)
+        self.stream = OdometryStream(
+            self.graph.manifold, self.notes, self.base_frame, resumed=True)
         self.loops.restore(growth, track, self.options.loop)
 
     def add_loop(self, loop: LoopClosure) -> None:
