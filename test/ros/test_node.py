@@ -28,7 +28,7 @@ from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions
-from l1slam_ros.core.online.loop_states import ACCEPTED
+from l1slam_ros.core.online.snapshot import ACCEPTED
 from l1slam_ros.core.options import with_values
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of

@@ -16,9 +16,8 @@ from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_sound
 from l1slam_ros.core.names import OF_THE_NODE
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
-from l1slam_ros.core.online.loop_states import LoopStates
 from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame
-from l1slam_ros.core.online.snapshot import Optimised, Robot, SavedMap
+from l1slam_ros.core.online.snapshot import LoopStates, Optimised, Robot, SavedMap
 from l1slam_ros.core.online.upkeep.live_map import Behind
 from l1slam_ros.core.online.upkeep.threads import Background
 from l1slam_ros.core.online.upkeep.upkeep import Stopped as Stopped

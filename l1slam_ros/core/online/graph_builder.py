@@ -15,11 +15,10 @@ from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.geometry.noise import MOST_OF_ODOMETRY, root_of_inverse
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.measurements import LoopClosure, Notes, OdometrySample
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.online.keyframes import KeyframeOptions, Level, Motion, OdometryOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
-from l1slam_ros.core.online.notes import Notes
 from l1slam_ros.core.online.odometry.odometry_stream import (
     UNSEEN_TURN,
     BaseFrame,
@@ -135,24 +134,19 @@ class GraphBuilder:
             self._glued = False  # the odometry begins again
         elif point.anew:
             self._forget()
-        on_gap, pose = self.options.on_time_jump, point.pose
+        on_gap, pose, manifold = self.options.on_time_jump, point.pose, self.graph.manifold
         goes_on = self._glued or self.track.goes_on(point.stamp, pose, self.offset)
-        gap = point.gap
-        if not self._glued and point.stamp <= self.track.last_stamp:
-            gap = f'odometry stamp {point.stamp} ns is before the end of the map'
-        elif not goes_on and on_gap == 'new_segment':
-            gap = f'odometry at {point.stamp} ns begins elsewhere than the map ends'
+        gap = self._gap(point, goes_on)
         if gap:
             self.add_due_loops()  # what came before is of that time
             cause, said = _SAID[on_gap]
             self.notes.tell(cause, f'{gap}; {said}')
-            self._level = Level(self.graph.manifold)
-        if gap and on_gap == 'reset':
-            self._forget()
+            self._level = Level(manifold)
+            if on_gap == 'reset':
+                self._forget()
         if not self.graph.n_poses:
             self._begin_part(point.stamp, pose)
             return
-        manifold = self.graph.manifold
         if gap or not goes_on:
             self.offset = manifold.compose(self.track.last_pose, manifold.inverse(pose))
             self._moved = True
@@ -163,7 +157,19 @@ class GraphBuilder:
             if self.track.begin_part(point.stamp):
                 self.loops.waiting.begin_anew(self.track.time)
             self._begin_part(point.stamp, pose)
-            return
+        else:
+            self._go_on(point, pose)
+
+    def _gap(self, point: Point, goes_on: bool) -> str:
+        """Return why no motion is known to a sample from the one before; empty: it is known."""
+        if not self._glued and point.stamp <= self.track.last_stamp:
+            return f'odometry stamp {point.stamp} ns is before the end of the map'
+        if not goes_on and self.options.on_time_jump == 'new_segment':
+            return f'odometry at {point.stamp} ns begins elsewhere than the map ends'
+        return point.gap
+
+    def _go_on(self, point: Point, pose: Array) -> None:
+        """Continue to a sample at `pose` (1, p); where that makes a keyframe, add its factor."""
         unseen = (point.unseen, UNSEEN_TURN * point.seconds) if point.gap else None
         motion = self._motion.step(point.sample, pose, self.options.keyframe,
                                    self.options.odometry, self._verbatim, unseen)
@@ -212,8 +218,9 @@ class GraphBuilder:
         self._motion = Motion(self.graph.manifold, track.last_stamp, track.last_pose)
         if growth.end > track.last_stamp:
             track.append(growth.end, growth.end_pose, is_keyframe=False)
+            by_model = self.options.odometry.covariance_source == 'model'
             self._motion.add_known(
-                growth.end, growth.end_pose, growth.end_covariance, self.options.odometry)
+                growth.end, growth.end_pose, None if by_model else growth.end_covariance)
         self._glued, self._moved, self._resumed = False, True, True
         self.stream = OdometryStream(
             self.graph.manifold, self.notes, self.base_frame, resumed=True)

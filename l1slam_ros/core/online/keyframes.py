@@ -149,36 +149,35 @@ class Motion:
 
     def add(self, sample: OdometrySample, pose: Array, options: OdometryOptions) -> None:
         """Continue to `pose` (1, p) in the odometry frame, that of a sample."""
+        stated = None
+        if options.covariance_source == 'increment':
+            stated = sample.covariance
+        elif options.covariance_source == 'twist':
+            stated = sample.twist_covariance * ((sample.stamp - self._stamp) * 1e-9) ** 2
+        self.add_known(sample.stamp, pose, None if stated is None else reduced_covariance(
+            self._manifold, stated))
+
+    def add_known(self, stamp: int, pose: Array, covariance: Array | None) -> None:
+        """Continue to `pose` (1, p) at a stamp [ns]; the covariance (d, d) is of the way there."""
         manifold = self._manifold
         length, angle = manifold.motion(manifold.local(self._ends, pose))
         (self._distance, metres), (self._turn, radians) = length.tolist(), angle.tolist()
         self._metres += metres
         self._radians += radians
-        if options.covariance_source == 'model':
+        if covariance is None:
             self._stated = None  # one message without a covariance: the model speaks for all
         elif self._stated is not None and len(self._stated) >= _SUMMED:
             self._sum_up()
-        if self._stated is not None:
+        if self._stated is not None and covariance is not None:
             self._poses.append(pose)
-            self._stated.append(
-                sample.covariance if options.covariance_source == 'increment'
-                else sample.twist_covariance * ((sample.stamp - self._stamp) * 1e-9) ** 2)
-        self._ends[1], self._stamp = pose[0], sample.stamp
+            self._stated.append(covariance)
+        self._ends[1], self._stamp = pose[0], stamp
 
     def _sum_up(self) -> None:
         """Let one covariance stand for those of all messages so far."""
         end = self._poses[-1]
         total = self._seen_from(end)
-        self._poses, self._stated = [end], None if total is None else [
-            _of_message(self._manifold, total.sum(axis=0))]
-
-    def add_known(self, stamp: int, pose: Array, covariance: Array,
-                  options: OdometryOptions) -> None:
-        """Continue to `pose` (1, p) at a stamp [ns]; the covariance (d, d) is of the way there."""
-        stated = _of_message(self._manifold, covariance)
-        seconds = (stamp - self._stamp) * 1e-9
-        self.add(OdometrySample(stamp, self._manifold.to_pose3(pose)[0], stated,
-                                stated / seconds**2), pose, options)
+        self._poses, self._stated = [end], None if total is None else [total.sum(axis=0)]
 
     def _add_unseen(self, sample: OdometrySample, metres: float, radians: float) -> None:
         """Continue to a sample at the same place, to which the robot may have gone some way."""
@@ -228,18 +227,10 @@ class Motion:
     def _seen_from(self, end: Array) -> Array | None:
         """Return what each message states (k, d, d), seen from an end (1, p); None: see `_sum`."""
         manifold = self._manifold
-        stated = reduced_covariance(manifold, np.array(self._stated))
+        stated = np.array(self._stated)
         if not usable(stated).all():
             return None
         if len(stated) == 1:
             return stated
         Ad = manifold.adjoint(manifold.between(end, np.concatenate(self._poses)))
         return Ad @ stated @ Ad.transpose(0, 2, 1)
-
-
-def _of_message(manifold: Manifold, covariance: Array) -> Array:
-    """Return a covariance (d, d) as a message has it, (6, 6)."""
-    rows = np.array(manifold.COVARIANCE_ROWS)
-    stated = np.zeros((6, 6))
-    stated[rows[:, None], rows] = covariance
-    return stated

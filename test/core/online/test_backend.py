@@ -27,7 +27,8 @@ from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions
-from l1slam_ros.core.online.loop_states import (
+from l1slam_ros.core.online.loops.loop_factors import LoopOptions
+from l1slam_ros.core.online.snapshot import (
     ACCEPTED,
     EXPIRED,
     LOOP_STATES,
@@ -35,7 +36,6 @@ from l1slam_ros.core.online.loop_states import (
     SUSPECT,
     WAITING,
 )
-from l1slam_ros.core.online.loops.loop_factors import LoopOptions
 from l1slam_ros.core.online.update import improve, optimise
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, minimise

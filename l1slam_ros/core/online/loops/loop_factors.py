@@ -30,10 +30,9 @@ from l1slam_ros.core.geometry.noise import (
 )
 from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
-from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.graph.measurements import LoopClosure, Notes
 from l1slam_ros.core.online.keyframes import diagonal_covariance, reduced_covariance
 from l1slam_ros.core.online.loops.waiting_loops import WaitingLoop, WaitingLoops
-from l1slam_ros.core.online.notes import Notes
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
 from l1slam_ros.core.online.snapshot import Growth
 from l1slam_ros.core.options import Options, option

@@ -29,9 +29,9 @@ from l1slam_ros.core.graph.measurements import (
     FASTEST,
     LONGEST_PAUSE,
     SHORTEST_STEP,
+    Notes,
     OdometrySample,
 )
-from l1slam_ros.core.online.notes import Notes
 
 # A restart at the identity is a step so many times the longest of the last few ...
 _FAR, _RECENT = 5.0, 16
