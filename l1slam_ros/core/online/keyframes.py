@@ -10,16 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l1slam_ros.core.geometry import se3
+from l1slam_ros.core.geometry import noise, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.geometry.noise import (
-    MOST_OF_ODOMETRY,
-    MOST_VARIANCE,
-    at_most,
-    bounds,
-    or_model,
-    usable,
-)
 from l1slam_ros.core.graph.measurements import OdometrySample
 from l1slam_ros.core.options import Options, option
 
@@ -218,17 +210,17 @@ class Motion:
         total = stated.sum(axis=0, keepdims=True)
         if verbatim:
             return total[0]
-        known, out = or_model(total, model, MOST_VARIANCE)
-        used, large = at_most(known, MOST_OF_ODOMETRY)
-        self.bounded = bounds(total, used, out | large)
+        known, out = noise.or_model(total, model, noise.MOST_VARIANCE)
+        used, large = noise.at_most(known, noise.MOST_OF_ODOMETRY)
+        self.bounded = noise.bounds(total, used, out | large)
         # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
-        return used[0] if len(stated) == 1 or usable(used)[0] else None
+        return used[0] if len(stated) == 1 or noise.usable(used)[0] else None
 
     def _seen_from(self, end: Array) -> Array | None:
         """Return what each message states (k, d, d), seen from an end (1, p); None: see `_sum`."""
         manifold = self._manifold
         stated = np.array(self._stated)
-        if not usable(stated).all():
+        if not noise.usable(stated).all():
             return None
         if len(stated) == 1:
             return stated

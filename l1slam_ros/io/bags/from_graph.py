@@ -19,15 +19,9 @@ from typing import Any
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
-from l1slam_ros.core.geometry import se3
+from l1slam_ros.core.geometry import noise, se3
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.geometry.noise import (
-    LEAST_VARIANCE,
-    MOST_OF_ODOMETRY,
-    MOST_VARIANCE,
-    Mask,
-    covariance_of,
-)
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
 from l1slam_ros.core.graph.measurements import FASTEST, LONGEST_PAUSE, SHORTEST_STEP
 from l1slam_ros.core.graph.parts import odometry_gaps
@@ -151,12 +145,12 @@ def _note(graph: FactorGraph, stamps: list[int]) -> dict[str, str]:
     metres, _ = manifold.motion(
         manifold.local(manifold.identity(len(steps)), factors.measurement[steps]))
     variances = np.where(factors.speaks, np.diagonal(
-        covariance_of(factors.sqrt_information), axis1=1, axis2=2), 1.0)
+        noise.covariance_of(factors.sqrt_information), axis1=1, axis2=2), 1.0)
     meant = (len(np.unique(equal, axis=0)) < len(equal) or (seconds > LONGEST_PAUSE).any()
              or (metres > FASTEST * np.maximum(seconds, SHORTEST_STEP)).any()
-             or variances.min(initial=1.0) < LEAST_VARIANCE
-             or variances[steps].max(initial=1.0) > MOST_OF_ODOMETRY
-             or variances.max(initial=1.0) > MOST_VARIANCE)
+             or variances.min(initial=1.0) < noise.LEAST_VARIANCE
+             or variances[steps].max(initial=1.0) > noise.MOST_OF_ODOMETRY
+             or variances.max(initial=1.0) > noise.MOST_VARIANCE)
     return (GRAPH_NOTE | (VERBATIM_NOTE if meant else {})
             | (SPACE_NOTE if manifold is se3 else {}))
 
