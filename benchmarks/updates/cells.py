@@ -19,7 +19,6 @@ from robust.cases import FalseCase, false_case
 from robust.kinds import BICOCCA, CITY, INTEL, KINDS, LIES, MANHATTAN
 from robust.places import Place, error_by_time, place, place_of
 from robust.runs import within
-from updates.isam2 import Isam2
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
@@ -31,7 +30,7 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.paper.updates import Kept, run_updates
+from l1slam_ros.paper.updates import Isam2, Kept, run_updates
 
 CHECKPOINTS = 20
 # Simulated: keyframes and edges of the paper's Manhattan10k, and of a large sparse world.
@@ -164,11 +163,11 @@ def _measured(place: Place, cell: Cell, patience: float) -> Row:
                 (kind.suite == 'recorded') == (cell.kind == RECORDED))
     case = false_case(place, kind, cell.share, 0)
     graph = case.graph
-    run_updates(prefix(graph, min(_WARM_UP, graph.n_poses)), 1e6, 1, cell.robust)
-    peer = Isam2(case.clean, patience).update if patience else lambda k: []
+    run_updates(prefix(graph, min(_WARM_UP, graph.n_poses)), None, 1e6, 1, cell.robust)
+    peer = Isam2(case.clean, patience) if patience else None
     # Until here the most was of what made the graph.
     Path('/proc/self/clear_refs').write_text('5')
-    found = run_updates(graph, cell.rate, CHECKPOINTS, cell.robust, peer=peer)
+    found = run_updates(graph, peer, cell.rate, CHECKPOINTS, cell.robust)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     row = Row(cell, commit(), graph.n_poses, len(graph.between), graph.n_poses / found.elapsed,
               spread(found.ours), found.behind, memory,

@@ -2,14 +2,16 @@
 """
 What an update costs while the map grows: Figure 5, and what `benchmarks/incremental.py` measures.
 
-In: a graph, fed to the back end pose by pose, in turn with another one where there is one.
+In: a graph, fed to the back end pose by pose, in turn with gtsam's ISAM2 where that is installed.
 Out: the seconds of each update, and the maps on the way. Seconds are of the thread's processor
 time: others on the machine do not lengthen them, and what goes on behind is counted by itself.
 """
 
+import importlib.util
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +28,8 @@ from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.compilation import load
 from l1slam_ros.io.trajectory import invented_stamps
 
+# [m or rad] ISAM2 linearises again what has moved by more, after each pose.
+_RELINEARISE = 0.1
 # [s] What is left to the workers after the last keyframe; the driver lags no more than this.
 IDLE, _LAG = 1.0, 0.1
 # As in City10k, the graph of the figure in the paper.
@@ -69,21 +73,78 @@ class Updates:
     at_rest: Kept | None = None
 
 
+class Isam2:
+    """
+    The peer: L2, every loop of the graph believed.
+
+    Parameters
+    ----------
+    graph : what it is fed with
+    patience : [s] of its updates in all; then it is left behind
+
+    """
+
+    def __init__(self, graph: FactorGraph, patience: float = float('inf')):
+        gtsam: Any = importlib.import_module('gtsam')
+        self._gtsam, self._factors, self._k = gtsam, graph.between, graph.manifold.TANGENT_SIZE
+        self._Pose, self._Between, self._Prior = (
+            (gtsam.Pose2, gtsam.BetweenFactorPose2, gtsam.PriorFactorPose2) if self._k == 3 else
+            (gtsam.Pose3, gtsam.BetweenFactorPose3, gtsam.PriorFactorPose3))
+        options = gtsam.ISAM2Params()
+        options.setRelinearizeThreshold(_RELINEARISE)
+        options.relinearizeSkip = 1
+        self._isam, self._at = gtsam.ISAM2(options), self._Pose()
+        ends = np.maximum(self._factors.i, self._factors.j)
+        self._rows = np.split(np.argsort(ends, kind='stable'),
+                              np.searchsorted(np.sort(ends), np.arange(1, graph.n_poses)))
+        self._odometry, self._left = self._factors.is_odometry, patience
+
+    def update(self, k: int) -> list[float]:
+        """Add keyframe k and its factors; return the seconds, [] once its time was up."""
+        if self._left <= 0:
+            return []
+        gtsam, new, values, step = self._gtsam, self._gtsam.NonlinearFactorGraph(), \
+            self._gtsam.Values(), self._Pose()
+        if k == 0:
+            new.add(self._Prior(0, step, gtsam.noiseModel.Constrained.All(self._k)))
+        for row in self._rows[k]:
+            i, j = int(self._factors.i[row]), int(self._factors.j[row])
+            Z = self._pose(self._factors.measurement[row])
+            # In space gtsam's rotations come first.
+            root = np.roll(self._factors.sqrt_information[row], self._k // 6 * 3, axis=1)
+            new.add(self._Between(i, j, Z, gtsam.noiseModel.Gaussian.SqrtInformation(root)))
+            if self._odometry[row]:
+                step = Z if j == k else Z.inverse()
+        values.insert(k, self._at.compose(step))
+        began = time.thread_time()
+        self._isam.update(new, values)
+        estimate = (self._isam.calculateEstimatePose2 if self._k == 3 else
+                    self._isam.calculateEstimatePose3)
+        self._at = estimate(k)
+        seconds = time.thread_time() - began
+        self._left -= seconds
+        return [seconds]
+
+    def _pose(self, pose: Array) -> Any:
+        if self._k == 3:
+            return self._Pose(*pose)
+        x, y, z, w = pose[3:]
+        return self._Pose(self._gtsam.Rot3.Quaternion(w, x, y, z), pose[:3])
+
+
 def measurements(graph: FactorGraph) -> Iterator[tuple[OdometrySample, list[LoopClosure]]]:
     """Yield each keyframe's odometry and the loops that end there, ten keyframes a second."""
     forward = turned(graph, graph.between.i > graph.between.j)
     return recorded(forward, invented_stamps(graph.n_poses).tolist())
 
 
-def run_updates(graph: FactorGraph, rate: float, maps: int, robust: bool = True,
-                advance: Callable[[], None] = lambda: None,
-                peer: Callable[[int], list[float]] = lambda k: []) -> Updates:
+def run_updates(graph: FactorGraph, peer: Isam2 | None, rate: float, maps: int,
+                robust: bool = True, advance: Callable[[], None] = lambda: None) -> Updates:
     """
-    Feed the back end with a graph, an update after each keyframe, and a peer in turn.
+    Feed the back end with a graph, an update after each keyframe, and the peer in turn.
 
     rate : keyframes per second, fewer where the updates of both take longer; maps : how many are
-    kept; advance : called after each keyframe; peer : adds keyframe k and its factors, too, and
-    returns the seconds of that, none once its time is up
+    kept; advance : called after each keyframe
     """
     options = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'),
                              robust=RobustOptions(robust))
@@ -99,7 +160,8 @@ def run_updates(graph: FactorGraph, rate: float, maps: int, robust: bool = True,
             before = time.thread_time()
             backend.update(0.0)
             found.ours.append(time.thread_time() - before)
-            found.peer += peer(k)
+            if peer:
+                found.peer += peer.update(k)
             if k + 1 in kept:
                 found.on_the_way.append(Kept.of(backend))
             advance()
@@ -128,9 +190,10 @@ def measure_growth(keyframes: int, rate: float, rng: np.random.Generator,
     the map as it is, ordered anew.
     """
     load()
-    run_updates(_world(_WARM_UP, rng), np.inf, 1)
+    run_updates(_world(_WARM_UP, rng), None, np.inf, 1)
     graph = _world(keyframes, rng)
-    updates = run_updates(graph, rate, _BATCHES, advance=advance)
+    peer = Isam2(graph) if importlib.util.find_spec('gtsam') else None
+    updates = run_updates(graph, peer, rate, _BATCHES, advance=advance)
     return updates, np.array([_batch_seconds(now) for now in updates.on_the_way])
 
 

@@ -8,12 +8,18 @@ from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.paper.updates import measure_growth, run_updates
 
 
+class Peer:
+    """Takes 2 ms each, and has no time left after 50."""
+
+    def update(self, k):
+        return [0.002] if k < 50 else []
+
+
 def test_the_back_end_gets_all_of_the_graph_and_the_peer_its_turns():
     graph = simulate_world(80, 160, WorldOptions(), np.random.default_rng(3)).graph
     backward = ~graph.between.is_odometry & (np.arange(160) % 2 == 0)
     told = []
-    found = run_updates(turned(graph, backward), 1e4, 4, advance=lambda: told.append(1),
-                        peer=lambda k: [0.002] if k < 50 else [])
+    found = run_updates(turned(graph, backward), Peer(), 1e4, 4, advance=lambda: told.append(1))
     assert len(found.ours) == len(told) == 80 and min(found.ours) > 0
     assert found.peer == [0.002] * 50
     assert [now.graph.n_poses for now in found.on_the_way] == [20, 40, 60, 80]
