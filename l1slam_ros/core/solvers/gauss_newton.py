@@ -64,7 +64,7 @@ def minimise_l2(
     cholesky: BlockCholesky,
     report: Report = lambda iteration, cost: None,
 ) -> Solution:
-    """Minimise chi2, the sum of squared whitened residuals; arguments as `optimiser.minimise`."""
+    """Minimise chi2, the sum of squared whitened residuals; arguments as `nonlinear.minimise`."""
     return gauss_newton(graph, poses, Huber(), options, cholesky, report)
 
 
@@ -78,7 +78,7 @@ def gauss_newton(
     surprise: float = 0.0,
 ) -> Solution:
     """
-    Minimise a norm, reweighted at each step; arguments as `optimiser.minimise`.
+    Minimise a norm, reweighted at each step; arguments as `nonlinear.minimise`.
 
     surprise : an undamped step that lowers the cost by what its linear problem says, but for so
     much, is the last one
