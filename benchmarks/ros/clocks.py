@@ -239,7 +239,7 @@ def main() -> None:
     measured = {}
     for _, topic, data in messages:
         if topic == ODOMETRY_TOPIC:
-            sample = conversion.odometry_in(data)[2]
+            sample = conversion.odometry_in(data)[1]
             measured[sample.stamp] = sample.pose3[:2], truth[sample.stamp][:2]
     undisturbed: Undisturbed | None = None
     folder = tempfile.TemporaryDirectory()

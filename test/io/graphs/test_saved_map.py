@@ -14,7 +14,7 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED, WAITING
+from l1slam_ros.core.online.snapshot import ACCEPTED, REJECTED, WAITING
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.core.robust.judgement import Doubt
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
