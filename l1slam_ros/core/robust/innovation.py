@@ -10,7 +10,7 @@ the covariance of the residual of one inside. All samples together cost a few or
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from math import lgamma
 
@@ -42,10 +42,10 @@ class Posterior:
     """
     A graph at its optimum.
 
-    system : its linearisation; noise : (m, k, q) signs, of each factor; samples : (free keyframes
-    + 1, k, q) steps from it that the noise makes, the last one of what is held fixed; moment :
-    (m, k, k) what noise as stated would make of the residual; speaks : (m, k) bool, see
-    `BetweenFactors`; fixed : keyframes that are held, see `anchor`.
+    system : its linearisation, b what is left at the optimum of this; noise : (m, k, q) signs, of
+    each factor; samples : (free keyframes + 1, k, q) steps from it that the noise makes, the last
+    one of what is held fixed; moment : (m, k, k) what noise as stated would make of the residual;
+    speaks : (m, k) bool, see `BetweenFactors`; fixed : keyframes that are held, see `anchor`.
     """
 
     system: LinearSystem
@@ -100,6 +100,9 @@ def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) 
     if not cholesky.factorise(system, np.ones_like(system.b)):
         raise GraphError('the normal matrix is singular: a part of the graph is not tied to '
                          'the anchor, or weights differ beyond double precision')
+    # A map that is to within its noise is no optimum to a factor that others hardly check.
+    step = cholesky.solve(system.transposed_times(system.b))
+    system = replace(system, b=system.b - system.times(step))
     k, q = system.block_size, SAMPLES
     # Signs have the covariance of white noise, and are quicker to draw.
     noise = signs(keys(graph.between.i, graph.between.j), k, q)
