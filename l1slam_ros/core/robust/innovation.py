@@ -27,9 +27,6 @@ from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, linearise
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
 _beta_quantile, _gamma_quantile = cache(beta_quantile), cache(gamma_quantile)
-# Standard deviations of so many samples are right to 10% (1 / sqrt(2 q)), and of two factors
-# together there are far more samples than rows.
-SAMPLES = 48
 # Noise has the tail of Student's distribution with so many degrees of freedom for each number of a
 # step: nobody knows its covariance any better.
 TAIL = 8
@@ -100,7 +97,7 @@ def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) 
     if not cholesky.factorise(system, np.ones_like(system.b)):
         raise GraphError('the normal matrix is singular: a part of the graph is not tied to '
                          'the anchor, or weights differ beyond double precision')
-    k, q = system.block_size, SAMPLES
+    k, q = system.block_size, kernels.prediction.SAMPLES
     # Signs have the covariance of white noise, and are quicker to draw.
     noise = signs(keys(graph.between.i, graph.between.j), k, q)
     speaks = graph.between.speaks
