@@ -106,7 +106,8 @@ def left_over(keyframe, blocks, x, y):
     """
     Return the second moment of y - A x for each factor, (m, k, k).
 
-    y : as of `gather`, of the first factors; zero of the others
+    y : as of `gather`, of the first factors; zero of the others; a row of A may have a block of
+    any number of keyframes
     """
     k, steps = x.shape[1], x.ravel()
     moment, d = np.empty((len(blocks), k, k)), np.empty(k * SAMPLES)
@@ -136,13 +137,13 @@ def moved(keyframe, blocks, x):
 
 
 @compiled
-def _add_moved(keyframe, pair, x, sign, d, to):
-    """Add sign (J_i x_i + J_j x_j) of one factor to the k rows of d from row `to` on."""
-    k = pair.shape[1]
-    for side in range(2):
+def _add_moved(keyframe, J, x, sign, d, to):
+    """Add sign times the sum of J x of one factor to the k rows of d from row `to` on."""
+    k = J.shape[1]
+    for side in range(len(J)):
         for r in range(0, k, 3):
             for c in range(0, k, 3):
-                _add(x, keyframe[side] * k + c, pair[side, r:r + 3, c:c + 3], sign, d, to + r)
+                _add(x, keyframe[side] * k + c, J[side, r:r + 3, c:c + 3], sign, d, to + r)
 
 
 @loop('(f8[:, :, ::1], f8[:, ::1])')
