@@ -25,18 +25,34 @@ _PROOF = f'{_KEYWORD}sha256 '
 _LAST = len(_PROOF) + 2 * sha256().digest_size + 1  # bytes of the last line
 # Rows to a line: readers whose lines have an end get through, and other threads their turn.
 _AT_ONCE = 500
+# [characters] So many are hashed and written at once. Both let go of the interpreter's lock, and
+# to get it back from threads that are busy may take longer than the work.
+_ENOUGH = 2**20
 
 
 def with_remarks(lines: Iterable[str], values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines of a file that says some values, too: arrays, or what JSON knows."""
+    """Yield the lines of a file that says some values, too, many to a string; see `_unproven`."""
     digest = sha256()
-    for line in _unproven(lines, values):
-        digest.update(f'{line}\n'.encode())
-        yield line
+    for text in _together(_unproven(lines, values)):
+        digest.update(f'{text}\n'.encode())
+        yield text
     yield f'{_PROOF}{digest.hexdigest()}'
 
 
+def _together(lines: Iterable[str]) -> Iterator[str]:
+    some: list[str] = []
+    size = 0
+    for line in lines:
+        some.append(line)
+        size += len(line)
+        if size > _ENOUGH:
+            yield '\n'.join(some)
+            some, size = [], 0
+    yield '\n'.join(some)
+
+
 def _unproven(lines: Iterable[str], values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield lines and values: arrays, or what JSON knows."""
     yield _FIRST
     yield from lines
     for name, value in values.items():
