@@ -30,25 +30,23 @@ def gather(keyframe, blocks, y, product):
 def solve_many(panels, first, start, pattern, offset, position, right):
     """Turn right hand sides, (n, k, q) in the order of the keyframes, into L'^-1 L^-1 right."""
     n, k, q = right.shape
-    x = np.empty((n * k, q))
+    x, row = right.reshape(n * k, q), np.empty(n, np.int64)
     for f in range(n):
-        x[position[f] * k:(position[f] + 1) * k] = right[f]
+        row[position[f]] = f * k
     for s in range(len(first) - 1):
         panel, rows = _panel(panels, first, start, pattern, offset, s, k)
         for c in range(0, panel.shape[1], 3):
-            own = first[s] * k + c
+            own = row[first[s] + c // k] + c % k
             _solve_three(panel[c:c + 3, c:c + 3], x, own)
             for r in range(c + 3, len(panel), 3):
-                _add(x, own, panel[r:r + 3, c:c + 3], -1.0, x, rows[r // k] * k + r % k)
+                _add(x, own, panel[r:r + 3, c:c + 3], -1.0, x, row[rows[r // k]] + r % k)
     for s in range(len(first) - 2, -1, -1):
         panel, rows = _panel(panels, first, start, pattern, offset, s, k)
         for c in range(panel.shape[1] - 3, -1, -3):
-            own = first[s] * k + c
+            own = row[first[s] + c // k] + c % k
             for r in range(c + 3, len(panel), 3):
-                _add(x, rows[r // k] * k + r % k, panel[r:r + 3, c:c + 3].T, -1.0, x, own)
+                _add(x, row[rows[r // k]] + r % k, panel[r:r + 3, c:c + 3].T, -1.0, x, own)
             _solve_three_transposed(panel[c:c + 3, c:c + 3], x, own)
-    for f in range(n):
-        right[f] = x[position[f] * k:(position[f] + 1) * k]
 
 
 @compiled
