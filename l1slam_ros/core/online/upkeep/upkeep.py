@@ -208,7 +208,9 @@ class Upkeep:
             if self._live.is_map_due(idle):
                 self._mapper.start(lambda: self._map_anew(idle, budget, check))
             if self._live.is_judge_due(idle, budget):
-                self._judge.start(lambda: self._judge_all(idle, check))
+                # First what is the sooner over, and all there is to find out most of the time.
+                anew = idle and self._live.all_judged
+                self._judge.start(lambda: self._judge_all(anew, check))
             elif self._live.is_norm_due(idle):
                 self._judge.start(lambda: self._ask_norm(check))
             return self._mapper.busy or self._judge.busy
