@@ -37,8 +37,6 @@ class NodeOptions(BackendOptions):
     dimension: int = option(2, 'of the world: SE(2) or SE(3)', '', 2, 3, fixed=True)
     map_frame: str = option('map', 'frame of the optimised poses', fixed=True)
     odom_frame: str = option('odom', 'frame of the odometry', fixed=True)
-    base_frame: str = option(
-        '', "the robot's frame; empty: the first child_frame_id seen", fixed=True)
     publish_tf: bool = option(
         True, 'publish map -> odom on /tf, where tf2_msgs is installed', fixed=True)
     transform_period: float = option(

@@ -23,13 +23,15 @@ from l1slam_ros.core.geometry.noise import Mask, filled
 from l1slam_ros.core.geometry.quantiles import beta_quantile, gamma_quantile
 from l1slam_ros.core.graph.draws import keys, signs
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
-from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, linearise
+from l1slam_ros.core.graph.linear_system import (
+    LinearSystem,
+    anchor,
+    linearise,
+    whitened_residual,
+)
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
 _beta_quantile, _gamma_quantile = cache(beta_quantile), cache(gamma_quantile)
-# Standard deviations of so many samples are right to 10% (1 / sqrt(2 q)), and of two factors
-# together there are far more samples than rows.
-SAMPLES = 48
 # Noise has the tail of Student's distribution with so many degrees of freedom for each number of a
 # step: nobody knows its covariance any better.
 TAIL = 8
@@ -42,10 +44,11 @@ class Posterior:
     """
     A graph at its optimum.
 
-    system : its linearisation, b what is left at the optimum of this; noise : (m, k, q) signs, of
-    each factor; samples : (free keyframes + 1, k, q) steps from it that the noise makes, the last
-    one of what is held fixed; moment : (m, k, k) what noise as stated would make of the residual;
-    speaks : (m, k) bool, see `BetweenFactors`; fixed : keyframes that are held, see `anchor`.
+    system : its linearisation, there or one step before, b what is left at the optimum of this;
+    noise : (m, k, q) signs, of each factor; samples : (free keyframes + 1, k, q) steps from it
+    that the noise makes, the last one of what is held fixed; moment : (m, k, k) what noise as
+    stated would make of the residual; speaks : (m, k) bool, see `BetweenFactors`; fixed :
+    keyframes that are held, see `anchor`.
     """
 
     system: LinearSystem
@@ -80,16 +83,20 @@ class Posterior:
         return np.where(alone | ~np.isfinite(square), 0.0, square)
 
 
-def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Posterior:
+def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
+                     solved: LinearSystem | None = None) -> Posterior:
     """
     Return the posterior of a graph about its optimum, poses (n, p).
+
+    solved : the system that was solved for these poses, which `cholesky` has factored
 
     Raises
     ------
     GraphError : some keyframe is not tied to the anchor.
 
     """
-    system = _factorised(graph, poses, cholesky)
+    system = (replace(solved, b=-whitened_residual(graph, poses)) if solved
+              else _factorised(graph, poses, cholesky))
     # A map that is to within its noise is no optimum to a factor that others hardly check.
     step = cholesky.solve(system.transposed_times(system.b))
     system = replace(system, b=system.b - system.times(step))
@@ -108,7 +115,7 @@ def covariances(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
     system = _factorised(graph, poses, cholesky)
     noisy = replace(system, blocks=system.blocks * np.sqrt(variance)[:, None, None, None])
     samples = _steps(graph, noisy, cholesky)[1][:-1]
-    return samples @ samples.transpose(0, 2, 1) / SAMPLES
+    return samples @ samples.transpose(0, 2, 1) / kernels.prediction.SAMPLES
 
 
 def _factorised(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> LinearSystem:
@@ -123,9 +130,10 @@ def _steps(graph: FactorGraph, system: LinearSystem,
            cholesky: BlockCholesky) -> tuple[np.ndarray, Array]:
     """Return signs (m, k, q), and the steps (free keyframes + 1, k, q) that such noise makes."""
     # Signs have the covariance of white noise, and are quicker to draw.
-    noise = signs(keys(graph.between.i, graph.between.j), system.block_size, SAMPLES)
+    k, q = system.block_size, kernels.prediction.SAMPLES
+    noise = signs(keys(graph.between.i, graph.between.j), k, q)
     noise[~graph.between.speaks] = 0
-    samples = np.zeros((system.size + 1, system.block_size, SAMPLES))
+    samples = np.zeros((system.size + 1, k, q))
     kernels.prediction.gather(system.keyframe, system.blocks, noise, samples)
     samples[-1] = 0.0
     cholesky.solve_many(samples[:-1])
@@ -186,12 +194,17 @@ class Innovations:
         rows, place = np.unique(np.concatenate((first, second)), return_inverse=True)
         moved = kernels.prediction.moved(system.keyframe[rows], system.blocks[rows],
                                          posterior.samples)
-        residual = -system.b.reshape(-1, k)[rows]
+        # Of all with all: each is of many pairs.
+        columns = moved.reshape(len(rows) * k, -1)
+        shared = (columns @ columns.T / columns.shape[1]).reshape(len(rows), k, len(rows), k)
         pairs = place.reshape(2, -1)
-        both = np.concatenate((moved[pairs[0]], moved[pairs[1]]), axis=1)
-        covariance = both @ both.transpose(0, 2, 1) / both.shape[2] + np.eye(2 * k)
+        covariance = np.empty((len(first), 2, k, 2, k))
+        for one, other in np.ndindex(2, 2):
+            covariance[:, one, :, other] = shared[pairs[one], :, pairs[other]]
+        covariance[:, [0, 1], :, [0, 1]] += np.eye(k)
+        residual = -system.b.reshape(-1, k)[rows[pairs.T]].reshape(-1, 2 * k)
         square, log_det = kernels.prediction.normalise(
-            covariance, np.concatenate((residual[pairs[0]], residual[pairs[1]]), axis=1))
+            covariance.reshape(-1, 2 * k, 2 * k), residual)
         claim = self.log_claim[first] + self.log_claim[second]
         freedom = self.freedom[first] + self.freedom[second]
         return square, log_likelihood_ratio(square, log_det, claim, freedom, k)

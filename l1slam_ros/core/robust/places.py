@@ -115,17 +115,21 @@ def _near(points: Array, reach: float) -> tuple[Indices, Indices]:
     """
     Return the pairs of points (n, k) that no component tells further apart than `reach`, (pairs,).
 
-    A sweep along the first component. SciPy's trees do the same, but to import them takes longer
-    than to solve most graphs.
+    In strips as wide as that along the first component, each sorted by the second. SciPy's trees
+    do the same, but to import them takes longer than to solve most graphs.
     """
-    order = np.argsort(points[:, 0], kind='stable')
-    points = points[order]
-    last = np.searchsorted(points[:, 0], points[:, 0] + reach, side='right')
-    within = last - np.arange(len(points))
-    first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for shift in range(1, within.max(initial=0)):
-        rows = np.flatnonzero(within > shift)
-        rows = rows[(np.abs(points[rows] - points[rows + shift]) <= reach).all(axis=1)]
-        first.append(order[rows])
-        second.append(order[rows + shift])
-    return np.concatenate(first), np.concatenate(second)
+    strip = np.floor(points[:, 0] / reach)
+    height = np.ptp(points[:, 1]) + 4 * reach if len(points) else 0.0
+    where = strip * height + points[:, 1]
+    order = np.argsort(where, kind='stable')
+    points, where, number = points[order], where[order], np.arange(len(order))
+    found = []
+    for first, last in ((number + 1, where + reach),
+                        (np.searchsorted(where, where + height - reach), where + height + reach)):
+        count = np.maximum(np.searchsorted(where, last, side='right') - first, 0)
+        one = np.repeat(number, count)
+        other = np.arange(len(one)) + np.repeat(first - (np.cumsum(count) - count), count)
+        near = (np.abs(points[one] - points[other]) <= reach).all(axis=1)
+        found.append((order[one[near]], order[other[near]]))
+    (one, other), (more, others) = found
+    return np.concatenate((one, more)), np.concatenate((other, others))

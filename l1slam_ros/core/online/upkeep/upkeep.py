@@ -219,6 +219,7 @@ class Upkeep:
             live, solver = self._live, self._solver
             exact = live.is_exact_due(idle)
         whole = now.problem()
+        del now  # holds the factors of a front that may be replaced meanwhile
         problem = as_one(whole)
         if exact:
             check = until(lambda: live.is_late, check)
@@ -243,6 +244,7 @@ class Upkeep:
             live, loops = self._live, self._live.begin_judgement()
             grown = live.growth()
         whole = now.problem()
+        del now  # as above
         problem = as_one(whole)
         at_rest = until(lambda: live.growth() != grown, check)
         judgement, poses = robust_solve(problem.graph, check=at_rest) if anew else judge(
