@@ -156,11 +156,11 @@ def _variants() -> list[Kind]:
             'half-of-loops': ('thinned', (0.5,)), 'three-quarters': ('thinned', (0.75,)),
             'first-half': ('stretch', (0.0, 0.5)), 'middle-half': ('stretch', (0.25, 0.75)),
             'last-half': ('stretch', (0.5, 1.0))}
-    lied = Bar(lost=0.1, error=ODOMETRY, doubt=EXCUSES)
+    lied, clean = Bar(lost=0.1, error=ODOMETRY, doubt=EXCUSES), Bar(lost=0.02)
     return [
         *(Kind('variants', name, graphs, change, amounts, bar=bar)
           for name, (change, amounts) in told.items()
-          for graphs, bar in (((BICOCCA,), lied), ((INTEL, *RECORDED_CLEAN), Bar()),
+          for graphs, bar in (((BICOCCA,), lied), ((INTEL, *RECORDED_CLEAN), clean),
                               # Its track has no times: of a part of the way it says nothing.
                               *([] if change == 'stretch' else [((BOVISA,), lied)]))),
         *(Kind('variants', f'more-{lies}', (BICOCCA,), lies=lies, shares=(1 / 3,), bar=lied)

@@ -45,10 +45,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import anchor
 from l1slam_ros.core.graph.parts import tied
-from l1slam_ros.core.robust.innovation import chi2_quantile, sample_posterior
+from l1slam_ros.core.robust.innovation import chi2_quantile, covariances
 from l1slam_ros.core.robust.judgement import NORM, Doubt, Judgement, doubts, judgement_of
 from l1slam_ros.core.robust.rounds import REFUSED, Growth
 from l1slam_ros.core.robust.slips import join, without_slip
@@ -110,16 +112,15 @@ def minimise_robustly(
     solution = minimise(whole, seed)
     rows = int(judgement.accepted.sum()) * graph.manifold.TANGENT_SIZE
     check()
-    judgement = replace(judgement, doubts=judgement.doubts + _doubts_of_norm(
-        graph, judgement, seed, solution.poses))
+    of_norm = _doubts_of_norm(graph, judgement, (whole, seed), solution.poses)
+    judgement = replace(judgement, doubts=judgement.doubts + of_norm)
     return RobustMap(replace(solution, dual=solution.dual[:rows]), seed, judgement)
 
 
 def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
                    check: Callable[[], None]) -> tuple[Doubt, ...]:
     """Return the doubts that `minimise_robustly` would have of a map, (n, p), by its norm."""
-    seed = _least_squares(graph, judgement, poses, check)[1]
-    return _doubts_of_norm(graph, judgement, seed, poses)
+    return _doubts_of_norm(graph, judgement, _least_squares(graph, judgement, poses, check), poses)
 
 
 def _least_squares(graph: FactorGraph, judgement: Judgement, poses: Array,
@@ -129,19 +130,24 @@ def _least_squares(graph: FactorGraph, judgement: Judgement, poses: Array,
     return whole, l2_map(whole, poses, cholesky_of(whole), lambda *_: check())
 
 
-def _doubts_of_norm(graph: FactorGraph, judgement: Judgement, seed: Array,
+def _doubts_of_norm(graph: FactorGraph, judgement: Judgement, least: tuple[FactorGraph, Array],
                     poses: Array) -> tuple[Doubt, ...]:
     """
-    Return a doubt where half of a map is further from the L2 map, (n, p) each, than noise makes.
+    Return a doubt where half of a map, (n, p), is further off the L2 map than noise makes it.
 
     Of normal noise, as it was found, the difference has pi/2 - 1 of the covariance of the L2 map
     at most, which is what L1 pays for it. Of the keyframes of one way all may err together.
+
+    least : of `_least_squares`
     """
-    rows, manifold = np.flatnonzero(judgement.accepted), graph.manifold
-    loop = ~graph.between.is_odometry[rows]
-    found = tied(graph.subset(rows, judgement.variance[loop.astype(np.int64)]), seed)
-    posterior = sample_posterior(found, seed, cholesky_of(found))
-    square = posterior.squares(manifold.local(seed, poses)[posterior.fixed:])
+    (whole, seed), manifold = least, graph.manifold
+    loop = ~graph.between.is_odometry[judgement.accepted]
+    # Where the part is as noisy as was found, odometry is its unit.
+    noise = judgement.variance[(loop & judgement.is_noise_stated).astype(np.int64)]
+    noise = np.concatenate((noise, np.ones(len(whole.between) - len(noise))))
+    step = manifold.local(seed, poses)[anchor(whole):]
+    square = kernels.prediction.normalise(
+        covariances(whole, seed, cholesky_of(whole), noise), step)[0]
     explained = (np.pi / 2 - 1) * chi2_quantile(1 - REFUSED, np.array([manifold.TANGENT_SIZE]))
     if np.count_nonzero(np.isfinite(square) & (square > explained)) <= len(square) / 2:
         return ()

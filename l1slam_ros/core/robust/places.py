@@ -47,17 +47,14 @@ def err_together(place: Indices, residual: Array, drawn: Array) -> bool:
                                          (left**2).mean(axis=2) / count[:, None]))
     if not expected.any():
         return False
-    single = (drawn**2).mean(axis=2)
-    larger = np.cbrt(found.sum() / (residual**2).sum() * single.sum() / expected.sum())
+    larger = (found.sum() / (residual**2).sum()
+              * (drawn**2).mean(axis=2).sum() / expected.sum())
     # A weighted sum of squares is nearly chi2 (F. E. Satterthwaite, An approximate distribution of
-    # estimates of variance components, 1946), the cube root of which is nearly normal; so is that
-    # of Fisher's F (E. Paulson, An approximate normalization of the analysis of variance
-    # distribution, 1942).
-    of_sums, of_single = (2 * (each**2).sum() / (9 * each.sum() ** 2)
-                          for each in (expected, single))
-    normal = ((1 - of_single) * larger - (1 - of_sums)) / np.sqrt(
-        of_single * larger**2 + of_sums)
-    return bool(normal > _BEYOND_DOUBT)
+    # estimates of variance components, 1946), the cube root of which is nearly normal (E. B.
+    # Wilson and M. M. Hilferty, The distribution of chi-square, 1931).
+    freedom = expected.sum() ** 2 / (expected**2).sum()
+    spread = 2 / (9 * freedom)
+    return bool(np.cbrt(larger) > 1 - spread + _BEYOND_DOUBT * np.sqrt(spread))
 
 
 def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
