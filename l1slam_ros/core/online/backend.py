@@ -202,12 +202,8 @@ class Backend(Upkeep):
                 self._begin(self._builder, now.known().unjudged())
         self._wake()
 
-    def add_odometry(self, sample: OdometrySample) -> Array | None:
-        """
-        Add one sample; return the odometry frame seen from the map for it, (1, p).
-
-        None: it is held, not used yet; see `GraphBuilder.add_odometry`.
-        """
+    def add_odometry(self, sample: OdometrySample) -> bool:
+        """Add one sample; return whether it is used, see `GraphBuilder.add_odometry`."""
         require_sound(sample)
         with self._lock:
             self._samples += 1
@@ -215,9 +211,8 @@ class Backend(Upkeep):
                 used = self._builder.add_odometry(sample)
             finally:  # of two samples the second may be refused
                 self._begin_map()
-            map_to_odom = self._map_to_odom_now() if used else None
         self._wake()
-        return map_to_odom
+        return used
 
     def robot(self) -> Robot | None:
         """Return where the robot is; None: no odometry has said yet where it is in this map."""

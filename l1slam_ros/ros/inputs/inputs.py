@@ -250,7 +250,7 @@ class Inputs:
             self._node.get_logger().warning(
                 f'odometry in frame {quoted(frame)} is used, but {self._map_frame} -> '
                 f'{self._odom_frame} is published; expected odom_frame to be its name', once=True)
-        self._unanswered |= self._backend.add_odometry(sample) is not None
+        self._unanswered |= self._backend.add_odometry(sample)
         if self._backlog < _ANSWERED:
             self._answer()
 

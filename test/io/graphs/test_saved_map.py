@@ -133,7 +133,8 @@ def test_the_motion_after_the_last_keyframe_is_not_lost(tmp_path):
     # Begun elsewhere, or anew, odometry goes on from where the robot was.
     for time, pose in (30, (40.0, 50.0, 1.0)), (20, (0.0, 0.0, 0.0)), (9000, (8.0, 0.8, 0.16)):
         backends[0].restore(load_map(path)[0])
-        moved = backends[0].add_odometry(odometry(time, pose))
+        assert backends[0].add_odometry(odometry(time, pose))
+        moved = backends[0].robot().map_to_odom
         np.testing.assert_allclose(se2.compose(moved, np.array([pose])), [[7.4, 0.8, 0.16]],
                                    atol=1e-9)
 

@@ -71,7 +71,8 @@ class WaitingLoops:
     def expired(self, since: int) -> list[WaitingLoop]:
         """Take out the loops that came before `since`, in the order they came."""
         early = takewhile(lambda item: item[1].arrival < since, self._loops.items())
-        return [self._take(number) for number in [number for number, _ in early]]
+        numbers = [number for number, _ in early]
+        return [self._take(number) for number in numbers]
 
     def begin_anew(self, time: Callable[[int], int], arrival: int | None = None) -> None:
         """
