@@ -46,7 +46,7 @@ class NodeOptions(BackendOptions):
         's', 0, 3600)
     save_path: str = option('', 'the .g2o file of ~/save and ~/load')
     autosave_period: float = option(
-        60.0, 'with a save_path, how often a map that changed is saved, and at the end; 0: off',
+        60.0, 'with a save_path, within what time a changed map is saved, and at the end; 0: off',
         's', 0, 1e9)
     load_on_start: bool = option(False, 'load the map of save_path at start', fixed=True)
     update: UpdateOptions = UpdateOptions()

@@ -134,6 +134,15 @@ def test_pose_and_transform_agree_with_the_path(bench, tmp_path, rng):
     assert ahead[0] == pytest.approx(10**8, abs=1e4) and (np.diff(ahead) > 0).all()
 
 
+def test_odometry_that_outruns_the_transforms_is_covered_at_once(bench):
+    """That of a bag played fast: look-ups at its times would wait for the next period."""
+    b = bench(transform_period=3600.0)
+    for k in range(5):
+        b.drive(k, k + 1)
+        b.until(lambda k=k: len(b.received['map_to_odom']) == k + 1, 'a transform with a message')
+        assert stamp_of(b.received['map_to_odom'][-1].header) == (k + 1) * 10**9 + 10**8
+
+
 def test_default_thresholds_make_a_keyframe_every_half_metre(bench):
     b = bench()
     for k in range(101):
