@@ -2,35 +2,42 @@
 """
 Many steps of all keyframes at once, and what they say of each factor.
 
-Arrays of steps are (n, k, q): q samples of the k numbers of each of n keyframes, the last keyframe
-standing for all that are held fixed; k is 3 or 6, and the work is done in tiles of 3 x 3. Other
-arrays are those of `LinearSystem` and of `cholesky`.
+Arrays of steps are (n, k, q): q = `SAMPLES` of the k numbers of each of n keyframes, the last
+keyframe standing for all that are held fixed; k is 3 or 6, and the work is done in tiles of 3 x 3.
+Other arrays are those of `LinearSystem` and of `cholesky`.
+
+Steps are passed on as flat arrays, and q is a constant: only so does the compiler know that rows
+do not overlap, and works on as many numbers at once as fit a register.
 """
 
 import numpy as np
 
 from l1slam_ros.core.kernels.compiled import compiled, loop
 
+# Standard deviations of so many samples are right to 10% (1 / sqrt(2 q)), and of two factors
+# together there are far more samples than rows.
+SAMPLES = 48
+
 
 @loop('(i8[:, ::1], f8[:, :, :, ::1], i1[:, :, ::1], f8[:, :, ::1])')
 def gather(keyframe, blocks, y, product):
     """Add A'y of all samples to product (n + 1, k, q); y : (m, k, q) whole numbers."""
-    k, q = product.shape[1:]
-    z = np.empty((k, q))
+    k, to = product.shape[1], product.ravel()
+    z = np.empty(k * SAMPLES)
     for f in range(len(blocks)):
-        z[:] = y[f]
+        z[:] = y[f].ravel()
         for side in range(2):
-            J, to = blocks[f, side], product[keyframe[f, side]]
+            J, at = blocks[f, side], keyframe[f, side] * k
             for c in range(0, k, 3):
                 for r in range(0, k, 3):
-                    _add(z, r, J[r:r + 3, c:c + 3].T, 1.0, to, c)
+                    _add(z, r, J[r:r + 3, c:c + 3].T, 1.0, to, at + c)
 
 
 @loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i4[::1], f8[:, :, ::1])')
 def solve_many(panels, first, start, pattern, offset, position, right):
     """Turn right hand sides, (n, k, q) in the order of the keyframes, into L'^-1 L^-1 right."""
-    n, k, q = right.shape
-    x, row = right.reshape(n * k, q), np.empty(n, np.int64)
+    n, k, _ = right.shape
+    x, row = right.ravel(), np.empty(n, np.int64)
     for f in range(n):
         row[position[f]] = f * k
     for s in range(len(first) - 1):
@@ -59,32 +66,39 @@ def _panel(panels, first, start, pattern, offset, s, k):
 @compiled
 def _add(x, at, F, sign, y, to):
     """Add sign F times three rows of x to three rows of y, F (3, 3)."""
+    u, z = x[at * SAMPLES:(at + 3) * SAMPLES], y[to * SAMPLES:(to + 3) * SAMPLES]
     a, b, c = sign * F[0, 0], sign * F[0, 1], sign * F[0, 2]
     d, e, f = sign * F[1, 0], sign * F[1, 1], sign * F[1, 2]
     g, h, i = sign * F[2, 0], sign * F[2, 1], sign * F[2, 2]
-    for t in range(x.shape[1]):
-        u, v, w = x[at, t], x[at + 1, t], x[at + 2, t]
-        y[to, t] += a * u + b * v + c * w
-        y[to + 1, t] += d * u + e * v + f * w
-        y[to + 2, t] += g * u + h * v + i * w
+    for t in range(SAMPLES):
+        p, q, r = u[t], u[SAMPLES + t], u[2 * SAMPLES + t]
+        z[t] += a * p + b * q + c * r
+        z[SAMPLES + t] += d * p + e * q + f * r
+        z[2 * SAMPLES + t] += g * p + h * q + i * r
 
 
 @compiled
 def _solve_three(L, x, at):
     """Solve L y = three rows of x, in place."""
-    for t in range(x.shape[1]):
-        x[at, t] /= L[0, 0]
-        x[at + 1, t] = (x[at + 1, t] - L[1, 0] * x[at, t]) / L[1, 1]
-        x[at + 2, t] = (x[at + 2, t] - L[2, 0] * x[at, t] - L[2, 1] * x[at + 1, t]) / L[2, 2]
+    x = x[at * SAMPLES:(at + 3) * SAMPLES]
+    a, b, c, d, e, f = 1 / L[0, 0], L[1, 0], 1 / L[1, 1], L[2, 0], L[2, 1], 1 / L[2, 2]
+    for t in range(SAMPLES):
+        u = x[t] * a
+        v = (x[SAMPLES + t] - b * u) * c
+        x[2 * SAMPLES + t] = (x[2 * SAMPLES + t] - d * u - e * v) * f
+        x[t], x[SAMPLES + t] = u, v
 
 
 @compiled
 def _solve_three_transposed(L, x, at):
     """Solve L'y = three rows of x, in place."""
-    for t in range(x.shape[1]):
-        x[at + 2, t] /= L[2, 2]
-        x[at + 1, t] = (x[at + 1, t] - L[2, 1] * x[at + 2, t]) / L[1, 1]
-        x[at, t] = (x[at, t] - L[1, 0] * x[at + 1, t] - L[2, 0] * x[at + 2, t]) / L[0, 0]
+    x = x[at * SAMPLES:(at + 3) * SAMPLES]
+    a, b, c, d, e, f = 1 / L[0, 0], L[1, 0], 1 / L[1, 1], L[2, 0], L[2, 1], 1 / L[2, 2]
+    for t in range(SAMPLES):
+        w = x[2 * SAMPLES + t] * f
+        v = (x[SAMPLES + t] - e * w) * c
+        x[t] = (x[t] - b * v - d * w) * a
+        x[SAMPLES + t], x[2 * SAMPLES + t] = v, w
 
 
 @loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1], i1[:, :, ::1])')
@@ -92,40 +106,44 @@ def left_over(keyframe, blocks, x, y):
     """
     Return the second moment of y - A x for each factor, (m, k, k).
 
-    y : as of `gather`, of the first factors; zero of the others
+    y : as of `gather`, of the first factors; zero of the others; a row of A may have a block of
+    any number of keyframes
     """
-    k, q = x.shape[1:]
-    moment, d = np.empty((len(blocks), k, k)), np.empty((k, q))
+    k, steps = x.shape[1], x.ravel()
+    moment, d = np.empty((len(blocks), k, k)), np.empty(k * SAMPLES)
     for f in range(len(blocks)):
         d[:] = 0.0
         if f < len(y):
-            d[:] = y[f]
-        _add_moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], -1.0, d)
+            d[:] = y[f].ravel()
+        _add_moved(keyframe[f], blocks[f], steps, -1.0, d, 0)
         for r in range(k):
+            one = d[r * SAMPLES:(r + 1) * SAMPLES]
             for c in range(r + 1):
-                total = 0.0
-                for t in range(q):
-                    total += d[r, t] * d[c, t]
-                moment[f, r, c] = moment[f, c, r] = total / q
+                other, total = d[c * SAMPLES:(c + 1) * SAMPLES], 0.0
+                for t in range(SAMPLES):
+                    total += one[t] * other[t]
+                moment[f, r, c] = moment[f, c, r] = total / SAMPLES
     return moment
 
 
 @loop('(i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1])')
 def moved(keyframe, blocks, x):
     """Return A x of each factor and sample, (m, k, q)."""
-    d = np.zeros((len(blocks), *x.shape[1:]))
+    k, steps, d = x.shape[1], x.ravel(), np.zeros((len(blocks), *x.shape[1:]))
+    product = d.ravel()
     for f in range(len(blocks)):
-        _add_moved(blocks[f], x[keyframe[f, 0]], x[keyframe[f, 1]], 1.0, d[f])
+        _add_moved(keyframe[f], blocks[f], steps, 1.0, product, f * k)
     return d
 
 
 @compiled
-def _add_moved(pair, x_i, x_j, sign, d):
-    """Add sign (J_i x_i + J_j x_j) of one factor to d (k, q)."""
-    for r in range(0, len(d), 3):
-        for c in range(0, len(d), 3):
-            _add(x_i, c, pair[0, r:r + 3, c:c + 3], sign, d, r)
-            _add(x_j, c, pair[1, r:r + 3, c:c + 3], sign, d, r)
+def _add_moved(keyframe, J, x, sign, d, to):
+    """Add sign times the sum of J x of one factor to the k rows of d from row `to` on."""
+    k = J.shape[1]
+    for side in range(len(J)):
+        for r in range(0, k, 3):
+            for c in range(0, k, 3):
+                _add(x, keyframe[side] * k + c, J[side, r:r + 3, c:c + 3], sign, d, to + r)
 
 
 @loop('(f8[:, :, ::1], f8[:, ::1])')

@@ -166,7 +166,8 @@ def noise_variance(found: Innovations) -> Array:
         log_det -= (k - freedom) * np.log(ratio)  # what says nothing has no noise
         for start in (1.0, *(np.quantile(square, (0.1, 0.5)) / k).tolist()):
             likelihood, scale = _fitted_scale(square, log_det, log_claim, freedom, k, start)
-            costs = _RATIO_COSTS * len(best) * (ratio != 1) + _DECADE_COSTS * abs(np.log10(scale))
+            costs = _RATIO_COSTS * len(best) * (ratio != 1) + _DECADE_COSTS * (
+                abs(np.log10(scale)) + abs(np.log10(ratio)))
             fits.append((likelihood - costs, scale, ratio))
     _, scale, ratio = max(fits)
     return np.array([scale, ratio * scale])

@@ -10,7 +10,7 @@ the covariance of the residual of one inside. All samples together cost a few or
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from math import lgamma
 
@@ -23,13 +23,15 @@ from l1slam_ros.core.geometry.noise import Mask, filled
 from l1slam_ros.core.geometry.quantiles import beta_quantile, gamma_quantile
 from l1slam_ros.core.graph.draws import keys, signs
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
-from l1slam_ros.core.graph.linear_system import LinearSystem, anchor, linearise
+from l1slam_ros.core.graph.linear_system import (
+    LinearSystem,
+    anchor,
+    linearise,
+    whitened_residual,
+)
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
 _beta_quantile, _gamma_quantile = cache(beta_quantile), cache(gamma_quantile)
-# Standard deviations of so many samples are right to 10% (1 / sqrt(2 q)), and of two factors
-# together there are far more samples than rows.
-SAMPLES = 48
 # Noise has the tail of Student's distribution with so many degrees of freedom for each number of a
 # step: nobody knows its covariance any better.
 TAIL = 8
@@ -42,10 +44,11 @@ class Posterior:
     """
     A graph at its optimum.
 
-    system : its linearisation; noise : (m, k, q) signs, of each factor; samples : (free keyframes
-    + 1, k, q) steps from it that the noise makes, the last one of what is held fixed; moment :
-    (m, k, k) what noise as stated would make of the residual; speaks : (m, k) bool, see
-    `BetweenFactors`; fixed : keyframes that are held, see `anchor`.
+    system : its linearisation, there or one step before, b what is left at the optimum of this;
+    noise : (m, k, q) signs, of each factor; samples : (free keyframes + 1, k, q) steps from it
+    that the noise makes, the last one of what is held fixed; moment : (m, k, k) what noise as
+    stated would make of the residual; speaks : (m, k) bool, see `BetweenFactors`; fixed :
+    keyframes that are held, see `anchor`.
     """
 
     system: LinearSystem
@@ -87,20 +90,27 @@ class Posterior:
         return np.where(alone | ~np.isfinite(square), 0.0, square)
 
 
-def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Posterior:
+def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
+                     solved: LinearSystem | None = None) -> Posterior:
     """
     Return the posterior of a graph about its optimum, poses (n, p).
+
+    solved : the system that was solved for these poses, which `cholesky` has factored
 
     Raises
     ------
     GraphError : some keyframe is not tied to the anchor.
 
     """
-    system = linearise(graph, poses)
-    if not cholesky.factorise(system, np.ones_like(system.b)):
+    residual = whitened_residual(graph, poses)
+    system = replace(solved, b=-residual) if solved else linearise(graph, poses, residual)
+    if not solved and not cholesky.factorise(system, np.ones_like(residual)):
         raise GraphError('the normal matrix is singular: a part of the graph is not tied to '
                          'the anchor, or weights differ beyond double precision')
-    k, q = system.block_size, SAMPLES
+    # A map that is to within its noise is no optimum to a factor that others hardly check.
+    step = cholesky.solve(system.transposed_times(system.b))
+    system = replace(system, b=system.b - system.times(step))
+    k, q = system.block_size, kernels.prediction.SAMPLES
     # Signs have the covariance of white noise, and are quicker to draw.
     noise = signs(keys(graph.between.i, graph.between.j), k, q)
     speaks = graph.between.speaks
@@ -167,12 +177,17 @@ class Innovations:
         rows, place = np.unique(np.concatenate((first, second)), return_inverse=True)
         moved = kernels.prediction.moved(system.keyframe[rows], system.blocks[rows],
                                          posterior.samples)
-        residual = -system.b.reshape(-1, k)[rows]
+        # Of all with all: each is of many pairs.
+        columns = moved.reshape(len(rows) * k, -1)
+        shared = (columns @ columns.T / columns.shape[1]).reshape(len(rows), k, len(rows), k)
         pairs = place.reshape(2, -1)
-        both = np.concatenate((moved[pairs[0]], moved[pairs[1]]), axis=1)
-        covariance = both @ both.transpose(0, 2, 1) / both.shape[2] + np.eye(2 * k)
+        covariance = np.empty((len(first), 2, k, 2, k))
+        for one, other in np.ndindex(2, 2):
+            covariance[:, one, :, other] = shared[pairs[one], :, pairs[other]]
+        covariance[:, [0, 1], :, [0, 1]] += np.eye(k)
+        residual = -system.b.reshape(-1, k)[rows[pairs.T]].reshape(-1, 2 * k)
         square, log_det = kernels.prediction.normalise(
-            covariance, np.concatenate((residual[pairs[0]], residual[pairs[1]]), axis=1))
+            covariance.reshape(-1, 2 * k, 2 * k), residual)
         claim = self.log_claim[first] + self.log_claim[second]
         freedom = self.freedom[first] + self.freedom[second]
         return square, log_likelihood_ratio(square, log_det, claim, freedom, k)

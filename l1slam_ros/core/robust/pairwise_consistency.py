@@ -116,8 +116,7 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
     a, b, error = a[near], b[near], error[near]
     factors, k = growth.subgraph(rows).between, manifold.TANGENT_SIZE
     roots = factors.sqrt_information[b]
-    change = _changes(growth, ends, a, b, roots)
-    covariance = 2 * np.eye(k) + change @ change.transpose(0, 2, 1) / change.shape[2]
+    covariance = 2 * np.eye(k) + _spread(growth, ends, a, b, roots)
     square, log_det = kernels.prediction.normalise(covariance, whiten(roots, error))
     volume = claimed_volume(manifold, poses)
     freedom = factors.freedom[b]
@@ -146,21 +145,18 @@ def _follows(
     return manifold.between(poses[low[b]], poses[low[a]]), manifold.compose(Z[a], S), S
 
 
-def _changes(growth: Growth, ends: Ends, a: Indices, b: Indices, roots: Array) -> Array:
+def _spread(growth: Growth, ends: Ends, a: Indices, b: Indices, roots: Array) -> Array:
     """
-    Return how the whitened difference of pairs changes by the samples, (pairs, k, q).
+    Return what the map's uncertainty makes of the whitened difference of pairs, (pairs, k, k).
 
     To first order Ad (Za S)^-1 and -Ad (F Za S)^-1 times the steps of the first ends of a and b,
     -Ad S^-1 and the identity times those of the second ends.
     """
     manifold, (low, high, _) = growth.graph.manifold, ends
-    samples, fixed = growth.posterior.samples, growth.posterior.fixed
+    samples, noise = growth.posterior.samples, growth.posterior.noise
     F, onward, S = _follows(manifold, ends, growth.poses, a, b)
     J = [manifold.adjoint(manifold.inverse(T)) for T in (onward, manifold.compose(F, onward), S)]
-    pairs = ((low, roots @ J[0], -roots @ J[1]), (high, -roots @ J[2], roots))
-    changes = []
-    for end, J_a, J_b in pairs:
-        keyframe = np.stack((end[a], end[b]), axis=1) - fixed
-        keyframe[keyframe < 0] = len(samples) - 1
-        changes.append(kernels.prediction.moved(keyframe, np.stack((J_a, J_b), axis=1), samples))
-    return changes[0] + changes[1]
+    blocks = np.stack((roots @ J[0], -roots @ J[1], -roots @ J[2], roots), axis=1)
+    keyframe = np.stack((low[a], low[b], high[a], high[b]), axis=1) - growth.posterior.fixed
+    keyframe[keyframe < 0] = len(samples) - 1
+    return kernels.prediction.left_over(keyframe, blocks, samples, noise[:0])

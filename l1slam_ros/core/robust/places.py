@@ -47,14 +47,17 @@ def err_together(place: Indices, residual: Array, drawn: Array) -> bool:
                                          (left**2).mean(axis=2) / count[:, None]))
     if not expected.any():
         return False
-    larger = (found.sum() / (residual**2).sum()
-              * (drawn**2).mean(axis=2).sum() / expected.sum())
+    single = (drawn**2).mean(axis=2)
+    larger = np.cbrt(found.sum() / (residual**2).sum() * single.sum() / expected.sum())
     # A weighted sum of squares is nearly chi2 (F. E. Satterthwaite, An approximate distribution of
-    # estimates of variance components, 1946), the cube root of which is nearly normal (E. B.
-    # Wilson and M. M. Hilferty, The distribution of chi-square, 1931).
-    freedom = expected.sum() ** 2 / (expected**2).sum()
-    spread = 2 / (9 * freedom)
-    return bool(np.cbrt(larger) > 1 - spread + _BEYOND_DOUBT * np.sqrt(spread))
+    # estimates of variance components, 1946), the cube root of which is nearly normal; so is that
+    # of Fisher's F (E. Paulson, An approximate normalization of the analysis of variance
+    # distribution, 1942).
+    of_sums, of_single = (2 * (each**2).sum() / (9 * each.sum() ** 2)
+                          for each in (expected, single))
+    normal = ((1 - of_single) * larger - (1 - of_sums)) / np.sqrt(
+        of_single * larger**2 + of_sums)
+    return bool(normal > _BEYOND_DOUBT)
 
 
 def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
@@ -112,17 +115,21 @@ def _near(points: Array, reach: float) -> tuple[Indices, Indices]:
     """
     Return the pairs of points (n, k) that no component tells further apart than `reach`, (pairs,).
 
-    A sweep along the first component. SciPy's trees do the same, but to import them takes longer
-    than to solve most graphs.
+    In strips as wide as that along the first component, each sorted by the second. SciPy's trees
+    do the same, but to import them takes longer than to solve most graphs.
     """
-    order = np.argsort(points[:, 0], kind='stable')
-    points = points[order]
-    last = np.searchsorted(points[:, 0], points[:, 0] + reach, side='right')
-    within = last - np.arange(len(points))
-    first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for shift in range(1, within.max(initial=0)):
-        rows = np.flatnonzero(within > shift)
-        rows = rows[(np.abs(points[rows] - points[rows + shift]) <= reach).all(axis=1)]
-        first.append(order[rows])
-        second.append(order[rows + shift])
-    return np.concatenate(first), np.concatenate(second)
+    strip = np.floor(points[:, 0] / reach)
+    height = np.ptp(points[:, 1]) + 4 * reach if len(points) else 0.0
+    where = strip * height + points[:, 1]
+    order = np.argsort(where, kind='stable')
+    points, where, number = points[order], where[order], np.arange(len(order))
+    found = []
+    for first, last in ((number + 1, where + reach),
+                        (np.searchsorted(where, where + height - reach), where + height + reach)):
+        count = np.maximum(np.searchsorted(where, last, side='right') - first, 0)
+        one = np.repeat(number, count)
+        other = np.arange(len(one)) + np.repeat(first - (np.cumsum(count) - count), count)
+        near = (np.abs(points[one] - points[other]) <= reach).all(axis=1)
+        found.append((order[one[near]], order[other[near]]))
+    (one, other), (more, others) = found
+    return np.concatenate((one, more)), np.concatenate((other, others))

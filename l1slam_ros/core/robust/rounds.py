@@ -33,7 +33,7 @@ from l1slam_ros.core.robust.innovation import (
 from l1slam_ros.core.robust.inspection import repeated_factors
 from l1slam_ros.core.robust.places import beside_refused, mates, places
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
-from l1slam_ros.core.solvers.gauss_newton import l2_map
+from l1slam_ros.core.solvers.gauss_newton import l2_optimum
 
 # At most one in so many true loops is refused for its noise alone; and of accepted ones, dropped.
 REFUSED = 1e-3
@@ -246,14 +246,15 @@ class Growth:
             subgraph = self.subgraph(rows)
             cholesky = cholesky_of(subgraph)
             self._check()
-            self.poses = l2_map(subgraph, self.poses, cholesky, lambda *_: self._check())
+            self.poses, solved = l2_optimum(subgraph, self.poses, cholesky,
+                                            lambda *_: self._check())
             self._check()
             # What is far goes by its residual alone: to sample takes longer than to solve.
             residual = whitened_residual(subgraph, self.poses).reshape(len(rows), -1)
             misfits = self._misfits(rows, residual) if noise_fits else rows[:0]
             if not len(misfits):
                 vars(self).pop('posterior', None)  # as large as the one that takes its place
-                self.posterior = sample_posterior(subgraph, self.poses, cholesky)
+                self.posterior = sample_posterior(subgraph, self.poses, cholesky, solved)
                 if self._is_noisier(rows):
                     continue
                 noise_fits = True

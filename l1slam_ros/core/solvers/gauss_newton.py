@@ -13,6 +13,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import (
+    LinearSystem,
     anchor,
     linearise,
     step_part,
@@ -75,17 +76,29 @@ def gauss_newton(
     options: LeastSquaresOptions,
     cholesky: BlockCholesky,
     report: Report = lambda iteration, cost: None,
-    surprise: float = 0.0,
 ) -> Solution:
+    """Minimise a norm, reweighted at each step; arguments as `nonlinear.minimise`."""
+    return _descend(graph, poses, norm, options, cholesky, report)[0]
+
+
+def _descend(
+    graph: FactorGraph,
+    poses: Array,
+    norm: SmoothNorm,
+    options: LeastSquaresOptions,
+    cholesky: BlockCholesky,
+    report: Report,
+    surprise: float = 0.0,
+) -> tuple[Solution, LinearSystem | None]:
     """
-    Minimise a norm, reweighted at each step; arguments as `nonlinear.minimise`.
+    Return what `gauss_newton` does, and the system that it solved last, None: a damped one.
 
     surprise : an undamped step that lowers the cost by what its linear problem says, but for so
     much, is the last one
     """
     residual = whitened_residual(graph, poses)
     history = [norm.cost(residual)]
-    status, damping = Status.ITERATION_LIMIT, 0.0
+    status, damping, solved = Status.ITERATION_LIMIT, 0.0, None
     while len(history) <= options.iterations:
         if fits_exactly(l1_cost(residual), len(residual)):
             status = Status.CONVERGED
@@ -97,7 +110,7 @@ def gauss_newton(
         moved = whitened_residual(graph, candidate)
         cost = norm.cost(moved)
         decrease = history[-1] - cost
-        full, free = damping <= _HARDLY, not damping
+        full, free, solved = damping <= _HARDLY, not damping, None if damping else system
         if decrease >= 0:
             poses, residual = candidate, moved
             damping = damping / 10 if damping > _LEAST_DAMPING else 0.0
@@ -114,16 +127,23 @@ def gauss_newton(
             status = Status.STALLED
             break
     return Solution(poses, history[-1], status, len(history) - 1, 0, np.array(history),
-                    np.zeros(len(residual)))
+                    np.zeros(len(residual))), solved
 
 
 def l2_map(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
            report: Report = lambda iteration, cost: None) -> Array:
+    """Return the L2 map of a graph to within its noise, (n, p); see `l2_optimum`."""
+    return l2_optimum(graph, poses, cholesky, report)[0]
+
+
+def l2_optimum(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
+               report: Report) -> tuple[Array, LinearSystem | None]:
     """
     Return the L2 map of a graph to within its noise: chi2 one above the optimum or less.
 
     From poses (n, p) that may be far off: where they do not fit to within the noise, first
-    rotations alone, then translations, each of which is linear; then Gauss-Newton.
+    rotations alone, then translations, each of which is linear; then Gauss-Newton. And the system
+    of its last step, which `cholesky` has factored; None: it was damped, or there was none.
     """
     # In units of its noise, chi2 is about as large as there are spare measurements.
     k = graph.manifold.TANGENT_SIZE
@@ -133,7 +153,8 @@ def l2_map(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
         linear = _two_linear_steps(graph, poses, cholesky)
         poses = linear if _chi2(graph, linear) < chi2 else poses
     options = LeastSquaresOptions(_NOISE_STEPS, 1 / spare)
-    return gauss_newton(graph, poses, Huber(), options, cholesky, report, surprise=_SURPRISE).poses
+    solution, solved = _descend(graph, poses, Huber(), options, cholesky, report, _SURPRISE)
+    return solution.poses, solved
 
 
 def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:

@@ -37,6 +37,7 @@ from l1slam_ros.core.online.snapshot import (
     WAITING,
 )
 from l1slam_ros.core.online.update import improve, optimise
+from l1slam_ros.core.robust.judgement import NORM
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, minimise
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
@@ -319,6 +320,23 @@ def test_at_rest_all_is_judged_from_the_graph_alone(careful, clean_errors):
     now = backend.snapshot()
     assert now.graph.between.i[now.optimised.judgement.slips].tolist() == [150]
     assert position_error(backend.poses, careful.truth) < 1.2 * clean_errors[-1] + 0.1
+
+
+def test_at_rest_a_map_is_doubted_for_its_norm_as_in_a_batch(careful):
+    backend = played(careful)
+    found = backend.settle()
+    settled(backend)
+    assert not backend.snapshot().optimised.judgement.doubts
+    turned = se2.identity(len(found.poses))
+    turned[:, 2] = np.linspace(0, 1, len(turned))
+    backend.adopt(replace(found, poses=se2.compose(turned, found.poses)))
+    settled(backend)
+    doubt, = backend.snapshot().optimised.judgement.doubts
+    assert doubt.kind == NORM
+    # It is of that map.
+    backend.settle()
+    settled(backend)
+    assert not backend.snapshot().optimised.judgement.doubts
 
 
 def test_a_trusted_loop_is_accepted_however_absurd(careful):
