@@ -39,7 +39,7 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.messages.conversion import reference_frame_id
 from l1slam_ros.io.trajectory import invented_stamps
 
-# What `bag.read_note` returns for a graph.
+# What `reader.read_note` returns for a graph.
 GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
 # And besides, where a reader of messages would take some for faults: see `_note`.
 VERBATIM_NOTE = {'messages': 'verbatim'}

@@ -63,3 +63,16 @@ def test_a_stray_of_two_that_came_at_once_leaves_a_whole_map():
         backend.add_odometry(replace(odometry(6, (1, 0, 0)), frame='b'))
     backend.update()
     assert backend.poses[:, 0].tolist() == [1.0]
+
+
+def test_a_stray_behind_a_restored_map_takes_nothing_of_it():
+    """The robot's odometry goes on from where the map ended."""
+    first, second = Backend(EVERY), Backend(EVERY)
+    for k in range(5):
+        first.add_odometry(replace(odometry(k, (k, 0, 0)), frame='b'))
+    second.restore(first.saved())
+    for time, x, frame in (10, 50, 'a'), (11, 70, 'b'), (12, 71, 'b'):
+        second.add_odometry(replace(odometry(time, (x, 0, 0)), frame=frame))
+    assert second.base_frame.name == 'b'
+    assert second.poses[:5].tolist() == first.poses.tolist()
+    assert second.poses[-2:, 0].tolist() == pytest.approx([4, 5])
