@@ -174,8 +174,8 @@ def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
 
     assert settle() > 0
     looked = []
-    snapshot = backend._snapshot
-    monkeypatch.setattr(backend, '_snapshot', lambda views: looked.append(1) or snapshot(views))
+    standing = backend._standing
+    monkeypatch.setattr(backend, '_standing', lambda: looked.append(1) or standing())
     version = backend.version
     backend.counts()
     looked.clear()

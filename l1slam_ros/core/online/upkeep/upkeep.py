@@ -110,11 +110,10 @@ class Upkeep:
             # First what takes long: until then messages come in.
             views = self._live.front.views if self._live.front else ()
             with self._lock:
-                builder, live = self._builder, self._live
-                track, loops = builder.track, builder.loops
-                builder.add_due_loops()
+                self._builder.add_due_loops()
+                live, track, loops = self._live, self._builder.track, self._builder.loops
                 yield Snapshot(
-                    live.number, self._version(), builder.graph.copy(), track.gaps,
+                    live.number, self._version(), self._builder.graph.copy(), track.gaps,
                     track.keyframe_stamps, track.keyframe_poses, self._map_to_odom_now(),
                     loops.rows, loops.stamps, live.optimised, live.robust, live.looks.view(),
                     live.all_judged, live.judged, live.stale, views)
@@ -170,8 +169,7 @@ class Upkeep:
                     return live.account(time.monotonic() - start)
             if came or live.last is not last or not idle:
                 return live.account(time.monotonic() - start)
-            if idle:
-                self._at_rest = self.version
+            self._at_rest = self.version
         return None
 
     def _check_of(self, live: LiveMap, stopped: Stopped) -> Callable[[], None]:
