@@ -107,10 +107,12 @@ class Upkeep:
     def _standing(self) -> Iterator[Snapshot]:
         """Let nothing change; give a snapshot, see `snapshot`."""
         with self._front:
-            # First what takes long: until then messages come in.
-            views = self._live.front.views if self._live.front else ()
+            front = self._live.front
+            # First what takes long: until then messages come in, and may begin another map.
+            views = front.views if front else ()
             with self._lock:
                 builder, live = self._builder, self._live
+                views = views if live.front is front else ()
                 track, loops = builder.track, builder.loops
                 builder.add_due_loops()
                 yield Snapshot(
