@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import component_labels
+from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
@@ -97,6 +97,37 @@ def test_a_session_begins_anywhere(place, name, parts):
     case, half = cases.false_case(place, kind(name), 0.3, 0), place.graph.n_poses // 2
     assert component_labels(case.graph).max() + 1 == parts == case.session.max() + 1
     assert np.hypot(*se2.between(case.start[half - 1], case.start[half])[:2]) > 2
+
+
+@pytest.mark.parametrize('name', dict.fromkeys(each.name for each in kinds.KINDS
+                         if each.suite == 'variants' and not each.lies))
+def test_what_is_told_otherwise_is_as_true(place, name):
+    truth, factors = place.best, place.graph.between
+    exact = FactorGraph(se2)
+    exact.add_poses(len(truth))
+    exact.append_between(factors.i, factors.j, se2.between(truth[factors.i], truth[factors.j]),
+                         factors.sqrt_information)
+    told = places.place_of('world', exact, None, places.error_by_time(truth[:, :2]))
+    case = cases.false_case(told, kind(name), 0.0, 0)
+    assert case.place.truth_error(case.start[:, :2]) == pytest.approx(0, abs=1e-6)
+    # Else the error of what was told wrong would be none, too.
+    assert case.place.truth_error(case.start[:, :2] * [1.0, 0.5]) > 1
+    # Whatever comes of the noise, what was measured without is met.
+    assert np.abs(se2.residual(case.graph.between.measurement, *(
+        case.start[ends] for ends in case.graph.between.pairs.T))).max() < 1e-9
+    assert np.isfinite(case.graph.between.sqrt_information).all()
+    assert case.is_true.sum() >= 0.3 * loops_of(case.place.graph) > 0
+
+
+def test_noise_is_carried_over_to_the_keyframes_that_are_kept(place):
+    told = cases.false_case(place, kind('every-3'), 0.0, 0).place
+    chains = [np.zeros((3, 3)), np.zeros((3, 3))]
+    for which, graph in enumerate((place.graph, told.graph)):
+        odometry = graph.subset(graph.between.is_odometry).between
+        for Z, root in zip(odometry.measurement, odometry.sqrt_information, strict=True):
+            back = se2.adjoint(se2.inverse(Z[None]))[0]
+            chains[which] = back @ chains[which] @ back.T + np.linalg.inv(root.T @ root)
+    assert chains[1] == pytest.approx(chains[0], rel=1e-6)
 
 
 def run_of(place, name, share, found):

@@ -12,6 +12,7 @@ import numpy as np
 from robust.changes import changed
 from robust.kinds import EXCUSES, KINDS, Bar, Kind
 from robust.places import Place
+from robust.variants import VARIANTS
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
@@ -48,6 +49,8 @@ class FalseCase:
 def false_case(place: Place, kind: Kind, share: float, seed: int) -> FalseCase:
     """Return a graph of which `share` of all loops are false; count = true share / (1 - share)."""
     rng = np.random.default_rng((seed, KINDS.index(kind), round(100 * share)))
+    if kind.change in VARIANTS:
+        place, kind = VARIANTS[kind.change](place, *kind.amounts), replace(kind, change='')
     change = changed(place, kind.change, kind.amounts, rng)
     graph, n = change.graph, change.graph.n_poses
     start, session = odometry_poses(graph), np.zeros(n, bool)

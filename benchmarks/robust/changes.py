@@ -164,7 +164,7 @@ def _apart(place: Place, rng: np.random.Generator) -> Changed:
 
 
 CHANGES: dict[str, Callable[..., Changed]] = {
-    'tenth': lambda place, rng: _true(_part_of_loops(place, 0.1, rng)),
+    'thinned': lambda place, rng, part: _true(_part_of_loops(place, part, rng)),
     'heading': _heading, 'odometry': _odometry, 'slip': _slip,
     'aliased': _aliased,
     'aliased half': lambda place, rng, *amounts: _aliased(place, rng, *amounts, part=0.5),

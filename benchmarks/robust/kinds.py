@@ -10,6 +10,7 @@ What the suite measures: kinds of wrong graphs, and the bar each has to pass; im
     slips      odometry that is wrong at one step or two
     sessions   a graph in two, with or without loops between
     doubtful   what nobody can settle
+    variants   recordings told otherwise: backwards, in other units, a part of them
 """
 
 from dataclasses import dataclass, replace
@@ -18,6 +19,8 @@ from dataclasses import dataclass, replace
 # loops that are lost; it excuses false loops that are kept, too; only with it does it pass.
 NEVER, FREE, EXCUSES_LOST, EXCUSES, MUST = 'never', 'free', 'excuses lost', 'excuses', 'must'
 UNBOUNDED = float('inf')
+# As an error: no more than that of the odometry.
+ODOMETRY = 'odometry'
 
 
 @dataclass(frozen=True)
@@ -26,12 +29,13 @@ class Bar:
     What a run has to reach.
 
     kept, lost : part of the false loops that may be kept, of the true ones that may be lost;
-    error : [m] of the map, None: what the graph is held to; doubt : one of the above.
+    error : [m] of the map, `ODOMETRY`, or None: what the graph is held to; doubt : one of the
+    above.
     """
 
     kept: float = 0.0
     lost: float = 0.01
-    error: float | None = None
+    error: float | str | None = None
     doubt: str = NEVER
 
 
@@ -40,8 +44,9 @@ class Kind:
     """
     One thing that is wrong with graphs.
 
-    change, amounts : of `changes.CHANGES`, and its arguments; lies : of the package's kinds of
-    false loops; shares : of all loops that are false, one run each; graphs : what it is made on.
+    change, amounts : of `changes.CHANGES` or `variants.VARIANTS`, and its arguments; lies : of the
+    package's kinds of false loops; shares : of all loops that are false, one run each; graphs :
+    what it is made on.
     """
 
     suite: str
@@ -90,7 +95,7 @@ def _synthetic() -> list[Kind]:
     return [
         Kind('synthetic', 'clean', (*_ALL, *SPACE)),
         *(Kind('synthetic', lies, _ALL, lies=lies, shares=ten_to_ninety) for lies in LIES),
-        *(Kind('synthetic', f'tenth-{lies}', PUBLIC, 'tenth', (), lies, (0.5,), worse)
+        *(Kind('synthetic', f'tenth-{lies}', PUBLIC, 'thinned', (0.1,), lies, (0.5,), worse)
           for lies in LIES),
         *(Kind('synthetic', name, PUBLIC, change, amounts, 'random', (0.3,), worse)
           for name, (change, amounts) in odometry.items()),
@@ -140,6 +145,28 @@ def _in_space() -> list[Kind]:
             for graphs, shares in (((SPHERE, GARAGE), (0.1, 0.5, 0.9)), ((TORUS,), (0.5,)))]
 
 
-KINDS = (*_synthetic(), *_aliased(), *_noise(), *_others(), *_in_space())
+def _variants() -> list[Kind]:
+    told = {'backwards': ('backwards', ()), 'mirrored': ('stretched', (1.0, -1.0, -1.0)),
+            'times-10': ('stretched', (10.0, 10.0, 1.0)),
+            'times-tenth': ('stretched', (0.1, 0.1, 1.0)),
+            'every-2': ('every', (2,)), 'every-3': ('every', (3,)),
+            'unknown-noise': ('unknown', ()),
+            'loops-10': ('information', ('loops', 10.0)),
+            'loops-tenth': ('information', ('loops', 0.1)),
+            'half-of-loops': ('thinned', (0.5,)), 'three-quarters': ('thinned', (0.75,)),
+            'first-half': ('stretch', (0.0, 0.5)), 'middle-half': ('stretch', (0.25, 0.75)),
+            'last-half': ('stretch', (0.5, 1.0))}
+    lied, clean = Bar(lost=0.1, error=ODOMETRY, doubt=EXCUSES), Bar(lost=0.02)
+    return [
+        *(Kind('variants', name, graphs, change, amounts, bar=bar)
+          for name, (change, amounts) in told.items()
+          for graphs, bar in (((BICOCCA,), lied), ((INTEL, *RECORDED_CLEAN), clean),
+                              # Its track has no times: of a part of the way it says nothing.
+                              *([] if change == 'stretch' else [((BOVISA,), lied)]))),
+        *(Kind('variants', f'more-{lies}', (BICOCCA,), lies=lies, shares=(1 / 3,), bar=lied)
+          for lies in LIES)]
+
+
+KINDS = (*_synthetic(), *_aliased(), *_noise(), *_others(), *_in_space(), *_variants())
 SUITES = tuple(dict.fromkeys(kind.suite for kind in KINDS))
 GRAPHS = tuple(dict.fromkeys(graph for kind in KINDS for graph in kind.graphs))

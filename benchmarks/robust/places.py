@@ -48,7 +48,8 @@ class Place:
 
     stored : (n, p) poses of its file, None without; is_false, is_true : (m,) bool, of its own
     loops, neither where nobody knows; truth_error : [m] of positions (n, k), None where nobody
-    knows the truth; timed : it is by time, so it has a meaning for the first part of a way, too.
+    knows the truth; timed : it is by time, so it has a meaning for the first part of a way, too;
+    unit : [m] of a length of one.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Place:
     is_true: Mask
     truth_error: Error | None = None
     timed: bool = True
+    unit: float = 1.0
 
     @cached_property
     def best(self) -> Array:
@@ -121,10 +123,14 @@ def _bicocca(folder: Path, found: Place) -> Place:
 
 
 def error_by_time(truth: Array) -> Error:
-    """Return the error of positions (k, 2), k <= n, to the truth (n, 2) [m], NaN where unknown."""
+    """
+    Return the error of positions (k, 2), k <= n, to the truth (n, 2) [m].
+
+    NaN, in either, where they are not known.
+    """
 
     def error(estimate: Array) -> float:
-        known = np.isfinite(truth[: len(estimate), 0])
+        known = np.isfinite(truth[: len(estimate), 0]) & np.isfinite(estimate[:, 0])
         if not known.any():
             return 0.0
         return absolute_trajectory_error(estimate[known], truth[: len(estimate)][known])
@@ -141,6 +147,7 @@ def nearest_error(track: Array) -> Error:
     """
 
     def error(estimate: Array) -> float:
+        estimate = estimate[np.isfinite(estimate[:, 0])]
         return min(_closest(estimate, track, heading)
                    for heading in np.linspace(0, 2 * np.pi, 36, endpoint=False))
 

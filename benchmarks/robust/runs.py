@@ -23,11 +23,13 @@ from robust.kinds import (
     HOLDS_ELSEWHERE,
     MUST,
     NEVER,
+    ODOMETRY,
     Bar,
     Kind,
 )
 from robust.places import Place, error_by_time
 from robust.solvers import DOUBTFUL, REFUSED, Found, RobustSolver
+from robust.variants import VARIANTS
 from scipy.stats import chi2
 
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
@@ -143,7 +145,7 @@ def measure(place: Place, kind: Kind, share: float, seeds: Iterable[int],
     """Return the runs of all seeds; a solver whose time was up does not run again."""
     runs: list[Run] = []
     left = list(solvers)
-    drawn = kind.change or kind.lies
+    drawn = kind.lies or kind.change not in ('', *VARIANTS)
     for seed in seeds if drawn else (0,):
         case = false_case(place, kind, share, seed)
         for solver in tuple(left):
@@ -187,7 +189,9 @@ def judged(name: tuple[str, str, str, float, int, str], case: FalseCase, found: 
     honest = (kept <= bar.kept * case.is_false.sum() and found.status != REFUSED
               and (not wrongly or len(case.slips) > 0))
     whole = not judges or parts == case.session.max() + 1
-    most = HOLDS.get(case.place.name, HOLDS_ELSEWHERE) if bar.error is None else bar.error
+    most = (error_of(case, 'l2', case.start) if bar.error == ODOMETRY
+            else HOLDS.get(case.place.name, HOLDS_ELSEWHERE) if bar.error is None
+            else float(bar.error))
     near = (error <= most and lost <= bar.lost * case.is_true.sum() and whole
             and (worse is None or worse <= WORSE))
     return Run(
@@ -212,12 +216,12 @@ def _passes(bar: Bar, honest: bool, near: bool, doubtful: bool) -> bool:
 def error_of(case: FalseCase, norm: str, poses: Array) -> float:
     """Return the error [m] of poses (n, p), of the worst of the sessions that nothing joins."""
     positions = case.graph.manifold.positions
-    if case.kind.suite == 'recorded' and case.place.truth_error is not None:
+    if case.kind.suite in ('recorded', 'variants') and case.place.truth_error is not None:
         return case.place.truth_error(positions(poses))
     best = positions(true_map(case.clean, case.place, norm))
-    return max(absolute_trajectory_error(positions(poses)[case.session == k],
-                                         best[case.session == k])
-               for k in range(case.session.max() + 1))
+    return case.place.unit * max(
+        absolute_trajectory_error(positions(poses)[case.session == k], best[case.session == k])
+        for k in range(case.session.max() + 1))
 
 
 def true_map(clean: FactorGraph, place: Place, norm: str) -> Array:

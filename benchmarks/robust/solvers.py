@@ -13,7 +13,7 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
 from l1slam_ros.core.online.backend import Backend, BackendOptions
-from l1slam_ros.core.online.loop_states import ACCEPTED
+from l1slam_ros.core.online.snapshot import ACCEPTED
 from l1slam_ros.core.robust import batch_map
 from l1slam_ros.core.robust.judgement import Doubt
 from l1slam_ros.paper.updates import dimension_of, measurements

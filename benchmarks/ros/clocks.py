@@ -11,11 +11,13 @@ with it, that jump back by 20 s halfway. Then with odometry that begins again at
 halfway, or is 5e8 m away from there on, and that with no loop from then on.
 
 Said is of each part of the map, one for each time that stamps go back, how far its keyframes are
-at worst from where they are in the undisturbed map, and its error to the truth, aligned, beside
-those of the undisturbed map and of the odometry. Loops that are sent again are known: what was
-played twice is odometry the second time. Where loops join two parts, the map is compared, too,
-with the L1 optimum of the same factors and of what nobody
-told the node: that each keyframe at which a part begins is where the robot was at that stamp.
+from where they are in the undisturbed map, at worst and as RMSE, and its error to the truth,
+aligned, beside those of the undisturbed map and of the odometry. Loops that are sent again are
+known: what was played twice is odometry the second time. Where loops join two parts, the map is
+compared, too, with the L1 optimum of the same factors and of what nobody told the node: that each
+keyframe at which a part begins is where the robot was at that stamp. Where odometry begins anew,
+one step of it is never told: what the loops allow is how far the undisturbed map's own factors,
+solved without that step, end from what they say with it.
 """
 
 import os
@@ -25,6 +27,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 # Its own domain: nobody else's messages are counted.
@@ -45,7 +48,9 @@ from std_srvs.srv import Trigger
 import l1slam_ros as l1
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
-from l1slam_ros.core.graph.factor_graph import component_labels
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
+from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.io.bags.reader import read_messages, read_raw
 from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
 from l1slam_ros.io.graphs.saved_map import load_map
@@ -60,10 +65,20 @@ _KINDS = {ODOMETRY_TOPIC: Odometry, LOOP_TOPIC: PoseWithCovarianceStamped}
 _TICK = _SECOND // 20  # [ns] from one message on /clock to the next
 _PAUSE, _BACK = 3.0, 20 * _SECOND  # [s], [ns]
 _EXACT = 1e-4  # [m], [rad] what is nearer is the same
+_NEAR = 0.05  # [m]
 _PATIENCE = 300.0  # [s]
 
 # What comes when, in the order it is sent: time on the clock [ns], topic, None: only the clock.
 Event = tuple[int, str | None, bytes]
+
+
+@dataclass(frozen=True)
+class Undisturbed:
+    """The map that is the yardstick: pose (3,) by stamp [ns], graph, stamps (n,) [ns]."""
+
+    poses: dict[int, Array]
+    graph: FactorGraph
+    stamps: Indices
 
 
 class Robot:
@@ -125,18 +140,30 @@ class Robot:
         pose3 = np.array([stamped_pose(pose)[1] for pose in poses])
         return np.array([stamp_of(pose.header) for pose in poses]), se2.from_pose3(pose3)
 
-    def joined(self) -> np.ndarray | None:
-        """Return the optimum (n, 3) of the saved map, its parts joined; None: no loops do."""
-        saved = load_map(self.path)[0]
-        stamps, accepted = saved.growth.stamps, saved.optimised.judgement.accepted
-        graph = saved.growth.graph.subset(accepted)
-        if component_labels(graph).any():
-            return None
-        for begin in np.flatnonzero(np.diff(stamps) < 0) + 1:
-            (same,) = np.flatnonzero(stamps[:begin] == stamps[begin])
-            graph.add_between(np.array([same]), np.array([begin]), np.zeros((1, 3)),
-                              np.eye(3)[None] / _EXACT**2)
-        return l1.solve(graph, robust=False).poses
+    def saved(self) -> tuple[FactorGraph, Indices]:
+        """Return the graph of what is accepted in the saved map, and the stamps (n,) [ns]."""
+        growth, optimised = (saved := load_map(self.path)[0]).growth, saved.optimised
+        return growth.graph.subset(optimised.judgement.accepted), growth.stamps
+
+
+def joined(graph: FactorGraph, stamps: Indices) -> Array | None:
+    """Return the optimum (n, 3) of a graph, its parts joined; None: no loops do."""
+    if component_labels(graph).any():
+        return None
+    for begin in np.flatnonzero(np.diff(stamps) < 0) + 1:
+        (same,) = np.flatnonzero(stamps[:begin] == stamps[begin])
+        graph.add_between(np.array([same]), np.array([begin]), np.zeros((1, 3)),
+                          np.eye(3)[None] / _EXACT**2)
+    return l1.solve(graph, robust=False).poses
+
+
+def without_step(graph: FactorGraph, stamps: Indices, stamp: int) -> Array:
+    """Return how far the optimum moves (n,) [m] without the odometry to the time `stamp`."""
+    factors, keyframe = graph.between, np.searchsorted(stamps, stamp)
+    lost = factors.is_odometry & (factors.j == keyframe)
+    with_it, without = (l1.solve(some, robust=False).poses
+                        for some in (graph, graph.subset(~lost)))
+    return np.linalg.norm(with_it[:, :2] - without[:, :2], axis=1)
 
 
 def with_clock(messages: list[Event]) -> Iterator[Event]:
@@ -212,42 +239,54 @@ def main() -> None:
     measured = {}
     for _, topic, data in messages:
         if topic == ODOMETRY_TOPIC:
-            sample = conversion.odometry_in(data)[2]
+            sample = conversion.odometry_in(data)[1]
             measured[sample.stamp] = sample.pose3[:2], truth[sample.stamp][:2]
-    known: dict[int, np.ndarray] = {}
+    undisturbed: Undisturbed | None = None
     folder = tempfile.TemporaryDirectory()
     for name, (sim_time, events) in plays.items():
         found = list(events())
         robot = Robot(sim_time, Path(folder.name) / 'map.g2o')
         robot.play(iter(found) if 'pause' not in name else events(), rate)
         stamps, poses = robot.finish(sum(topic == ODOMETRY_TOPIC for _, topic, _ in found))
-        known = known or dict(zip(stamps.tolist(), poses, strict=True))
-        _tell(name, stamps, poses, known, measured, robot)
+        undisturbed = undisturbed or Undisturbed(dict(zip(stamps.tolist(), poses, strict=True)),
+                                                 *robot.saved())
+        _tell(name, stamps, poses, undisturbed, measured, robot)
 
 
-def _tell(name: str, stamps: np.ndarray, poses: np.ndarray, known: dict[int, np.ndarray],
-          measured: dict[int, tuple[np.ndarray, ...]], robot: Robot) -> None:
-    said, joined = robot.said, robot.joined()
+def _tell(name: str, stamps: Indices, poses: Array, undisturbed: Undisturbed,
+          measured: dict[int, tuple[Array, ...]], robot: Robot) -> None:
+    said, (graph, _) = robot.said, robot.saved()
     # A stamp that comes twice is in two parts; each is told of on its own.
     parts = np.split(np.arange(len(stamps)), np.flatnonzero(np.diff(stamps) < 0) + 1)
     print(f'{name}: {len(stamps)} keyframes, {said["accepted_loops"]} loops accepted, '
           f'{said["rejected_loops"]} rejected', flush=True)
+    optimum = joined(graph, stamps) if len(parts) > 1 else None
     for part in parts:
-        both = [k for k in part if stamps[k] in known]
-        map_, undisturbed, odometry, true = (np.array(rows) for rows in zip(*(
-            (poses[k, :2], known[stamps[k]][:2], *measured[stamps[k]]) for k in both),
+        both = [k for k in part if stamps[k] in undisturbed.poses]
+        map_, before, odometry, true = (np.array(rows) for rows in zip(*(
+            (poses[k, :2], undisturbed.poses[stamps[k]][:2], *measured[stamps[k]]) for k in both),
             strict=True))
-        print(f'    of {len(both)}, off by at most {_worst(map_, undisturbed):.3f} m; to the '
+        print(f'    of {len(both)}, off by {_far(map_, before)}; to the '
               f'truth {absolute_trajectory_error(map_, true):.3f} m, undisturbed '
-              f'{absolute_trajectory_error(undisturbed, true):.3f}, '
+              f'{absolute_trajectory_error(before, true):.3f}, '
               f'odometry {absolute_trajectory_error(odometry, true):.3f}', flush=True)
-        if joined is not None and len(parts) > 1:
-            print(f'    of the optimum that knows where it began, off by at most '
-                  f'{_worst(poses[part, :2], joined[part, :2]):.3f} m', flush=True)
+        if optimum is not None:
+            print(f'    of the optimum that knows where it began, off by '
+                  f'{_far(poses[part, :2], optimum[part, :2])}', flush=True)
+    for gap in odometry_gaps(graph) + 1:
+        if len(parts) == 1 and not component_labels(graph).any():
+            moved = without_step(undisturbed.graph, undisturbed.stamps, int(stamps[gap]))
+            print(f'    the undisturbed map without the step that is lost, off by {_of(moved)}',
+                  flush=True)
 
 
-def _worst(positions: np.ndarray, others: np.ndarray) -> float:
-    return float(np.linalg.norm(positions - others, axis=1).max())
+def _far(positions: Array, others: Array) -> str:
+    return _of(np.linalg.norm(positions - others, axis=1))
+
+
+def _of(distances: Array) -> str:
+    return (f'at most {distances.max():.3f} m ({np.sqrt(np.mean(distances**2)):.3f} RMSE, '
+            f'{np.count_nonzero(distances > _NEAR)} beyond {_NEAR} m)')
 
 
 if __name__ == '__main__':

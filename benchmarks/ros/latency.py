@@ -2,10 +2,13 @@
 """
 How late poses come, and how many transforms are older than the newest odometry, at 50 Hz.
 
-    python benchmarks/ros/latency.py [KEYFRAMES [SECONDS]]
+    python benchmarks/ros/latency.py [KEYFRAMES [SECONDS [TURNS]]]
 
-The node goes on from a saved map of so many keyframes, with its solver at work; in turns without
-and with somebody who looks at `graph`, which is a process of its own and takes bytes as they come.
+The node goes on from a saved map of so many keyframes, with its solver at work; in many short
+turns without and with somebody who looks at `graph`, so that what else the machine does meets both
+alike. Who looks is a process of its own and takes bytes as they come. Said is what all turns of a
+kind gave together, and how much as noise alone: the turns in which nobody looked, every other one
+against the rest.
 """
 
 import os
@@ -13,8 +16,8 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +29,7 @@ import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -37,7 +40,8 @@ from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.ros.demo import executable
 from l1slam_ros.ros.publishing import header
 
-KEYFRAMES, SECONDS, TURNS = 10_000, 20.0, 3
+KEYFRAMES, SECONDS, TURNS = 10_000, 5.0, 12
+_BETWEEN = 1.5  # [s] from one turn to the next: who begins to look is sent all of the graph
 _RATE, _STEP = 50.0, 0.05  # [1/s], [m]: five keyframes a second
 
 
@@ -60,8 +64,8 @@ class Probe:
     def _on_transform(self, message: TransformStamped) -> None:
         self._old.append(stamp_of(message.header) < self._newest)
 
-    def drive(self, seconds: float) -> str:
-        """Send odometry for some seconds; return what came of it."""
+    def drive(self, seconds: float) -> tuple[list[float], list[bool]]:
+        """Send odometry; return how late each pose was [s], and which transforms were older."""
         self._late, self._old, began = [], [], time.monotonic()
         for k in range(int(seconds * _RATE)):
             while (left := began + k / _RATE - time.monotonic()) > 0:
@@ -72,17 +76,16 @@ class Probe:
             self._sent[self._newest] = time.monotonic()
             self._odometry.publish(message)
             self._count += 1
-        p50, p99 = 1e3 * np.percentile(self._late, (50, 99))
-        return (f'pose after {p50:.1f} ms, p99 {p99:.1f} ms; {sum(self._old)} of '
-                f'{len(self._old)} transforms older than the newest odometry')
+        return self._late, self._old
 
 
 def main() -> int:
     """Measure and print."""
     if sys.argv[1:] == ['look']:
         return _look()
-    n = int(sys.argv[1]) if len(sys.argv) > 1 else KEYFRAMES
-    seconds = float(sys.argv[2]) if len(sys.argv) > 2 else SECONDS
+    given = [float(value) for value in sys.argv[1:]]
+    keyframes, seconds, turns = given + [KEYFRAMES, SECONDS, TURNS][len(given):]
+    n = int(keyframes)
     rclpy.init()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'map.g2o'
@@ -91,21 +94,46 @@ def main() -> int:
         write_graph_file(path, GraphRecord(world.graph, world.truth, np.arange(n), stamps))
         backend = subprocess.Popen([executable('backend'), '--ros-args',
                                     '-p', f'save_path:={path}', '-p', 'autosave_period:=0.0'])
+        looker = subprocess.Popen([sys.executable, __file__, 'look'], stdin=subprocess.PIPE,
+                                  stdout=subprocess.PIPE, text=True)
         try:
             probe = Probe()
             _load(probe.node)
-            probe.drive(seconds / 4)
-            for _ in range(TURNS):
-                print('nobody looks:  ', probe.drive(seconds), flush=True)
-                looker = subprocess.Popen([sys.executable, __file__, 'look'])
-                probe.drive(2.0)  # it takes a while to begin
-                print('somebody looks:', probe.drive(seconds), flush=True)
-                looker.send_signal(signal.SIGINT)
-                looker.wait()
+            probe.drive(4 * _BETWEEN)
+            _tell(*_measure(probe, looker, seconds, int(turns)))
+            print(looker.communicate('end\n')[0].strip())
         finally:
+            looker.kill()
             backend.send_signal(signal.SIGINT)
             backend.wait()
     return 0
+
+
+def _measure(probe: Probe, looker: 'subprocess.Popen[str]', seconds: float, turns: int
+             ) -> tuple[list[list[float]], list[bool]]:
+    """Return how late poses were in each turn, nobody looks in those that are even [s]."""
+    late, old = [], []
+    assert looker.stdin is not None
+    for turn in range(2 * turns):
+        looker.stdin.write('look\n' if turn % 2 else 'away\n')
+        looker.stdin.flush()
+        probe.drive(_BETWEEN)
+        found = probe.drive(seconds)
+        late.append(found[0])
+        old += found[1]
+    return late, old
+
+
+def _tell(late: list[list[float]], old: list[bool]) -> None:
+    p99 = {}
+    for name, first, step in (('nobody looks', 0, 2), ('somebody looks', 1, 2),
+                              ('one half', 0, 4), ('the other', 2, 4)):
+        p50, p95, p99[name] = 1e3 * np.percentile(
+            [one for turn in late[first::step] for one in turn], (50, 95, 99))
+        print(f'{name + ":":16}pose after {p50:.2f} ms, p95 {p95:.2f}, p99 {p99[name]:.2f} ms')
+    print(f'p99 {p99["somebody looks"] / p99["nobody looks"]:.2f} times that without; noise alone '
+          f'{p99["one half"] / p99["the other"]:.2f}')
+    print(f'{sum(old)} of {len(old)} transforms older than the newest odometry')
 
 
 def _load(node: Any) -> None:
@@ -117,15 +145,24 @@ def _load(node: Any) -> None:
 
 
 def _look() -> int:
-    """Take markers until SIGINT; print how many bytes."""
+    """Take markers while told to look; print how many bytes."""
     rclpy.init()
-    node, sizes = rclpy.create_node('looker'), []
-    node.create_subscription(MarkerArray, 'graph', lambda data: sizes.append(len(data)),
-                             QoSProfile(depth=100), raw=True)
-    with suppress(KeyboardInterrupt, ExternalShutdownException):
-        rclpy.spin(node)
-    print(f'{len(sizes)} messages of {sum(sizes) / 1e6:.1f} MB in all', flush=True)
-    return 0
+    node, sizes, subscription = rclpy.create_node('looker'), [0], None
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    threading.Thread(target=executor.spin, daemon=True).start()
+    for line in sys.stdin:
+        if subscription is not None:
+            node.destroy_subscription(subscription)
+            subscription = None
+        if line == 'look\n':
+            subscription = node.create_subscription(
+                MarkerArray, 'graph', lambda data: sizes.append(len(data)), QoSProfile(depth=100),
+                raw=True)
+        if line == 'end\n':
+            break
+    print(f'{len(sizes) - 1} messages on graph of {sum(sizes) / 1e6:.1f} MB in all', flush=True)
+    os._exit(0)
 
 
 if __name__ == '__main__':

@@ -4,12 +4,13 @@
 import argparse
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from l1slam_ros.cli.commands import Ending, read, warn
-from l1slam_ros.cli.reference import known_false, position_error, read_truth
+from l1slam_ros.cli.reference import Truth, known_false, position_error, read_truth
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
@@ -30,36 +31,26 @@ def solve(arguments: argparse.Namespace) -> Ending:
     """Optimise a graph; print, write and draw what came out."""
     _check_outputs(arguments)
     asked = _asked(arguments)
-    record = read(arguments, arguments.input, arguments.quiet)
-    truth, warnings = None, list(record.skipped)
-    if arguments.reference:
-        truth = read_truth(arguments.reference, record, arguments.input)
-        warn(truth.skipped, arguments.quiet)
-        warnings += truth.skipped
+    record = read(arguments, arguments.input, quiet=True)
+    truth = read_truth(arguments.reference, record, arguments.input) if (
+        arguments.reference) else None
+    warnings = [*record.skipped, *(truth.skipped if truth else ())]
+    warn(warnings, arguments.quiet)
     if arguments.plot:
         known_false(arguments.input, record)  # damaged, it is refused before the work
     compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
     outcome = _solved(arguments, record, asked)
-    remarks = [f'no loop was doubted: {outcome.unjudged}'] if outcome.unjudged else []
-    if outcome.parts > 1:
-        remarks.append(f'{outcome.parts:,} parts that nothing accepted joins: where one lies from '
-                       'another is a guess')
+    remarks = list(_remarks(outcome))
     warn(remarks, arguments.quiet)
-    warnings += remarks
     judgement = outcome.judgement
     ending = Ending(record.damage, doubt_sentence(
         judgement.doubts if judgement else (), record.ids, record.stamps))
     report = _report(record, outcome)
-    report['warnings'] = [*warnings, *filter(None, ending)]
+    report['warnings'] = [*warnings, *remarks, *filter(None, ending)]
     if truth:
         report['ate'] = position_error(record, outcome.solution.poses, truth)
         report['ate_poses'] = len(truth.rows)
-    if arguments.plot:
-        from l1slam_ros.cli.drawing import plot_outcome
-
-        plot_outcome(arguments, record, outcome, truth, _cost_name(asked))
-    if arguments.output:
-        formats.write_output(arguments.output, replace(record, poses=outcome.solution.poses))
+    _write(arguments, record, outcome, truth, _cost_name(asked))
     if arguments.json:
         # What is not finite has no place in JSON.
         print(json.dumps({name: None if isinstance(value, float) and not math.isfinite(value)
@@ -69,6 +60,26 @@ def solve(arguments: argparse.Namespace) -> Ending:
         for sentence in judgement_sentences(record, judgement) if judgement else ():
             print(sentence)
     return ending
+
+
+def _remarks(outcome: Outcome) -> Iterator[str]:
+    """Yield what a map is not."""
+    if outcome.unjudged:
+        yield f'no loop was doubted: {outcome.unjudged}'
+    if outcome.parts > 1:
+        yield (f'{outcome.parts:,} parts that nothing accepted joins: where one lies from another '
+               'is a guess')
+
+
+def _write(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
+           truth: Truth | None, cost_name: str) -> None:
+    """Draw and write the map, where that was asked for."""
+    if arguments.plot:
+        from l1slam_ros.cli.drawing import plot_outcome
+
+        plot_outcome(arguments, record, outcome, truth, cost_name)
+    if arguments.output:
+        formats.write_output(arguments.output, replace(record, poses=outcome.solution.poses))
 
 
 def _solved(arguments: argparse.Namespace, record: GraphRecord, asked: SolveOptions) -> Outcome:

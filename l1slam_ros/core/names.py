@@ -15,6 +15,6 @@ ROTATION_INFORMATION = QUATERNION, ANGLE = ('quaternion', 'angle')
 # and to the one around a back end.
 OF_ROS = frozenset(('use_sim_time', 'start_type_description_service', 'qos_overrides'))
 OF_THE_NODE = OF_ROS | {
-    'autostart', 'dimension', 'map_frame', 'odom_frame', 'base_frame', 'publish_tf',
+    'autostart', 'dimension', 'map_frame', 'odom_frame', 'publish_tf',
     'transform_period', 'transform_tolerance', 'save_path', 'autosave_period', 'load_on_start',
     'update'}

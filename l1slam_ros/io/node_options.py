@@ -37,8 +37,6 @@ class NodeOptions(BackendOptions):
     dimension: int = option(2, 'of the world: SE(2) or SE(3)', '', 2, 3, fixed=True)
     map_frame: str = option('map', 'frame of the optimised poses', fixed=True)
     odom_frame: str = option('odom', 'frame of the odometry', fixed=True)
-    base_frame: str = option(
-        '', "the robot's frame; empty: the first child_frame_id seen", fixed=True)
     publish_tf: bool = option(
         True, 'publish map -> odom on /tf, where tf2_msgs is installed', fixed=True)
     transform_period: float = option(
@@ -48,7 +46,7 @@ class NodeOptions(BackendOptions):
         's', 0, 3600)
     save_path: str = option('', 'the .g2o file of ~/save and ~/load')
     autosave_period: float = option(
-        60.0, 'with a save_path, how often a map that changed is saved, and at the end; 0: off',
+        60.0, 'with a save_path, within what time a changed map is saved, and at the end; 0: off',
         's', 0, 1e9)
     load_on_start: bool = option(False, 'load the map of save_path at start', fixed=True)
     update: UpdateOptions = UpdateOptions()

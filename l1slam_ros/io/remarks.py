@@ -2,14 +2,19 @@
 """
 What a saved map says that no graph format has a tag for, in lines that others take for comments.
 
-    #L1SLAM map 1               the first line: the version of what follows
+    #L1SLAM map 2               the first line: the version of what follows
     #L1SLAM <name> <JSON>       a value; of one with many rows the first, and more in lines to come
+    #L1SLAM <name> <f8 <Base64> the numbers of an array, of NumPy's type `<f8`; more to come, too
     #L1SLAM sha256 <digest>     the last line: of all bytes before, the proof that they are whole
+
+A map of version 1 is the same without Base64: as text numbers take most of the time of saving.
 """
 
 import json
+from base64 import b64decode, b64encode
 from collections.abc import Iterable, Iterator, Mapping
 from hashlib import sha256
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -20,23 +25,39 @@ from l1slam_ros.core.errors import FileError
 Remarks = Mapping[str, Any] | None
 
 _KEYWORD = '#L1SLAM '
-_FIRST = f'{_KEYWORD}map 1'
+_FIRST, _BEFORE = f'{_KEYWORD}map 2', f'{_KEYWORD}map 1'
 _PROOF = f'{_KEYWORD}sha256 '
 _LAST = len(_PROOF) + 2 * sha256().digest_size + 1  # bytes of the last line
 # Rows to a line: readers whose lines have an end get through, and other threads their turn.
 _AT_ONCE = 500
+# [characters] So many are hashed and written at once. Both let go of the interpreter's lock, and
+# to get it back from threads that are busy may take longer than the work.
+_ENOUGH = 2**20
 
 
 def with_remarks(lines: Iterable[str], values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines of a file that says some values, too: arrays, or what JSON knows."""
+    """Yield the lines of a file that says some values, too, many to a string; see `_unproven`."""
     digest = sha256()
-    for line in _unproven(lines, values):
-        digest.update(f'{line}\n'.encode())
-        yield line
+    for text in _together(_unproven(lines, values)):
+        digest.update(f'{text}\n'.encode())
+        yield text
     yield f'{_PROOF}{digest.hexdigest()}'
 
 
+def _together(lines: Iterable[str]) -> Iterator[str]:
+    some: list[str] = []
+    size = 0
+    for line in lines:
+        some.append(line)
+        size += len(line)
+        if size > _ENOUGH:
+            yield '\n'.join(some)
+            some, size = [], 0
+    yield '\n'.join(some)
+
+
 def _unproven(lines: Iterable[str], values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield lines and values: arrays, or what JSON knows."""
     yield _FIRST
     yield from lines
     for name, value in values.items():
@@ -44,8 +65,9 @@ def _unproven(lines: Iterable[str], values: Mapping[str, Any]) -> Iterator[str]:
         if isinstance(value, np.ndarray | list):
             parts = [value[k : k + _AT_ONCE] for k in range(0, max(len(value), 1), _AT_ONCE)]
         for part in parts:
-            rows = (part + 0).tolist() if isinstance(part, np.ndarray) else part  # 1, not true
-            yield f'{_KEYWORD}{name} ' + json.dumps(rows, separators=(',', ':'))
+            yield f'{_KEYWORD}{name} ' + (
+                f'{part.dtype.str} {b64encode(part.tobytes()).decode()}'
+                if isinstance(part, np.ndarray) else json.dumps(part, separators=(',', ':')))
 
 
 def is_proven(path: object, content: bytes) -> bool:
@@ -63,7 +85,7 @@ def is_proven(path: object, content: bytes) -> bool:
     if last != f'{_PROOF}{sha256(memoryview(content)[:-_LAST]).hexdigest()}\n'.encode():
         raise FileError(path, 'is damaged: its last line is not the checksum of those before; '
                         'expected a saved map as it was written')
-    if not content.startswith(f'{_FIRST}\n'.encode()):
+    if not content.startswith((f'{_FIRST}\n'.encode(), f'{_BEFORE}\n'.encode())):
         raise FileError(path, f'is a saved map of another version; expected {_FIRST!r}', 1)
     return True
 
@@ -79,10 +101,21 @@ def read_remarks(path: object, content: bytes) -> Remarks:
     """
     if not is_proven(path, content):
         return None
-    values: dict[str, Any] = {}
+    parts: dict[str, list[Any]] = {}
     _, *lines, _ = (line.split(' ', 2)[1:] for line in content.decode().split('\n')
                     if line.startswith(_KEYWORD))
     for name, text in lines:
-        value = json.loads(text)
-        values[name] = values[name] + value if name in values else value
-    return values
+        parts.setdefault(name, []).append(_value(text))
+    return {name: _joined(of_name) for name, of_name in parts.items()}
+
+
+def _joined(parts: list[Any]) -> Any:
+    if isinstance(parts[0], np.ndarray):
+        return np.concatenate(parts)
+    return list(chain(*parts)) if isinstance(parts[0], list) else parts[0]
+
+
+def _value(text: str) -> Any:
+    kind, _, numbers = text.partition(' ')
+    # As no JSON does, a type begins with the order of its bytes.
+    return np.frombuffer(b64decode(numbers), kind) if kind[0] in '<>|' else json.loads(text)

@@ -19,7 +19,7 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.graph.recording import recorded
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
@@ -133,24 +133,9 @@ class Isam2:
 
 
 def measurements(graph: FactorGraph) -> Iterator[tuple[OdometrySample, list[LoopClosure]]]:
-    """Yield each keyframe's odometry and the loops that end at it."""
+    """Yield each keyframe's odometry and the loops that end there, ten keyframes a second."""
     forward = turned(graph, graph.between.i > graph.between.j)
-    factors, manifold, stamps = forward.between, graph.manifold, invented_stamps(graph.n_poses)
-    chain, measured = map(manifold.to_pose3, (odometry_poses(graph), factors.measurement))
-    root = factors.sqrt_information
-    covariance = np.zeros((len(factors), 6, 6))
-    said = np.array(manifold.COVARIANCE_ROWS)
-    covariance[:, said[:, None], said] = np.linalg.inv(root.transpose(0, 2, 1) @ root)
-    step = {int(factors.j[row]): row for row in np.flatnonzero(factors.is_odometry)}
-    loops: dict[int, list[LoopClosure]] = {}
-    for row in np.flatnonzero(~factors.is_odometry):
-        i, j = int(factors.i[row]), int(factors.j[row])
-        loops.setdefault(j, []).append(
-            LoopClosure(int(stamps[i]), int(stamps[j]), measured[row], covariance[row]))
-    none = np.zeros((6, 6))
-    for k in range(graph.n_poses):
-        motion = covariance[step[k]] if k else none
-        yield OdometrySample(int(stamps[k]), chain[k], motion, none), loops.get(k, [])
+    return recorded(forward, invented_stamps(graph.n_poses).tolist())
 
 
 def run_updates(graph: FactorGraph, peer: Isam2 | None, rate: float, maps: int,

@@ -19,17 +19,16 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import WORLD
-from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED, SUSPECT
-from l1slam_ros.core.online.snapshot import Snapshot
+from l1slam_ros.core.online.snapshot import ACCEPTED, REJECTED, SUSPECT, Snapshot
 from l1slam_ros.ros.publishing import cdr, header_bytes, string_bytes
 
-# Okabe and Ito's colours, as in the pictures.
+# As in the pictures: Okabe and Ito's, and a redder red.
 _BLUE, _GREY = (0.0, 0.447, 0.698), (0.5, 0.5, 0.5)
 # Loops: from green over yellow to red as their residual grows to so many sigmas.
 _SIGMAS, _WORST = (0.0, 2.5, 5.0), 5.0
-_LADDER = np.array([(0.0, 0.62, 0.451), (0.902, 0.624, 0.0), (0.835, 0.369, 0.0)])
+_LADDER = np.array([(0.0, 0.62, 0.451), (0.902, 0.624, 0.0), (0.835, 0.216, 0.055)])
 _LOOPS = {'loops': ACCEPTED, 'suspect_loops': SUSPECT, 'rejected_loops': REJECTED}
-_POINT, _LINE = 0.1, 0.03  # [m]
+_POINT, _LINE = 0.12, 0.05  # [m]
 # Keyframes or factors of one marker; what moves by less [m] is not sent again.
 _PIECE, _STILL = 500, 0.01
 _EVERY = 1.0  # [s] people look no faster

@@ -105,7 +105,8 @@ class BackendNode(LifecycleNode):
             self.trigger_activate()
         # Active first: who hears of a loaded map may send odometry at once.
         self._tell(None)
-        self._jobs.start(self._map_services.autosave)
+        self._jobs.start()
+        self._map_services.start()
         self._solver.start()
         self._inputs.start()
 
@@ -150,9 +151,9 @@ class BackendNode(LifecycleNode):
         deadline = time.monotonic() + seconds
         self._solver.close(0.0)  # what it works at for a job stops
         ended = self._inputs.close(seconds)
-        self._map_services.save_changes()
-        ended &= self._jobs.close(seconds) or (
-            self._map_file.is_saving and self._jobs.close(_SAVING))
+        self._map_services.close()
+        ended &= self._jobs.close(seconds)
+        ended &= self._map_services.is_closed(max(deadline - time.monotonic(), 0.0) + _SAVING)
         ended &= self._solver.close(max(deadline - time.monotonic(), 0.0))
         if ended:
             self.destroy_node()
@@ -162,7 +163,7 @@ class BackendNode(LifecycleNode):
 
     def is_saving(self) -> bool:
         """Return whether the map is being saved."""
-        return self._map_file.is_saving
+        return self._map_services.is_saving()
 
     def _make_publishers(self) -> None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

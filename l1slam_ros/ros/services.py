@@ -1,6 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The services of the node, and what the thread of the jobs does for each."""
+"""
+The services of the node, what the thread of the jobs does for each, and a thread that saves.
 
+That one has no more to wait for than a moment in which nothing is appended: neither for what
+services ask for nor for the solver, and it makes way for neither.
+"""
+
+import threading
 import time
 from collections.abc import Awaitable, Callable
 
@@ -16,6 +22,9 @@ from l1slam_ros.io.graphs.map_file import MapFile
 from l1slam_ros.io.sentences import doubt_sentence
 from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.job_queue import JobQueue
+
+# [s] So often is looked whether there is something to save.
+_LOOK = 0.1
 
 
 class MapServices:
@@ -38,6 +47,8 @@ class MapServices:
                  failures: Failures, pause: Callable[[bool], None], stopped: Stopped):
         self._backend, self._jobs, self._map_file = backend, jobs, map_file
         self._failures, self._pause, self._stopped = failures, pause, stopped
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._keep_saving, name='autosave', daemon=True)
         # A group of their own: a service that awaits its answer would block its whole group.
         group = ReentrantCallbackGroup()
         for name, work in (('optimize', self._optimise), ('reset', self._reset),
@@ -90,17 +101,30 @@ class MapServices:
         """Let the map be emptied, which nobody asked for: what is new in it is saved."""
         self._jobs.put(why, lambda: self._autosave(self._backend.reset))
 
-    def autosave(self) -> float:
-        """Save the map if it is time; return after how long to ask again [s]."""
-        wait, began = self._map_file.seconds_left(), time.monotonic()
-        if wait > 0:
-            return wait
-        self._autosave()
-        return time.monotonic() - began  # no more than half of the time
+    def start(self) -> None:
+        """Begin to save the map whenever it is time."""
+        self._thread.start()
 
-    def save_changes(self) -> None:
-        """Let the map be saved if it has changed."""
-        self._jobs.put('the map file', self._autosave)
+    def close(self) -> None:
+        """Save the map a last time if it has changed."""
+        self._ending.set()
+
+    def is_closed(self, seconds: float) -> bool:
+        """Return whether that is done within some seconds."""
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+    def is_saving(self) -> bool:
+        """Return whether the map is being saved, or will be at once."""
+        return self._map_file.is_saving or (self._ending.is_set() and self._thread.is_alive())
+
+    def _keep_saving(self) -> None:
+        again = 0.0
+        while not self._ending.wait(_LOOK):
+            if self._map_file.is_due() and (began := time.monotonic()) >= again:
+                self._autosave()
+                again = 2 * time.monotonic() - began  # no more than half of the time
+        self._autosave()
 
     def _autosave(self, taken: Callable[[], None] = lambda: None) -> str:
         try:

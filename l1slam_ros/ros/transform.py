@@ -9,6 +9,7 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 
 from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.core.online.snapshot import Robot
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.publishing import transform_bytes
 
@@ -53,20 +54,24 @@ class MapToOdom:
         self._before = self._newest
 
     def tick(self) -> float:
-        """Publish if it is time; return when to call again [s], infinity: with new odometry."""
-        left = self._due - time.monotonic()
-        if left > 0:
-            return left
-        if not self._publish():
-            return math.inf
-        self._due = max(self._due + self._options().transform_period, time.monotonic())
-        return self._due - time.monotonic()
+        """
+        Publish if it is time; return when to call again [s], infinity: with new odometry.
 
-    def _publish(self) -> bool:
-        """Publish the transform as it is now; return whether any odometry has come."""
-        robot, options = self._backend.robot(), self._options()
+        It is time, too, when odometry has come that is newer than the last transform: a bag that
+        is played fast, or odometry that comes seldom, outruns the tolerance within a period.
+        """
+        robot, now = self._backend.robot(), time.monotonic()
         if robot is None or robot.stamp == self._before:
-            return False
+            return math.inf
+        if now >= self._due or robot.stamp > self._stamp:
+            self._publish(robot)
+            late, period = now - self._due, self._options().transform_period
+            self._due = now + period - (late if 0 <= late < period else 0.0)
+        return self._due - now
+
+    def _publish(self, robot: Robot) -> None:
+        """Publish the transform as it is now."""
+        options = self._options()
         self._before = 0
         if robot.stamp < self._newest:
             self._stamp = 0  # time itself went back
@@ -81,4 +86,3 @@ class MapToOdom:
         self._publisher.publish(transform_bytes(*said))
         if self._tf is not None:
             self._tf.publish(transform_bytes(*said, in_sequence=True))
-        return True

@@ -545,7 +545,7 @@ def corrupted(capsys, path, output, *options):
 
 
 @pytest.mark.parametrize('kind', ['random', 'identity', 'grouped'])
-def test_corrupt_adds_far_pairs_and_keeps_the_rest(capsys, odd, world, tmp_path, kind):
+def test_corrupt_adds_loops_and_keeps_the_rest(capsys, odd, tmp_path, kind):
     before = read_graph_file(odd)
     after, false, pairs = corrupted(capsys, odd, tmp_path / 'bad.g2o', '--false-loops', 40,
                                     '--kind', kind, '--seed', 3)
@@ -555,12 +555,6 @@ def test_corrupt_adds_far_pairs_and_keeps_the_rest(capsys, odd, world, tmp_path,
     np.testing.assert_array_equal(after.stamps, before.stamps)
     np.testing.assert_array_equal(after.graph.between.measurement[~false],
                                   before.graph.between.measurement)
-    truth = np.loadtxt(f'{world}.truth.txt')[:, 1:3]
-    i, j = ((pairs - 10) // 3).T
-    distance = np.linalg.norm(truth[i] - truth[j], axis=1)
-    # A tenth of the diagonal of the map; the map that judged it is some centimetres off.
-    assert distance.min() > 0.1 * np.linalg.norm(np.ptp(truth, axis=0)) - 0.3
-    assert (j - i).min() >= 15
     claimed = np.linalg.norm(after.graph.between.measurement[false][:, :2], axis=1)
     assert claimed.max() < {'random': 2, 'identity': 1e-9, 'grouped': 40}[kind]
     assert solve_json(capsys, tmp_path / 'bad.g2o')['loops'] == 141

@@ -19,7 +19,6 @@ import pytest
 
 from l1slam_ros.cli.main import main
 from l1slam_ros.io.progress import Progress
-from l1slam_ros.io.wording import counted
 
 ROOT = Path(__file__).parents[2]
 DEADLINE = 60.0
@@ -185,13 +184,6 @@ def test_in_a_log_there_is_a_line_now_and_then_of_what_takes_long(capsys, monkey
     with Progress(2, 'step', label='soon done') as progress:
         progress.advance(2)
     assert capsys.readouterr().err == ''
-
-
-@pytest.mark.parametrize('count, plural, said', [
-    (0, '', '0 loops'), (1, '', '1 loop'), (1837, '', '1,837 loops'), (1, 'looses', '1 loop'),
-    (2, 'looses', '2 looses')])
-def test_numbers_in_sentences(count, plural, said):
-    assert counted(count, 'loop', plural) == said
 
 
 def test_what_is_said_of_one_of_each_is_in_the_singular(tmp_path):

@@ -21,15 +21,6 @@ from l1slam_ros.io.trajectory import write_tum
 SECOND = 10**9
 
 
-def test_between_true_poses_the_position_is_on_the_line_and_the_heading_on_the_shorter_arc():
-    poses = np.array([[1.0, 0.0, 3.0], [3.0, 4.0, -3.0]])
-    rows, found = poses_at(se2, np.array([0, 10]), poses, np.array([0, 5, 10]), 10, 0)
-    assert rows.tolist() == [0, 1, 2]
-    np.testing.assert_allclose(found[1, :2], [2, 2], atol=1e-12)
-    assert abs(found[1, 2]) == pytest.approx(np.pi, abs=1e-12)
-    np.testing.assert_allclose(found[[0, 2]], poses, atol=1e-12)
-
-
 def test_nothing_is_extrapolated_nor_bridged():
     times, poses = np.array([10, 20, 30, 90, 100]), np.arange(15.0).reshape(5, 3) / 10
     at = np.array([8, 9, 10, 25, 30, 31, 32, 60, 88, 89, 90, 95, 100, 101, 102])

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from problems import retold
 
-from l1slam_ros.cli.summary import bag_numbers, complaints, numbers
+from l1slam_ros.cli.summary import complaints, numbers
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.bags.from_graph import write_graph_bag
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file
 
 # Vertices 10, 11, 12, 13, 14 in a row, and a loop.
@@ -26,10 +25,6 @@ def record_of(tmp_path):
         path.write_text('\n'.join(lines) + '\n')
         return read_graph_file(path)
     return read
-
-
-def test_nothing_is_wrong_with_a_good_graph(record_of):
-    assert complaints(record_of(*LINES, LOOP)) == []
 
 
 @pytest.mark.parametrize('more, sentence', [
@@ -118,14 +113,3 @@ def test_the_cost_is_that_which_is_minimised(record_of, rng):
     record = record_of(*vertices, *LINES, LOOP, 'EDGE_PRIOR_SE2 12 1 2 .5 4 1 1 5 1 6')
     expected = l1_cost(whitened_residual(record.graph, record.poses))
     assert dict(numbers(record))['l1 cost'] == f'{expected:.6g} at the stored poses'
-
-
-def test_the_numbers_of_a_bag(rng, tmp_path):
-    world = simulate_world(30, 40, WorldOptions(), rng)
-    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(30)), world.truth)
-    assert bag_numbers(tmp_path / 'bag') == [
-        ('duration', '2.9 s from 1000.000000000'),
-        ('note', 'covariance increment, keyframes every'),
-        ('topic', '/ground_truth: 30 of geometry_msgs/msg/PoseStamped'),
-        ('topic', '/loop_closures: 11 of geometry_msgs/msg/PoseWithCovarianceStamped'),
-        ('topic', '/odom: 30 of nav_msgs/msg/Odometry')]

@@ -11,7 +11,6 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.files import (
     first_failure,
     read_lines,
-    require_folder,
     rounded,
     stamp_from_text,
     stamp_text,
@@ -92,16 +91,6 @@ def test_comments_and_blank_lines_are_left_out_and_still_counted(tmp_path):
     lines = read_lines(path)
     assert lines.numbers == [4, 6]
     assert [text.split() for text in lines.texts] == [['a', '1'], ['c', '3']]
-
-
-def test_a_folder_that_is_not_there_is_named(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    require_folder('a.txt')
-    require_folder(tmp_path / 'a.txt')
-    for path in 'none/a.txt', tmp_path / 'none' / 'a.txt':
-        with pytest.raises(FileError) as caught:
-            require_folder(path)
-        assert str(caught.value) == f'{path}: cannot be written: {tmp_path}/none is no folder'
 
 
 @pytest.mark.parametrize(('value', 'decimal'), [

@@ -232,17 +232,6 @@ def test_the_largest_residual_is_that_of_a_linear_program(world, seed):
     assert largest['L-infinity'] == pytest.approx(best, rel=1e-2)
 
 
-def fails(results, folder):
-    raise FileError(folder / 'figure_7.png', 'cannot be drawn')
-
-
-def test_nothing_is_left_of_a_report_that_fails(tmp_path, monkeypatch):
-    monkeypatch.setitem(reproduce.SECTIONS, 'Figure 7: to come', fails)
-    with pytest.raises(FileError, match=r'figure_7\.png: cannot be drawn'):
-        reproduce.reproduce(None, [TINY_50K], tmp_path / 'out', LITTLE)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_report_replaces_its_former_self_and_nothing_else(tmp_path):
     (tmp_path / 'report.md').write_text('former')
     (tmp_path / 'notes.txt').write_text('mine')

@@ -38,14 +38,6 @@ def test_the_start_that_is_drawn_is_the_first_that_l2_does_not_survive(world, rn
     assert least.noise == NOISES[0] and off(world.graph, least.l2, run.l1) < 0.02 * size
 
 
-def test_false_loops_are_new_and_between_far_poses(world, liars):
-    i, j = liars.graph.between.pairs[liars.false].T
-    assert len(i) == 3
-    assert np.linalg.norm(world.truth[i, :2] - world.truth[j, :2], axis=1).min() > 0.5
-    np.testing.assert_array_equal(liars.graph.between.pairs[~liars.false],
-                                  world.graph.between.pairs)
-
-
 def test_the_robust_map_is_the_clean_one_and_hubers_is_not(liars):
     np.testing.assert_array_equal(liars.accepted, ~liars.false)
     robust, huber = (off(liars.graph, poses, liars.clean) for poses in (liars.robust, liars.huber))

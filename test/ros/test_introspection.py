@@ -145,23 +145,41 @@ def test_parameters_given_by_a_wrong_name_are_told_of(bench, capfd):
         "there is no parameter 'zzz': it is not used"]
 
 
-@pytest.mark.parametrize('name', ['l1slam.rviz', 'foxglove.json'])
-def test_layouts_show_what_the_node_publishes(name):
-    text = (CONFIG / name).read_text()
-    layout = yaml.safe_load(text)  # JSON is YAML, too
-    topics = set(re.findall(r'["\s](/[a-z_]+)', text))
-    assert layout and {'/path', '/graph', '/pose', '/pose_with_covariance'} <= topics
-    assert topics <= OUTPUTS.keys() | INPUTS.keys()
+def rviz():
+    return yaml.safe_load((CONFIG / 'l1slam.rviz').read_text())['Visualization Manager']
+
+
+def foxglove():
+    return yaml.safe_load((CONFIG / 'foxglove.json').read_text())['configById']  # JSON is YAML
 
 
 def test_rviz_displays_each_topic_as_what_it_is():
-    """With the durability that it has, or who starts RViz late sees nothing of what stands."""
-    layout = yaml.safe_load((CONFIG / 'l1slam.rviz').read_text())
-    shown = {display['Topic']['Value']: (
+    """
+    With the durability that it has, or who starts RViz late sees nothing of what stands.
+
+    Relative, so that RViz in the namespace of a robot shows that one.
+    """
+    shown = {'/' + display['Topic']['Value']: (
         display['Class'].split('/')[1], display['Topic']['Durability Policy'] != 'Volatile')
-        for display in layout['Visualization Manager']['Displays'] if 'Topic' in display}
+        for display in rviz()['Displays'] if 'Topic' in display}
     assert shown == {topic: (OUTPUTS[topic].split('/')[2].removesuffix('Stamped'),
                              topic in LATCHED) for topic in shown} and len(shown) == 4
+
+
+def test_foxglove_shows_topics_that_there_are():
+    panels = foxglove()
+    shown = panels['3D!map']['topics'].keys() | {
+        panels['DiagnosticSummary!all']['topicToRender'], panels['RawMessages!loops']['topicPath']}
+    assert shown < OUTPUTS.keys() and len(shown) == 6
+
+
+def test_a_person_can_say_in_both_where_the_robot_is():
+    """Foxglove names the topic of each kind of click by a key of its own."""
+    (tool,) = (tool for tool in rviz()['Tools'] if tool['Class'].endswith('/SetInitialPose'))
+    publish = foxglove()['3D!map']['publish']
+    assert publish['type'] == 'pose_estimate'
+    for topic in '/' + tool['Topic']['Value'], publish['poseEstimateTopic']:
+        assert INPUTS[topic] == 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 
 def test_foxglove_plots_fields_that_there_are():

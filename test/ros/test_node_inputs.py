@@ -82,7 +82,7 @@ def test_strays_do_not_stop_the_map(bench, capfd):
         told += capfd.readouterr().err
         return part in told
 
-    for part in ("refused: odometry of 'gripper'; expected that of 'base_link'",
+    for part in ("odometry of 'gripper'; expected that of 'base_link'",
                  f'odometry stamp {seconds(86_413.0)} ns is 86400 s after the one before',
                  'odometry 5e+08 m from one message to the next',
                  'a loop from 11000000000 ns to 18000000000 ns was sent before'):

@@ -4,6 +4,7 @@
 import os
 import signal
 import subprocess
+import threading
 import time
 
 import numpy as np
@@ -17,6 +18,7 @@ from nav_msgs.msg import Path as PathMessage
 from node_bench import call, odometry, poses_of
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import Trigger
 
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs.saved_map import is_map, load_map
@@ -46,6 +48,29 @@ def test_the_map_is_saved_while_it_grows_and_at_the_end(bench, tmp_path, monkeyp
     b.until(lambda: len(b.path().poses) == 6, 'a keyframe more')
     assert b.backend.close(DEADLINE) and keyframes(other) == 6 and len(now.poses) == 5
     b.peer.destroy_node()
+
+
+def test_the_map_is_saved_whatever_a_service_works_at(bench, tmp_path, monkeypatch):
+    path, optimise = tmp_path / 'map.g2o', upkeep.optimise
+    begun, finish = threading.Event(), threading.Event()
+
+    def slow(*arguments):
+        begun.set()
+        finish.wait(DEADLINE)
+        return optimise(*arguments)
+
+    monkeypatch.setattr(upkeep, 'optimise', slow)
+    b = bench(save_path=str(path), autosave_period=0.2)
+    b.drive(0, 3)
+    b.until(lambda: keyframes(path) == 3, 'the map is saved')
+    client = b.peer.create_client(Trigger, '/backend/optimize')
+    b.until(client.service_is_ready, 'optimize is offered')
+    waiting = client.call_async(Trigger.Request())
+    b.until(begun.is_set, 'it works')
+    b.drive(3, 5)
+    b.until(lambda: keyframes(path) == 5, 'the map is saved again')
+    finish.set()
+    b.until(waiting.done, 'optimize is answered')
 
 
 def test_a_settled_map_is_loaded_at_start_and_published_at_once(bench, tmp_path, monkeypatch):

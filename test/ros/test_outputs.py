@@ -14,7 +14,7 @@ from systems import dense_covariance
 from visualization_msgs.msg import Marker, MarkerArray
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.online.loop_states import (
+from l1slam_ros.core.online.snapshot import (
     ACCEPTED,
     EXPIRED,
     REJECTED,

@@ -12,7 +12,7 @@ from nav_msgs.msg import Path
 from rclpy.serialization import deserialize_message
 from rosbags.typesys import Stores, get_typestore
 
-from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED, WAITING, LoopStates
+from l1slam_ros.core.online.snapshot import ACCEPTED, REJECTED, WAITING, LoopStates
 from l1slam_ros.ros.loop_status import states_bytes
 from l1slam_ros.ros.publishing import path_bytes, pose_bytes, transform_bytes
 

@@ -16,8 +16,8 @@ from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_sound
 from l1slam_ros.core.names import OF_THE_NODE
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
-from l1slam_ros.core.online.loop_states import LoopStates
-from l1slam_ros.core.online.snapshot import Optimised, Robot, SavedMap
+from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame
+from l1slam_ros.core.online.snapshot import LoopStates, Optimised, Robot, SavedMap
 from l1slam_ros.core.online.upkeep.live_map import Behind
 from l1slam_ros.core.online.upkeep.threads import Background
 from l1slam_ros.core.online.upkeep.upkeep import Stopped as Stopped
@@ -64,6 +64,7 @@ class Backend(Upkeep):
     Attributes
     ----------
     manifold : what the poses live on
+    base_frame : of the robot, as far as is known; no reset forgets it
 
     Raises
     ------
@@ -77,6 +78,7 @@ class Backend(Upkeep):
             raise OptionError(f'dimension is {dimension!r}, expected 2 or 3')
         self.manifold, self._options = _MANIFOLDS[dimension], options
         super().__init__(options.solver, options.robust.enabled)
+        self.base_frame = BaseFrame(options.base_frame)
         self._counted: tuple[object, dict[str, int]] = (None, {})
         self._background: Background | None = None
         self._graph: object = None
@@ -108,8 +110,7 @@ class Backend(Upkeep):
 
     def reset(self) -> None:
         """Forget everything."""
-        self._replace(GraphBuilder(self.manifold, self._options),
-                      Optimised.nothing(self.manifold.identity(0)))
+        self._replace(self._new_builder(), Optimised.nothing(self.manifold.identity(0)))
 
     def saved(self) -> SavedMap | None:
         """Return all that another back end goes on from; None: there are no factors yet."""
@@ -127,9 +128,12 @@ class Backend(Upkeep):
         Return the number of its graph in this one, see `SavedMap`.
         """
         saved.require(self.manifold)
-        builder = GraphBuilder(self.manifold, self._options)
+        builder = self._new_builder()
         builder.restore(saved.growth)
         return self._replace(builder, saved.as_judged(self._robust))
+
+    def _new_builder(self) -> GraphBuilder:
+        return GraphBuilder(self.manifold, self._options, base_frame=self.base_frame)
 
     def _replace(self, builder: GraphBuilder, optimised: Optimised) -> int:
         """Begin a map with the graph of a builder; what is made for the one before is left."""
@@ -198,32 +202,23 @@ class Backend(Upkeep):
                 self._begin(self._builder, now.known().unjudged())
         self._wake()
 
-    def add_odometry(self, sample: OdometrySample) -> Array | None:
-        """
-        Add one sample; return the odometry frame seen from the map for it, (1, p).
-
-        None: it is held, not used yet; see `GraphBuilder.add_odometry`.
-        """
+    def add_odometry(self, sample: OdometrySample) -> bool:
+        """Add one sample; return whether it is used, see `GraphBuilder.add_odometry`."""
         require_sound(sample)
         with self._lock:
             self._samples += 1
-            used = self._builder.add_odometry(sample)
-            self._begin_map()
-            map_to_odom = self._map_to_odom_now() if used else None
+            try:
+                used = self._builder.add_odometry(sample)
+            finally:  # of two samples the second may be refused
+                self._begin_map()
         self._wake()
-        return map_to_odom
+        return used
 
     def robot(self) -> Robot | None:
         """Return where the robot is; None: no odometry has said yet where it is in this map."""
         with self._lock:
             last = self._builder.stream.last
             return Robot(last.stamp, last.pose, self._map_to_odom_now()) if last else None
-
-    def begin_anew(self) -> None:
-        """Forget the only sample so far; see `GraphBuilder.begin_anew`."""
-        with self._lock:
-            self._builder.begin_anew()
-            self._begin_map()
 
     def _begin_map(self, optimised: Optimised | None = None) -> None:
         """Begin with what is known of another map; None: with nothing, if the builder did."""

@@ -15,12 +15,16 @@ from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.geometry.noise import MOST_OF_ODOMETRY, root_of_inverse
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.measurements import LoopClosure, Notes, OdometrySample
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.online.keyframes import KeyframeOptions, Level, Motion, OdometryOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
-from l1slam_ros.core.online.notes import Notes
-from l1slam_ros.core.online.odometry.odometry_stream import UNSEEN_TURN, OdometryStream, Point
+from l1slam_ros.core.online.odometry.odometry_stream import (
+    UNSEEN_TURN,
+    BaseFrame,
+    OdometryStream,
+    Point,
+)
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
 from l1slam_ros.core.online.snapshot import Growth
 from l1slam_ros.core.options import Options, option
@@ -43,6 +47,8 @@ class GraphBuilderOptions(Options):
         'further than any robot moves: the map stays and a new part begins, which loops may join '
         'to it; or the map begins anew; or the robot is taken to be where it was, and old stamps '
         'are dropped', '', choices=tuple(_SAID))
+    base_frame: str = option(
+        '', "the robot's frame; empty: the first child_frame_id seen", fixed=True)
 
 
 class GraphBuilder:
@@ -55,10 +61,12 @@ class GraphBuilder:
     options : see `GraphBuilderOptions`; may be replaced at any time
     verbatim : the messages are those of a graph: each is a measurement as it is stated, none a
         loop sent again or odometry that jumps
+    base_frame : tells whose odometry it is; None: by the options alone
 
     Attributes
     ----------
     graph : the factor graph so far; loops enter it in `add_due_loops`
+    base_frame : as far as is known
     stream : passes on what is the robot's motion, and holds what may not be
     track : the odometry so far, its keyframes and gaps
     loops : those in the graph, and those that wait
@@ -68,12 +76,14 @@ class GraphBuilder:
 
     """
 
-    def __init__(self, manifold: Manifold, options: GraphBuilderOptions, verbatim: bool = False):
+    def __init__(self, manifold: Manifold, options: GraphBuilderOptions, verbatim: bool = False,
+                 base_frame: BaseFrame | None = None):
         self.options = options
         self.graph = FactorGraph(manifold)
         self.notes = Notes()
         self._verbatim = verbatim
-        self.stream = OdometryStream(manifold, self.notes)
+        self.base_frame = base_frame or BaseFrame(options.base_frame)
+        self.stream = OdometryStream(manifold, self.notes, self.base_frame)
         self.loops = LoopFactors(manifold, self.notes, verbatim)
         self._motion: Motion
         self._resumed = False
@@ -95,21 +105,23 @@ class GraphBuilder:
 
         Raises
         ------
-        MessageError : `old_stamp`, the stamp is not after the last one; nothing is added.
+        MessageError : `child_frame`, it is another's, or `old_stamp`, the stamp is not after the
+            last one; nothing is added.
 
         """
         ignore, track = self.options.on_time_jump == 'ignore', self.track
         if ignore and not self._glued and sample.stamp <= track.last_stamp:
             raise MessageError('old_stamp', f'odometry stamp {sample.stamp} ns is not after the '
                                f'last one, {track.last_stamp} ns')
-        points = self.stream.take(sample, self._verbatim, not ignore)
-        for point in points:
+        used = False
+        for point in self.stream.take(sample, self._verbatim, not ignore):
             self._add(point)
+            used = True
         track = self.track  # a new one, maybe
         # Loops that are due become factors by the samples as they came.
         if track.may_be_thinned and not self.loops.waiting.is_due(track.last):
             track.thin()
-        return bool(points)
+        return used
 
     def finish(self) -> None:
         """Use the last sample of all, if it is held for a pause alone; see `held`."""
@@ -118,24 +130,23 @@ class GraphBuilder:
 
     def _add(self, point: Point) -> None:
         """Add a sample of the robot's motion."""
-        on_gap, pose = self.options.on_time_jump, point.pose
+        if point.anew and self._resumed:
+            self._glued = False  # the odometry begins again
+        elif point.anew:
+            self._forget()
+        on_gap, pose, manifold = self.options.on_time_jump, point.pose, self.graph.manifold
         goes_on = self._glued or self.track.goes_on(point.stamp, pose, self.offset)
-        gap = point.gap
-        if not self._glued and point.stamp <= self.track.last_stamp:
-            gap = f'odometry stamp {point.stamp} ns is before the end of the map'
-        elif not goes_on and on_gap == 'new_segment':
-            gap = f'odometry at {point.stamp} ns begins elsewhere than the map ends'
+        gap = self._gap(point, goes_on)
         if gap:
             self.add_due_loops()  # what came before is of that time
             cause, said = _SAID[on_gap]
             self.notes.tell(cause, f'{gap}; {said}')
-            self._level = Level(self.graph.manifold)
-        if point.anew or (gap and on_gap == 'reset'):
-            self._forget()
+            self._level = Level(manifold)
+            if on_gap == 'reset':
+                self._forget()
         if not self.graph.n_poses:
             self._begin_part(point.stamp, pose)
             return
-        manifold = self.graph.manifold
         if gap or not goes_on:
             self.offset = manifold.compose(self.track.last_pose, manifold.inverse(pose))
             self._moved = True
@@ -146,7 +157,19 @@ class GraphBuilder:
             if self.track.begin_part(point.stamp):
                 self.loops.waiting.begin_anew(self.track.time)
             self._begin_part(point.stamp, pose)
-            return
+        else:
+            self._go_on(point, pose)
+
+    def _gap(self, point: Point, goes_on: bool) -> str:
+        """Return why no motion is known to a sample from the one before; empty: it is known."""
+        if not self._glued and point.stamp <= self.track.last_stamp:
+            return f'odometry stamp {point.stamp} ns is before the end of the map'
+        if not goes_on and self.options.on_time_jump == 'new_segment':
+            return f'odometry at {point.stamp} ns begins elsewhere than the map ends'
+        return point.gap
+
+    def _go_on(self, point: Point, pose: Array) -> None:
+        """Continue to a sample at `pose` (1, p); where that makes a keyframe, add its factor."""
         unseen = (point.unseen, UNSEEN_TURN * point.seconds) if point.gap else None
         motion = self._motion.step(point.sample, pose, self.options.keyframe,
                                    self.options.odometry, self._verbatim, unseen)
@@ -168,14 +191,6 @@ class GraphBuilder:
         self.track.append(stamp, pose, is_keyframe=True)
         self.graph.add_poses(1)
         self._motion = Motion(self.graph.manifold, stamp, pose)
-
-    def begin_anew(self) -> None:
-        """Forget the only sample so far, a stray; of a restored map: let odometry begin again."""
-        self.stream = OdometryStream(self.graph.manifold, self.notes, self._resumed)
-        if self._resumed:
-            self._glued = False
-            return
-        self._forget()
 
     def _forget(self) -> None:
         """Begin anew; loops that came may yet find odometry of their times."""
@@ -203,10 +218,12 @@ class GraphBuilder:
         self._motion = Motion(self.graph.manifold, track.last_stamp, track.last_pose)
         if growth.end > track.last_stamp:
             track.append(growth.end, growth.end_pose, is_keyframe=False)
+            by_model = self.options.odometry.covariance_source == 'model'
             self._motion.add_known(
-                growth.end, growth.end_pose, growth.end_covariance, self.options.odometry)
+                growth.end, growth.end_pose, None if by_model else growth.end_covariance)
         self._glued, self._moved, self._resumed = False, True, True
-        self.stream = OdometryStream(self.graph.manifold, self.notes, resumed=True)
+        self.stream = OdometryStream(
+            self.graph.manifold, self.notes, self.base_frame, resumed=True)
         self.loops.restore(growth, track, self.options.loop)
 
     def add_loop(self, loop: LoopClosure) -> None:

@@ -10,16 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l1slam_ros.core.geometry import se3
+from l1slam_ros.core.geometry import noise, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.geometry.noise import (
-    MOST_OF_ODOMETRY,
-    MOST_VARIANCE,
-    at_most,
-    bounds,
-    or_model,
-    usable,
-)
 from l1slam_ros.core.graph.measurements import OdometrySample
 from l1slam_ros.core.options import Options, option
 
@@ -149,36 +141,35 @@ class Motion:
 
     def add(self, sample: OdometrySample, pose: Array, options: OdometryOptions) -> None:
         """Continue to `pose` (1, p) in the odometry frame, that of a sample."""
+        stated = None
+        if options.covariance_source == 'increment':
+            stated = sample.covariance
+        elif options.covariance_source == 'twist':
+            stated = sample.twist_covariance * ((sample.stamp - self._stamp) * 1e-9) ** 2
+        self.add_known(sample.stamp, pose, None if stated is None else reduced_covariance(
+            self._manifold, stated))
+
+    def add_known(self, stamp: int, pose: Array, covariance: Array | None) -> None:
+        """Continue to `pose` (1, p) at a stamp [ns]; the covariance (d, d) is of the way there."""
         manifold = self._manifold
         length, angle = manifold.motion(manifold.local(self._ends, pose))
         (self._distance, metres), (self._turn, radians) = length.tolist(), angle.tolist()
         self._metres += metres
         self._radians += radians
-        if options.covariance_source == 'model':
+        if covariance is None:
             self._stated = None  # one message without a covariance: the model speaks for all
         elif self._stated is not None and len(self._stated) >= _SUMMED:
             self._sum_up()
-        if self._stated is not None:
+        if self._stated is not None and covariance is not None:
             self._poses.append(pose)
-            self._stated.append(
-                sample.covariance if options.covariance_source == 'increment'
-                else sample.twist_covariance * ((sample.stamp - self._stamp) * 1e-9) ** 2)
-        self._ends[1], self._stamp = pose[0], sample.stamp
+            self._stated.append(covariance)
+        self._ends[1], self._stamp = pose[0], stamp
 
     def _sum_up(self) -> None:
         """Let one covariance stand for those of all messages so far."""
         end = self._poses[-1]
         total = self._seen_from(end)
-        self._poses, self._stated = [end], None if total is None else [
-            _of_message(self._manifold, total.sum(axis=0))]
-
-    def add_known(self, stamp: int, pose: Array, covariance: Array,
-                  options: OdometryOptions) -> None:
-        """Continue to `pose` (1, p) at a stamp [ns]; the covariance (d, d) is of the way there."""
-        stated = _of_message(self._manifold, covariance)
-        seconds = (stamp - self._stamp) * 1e-9
-        self.add(OdometrySample(stamp, self._manifold.to_pose3(pose)[0], stated,
-                                stated / seconds**2), pose, options)
+        self._poses, self._stated = [end], None if total is None else [total.sum(axis=0)]
 
     def _add_unseen(self, sample: OdometrySample, metres: float, radians: float) -> None:
         """Continue to a sample at the same place, to which the robot may have gone some way."""
@@ -219,27 +210,19 @@ class Motion:
         total = stated.sum(axis=0, keepdims=True)
         if verbatim:
             return total[0]
-        known, out = or_model(total, model, MOST_VARIANCE)
-        used, large = at_most(known, MOST_OF_ODOMETRY)
-        self.bounded = bounds(total, used, out | large)
+        known, out = noise.or_model(total, model, noise.MOST_VARIANCE)
+        used, large = noise.at_most(known, noise.MOST_OF_ODOMETRY)
+        self.bounded = noise.bounds(total, used, out | large)
         # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
-        return used[0] if len(stated) == 1 or usable(used)[0] else None
+        return used[0] if len(stated) == 1 or noise.usable(used)[0] else None
 
     def _seen_from(self, end: Array) -> Array | None:
         """Return what each message states (k, d, d), seen from an end (1, p); None: see `_sum`."""
         manifold = self._manifold
-        stated = reduced_covariance(manifold, np.array(self._stated))
-        if not usable(stated).all():
+        stated = np.array(self._stated)
+        if not noise.usable(stated).all():
             return None
         if len(stated) == 1:
             return stated
         Ad = manifold.adjoint(manifold.between(end, np.concatenate(self._poses)))
         return Ad @ stated @ Ad.transpose(0, 2, 1)
-
-
-def _of_message(manifold: Manifold, covariance: Array) -> Array:
-    """Return a covariance (d, d) as a message has it, (6, 6)."""
-    rows = np.array(manifold.COVARIANCE_ROWS)
-    stated = np.zeros((6, 6))
-    stated[rows[:, None], rows] = covariance
-    return stated

@@ -17,15 +17,6 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.incremental.growing_map import View
-from l1slam_ros.core.online.loop_states import (
-    ACCEPTED,
-    EXPIRED,
-    LOOP_STATES,
-    REJECTED,
-    SUSPECT,
-    WAITING,
-    LoopStates,
-)
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.optimality import Status
 from l1slam_ros.core.solvers.solve import AUTO, PRIMAL_DUAL, Method, choose
@@ -33,6 +24,24 @@ from l1slam_ros.core.solvers.solve import AUTO, PRIMAL_DUAL, Method, choose
 # A large map gets but one linearisation into an update, and never meets a test that takes two of
 # them. It is at rest when so many updates in a row lowered the cost by less than is looked for.
 _QUIET_UPDATES = 5
+# What can become of a loop; `LoopStates.state` counts in this order.
+LOOP_STATES = ('waiting', 'suspect', 'accepted', 'rejected', 'expired')
+WAITING, SUSPECT, ACCEPTED, REJECTED, EXPIRED = range(len(LOOP_STATES))
+
+
+@dataclass(frozen=True)
+class LoopStates:
+    """
+    What has become of the loops.
+
+    rows : (k,) the between factors of the first k of them; stamps : (l, 2) [ns] reference and end;
+    state : (l,) of `LOOP_STATES`; sigmas : (l,), NaN where a loop was not looked at.
+    """
+
+    rows: Indices
+    stamps: Indices
+    state: Indices
+    sigmas: Array
 
 
 @dataclass(frozen=True)

@@ -45,11 +45,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import anchor
 from l1slam_ros.core.graph.parts import tied
-from l1slam_ros.core.robust.innovation import chi2_quantile, sample_posterior
-from l1slam_ros.core.robust.judgement import Judgement, doubt_of_norm, doubts, judgement_of
+from l1slam_ros.core.robust.innovation import chi2_quantile, covariances
+from l1slam_ros.core.robust.judgement import NORM, Doubt, Judgement, doubts, judgement_of
 from l1slam_ros.core.robust.rounds import REFUSED, Growth
 from l1slam_ros.core.robust.slips import join, without_slip
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
@@ -106,31 +108,50 @@ def minimise_robustly(
     minimise : from a graph and poses (n, p) to its solution; report, check : see `robust_solve`
     """
     judgement, poses = robust_solve(graph, report, check)
-    accepted = judgement.believed(graph)
-    whole = tied(accepted, poses)
-    seed = l2_map(whole, poses, cholesky_of(whole), lambda *_: check())
+    whole, seed = _least_squares(graph, judgement, poses, check)
     solution = minimise(whole, seed)
-    rows = len(accepted.between) * graph.manifold.TANGENT_SIZE
+    rows = int(judgement.accepted.sum()) * graph.manifold.TANGENT_SIZE
     check()
-    if _leaves(graph, judgement, seed, solution.poses):
-        judgement = replace(judgement, doubts=(*judgement.doubts, doubt_of_norm(graph, judgement)))
+    of_norm = _doubts_of_norm(graph, judgement, (whole, seed), solution.poses)
+    judgement = replace(judgement, doubts=judgement.doubts + of_norm)
     return RobustMap(replace(solution, dual=solution.dual[:rows]), seed, judgement)
 
 
-def _leaves(graph: FactorGraph, judgement: Judgement, seed: Array, poses: Array) -> bool:
+def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
+                   check: Callable[[], None]) -> tuple[Doubt, ...]:
+    """Return the doubts that `minimise_robustly` would have of a map, (n, p), by its norm."""
+    return _doubts_of_norm(graph, judgement, _least_squares(graph, judgement, poses, check), poses)
+
+
+def _least_squares(graph: FactorGraph, judgement: Judgement, poses: Array,
+                   check: Callable[[], None]) -> tuple[FactorGraph, Array]:
+    """Return the accepted factors, in one piece, and their L2 map (n, p), from poses (n, p)."""
+    whole = tied(judgement.believed(graph), poses)
+    return whole, l2_map(whole, poses, cholesky_of(whole), lambda *_: check())
+
+
+def _doubts_of_norm(graph: FactorGraph, judgement: Judgement, least: tuple[FactorGraph, Array],
+                    poses: Array) -> tuple[Doubt, ...]:
     """
-    Return whether half of a map is further from the L2 map, (n, p) each, than noise explains.
+    Return a doubt where half of a map, (n, p), is further off the L2 map than noise makes it.
 
     Of normal noise, as it was found, the difference has pi/2 - 1 of the covariance of the L2 map
     at most, which is what L1 pays for it. Of the keyframes of one way all may err together.
+
+    least : of `_least_squares`
     """
-    rows, manifold = np.flatnonzero(judgement.accepted), graph.manifold
-    kind = ~graph.between.is_odometry[rows]
-    found = tied(graph.subset(rows, judgement.variance[kind.astype(np.int64)]), seed)
-    posterior = sample_posterior(found, seed, cholesky_of(found))
-    square = posterior.squares(manifold.local(seed, poses)[posterior.fixed:])
+    (whole, seed), manifold = least, graph.manifold
+    loop = ~graph.between.is_odometry[judgement.accepted]
+    # Where the part is as noisy as was found, odometry is its unit.
+    noise = judgement.variance[(loop & judgement.is_noise_stated).astype(np.int64)]
+    noise = np.concatenate((noise, np.ones(len(whole.between) - len(noise))))
+    step = manifold.local(seed, poses)[anchor(whole):]
+    square = kernels.prediction.normalise(
+        covariances(whole, seed, cholesky_of(whole), noise), step)[0]
     explained = (np.pi / 2 - 1) * chi2_quantile(1 - REFUSED, np.array([manifold.TANGENT_SIZE]))
-    return bool(np.count_nonzero(np.isfinite(square) & (square > explained)) > len(square) / 2)
+    if np.count_nonzero(np.isfinite(square) & (square > explained)) <= len(square) / 2:
+        return ()
+    return (Doubt(NORM, int(np.count_nonzero(loop)), 0, graph.n_poses - 1),)
 
 
 def rounds(

@@ -107,20 +107,12 @@ def together(found: Innovations, posterior: Posterior, gate: Gate,
 
     """
     fits, log_ratio, odds = alone
-    best = np.flatnonzero(fits)
-    best = best[np.argsort(-log_ratio[best], kind='stable')[:_CANDIDATES]]
-    a, b = (best[side] for side in np.triu_indices(len(best), 1))
-    a, b = (ends[place[a] != place[b]] for ends in (a, b))
-    if not len(a):
-        return best[:0]
-    square, both = found.joint(posterior, a, b)
-    agree = np.flatnonzero(square < gate(found.freedom[a] + found.freedom[b]))
-    a, b, both = a[agree], b[agree], both[agree]
-    far = np.zeros(len(fits))
-    for one, other in ((a, b), (b, a)):
-        np.maximum.at(far, one, both - log_ratio[one] - np.maximum(odds[other], 0.0))
-    sure = (log_ratio + far > odds + np.log(1 / DOUBT - 1)) & (far > 0)
-    believed: Indices = best[sure[best]]
+    one, other, square, both = _pairs(found, posterior, np.flatnonzero(fits), log_ratio, place)
+    far, agree = np.zeros(len(fits)), square < gate(found.freedom[one] + found.freedom[other])
+    gain = both - log_ratio[one] - np.maximum(odds[other], 0.0)
+    np.maximum.at(far, one[agree], gain[agree])
+    believed: Indices = np.flatnonzero(
+        (log_ratio + far > odds + np.log(1 / DOUBT - 1)) & (far > 0))
     return believed
 
 
@@ -136,16 +128,27 @@ def rivals(found: Innovations, posterior: Posterior, alone: tuple[Mask, Array, f
     """
     fits, log_ratio, odds = alone
     unsure = np.flatnonzero(fits & (found.log_det > found.freedom * np.log(2)))
-    unsure = unsure[np.argsort(-log_ratio[unsure], kind='stable')[:_CANDIDATES]]
-    a, b = (unsure[side] for side in np.triu_indices(len(unsure), 1))
-    a, b = (ends[place[a] != place[b]] for ends in (a, b))
+    one, other, _, both = _pairs(found, posterior, unsure, log_ratio, place)
     best = np.full(len(fits), -np.inf)
-    if len(a):
-        both = found.joint(posterior, a, b)[1] - odds
-        for one, other in ((a, b), (b, a)):
-            np.maximum.at(best, one, log_ratio[other] - np.logaddexp(
-                0.0, both - log_ratio[one]))
+    np.maximum.at(best, one, log_ratio[other] - np.logaddexp(
+        0.0, both - odds - log_ratio[one]))
     return best
+
+
+def _pairs(found: Innovations, posterior: Posterior, rows: Indices, log_ratio: Array,
+           place: Indices) -> tuple[Indices, Indices, Array, Array]:
+    """
+    Return the pairs of two places, both ways round, of those of some factors that fit best.
+
+    The one and the other, (pairs,) each, the square and the log ratio of both, see
+    `Innovations.joint`.
+    """
+    best = rows[np.argsort(-log_ratio[rows], kind='stable')[:_CANDIDATES]]
+    a, b = (best[side] for side in np.triu_indices(len(best), 1))
+    a, b = (ends[place[a] != place[b]] for ends in (a, b))
+    square, both = found.joint(posterior, a, b) if len(a) else (np.zeros(0), np.zeros(0))
+    return (np.concatenate((a, b)), np.concatenate((b, a)), np.tile(square, 2),
+            np.tile(both, 2))
 
 
 def noise_variance(found: Innovations) -> Array:
@@ -166,7 +169,8 @@ def noise_variance(found: Innovations) -> Array:
         log_det -= (k - freedom) * np.log(ratio)  # what says nothing has no noise
         for start in (1.0, *(np.quantile(square, (0.1, 0.5)) / k).tolist()):
             likelihood, scale = _fitted_scale(square, log_det, log_claim, freedom, k, start)
-            costs = _RATIO_COSTS * len(best) * (ratio != 1) + _DECADE_COSTS * abs(np.log10(scale))
+            costs = _RATIO_COSTS * len(best) * (ratio != 1) + _DECADE_COSTS * (
+                abs(np.log10(scale)) + abs(np.log10(ratio)))
             fits.append((likelihood - costs, scale, ratio))
     _, scale, ratio = max(fits)
     return np.array([scale, ratio * scale])

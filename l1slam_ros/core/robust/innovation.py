@@ -44,10 +44,11 @@ class Posterior:
     """
     A graph at its optimum.
 
-    system : its linearisation, there or one step before; noise : (m, k, q) signs, of each factor;
-    samples : (free keyframes + 1, k, q) steps from it that the noise makes, the last one of what
-    is held fixed; moment : (m, k, k) what noise as stated would make of the residual; speaks :
-    (m, k) bool, see `BetweenFactors`; fixed : keyframes that are held, see `anchor`.
+    system : its linearisation, there or one step before, b what is left at the optimum of this;
+    noise : (m, k, q) signs, of each factor; samples : (free keyframes + 1, k, q) steps from it
+    that the noise makes, the last one of what is held fixed; moment : (m, k, k) what noise as
+    stated would make of the residual; speaks : (m, k) bool, see `BetweenFactors`; fixed :
+    keyframes that are held, see `anchor`.
     """
 
     system: LinearSystem
@@ -67,13 +68,6 @@ class Posterior:
         system = self.system
         return self.noise[rows] - kernels.prediction.moved(
             system.keyframe[rows], system.blocks[rows], self.samples)
-
-    def squares(self, step: Array) -> Array:
-        """Return the squared length of steps (free keyframes, k) in their covariance, (free,)."""
-        samples = self.samples[:-1]
-        moment = samples @ samples.transpose(0, 2, 1) / samples.shape[2]
-        square: Array = kernels.prediction.normalise(moment, step)[0]
-        return square
 
     def left_out(self) -> Array:
         """
@@ -101,22 +95,49 @@ def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
     GraphError : some keyframe is not tied to the anchor.
 
     """
-    residual = whitened_residual(graph, poses)
-    system = replace(solved, b=-residual) if solved else linearise(graph, poses, residual)
-    if not solved and not cholesky.factorise(system, np.ones_like(residual)):
+    system = (replace(solved, b=-whitened_residual(graph, poses)) if solved
+              else _factorised(graph, poses, cholesky))
+    # A map that is to within its noise is no optimum to a factor that others hardly check.
+    step = cholesky.solve(system.transposed_times(system.b))
+    system = replace(system, b=system.b - system.times(step))
+    noise, samples = _steps(graph, system, cholesky)
+    moment = kernels.prediction.left_over(system.keyframe, system.blocks, samples, noise)
+    return Posterior(system, noise, samples, moment, graph.between.speaks, anchor(graph))
+
+
+def covariances(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
+                variance: Array) -> Array:
+    """
+    Return the covariances of the L2 map (n, p) of a graph, (free keyframes, k, k).
+
+    variance : (m,) of the noise that there is, in units of what each factor states
+    """
+    system = _factorised(graph, poses, cholesky)
+    noisy = replace(system, blocks=system.blocks * np.sqrt(variance)[:, None, None, None])
+    samples = _steps(graph, noisy, cholesky)[1][:-1]
+    return samples @ samples.transpose(0, 2, 1) / kernels.prediction.SAMPLES
+
+
+def _factorised(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> LinearSystem:
+    system = linearise(graph, poses)
+    if not cholesky.factorise(system, np.ones_like(system.b)):
         raise GraphError('the normal matrix is singular: a part of the graph is not tied to '
                          'the anchor, or weights differ beyond double precision')
-    k, q = system.block_size, kernels.prediction.SAMPLES
+    return system
+
+
+def _steps(graph: FactorGraph, system: LinearSystem,
+           cholesky: BlockCholesky) -> tuple[np.ndarray, Array]:
+    """Return signs (m, k, q), and the steps (free keyframes + 1, k, q) that such noise makes."""
     # Signs have the covariance of white noise, and are quicker to draw.
+    k, q = system.block_size, kernels.prediction.SAMPLES
     noise = signs(keys(graph.between.i, graph.between.j), k, q)
-    speaks = graph.between.speaks
-    noise[~speaks] = 0
+    noise[~graph.between.speaks] = 0
     samples = np.zeros((system.size + 1, k, q))
     kernels.prediction.gather(system.keyframe, system.blocks, noise, samples)
     samples[-1] = 0.0
     cholesky.solve_many(samples[:-1])
-    moment = kernels.prediction.left_over(system.keyframe, system.blocks, samples, noise)
-    return Posterior(system, noise, samples, moment, speaks, anchor(graph))
+    return noise, samples
 
 
 def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array,

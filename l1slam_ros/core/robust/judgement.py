@@ -195,12 +195,6 @@ def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
     return tuple(dict.fromkeys(reasons))
 
 
-def doubt_of_norm(graph: FactorGraph, judgement: Judgement) -> Doubt:
-    """Return the doubt that the map hangs on the norm by which it is made of what is accepted."""
-    loops = judgement.accepted & ~graph.between.is_odometry
-    return Doubt(NORM, int(np.count_nonzero(loops)), 0, graph.n_poses - 1)
-
-
 def _carries_all(growth: Growth, accepted: Indices) -> bool:
     """Return whether all accepted loops are of one place, and join but a small part of the way."""
     if len(accepted) < _HANDFUL or growth.trusted[accepted].any():

@@ -65,7 +65,7 @@ def minimise_l2(
     cholesky: BlockCholesky,
     report: Report = lambda iteration, cost: None,
 ) -> Solution:
-    """Minimise chi2, the sum of squared whitened residuals; arguments as `optimiser.minimise`."""
+    """Minimise chi2, the sum of squared whitened residuals; arguments as `nonlinear.minimise`."""
     return gauss_newton(graph, poses, Huber(), options, cholesky, report)
 
 
@@ -77,7 +77,7 @@ def gauss_newton(
     cholesky: BlockCholesky,
     report: Report = lambda iteration, cost: None,
 ) -> Solution:
-    """Minimise a norm, reweighted at each step; arguments as `optimiser.minimise`."""
+    """Minimise a norm, reweighted at each step; arguments as `nonlinear.minimise`."""
     return _descend(graph, poses, norm, options, cholesky, report)[0]
 
 

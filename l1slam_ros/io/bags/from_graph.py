@@ -14,24 +14,18 @@ a pose is seen from an earlier one: factors the other way are turned, and the no
 """
 
 import os
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
-from l1slam_ros.core.geometry import se3
-from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.geometry.noise import (
-    LEAST_VARIANCE,
-    MOST_OF_ODOMETRY,
-    MOST_VARIANCE,
-    Mask,
-    covariance_of,
-)
-from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph, turned
+from l1slam_ros.core.geometry import noise, se3
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
 from l1slam_ros.core.graph.measurements import FASTEST, LONGEST_PAUSE, SHORTEST_STEP
 from l1slam_ros.core.graph.parts import odometry_gaps
+from l1slam_ros.core.graph.recording import loops_of, recorded, steps_of
 from l1slam_ros.io.bags.topics import (
     ABSOLUTE_TOPIC,
     LOOP_TOPIC,
@@ -45,7 +39,7 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.messages.conversion import reference_frame_id
 from l1slam_ros.io.trajectory import invented_stamps
 
-# What `bag.read_note` returns for a graph.
+# What `reader.read_note` returns for a graph.
 GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
 # And besides, where a reader of messages would take some for faults: see `_note`.
 VERBATIM_NOTE = {'messages': 'verbatim'}
@@ -79,41 +73,40 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
 
     """
     stamps, backward = _stamps(record), _backward(record)
-    record = replace(record, graph=turned(record.graph, backward))
-    graph, steps, loops = record.graph, _steps(record), _loops(record)
+    _require_sayable(record)
     if truth is not None and len(truth) != len(stamps):
         raise GraphError(f'{len(truth)} true poses; expected {len(stamps)}, one for each vertex')
-    to_pose3, factors = graph.manifold.to_pose3, graph.between
-    covariances = _covariances(graph)
-    chain, measured = to_pose3(_chain(graph, steps)), to_pose3(factors.measurement)
-    topics = np.where(factors.is_absolute, ABSOLUTE_TOPIC, np.where(
-        factors.trusted & ~factors.is_odometry, TRUSTED_LOOP_TOPIC, LOOP_TOPIC)).tolist()
-    note = _note(record, stamps, steps) | _turned_note(backward, steps, loops)
-    with new_bag(path, note) as writer:
+    graph = turned(record.graph, backward)
+    factors, to_pose3 = graph.between, graph.manifold.to_pose3
+    topics = {LOOP_TOPIC: True, ABSOLUTE_TOPIC: factors.is_absolute.any(),
+              TRUSTED_LOOP_TOPIC: (factors.trusted & ~factors.is_odometry).any()}
+    with new_bag(path, _note(graph, stamps) | _turned_note(graph, backward)) as writer:
         messages = _Messages(writer.types)
         writer.add_topic(ODOMETRY_TOPIC, _ODOMETRY)
-        for topic in sorted({LOOP_TOPIC, *topics}):
+        for topic in sorted(topic for topic, used in topics.items() if used):
             writer.add_topic(topic, _LOOP)
         if truth is not None:
             writer.add_topic(TRUTH_TOPIC, _TRUTH)
             true = to_pose3(truth)
-        for k, stamp in enumerate(stamps):
-            covariance = covariances[steps[k - 1]] if k else np.zeros(36)
+        for k, (sample, loops) in enumerate(recorded(graph, stamps)):
+            stamp = sample.stamp
             writer.write(ODOMETRY_TOPIC, stamp, messages.stamped(
-                _ODOMETRY, 'odom', stamp, _BASE_FRAME, messages.pose(chain[k], covariance),
-                messages.standing))
+                _ODOMETRY, 'odom', stamp, _BASE_FRAME,
+                messages.pose(sample.pose3, sample.covariance), messages.standing))
             if truth is not None:
                 writer.write(TRUTH_TOPIC, stamp, messages.stamped(
                     _TRUTH, 'map', stamp, messages.pose(true[k])))
-            for loop in loops[k]:
-                i = factors.i[loop]
-                frame = 'map' if i == WORLD else reference_frame_id(_BASE_FRAME, stamps[i])
-                writer.write(topics[loop], stamp, messages.stamped(
-                    _LOOP, frame, stamp, messages.pose(measured[loop], covariances[loop])))
+            for loop in loops:
+                topic, frame = ABSOLUTE_TOPIC, 'map'
+                if loop.reference_stamp is not None:
+                    topic = TRUSTED_LOOP_TOPIC if loop.trusted else LOOP_TOPIC
+                    frame = reference_frame_id(_BASE_FRAME, loop.reference_stamp)
+                writer.write(topic, stamp, messages.stamped(
+                    _LOOP, frame, stamp, messages.pose(loop.pose3, loop.covariance)))
 
 
 class _Messages:
-    """Makes messages of stamps [ns], poses x y z qx qy qz qw and covariances (36,)."""
+    """Makes messages of stamps [ns], poses x y z qx qy qz qw and covariances (6, 6)."""
 
     def __init__(self, types: dict[str, Any]):
         self._types = types
@@ -126,81 +119,58 @@ class _Messages:
         time = self._types['builtin_interfaces/msg/Time'](*divmod(stamp, NANOSECONDS))
         return self._types[msgtype](self._types['std_msgs/msg/Header'](time, frame), *fields)
 
-    def pose(self, pose3: Array, *covariance: Array) -> Any:
+    def pose(self, pose3: Array, covariance: Array | None = None) -> Any:
         """Return a Pose, or a PoseWithCovariance."""
         numbers = pose3.tolist()
         pose = self._geometry('Pose', self._geometry('Point', *numbers[:3]),
                               self._geometry('Quaternion', *numbers[3:]))
-        return self._geometry('PoseWithCovariance', pose, *covariance) if covariance else pose
+        return pose if covariance is None else self._geometry(
+            'PoseWithCovariance', pose, covariance.ravel())
 
     def _geometry(self, name: str, *fields: Any) -> Any:
         return self._types[f'geometry_msgs/msg/{name}'](*fields)
 
 
-def _covariances(graph: FactorGraph) -> Array:
-    """Return the covariance of each factor as messages have it, (m, 36)."""
-    manifold, factors = graph.manifold, graph.between
-    rows, diagonal = manifold.COVARIANCE_ROWS, np.arange(manifold.TANGENT_SIZE)
-    of_manifold = covariance_of(factors.sqrt_information)
-    of_manifold[:, diagonal, diagonal] += np.where(factors.speaks, 0.0, np.inf)
-    covariances = np.zeros((len(factors), 6, 6))
-    covariances[np.ix_(range(len(factors)), rows, rows)] = of_manifold
-    return covariances.reshape(-1, 36)
-
-
-def _note(record: GraphRecord, stamps: list[int], steps: Indices) -> dict[str, str]:
+def _note(graph: FactorGraph, stamps: list[int]) -> dict[str, str]:
     """
     Return what is noted of a graph in its bag.
 
     A graph may have loops that are equal in all, steps longer than a robot's, years between its
     keyframes, and variances of no measurement: each message is meant then, and the note says so.
     """
-    factors = record.graph.between
-    loops = np.flatnonzero(~factors.is_odometry)
+    factors, steps, loops = graph.between, steps_of(graph), loops_of(graph)
     equal = np.concatenate((factors.pairs[loops], factors.measurement[loops]), axis=1)
     seconds = np.diff(stamps) * 1e-9
-    manifold = record.graph.manifold
+    manifold = graph.manifold
     metres, _ = manifold.motion(
         manifold.local(manifold.identity(len(steps)), factors.measurement[steps]))
     variances = np.where(factors.speaks, np.diagonal(
-        covariance_of(factors.sqrt_information), axis1=1, axis2=2), 1.0)
+        noise.covariance_of(factors.sqrt_information), axis1=1, axis2=2), 1.0)
     meant = (len(np.unique(equal, axis=0)) < len(equal) or (seconds > LONGEST_PAUSE).any()
              or (metres > FASTEST * np.maximum(seconds, SHORTEST_STEP)).any()
-             or variances.min(initial=1.0) < LEAST_VARIANCE
-             or variances[steps].max(initial=1.0) > MOST_OF_ODOMETRY
-             or variances.max(initial=1.0) > MOST_VARIANCE)
+             or variances.min(initial=1.0) < noise.LEAST_VARIANCE
+             or variances[steps].max(initial=1.0) > noise.MOST_OF_ODOMETRY
+             or variances.max(initial=1.0) > noise.MOST_VARIANCE)
     return (GRAPH_NOTE | (VERBATIM_NOTE if meant else {})
             | (SPACE_NOTE if manifold is se3 else {}))
 
 
-def _steps(record: GraphRecord) -> Indices:
-    """Return which factor leads from each keyframe to the next, (n - 1,)."""
+def _require_sayable(record: GraphRecord) -> None:
+    """Refuse a graph that messages cannot express exactly."""
     factors, ids = record.graph.between, record.ids
     rows, gaps = np.flatnonzero(factors.is_odometry), odometry_gaps(record.graph)
-    first = np.minimum(factors.i, factors.j)[rows]
     if len(gaps):
         k = gaps[0]
         raise GraphError(f'no edge between the consecutive vertices {ids[k]} and {ids[k + 1]}; '
                          'a bag needs the odometry of every vertex')
-    unsaid = first[~factors.speaks[rows].all(axis=1)]
+    unsaid = np.minimum(factors.i, factors.j)[rows[~factors.speaks[rows].all(axis=1)]]
     if len(unsaid):
         raise GraphError(f'the odometry from vertex {ids[unsaid[0]]} leaves a component unsaid; '
                          'in a bag it says all')
-    return rows[np.argsort(first)]
-
-
-def _loops(record: GraphRecord) -> list[list[int]]:
-    """Return the loops that end at each keyframe, in the order of the graph."""
-    factors = record.graph.between
     trusted = factors.j[factors.is_absolute & factors.trusted]
     if len(trusted):
-        raise GraphError(f'a trusted absolute pose of vertex {record.ids[trusted[0]]}; in a bag '
-                         'it would be doubted')
-    rows = np.flatnonzero(~factors.is_odometry)
-    loops: list[list[int]] = [[] for _ in record.ids]
-    for row, j in zip(rows.tolist(), factors.j[rows].tolist(), strict=True):
-        loops[j].append(row)
-    return loops
+        raise GraphError(f'a trusted absolute pose of vertex {ids[trusted[0]]}; in a bag it would '
+                         'be doubted')
 
 
 def _backward(record: GraphRecord) -> Mask:
@@ -215,10 +185,9 @@ def _backward(record: GraphRecord) -> Mask:
     return backward
 
 
-def _turned_note(backward: Mask, steps: Indices, loops: list[list[int]]) -> dict[str, str]:
+def _turned_note(graph: FactorGraph, backward: Mask) -> dict[str, str]:
     """Return which steps and which loops, in the order of the messages, were turned."""
-    in_order = np.array([row for ending in loops for row in ending], np.int64)
-    rows = {TURNED_STEPS: steps, TURNED_LOOPS: in_order}
+    rows = {TURNED_STEPS: steps_of(graph), TURNED_LOOPS: loops_of(graph)}
     return {name: ' '.join(map(str, np.flatnonzero(backward[of]).tolist()))
             for name, of in rows.items() if backward[of].any()}
 
@@ -234,15 +203,3 @@ def _stamps(record: GraphRecord) -> list[int]:
         raise GraphError(f'vertex {record.ids[k]} has the stamp {stamps[k]} ns; expected one '
                          'after 0, after that of the vertex before, and before the year 2038')
     return stamps.tolist()
-
-
-def _chain(graph: FactorGraph, steps: Indices) -> Array:
-    """
-    Return the poses (n, p) that the odometry alone gives, from the identity.
-
-    One after the other: so each is exact to rounding *relative to the one before*.
-    """
-    poses = graph.manifold.identity(graph.n_poses)
-    for k, step in enumerate(graph.between.measurement[steps]):
-        poses[k + 1] = graph.manifold.compose(poses[k], step)
-    return poses

@@ -39,7 +39,6 @@ from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.messages import conversion
-from l1slam_ros.io.messages.base_frame import BaseFrame, Sorted
 from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
 from l1slam_ros.io.trajectory import Reference
 from l1slam_ros.io.wording import counted
@@ -100,7 +99,7 @@ class _Growing:
                  verbatim: bool):
         self._builder = GraphBuilder(manifold, options, verbatim)
         self._topics, self._types = topics, topics.types()
-        self._base_frame, self._map_frame = BaseFrame(''), ''
+        self._map_frame = ''
         self._graphs, self._is_graph = PoseGraphs(), False
         self.seen: set[str] = set()
 
@@ -116,15 +115,14 @@ class _Growing:
             elif message.msgtype != expected:
                 raise MessageError('type', f'{message.msgtype} on {topic}; expected {expected}')
             elif topic == self._topics.odometry:
-                self._add_odometry(self._base_frame.take(
-                    message.data.child_frame_id, conversion.odometry_sample(message.data)))
+                self._builder.add_odometry(conversion.odometry_sample(message.data))
             elif topic == self._topics.absolute:
                 # The map is the frame that the first one names.
                 self._builder.add_loop(conversion.absolute_pose(message.data, self._map_frame))
                 self._map_frame = message.data.header.frame_id
             else:
                 self._builder.add_loop(conversion.loop_closure(
-                    message.data, self._base_frame.name, topic == self._topics.trusted))
+                    message.data, self._builder.base_frame.name, topic == self._topics.trusted))
         except MessageError as error:
             notes.refuse(error.cause, str(error))
         except (AttributeError, TypeError, ValueError):
@@ -141,17 +139,6 @@ class _Growing:
             elif not self._is_graph:
                 self._builder.add_loop(found)
 
-    def _add_odometry(self, found: Sorted) -> None:
-        if found.anew:
-            self._builder.begin_anew()
-        for error in found.others:
-            self._builder.notes.refuse(error.cause, str(error))
-        for sample in found.ours:
-            try:
-                self._builder.add_odometry(sample)
-            except MessageError as error:
-                self._builder.notes.refuse(error.cause, str(error))
-
     def record(self, damage: str) -> GraphRecord:
         """Return the graph that has grown; damage : of the bag."""
         builder = self._builder
@@ -160,7 +147,6 @@ class _Growing:
             graph, ids = self._graphs.graph(manifold, diagonal_covariance(
                 manifold, loop.sigma_translation, loop.sigma_rotation))
             return GraphRecord(graph, None, ids, None, tuple(builder.notes.sentences()), damage)
-        self._add_odometry(Sorted(others=self._base_frame.rest()))
         builder.finish()
         builder.add_due_loops()
         skipped = builder.notes.sentences()

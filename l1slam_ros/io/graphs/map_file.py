@@ -2,6 +2,7 @@
 """Where a running back end keeps its map: when it is saved, and never over that of another."""
 
 import os
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,16 +14,16 @@ from l1slam_ros.core.online.snapshot import SavedMap
 from l1slam_ros.io.graphs.saved_map import keep_as, load_map, save_map
 from l1slam_ros.io.node_options import NodeOptions
 
-# An autosave begins after such a part of its period: a busy machine comes late to it, and odometry
-# on its way is not in it yet.
-_PART = 0.8
+# An autosave begins after such a part of its period. Whoever pulls the plug just before it is done
+# loses what came since the one before began: so it has as long again to come to its end.
+_PART = 0.5
 # [bytes] Enough of the end of a file to tell a map from another: its checksum is in it.
 _END = 128
 
 
 class MapFile:
     """
-    Saves and loads the map of a back end; one thread at a time may.
+    Saves and loads the map of a back end; of several threads one after the other does.
 
     Parameters
     ----------
@@ -39,8 +40,8 @@ class MapFile:
     def __init__(self, backend: Backend, options: Callable[[], NodeOptions],
                  warn: Callable[[str], object]):
         self._backend, self._options, self._warn = backend, options, warn
-        self.is_saving = False
-        self._began, self._took = time.monotonic(), 0.0
+        self.is_saving, self._one = False, threading.Lock()
+        self._began = time.monotonic()
         # Where the map was saved or loaded last, and its version then.
         self._known = _absolute(options().save_path), backend.version
         # The file that we wrote or loaded, its end, and the graph whose map it holds.
@@ -74,11 +75,12 @@ class MapFile:
 
     @contextmanager
     def _at_work(self) -> Iterator[None]:
-        self._began, self.is_saving = time.monotonic(), True
-        try:
-            yield
-        finally:
-            self._took, self.is_saving = time.monotonic() - self._began, False
+        with self._one:
+            self._began, self.is_saving = time.monotonic(), True
+            try:
+                yield
+            finally:
+                self.is_saving = False
 
     def _write(self, path: Path, saved: SavedMap | None,
                version: tuple[int, int, int]) -> str:
@@ -89,7 +91,8 @@ class MapFile:
 
     def load(self) -> str:
         """Load the map; return a sentence that says from where."""
-        sentence, whole = self._loaded()
+        with self._one:
+            sentence, whole = self._loaded()
         if not whole:
             self._warn(sentence)
         return sentence
@@ -115,13 +118,10 @@ class MapFile:
             sentence, well = f'the map begins empty: {error}', not self._path().exists()
         (tell if well else self._warn)(sentence)
 
-    def seconds_left(self) -> float:
-        """Return in how many seconds `autosave` is due, or when to ask again."""
-        options = self._options()
-        # It is to end within a period of the beginning of the last.
-        wait = _PART * options.autosave_period - 2 * self._took
-        left = self._began + wait - time.monotonic()
-        return max(left, 0.0 if self._is_to_be_saved() else options.update.period)
+    def is_due(self) -> bool:
+        """Return whether to autosave now."""
+        due = self._began + _PART * self._options().autosave_period
+        return time.monotonic() >= due and self._is_to_be_saved()
 
     def _is_to_be_saved(self) -> bool:
         options = self._options()

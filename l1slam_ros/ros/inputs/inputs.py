@@ -36,7 +36,6 @@ from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.io.files import quoted
 from l1slam_ros.io.messages import conversion
-from l1slam_ros.io.messages.base_frame import BaseFrame
 from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.inputs.traffic import Traffic
@@ -103,8 +102,7 @@ class Inputs:
                  moved: Callable[[], None], tick: Callable[[], float]):
         self._node, self._backend, self._failures = node, backend, failures
         self._moved, self._tick = moved, tick
-        self._base_frame, self._map_frame = BaseFrame(options.base_frame), options.map_frame
-        self._odom_frame = options.odom_frame
+        self._map_frame, self._odom_frame = options.map_frame, options.odom_frame
         self._group, self.active = _Apart(), False
         self._closing = self._unanswered = False
         self.refused: Counter[str] = Counter()
@@ -118,11 +116,12 @@ class Inputs:
         self.traffic = {topic.name: topic.traffic for topic in self._topics}
 
     def _subscribe_all(self) -> None:
+        base_frame = self._backend.base_frame
         for name, read in (
-            ('loop_closures', lambda m: conversion.loop_closure(m, self._base_frame.name, False)),
+            ('loop_closures', lambda m: conversion.loop_closure(m, base_frame.name, False)),
             ('trusted_loop_closures',
-             lambda m: conversion.loop_closure(m, self._base_frame.name, True)),
-            ('false_loop_closures', lambda m: conversion.false_loop(m, self._base_frame.name)),
+             lambda m: conversion.loop_closure(m, base_frame.name, True)),
+            ('false_loop_closures', lambda m: conversion.false_loop(m, base_frame.name)),
             ('absolute_poses', lambda m: conversion.absolute_pose(m, self._map_frame)),
         ):
             self._subscribe(PoseWithCovarianceStamped, name, partial(self._on_loop, read))
@@ -246,20 +245,14 @@ class Inputs:
             self._answer()
 
     def _on_odometry(self, data: bytes) -> None:
-        frame, child_frame, sample = conversion.odometry_in(data)
+        frame, sample = conversion.odometry_in(data)
         if frame.removeprefix('/') not in (self._odom_frame, ''):
             self._node.get_logger().warning(
                 f'odometry in frame {quoted(frame)} is used, but {self._map_frame} -> '
                 f'{self._odom_frame} is published; expected odom_frame to be its name', once=True)
-        found = self._base_frame.take(child_frame, sample)
-        if found.anew:
-            self._backend.begin_anew()
-        for other in found.others:
-            self._refuse(other)
-        for sample in found.ours:
-            self._unanswered |= self._backend.add_odometry(sample) is not None
-            if self._backlog < _ANSWERED:
-                self._answer()
+        self._unanswered |= self._backend.add_odometry(sample)
+        if self._backlog < _ANSWERED:
+            self._answer()
 
     def _answer(self) -> None:
         if self._unanswered:

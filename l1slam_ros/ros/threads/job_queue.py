@@ -3,7 +3,6 @@
 
 import queue
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 
 from rclpy.node import Node
@@ -50,12 +49,10 @@ class JobQueue:
     def __init__(self, node: Node, failures: Failures, done: Callable[[], None]):
         self._node, self._failures, self._done = node, failures, done
         self._queue: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
-        self._idle: Callable[[], float]
         self._thread = background('services', self._work)
 
-    def start(self, idle: Callable[[], float]) -> None:
-        """Begin; idle : called where nothing is queued, again after so many seconds."""
-        self._idle = idle
+    def start(self) -> None:
+        """Begin."""
         self._thread.start()
 
     def put(self, name: str, work: Callable[[], str]) -> Future:
@@ -71,15 +68,10 @@ class JobQueue:
         return not self._thread.is_alive()
 
     def _work(self) -> None:
-        while (job := self._next()) is not None:
+        while (job := self._queue.get()) is not None:
             job.future.set_result(self._carry_out(job))
             if (executor := self._node.executor) is not None:
                 executor.wake()  # it looks whether the answer is there only when it is up
-
-    def _next(self) -> _Job | None:
-        while True:
-            with suppress(queue.Empty):
-                return self._queue.get(timeout=self._idle())
 
     def _carry_out(self, job: _Job) -> Answer:
         try:

@@ -51,16 +51,6 @@ def test_factors_are_kept_in_the_order_they_came(rng):
     assert_allclose(root.transpose(0, 2, 1) @ root, information)
 
 
-def test_trust_is_of_each_factor_and_none_where_nobody_speaks():
-    graph = graph_with(4, [(0, 1)])
-    z, information = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
-    graph.add_between(np.array([0, 1, 0]), np.array([2, 2, 3]), z, information,
-                      np.array([True, False, True]))
-    graph.add_between(np.array([1, 2, 2]), np.array([3, 3, 0]), z, information, True)
-    assert graph.between.trusted.dtype == bool
-    assert graph.between.trusted.tolist() == [False, True, False, True, True, True, True]
-
-
 def test_the_world_is_an_end_like_any_keyframe(rng):
     graph = graph_with(3, [(0, 1)])
     measurement, information = random_poses(2, rng), random_information(2, rng)

@@ -99,10 +99,3 @@ def test_a_tree_of_any_shape_is_composed(rng):
             if parent[k] != k:
                 expected = se2.compose(poses[parent[k]][None], expected)
             assert_same(poses[k : k + 1], expected)
-
-
-@pytest.mark.parametrize('poses_of', [odometry_poses, lambda graph: tree_poses(graph, 0)])
-def test_one_keyframe_is_at_the_identity(poses_of):
-    graph = FactorGraph(se2)
-    graph.add_poses(1)
-    assert_array_equal(poses_of(graph), np.zeros((1, 3)))

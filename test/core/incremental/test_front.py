@@ -12,8 +12,7 @@ from systems import dense_covariance
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.core.online.loop_states import ACCEPTED
-from l1slam_ros.core.online.snapshot import Growth, Optimised, SavedMap
+from l1slam_ros.core.online.snapshot import ACCEPTED, Growth, Optimised, SavedMap
 from l1slam_ros.core.online.update import improve
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world

@@ -27,7 +27,8 @@ from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions
-from l1slam_ros.core.online.loop_states import (
+from l1slam_ros.core.online.loops.loop_factors import LoopOptions
+from l1slam_ros.core.online.snapshot import (
     ACCEPTED,
     EXPIRED,
     LOOP_STATES,
@@ -35,8 +36,8 @@ from l1slam_ros.core.online.loop_states import (
     SUSPECT,
     WAITING,
 )
-from l1slam_ros.core.online.loops.loop_factors import LoopOptions
 from l1slam_ros.core.online.update import improve, optimise
+from l1slam_ros.core.robust.judgement import NORM
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, minimise
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
@@ -134,22 +135,6 @@ def test_a_solve_to_the_end_minimises_the_norms_that_were_asked_for(world):
     assert mixed.cost == pytest.approx(cost_at(mixed.poses)) and mixed.cost < cost_at(l1.poses)
 
 
-def test_nothing_to_do_is_none(world):
-    backend = Backend(EVERY)
-    assert backend.update(PLENTY) is None
-    play(backend, world, 0, 60)
-    assert settled(backend) >= 1
-    poses = backend.poses
-    assert backend.snapshot().problem().settled and backend.update(PLENTY) is None
-    assert_array_equal(backend.poses, poses)
-    # Nor for a loop that still waits.
-    backend.add_loop(loop(0.0, 100.0, (1.0, 0.0, 0.0)))
-    assert backend.update(PLENTY) is None and len(backend._builder.loops.waiting) == 1
-    play(backend, world, 60, 61)
-    assert not backend.snapshot().problem().settled
-    assert backend.update(PLENTY) is not None
-
-
 def test_settled_the_map_is_the_optimum_and_all_loops_are_judged(careful):
     world = spoilt(careful, 'random', 130)
     with Backend(EVERY) as backend:
@@ -198,20 +183,6 @@ def test_the_budget_is_kept(budget):
     assert improvement.cost < improvement.cost_before
 
 
-def test_small_budgets_add_up(world):
-    """The costs of one set of loops: those that are yet to be believed would add theirs."""
-    backend, end = Backend(CREDULOUS), time.monotonic() + PLENTY
-    play(backend, world)
-    costs = []
-    while (improvement := backend.update(0.01)) is not None:
-        assert time.monotonic() < end
-        # None yet, while the first one is at work.
-        costs += [improvement.cost] if improvement.cost else []
-    assert (np.diff(costs) <= 1e-9).all()
-    batch = batch_of(world.graph)
-    assert costs[-1] == pytest.approx(batch.cost, rel=2e-3)
-
-
 def test_small_budgets_judge_to_the_end(world):
     """A budget too short for one look at the loops leaves it behind, and it is done."""
     backend, end = Backend(EVERY), time.monotonic() + PLENTY
@@ -257,20 +228,6 @@ def test_keyframes_during_an_update_follow_the_map(world):
     graph = backend.snapshot().problem().graph
     batch = batch_of(graph)
     assert cost(graph, backend.poses) == pytest.approx(batch.cost, rel=1e-3)
-
-
-def test_poses_are_always_finite(world, rng):
-    backend = Backend(EVERY)
-    for k in range(0, 150, 30):
-        play(backend, world, k, k + 30)
-        for _ in range(3):  # and loops that are nonsense, with covariances that are none
-            i, j = np.sort(rng.choice(k + 30, 2, replace=False))
-            backend.add_loop(loop(i * PERIOD, j * PERIOD, 1e3 * rng.standard_normal(3),
-                                  rng.choice([0.0, -1.0, np.nan, 9999.0]) * np.eye(6)))
-        backend.update(0.02)
-        assert np.isfinite(backend.poses).all()
-        assert np.isfinite(backend.snapshot().map_to_odom).all()
-        assert len(backend.poses) == k + 30
 
 
 def test_several_loops_at_once_bring_a_drifted_drive_back():
@@ -363,6 +320,23 @@ def test_at_rest_all_is_judged_from_the_graph_alone(careful, clean_errors):
     now = backend.snapshot()
     assert now.graph.between.i[now.optimised.judgement.slips].tolist() == [150]
     assert position_error(backend.poses, careful.truth) < 1.2 * clean_errors[-1] + 0.1
+
+
+def test_at_rest_a_map_is_doubted_for_its_norm_as_in_a_batch(careful):
+    backend = played(careful)
+    found = backend.settle()
+    settled(backend)
+    assert not backend.snapshot().optimised.judgement.doubts
+    turned = se2.identity(len(found.poses))
+    turned[:, 2] = np.linspace(0, 1, len(turned))
+    backend.adopt(replace(found, poses=se2.compose(turned, found.poses)))
+    settled(backend)
+    doubt, = backend.snapshot().optimised.judgement.doubts
+    assert doubt.kind == NORM
+    # It is of that map.
+    backend.settle()
+    settled(backend)
+    assert not backend.snapshot().optimised.judgement.doubts
 
 
 def test_a_trusted_loop_is_accepted_however_absurd(careful):
@@ -600,18 +574,6 @@ def test_options_may_change_on_the_way(world):
     assert_array_equal(backend.poses, poses)
     play(backend, world, 40, 60)
     assert len(backend.poses) == 40
-
-
-def test_whether_loops_are_doubted_can_be_changed_while_it_runs():
-    backend = Backend(CREDULOUS)
-    for k in range(60):
-        backend.add_odometry(odometry(k * PERIOD, (float(k), 0.1 * (k % 3), 0.01 * (k % 5)),
-                                      1e-4 * np.eye(6)))
-    backend.add_loop(loop(5 * PERIOD, 50 * PERIOD, (0.0, 0.0, 0.0), 1e-4 * np.eye(6)))
-    for options, state in ((CREDULOUS, ACCEPTED), (EVERY, REJECTED), (CREDULOUS, ACCEPTED)):
-        backend.set_options(options)
-        settled(backend)
-        assert backend.loop_states().state.tolist() == [state]
 
 
 @pytest.mark.parametrize('dimension', [2, 3])

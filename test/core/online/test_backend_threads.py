@@ -16,7 +16,7 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions
-from l1slam_ros.core.online.loop_states import ACCEPTED
+from l1slam_ros.core.online.snapshot import ACCEPTED
 from l1slam_ros.core.online.update import Improvement, improve
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.core.online.upkeep.threads import Background

@@ -22,7 +22,7 @@ from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.online.loop_states import ACCEPTED
+from l1slam_ros.core.online.snapshot import ACCEPTED
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world

@@ -29,7 +29,7 @@ from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.keyframes import KeyframeOptions
-from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED
+from l1slam_ros.core.online.snapshot import ACCEPTED, REJECTED
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 N, HALF = 200, 100

@@ -13,7 +13,6 @@ from problems import (
     covariance6,
     covariance_of,
     curve,
-    drive,
     drive_on,
     grown,
     keyframe_samples,
@@ -27,7 +26,6 @@ from problems import (
 )
 from scipy.spatial.transform import Rotation
 
-from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.graph.factor_graph import WORLD
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
@@ -55,57 +53,6 @@ def assert_true(builder, poses):
 
 
 # Odometry
-
-
-def test_nothing_yet():
-    builder = GraphBuilder(se2, DEFAULTS)
-    assert builder.graph.n_poses == len(builder.loops.waiting) == builder.add_due_loops() == 0
-    assert builder.track.keyframe_stamps.shape == (0,)
-    assert builder.track.keyframe_poses.shape == (0, 3)
-
-
-def test_every_sample_can_be_a_keyframe(rng):
-    poses = drive(30, rng)
-    builder = grown(poses, EVERY)
-    factors = builder.graph.between
-    assert_array_equal(builder.track.keyframe_stamps, [seconds(k * PERIOD) for k in range(30)])
-    assert_allclose(builder.track.keyframe_poses, poses, atol=1e-12)
-    assert_array_equal(np.stack((factors.i, factors.j)), [np.arange(29), np.arange(1, 30)])
-    assert_allclose(factors.measurement, se2.between(poses[:-1], poses[1:]), atol=1e-12)
-
-
-def test_keyframes_come_when_the_motion_passes_a_threshold():
-    poses = curve(200)
-    builder = GraphBuilder(se2, DEFAULTS)
-    last, expected = 0, [0]
-    for k, pose in enumerate(poses):
-        builder.add_odometry(odometry(k * PERIOD, pose))
-        moved = se2.between(poses[last : last + 1], pose[None])[0]
-        due = k == 0 or np.hypot(*moved[:2]) >= 0.5 or abs(moved[2]) >= 0.2
-        if due and k:
-            expected.append(k)
-            last = k
-        assert builder.graph.n_poses == len(expected)
-    assert 20 < len(expected) < 60
-    assert_array_equal(builder.track.keyframe_stamps, [seconds(k * PERIOD) for k in expected])
-    keyframes = poses[expected]
-    assert_allclose(builder.graph.between.measurement,
-                    se2.between(keyframes[:-1], keyframes[1:]), atol=1e-12)
-
-
-@pytest.mark.parametrize('time', [0.9, 0.5, 0.41])
-def test_an_old_stamp_is_refused_and_nothing_is_added(time):
-    poses = curve(12)
-    builder = grown(poses[:10], EVERY)
-    with pytest.raises(MessageError) as caught:
-        builder.add_odometry(odometry(time, (100.0, 100.0, 1.0)))
-    assert caught.value.cause == 'old_stamp'
-    assert str(caught.value) == (f'odometry stamp {seconds(time)} ns is not after the last one, '
-                                 f'{seconds(0.9)} ns')
-    assert builder.graph.n_poses == len(builder.track.keyframe_stamps) == 10
-    builder.add_odometry(odometry(1.0, poses[10]))
-    assert_allclose(builder.graph.between.measurement[9:], se2.between(poses[9:10], poses[10:11]),
-                    atol=1e-12)
 
 
 def test_snapshots_stay_as_they_were():
@@ -165,33 +112,6 @@ def test_a_loop_before_its_odometry_gives_the_same_factor():
         assert builder.add_due_loops() == 3
         for ours, theirs in zip(loops_of(builder), loops_of(after), strict=True):
             assert_array_equal(ours, theirs)
-
-
-def test_the_factor_does_not_hang_on_when_the_timer_fires():
-    poses = curve(30)
-    loops = [true_loop(poses, 0, k) for k in range(3, 26)]
-    offline, live = GraphBuilder(se2, DEFAULTS), GraphBuilder(se2, DEFAULTS)
-    for one in loops:
-        offline.add_loop(one)
-        live.add_loop(one)
-    drive_on(offline, poses, 0)
-    offline.add_due_loops()
-    for k, pose in enumerate(poses):
-        live.add_odometry(odometry(k * PERIOD, pose))
-        live.add_due_loops()
-    assert loops_of(live)[:2] == loops_of(offline)[:2]
-
-
-def test_a_loop_waits_for_its_odometry():
-    poses = curve(100)
-    builder = grown(poses[:50], DEFAULTS)
-    assert added(builder, true_loop(poses, 3, 60), true_loop(poses, 3, 40)) == 1
-    assert len(builder.loops.waiting) == 1
-    for k in range(50, 61):
-        assert builder.add_due_loops() == 0
-        builder.add_odometry(odometry(k * PERIOD, poses[k]))
-    assert builder.add_due_loops() == 1 and len(builder.loops.waiting) == 0
-    assert builder.add_due_loops() == 0 and not +builder.notes.refused
 
 
 def test_a_loop_expires_when_it_has_waited_too_long():

@@ -11,8 +11,6 @@ from l1slam_ros.core.online.keyframes import (
     KeyframeOptions,
     Motion,
     OdometryOptions,
-    diagonal_covariance,
-    reduced_covariance,
 )
 
 OFF = {'translation': 0.0, 'rotation': 0.0, 'period': 0.0}
@@ -72,16 +70,6 @@ def test_any_one_threshold_is_enough():
 
 def test_with_all_off_any_message_is_a_keyframe():
     assert is_keyframe([(0.0, 0, 0)], 0.0)
-
-
-def test_covariance_of_two_sigmas():
-    assert_allclose(diagonal_covariance(se2, 2.0, 3.0), np.diag([4.0, 4.0, 9.0]))
-
-
-def test_the_plane_takes_rows_x_y_and_yaw(rng):
-    covariance = rng.standard_normal((6, 6))
-    rows = [0, 1, 5]
-    assert_allclose(reduced_covariance(se2, covariance), covariance[rows][:, rows])
 
 
 # The model

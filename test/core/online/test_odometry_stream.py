@@ -211,14 +211,6 @@ def test_a_restored_map_does_not_begin_anew():
     assert second.graph.n_poses == 61 and (np.diff(second.track.keyframe_stamps) > 0).all()
 
 
-def test_of_a_graph_each_message_is_meant():
-    poses = [(0.0, 0.0, 0.0), (5e5, 0.0, 0.0), (5e5, 1.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0)]
-    times = [1.0, 1.1, 1e6, 1e6 + 0.1, 2e9]
-    builder, _ = fed(zip(times, poses, strict=True), verbatim=True)
-    assert not builder.notes.refused and not builder.notes.warned
-    assert_allclose(builder.track.keyframe_poses, poses, atol=1e-6)
-
-
 def test_a_graph_of_odd_messages_comes_back_from_a_bag_exactly(tmp_path):
     """Loops twice, years between keyframes, steps of kilometres, variances of 1e-12 and 1e9."""
     builder = GraphBuilder(se2, EVERY, verbatim=True)
@@ -226,7 +218,7 @@ def test_a_graph_of_odd_messages_comes_back_from_a_bag_exactly(tmp_path):
         builder.add_odometry(odometry(time, (x, 0.0, 0.1 * k)))
     for _ in range(2):
         builder.add_loop(loop(1.0, 1.2, (1.0, 2.0, 0.3), np.diag([1e-12, 1e9, 1, 1, 1, 0.1])))
-    assert builder.add_due_loops() == 2
+    assert builder.add_due_loops() == 2 and builder.graph.n_poses == 5
     record = GraphRecord(builder.graph, None, np.arange(5), builder.track.keyframe_stamps)
     write_graph_bag(tmp_path / 'bag', record)
     read = graph_from_bag(tmp_path / 'bag', None, DEFAULT_TOPICS)

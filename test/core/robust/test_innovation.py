@@ -11,6 +11,7 @@ from l1slam_ros.core.robust.innovation import (
     TAIL,
     chi2_quantile,
     claimed_volume,
+    covariances,
     innovations,
     log_likelihood_ratio,
     sample_posterior,
@@ -65,6 +66,28 @@ def test_a_factor_left_out_is_as_far_off_as_if_it_had_never_been_there(solved):
     best = minimise_l2(without, poses, LeastSquaresOptions(), cholesky_of(without)).poses
     alone = dense_squares(without, whole.subset(np.array([row])), best)[0]
     assert inside[row] == pytest.approx(alone, rel=0.8)
+
+
+def test_a_map_that_is_not_quite_at_its_optimum_says_the_same_of_each_factor(solved):
+    part, _, poses, posterior = solved
+    off = se2.retract(poses, 3e-4 * np.random.default_rng(0).standard_normal(poses.shape))
+    off[0] = poses[0]
+    whitened = [(linearise(part, at).b ** 2).sum() for at in (poses, off)]
+    assert 1e-3 < whitened[1] - whitened[0] < 1
+    again = sample_posterior(part, off, cholesky_of(part))
+    assert again.residual == pytest.approx(posterior.residual, abs=1e-3)
+
+
+def test_the_noise_that_there_is_shows_in_the_map_by_the_weights_that_are_stated(solved):
+    part, _, poses, _ = solved
+    variance = np.where(part.between.is_odometry, 9.0, 1.0)
+    A = linearise(part, poses).A.toarray()
+    gain = np.linalg.inv(A.T @ A) @ A.T * np.sqrt(np.repeat(variance, 3))
+    exact = np.diag(gain @ gain.T)
+    found = covariances(part, poses, cholesky_of(part), variance)
+    ratio = np.diagonal(found, axis1=1, axis2=2).ravel() / exact
+    assert np.median(ratio) == pytest.approx(1, abs=0.1)
+    assert ratio.min() > 0.4 and ratio.max() < 2.5
 
 
 @pytest.mark.parametrize(('size', 'k'), [(3, 3), (6, 3), (6, 6)])

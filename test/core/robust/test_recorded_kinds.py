@@ -14,6 +14,7 @@ from l1slam_ros.core.robust.batch import judge, robust_solve
 from l1slam_ros.core.robust.batch_map import SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.robust.judgement import ONE_JOINS, ONE_PLACE, OTHER_MAP, Doubt
+from l1slam_ros.io.graphs.graph_file import read_graph_file
 
 
 @pytest.fixture(scope='module')
@@ -49,6 +50,15 @@ def test_a_graph_that_says_all_twice_is_believed(world):
     graph = world.graph.copy()
     graph.append_between(factors.i, factors.j, factors.measurement, factors.sqrt_information)
     assert robust_solve(graph)[0].accepted.all()
+
+
+def test_a_dozen_loops_do_not_teach_that_noise_is_a_thousand_times_what_is_stated(datasets):
+    graph = read_graph_file(datasets / 'real' / 'kitti_00.g2o').graph
+    factors = graph.between
+    first = factors.is_odometry | (np.maximum(factors.i, factors.j) < graph.n_poses // 2)
+    found, _ = robust_solve(graph.subset(first))
+    assert found.accepted.all() and np.count_nonzero(first & ~factors.is_odometry) == 12
+    assert np.abs(np.log10(found.variance)).max() < 1
 
 
 @pytest.mark.parametrize('joined', [True, False])

@@ -162,19 +162,6 @@ def test_the_stamps_of_the_graph_are_kept(tmp_path, rng):
     assert messages[-1][2].header.frame_id == 'base_link@0.000000001'
 
 
-def test_truth_has_a_topic(tmp_path, rng):
-    record = record_of([(0, 1), (1, 2), (0, 2)], rng)
-    truth = rng.uniform(-3, 3, (3, 3))
-    write_graph_bag(tmp_path / 'bag', record, truth)
-    messages = read_with_rosbags(tmp_path / 'bag')
-    poses = [m for topic, _, m in messages if topic == '/ground_truth']
-    assert [stamp_of(m.header) for m in poses] == (10**12 + 10**8 * np.arange(3)).tolist()
-    assert {m.header.frame_id for m in poses} == {'map'}
-    found = [(p.x, p.y, 2 * np.arctan2(q.z, q.w)) for p, q in
-             ((m.pose.position, m.pose.orientation) for m in poses)]
-    np.testing.assert_allclose(found, truth, rtol=0, atol=1e-15)
-
-
 def test_the_same_graph_gives_the_same_bytes(tmp_path, rng):
     record = record_of([(0, 1), (1, 2), (0, 2)], rng)
     for folder in ('first', 'second'):

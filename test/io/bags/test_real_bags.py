@@ -11,7 +11,7 @@ from bags import KINDS, TYPES, mcap_file, recording_of, rosbag2_directory, write
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_raw
+from l1slam_ros.io.bags.reader import read_messages, read_raw
 from l1slam_ros.io.bags.to_graph import Topics
 from l1slam_ros.io.formats import read_input
 
@@ -51,16 +51,6 @@ def test_every_kind_is_the_same_recording(tmp_path, world, kind):
                                   'split mcap', 'db3 with a journal'])
 def test_the_note_is_found_in_every_kind_that_can_have_one(tmp_path, world, kind):
     assert_same_graph(read_input(KINDS[kind](tmp_path, world[1])), world[2])
-
-
-@pytest.mark.parametrize('kind', ['directory of mcap', 'db3', 'split db3', 'ROS 1'])
-def test_a_summary_of_every_kind(tmp_path, world, kind):
-    recording = world[1]
-    summary = bag_summary(KINDS[kind](tmp_path, recording))
-    assert [(t.name, t.msgtype) for t in summary.topics] == [
-        ('/loop_closures', 'geometry_msgs/msg/PoseWithCovarianceStamped'),
-        ('/odom', 'nav_msgs/msg/Odometry')]
-    assert summary.start == recording[0][2]
 
 
 def test_a_robot_without_our_note_goes_by_the_defaults_of_the_node(tmp_path, world):
@@ -181,31 +171,6 @@ def test_messages_come_in_order_of_time_even_from_a_file_without_order(tmp_path,
         path = mcap_file(tmp_path / 'a.mcap', shuffled, **options)
         times = [m.time for m in read_messages(path)]
         assert times == [m[2] for m in world[1]]
-
-
-def test_a_stray_base_frame_in_the_beginning_is_dropped(tmp_path, world):
-    recording = list(world[1])
-    first = next(m for m in recording if m[0] == '/odom')
-    wrong = changed(first, lambda m: setattr(m, 'child_frame_id', 'gripper'))
-    record = read_input(mcap_file(tmp_path / 'a.mcap', [
-        (*wrong[:2], first[2] - 1, wrong[3]), *recording]), EVERY)
-    assert record.skipped == ("1 message refused: odometry of 'gripper'; expected that of "
-                              "'base_link'",)
-    np.testing.assert_array_equal(record.graph.between.measurement,
-                                  world[2].graph.between.measurement)
-
-
-def test_a_bag_played_twice_has_twice_the_odometry(tmp_path, world):
-    """Into one recording: all once more, later, with the stamps it had."""
-    recording = world[1]
-    again = [(*m[:2], m[2] + 1000 * SECOND, m[3]) for m in recording]
-    record = read_input(mcap_file(tmp_path / 'a.mcap', recording + again), EVERY)
-    once = world[2].graph.between
-    assert len(record.graph.between) == len(once) + np.count_nonzero(once.is_odometry)
-    loops = sum(m[0] == '/loop_closures' for m in recording)
-    repeated, = (sentence for sentence in record.skipped if 'was sent before' in sentence)
-    assert repeated.startswith(f'{loops} messages refused')
-    assert sum('a new part of the map begins' in sentence for sentence in record.skipped) == 1
 
 
 def test_faults_of_the_odometry_are_told(tmp_path, world):

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A saved map: one file that says all, proves itself whole, and keeps the one before it."""
 
+import json
 import os
+from base64 import b64decode
 from dataclasses import fields, is_dataclass, replace
+from hashlib import sha256
 
 import numpy as np
 import pytest
@@ -14,7 +17,7 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.online.loop_states import ACCEPTED, REJECTED, WAITING
+from l1slam_ros.core.online.snapshot import ACCEPTED, REJECTED, WAITING
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.core.robust.judgement import Doubt
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
@@ -133,7 +136,8 @@ def test_the_motion_after_the_last_keyframe_is_not_lost(tmp_path):
     # Begun elsewhere, or anew, odometry goes on from where the robot was.
     for time, pose in (30, (40.0, 50.0, 1.0)), (20, (0.0, 0.0, 0.0)), (9000, (8.0, 0.8, 0.16)):
         backends[0].restore(load_map(path)[0])
-        moved = backends[0].add_odometry(odometry(time, pose))
+        assert backends[0].add_odometry(odometry(time, pose))
+        moved = backends[0].robot().map_to_odom
         np.testing.assert_allclose(se2.compose(moved, np.array([pose])), [[7.4, 0.8, 0.16]],
                                    atol=1e-9)
 
@@ -231,8 +235,28 @@ def test_the_commands_read_both_and_notice_damage_too(two, capsys):
     assert capsys.readouterr().err.strip().endswith(
         f'{two}: is damaged: its last line is not the checksum of those before; expected a saved '
         'map as it was written')
-    two.write_bytes(content.replace(b'map 1', b'map 2'))
+    two.write_bytes(content.replace(b'map 2', b'map 3'))
     assert not is_map(two)
+
+
+def test_a_map_of_the_version_before_is_read_too(halfway, tmp_path):
+    """Its numbers were text."""
+    path = tmp_path / 'map.g2o'
+    save_map(path, halfway.saved())
+    saved = load_map(path)[0]
+
+    def as_text(line):
+        words = line.split(' ', 3)
+        if words[0] != '#L1SLAM' or words[2][0] not in '<|':
+            return line
+        numbers = np.frombuffer(b64decode(words[3]), words[2]) + 0
+        return f'#L1SLAM {words[1]} {json.dumps(numbers.tolist())}'
+
+    *lines, _ = path.read_text().replace('map 2', 'map 1').splitlines()
+    content = ''.join(f'{as_text(line)}\n' for line in lines)
+    path.write_text(f'{content}#L1SLAM sha256 {sha256(content.encode()).hexdigest()}\n')
+    assert len(content.split('dual [')) == 2
+    assert_equal(load_map(path)[0], saved)
 
 
 # The disk

@@ -13,27 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l1slam_ros.core.geometry import noise
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import (
-    LEAST_VARIANCE,
-    MOST_VARIANCE,
-    Mask,
-    at_most,
-    bounds,
-    filled,
-    loop_identity,
-    or_model,
-    root_of_inverse,
-    silenced,
-    silent_components,
-    usable,
-)
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
-from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.graph.measurements import LoopClosure, Notes
 from l1slam_ros.core.online.keyframes import diagonal_covariance, reduced_covariance
 from l1slam_ros.core.online.loops.waiting_loops import WaitingLoop, WaitingLoops
-from l1slam_ros.core.online.notes import Notes
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
 from l1slam_ros.core.online.snapshot import Growth
 from l1slam_ros.core.options import Options, option
@@ -125,7 +112,7 @@ class LoopFactors:
         if covariance is None:
             return
         measurement = _said(self._manifold, loop, covariance)
-        key = loop_identity(*loop.stamps, measurement, covariance)
+        key = noise.loop_identity(*loop.stamps, measurement, covariance)
         if not loop.struck:
             known = self._seen.get(key)
             if known is not None and known >= loop.trusted and not self._verbatim:
@@ -181,7 +168,7 @@ class LoopFactors:
         measurement, covariance, sound = _carried(manifold, loops, ways[:m], ways[m:])
         covariance = np.where(sound[:, None, None], covariance, self._model(options))
         i = np.where([one.loop.is_absolute for one in loops], WORLD, pairs[:, 0])
-        graph.append_between(i, pairs[:, 1], measurement, root_of_inverse(covariance),
+        graph.append_between(i, pairs[:, 1], measurement, noise.root_of_inverse(covariance),
                              np.array([one.loop.trusted for one in loops]))
         rows = len(graph.between) + np.arange(-m, 0)
         self._note(rows, np.array([one.loop.stamps for one in loops]))
@@ -233,10 +220,10 @@ class LoopFactors:
         if options.covariance_source == 'model' and not absolute:
             return model[None]
         used, bounded = _loop_covariance(stated, None if absolute else model, self._verbatim)
-        self._notes.warn_bounds('loop', loop.stamp, bounded, MOST_VARIANCE)
+        self._notes.warn_bounds('loop', loop.stamp, bounded, noise.MOST_VARIANCE)
         if used is None:
             self._refuse('covariance', loop, f'has the variances {np.diagonal(stated[0])}; '
-                         f'expected one above 0, to {MOST_VARIANCE:g}')
+                         f'expected one above 0, to {noise.MOST_VARIANCE:g}')
         return used
 
     def _model(self, options: LoopOptions) -> Array:
@@ -276,13 +263,13 @@ def _carried(manifold: Manifold, used: list[WaitingLoop], to_reference: Array,
     Ad = manifold.adjoint(manifold.inverse(to_keyframe))
     turned = Ad @ covariance @ Ad.transpose(0, 2, 1)
     if not silent.any():
-        return measurement, turned, usable(turned)
+        return measurement, turned, noise.usable(turned)
     way = manifold.local(manifold.identity(len(used)), to_keyframe)
     lost = np.zeros(silent.shape)
     lost[:, manifold.TRANSLATION] = (way[:, manifold.TRANSLATION] ** 2).mean(axis=1)[:, None]
     kept = covariance + (lost * (unturned[:, None] & ~silent))[:, :, None] * np.eye(lost.shape[1])
     covariance = np.where(silent.any(axis=1)[:, None, None], kept, turned)
-    return measurement, covariance, usable(filled(covariance, silent))
+    return measurement, covariance, noise.usable(noise.filled(covariance, silent))
 
 
 def _loop_covariance(stated: Array, model: Array | None,
@@ -299,15 +286,16 @@ def _loop_covariance(stated: Array, model: Array | None,
     verbatim : as stated, though its variances be none of a measurement
 
     """
-    silent = silent_components(stated, absolute=model is None)
-    whole = filled(stated, silent)
-    if silent.all() or not usable(whole)[0]:
+    silent = noise.silent_components(stated, absolute=model is None)
+    whole = noise.filled(stated, silent)
+    if silent.all() or not noise.usable(whole)[0]:
         return None if model is None else model[None], []
     if verbatim:
-        return silenced(stated, silent), []
-    cut, large = at_most(whole, MOST_VARIANCE)
-    used, small = or_model(cut, LEAST_VARIANCE * np.eye(len(cut[0])) if model is None else model)
-    return silenced(used, silent), bounds(whole, used, large | small)
+        return noise.silenced(stated, silent), []
+    cut, large = noise.at_most(whole, noise.MOST_VARIANCE)
+    least = noise.LEAST_VARIANCE * np.eye(len(cut[0]))
+    used, small = noise.or_model(cut, least if model is None else model)
+    return noise.silenced(used, silent), noise.bounds(whole, used, large | small)
 
 
 def _said(manifold: Manifold, loop: LoopClosure, covariance: Array) -> Array:

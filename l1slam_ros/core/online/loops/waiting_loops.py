@@ -2,9 +2,9 @@
 """Loop closures that wait for odometry to reach their times, or for their time to be over."""
 
 import heapq
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from itertools import takewhile
 
 import numpy as np
 
@@ -35,9 +35,9 @@ class WaitingLoops:
     """Loops by the times they wait for; each costs O(log n) once, however long it waits."""
 
     def __init__(self) -> None:
+        # By number, in the order they came.
         self._loops: dict[int, WaitingLoop] = {}
         self._by_end: list[tuple[int, int]] = []
-        self._by_arrival: deque[int] = deque()
         self._count = 0
         self._stamps: Indices | None = None
 
@@ -52,7 +52,6 @@ class WaitingLoops:
         """Add a loop, which comes not before those that are there."""
         self._loops[self._count] = waiting
         heapq.heappush(self._by_end, (waiting.end, self._count))
-        self._by_arrival.append(self._count)
         self._count += 1
         self._stamps = None
 
@@ -71,15 +70,9 @@ class WaitingLoops:
 
     def expired(self, since: int) -> list[WaitingLoop]:
         """Take out the loops that came before `since`, in the order they came."""
-        expired = []
-        while self._by_arrival:
-            number = self._by_arrival[0]
-            if number in self._loops:  # else it was due
-                if self._loops[number].arrival >= since:
-                    break
-                expired.append(self._take(number))
-            self._by_arrival.popleft()
-        return expired
+        early = takewhile(lambda item: item[1].arrival < since, self._loops.items())
+        numbers = [number for number, _ in early]
+        return [self._take(number) for number in numbers]
 
     def begin_anew(self, time: Callable[[int], int], arrival: int | None = None) -> None:
         """

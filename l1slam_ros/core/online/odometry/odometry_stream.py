@@ -6,6 +6,7 @@ In: samples as they come. Out: those to be used, in order. A sample that its pre
 explain is held until the next one speaks for it (goes on from it) or against it (goes on from
 before); nothing that is held is used, nothing is dropped without being counted:
 
+    child_frame   of another frame than the robot's
     stamp_ahead   a gap in time, and the next sample is back at the time before
     jump          a motion no robot makes, and the next sample is back where the robot was
     old_stamp     not after the sample before; also a first sample whose stamp was the stray
@@ -20,6 +21,7 @@ the identity exactly and that is far; a restart at the identity nearer than half
 
 import math
 from collections import deque
+from collections.abc import Iterator
 
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array, Manifold
@@ -27,9 +29,9 @@ from l1slam_ros.core.graph.measurements import (
     FASTEST,
     LONGEST_PAUSE,
     SHORTEST_STEP,
+    Notes,
     OdometrySample,
 )
-from l1slam_ros.core.online.notes import Notes
 
 # A restart at the identity is a step so many times the longest of the last few ...
 _FAR, _RECENT = 5.0, 16
@@ -44,11 +46,86 @@ _GAP = 2.0
 UNSEEN, UNSEEN_TURN = 1.0, 1.0
 # [m], [rad] The identity, after its way through a quaternion.
 _EXACT = 1e-9
+# So much of a frame's name is quoted.
+_QUOTED = 40
 
 
 def is_identity(manifold: Manifold, pose: Array) -> bool:
     """Tell whether a pose (1, p) is where odometry begins."""
     return bool(abs(manifold.local(manifold.identity(1), pose)).max() < _EXACT)
+
+
+class BaseFrame:
+    """
+    Tells the robot's odometry from that of others by its `child_frame_id`.
+
+    The first sample is the robot's at once. If two of one other frame come before a second one
+    of its own, it was a stray: those two are the robot's. What the user names is not doubted.
+
+    Parameters
+    ----------
+    name : the frame, when it is known; empty: to be found out
+
+    Attributes
+    ----------
+    name : the frame as far as is known, without a slash before it, as in tf2; samples without one
+        go with any
+
+    """
+
+    def __init__(self, name: str):
+        self.name = name.removeprefix('/')
+        self._sure = bool(name)
+        self._used = 0
+        self._held: list[OdometrySample] = []
+
+    def take(self, sample: OdometrySample, notes: Notes) -> list[OdometrySample]:
+        """
+        Return the robot's samples that may be used now: this one, none, or a held one and this.
+
+        Two: what was used before was another's. notes : told of those
+
+        Raises
+        ------
+        MessageError : `child_frame`, the sample is another's.
+
+        """
+        frame = _frame(sample)
+        if frame and not self.name:
+            self.name, self._sure = frame, self._used > 0
+        elif frame == self.name:
+            self._sure = True
+        if frame in (self.name, ''):
+            self._used += 1
+            if self._sure:
+                self.refuse_rest(notes)
+            return [sample]
+        if self._sure:
+            raise self._error(frame)
+        ours = [one for one in self._held if _frame(one) == frame] + [sample]
+        if len(ours) == 1:
+            self._held.append(sample)
+            return []
+        stray, self.name, self._sure = self.name, frame, True
+        for _ in range(self._used):
+            notes.refuse('child_frame', str(self._error(stray)))
+        self.refuse_rest(notes)
+        return ours
+
+    def refuse_rest(self, notes: Notes) -> None:
+        """Count what is held and another's: there is nothing to wait for any more."""
+        for sample in self._held:
+            if _frame(sample) != self.name:
+                notes.refuse('child_frame', str(self._error(_frame(sample))))
+        self._held = []
+
+    def _error(self, frame: str) -> MessageError:
+        return MessageError('child_frame', f'odometry of {frame[:_QUOTED]!r}; expected that of '
+                            f'{self.name[:_QUOTED]!r}')
+
+
+def _frame(sample: OdometrySample) -> str:
+    return sample.frame.removeprefix('/')
 
 
 class Point:
@@ -79,6 +156,7 @@ class OdometryStream:
     ----------
     manifold : what the poses live on
     notes : told of all that is dropped or moved
+    base_frame : tells whose samples they are
     resumed : a map is there already, which no stamp makes begin anew
 
     Attributes
@@ -88,25 +166,41 @@ class OdometryStream:
 
     """
 
-    def __init__(self, manifold: Manifold, notes: Notes, resumed: bool = False):
+    def __init__(self, manifold: Manifold, notes: Notes, base_frame: BaseFrame,
+                 resumed: bool = False):
         self._manifold, self._notes, self._resumed = manifold, notes, resumed
+        self._base_frame = base_frame
         self.last: Point | None = None
         self._recent: deque[float] = deque(maxlen=_RECENT)
         self._alone = False
         self.held: Point | None = None
 
-    def take(self, sample: OdometrySample, verbatim: bool, back: bool = False) -> list[Point]:
+    def take(self, sample: OdometrySample, verbatim: bool, back: bool = False
+             ) -> Iterator[Point]:
         """
-        Return the samples that may be used now: this one, none, or a held one and this.
+        Yield the samples that may be used now: this one, none, or a held one and this.
 
         verbatim : none is to be doubted; back : time may go back
 
         Raises
         ------
-        MessageError : `old_stamp`, the stamp is not after the last one, and time did not go back.
+        MessageError : `child_frame`, it is another's; `old_stamp`, the stamp is not after the last
+            one, and time did not go back.
 
         """
-        point, last, held = Point(self._manifold, sample), self.last, self.held
+        ours = self._base_frame.take(sample, self._notes)
+        stray = len(ours) > 1
+        if stray:  # what was used before
+            self.last = self.held = None
+            self._recent.clear()
+        for one in ours:
+            point = Point(self._manifold, one)
+            point.anew, stray = stray, False
+            yield from self._taken(point, verbatim, back)
+
+    def _taken(self, point: Point, verbatim: bool, back: bool) -> list[Point]:
+        """Return what may be used now that the robot's next sample is here; see `take`."""
+        last, held = self.last, self.held
         if last is None:
             used = self._used(point)
             self._alone = not self._resumed
@@ -135,6 +229,7 @@ class OdometryStream:
 
     def finish(self) -> list[Point]:
         """Return, as no more will come, what is held if it came after no more than a pause."""
+        self._base_frame.refuse_rest(self._notes)
         last, held = self.last, self.held
         if last is None or held is None or held.doubt != 'stamp_ahead' or (
                 (held.stamp - last.stamp) * 1e-9 > LONGEST_PAUSE):

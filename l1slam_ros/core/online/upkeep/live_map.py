@@ -19,7 +19,7 @@ from l1slam_ros.core.incremental.front import UNKNOWN, Front
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.snapshot import Optimised
 from l1slam_ros.core.online.update import Improvement
-from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.robust.judgement import Doubt, Judgement
 from l1slam_ros.core.solvers.optimality import Status
 
 # A map is factored anew from so many factors on that came since: those of ten keyframes.
@@ -68,6 +68,7 @@ class LiveMap:
     last : the last improvement, None: there was none
     newest : the last keyframe of the map, and its pose (1, p)
     judge_took : [s] time of the last judgement
+    asked : the last map of which it was asked whether it hangs on its norm
 
     """
 
@@ -76,6 +77,7 @@ class LiveMap:
         self.optimised, self.looks = optimised, GrowingArray((3,))
         self.front: Front | None = None
         self.judged: Array | None = None
+        self.asked: Array | None = None
         self.stale = False
         self.last: Improvement | None = None
         self.newest: tuple[int, Array]
@@ -187,6 +189,17 @@ class LiveMap:
         return not self.all_judged and (budget > self.judge_took
                                         or time.monotonic() > self._judge_at + wait)
 
+    def is_norm_due(self, idle: bool) -> bool:
+        """Return whether to ask if the map hangs on its norm: for now it is the last one."""
+        return (self.robust and idle and not self.is_map_due(idle) and self.all_judged_anew
+                and self.asked is not self.optimised.poses)
+
+    def take_doubts(self, of: Optimised, doubts: tuple[Doubt, ...]) -> None:
+        """Take over the doubts that the norm of a map leaves, if it is still the last one."""
+        if self.optimised is of:
+            self.asked, doubts = of.poses, tuple(dict.fromkeys(of.judgement.doubts + doubts))
+            self.optimised = replace(of, judgement=replace(of.judgement, doubts=doubts))
+
     def begin_judgement(self) -> int:
         """Expect a judgement of all loops there are; return how many."""
         self._fits, self._judge_began = False, time.monotonic()
@@ -203,7 +216,7 @@ class LiveMap:
         self.looks = GrowingArray((3,))
         self.looks.extend(looks[len(judgement.accepted) - before:])
         self.optimised = replace(self.optimised, judgement=judgement)
-        self._judged_loops, self.judged = loops, poses
+        self._judged_loops, self.judged, self.asked = loops, poses, None
         self._judge_at = time.monotonic()
         if anew:
             self._judged_anew = loops

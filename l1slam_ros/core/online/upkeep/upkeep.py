@@ -7,13 +7,12 @@ not grow with the map. Two workers go on behind it, each in a thread of its own,
 to the next:
 
     map     lowers the L1 cost of what is accepted, and factors it for the next front
-    judge   looks at all loops again, at rest anew, and moves nothing
+    judge   looks at all loops again, at rest anew and at the norm, and moves nothing
 
 One lock is held to append, to take a snapshot and to adopt, for moments, so that messages never
 wait. Who uses or replaces the front, or what was made so far, holds the front's before it; never
-while solving, reading or writing a file. A third one lets one thread at a time update. What is
-worked out for a map that is replaced, or that `settle` is to solve, is told to stop, and never
-adopted.
+while solving, reading or writing a file. A third one lets one thread at a time update. Work for a
+map that is replaced, or that `settle` is to solve, is told to stop, and its result never adopted.
 """
 
 import threading
@@ -27,14 +26,13 @@ import numpy as np
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.incremental.front import Front
-from l1slam_ros.core.incremental.growing_map import View
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
 from l1slam_ros.core.online.update import Improvement, front_of, improve, one_round, optimise
 from l1slam_ros.core.online.upkeep.live_map import AT_ONCE, LiveMap
 from l1slam_ros.core.online.upkeep.threads import Worker, until
-from l1slam_ros.core.robust.batch import judge, robust_solve
+from l1slam_ros.core.robust.batch import doubts_of_norm, judge, robust_solve
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
 # Asked on the way, often: whether to stop.
@@ -96,10 +94,9 @@ class Upkeep:
             return self._version()
 
     def _version(self) -> tuple[int, int, int]:
-        builder = self._builder
         # While loops wait, any sample may be the one that they wait for, or one too many.
-        waits = len(builder.loops.waiting) > 0
-        return (self._changes, builder.graph.n_poses, self._samples if waits else 0)
+        waits = len(self._builder.loops.waiting) > 0
+        return (self._changes, self._builder.graph.n_poses, self._samples if waits else 0)
 
     def snapshot(self) -> Snapshot:
         """Return the back end as it is now, the due loops in its graph, to be read at leisure."""
@@ -113,17 +110,14 @@ class Upkeep:
             # First what takes long: until then messages come in.
             views = self._live.front.views if self._live.front else ()
             with self._lock:
-                yield self._snapshot(views)
-
-    def _snapshot(self, views: tuple[View, ...]) -> Snapshot:
-        builder, live = self._builder, self._live
-        track, loops = builder.track, builder.loops
-        builder.add_due_loops()
-        return Snapshot(
-            live.number, self._version(), builder.graph.copy(), track.gaps, track.keyframe_stamps,
-            track.keyframe_poses, self._map_to_odom_now(), loops.rows, loops.stamps,
-            live.optimised, live.robust, live.looks.view(), live.all_judged, live.judged,
-            live.stale, views)
+                builder, live = self._builder, self._live
+                track, loops = builder.track, builder.loops
+                builder.add_due_loops()
+                yield Snapshot(
+                    live.number, self._version(), builder.graph.copy(), track.gaps,
+                    track.keyframe_stamps, track.keyframe_poses, self._map_to_odom_now(),
+                    loops.rows, loops.stamps, live.optimised, live.robust, live.looks.view(),
+                    live.all_judged, live.judged, live.stale, views)
 
     def _map_to_odom_now(self) -> Array:
         """Return the odometry frame seen from the map: what its last keyframe says."""
@@ -214,7 +208,11 @@ class Upkeep:
             if self._live.is_map_due(idle):
                 self._mapper.start(lambda: self._map_anew(idle, budget, check))
             if self._live.is_judge_due(idle, budget):
-                self._judge.start(lambda: self._judge_all(idle, check))
+                # First what is the sooner over, and all there is to find out most of the time.
+                anew = idle and self._live.all_judged
+                self._judge.start(lambda: self._judge_all(anew, check))
+            elif self._live.is_norm_due(idle):
+                self._judge.start(lambda: self._ask_norm(check))
             return self._mapper.busy or self._judge.busy
 
     def _map_anew(self, idle: bool, budget: float, check: Callable[[], None]) -> None:
@@ -256,6 +254,15 @@ class Upkeep:
         check()
         with self._front, self._lock:
             live.take_judgement(judgement_of_all(judgement, whole), poses, loops, anew)
+            self._changes += 1
+
+    def _ask_norm(self, check: Callable[[], None]) -> None:
+        """Doubt the map where it hangs on its norm."""
+        now = self.snapshot()
+        problem = as_one(now.problem())
+        doubts = doubts_of_norm(problem.graph, problem.judgement, problem.poses, check)
+        with self._front, self._lock:
+            self._live.take_doubts(now.optimised, doubts)
             self._changes += 1
 
     def settle(self, stopped: Stopped = lambda: False) -> Improvement | None:
@@ -315,8 +322,7 @@ class Upkeep:
     def _note_map(self, before: Array) -> None:
         """Note that the map is another now; before : map -> odom until then."""
         self._map_to_odom = None
-        first = before if self._moved is None else self._moved[0]
-        self._moved = first, self._map_to_odom_now()
+        self._moved = (self._moved or (before,))[0], self._map_to_odom_now()
         self._changes += 1
         self.maps += 1
 

@@ -355,16 +355,6 @@ def test_a_ros1_bag_with_a_damaged_chunk(tmp_path, recording):
     assert_told(said, path, len(found))
 
 
-def test_a_ros1_bag_that_ends_before_its_index(tmp_path, recording):
-    path = ros1_file(tmp_path / 'a.bag', recording)
-    whole = path.read_bytes()
-    at = whole.index(b'index_pos=') + len(b'index_pos=')
-    path.write_bytes(whole[:int.from_bytes(whole[at:at + 8], 'little')])
-    found, said = read(path)
-    assert len(found) == len(recording)
-    assert_told(said, path, len(found))
-
-
 # What happens to files: bytes are changed, lost or inserted, and the end is lost or zero.
 PIECES = st.tuples(st.sampled_from(['flip', 'write', 'insert', 'delete', 'cut', 'zero']),
                    st.floats(0, 1), st.binary(min_size=1, max_size=40))

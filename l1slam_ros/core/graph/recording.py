@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A graph as the samples and loops of the robot that would have measured it.
+
+In: a graph whose factors lead from earlier keyframes to later ones, see `factor_graph.turned`, and
+whose odometry says all of every step. Out: each keyframe's odometry, and the loops that end there.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import covariance_of
+from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+
+
+def steps_of(graph: FactorGraph) -> Indices:
+    """Return which factor leads from each keyframe to the next, (n - 1,)."""
+    factors = graph.between
+    rows = np.flatnonzero(factors.is_odometry)
+    return rows[np.argsort(np.minimum(factors.i, factors.j)[rows])]
+
+
+def loops_of(graph: FactorGraph) -> Indices:
+    """Return the other factors in the order of the keyframes where they end, (l,)."""
+    rows = np.flatnonzero(~graph.between.is_odometry)
+    return rows[np.argsort(graph.between.j[rows], kind='stable')]
+
+
+def recorded(graph: FactorGraph,
+             stamps: list[int]) -> Iterator[tuple[OdometrySample, list[LoopClosure]]]:
+    """
+    Yield each keyframe's odometry and the loops that end there; stamps : (n,) of keyframes [ns].
+
+    Covariances are those of the factors; what is left unsaid has an infinite variance.
+    """
+    factors, to_pose3 = graph.between, graph.manifold.to_pose3
+    steps, loops = steps_of(graph), loops_of(graph)
+    poses, measured, covariances = to_pose3(_chain(graph, steps)), to_pose3(
+        factors.measurement), _covariances(graph)
+    ends = np.searchsorted(factors.j[loops], np.arange(graph.n_poses + 1))
+    still = np.zeros((6, 6))
+    for k, stamp in enumerate(stamps):
+        sample = OdometrySample(stamp, poses[k], covariances[steps[k - 1]] if k else still, still)
+        yield sample, [
+            LoopClosure(None if factors.i[row] == WORLD else stamps[factors.i[row]], stamp,
+                        measured[row], covariances[row], bool(factors.trusted[row]))
+            for row in loops[ends[k]:ends[k + 1]]]
+
+
+def _chain(graph: FactorGraph, steps: Indices) -> Array:
+    """
+    Return the poses (n, p) that the odometry alone gives, from the identity.
+
+    One after the other: so each is exact to rounding *relative to the one before*.
+    """
+    poses = graph.manifold.identity(graph.n_poses)
+    for k, step in enumerate(graph.between.measurement[steps]):
+        poses[k + 1] = graph.manifold.compose(poses[k], step)
+    return poses
+
+
+def _covariances(graph: FactorGraph) -> Array:
+    """Return the covariance of each factor as messages have it, (m, 6, 6)."""
+    manifold, factors = graph.manifold, graph.between
+    rows, diagonal = manifold.COVARIANCE_ROWS, np.arange(manifold.TANGENT_SIZE)
+    of_manifold = covariance_of(factors.sqrt_information)
+    of_manifold[:, diagonal, diagonal] += np.where(factors.speaks, 0.0, np.inf)
+    covariances = np.zeros((len(factors), 6, 6))
+    covariances[np.ix_(range(len(factors)), rows, rows)] = of_manifold
+    return covariances
