@@ -107,9 +107,8 @@ class Upkeep:
     def _standing(self) -> Iterator[Snapshot]:
         """Let nothing change; give a snapshot, see `snapshot`."""
         with self._front:
-            front = self._live.front
             # First what takes long: until then messages come in, and may begin another map.
-            views = front.views if front else ()
+            views = front.views if (front := self._live.front) else ()
             with self._lock:
                 self._builder.add_due_loops()
                 live, track, loops = self._live, self._builder.track, self._builder.loops
