@@ -3,8 +3,7 @@
 Keeping a map up to date while it grows: the front in an update, map and judge behind it.
 
 An update takes what has come into a map that was factored before (`front`), in a time that does
-not grow with the map. Two workers go on behind it, each in a thread of its own, from one snapshot
-to the next:
+not grow with the map. Two workers go on behind it, in threads, from one snapshot to the next:
 
     map     lowers the L1 cost of what is accepted, and factors it for the next front
     judge   looks at all loops again, at rest anew and at the norm, and moves nothing
