@@ -195,6 +195,20 @@ def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
     assert settle() > 0 and len(backend.loop_states().rows) == 2
 
 
+def test_a_map_of_nothing_is_not_asked_whether_it_hangs_on_its_norm(monkeypatch):
+    """To compiled loops it would be memory of others."""
+    asked = []
+    monkeypatch.setattr(
+        upkeep, 'doubts_of_norm', lambda graph, *_: asked.append(graph.n_poses) or ())
+    backend = Backend(EVERY)
+    for count in 5, 0, 1:
+        drive(backend, 0, count)
+        while backend.update(DEADLINE, go_on) is not None:
+            pass
+        backend.reset()
+    assert asked == [5]
+
+
 # In the background
 
 
