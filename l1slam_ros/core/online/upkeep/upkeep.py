@@ -258,10 +258,7 @@ class Upkeep:
         """Doubt the map where it hangs on its norm."""
         now = self.snapshot()
         problem = as_one(now.problem())
-        # Between two looks the map may have been emptied.
-        doubts = doubts_of_norm(
-            problem.graph, problem.judgement, problem.poses, check
-        ) if len(problem.graph.between) else ()
+        doubts = doubts_of_norm(problem.graph, problem.judgement, problem.poses, check)
         with self._front, self._lock:
             self._live.take_doubts(now.optimised, doubts)
             self._changes += 1
