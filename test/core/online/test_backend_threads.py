@@ -14,6 +14,7 @@ from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.incremental.front import Front
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.online.snapshot import ACCEPTED
@@ -101,6 +102,22 @@ def test_nobody_sees_the_front_of_one_map_with_the_poses_of_another(monkeypatch)
     assert after.loop_states().state.tolist() == [ACCEPTED]
     assert (seen.poses == seen.optimised.poses).all() or (
         seen.optimised.poses != after.optimised.poses).any()
+
+
+def test_nobody_sees_the_front_of_a_map_that_was_replaced(monkeypatch):
+    backend, views = Backend(EVERY), Front.views.fget
+    drive(backend, 0, 5)
+    while backend.update(DEADLINE, go_on) is not None:
+        pass
+
+    def slowly(front):
+        seen = views(front)
+        backend.reset()
+        return seen
+
+    monkeypatch.setattr(Front, 'views', property(slowly))
+    now = backend.snapshot()
+    assert len(now.poses) == now.graph.n_poses == 0
 
 
 def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):
