@@ -21,6 +21,7 @@ from l1slam_ros.core.online.snapshot import ACCEPTED
 from l1slam_ros.core.online.update import Improvement, improve
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.core.online.upkeep.threads import Background
+from l1slam_ros.core.robust import batch
 from l1slam_ros.core.solvers.optimality import l1_cost
 
 DEADLINE = 30.0
@@ -210,6 +211,20 @@ def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
     assert settle() == 0
     drive(backend, 32, 33)
     assert settle() > 0 and len(backend.loop_states().rows) == 2
+
+
+def test_a_map_of_nothing_is_not_asked_whether_it_hangs_on_its_norm(monkeypatch):
+    """To compiled loops it would be memory of others."""
+    asked, least_squares = [], batch._least_squares
+    monkeypatch.setattr(batch, '_least_squares', lambda graph, *rest: (
+        asked.append(graph.n_poses) or least_squares(graph, *rest)))
+    backend = Backend(EVERY)
+    for count in 5, 0, 1:
+        drive(backend, 0, count)
+        while backend.update(DEADLINE, go_on) is not None:
+            pass
+        backend.reset()
+    assert asked == [5]
 
 
 # In the background
