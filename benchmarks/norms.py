@@ -2,7 +2,7 @@
 """
 Which norm makes the better map: paired draws of the noise, errors over those of least squares.
 
-    python benchmarks/norms.py GRAPH TRUTH [--seeds 42]
+    python benchmarks/norms.py GRAPH TRUTH [--seeds 42] [--noises contaminated]
 
 GRAPH and TRUTH (lines of id x y theta) are Manhattan's, say. Every draw measures the pairs of the
 graph anew in the truth, with noise as large as that of the file is at its L2 map: normal; of
@@ -92,14 +92,15 @@ def main() -> None:
     parser.add_argument('graph', type=Path)
     parser.add_argument('truth', type=Path)
     parser.add_argument('--seeds', type=int, default=42)
+    parser.add_argument('--noises', nargs='+', choices=NOISES, default=NOISES, metavar='NAME')
     given = parser.parse_args()
     graph, truth = read_graph_file(given.graph).graph, np.loadtxt(given.truth)[:, 1:]
     graph = as_noisy_as_it_is(graph, truth)
     print('| error over that of L2 | L2 [m] |', ' | '.join(
         a if b == SAME else f'{a} / {b}' for a, b in NORMS), '|')
     print('|---' * (len(NORMS) + 2) + '|')
-    for name, noise in NOISES.items():
-        found = np.array([errors(measured(graph, truth, noise(graph, rng)), truth)
+    for name in given.noises:
+        found = np.array([errors(measured(graph, truth, NOISES[name](graph, rng)), truth)
                           for rng in map(np.random.default_rng, range(given.seeds))])
         ratio = np.log(found[:, 1:] / found[:, :1])
         mean, spread = np.exp(ratio.mean(axis=0)), ratio.std(axis=0) / np.sqrt(len(ratio))

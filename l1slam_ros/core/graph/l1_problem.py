@@ -14,11 +14,13 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import (
     LinearSystem,
+    anchor,
     ends,
     linearise,
     step_poses,
     whitened_residual,
 )
+from l1slam_ros.core.graph.spanning_tree import compose_tree
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,21 @@ class GraphProblem:
     def step(self, poses: Array, x: Array) -> Array:
         """Return the poses moved by x (columns,)."""
         return step_poses(self.graph, poses, x)
+
+    def step_along(self, poses: Array, x: Array) -> Array:
+        """
+        Return the poses moved by x (columns,), each as seen from the one before.
+
+        The same to first order; but where a long way turns as a whole, none of it is torn.
+        """
+        manifold, fixed = self.graph.manifold, anchor(self.graph)
+        step = np.zeros((len(poses), manifold.TANGENT_SIZE))
+        step[fixed:] = x.reshape(-1, manifold.TANGENT_SIZE)
+        relative = manifold.between(poses[:-1], poses[1:])
+        carried = manifold.adjoint(manifold.inverse(relative)) @ step[:-1, :, None]
+        chain = np.concatenate((manifold.retract(poses[:1], step[:1]),
+                                manifold.retract(relative, step[1:] - carried[..., 0])))
+        return compose_tree(manifold, np.maximum(np.arange(len(poses)) - 1, 0), chain)
 
     def curvature(self, poses: Array, dual: Array) -> Array:
         """Return the Hessian of dual'e for each factor, (m, 2 k, 2 k)."""
@@ -66,6 +83,8 @@ class LinearProblem:
     def step(self, poses: Array, x: Array) -> Array:
         """See `GraphProblem`."""
         return poses + x
+
+    step_along = step
 
     def curvature(self, poses: Array, dual: Array) -> None:
         """See `GraphProblem`."""

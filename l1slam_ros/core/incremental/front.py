@@ -99,8 +99,12 @@ class Front:
                         - np.log(_SURE - 1) - gate.log_odds)
         self._variance = np.repeat(gate.variance[:, None], k, axis=1)
         self._mu = _SMOOTHING * smoothing(system.b)
-        if not choleskys[L1].factorise(system, 1 / np.hypot(system.b, self._mu)):
+        weights = 1 / np.hypot(system.b, self._mu)
+        if not choleskys[L1].factorise(system, weights):
             raise GraphError('a part of the graph is not tied to the anchor')
+        # Of a keyframe's first factor, whose residual the loops to come will say: it is weighed
+        # as the others are in the mean, one without a residual among them.
+        self._usual = 1 / np.append(weights, 1 / self._mu).mean()
         self._map = GrowingMap(part, poses, choleskys)
 
     @property
@@ -170,7 +174,7 @@ class Front:
         try:
             if first_seen:
                 self._map.begin(L2, new, at, self._variance[0])
-                self._map.begin(L1, new, at, np.full(len(own), self._mu))
+                self._map.begin(L1, new, at, np.full(len(own), self._usual))
                 return Look(True, False, 0.0)
             variance, predicted = self._variance[1], self._map.predict(L2, new, at)
             look, left = self._test(predicted, own, variance, known == 1)

@@ -121,6 +121,8 @@ def minimise_robustly(
 def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
                    check: Callable[[], None]) -> tuple[Doubt, ...]:
     """Return the doubts that `minimise_robustly` would have of a map, (n, p), by its norm."""
+    if not len(graph.between):  # of nothing: compiled loops would go past its arrays
+        return ()
     return _doubts_of_norm(graph, judgement, _least_squares(graph, judgement, poses, check), poses)
 
 

@@ -62,7 +62,11 @@ _LEAST_WEIGHT = 1e-2
 
 @dataclass
 class _Iterate:
-    """Poses and their linearisation; the splitting u, v of the residual, slacks s, t, dual y."""
+    """
+    Poses and their linearisation; the splitting u, v of the residual, slacks s, t, dual y.
+
+    is_torn : whether a step was refused.
+    """
 
     poses: Array
     system: LinearSystem
@@ -71,6 +75,7 @@ class _Iterate:
     s: Array
     t: Array
     y: Array
+    is_torn: bool = False
 
     @property
     def residual(self) -> Array:
@@ -292,13 +297,23 @@ def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, c1: Array,
 
 
 def _trusted(problem: Problem, at: _Iterate, direction: _Direction) -> tuple[float, Array, Array]:
-    """Halve the primal step while the residual departs too far from its linearisation."""
+    """
+    Halve the primal step while the residual departs too far from its linearisation.
+
+    Each pose moves by itself, until such a step is refused for once: to second order that tears a
+    long way. From then on poses may move along the way as well, whichever costs less.
+    """
     length, allowed = direction.primal, _DEPARTURE * at.gap
     while True:
-        poses = problem.step(at.poses, length * direction.x)
-        linear = at.residual + length * direction.residual
-        residual = problem.residual(poses)
-        departure = l1_cost(residual - linear)
+        linear, best = at.residual + length * direction.residual, np.inf
+        for step in problem.step, problem.step_along:
+            moved = step(at.poses, length * direction.x)
+            after = problem.residual(moved)
+            if not (cost := l1_cost(after)) > best:
+                best, poses, residual, departure = cost, moved, after, l1_cost(after - linear)
+            if not at.is_torn and departure <= allowed:
+                break
+            at.is_torn = True
         if departure <= allowed or length < _SHORTEST:
             return length, poses, residual
         length /= 2

@@ -65,7 +65,8 @@ def lines_by_tag(path: str | os.PathLike[str]) -> tuple[dict[str, TextLines], Re
     known = TAGS.keys() | TAGS_LEFT_OUT.keys() | {'FIX'}
     for tag, group in groups.items():
         if tag not in known and not tag.startswith('PARAMS_'):
-            raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(TAGS)}',
+            usual = [name for name in TAGS if TAGS[name].kind in ('vertex', 'between')]
+            raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(usual)}',
                             group.numbers[0])
     return groups, lines.remarks
 
@@ -107,7 +108,7 @@ def _parse(path: object, name: str, lines: TextLines, rotation_information: str,
     if tag.has_quaternion:
         refuse_quaternions(path, values[:, 3:p], lines.numbers)
     moved = np.isin(ids[:, tag.vertices:], offsets).any(axis=1)
-    if moved.any():
+    if tag.vertices == 1 and moved.any():
         k = int(np.argmax(moved))
         raise FileError(path, f'{name}: measured by {OFFSET} {ids[k, 1]}, which is not where the '
                         'robot is; expected no offset', lines.numbers[k])

@@ -10,6 +10,11 @@ A line is a tag, one or two vertex ids, a pose, and the upper triangle of an inf
     VERTEX_SE3:QUAT id x y z qx qy qz qw                   VERTEX3 id x y z roll pitch yaw
     EDGE_SE3:QUAT i j x y z qx qy qz qw xx xy ...          EDGE3 i j x y z roll pitch yaw xx xy ...
     EDGE_SE3_PRIOR id 0 x y z qx qy qz qw xx xy ...        EDGE_SE3_XYZPRIOR id 0 x y z xx xy ...
+    EDGE_SE3_PRIORXYZ id x y z xx xy ...                   EDGE_SE3_PRIORXY id x y xx xy yy
+    EDGE_SE3_SWITCHABLE i j k x y z qx qy qz qw xx ...     EDGE_SE2_SWITCHABLE i j k x y theta ...
+
+Those of the last lines but one are hdl_graph_slam's GPS. The last ones are loops of Vertigo and
+RTAB-Map, with a vertex k that would switch them off: here it is judged which are true.
 
 Priors are absolute factors; rows and columns of zeros in the information say nothing. The number
 after the id of one in space is that of a `PARAMS_SE3OFFSET` between the robot and what was
@@ -51,11 +56,11 @@ class Tag:
     """
     How the lines of one tag are read.
 
-    kind : vertex, between, absolute or position (absolute, too); ids : how many whole numbers
-    lead, of which `vertices` are vertex ids; values : how many numbers of a pose follow, which
-    `read` turns into the first ones of a pose of the manifold, the rest is that of the identity;
-    information : row and column of each entry of the upper triangle, in the order of the file;
-    none for a vertex.
+    kind : vertex, between, switched (between, too), absolute or position (absolute, too); ids :
+    how many whole numbers lead, the first `vertices` of which are vertex ids; values : how many
+    numbers of a pose follow, which `read` turns into the first ones of a pose of the manifold, the
+    rest is that of the identity; information : row and column of each entry of the upper triangle,
+    in the order of the file; none for a vertex.
     """
 
     kind: str
@@ -68,7 +73,7 @@ class Tag:
     @property
     def vertices(self) -> int:
         """How many vertices a line names."""
-        return 2 if self.kind == 'between' else 1
+        return 2 if self.kind in ('between', 'switched') else 1
 
     @property
     def has_quaternion(self) -> bool:
@@ -106,10 +111,14 @@ TAGS = {
     'EDGE_SE3:QUAT': Tag('between', se3, 2, 7, _triangle(6), se3.from_pose3),
     'EDGE_SE3_PRIOR': Tag('absolute', se3, 2, 7, _triangle(6), se3.from_pose3),
     'EDGE_SE3_XYZPRIOR': Tag('position', se3, 2, 3, _triangle(3)),
+    'EDGE_SE3_PRIORXYZ': Tag('position', se3, 1, 3, _triangle(3)),
+    'EDGE_SE3_PRIORXY': Tag('position', se3, 1, 2, _triangle(2)),
+    'EDGE_SE2_SWITCHABLE': Tag('switched', se2, 3, 3, _triangle(3)),
+    'EDGE_SE3_SWITCHABLE': Tag('switched', se3, 3, 7, _triangle(6), se3.from_pose3),
     'VERTEX3': Tag('vertex', se3, 1, 6, (), _from_angles),
     'EDGE3': Tag('between', se3, 2, 6, _triangle(6), _from_angles),
 }
-FACTORS = 'between', 'absolute', 'position'
+FACTORS = 'between', 'switched', 'absolute', 'position'
 # What g2o measures an absolute pose in space by: its line where there is no offset.
 OFFSET = 'PARAMS_SE3OFFSET'
 NO_OFFSET = f'{OFFSET} 0 0 0 0 0 0 0 1'
@@ -124,8 +133,15 @@ TAGS_LEFT_OUT = {
         'VERTEX_SEGMENT2D', 'VERTEX_LINE2D', 'EDGE_SE2_SEGMENT2D', 'EDGE_SE2_SEGMENT2D_LINE',
         'EDGE_SE2_SEGMENT2D_POINTLINE', 'EDGE_SE2_LINE2D', 'EDGE_LINE2D', 'EDGE_LINE2D_POINTXY',
         'VERTEX_TRACKXYZ', 'EDGE_SE3_TRACKXYZ', 'EDGE_POINTXYZ', 'EDGE_XYZPRIOR',
-        'EDGE_PROJECT_DEPTH', 'EDGE_PROJECT_DISPARITY',
+        'EDGE_PROJECT_DEPTH', 'EDGE_PROJECT_DISPARITY', 'EDGE_POINTXYZ_PRIOR', 'VERTEX_PLANE',
+        'EDGE_SE3_PLANE', 'EDGE_PLANE_PRIOR_NORMAL', 'EDGE_PLANE_PRIOR_DISTANCE',
+        'EDGE_PLANE_IDENTITY', 'EDGE_PLANE_PARALLEL', 'EDGE_PLANE_PERPENDICULAR',
+        'EDGE_PLANE_PAERPENDICULAR',
     ), _LANDMARKS),
+    **dict.fromkeys(('EDGE_SE3_PRIORQUAT', 'EDGE_SE3_PRIORVEC'),
+                    'an attitude without a position is not read'),
+    **dict.fromkeys(('VERTEX_SWITCH', 'EDGE_SWITCH_PRIOR'),
+                    'which loops are true is judged here'),
     **dict.fromkeys((
         'ROBOTLASER1', 'RAWLASER1', 'FRONTLASER1', 'REARLASER1', 'VERTEX_TAG', 'VERTEX_ELLIPSE',
     ), SENSORS),

@@ -14,12 +14,14 @@ from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.incremental.front import Front
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.online.snapshot import ACCEPTED
 from l1slam_ros.core.online.update import Improvement, improve
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.core.online.upkeep.threads import Background
+from l1slam_ros.core.robust import batch
 from l1slam_ros.core.solvers.optimality import l1_cost
 
 DEADLINE = 30.0
@@ -102,6 +104,22 @@ def test_nobody_sees_the_front_of_one_map_with_the_poses_of_another(monkeypatch)
         seen.optimised.poses != after.optimised.poses).any()
 
 
+def test_nobody_sees_the_front_of_a_map_that_was_replaced(monkeypatch):
+    backend, views = Backend(EVERY), Front.views.fget
+    drive(backend, 0, 5)
+    while backend.update(DEADLINE, go_on) is not None:
+        pass
+
+    def slowly(front):
+        seen = views(front)
+        backend.reset()
+        return seen
+
+    monkeypatch.setattr(Front, 'views', property(slowly))
+    now = backend.snapshot()
+    assert len(now.poses) == now.graph.n_poses == 0
+
+
 def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):
     backend, meeting = Backend(EVERY), Meeting()
     drive(backend, 0, 5)
@@ -174,8 +192,8 @@ def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
 
     assert settle() > 0
     looked = []
-    snapshot = backend._snapshot
-    monkeypatch.setattr(backend, '_snapshot', lambda views: looked.append(1) or snapshot(views))
+    standing = backend._standing
+    monkeypatch.setattr(backend, '_standing', lambda: looked.append(1) or standing())
     version = backend.version
     backend.counts()
     looked.clear()
@@ -193,6 +211,20 @@ def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
     assert settle() == 0
     drive(backend, 32, 33)
     assert settle() > 0 and len(backend.loop_states().rows) == 2
+
+
+def test_a_map_of_nothing_is_not_asked_whether_it_hangs_on_its_norm(monkeypatch):
+    """To compiled loops it would be memory of others."""
+    asked, least_squares = [], batch._least_squares
+    monkeypatch.setattr(batch, '_least_squares', lambda graph, *rest: (
+        asked.append(graph.n_poses) or least_squares(graph, *rest)))
+    backend = Backend(EVERY)
+    for count in 5, 0, 1:
+        drive(backend, 0, count)
+        while backend.update(DEADLINE, go_on) is not None:
+            pass
+        backend.reset()
+    assert asked == [5]
 
 
 # In the background

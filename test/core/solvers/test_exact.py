@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from problems import linprog_l1
+from problems import chain_of, graph_of, linprog_l1, straight
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -87,6 +87,24 @@ def stiff_part_on_soft_ties(rng):
     graph.add_between(*pairs.T, measured + 1e-9 * rng.standard_normal(measured.shape),
                       np.where(pairs[:, 0] > 0, 3e5, 1.0)[:, None, None] * np.eye(3))
     return graph
+
+
+def test_long_straight_ways_with_few_loops_are_solved_to_their_end():
+    """600 m that bend as a whole: of ten, steps of each pose by itself solve seven."""
+    n, loops, sigma = 600, 9, np.array([0.05, 0.05, 0.01])
+    solved = 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        last = rng.integers(n // 10, n, loops)
+        first = last - rng.integers(2, n // 10, loops)
+        pairs = np.concatenate((chain_of(n), np.column_stack((first, last))))
+        graph = graph_of(straight(n), pairs, rng.normal(size=(len(pairs), 3)) * sigma,
+                         np.diag(sigma**-2))
+        cholesky = cholesky_of(graph)
+        solution = minimise_interior_point(graph, seed_poses(graph, cholesky), OptimiserOptions(),
+                                           cholesky)
+        solved += solution.status is Status.CONVERGED and solution.outer_iterations < 30
+    assert solved > 8
 
 
 def test_what_rounding_leaves_indefinite_is_solved_to_its_end():

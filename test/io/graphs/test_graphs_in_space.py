@@ -122,3 +122,63 @@ def test_what_was_measured_elsewhere_than_at_the_robot_is_named(write):
     beside = ABSOLUTE.replace('4 0 0 0', '4 0 0.5 0')
     with pytest.raises(FileError, match=r'a\.g2o:6: EDGE_SE3_PRIOR: measured by PARAMS'):
         read_graph_file(write(SQUARE + beside))
+
+
+FIXES = """\
+VERTEX_PLANE 20 0 0 1 0
+EDGE_SE3_PLANE 7 20 0 0 1 0.5 10 0 0 10 0 10
+EDGE_SE3_PRIORXYZ 3 1 2 3 10 0 0 10 0 30
+EDGE_SE3_PRIORXY 7 4 5 20 0 20
+"""
+
+
+def test_position_fixes_of_hdl_graph_slam(write, tmp_path):
+    """Those without a height say nothing of it; the floor it saw is no part of a pose graph."""
+    record = read_graph_file(write(SQUARE + FIXES))
+    assert [sentence.split()[1] for sentence in record.skipped] == [
+        "'VERTEX_PLANE'", "'EDGE_SE3_PLANE'"]
+    for _ in range(2):
+        factors = record.graph.between
+        assert factors.i.tolist() == [0, WORLD, WORLD] and factors.j.tolist() == [1, 0, 1]
+        assert_allclose(factors.measurement[1:, :3], [[1, 2, 3], [4, 5, 0]])
+        assert_allclose([np.diag(one) for one in information_of(record.graph)[1:]],
+                        [[10, 10, 30, 0, 0, 0], [20, 20, 0, 0, 0, 0]])
+        write_graph_file(tmp_path / 'b.g2o', record)
+        record = read_graph_file(tmp_path / 'b.g2o')
+
+
+def test_loops_that_could_be_switched_off_are_loops(write):
+    """Whatever the number of the switch, which is no vertex, nor that of an offset."""
+    plain = SQUARE + f'EDGE_SE3:QUAT 7 3 0 1 2 0 0 0 1 {UNIT}\n'
+    lines = plain.replace('QUAT 7 3 0 1', 'QUAT 7 3 4 0 1').replace(
+        'EDGE_SE3:QUAT 7', 'PARAMS_SE3OFFSET 4 0 0.5 0 0 0 0 1\nVERTEX_SWITCH 4 1\n'
+        'EDGE_SWITCH_PRIOR 4 1 1.0\nEDGE_SE3_SWITCHABLE 7')
+    record, expected = (read_graph_file(write(content)) for content in (lines, plain))
+    assert record.ids.tolist() == [3, 7] and len(record.skipped) == 2
+    for name in 'i', 'j', 'measurement', 'sqrt_information':
+        assert_array_equal(getattr(record.graph.between, name),
+                           getattr(expected.graph.between, name))
+
+
+def line(i, j):
+    return f'EDGE_SE3:QUAT {i} {j} 1 0 0 0 0 0 1 {UNIT}\n'
+
+
+@pytest.mark.parametrize(('fixed', 'edges', 'ids'), [
+    (5, ((5, 3), (7, 3), (7, 9)), [3, 7, 9]),  # as hdl_graph_slam numbers them
+    (3, ((5, 3), (7, 3), (7, 9)), [3, 5, 7, 9]),
+    (5, ((5, 3), (5, 7), (7, 9)), [3, 5, 7, 9]),
+    (5, ((5, 3), (7, 3), (5, 9), (7, 9)), [3, 5, 7, 9]),
+    (9, ((5, 3), (7, 5), (7, 9), (7, 3)), [3, 5, 7, 9]),
+])
+def test_an_anchor_beside_the_way_is_left_out(write, fixed, edges, ids):
+    """It only holds the graph in place; a keyframe that is fixed stays."""
+    vertices = ''.join(f'VERTEX_SE3:QUAT {k} {k} 0 0 0 0 0 1\n' for k in (3, 5, 7, 9))
+    lines = ''.join(line(*pair) for pair in edges)
+    for content in (vertices + lines, lines):
+        record = read_graph_file(write(f'FIX {fixed}\n{content}'))
+        assert record.ids.tolist() == ids
+        assert len(record.graph.between) == len(edges) - (len(ids) < 4)
+        assert record.poses is None or record.poses[:, 0].tolist() == ids
+        assert any('vertex 5 and its edge are not used' in said
+                   for said in record.skipped) == (len(ids) < 4)

@@ -3,8 +3,7 @@
 Keeping a map up to date while it grows: the front in an update, map and judge behind it.
 
 An update takes what has come into a map that was factored before (`front`), in a time that does
-not grow with the map. Two workers go on behind it, each in a thread of its own, from one snapshot
-to the next:
+not grow with the map. Two workers go on behind it, in threads, from one snapshot to the next:
 
     map     lowers the L1 cost of what is accepted, and factors it for the next front
     judge   looks at all loops again, at rest anew and at the norm, and moves nothing
@@ -107,17 +106,16 @@ class Upkeep:
     def _standing(self) -> Iterator[Snapshot]:
         """Let nothing change; give a snapshot, see `snapshot`."""
         with self._front:
-            # First what takes long: until then messages come in.
-            views = self._live.front.views if self._live.front else ()
+            # First what takes long: until then messages come in, and may begin another map.
+            views = front.views if (front := self._live.front) else ()
             with self._lock:
-                builder, live = self._builder, self._live
-                track, loops = builder.track, builder.loops
-                builder.add_due_loops()
+                self._builder.add_due_loops()
+                live, track, loops = self._live, self._builder.track, self._builder.loops
                 yield Snapshot(
-                    live.number, self._version(), builder.graph.copy(), track.gaps,
+                    live.number, self._version(), self._builder.graph.copy(), track.gaps,
                     track.keyframe_stamps, track.keyframe_poses, self._map_to_odom_now(),
                     loops.rows, loops.stamps, live.optimised, live.robust, live.looks.view(),
-                    live.all_judged, live.judged, live.stale, views)
+                    live.all_judged, live.judged, live.stale, views if live.front is front else ())
 
     def _map_to_odom_now(self) -> Array:
         """Return the odometry frame seen from the map: what its last keyframe says."""
@@ -170,8 +168,7 @@ class Upkeep:
                     return live.account(time.monotonic() - start)
             if came or live.last is not last or not idle:
                 return live.account(time.monotonic() - start)
-            if idle:
-                self._at_rest = self.version
+            self._at_rest = self.version
         return None
 
     def _check_of(self, live: LiveMap, stopped: Stopped) -> Callable[[], None]:
