@@ -92,7 +92,7 @@ class Growth:
         self.poses = placed(self.graph.subset(self.accepted), odometry_poses(self.graph))
         self.part = np.zeros(graph.n_poses, np.int64)
         self.variance = np.ones(2)
-        self._learnt_of, self._as_found = np.zeros(0, bool), np.full(len(self.factors), np.inf)
+        self._learnt_of = np.zeros(0, bool)
         self._floor, self.at_their_word = np.full(2, _LEAST_VARIANCE), False
         self.posterior: Posterior
         self.slip_odds: dict[int, float] = {}
@@ -175,8 +175,9 @@ class Growth:
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
         clone = copy.copy(self)
-        for name in ('accepted', 'drops', 'cut', 'variance', '_as_found', 'slip_odds'):
-            setattr(clone, name, getattr(self, name).copy())
+        clone.accepted, clone.drops = self.accepted.copy(), self.drops.copy()
+        clone.cut, clone.variance = self.cut.copy(), self.variance.copy()
+        clone.slip_odds = self.slip_odds.copy()
         return clone
 
     def uncut(self) -> 'Growth':
@@ -210,10 +211,8 @@ class Growth:
 
     def take_at_their_word(self) -> None:
         """From now on let factors be as noisy as they say, if they are not noisier."""
-        self.drops[:] = 0
-        rows = self.undecided()
-        self._as_found[rows] = self.innovations(rows).log_ratio()
         self.at_their_word = True
+        self.drops[:] = 0
 
     def undecided(self) -> Indices:
         """Return the loops within a part that may yet be accepted, (k,)."""
@@ -334,15 +333,13 @@ class Growth:
         fits = found.square < self.gate(found.freedom)
         refused = self.is_loop & ~self.accepted
         refused[rows[fits]] = False
-        # At their word more fit by chance: then only the rest says how many of it are false.
+        # Taken at their word all are noisier than they are, so that more fit by chance: then only
+        # the rest says how many of the rest are false.
         true = 0 if self.at_their_word else np.count_nonzero(loops)
         believed: Indices = rows[believable(
             found, self.posterior, self.gate, fits, int(true), self.place[rows],
             beside_refused(self._mates, refused, loops)[rows])]
-        # At their word only what is likelier than all others by the noise as it was found.
-        others = self._as_found[np.setdiff1d(rows, believed)]
-        least = others.max(initial=-np.inf, where=others < np.inf)
-        return believed[self._as_found[believed] > least] if self.at_their_word else believed
+        return believed
 
     def some(self, rows: Indices, count: int) -> Indices:
         """Return so many of some factors, as if at random, or all, (k,)."""
