@@ -52,8 +52,7 @@ def _introduction(recorded: Mapping[str, Any]) -> Lines:
         'it believes: those whose residual at its map is within the '
         f'{KEPT_PROBABILITY:.1%} quantile of chi2. **slips**: named and there, of those there; '
         'after a plus, named and not there.',
-        f'- **{NOTHING}**: the time was up; then the solver did not get the other seeds. '
-        '**before**: by the version of ours whose judgement was another.',
+        f'- **{NOTHING}**: the time was up; then the solver did not get the other seeds.',
         '- gtsam: Levenberg-Marquardt, kernels on loops only, GNC told that the odometry is sure. '
         'The last word is the start: the odometry chain, our seed (L1, Algorithm 3, of all '
         'loops), or the poses stored in the file, which are much better than what a robot has. '
