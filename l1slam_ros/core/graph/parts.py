@@ -50,12 +50,26 @@ def tied(graph: FactorGraph, poses: Array) -> FactorGraph:
     return _with_steps(graph, first - 1, graph.manifold.between(poses[first - 1], poses[first]))
 
 
+def as_sure(graph: FactorGraph, rows: Mask) -> FactorGraph:
+    """Return the graph, some factors of which, (m,) bool, are as sure as its odometry."""
+    if not rows.any():
+        return graph
+    sure = graph.subset(np.arange(len(rows)))
+    sure.between.sqrt_information[rows] = _usual(graph)
+    return sure
+
+
 def _with_steps(graph: FactorGraph, at: Indices, Z: Array) -> FactorGraph:
     """Return the graph with steps Z (k, p) from keyframes `at` (k,), as sure as its odometry."""
     if not len(at):
         return graph
-    whole, roots = graph.copy(), graph.between.sqrt_information
-    usual = (np.median(roots[graph.between.is_odometry], axis=0) if graph.between.is_odometry.any()
-             else np.eye(graph.manifold.TANGENT_SIZE))
+    whole, usual = graph.copy(), _usual(graph)
     whole.append_between(at, at + 1, Z, np.broadcast_to(usual, (len(at), *usual.shape)))
     return whole
+
+
+def _usual(graph: FactorGraph) -> Array:
+    """Return the root of the information of odometry, in the median, (k, k)."""
+    odometry = graph.between.is_odometry
+    return (np.median(graph.between.sqrt_information[odometry], axis=0) if odometry.any()
+            else np.eye(graph.manifold.TANGENT_SIZE))

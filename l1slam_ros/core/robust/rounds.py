@@ -17,7 +17,7 @@ from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, turned
 from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.linear_system import whitened_residual
-from l1slam_ros.core.graph.parts import bridged, vague_odometry
+from l1slam_ros.core.graph.parts import as_sure, bridged, vague_odometry
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.robust.gating import believable, noise_variance
@@ -82,11 +82,14 @@ class Growth:
         self._check = check
         whole, self.size = bridged(graph), len(graph.between)
         # Which end is named first is no reason to judge otherwise.
-        self.graph = turned(whole, whole.between.i > whole.between.j)
+        in_order = turned(whole, whole.between.i > whole.between.j)
+        self.gap: Mask = vague_odometry(in_order) | (np.arange(len(whole.between)) >= self.size)
+        # A gap says where its sides are, see `subgraph`. As vague as that of a long part may be
+        # stated, digits are lost: the part would turn about it by its rounding.
+        self.graph = as_sure(in_order, self.gap)
         self.factors, self.trusted = self.graph.between, self.graph.between.trusted
         self.low, self.high = self.factors.i, self.factors.j
         self.is_loop: Mask = ~self.factors.is_odometry
-        self.gap: Mask = vague_odometry(self.graph) | (np.arange(len(self.factors)) >= self.size)
         self.cut: Mask = self.gap.copy()
         self.accepted: Mask = ~self.is_loop | self.trusted
         self.poses = placed(self.graph.subset(self.accepted), odometry_poses(self.graph))

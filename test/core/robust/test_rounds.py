@@ -6,8 +6,11 @@ import pytest
 from lies import careful_world
 from problems import chain_of, graph_of, measure, straight
 
+from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.draws import keys
+from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust import innovation
+from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.rounds import Growth
 
 
@@ -90,3 +93,17 @@ def test_of_two_that_contradict_each_other_neither_is_believed(apart, count, bel
     found = growth.innovations(rows)
     assert (found.square < growth.gate(found.freedom)).all()
     assert len(growth.believable(rows)) == believed
+
+
+def test_a_long_part_behind_a_step_that_says_nothing_is_judged():
+    """Solved for, the part would turn about the vague step by its rounding."""
+    n, graph = 1500, FactorGraph(se2)
+    graph.add_poses(n)
+    for d in (1, 10, 25, 50):
+        i = np.arange(0 if d == 1 else 5, n - d)
+        root = np.tile(np.diag([80.0, 80.0, 140.0 if d == 1 else 80.0]), (len(i), 1, 1))
+        if d == 1:
+            root[4] = np.diag([2 / n, 2 / n, 1.0])
+        graph.append_between(i, i + d, np.tile([0.5 * d, 0.0, 0.0], (len(i), 1)), root)
+    judgement, _ = robust_solve(graph)
+    assert judgement.accepted.all()
