@@ -177,12 +177,11 @@ def front_of(problem: Problem, poses: Array, rows: int,
     if not problem.is_sparse or method.cholesky is None:
         return None
     loops = ~problem.graph.between.is_odometry
-    believed, kinds = loops & judgement.accepted, loops[judgement.accepted].astype(np.int64)
+    believed = loops & judgement.accepted
     gate = Gate.of(part.manifold, poses, judgement.variance, int(believed.sum()),
                    int((loops & ~believed).sum()))
-    # Where the part is as noisy as was found, odometry is its unit.
-    kinds = kinds * judgement.is_noise_stated
-    found = part.subset(np.arange(len(kinds)), judgement.variance[kinds])
+    variance = judgement.found_variance(problem.graph)
+    found = part.subset(np.arange(len(variance)), variance)
     starts = [poses, *problem.starts[1:]]
     l2_poses = min(starts, key=lambda start: l2_cost(whitened_residual(found, start)))
     system = linearise(found, l2_poses)

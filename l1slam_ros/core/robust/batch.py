@@ -143,9 +143,7 @@ def _doubts_of_norm(graph: FactorGraph, judgement: Judgement, least: tuple[Facto
     least : of `_least_squares`
     """
     (whole, seed), manifold = least, graph.manifold
-    loop = ~graph.between.is_odometry[judgement.accepted]
-    # Where the part is as noisy as was found, odometry is its unit.
-    noise = judgement.variance[(loop & judgement.is_noise_stated).astype(np.int64)]
+    noise = judgement.found_variance(graph)
     noise = np.concatenate((noise, np.ones(len(whole.between) - len(noise))))
     step = manifold.local(seed, poses)[anchor(whole):]
     square = kernels.prediction.normalise(
@@ -153,7 +151,8 @@ def _doubts_of_norm(graph: FactorGraph, judgement: Judgement, least: tuple[Facto
     explained = (np.pi / 2 - 1) * chi2_quantile(1 - REFUSED, np.array([manifold.TANGENT_SIZE]))
     if np.count_nonzero(np.isfinite(square) & (square > explained)) <= len(square) / 2:
         return ()
-    return (Doubt(NORM, int(np.count_nonzero(loop)), 0, graph.n_poses - 1),)
+    loops = np.count_nonzero(judgement.accepted & ~graph.between.is_odometry)
+    return (Doubt(NORM, int(loops), 0, graph.n_poses - 1),)
 
 
 def rounds(

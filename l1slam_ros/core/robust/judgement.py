@@ -102,6 +102,12 @@ class Judgement:
         """Return the accepted factors of a graph, as noisy as they are."""
         return graph.subset(self.accepted, self.noise[self.accepted])
 
+    def found_variance(self, graph: FactorGraph) -> Array:
+        """Return the variance that was found of these, in units of what they then state, (k,)."""
+        loops = ~graph.between.is_odometry[self.accepted]
+        # Where the part is as noisy as was found, odometry is its unit.
+        return self.variance[(loops & self.is_noise_stated).astype(np.int64)]
+
     def extended(self, graph: FactorGraph, robust: bool) -> 'Judgement':
         """
         Return the judgement of all factors that the graph has by now.

@@ -205,8 +205,11 @@ def _anchors(groups: dict[str, TextLines], ids: Indices, edges: Rows) -> Indices
     As of hdl_graph_slam: fixed, on a single edge, and another leads from the vertex before to the
     one behind. The map is the same without them; with them the odometry would have a gap.
     """
+    fixed = _fixed(groups)
+    if not fixed:  # as in most files; else each vertex gets a name to compare
+        return ids[:0]
     anchors, ends = [], np.sort(edges.ids, axis=1)
-    for k in np.flatnonzero(np.isin(ids.astype(str), _fixed(groups))):
+    for k in np.flatnonzero(np.isin(ids.astype(str), fixed)):
         passed = (ends == ids[[k - 1, (k + 1) % len(ids)]]).all(axis=1)
         if (ends == ids[k]).any(axis=1).sum() == 1 and passed.any():
             anchors.append(ids[k])
