@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
@@ -28,16 +28,16 @@ from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.graphs.map_file import MapFile, unusable_path
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.diagnostics import Diagnostics
-from l1slam_ros.ros.inputs.inputs import Inputs
 from l1slam_ros.ros.loop_status import LoopStatus
 from l1slam_ros.ros.markers import GraphMarkers
 from l1slam_ros.ros.parameters import NodeParameters
-from l1slam_ros.ros.publishing import path_bytes, pose_bytes, pose_with_covariance
+from l1slam_ros.ros.publishing import path_bytes, pose_with_covariance
+from l1slam_ros.ros.robot import RobotPublisher
 from l1slam_ros.ros.services import MapServices
 from l1slam_ros.ros.threads.failures import Failures
+from l1slam_ros.ros.threads.inputs import Inputs
 from l1slam_ros.ros.threads.job_queue import JobQueue
 from l1slam_ros.ros.threads.solver_thread import SolverThread
-from l1slam_ros.ros.transform import MapToOdom
 
 _REPEAT_WARNING = 5.0  # [s]
 # [s] The end of the node waits so much longer for a map that is being saved.
@@ -80,8 +80,7 @@ class BackendNode(LifecycleNode):
         self._map_file = MapFile(self._backend, lambda: self.options, self.get_logger().warning)
         if options.load_on_start:
             self._map_file.load_at_start(self.get_logger().info)
-        self._inputs = Inputs(self, self._backend, options, self.failures, self._on_moved,
-                              self._transform.tick)
+        self._inputs = Inputs(self, self._backend, options, self.failures, self._robot)
         self._diagnostics = Diagnostics(self, self._inputs.traffic, self._solver, self.failures)
         self._map_services = MapServices(
             self, self._backend, self._jobs, self._map_file, self.failures,
@@ -168,11 +167,10 @@ class BackendNode(LifecycleNode):
     def _make_publishers(self) -> None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._path = self.create_publisher(Path, 'path', latched)
-        self._pose = self.create_publisher(PoseStamped, 'pose', 10)
         self._covariance = self.create_publisher(
             PoseWithCovarianceStamped, 'pose_with_covariance', 10)
         self._markers = GraphMarkers(self)
-        self._transform = MapToOdom(self, self._backend, lambda: self.options)
+        self._robot = RobotPublisher(self, self._backend, self._declared)
         self._loop_status = LoopStatus(self)
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
@@ -185,17 +183,10 @@ class BackendNode(LifecycleNode):
         self._backend.set_options(options)
 
     def _on_time_jump(self, _: TimeJump) -> None:
-        self._transform.forget()
+        self._robot.forget()
         if self.options.on_time_jump == 'reset':
             self.get_logger().warning('the clock jumped back: the map begins anew')
             self._map_services.begin_anew('time jump')
-
-    def _on_moved(self) -> None:
-        robot, manifold = self._backend.robot(), self._manifold
-        if robot is not None:  # else the map has been emptied meanwhile
-            pose = manifold.compose(robot.map_to_odom, robot.odometry)
-            self._pose.publish(pose_bytes(
-                self.options.map_frame, robot.stamp, manifold.to_pose3(pose)[0]))
 
     def _on_second(self) -> None:
         self._inputs.look_at_events()
