@@ -13,9 +13,9 @@ from rclpy.node import Node
 
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.snapshot import Robot
+from l1slam_ros.io.messages.serialisation import pose_bytes, transform_bytes
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.parameters import NodeParameters
-from l1slam_ros.ros.publishing import pose_bytes, transform_bytes
 
 try:
     from tf2_msgs.msg import TFMessage
