@@ -60,7 +60,7 @@ class BackendNode(LifecycleNode):
 
     def __init__(self, **keywords: Any):
         super().__init__('backend', **keywords)
-        self._declared = NodeParameters(self, NodeOptions(), self._on_options)
+        self._declared = NodeParameters(self, lambda options: self._backend.set_options(options))
         options = self.options
         self._backend = Backend(options, options.dimension)
         self.failures = Failures(self.get_logger(), self.context.ok)
@@ -161,9 +161,6 @@ class BackendNode(LifecycleNode):
         wrong = ''.join(unusable_path(str(parameter.value)) for parameter in parameters
                         if parameter.name == 'save_path')
         return SetParametersResult(successful=not wrong, reason=wrong)
-
-    def _on_options(self, options: NodeOptions) -> None:
-        self._backend.set_options(options)
 
     def _on_time_jump(self, _: TimeJump) -> None:
         self._robot.forget()

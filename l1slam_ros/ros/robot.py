@@ -14,7 +14,6 @@ from rclpy.node import Node
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.snapshot import Robot
 from l1slam_ros.io.messages.serialisation import pose_bytes, transform_bytes
-from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.parameters import NodeParameters
 
 try:
@@ -43,7 +42,7 @@ class RobotPublisher:
 
     """
 
-    def __init__(self, node: Node, backend: Backend, parameters: NodeParameters[NodeOptions]):
+    def __init__(self, node: Node, backend: Backend, parameters: NodeParameters):
         self._backend, self._parameters = backend, parameters
         self._pose = node.create_publisher(PoseStamped, 'pose', 10)
         self._transform = node.create_publisher(TransformStamped, 'map_to_odom', 10)
