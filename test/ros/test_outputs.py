@@ -21,9 +21,10 @@ from l1slam_ros.core.online.snapshot import (
     WAITING,
     LoopStates,
 )
+from l1slam_ros.io.messages.serialisation import header_bytes
 from l1slam_ros.ros.loop_status import LoopStatus
 from l1slam_ros.ros.markers import _array_bytes
-from l1slam_ros.ros.publishing import header_bytes, pose_with_covariance
+from l1slam_ros.ros.publishing import pose_with_covariance
 
 
 class Drawing:
@@ -119,7 +120,7 @@ def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path, rng):
     b = bench(**EVERY_MESSAGE)
     heard = []
     b.peer.create_subscription(PoseWithCovarianceStamped, 'pose_with_covariance', heard.append, 10)
-    b.until(lambda: b.backend._covariance.get_subscription_count(), 'somebody listens')
+    b.until(lambda: b.backend._map.covariance.get_subscription_count(), 'somebody listens')
     b.play(tmp_path / 'bag')
     b.until(lambda: heard and heard[-1].header.stamp == b.path().poses[-1].header.stamp
             and b.backend._backend.update(0.0) is None, 'the map is done')

@@ -13,8 +13,8 @@ from rclpy.serialization import deserialize_message
 from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.core.online.snapshot import ACCEPTED, REJECTED, WAITING, LoopStates
+from l1slam_ros.io.messages.serialisation import path_bytes, pose_bytes, transform_bytes
 from l1slam_ros.ros.loop_status import states_bytes
-from l1slam_ros.ros.publishing import path_bytes, pose_bytes, transform_bytes
 
 
 def numbers(pose):

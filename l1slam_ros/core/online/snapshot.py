@@ -16,7 +16,7 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure
-from l1slam_ros.core.incremental.growing_map import View
+from l1slam_ros.core.incremental.front import View
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.optimality import Status
 from l1slam_ros.core.solvers.solve import AUTO, PRIMAL_DUAL, Method, choose

@@ -9,7 +9,7 @@ their time to import, so who may do without a bag imports this module only where
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,12 +28,14 @@ from l1slam_ros.io.bags.damaged.salvage import (
     directory_metadata,
     storage_files,
 )
-from l1slam_ros.io.bags.damaged.walk import BagMessage, ros1_types
+from l1slam_ros.io.bags.damaged.walk import BagMessage
 from l1slam_ros.io.bags.damaged.walk_mcap import is_indexed, mcap_metadata
 from l1slam_ros.io.bags.damaged.walk_sqlite import has_journal, is_cut, sqlite_metadata
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES
 from l1slam_ros.io.bags.writer import NOTE_KEY
 
+# What types of ROS 1 are made of, as ROS 2 has it.
+_BASIC = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
 _TO_ITS_END = 'expected a bag that can be read to its end'
 # Told of damage, in one sentence.
 OnDamage = Callable[[str], None]
@@ -237,7 +239,7 @@ def _messages(path: str | os.PathLike[str], topics: Collection[str] | None, star
 def _by_library(bag: Path, topics: Collection[str] | None, start: int | None,
                 stop: int | None) -> Iterator[tuple[BagMessage, Any]]:
     with _reader(bag) as reader:
-        types = reader.typestore if reader.is2 else ros1_types(reader.typestore.fielddefs)
+        types = reader.typestore if reader.is2 else _ros1_types(reader.typestore.fielddefs)
         connections = [c for c in reader.connections if topics is None or c.topic in topics]
         missing = sum(c.msgcount for c in connections)
         # No connection would mean all of them to the library.
@@ -248,6 +250,15 @@ def _by_library(bag: Path, topics: Collection[str] | None, start: int | None,
         # Within a chunk the library stops at a damaged record without a word.
         if missing > 0 and start is None and stop is None:
             raise LookupError(f'{missing:,} messages are missing')
+
+
+def _ros1_types(fields: Mapping[str, Any]) -> Any:
+    """Return the types by which messages of ROS 1 become CDR, and are decoded from that."""
+    jazzy = get_typestore(Stores.ROS2_JAZZY).fielddefs
+    types = get_typestore(Stores.EMPTY)
+    # In ROS 1 a header has one field more, which the library's conversion leaves out.
+    types.register({**fields, **{name: jazzy[name] for name in _BASIC}})
+    return types
 
 
 @contextmanager
@@ -266,6 +277,9 @@ def _reader(bag: Path) -> Iterator[Any]:
 
 def _salvage(bag: Path, error: Exception) -> Salvage:
     """Return what can be had of a bag that the library gave up on."""
+    if bag.suffix.lower() == '.bag':
+        raise FileError(bag, f'damaged, or no bag ({complaint(error)}); {_TO_ITS_END}: '
+                        '`rosbag reindex` may make one of it') from error
     salvage = Salvage(bag)
     if salvage.counts:
         return salvage

@@ -129,7 +129,7 @@ def test_a_front_that_fails_is_closed_and_moves_nothing(world, monkeypatch):
         raise np.linalg.LinAlgError
 
     before = backend.poses
-    monkeypatch.setattr(front._map, 'add', fail)
+    monkeypatch.setattr(front._borders[1], 'add', fail)
     play(backend, world, KNOWN, KNOWN + 5)
     backend.update(10.0)
     assert front.closed

@@ -20,7 +20,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from l1slam_ros.io.bags.damaged.walk import DECODERS, BagMessage, BrokenRecordError
 from l1slam_ros.io.bags.damaged.walk_mcap import walk_mcap
-from l1slam_ros.io.bags.damaged.walk_rosbag1 import walk_rosbag1
 from l1slam_ros.io.bags.damaged.walk_sqlite import walk_sqlite
 
 METADATA = 'metadata.yaml'
@@ -28,7 +27,7 @@ METADATA = 'metadata.yaml'
 _STORAGE_NAME = re.compile(r'(?P<bag>.+?)(_[0-9]+)?(\.mcap|\.db3)(\.zstd)?')
 # The first bytes of a message that rosbag2 has compressed by itself; of CDR they never are.
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
-_WALKS = {'.mcap': walk_mcap, '.db3': walk_sqlite, '.bag': walk_rosbag1}
+_WALKS = {'.mcap': walk_mcap, '.db3': walk_sqlite}
 _PIECE = 4096  # [bytes] of a compressed file that are decompressed at a time
 _COMPLAINT = 200  # the longest piece of a library's complaint that is passed on
 
@@ -55,7 +54,7 @@ class Salvage:
 
     Parameters
     ----------
-    bag : a rosbag2 directory, .mcap, .db3 or .bag
+    bag : a rosbag2 directory, .mcap or .db3
 
     Attributes
     ----------

@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the walks through bag files share: each yields messages from the start to the damage."""
 
-import bz2
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]  # comes with both bag libraries
 import zstandard  # comes with the mcap library
-from rosbags.typesys import Stores, get_typestore
 
-_BASIC = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
 # [bytes] A decoder is given so much at a time: when it fails, what it made of that is lost.
 _PIECE = 64
 
@@ -40,24 +37,15 @@ def broken_at(position: int, messages: Iterator[BagMessage]) -> Iterator[BagMess
         raise BrokenRecordError(position) from error
 
 
-def ros1_types(fields: Mapping[str, Any]) -> Any:
-    """Return the types by which messages of ROS 1 become CDR, and are decoded from that."""
-    jazzy = get_typestore(Stores.ROS2_JAZZY).fielddefs
-    types = get_typestore(Stores.EMPTY)
-    # In ROS 1 a header has one field more, which the library's conversion leaves out.
-    types.register({**fields, **{name: jazzy[name] for name in _BASIC}})
-    return types
-
-
-# By their names in MCAP and in bags of ROS 1, each for one use.
+# By their names in MCAP, each for one use.
 DECODERS: dict[str, Callable[[], Any]] = {
     'zstd': lambda: zstandard.ZstdDecompressor().decompressobj(),
-    'lz4': lz4.frame.LZ4FrameDecompressor, 'bz2': bz2.BZ2Decompressor}
+    'lz4': lz4.frame.LZ4FrameDecompressor}
 
 
 def uncompressed(data: bytes, compression: str) -> bytes:
     """Return the content of a chunk as far as it goes: up to a piece before it is damaged."""
-    if compression in ('', 'none'):
+    if not compression:
         return data
     decoder, parts = DECODERS[compression](), []
     with suppress(Exception):  # the decoders have no exception in common
