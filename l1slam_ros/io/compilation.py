@@ -39,9 +39,8 @@ ONLINE = ('border',)
 STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
 # What poses in space need besides; after the colon: the versions for them of that module's loops.
 _SPACE = ':space'
-_IN_SPACE = {'halpern': f'halpern{_SPACE}', 'cholesky': f'cholesky{_SPACE}',
+IN_SPACE = {'halpern': f'halpern{_SPACE}', 'cholesky': f'cholesky{_SPACE}',
              'blocks': f'blocks{_SPACE}', 'se2': 'se3'}
-STEPS_IN_SPACE = tuple(_IN_SPACE.values())
 
 _KERNELS = Path(__file__).parents[1] / 'core' / 'kernels'
 # [s] How often the caller is asked whether to stop.
@@ -56,7 +55,7 @@ def with_space(steps: tuple[str, ...], manifold: Manifold) -> tuple[str, ...]:
     """Return the steps, and where the poses are not in the plane, what they need besides."""
     if manifold.NAME == 'SE2':
         return steps
-    return (*(_IN_SPACE[step] for step in steps if step in _IN_SPACE), *steps)
+    return (*(IN_SPACE[step] for step in steps if step in IN_SPACE), *steps)
 
 
 def compile_now(steps: Sequence[str], quiet: bool = False) -> None:

@@ -36,12 +36,12 @@ class DamageError(Exception):
     """
     What keeps a bag from being read to its end.
 
-    path : the file or directory; where : words that follow 'damaged'; used : which messages are
+    where : words that follow 'damaged'; used : which messages are
     """
 
     def __init__(self, path: Path, where: str, used: str = 'before that'):
         super().__init__(f'{path} is damaged{where}')
-        self.path, self.where, self.used = path, where, used
+        self.where, self.used = where, used
 
     def sentence(self, count: int) -> str:
         """Say it all, when `count` messages were used."""

@@ -2,14 +2,10 @@
 """What the walks through bag files share: each yields messages from the start to the damage."""
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]  # comes with both bag libraries
 import zstandard  # comes with the mcap library
-
-# [bytes] A decoder is given so much at a time: when it fails, what it made of that is lost.
-_PIECE = 64
 
 
 class BagMessage(NamedTuple):
@@ -44,11 +40,5 @@ DECODERS: dict[str, Callable[[], Any]] = {
 
 
 def uncompressed(data: bytes, compression: str) -> bytes:
-    """Return the content of a chunk as far as it goes: up to a piece before it is damaged."""
-    if not compression:
-        return data
-    decoder, parts = DECODERS[compression](), []
-    with suppress(Exception):  # the decoders have no exception in common
-        for start in range(0, len(data), _PIECE):
-            parts.append(decoder.decompress(data[start:start + _PIECE]))
-    return b''.join(parts)
+    """Return the content of a chunk, as far as it goes where the end of it is cut off."""
+    return DECODERS[compression]().decompress(data) if compression else data
