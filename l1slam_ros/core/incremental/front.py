@@ -105,7 +105,7 @@ class Front:
         # Of a keyframe's first factor, whose residual the loops to come will say: it is weighed
         # as the others are in the mean, one without a residual among them.
         self._usual = 1 / np.append(weights, 1 / self._mu).mean()
-        self._map = GrowingMap(part, poses, choleskys)
+        self._map = GrowingMap(part, poses, choleskys, _MOST_POINTS, _MOST_ROWS)
 
     @property
     def keyframes(self) -> int:

@@ -74,14 +74,15 @@ class GrowingMap:
     graph : what was factored
     poses : two of (n, p) at which it was, its optima
     choleskys : hold the factors, and must stay
+    points, rows : see `Border`
 
     """
 
     def __init__(self, graph: FactorGraph, poses: tuple[Array, Array],
-                 choleskys: tuple[BlockCholesky, BlockCholesky]):
+                 choleskys: tuple[BlockCholesky, BlockCholesky], points: int, rows: int):
         self._manifold, self.fixed = graph.manifold, anchor(graph)
         k, size = graph.manifold.TANGENT_SIZE, graph.n_poses - self.fixed
-        self._borders = [Border(cholesky, size, k) for cholesky in choleskys]
+        self._borders = [Border(cholesky, size, k, points, rows) for cholesky in choleskys]
         self._first = GrowingArray((2, graph.manifold.POSE_SIZE))
         self._first.extend(np.stack(poses, axis=1))
 
@@ -115,9 +116,7 @@ class GrowingMap:
 
     def covariance(self, keyframe: int) -> Array:
         """Return the covariance of the step of a keyframe in the L2 map, (k, k)."""
-        k = self._manifold.TANGENT_SIZE
-        blocks, end = np.stack((np.eye(k), np.zeros((k, k)))), max(keyframe - self.fixed, FIXED)
-        return self._borders[L2].predict((end, FIXED), blocks, np.zeros(k)).covariance
+        return self._borders[L2].covariance(max(keyframe - self.fixed, FIXED))
 
     def linearise(self, factors: BetweenFactors, rows: slice) -> Linearised:
         """
