@@ -153,7 +153,8 @@ class Front:
         # Of a keyframe's first factor, whose residual the loops to come will say: it is weighed
         # as the others are in the mean, one without a residual among them.
         self._usual = np.full(k, 1 / np.append(weights, 1 / self._mu).mean())
-        self._borders = [Border(cholesky, system.size, k) for cholesky in choleskys]
+        self._borders = [Border(cholesky, system.size, k, _MOST_POINTS, _MOST_ROWS)
+                         for cholesky in choleskys]
         self._first = GrowingArray((2, part.manifold.POSE_SIZE))
         self._first.extend(np.stack(poses, axis=1))
 
@@ -184,9 +185,7 @@ class Front:
 
     def covariance(self, keyframe: int) -> Array:
         """Return the covariance of a keyframe's step from the L2 map, (k, k)."""
-        k = self._manifold.TANGENT_SIZE
-        blocks, end = np.stack((np.eye(k), np.zeros((k, k)))), max(keyframe - self._fixed, FIXED)
-        return self._borders[L2].predict((end, FIXED), blocks, np.zeros(k)).covariance
+        return self._borders[L2].covariance(max(keyframe - self._fixed, FIXED))
 
     def take(self, factors: BetweenFactors, accept: Indices) -> list[Look]:
         """

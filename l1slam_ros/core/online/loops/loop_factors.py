@@ -162,7 +162,7 @@ class LoopFactors:
         """Carry loops to the keyframes pairs (m, 2), and make factors of them."""
         manifold, m = self._manifold, len(loops)
         begin, end = np.array([(one.begin, one.end) for one in loops]).T
-        at, keyframes = track.at(np.append(begin, end)), track.keyframe_poses[pairs.T.ravel()]
+        at, keyframes = track.at(np.append(begin, end)), track.poses_of(pairs.T.ravel())
         ways = manifold.between(np.concatenate((keyframes[:m], at[m:])),
                                 np.concatenate((at[:m], keyframes[m:])))
         measurement, covariance, sound = _carried(manifold, loops, ways[:m], ways[m:])

@@ -125,7 +125,7 @@ class Upkeep:
             return manifold.identity(1)
         # Asked for with every sample: worked out when an update or a new offset changes it.
         if self._map_to_odom is None or self._map_to_odom[0] is not offset:
-            odometry = self._builder.track.keyframe_pose(last)
+            odometry = self._builder.track.poses_of(np.array([last]))
             to_kept = manifold.compose(pose, manifold.inverse(odometry))
             self._map_to_odom = offset, manifold.compose(to_kept, offset)
         return self._map_to_odom[1]
