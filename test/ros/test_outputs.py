@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from node_bench import EVERY_MESSAGE, loop, recorded
 from rclpy.serialization import deserialize_message
@@ -22,7 +22,7 @@ from l1slam_ros.core.online.snapshot import (
     LoopStates,
 )
 from l1slam_ros.io.messages.serialisation import header_bytes
-from l1slam_ros.ros.loop_status import LoopStatus
+from l1slam_ros.ros.loop_status import LoopStatus, states_bytes
 from l1slam_ros.ros.markers import _array_bytes
 from l1slam_ros.ros.publishing import pose_with_covariance
 
@@ -93,6 +93,25 @@ def test_markers_are_what_their_bytes_say(frame, rng):
         assert [(p.x, p.y, p.z) for p in marker.points] == [tuple(p) for p in points]
         assert [(c.r, c.g, c.b, c.a) for c in marker.colors] == [tuple(c) for c in colours]
         assert not marker.text and not marker.mesh_resource and not marker.texture.data
+
+
+# Every remainder modulo 4.
+@pytest.mark.parametrize('name', ['/b', '/ba', '/bac', '/back'])
+def test_ros_reads_the_states_of_loops_that_were_meant(name):
+    stamps = np.array([[1, 2], [10**9 + 5, 7 * 10**9], [3, 4 * 10**9 + 1]])
+    states = LoopStates(np.arange(2), stamps, np.array([ACCEPTED, REJECTED, WAITING]),
+                        np.array([0.5, 12.346, np.nan]))
+    data = states_bytes(name, 5_000_000_007, states, [1, 2])
+    read = deserialize_message(data, DiagnosticArray)
+    assert (read.header.stamp.sec, read.header.stamp.nanosec) == (5, 7)
+    refused, waiting = read.status
+    assert refused.name == f'{name}: loop 1.000000005 - 7.000000000'
+    assert (refused.level, refused.message, refused.hardware_id) == (
+        DiagnosticStatus.WARN, 'rejected', name)
+    assert {value.key: value.value for value in refused.values} == {
+        'reference_stamp': '1.000000005', 'stamp': '7.000000000', 'state': 'rejected',
+        'sigmas': '12.35'}
+    assert waiting.level == DiagnosticStatus.OK and waiting.values[3].value == ''
 
 
 def test_each_loop_is_told_of_when_it_comes_and_when_it_changes(bench):
