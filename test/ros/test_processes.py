@@ -30,13 +30,11 @@ DEADLINE = 300.0  # [s] the solver can have to be compiled first
 
 
 @pytest.fixture
-def backend():
-    process = subprocess.Popen([executable('backend')], stderr=subprocess.PIPE, text=True)
+def backend(start):
+    process = start()
     # The node says when it is ready; before that a signal would meet a half-started process.
     assert 'ready' in process.stderr.readline()
-    yield process
-    process.kill()
-    process.communicate()
+    return process
 
 
 @pytest.fixture
