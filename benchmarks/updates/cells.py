@@ -19,6 +19,7 @@ from robust.cases import FalseCase, false_case
 from robust.kinds import BICOCCA, CITY, INTEL, KINDS, LIES, MANHATTAN
 from robust.places import Place, error_by_time, place, place_of
 from robust.runs import within
+from updates.in_space import SPACES
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
@@ -35,7 +36,7 @@ from l1slam_ros.paper.updates import Isam2, Kept, run_updates
 CHECKPOINTS = 20
 # Simulated: keyframes and edges of the paper's Manhattan10k, and of a large sparse world.
 WORLDS = {'world10k': (10_000, 64_000), 'world50k': (50_000, 80_000)}
-GRAPHS = (INTEL, MANHATTAN, BICOCCA, CITY, *WORLDS)
+GRAPHS = (INTEL, MANHATTAN, BICOCCA, CITY, *WORLDS, *SPACES)
 CLEAN, RECORDED = 'clean', 'recorded'
 # Of all loops that are false, by graph and kind, where it is not the usual share.
 _SHARES = {(MANHATTAN, 'grouped'): (0.3, 0.5)}
@@ -149,6 +150,9 @@ def _place(datasets: Path, cell: Cell) -> Place:
     if cell.graph in WORLDS:
         world = simulate_world(*WORLDS[cell.graph], WorldOptions(), np.random.default_rng(0))
         found = place_of(cell.graph, world.graph, None, error_by_time(world.truth[:, :2]))
+    elif cell.graph in SPACES:
+        graph, truth = SPACES[cell.graph](datasets)
+        found = place_of(cell.graph, graph, None, error_by_time(truth[:, :3]))
     else:
         found = place(datasets, cell.graph)
     if not 0 < cell.poses < found.graph.n_poses:

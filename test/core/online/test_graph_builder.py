@@ -293,6 +293,14 @@ def test_the_model_speaks_where_it_has_to(stated, options):
     assert_allclose(covariance_of(builder, -1), np.diag([0.09, 0.09, 0.04]), atol=1e-12)
 
 
+def test_what_a_loop_leaves_unset_the_model_says():
+    builder = grown(curve(50), GraphBuilderOptions(EVERY.keyframe, loop=MODEL))
+    added(builder, true_loop(curve(50), 4, 40, covariance6(np.diag([0.01, 0.02, 0]))))
+    assert_allclose(covariance_of(builder, -1), np.diag([0.01, 0.02, 0.04]), atol=1e-12)
+    (told,) = builder.notes.sentences()
+    assert told.startswith('variance 0 of loop at') and told.endswith('0.04 is used')
+
+
 # What must not break it
 
 

@@ -288,7 +288,8 @@ def _loop_covariance(stated: Array, model: Array | None,
     """
     silent = noise.silent_components(stated, absolute=model is None)
     whole = noise.filled(stated, silent)
-    if silent.all() or not noise.usable(whole)[0]:
+    asked = whole if verbatim else noise.without_unset(whole)
+    if silent.all() or not noise.usable(asked)[0]:
         return None if model is None else model[None], []
     if verbatim:
         return noise.silenced(stated, silent), []
