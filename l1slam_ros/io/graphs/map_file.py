@@ -49,7 +49,7 @@ class MapFile:
 
     def save(self) -> str:
         """Save the map; return a sentence that says where."""
-        with self._at_work():
+        with self._at_work(), self._backend.calm:
             version = self._backend.version
             return self._write(self._path(), self._backend.saved(), version)
 
