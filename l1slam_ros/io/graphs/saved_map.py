@@ -16,13 +16,13 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.graph.measurements import LoopClosure
-from l1slam_ros.core.online.snapshot import Growth, Optimised, SavedMap
+from l1slam_ros.core.online.snapshot import BuilderState, Optimised, SavedMap
 from l1slam_ros.core.robust.judgement import Doubt, Judgement
 from l1slam_ros.io.files import put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord, graph_lines, read_graph_file
 from l1slam_ros.io.remarks import is_proven, with_remarks
 
-_Record = TypeVar('_Record', Growth, Optimised, Judgement)
+_Record = TypeVar('_Record', BuilderState, Optimised, Judgement)
 
 
 def save_map(path: Path, saved: SavedMap | None) -> str:
@@ -134,7 +134,7 @@ def _read(path: Path) -> SavedMap:
     record = read_graph_file(path)
     if record.poses is None or record.stamps is None:
         raise FileError(path, 'has no poses or no stamps; expected a saved map')
-    growth = Growth.of_graph(record.graph, record.poses, record.stamps)
+    growth = BuilderState.of_graph(record.graph, record.poses, record.stamps)
     optimised, values = Optimised.nothing(record.poses), dict(record.remarks or {})
     if not values:
         return SavedMap(growth, optimised, True)
