@@ -213,23 +213,23 @@ class GraphBuilder:
             self._motion.covariance(self.options.odometry, self._verbatim),
             loops.rows, in_graph, expired, loops.waiting.arrivals(track.last), loops.seen())
 
-    def restore(self, growth: BuilderState) -> None:
+    def restore(self, state: BuilderState) -> None:
         """Go on where a run ended; odometry that begins elsewhere begins a part there."""
-        self._begin(growth.graph)
-        track, stamps = self.track, growth.stamps
+        self._begin(state.graph)
+        track, stamps = self.track, state.stamps
         for part in np.split(np.arange(len(stamps)), odometry_gaps(self.graph) + 1):
-            track.extend_by_part(stamps[part], growth.odometry[part])
-        self.offset = growth.offset
+            track.extend_by_part(stamps[part], state.odometry[part])
+        self.offset = state.offset
         self._motion = KeyframeMotion(self.graph.manifold, track.last_stamp, track.last_pose)
-        if growth.end > track.last_stamp:
-            track.append(growth.end, growth.end_pose, is_keyframe=False)
+        if state.end > track.last_stamp:
+            track.append(state.end, state.end_pose, is_keyframe=False)
             by_model = self.options.odometry.covariance_source == 'model'
             self._motion.add_known(
-                growth.end, growth.end_pose, None if by_model else growth.end_covariance)
+                state.end, state.end_pose, None if by_model else state.end_covariance)
         self._glued, self._moved, self._resumed = False, True, True
         self.stream = OdometryStream(
             self.graph.manifold, self.notes, self.base_frame, resumed=True)
-        self.loops.restore(growth, track, self.options.loop)
+        self.loops.restore(state, track, self.options.loop)
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Take a loop closure or an absolute pose in, once; see `add_due_loops`."""

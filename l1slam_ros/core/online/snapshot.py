@@ -163,14 +163,14 @@ class SavedMap:
     began anew there
     """
 
-    growth: BuilderState
+    builder: BuilderState
     optimised: Optimised
     robust: bool
     number: int = 0
 
     def require(self, manifold: Manifold) -> None:
         """Refuse, by a `GraphError`, a map whose poses are of another manifold."""
-        found = self.growth.graph.manifold
+        found = self.builder.graph.manifold
         if found is not manifold:
             raise GraphError(f'a map of {found.NAME}, expected one of {manifold.NAME}')
 

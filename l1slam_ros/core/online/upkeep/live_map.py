@@ -273,7 +273,7 @@ class LiveMap:
             0 if self.all_judged else len(self._builder.loops.rows) - max(self._judged_loops, 0),
             self._bound if holds else np.nan, now - self._bound_at if holds else np.nan)
 
-    def growth(self) -> tuple[FactorGraph, int, int]:
+    def size(self) -> tuple[FactorGraph, int, int]:
         """Return what changes when something comes."""
         graph = self._builder.graph
         return graph, graph.n_poses, len(graph.between)
