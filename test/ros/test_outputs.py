@@ -8,11 +8,12 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_bench import EVERY_MESSAGE, loop, recorded
+from node_bench import EVERY_MESSAGE, loop
 from rclpy.serialization import deserialize_message
 from systems import dense_covariance
 from visualization_msgs.msg import Marker, MarkerArray
 
+from bags import write_world
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.online.snapshot import (
     ACCEPTED,
@@ -49,8 +50,8 @@ class Drawing:
         return sizes
 
 
-def test_the_graph_is_drawn_for_who_looks_also_for_who_comes_late(bench, tmp_path, rng):
-    recorded(tmp_path / 'bag', 40, 60, rng)
+def test_the_graph_is_drawn_for_who_looks_also_for_who_comes_late(bench, tmp_path):
+    write_world(tmp_path / 'bag', 40, 60)
     b = bench(**EVERY_MESSAGE)
     early = Drawing(b)
     b.play(tmp_path / 'bag')
@@ -134,8 +135,8 @@ def test_each_loop_is_told_of_when_it_comes_and_when_it_changes(bench):
                     [('7', 'waiting')]]
 
 
-def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path, rng):
-    recorded(tmp_path / 'bag', 60, 130, rng)
+def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path):
+    write_world(tmp_path / 'bag', 60, 130)
     b = bench(**EVERY_MESSAGE)
     heard = []
     b.peer.create_subscription(PoseWithCovarianceStamped, 'pose_with_covariance', heard.append, 10)

@@ -61,11 +61,11 @@ from l1slam_ros.core.solvers.nonlinear import Solution
 _MOST_ROUNDS = 200
 
 # From the round and the loops accepted so far.
-Report = Callable[[int, int], None]
+OnRound = Callable[[int, int], None]
 
 
 def robust_solve(
-    graph: FactorGraph, report: Report = lambda round_, accepted: None,
+    graph: FactorGraph, report: OnRound = lambda round_, accepted: None,
     check: Callable[[], None] = lambda: None,
 ) -> tuple[Judgement, Array]:
     """
@@ -96,7 +96,7 @@ class RobustMap:
 
 def minimise_robustly(
     graph: FactorGraph, minimise: Callable[[FactorGraph, Array], Solution],
-    report: Report = lambda round_, accepted: None, check: Callable[[], None] = lambda: None,
+    report: OnRound = lambda round_, accepted: None, check: Callable[[], None] = lambda: None,
 ) -> RobustMap:
     """
     Return the map that `minimise` makes of the factors that are accepted.

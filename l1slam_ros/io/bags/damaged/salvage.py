@@ -16,9 +16,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import yaml
+import zstandard  # comes with the bag libraries
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from l1slam_ros.io.bags.damaged.walk import DECODERS, BagMessage, BrokenRecordError
+from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError
 from l1slam_ros.io.bags.damaged.walk_mcap import walk_mcap
 from l1slam_ros.io.bags.damaged.walk_sqlite import walk_sqlite
 
@@ -188,7 +189,7 @@ def _decompressed(file: Path) -> Iterator[Path]:
         yield file
         return
     with TemporaryDirectory() as folder:
-        readable, decoder = Path(folder, file.stem), DECODERS['zstd']()
+        readable, decoder = Path(folder, file.stem), zstandard.ZstdDecompressor().decompressobj()
         with file.open('rb') as source, readable.open('wb') as target, suppress(Exception):
             while piece := source.read(_PIECE):
                 target.write(decoder.decompress(piece))
@@ -199,4 +200,5 @@ def _unpacked(message: BagMessage) -> BagMessage:
     """Return a message, decompressed where it was compressed by itself."""
     if not message.data.startswith(_ZSTD_MAGIC):
         return message
-    return message._replace(data=DECODERS['zstd']().decompress(message.data))
+    decoder = zstandard.ZstdDecompressor().decompressobj()
+    return message._replace(data=decoder.decompress(message.data))
