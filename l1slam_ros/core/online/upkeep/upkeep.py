@@ -29,7 +29,7 @@ from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
 from l1slam_ros.core.online.update import Improvement, front_of, improve, one_round, optimise
-from l1slam_ros.core.online.upkeep.live_map import AT_ONCE, LiveMap
+from l1slam_ros.core.online.upkeep.live_map import LiveMap
 from l1slam_ros.core.online.upkeep.threads import LOOK, Calm, Worker, until
 from l1slam_ros.core.robust.batch import doubts_of_norm, judge, robust_solve
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
@@ -232,7 +232,7 @@ class Upkeep:
                 factors, accepted = self._builder.graph.between, live.accepted
             while front is not None and not front.closed and front.rows < len(accepted):
                 check()
-                front.take(factors, accepted[front.rows:front.rows + AT_ONCE].astype(int))
+                front.take(factors, accepted[front.rows:].astype(int))
         check()
         self.adopt(of_all(improvement, whole), front)
 
