@@ -24,9 +24,9 @@ from l1slam_ros.core.solvers.optimality import Status
 
 # A map is factored anew from so many factors on that came since: those of ten keyframes.
 _MANY = 20
-# Factors that a front takes while its lock is held, and between two looks at the clock: on a large
-# map some take two milliseconds each.
-AT_ONCE = 4
+# Factors that a front takes while its lock is held, and between two looks at the clock: about
+# those of one keyframe. On a large map a loop takes milliseconds.
+_AT_ONCE = 2
 # [s] While loops come none of which fits, they are judged so often.
 _JUDGE_EVERY = 2.0
 
@@ -140,7 +140,7 @@ class LiveMap:
         if front is None or front.closed or front.rows >= len(factors):
             return False
         first, judged = front.rows, self.optimised.judgement.accepted
-        rows = np.arange(first, min(first + AT_ONCE, len(factors)))
+        rows = np.arange(first, min(first + _AT_ONCE, len(factors)))
         known = len(judged) + len(self.looks)
         accept = np.where(factors.trusted[rows] | (not self.robust), 1, UNKNOWN)
         before = rows[rows < known]
