@@ -20,7 +20,7 @@ from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import as_sure, bridged, vague_odometry
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.robust.gating import believable, noise_variance
+from l1slam_ros.core.robust.gating import believable, noise_variance, stand_apart
 from l1slam_ros.core.robust.innovation import (
     Innovations,
     Posterior,
@@ -40,8 +40,6 @@ REFUSED = 1e-3
 _DROPPED = 2e-5
 # Probability that any true factor of a round is doubted for what the others say.
 _DOUBTED = 0.01
-# A loop that was dropped that often is not tried again.
-_CHANCES = 2
 # What is measured of the noise counts against as many factors on which it was measured before.
 _KNOWN = 20
 # The noise is learnt to be no less than this part of the variance that was found first: factors
@@ -73,9 +71,10 @@ class Growth:
     high : (m,) the earlier and the later keyframe of each; place : (m,) see `places`; part : (n,)
     number of the part of each keyframe; poses : (n, p) the L2 map of the accepted; posterior : of
     these; variance : (2,) of odometry and loops in units of what they state; slip_odds : ln
-    P(slipped) / P(measured) of the odometry factors that were suspected; drops : (m,) how often
-    each was accepted and did not fit; at_their_word : whether factors may be as noisy as they say;
-    check : called before long steps, raises where the work shall stop.
+    P(slipped) / P(measured) of the odometry factors that were suspected; dropped : (m,) bool,
+    accepted and did not fit; at_their_word : whether factors may be as noisy as they say;
+    in_tail : (m,) bool, not the loops that are too far off for that; check : called before long
+    steps, raises where the work shall stop.
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
@@ -99,7 +98,8 @@ class Growth:
         self._floor, self.at_their_word = np.full(2, _LEAST_VARIANCE), False
         self.posterior: Posterior
         self.slip_odds: dict[int, float] = {}
-        self.drops = np.zeros(len(self.factors), np.int64)
+        self.dropped = np.zeros(len(self.factors), bool)
+        self.in_tail = ~self.dropped
 
     @cached_property
     def _places(self) -> tuple[Indices, Array]:
@@ -178,7 +178,7 @@ class Growth:
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
         clone = copy.copy(self)
-        clone.accepted, clone.drops = self.accepted.copy(), self.drops.copy()
+        clone.accepted, clone.dropped = self.accepted.copy(), self.dropped.copy()
         clone.cut, clone.variance = self.cut.copy(), self.variance.copy()
         clone.slip_odds = self.slip_odds.copy()
         return clone
@@ -213,9 +213,14 @@ class Growth:
         return noise
 
     def take_at_their_word(self) -> None:
-        """From now on let factors be as noisy as they say, if they are not noisier."""
+        """From now on let factors be as noisy as they say; loops, where `stand_apart` has it."""
+        rows, self.in_tail = self.undecided(), np.ones(len(self.factors), bool)
+        own = np.where(self.factors.is_absolute[rows], 1.0,
+                       self.variance_at_their_word()[1] / self.variance[1])
+        self.in_tail[rows] = stand_apart(self.innovations(rows), own, self.gate,
+                                         int((self.accepted & self.is_loop).sum()))
         self.at_their_word = True
-        self.drops[:] = 0
+        self.dropped[:] = False
 
     def undecided(self) -> Indices:
         """Return the loops within a part that may yet be accepted, (k,)."""
@@ -223,11 +228,10 @@ class Growth:
 
     def joining(self) -> Indices:
         """Return the loops from one part to another that may yet be accepted, (k,)."""
-        return self._open(self.across())
+        return self._open(self.across() & ~self.dropped)
 
     def _open(self, some: Mask) -> Indices:
-        still: Indices = np.flatnonzero(
-            some & ~self.accepted & ~self.factors.struck & (self.drops < _CHANCES))
+        still: Indices = np.flatnonzero(some & ~self.accepted & ~self.factors.struck)
         return still
 
     def across(self) -> Mask:
@@ -265,7 +269,7 @@ class Growth:
                 if not len(misfits):
                     break
             self.accepted[misfits] = False
-            self.drops[misfits] += 1
+            self.dropped[misfits] = True
         if not self._knows_noise:
             self._learn_variance(rows)
             self._learnt_of = self.accepted.copy()
@@ -320,20 +324,16 @@ class Growth:
         return innovations(self.subgraph(rows), self.poses, self.posterior, widths)
 
     def news(self) -> Indices:
-        """Return the loops to accept next, (k,); in the end what was dropped, all at once."""
-        news = self.believable(self.undecided())
-        fresh: Indices = news[self.drops[news] == 0]
-        if len(fresh):
-            return fresh
-        self.drops[self.drops > 0] += 1
-        return news
+        """Return the loops to accept next, (k,)."""
+        news: Indices = self.believable(self.undecided())
+        return news[~self.dropped[news]]
 
     def believable(self, rows: Indices) -> Indices:
         """Return which of some loops may be accepted: each by itself, or else together, (k,)."""
         if not len(rows):
             return rows
         found, loops = self.innovations(rows), self.accepted & self.is_loop
-        fits = found.square < self.gate(found.freedom)
+        fits = (found.square < self.gate(found.freedom)) & self.in_tail[rows]
         refused = self.is_loop & ~self.accepted
         refused[rows[fits]] = False
         # Taken at their word all are noisier than they are, so that more fit by chance: then only
