@@ -13,7 +13,6 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, turned
 from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.linear_system import whitened_residual
@@ -40,6 +39,8 @@ REFUSED = 1e-3
 _DROPPED = 2e-5
 # Probability that any true factor of a round is doubted for what the others say.
 _DOUBTED = 0.01
+# A loop that was dropped that often is not tried again.
+_CHANCES = 2
 # What is measured of the noise counts against as many factors on which it was measured before.
 _KNOWN = 20
 # The noise is learnt to be no less than this part of the variance that was found first: factors
@@ -71,8 +72,8 @@ class Growth:
     high : (m,) the earlier and the later keyframe of each; place : (m,) see `places`; part : (n,)
     number of the part of each keyframe; poses : (n, p) the L2 map of the accepted; posterior : of
     these; variance : (2,) of odometry and loops in units of what they state; slip_odds : ln
-    P(slipped) / P(measured) of the odometry factors that were suspected; dropped : (m,) bool,
-    accepted and did not fit; at_their_word : whether factors may be as noisy as they say;
+    P(slipped) / P(measured) of the odometry factors that were suspected; drops : (m,) how often
+    each was accepted and did not fit; at_their_word : whether factors may be as noisy as they say;
     in_tail : (m,) bool, not the loops that are too far off for that; check : called before long
     steps, raises where the work shall stop.
     """
@@ -98,8 +99,8 @@ class Growth:
         self._floor, self.at_their_word = np.full(2, _LEAST_VARIANCE), False
         self.posterior: Posterior
         self.slip_odds: dict[int, float] = {}
-        self.dropped = np.zeros(len(self.factors), bool)
-        self.in_tail = ~self.dropped
+        self.drops = np.zeros(len(self.factors), np.int64)
+        self.in_tail = np.ones(len(self.factors), bool)
 
     @cached_property
     def _places(self) -> tuple[Indices, Array]:
@@ -178,9 +179,8 @@ class Growth:
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
         clone = copy.copy(self)
-        clone.accepted, clone.dropped = self.accepted.copy(), self.dropped.copy()
-        clone.cut, clone.variance = self.cut.copy(), self.variance.copy()
-        clone.slip_odds = self.slip_odds.copy()
+        for name in ('accepted', 'drops', 'cut', 'variance', 'slip_odds'):
+            setattr(clone, name, getattr(self, name).copy())
         return clone
 
     def uncut(self) -> 'Growth':
@@ -220,7 +220,7 @@ class Growth:
         self.in_tail[rows] = stand_apart(self.innovations(rows), own, self.gate,
                                          int((self.accepted & self.is_loop).sum()))
         self.at_their_word = True
-        self.dropped[:] = False
+        self.drops[:] = 0
 
     def undecided(self) -> Indices:
         """Return the loops within a part that may yet be accepted, (k,)."""
@@ -228,10 +228,11 @@ class Growth:
 
     def joining(self) -> Indices:
         """Return the loops from one part to another that may yet be accepted, (k,)."""
-        return self._open(self.across() & ~self.dropped)
+        return self._open(self.across())
 
     def _open(self, some: Mask) -> Indices:
-        still: Indices = np.flatnonzero(some & ~self.accepted & ~self.factors.struck)
+        still: Indices = np.flatnonzero(
+            some & ~self.accepted & ~self.factors.struck & (self.drops < _CHANCES))
         return still
 
     def across(self) -> Mask:
@@ -269,7 +270,7 @@ class Growth:
                 if not len(misfits):
                     break
             self.accepted[misfits] = False
-            self.dropped[misfits] = True
+            self.drops[misfits] += 1
         if not self._knows_noise:
             self._learn_variance(rows)
             self._learnt_of = self.accepted.copy()
@@ -324,9 +325,13 @@ class Growth:
         return innovations(self.subgraph(rows), self.poses, self.posterior, widths)
 
     def news(self) -> Indices:
-        """Return the loops to accept next, (k,)."""
-        news: Indices = self.believable(self.undecided())
-        return news[~self.dropped[news]]
+        """Return the loops to accept next, (k,); in the end what was dropped, all at once."""
+        news = self.believable(self.undecided())
+        fresh: Indices = news[self.drops[news] == 0]
+        if len(fresh):
+            return fresh
+        self.drops[self.drops > 0] += 1
+        return news
 
     def believable(self, rows: Indices) -> Indices:
         """Return which of some loops may be accepted: each by itself, or else together, (k,)."""
@@ -343,8 +348,3 @@ class Growth:
             found, self.posterior, self.gate, fits, int(true), self.place[rows],
             beside_refused(self._mates, refused, loops)[rows])]
         return believed
-
-    def some(self, rows: Indices, count: int) -> Indices:
-        """Return so many of some factors, as if at random, or all, (k,)."""
-        chosen: Indices = rows[np.argsort(keys(self.low[rows], self.high[rows]))[:count]]
-        return chosen

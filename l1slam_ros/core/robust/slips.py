@@ -167,7 +167,7 @@ def _without(growth: Growth, step: int) -> Growth | None:
     """Return the state after the rounds that follow if a step is cut; None: it falls apart."""
     state, span = growth.copy(), spanning(growth, step)
     state.cut[step] = True
-    state.dropped[:] = False
+    state.drops[:] = 0
     state.accepted[span] = state.trusted[span]
     state.solve()
     if not join(state) or state.across()[step]:
