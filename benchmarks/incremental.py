@@ -31,6 +31,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     """Return the arguments, with the cells that they ask for as `cells`."""
     from robust.kinds import BICOCCA, LIES
     from updates.cells import CLEAN, GRAPHS, RECORDED, WORLDS, cells
+    from updates.in_space import BUILDING, HILLS
 
     kinds = (CLEAN, *LIES, RECORDED)
     parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
@@ -60,8 +61,8 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
         robust=not arguments.no_robust)]
     if not arguments.cells:
         parser.error('there is no such kind on these graphs')
-    needed = {BICOCCA: Path('real')}
-    for graph in set(arguments.graphs) - set(WORLDS):
+    needed = {BICOCCA: Path('real'), HILLS: Path('real')}
+    for graph in set(arguments.graphs) - {*WORLDS, BUILDING}:
         if not (arguments.datasets / needed.get(graph, Path(f'{graph}.g2o'))).exists():
             parser.error(f'--datasets: {arguments.datasets} has no {graph}')
     return arguments
@@ -78,11 +79,11 @@ def main() -> None:
     from updates.cells import Row, commit, is_done, measure
     from updates.tables import document
 
-    from l1slam_ros.io.compilation import load
+    from l1slam_ros.io.compilation import STEPS, STEPS_IN_SPACE, load
     from l1slam_ros.io.files import write_lines
 
     # Each cell is a copy of this process, which has all loops compiled.
-    load()
+    load((*STEPS, *STEPS_IN_SPACE))
     file = arguments.output / 'results' / 'incremental.json'
     file.parent.mkdir(parents=True, exist_ok=True)
     before = json.loads(file.read_text())['rows'] if file.exists() else []

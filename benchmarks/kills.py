@@ -11,10 +11,10 @@ restarts that did not load, how much was lost at most, and the cost in the end b
 without kills.
 """
 
+import argparse
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -162,7 +162,10 @@ def _run(bag: Path, path: Path, kills: int) -> str:
 
 def main() -> None:
     """Measure, and print."""
-    kills = int(sys.argv[1]) if len(sys.argv) > 1 else KILLS
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('kills', type=int, nargs='?', default=KILLS)
+    kills = parser.parse_args().kills
     rclpy.init()
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / 'bag'

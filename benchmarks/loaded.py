@@ -10,6 +10,7 @@ of ours after each, while the map is saved as `~/save` does it and read, again a
 of the clock, so on a machine that has nothing else to do.
 """
 
+import pickle
 import resource
 import subprocess
 import sys
@@ -17,23 +18,22 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from updates.cells import prefix
 from updates.tables import LARGE_MEMORY
 
-from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.online.snapshot import Growth, Optimised, SavedMap
+from l1slam_ros.core.online.snapshot import BuilderState, Optimised, SavedMap
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.compilation import load
 from l1slam_ros.io.graphs.saved_map import load_map, save_map
 from l1slam_ros.io.trajectory import invented_stamps
-from l1slam_ros.paper.updates import measurements
+from l1slam_ros.paper.updates import Drive
 
 KEYFRAMES, EDGES, REST, RATE = 50_000, 80_000, 1_000, 100.0
 # [s] An update may take so long; bars on the first one, and on any answer.
@@ -47,39 +47,41 @@ def main() -> None:
     """Measure, and print."""
     given = [int(word) for word in sys.argv[1:3]]
     keyframes, edges = given + [KEYFRAMES, EDGES][len(given):]
-    graph = simulate_world(keyframes, edges, WorldOptions(), np.random.default_rng(0)).graph
-    first = keyframes - min(REST, keyframes // 2)
+    if sys.argv[3:]:
+        _save(keyframes, edges, Path(sys.argv[3]))
+        return
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'map.g2o'
-        if sys.argv[3:]:
-            _save(graph, first, Path(sys.argv[3]))
-            return
+        # That one has the graph in its memory, this one has not.
         subprocess.run([sys.executable, __file__, str(keyframes), str(edges), str(path)],
                        check=True)
         load()
         Path('/proc/self/clear_refs').write_text('5')
         with Backend(_OPTIONS) as backend:
-            _measure(backend, graph, first, path)
+            _measure(backend, path)
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     _tell('memory', most, LARGE_MEMORY, 'MiB')
 
 
-def _save(graph: FactorGraph, count: int, path: Path) -> None:
-    """Solve the map of the first keyframes and save it."""
+def _save(keyframes: int, edges: int, path: Path) -> None:
+    """Solve the map of the first keyframes and save it, and beside it what comes then."""
+    graph = simulate_world(keyframes, edges, WorldOptions(), np.random.default_rng(0)).graph
+    count = keyframes - min(REST, keyframes // 2)
     part, chain = prefix(graph, count), odometry_poses(graph)[:count]
     with Backend(_OPTIONS) as backend:
-        backend.restore(SavedMap(Growth.of_graph(part, chain, invented_stamps(count)),
+        backend.restore(SavedMap(BuilderState.of_graph(part, chain, invented_stamps(count)),
                                  Optimised.nothing(chain), True))
         backend.settle()
         print(save_map(path, backend.saved()), flush=True)
+    rest = list(islice(Drive.of(graph).messages, count, None))
+    path.with_suffix('.rest').write_bytes(pickle.dumps(rest))
 
 
-def _measure(backend: Backend, graph: FactorGraph, first: int, path: Path) -> None:
-    rest = [said for k, said in enumerate(measurements(graph)) if k >= first]
+def _measure(backend: Backend, path: Path) -> None:
     read = _seconds(lambda: backend.restore(load_map(path)[0]))
-    print(f'{first} keyframes loaded in {read:.2f} s', flush=True)
+    print(f'{len(backend.poses)} keyframes loaded in {read:.2f} s', flush=True)
     took: list[float] = []
-    driven = threading.Thread(target=lambda: _drive(backend, rest, took))
+    driven = threading.Thread(target=lambda: _drive(backend, path.with_suffix('.rest'), took))
     driven.start()
     answers: dict[str, list[float]] = {'save': [], 'poses': [], 'loops': []}
     while driven.is_alive():
@@ -94,10 +96,10 @@ def _measure(backend: Backend, graph: FactorGraph, first: int, path: Path) -> No
     print(f'updates: median {1e3 * np.median(took):.1f} ms, longest {1e3 * max(took):.1f} ms')
 
 
-def _drive(backend: Backend, rest: list[Any], took: list[float]) -> None:
+def _drive(backend: Backend, rest: Path, took: list[float]) -> None:
     """Let the rest of the drive come, an update after each keyframe; note the seconds of each."""
     due = time.monotonic()
-    for sample, loops in rest:
+    for sample, loops in pickle.loads(rest.read_bytes()):
         backend.add_odometry(sample)
         for loop in loops:
             backend.add_loop(loop)

@@ -2,6 +2,7 @@
 """Fixtures every test may ask for."""
 
 import os
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -60,3 +61,24 @@ def bench(ros):
     yield make
     for made in benches:
         made.close()
+
+
+@pytest.fixture
+def start():
+    """Return what starts the node as a process, in a session of its own; it ends with the test."""
+    from l1slam_ros.ros.demo import executable
+
+    processes = []
+
+    def begin(*arguments, first='', **environment):
+        """Start it, after the shell has done something first."""
+        processes.append(subprocess.Popen(
+            ['sh', '-c', f'{first} exec "$@"', 'sh', executable('backend'), *arguments],
+            stderr=subprocess.PIPE, text=True, start_new_session=True,
+            env={**os.environ, **environment}))
+        return processes[-1]
+
+    yield begin
+    for process in processes:
+        process.kill()
+        process.communicate()

@@ -13,10 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.bags.from_graph import write_graph_bag
 from l1slam_ros.io.bags.reader import read_raw
-from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.ros.node import BackendNode
 from l1slam_ros.ros.publishing import header
 
@@ -103,13 +100,6 @@ def loop(stamp, x=0.0, frame='base_link@1.000000000', variance=0.0):
     message.pose.pose.position.x, message.pose.pose.orientation.w = x, 1.0
     message.pose.covariance = (variance * np.eye(6)).ravel()
     return message
-
-
-def recorded(bag, poses, edges, rng):
-    """Write the bag of a simulated world; return its graph."""
-    graph = simulate_world(poses, edges, WorldOptions(), rng).graph
-    write_graph_bag(bag, GraphRecord(graph, None, np.arange(poses)))
-    return graph
 
 
 def poses_of(path):

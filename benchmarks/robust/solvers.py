@@ -16,7 +16,7 @@ from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.snapshot import ACCEPTED
 from l1slam_ros.core.robust import batch_map
 from l1slam_ros.core.robust.judgement import Doubt
-from l1slam_ros.paper.updates import dimension_of, measurements
+from l1slam_ros.paper.updates import Drive
 
 # Online: an update after so many keyframes, for so long [s].
 _EVERY, _BUDGET = 10, 0.1
@@ -105,8 +105,9 @@ def _online(rate: float) -> Callable[[FactorGraph, Array], Found]:
         nothing = dict.fromkeys(('translation', 'rotation', 'period'), 0.0)
         options = BackendOptions.from_mapping(
             {'keyframe': nothing, 'odometry': {'covariance_source': 'increment'}})
-        with Backend(options, dimension_of(graph), rate > 0) as backend:
-            for k, (sample, loops) in enumerate(measurements(graph), 1):
+        drive = Drive.of(graph)
+        with Backend(options, drive.dimension, rate > 0) as backend:
+            for k, (sample, loops) in enumerate(drive.messages, 1):
                 backend.add_odometry(sample)
                 for loop in loops:
                     backend.add_loop(loop)

@@ -20,10 +20,10 @@ one step of it is never told: what the loops allow is how far the undisturbed ma
 solved without that step, end from what they say with it.
 """
 
+import argparse
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -217,8 +217,12 @@ def moved(messages: list[Event], frame: tuple[float, float, float],
 
 def main() -> None:
     """Measure, and print."""
-    bag = Path(sys.argv[1]) if len(sys.argv) > 1 else BAG
-    rate = float(sys.argv[2]) if len(sys.argv) > 2 else RATE
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('bag', type=Path, nargs='?', default=BAG)
+    parser.add_argument('rate', type=float, nargs='?', default=RATE)
+    given = parser.parse_args()
+    bag, rate = given.bag, given.rate
     rclpy.init()
     messages: list[Event] = [(m.time, m.topic, m.data) for m in read_raw(bag, _KINDS)]
     plays: dict[str, tuple[bool, Callable[[], Iterator[Event]]]] = {

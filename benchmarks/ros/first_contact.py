@@ -2,7 +2,7 @@
 """
 What the node costs when it has nothing to do, and how soon it answers when it has much.
 
-    python benchmarks/ros/first_contact.py GRAPH [POSES EDGES]
+    python benchmarks/ros/first_contact.py GRAPH [POSES [EDGES]]
 
 A saved map of GRAPH is loaded and settles: processor's time then, in % of a core, without
 odometry and with that of a robot that stands, at 50 Hz; the same after 20,000 loops have expired,
@@ -11,6 +11,7 @@ simulated world (50,000 poses, 80,000 edges) is loaded, services are called whil
 SIGTERM ends the node amid an update. The node is a process, run as shipped.
 """
 
+import argparse
 import os
 import signal
 import subprocess
@@ -132,19 +133,24 @@ def main() -> None:
     if sys.argv[1:] == ['bare']:
         _answer()
         return
-    graph = Path(sys.argv[1])
-    poses, edges = map(int, sys.argv[2:4]) if len(sys.argv) > 2 else (POSES, EDGES)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('graph', type=Path)
+    parser.add_argument('poses', type=int, nargs='?', default=POSES)
+    parser.add_argument('edges', type=int, nargs='?', default=EDGES)
+    given = parser.parse_args()
     rclpy.init()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'map.g2o'
-        record = read_graph_file(graph)
+        record = read_graph_file(given.graph)
         write_graph_file(path, replace(record, stamps=_stamps(len(record.ids))))
         with running(path) as backend:
             _at_rest(backend, len(record.ids))
         _bare()
-        world = simulate_world(poses, edges, WorldOptions(), np.random.default_rng(0))
-        write_graph_file(
-            path, GraphRecord(world.graph, world.odometry, np.arange(poses), _stamps(poses)))
+        world = simulate_world(
+            given.poses, given.edges, WorldOptions(), np.random.default_rng(0))
+        write_graph_file(path, GraphRecord(
+            world.graph, world.odometry, np.arange(given.poses), _stamps(given.poses)))
         with running(path) as backend:
             _at_work(backend)
 

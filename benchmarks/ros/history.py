@@ -12,8 +12,8 @@ standard deviation that a measurement may claim. Whatever is not redundant in th
 32 bytes in the plane and 64 in space.
 """
 
+import argparse
 import resource
-import sys
 import time
 
 import numpy as np
@@ -38,7 +38,10 @@ def position(kind: str, seconds: float, rng: np.random.Generator) -> float:
 
 def main() -> None:
     """Measure, and print."""
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else MESSAGES
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('messages', type=int, nargs='?', default=MESSAGES)
+    count = parser.parse_args().messages
     for kind in ('stands', 'goes', 'shakes'):
         for source in ('model', 'increment'):
             _run(kind, source, count)

@@ -11,6 +11,7 @@ kind gave together, and how much as noise alone: the turns in which nobody looke
 against the rest.
 """
 
+import argparse
 import os
 import signal
 import subprocess
@@ -83,9 +84,13 @@ def main() -> int:
     """Measure and print."""
     if sys.argv[1:] == ['look']:
         return _look()
-    given = [float(value) for value in sys.argv[1:]]
-    keyframes, seconds, turns = given + [KEYFRAMES, SECONDS, TURNS][len(given):]
-    n = int(keyframes)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('keyframes', type=int, nargs='?', default=KEYFRAMES)
+    parser.add_argument('seconds', type=float, nargs='?', default=SECONDS)
+    parser.add_argument('turns', type=int, nargs='?', default=TURNS)
+    given = parser.parse_args()
+    n = given.keyframes
     rclpy.init()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'map.g2o'
@@ -100,7 +105,7 @@ def main() -> int:
             probe = Probe()
             _load(probe.node)
             probe.drive(4 * _BETWEEN)
-            _tell(*_measure(probe, looker, seconds, int(turns)))
+            _tell(*_measure(probe, looker, given.seconds, given.turns))
             print(looker.communicate('end\n')[0].strip())
         finally:
             looker.kill()

@@ -10,8 +10,8 @@ colours, sizes, panels and scale, on which background. Neither program is asked:
 what a layout leaves to them are like theirs at best.
 """
 
+import argparse
 import json
-import sys
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -232,7 +232,10 @@ def _write(axes: Axes, lines: list[tuple[str, Any, str]]) -> None:
 
 def main() -> None:
     """Play, listen and draw."""
-    png = Path(sys.argv[1]) if len(sys.argv) > 1 else PNG
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('png', type=Path, nargs='?', default=PNG)
+    png = parser.parse_args().png
     rclpy.init()
     listener = Listener(rclpy.create_node('onlooker'), read_recording(BAG))
     seen = Seen(listener.node)

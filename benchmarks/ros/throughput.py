@@ -12,6 +12,7 @@ other, and how old the last was that they had, over all the time: the node does 
 message of a backlog.
 """
 
+import argparse
 import os
 import signal
 import subprocess
@@ -53,18 +54,23 @@ def main() -> int:
     """Measure and print."""
     if sys.argv[1:] in (['count'], ['listen']):
         return _count() if sys.argv[1] == 'count' else _listen()
-    given = [float(value) for value in sys.argv[1:]]
-    seconds, rate, loops, keyframes = given + [SECONDS, RATE, LOOPS, KEYFRAMES][len(given):]
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('seconds', type=float, nargs='?', default=SECONDS)
+    parser.add_argument('rate', type=float, nargs='?', default=RATE)
+    parser.add_argument('loops', type=float, nargs='?', default=LOOPS)
+    parser.add_argument('keyframes', type=int, nargs='?', default=KEYFRAMES)
+    given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'map.g2o'
-        _write_map(path, int(keyframes))
+        _write_map(path, given.keyframes)
         bare, ear = (subprocess.Popen([sys.executable, __file__, what], stdout=subprocess.PIPE,
                                       text=True) for what in ('count', 'listen'))
         backend = subprocess.Popen([
             executable('backend'), '--ros-args', '--log-level', 'error',
             '-p', f'save_path:={path}', '-p', 'autosave_period:=0.0', '-p', 'load_on_start:=true'])
         try:
-            said, sent, cpu = _measure(seconds, rate, loops, backend.pid)
+            said, sent, cpu = _measure(given.seconds, given.rate, given.loops, backend.pid)
         finally:
             for process in (bare, ear, backend):
                 process.send_signal(signal.SIGINT)

@@ -6,10 +6,13 @@ In: a folder of datasets, and what to measure. Out: `Row`, the cost of the updat
 ISAM2's, and what the map was at checkpoints; that is worked out after the run.
 """
 
+import multiprocessing
 import resource
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,7 @@ from robust.cases import FalseCase, false_case
 from robust.kinds import BICOCCA, CITY, INTEL, KINDS, LIES, MANHATTAN
 from robust.places import Place, error_by_time, place, place_of
 from robust.runs import within
+from updates.in_space import SPACES
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
@@ -30,12 +34,12 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.paper.updates import Isam2, Kept, run_updates
+from l1slam_ros.paper.updates import Drive, Isam2, Kept, run_updates
 
 CHECKPOINTS = 20
 # Simulated: keyframes and edges of the paper's Manhattan10k, and of a large sparse world.
 WORLDS = {'world10k': (10_000, 64_000), 'world50k': (50_000, 80_000)}
-GRAPHS = (INTEL, MANHATTAN, BICOCCA, CITY, *WORLDS)
+GRAPHS = (INTEL, MANHATTAN, BICOCCA, CITY, *WORLDS, *SPACES)
 CLEAN, RECORDED = 'clean', 'recorded'
 # Of all loops that are false, by graph and kind, where it is not the usual share.
 _SHARES = {(MANHATTAN, 'grouped'): (0.3, 0.5)}
@@ -69,7 +73,8 @@ class Row:
 
     commit : of the package; n, edges : of the graph; reached : keyframes per second; ours, peer :
     of `spread`; beside : ours, of the updates that the peer had time for, `peer_poses`; behind :
-    [s] of our other threads; memory : the most that the process held then [MiB].
+    [s] of our other threads; memory : the most that the process held then [MiB], the peer and its
+    graph among it.
 
     At the checkpoints, after `keyframes` (c,), and last a second after the end: excess over the
     L1 optimum of what is believed [%]; position error [m] of the map, of the L1 map of all true
@@ -142,13 +147,16 @@ def measure(datasets: Path, cell: Cell, patience: float) -> Row | None:
     """
     report_progress(f'{cell.graph} {cell.kind} {cell.share:.0%}, '
                     f'{cell.poses or "all"} keyframes')
-    return within(_PATIENCE, lambda: _measured(_place(datasets, cell), cell, patience))
+    return within(_PATIENCE, lambda: _measured(datasets, cell, patience))
 
 
 def _place(datasets: Path, cell: Cell) -> Place:
     if cell.graph in WORLDS:
         world = simulate_world(*WORLDS[cell.graph], WorldOptions(), np.random.default_rng(0))
         found = place_of(cell.graph, world.graph, None, error_by_time(world.truth[:, :2]))
+    elif cell.graph in SPACES:
+        graph, truth = SPACES[cell.graph](datasets)
+        found = place_of(cell.graph, graph, None, error_by_time(truth[:, :3]))
     else:
         found = place(datasets, cell.graph)
     if not 0 < cell.poses < found.graph.n_poses:
@@ -158,24 +166,52 @@ def _place(datasets: Path, cell: Cell) -> Place:
                    is_false=found.is_false[rows], is_true=found.is_true[rows])
 
 
-def _measured(place: Place, cell: Cell, patience: float) -> Row:
-    kind = next(kind for kind in KINDS if kind.name == cell.kind and
-                (kind.suite == 'recorded') == (cell.kind == RECORDED))
-    case = false_case(place, kind, cell.share, 0)
-    graph = case.graph
-    run_updates(prefix(graph, min(_WARM_UP, graph.n_poses)), None, 1e6, 1, cell.robust)
-    peer = Isam2(case.clean, patience) if patience else None
-    # Until here the most was of what made the graph.
-    Path('/proc/self/clear_refs').write_text('5')
-    found = run_updates(graph, peer, cell.rate, CHECKPOINTS, cell.robust)
+def _measured(datasets: Path, cell: Cell, patience: float) -> Row:
+    # Without a peer no graph is made in this process before its memory is known.
+    case = _case(datasets, cell) if patience else None
+    with _played(datasets, cell) as drives:
+        run_updates(next(drives), None, 1e6, 1, cell.robust)
+        drive, peer = next(drives), Isam2(case.clean, patience) if case else None
+        Path('/proc/self/clear_refs').write_text('5')
+        found = run_updates(drive, peer, cell.rate, CHECKPOINTS, cell.robust)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    row = Row(cell, commit(), graph.n_poses, len(graph.between), graph.n_poses / found.elapsed,
+    case = case or _case(datasets, cell)
+    n = case.graph.n_poses
+    row = Row(cell, commit(), n, len(case.graph.between), n / found.elapsed,
               spread(found.ours), found.behind, memory,
               [now.graph.n_poses for now in found.on_the_way])
     if found.peer:
         row = replace(row, peer=spread(found.peer), peer_poses=len(found.peer),
                       beside=spread(found.ours[:len(found.peer)]))
     return _judged(row, case, [*found.on_the_way, found.at_rest])
+
+
+def _case(datasets: Path, cell: Cell) -> FalseCase:
+    kind = next(kind for kind in KINDS if kind.name == cell.kind and
+                (kind.suite == 'recorded') == (cell.kind == RECORDED))
+    return false_case(_place(datasets, cell), kind, cell.share, 0)
+
+
+@contextmanager
+def _played(datasets: Path, cell: Cell) -> Iterator[Iterator[Drive]]:
+    """Give the drives, first a short one to warm up, of a cell that another process makes."""
+    context = multiprocessing.get_context('fork')
+    here, there = context.Pipe(duplex=False)
+    player = context.Process(target=_play, args=(there, datasets, cell))
+    player.start()
+    there.close()
+    yield (Drive(*here.recv(), iter(here.recv, None)) for _ in range(2))
+    player.join()
+
+
+def _play(there: Connection, datasets: Path, cell: Cell) -> None:
+    graph = _case(datasets, cell).graph
+    for part in prefix(graph, min(_WARM_UP, graph.n_poses)), graph:
+        drive = Drive.of(part)
+        there.send((drive.keyframes, drive.dimension))
+        for message in drive.messages:
+            there.send(message)
+        there.send(None)
 
 
 def _judged(row: Row, case: FalseCase, maps: list[Kept]) -> Row:

@@ -10,12 +10,11 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, align, poses_at
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.io.files import NANOSECONDS
+from l1slam_ros.io.files import NANOSECONDS, counted
 from l1slam_ros.io.formats import is_bag, stamps_of
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import named_loops
 from l1slam_ros.io.trajectory import Reference, read_reference
-from l1slam_ros.io.wording import counted
 
 # [ns] As far as that a pose may lie before the first or after the last true one: files round.
 _SAME_STAMP = 1_000_000

@@ -20,11 +20,11 @@ from l1slam_ros.core.solvers.optimality import SENTENCES
 from l1slam_ros.core.solvers.solve import PRIMAL_DUAL
 from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import DENSE, JUDGEMENT, SPARSE, compile_now, with_space
+from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.node_options import read_params_file
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.sentences import DOUBTFUL, doubt_sentence, doubted, judgement_sentences
-from l1slam_ros.io.wording import counted
 
 
 def solve(arguments: argparse.Namespace) -> Ending:

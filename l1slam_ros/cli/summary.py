@@ -12,9 +12,8 @@ from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.names import ANGLE, QUATERNION
 from l1slam_ros.core.robust import inspection
-from l1slam_ros.io.files import NANOSECONDS, stamp_text
+from l1slam_ros.io.files import NANOSECONDS, counted, stamp_text
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.wording import counted
 
 # Errors that many times as large, or as small, as their information says are worth a sentence.
 _OFF_SCALE = 3.0

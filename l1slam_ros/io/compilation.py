@@ -10,6 +10,7 @@ knows without numba that nothing is to be done. The note counts only for the ver
 numba and processor that it was made with, and while the files it names are there.
 """
 
+import ctypes
 import gc
 import hashlib
 import importlib.util
@@ -23,6 +24,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from l1slam_ros.core import kernels
@@ -39,13 +41,17 @@ ONLINE = ('border',)
 STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
 # What poses in space need besides; after the colon: the versions for them of that module's loops.
 _SPACE = ':space'
-_IN_SPACE = {'halpern': f'halpern{_SPACE}', 'cholesky': f'cholesky{_SPACE}',
+IN_SPACE = {'halpern': f'halpern{_SPACE}', 'cholesky': f'cholesky{_SPACE}',
              'blocks': f'blocks{_SPACE}', 'se2': 'se3'}
-STEPS_IN_SPACE = tuple(_IN_SPACE.values())
 
 _KERNELS = Path(__file__).parents[1] / 'core' / 'kernels'
 # [s] How often the caller is asked whether to stop.
 _LOOK = 0.1
+# Of glibc's `mallopt`: from which size on an array has pages of its own, and how much may lie free
+# at the end of a heap. Left alone it raises both, to tens of megabytes for each thread.
+_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
+# [bytes] NumPy asks for huge pages from here on: then fresh ones cost no more than to reuse some.
+_HUGE = 2**22
 # Other processes go first, though not by far: whoever waits for the loops waits for these.
 _NICE = 5
 # What a processor is known by, of all that the kernel of Linux says of it.
@@ -56,7 +62,7 @@ def with_space(steps: tuple[str, ...], manifold: Manifold) -> tuple[str, ...]:
     """Return the steps, and where the poses are not in the plane, what they need besides."""
     if manifold.NAME == 'SE2':
         return steps
-    return (*(_IN_SPACE[step] for step in steps if step in _IN_SPACE), *steps)
+    return (*(IN_SPACE[step] for step in steps if step in IN_SPACE), *steps)
 
 
 def compile_now(steps: Sequence[str], quiet: bool = False) -> None:
@@ -147,6 +153,10 @@ def load(steps: Sequence[str] = STEPS) -> None:
     # Some 100,000 objects that stay: to look at them for garbage takes a tenth of a second.
     gc.collect()
     gc.freeze()
+    with suppress(AttributeError, OSError):  # another C library
+        ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _HUGE)
+        # As it would by itself.
+        ctypes.CDLL(None).mallopt(_TRIM_THRESHOLD, 2 * _HUGE)
 
 
 def make_ready(step: str) -> list[str]:

@@ -22,7 +22,6 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.measurements import QUATERNION_NORM_ERROR
 from l1slam_ros.io.remarks import Remarks, read_remarks
-from l1slam_ros.io.wording import counted
 
 NANOSECONDS = 10**9
 # No pose or information is beyond this, and with less no square of one leaves the doubles.
@@ -163,6 +162,11 @@ def read_lines(path: str | os.PathLike[str]) -> TextLines:
     kept = [(number, line) for number, line in enumerate(text.split('\n'), 1)
             if line and not line.isspace() and not line.lstrip().startswith('#')]
     return TextLines([number for number, _ in kept], [line for _, line in kept], remarks)
+
+
+def counted(count: int, noun: str, plural: str = '') -> str:
+    """Return e.g. `1 loop`, `1,837 loops`; plural : where it is not the noun and an s."""
+    return f'{count:,} {noun if count == 1 else plural or noun + "s"}'
 
 
 def quoted(text: str) -> str:

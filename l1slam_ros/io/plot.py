@@ -21,8 +21,7 @@ from matplotlib.transforms import ScaledTranslation
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.io.files import replacing, require_file
-from l1slam_ros.io.wording import counted
+from l1slam_ros.io.files import counted, replacing, require_file
 
 _SUFFIXES = ('.png', '.svg', '.pdf')
 _BLUE, _GREEN, _ORANGE, _RED, _GREY = '#0072B2', '#009E73', '#E69F00', '#D5370E', '#808080'

@@ -7,7 +7,7 @@ What a saved map says that no graph format has a tag for, in lines that others t
     #L1SLAM <name> <f8 <Base64> the numbers of an array, of NumPy's type `<f8`; more to come, too
     #L1SLAM sha256 <digest>     the last line: of all bytes before, the proof that they are whole
 
-A map of version 1 is the same without Base64: as text numbers take most of the time of saving.
+As text numbers would take most of the time of saving.
 """
 
 import json
@@ -25,7 +25,7 @@ from l1slam_ros.core.errors import FileError
 Remarks = Mapping[str, Any] | None
 
 _KEYWORD = '#L1SLAM '
-_FIRST, _BEFORE = f'{_KEYWORD}map 2', f'{_KEYWORD}map 1'
+_FIRST = f'{_KEYWORD}map 2'
 _PROOF = f'{_KEYWORD}sha256 '
 _LAST = len(_PROOF) + 2 * sha256().digest_size + 1  # bytes of the last line
 # Rows to a line: readers whose lines have an end get through, and other threads their turn.
@@ -85,7 +85,7 @@ def is_proven(path: object, content: bytes) -> bool:
     if last != f'{_PROOF}{sha256(memoryview(content)[:-_LAST]).hexdigest()}\n'.encode():
         raise FileError(path, 'is damaged: its last line is not the checksum of those before; '
                         'expected a saved map as it was written')
-    if not content.startswith((f'{_FIRST}\n'.encode(), f'{_BEFORE}\n'.encode())):
+    if not content.startswith(f'{_FIRST}\n'.encode()):
         raise FileError(path, f'is a saved map of another version; expected {_FIRST!r}', 1)
     return True
 

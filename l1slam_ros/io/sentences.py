@@ -18,9 +18,8 @@ from l1slam_ros.core.robust.judgement import (
     Doubt,
     Judgement,
 )
-from l1slam_ros.io.files import stamp_text
+from l1slam_ros.io.files import counted, stamp_text
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.wording import counted
 
 # The status of a map that is not to be relied on.
 DOUBTFUL = 'doubtful'

@@ -17,6 +17,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.io.files import (
     NANOSECONDS,
     TextLines,
+    counted,
     parse_rows,
     quoted,
     read_lines,
@@ -26,7 +27,6 @@ from l1slam_ros.io.files import (
     write_lines,
 )
 from l1slam_ros.io.graphs.graph_file import read_vertices
-from l1slam_ros.io.wording import counted
 
 _TUM_COLUMNS = 8
 

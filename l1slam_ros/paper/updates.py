@@ -9,7 +9,7 @@ time: others on the machine do not lengthen them, and what goes on behind is cou
 
 import importlib.util
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -132,28 +132,44 @@ class Isam2:
         return self._Pose(self._gtsam.Rot3.Quaternion(w, x, y, z), pose[:3])
 
 
-def measurements(graph: FactorGraph) -> Iterator[tuple[OdometrySample, list[LoopClosure]]]:
-    """Yield each keyframe's odometry and the loops that end there, ten keyframes a second."""
-    forward = turned(graph, graph.between.i > graph.between.j)
-    return recorded(forward, invented_stamps(graph.n_poses).tolist())
+@dataclass(frozen=True)
+class Drive:
+    """
+    What a robot measures on the way, that of a graph.
+
+    keyframes, dimension : how many, of which world; messages : each keyframe's odometry and the
+    loops that end there, ten keyframes a second
+    """
+
+    keyframes: int
+    dimension: int
+    messages: Iterable[tuple[OdometrySample, list[LoopClosure]]]
+
+    @staticmethod
+    def of(graph: FactorGraph) -> 'Drive':
+        """Return that of a graph."""
+        forward = turned(graph, graph.between.i > graph.between.j)
+        stamps = invented_stamps(graph.n_poses).tolist()
+        dimension = int(graph.manifold.positions(graph.manifold.identity(1)).shape[1])
+        return Drive(graph.n_poses, dimension, recorded(forward, stamps))
 
 
-def run_updates(graph: FactorGraph, peer: Isam2 | None, rate: float, maps: int,
+def run_updates(drive: Drive, peer: Isam2 | None, rate: float, maps: int,
                 robust: bool = True, advance: Callable[[], None] = lambda: None) -> Updates:
     """
-    Feed the back end with a graph, an update after each keyframe, and the peer in turn.
+    Feed the back end with a drive, an update after each keyframe, and the peer in turn.
 
     rate : keyframes per second, fewer where the updates of both take longer; maps : how many are
     kept; advance : called after each keyframe
     """
     options = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'),
                              robust=RobustOptions(robust))
-    kept = set(np.linspace(graph.n_poses / maps, graph.n_poses, maps).astype(int))
+    kept = set(np.linspace(drive.keyframes / maps, drive.keyframes, maps).astype(int))
     found = Updates()
-    with Backend(options, dimension_of(graph)) as backend:
+    with Backend(options, drive.dimension) as backend:
         began, whole, alone = time.perf_counter(), time.process_time(), time.thread_time()
         due = began
-        for k, (sample, loops) in enumerate(measurements(graph)):
+        for k, (sample, loops) in enumerate(drive.messages):
             backend.add_odometry(sample)
             for loop in loops:
                 backend.add_loop(loop)
@@ -176,11 +192,6 @@ def run_updates(graph: FactorGraph, peer: Isam2 | None, rate: float, maps: int,
     return found
 
 
-def dimension_of(graph: FactorGraph) -> int:
-    """Return 2 or 3, as the back end calls it."""
-    return int(graph.manifold.positions(graph.manifold.identity(1)).shape[1])
-
-
 def measure_growth(keyframes: int, rate: float, rng: np.random.Generator,
                    advance: Callable[[], None] = lambda: None) -> tuple[Updates, Array]:
     """
@@ -190,10 +201,10 @@ def measure_growth(keyframes: int, rate: float, rng: np.random.Generator,
     the map as it is, ordered anew.
     """
     load()
-    run_updates(_world(_WARM_UP, rng), None, np.inf, 1)
+    run_updates(Drive.of(_world(_WARM_UP, rng)), None, np.inf, 1)
     graph = _world(keyframes, rng)
     peer = Isam2(graph) if importlib.util.find_spec('gtsam') else None
-    updates = run_updates(graph, peer, rate, _BATCHES, advance=advance)
+    updates = run_updates(Drive.of(graph), peer, rate, _BATCHES, advance=advance)
     return updates, np.array([_batch_seconds(now) for now in updates.on_the_way])
 
 

@@ -23,9 +23,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Path as PathMessage
-from rcl_interfaces.msg import Log
 from rclpy.executors import ExternalShutdownException
-from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
@@ -98,13 +96,12 @@ class Heard:
     """
     What the back end published.
 
-    path : the last one; times : [s] when each came; states : loop (reference, end) [ns] -> what
-    has become of it; sentence : of its diagnostics; calm : how many diagnostics in a row said the
-    same of the map, with no other news in between.
+    path : the last one; states : loop (reference, end) [ns] -> what has become of it; sentence :
+    of its diagnostics; calm : how many of these in a row said the same of the map, with no other
+    news in between.
     """
 
     path: PathMessage | None = None
-    times: list[float] = field(default_factory=list)
     states: dict[tuple[int, int], str] = field(default_factory=dict)
     sentence: str = 'nothing yet'
     calm: int = 0
@@ -135,11 +132,9 @@ class Listener:
         every = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         node.create_subscription(DiagnosticArray, 'loop_status', self._hear_of_loops, every)
         node.create_subscription(DiagnosticArray, '/diagnostics', self._hear_of_the_map, 10)
-        node.create_subscription(Log, '/rosout', self._hear_it_log, every)
 
     def _hear(self, message: PathMessage) -> None:
         self.heard.path = message
-        self.heard.times.append(time.monotonic())
         self._move()
 
     def _hear_of_loops(self, message: DiagnosticArray) -> None:
@@ -155,17 +150,13 @@ class Listener:
             said = {key: values[key] for key in OF_THE_MAP if key in values}
             if not said:
                 continue
+            # How far it is with compiling is news, but not of the map.
             if status.message != self.heard.sentence:
                 self.heard.sentence, self.moved = status.message, time.monotonic()
             if said != self._said:
                 self._said = said
                 self._move()
             self.heard.calm += 1
-
-    def _hear_it_log(self, message: Log) -> None:
-        # How far it is with compiling is news, but not of the map; that it failed again is none.
-        if message.name == BACKEND and message.level == LoggingSeverity.INFO:
-            self.moved = time.monotonic()
 
     def _move(self) -> None:
         self.heard.calm, self.moved = 0, time.monotonic()
@@ -266,14 +257,12 @@ def summarise(recording: Recording, heard: Heard, picture: Path) -> str:
                                    aligned_positions(truth, positions), loops[~refused & ~false],
                                    rejected=loops[refused], false=loops[~refused & false],
                                    note=note)])
-    rate = (len(heard.times) - 1) / max(heard.times[-1] - heard.times[0], 1e-9)
     return '\n'.join((
         f'position error  {errors[0]:.3f} m by odometry, {errors[1]:.3f} m in the map (RMSE)',
         f'graph           {len(stamps)} keyframes, {len(loops)} loops, {false.sum()} of them '
         'false',
         f'refused         {(refused & false).sum()} false loops, {(refused & ~false).sum()} true '
         'ones',
-        f'node            {rate:.1f} updates per second',
         f'picture         {picture}'))
 
 

@@ -11,8 +11,8 @@ from rclpy.node import Node
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.core.online.upkeep.live_map import Behind
-from l1slam_ros.ros.inputs.traffic import Traffic
 from l1slam_ros.ros.threads.failures import Failures
+from l1slam_ros.ros.threads.inputs import Traffic
 from l1slam_ros.ros.threads.solver_thread import SolverThread
 
 # Seconds, which are as many publications.

@@ -3,7 +3,7 @@
 The graph as RViz and Foxglove draw it: keyframes as points, factors as lines.
 
 Each namespace is drawn in pieces, a marker each, and only the pieces that changed are sent: most
-of a large map stands still. They are made as bytes, of arrays, see `publishing.path_bytes`.
+of a large map stands still. They are made as bytes, of arrays, see `serialisation.path_bytes`.
 """
 
 import struct
@@ -20,7 +20,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import WORLD
 from l1slam_ros.core.online.snapshot import ACCEPTED, REJECTED, SUSPECT, Snapshot
-from l1slam_ros.ros.publishing import cdr, header_bytes, string_bytes
+from l1slam_ros.io.messages.serialisation import cdr, header_bytes, string_bytes
 
 # As in the pictures: Okabe and Ito's, and a redder red.
 _BLUE, _GREY = (0.0, 0.447, 0.698), (0.5, 0.5, 0.5)

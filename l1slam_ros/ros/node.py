@@ -12,32 +12,25 @@ from collections import Counter
 from functools import partial
 from typing import Any
 
-import numpy as np
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from nav_msgs.msg import Path
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.graphs.map_file import MapFile, unusable_path
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.diagnostics import Diagnostics
-from l1slam_ros.ros.inputs.inputs import Inputs
-from l1slam_ros.ros.loop_status import LoopStatus
-from l1slam_ros.ros.markers import GraphMarkers
 from l1slam_ros.ros.parameters import NodeParameters
-from l1slam_ros.ros.publishing import path_bytes, pose_bytes, pose_with_covariance
+from l1slam_ros.ros.publishing import MapPublisher
+from l1slam_ros.ros.robot import RobotPublisher
 from l1slam_ros.ros.services import MapServices
 from l1slam_ros.ros.threads.failures import Failures
+from l1slam_ros.ros.threads.inputs import Inputs
 from l1slam_ros.ros.threads.job_queue import JobQueue
 from l1slam_ros.ros.threads.solver_thread import SolverThread
-from l1slam_ros.ros.transform import MapToOdom
 
 _REPEAT_WARNING = 5.0  # [s]
 # [s] The end of the node waits so much longer for a map that is being saved.
@@ -67,22 +60,20 @@ class BackendNode(LifecycleNode):
 
     def __init__(self, **keywords: Any):
         super().__init__('backend', **keywords)
-        self._declared = NodeParameters(self, NodeOptions(), self._on_options)
+        self._declared = NodeParameters(self, lambda options: self._backend.set_options(options))
         options = self.options
         self._backend = Backend(options, options.dimension)
-        self._manifold = self._backend.manifold
-        self._told_map, self._told_version = 0, self._backend.version
         self.failures = Failures(self.get_logger(), self.context.ok)
-        self._solver = SolverThread(self._backend, self.failures, self.get_logger(),
-                                    lambda: self.options.update, self._tell)
+        self._solver = SolverThread(
+            self._backend, self.failures, self.get_logger(), self._declared)
         self._jobs = JobQueue(self, self.failures, self._solver.hurry)
-        self._make_publishers()
         self._map_file = MapFile(self._backend, lambda: self.options, self.get_logger().warning)
         if options.load_on_start:
             self._map_file.load_at_start(self.get_logger().info)
-        self._inputs = Inputs(self, self._backend, options, self.failures, self._on_moved,
-                              self._transform.tick)
+        self._robot = RobotPublisher(self, self._backend, self._declared)
+        self._inputs = Inputs(self, self._backend, options, self.failures, self._robot)
         self._diagnostics = Diagnostics(self, self._inputs.traffic, self._solver, self.failures)
+        self._map = MapPublisher(self, self._backend, self._declared, self._diagnostics)
         self._map_services = MapServices(
             self, self._backend, self._jobs, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
@@ -104,10 +95,10 @@ class BackendNode(LifecycleNode):
             self.trigger_configure()
             self.trigger_activate()
         # Active first: who hears of a loaded map may send odometry at once.
-        self._tell(None)
+        self._map.tell()
         self._jobs.start()
         self._map_services.start()
-        self._solver.start()
+        self._solver.start(self._map.tell)
         self._inputs.start()
 
     def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
@@ -165,37 +156,17 @@ class BackendNode(LifecycleNode):
         """Return whether the map is being saved."""
         return self._map_services.is_saving()
 
-    def _make_publishers(self) -> None:
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._path = self.create_publisher(Path, 'path', latched)
-        self._pose = self.create_publisher(PoseStamped, 'pose', 10)
-        self._covariance = self.create_publisher(
-            PoseWithCovarianceStamped, 'pose_with_covariance', 10)
-        self._markers = GraphMarkers(self)
-        self._transform = MapToOdom(self, self._backend, lambda: self.options)
-        self._loop_status = LoopStatus(self)
-
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         """Refuse a file that cannot be; at start its folder may be mounted later."""
         wrong = ''.join(unusable_path(str(parameter.value)) for parameter in parameters
                         if parameter.name == 'save_path')
         return SetParametersResult(successful=not wrong, reason=wrong)
 
-    def _on_options(self, options: NodeOptions) -> None:
-        self._backend.set_options(options)
-
     def _on_time_jump(self, _: TimeJump) -> None:
-        self._transform.forget()
+        self._robot.forget()
         if self.options.on_time_jump == 'reset':
             self.get_logger().warning('the clock jumped back: the map begins anew')
             self._map_services.begin_anew('time jump')
-
-    def _on_moved(self) -> None:
-        robot, manifold = self._backend.robot(), self._manifold
-        if robot is not None:  # else the map has been emptied meanwhile
-            pose = manifold.compose(robot.map_to_odom, robot.odometry)
-            self._pose.publish(pose_bytes(
-                self.options.map_frame, robot.stamp, manifold.to_pose3(pose)[0]))
 
     def _on_second(self) -> None:
         self._inputs.look_at_events()
@@ -215,45 +186,3 @@ class BackendNode(LifecycleNode):
         wrong = f'{count} nodes are called {self.get_fully_qualified_name()}; expected one'
         self.get_logger().warning(wrong, throttle_duration_sec=_REPEAT_WARNING)
         return wrong
-
-    def _tell(self, improvement: Improvement | None) -> None:
-        """Publish what is new; the solver's thread calls it."""
-        if improvement is not None:
-            self._diagnostics.note(improvement)
-        maps, version = self._backend.maps, self._backend.version
-        if maps != self._told_map:
-            self._publish_map()
-            self._told_map = maps
-        elif version != self._told_version:
-            # Nothing new in the map, but a loop can have come for later, or expired.
-            self._loop_status.publish(self._backend.loop_states())
-        elif self._markers.behind:
-            self._markers.publish(self.options.map_frame, self._newest(), self._backend.snapshot())
-        self._told_version = version
-
-    def _publish_map(self) -> None:
-        now = self._backend.snapshot()
-        poses, loops = now.poses, now.loop_states()
-        if not np.isfinite(poses).all() or not np.isfinite(now.map_to_odom).all():
-            raise ArithmeticError('a pose of the map is not finite: it is not published')
-        robot = self._backend.robot()
-        if robot is not None:
-            before, after = (self._manifold.compose(transform, robot.odometry)
-                             for transform in self._backend.moved())
-            self._diagnostics.note_jump(self._manifold, before, after)
-        frame, stamp = self.options.map_frame, self._newest()
-        pose3 = self._manifold.to_pose3(poses)
-        self._path.publish(path_bytes(frame, stamp, now.stamps, pose3))
-        self._loop_status.publish(loops)
-        self._markers.publish(frame, stamp, now)
-        if self._covariance.get_subscription_count() and len(poses):
-            covariance = self._backend.marginal_covariance(len(poses) - 1)
-            # None: a later map knows it, if any.
-            if covariance is not None:
-                self._covariance.publish(pose_with_covariance(
-                    frame, int(now.stamps[-1]), self._manifold, poses[-1:], covariance))
-
-    def _newest(self) -> int:
-        """Return the stamp of the newest odometry [ns], 0 where there is none."""
-        robot = self._backend.robot()
-        return robot.stamp if robot is not None else 0

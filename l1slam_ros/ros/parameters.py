@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options <-> ROS parameters, generically: a parameter is declared nowhere but at its field."""
+"""Options <-> ROS parameters: one is declared nowhere but at its field."""
 
 from collections.abc import Callable
 from difflib import get_close_matches
-from typing import Generic
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -16,17 +15,17 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from l1slam_ros.core.errors import OptionError
-from l1slam_ros.core.options import AnyOptions, Meaning, Scalar, flatten, with_values
+from l1slam_ros.core.options import Meaning, Scalar, flatten, with_values
+from l1slam_ros.io.node_options import NodeOptions
 
 
-class NodeParameters(Generic[AnyOptions]):
+class NodeParameters:
     """
     The parameters of a node, as one options record that follows every change.
 
     Parameters
     ----------
     node : where to declare them
-    defaults : the options as shipped
     on_change : called with the new options after each accepted change
 
     Raises
@@ -35,16 +34,14 @@ class NodeParameters(Generic[AnyOptions]):
 
     """
 
-    def __init__(self, node: Node, defaults: AnyOptions,
-                 on_change: Callable[[AnyOptions], None]):
-        self._node, self._names = node, set(flatten(defaults))
-        self._on_change = on_change
+    def __init__(self, node: Node, on_change: Callable[[NodeOptions], None]):
+        self._node, self._on_change = node, on_change
         try:
             given = {name: node.declare_parameter(name, value, _descriptor(value, meaning)).value
-                     for name, (value, meaning) in flatten(defaults).items()}
+                     for name, (value, meaning) in flatten(NodeOptions()).items()}
         except ParameterException as error:
             raise OptionError(str(error)) from error
-        self.options = with_values(defaults, given)
+        self.options = with_values(NodeOptions(), given)
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
 
@@ -71,10 +68,10 @@ class NodeParameters(Generic[AnyOptions]):
             self.options = changed
             self._on_change(changed)
 
-    def _changed(self, parameters: list[Parameter]) -> AnyOptions:
+    def _changed(self, parameters: list[Parameter]) -> NodeOptions:
         return with_values(self.options, {parameter.name: parameter.value
                                           for parameter in parameters
-                                          if parameter.name in self._names})
+                                          if parameter.name in flatten(self.options)})
 
 
 def _descriptor(value: Scalar, meaning: Meaning) -> ParameterDescriptor:

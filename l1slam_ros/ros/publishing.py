@@ -1,77 +1,89 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses -> messages: pure functions of arrays and stamps."""
-
-import struct
+"""The map on its topics, as often as there is something new in it."""
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Path
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
-from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-
-_SECOND = 1_000_000_000
-# CDR, little endian.
-_ENCAPSULATION = b'\x00\x01\x00\x00'
-
-
-def cdr(*parts: tuple[int, bytes | memoryview]) -> bytes:
-    """Return a serialised message of parts, each at a multiple of so many bytes from the start."""
-    data = bytearray()
-    for multiple, part in parts:
-        data += bytes(-len(data) % multiple)
-        data += part
-    return _ENCAPSULATION + data
+from l1slam_ros.core.geometry.manifold import Array, Manifold
+from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.core.online.update import Improvement
+from l1slam_ros.io.files import NANOSECONDS
+from l1slam_ros.io.messages.serialisation import path_bytes
+from l1slam_ros.ros.diagnostics import Diagnostics
+from l1slam_ros.ros.loop_status import LoopStatus
+from l1slam_ros.ros.markers import GraphMarkers
+from l1slam_ros.ros.parameters import NodeParameters
 
 
-def path_bytes(frame: str, stamp: int, stamps: Indices, pose3: Array) -> bytes:
+class MapPublisher:
     """
-    Return a serialised nav_msgs/Path, made from one structured array: no object per pose.
-
-    Each PoseStamped is a header (seconds, nanoseconds, length and characters of the frame) padded
-    to a multiple of 8, then seven doubles. All poses after the first start at a multiple of 8
-    and have one layout. Records are therefore cut one header later: (doubles of pose k, header
-    of pose k + 1); the header of the first pose, whose padding differs, goes in front, and the
-    last record's header is cut off.
+    Publishes `path`, `pose_with_covariance`, `graph` and `loop_status`.
 
     Parameters
     ----------
-    frame : the frame of the path and of each pose
-    stamp : of the path's own header [ns]
-    stamps : (n,) of the poses [ns]
-    pose3 : (n, 7) x y z qx qy qz qw
+    node : to publish from
+    backend : whose map
+    parameters : of the node
+    diagnostics : told of updates, and of how far they moved the robot
 
     """
-    start = (4, header_bytes(frame, stamp)), (4, struct.pack('<I', len(stamps)))
-    if not len(stamps):
-        return cdr(*start)
-    name = string_bytes(frame)
-    record = np.dtype([('pose', '<f8', 7), ('seconds', '<i4'), ('nanoseconds', '<u4'),
-                       ('frame', f'V{len(name) + (-len(name) - 8) % 8}')])
-    records = np.zeros(len(stamps), record)
-    records['pose'] = pose3
-    seconds, nanoseconds = np.divmod(stamps, _SECOND)
-    records['seconds'][:-1] = seconds[1:]
-    records['nanoseconds'][:-1] = nanoseconds[1:]
-    records['frame'] = np.void(name.ljust(record['frame'].itemsize, b'\0'))
-    body = memoryview(records.tobytes())[: -(record.itemsize - 56)]
-    return cdr(*start, (4, header_bytes(frame, int(stamps[0]))), (8, body))
 
+    def __init__(self, node: Node, backend: Backend, parameters: NodeParameters,
+                 diagnostics: Diagnostics):
+        self._backend, self._diagnostics = backend, diagnostics
+        self._frame = parameters.options.map_frame
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._path = node.create_publisher(Path, 'path', latched)
+        self.covariance = node.create_publisher(
+            PoseWithCovarianceStamped, 'pose_with_covariance', 10)
+        self._markers, self._loop_status = GraphMarkers(node), LoopStatus(node)
+        self._maps, self._version = 0, backend.version
 
-def pose_bytes(frame: str, stamp: int, pose3: Array) -> bytes:
-    """Return a serialised geometry_msgs/PoseStamped: one pose (7,) at one time [ns]."""
-    return cdr((4, header_bytes(frame, stamp)), (8, pose3.tobytes()))
+    def tell(self, improvement: Improvement | None = None) -> None:
+        """Publish what is new; improvement : what the last update did, None: nothing."""
+        if improvement is not None:
+            self._diagnostics.note(improvement)
+        maps, version = self._backend.maps, self._backend.version
+        if maps != self._maps:
+            self._publish_map()
+            self._maps = maps
+        elif version != self._version:
+            # Nothing new in the map, but a loop can have come for later, or expired.
+            self._loop_status.publish(self._backend.loop_states())
+        elif self._markers.behind:
+            self._markers.publish(self._frame, self._newest(), self._backend.snapshot())
+        self._version = version
 
+    def _publish_map(self) -> None:
+        now, manifold = self._backend.snapshot(), self._backend.manifold
+        poses, loops = now.poses, now.loop_states()
+        if not np.isfinite(poses).all() or not np.isfinite(now.map_to_odom).all():
+            raise ArithmeticError('a pose of the map is not finite: it is not published')
+        robot = self._backend.robot()
+        if robot is not None:
+            before, after = (manifold.compose(transform, robot.odometry)
+                             for transform in self._backend.moved())
+            self._diagnostics.note_jump(manifold, before, after)
+        stamp = self._newest()
+        self._path.publish(path_bytes(self._frame, stamp, now.stamps, manifold.to_pose3(poses)))
+        self._loop_status.publish(loops)
+        self._markers.publish(self._frame, stamp, now)
+        if self.covariance.get_subscription_count() and len(poses):
+            covariance = self._backend.marginal_covariance(len(poses) - 1)
+            # None: a later map knows it, if any.
+            if covariance is not None:
+                self.covariance.publish(pose_with_covariance(
+                    self._frame, int(now.stamps[-1]), manifold, poses[-1:], covariance))
 
-def transform_bytes(parent: str, child: str, stamp: int, pose3: Array,
-                    in_sequence: bool = False) -> bytes:
-    """
-    Return a serialised geometry_msgs/TransformStamped: the pose (7,) of the child in the parent.
-
-    in_sequence : as the only one of a sequence, which is a tf2_msgs/TFMessage
-    """
-    return cdr((4, struct.pack('<I', 1) if in_sequence else b''), (4, header_bytes(parent, stamp)),
-               (4, string_bytes(child)), (8, pose3.tobytes()))
+    def _newest(self) -> int:
+        """Return the stamp of the newest odometry [ns], 0 where there is none."""
+        robot = self._backend.robot()
+        return robot.stamp if robot is not None else 0
 
 
 def pose_with_covariance(frame: str, stamp: int, manifold: Manifold, pose: Array,
@@ -96,17 +108,5 @@ def pose_with_covariance(frame: str, stamp: int, manifold: Manifold, pose: Array
 
 def header(frame: str, stamp: int) -> Header:
     """Return a header with its stamp [ns]."""
-    seconds, nanoseconds = divmod(int(stamp), _SECOND)
+    seconds, nanoseconds = divmod(int(stamp), NANOSECONDS)
     return Header(frame_id=frame, stamp=Time(sec=seconds, nanosec=nanoseconds))
-
-
-def string_bytes(text: str) -> bytes:
-    """Return a CDR string: its length with the closing zero, its characters."""
-    data = text.encode() + b'\0'
-    return struct.pack('<I', len(data)) + data
-
-
-def header_bytes(frame: str, stamp: int) -> bytes:
-    """Return a std_msgs/Header in CDR; stamp [ns]."""
-    seconds, nanoseconds = divmod(stamp, _SECOND)
-    return struct.pack('<iI', seconds, nanoseconds) + string_bytes(frame)

@@ -13,7 +13,7 @@ import pytest
 from l1slam_ros.core import kernels
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io import compilation
-from l1slam_ros.io.compilation import STEPS, STEPS_IN_SPACE, fill_cache
+from l1slam_ros.io.compilation import IN_SPACE, STEPS, fill_cache
 from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
 
 # Prints what a process compiles.
@@ -198,10 +198,10 @@ def test_only_what_is_needed_is_read(world, what, most_loops, missing):
 
 def test_every_module_of_loops_is_a_step():
     modules = {module.name for module in pkgutil.iter_modules(kernels.__path__)}
-    assert {step.split(':')[0] for step in (*STEPS, *STEPS_IN_SPACE)} == modules - {'compiled'}
+    assert {step.split(':')[0] for step in (*STEPS, *IN_SPACE.values())} == modules - {'compiled'}
     assert set(STEPS) == {*compilation.SPARSE, *compilation.JUDGEMENT, *compilation.DENSE,
                           *compilation.ONLINE}
-    assert not {'se3', *STEPS_IN_SPACE} & set(STEPS)
+    assert not {'se3', *IN_SPACE.values()} & set(STEPS)
 
 
 def test_every_version_for_space_is_in_a_step_for_space():
@@ -209,4 +209,4 @@ def test_every_version_for_space_is_in_a_step_for_space():
         module = importlib.import_module(f'{kernels.__name__}.{name}')
         wider = [kernel for kernel in vars(module).values()
                  if getattr(kernel, 'takes_in_space', ())]
-        assert bool(wider) == (f'{name}:space' in STEPS_IN_SPACE)
+        assert bool(wider) == (f'{name}:space' in IN_SPACE.values())

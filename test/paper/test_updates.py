@@ -5,7 +5,7 @@ import numpy as np
 
 from l1slam_ros.core.graph.factor_graph import turned
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.paper.updates import measure_growth, run_updates
+from l1slam_ros.paper.updates import Drive, measure_growth, run_updates
 
 
 class Peer:
@@ -19,7 +19,8 @@ def test_the_back_end_gets_all_of_the_graph_and_the_peer_its_turns():
     graph = simulate_world(80, 160, WorldOptions(), np.random.default_rng(3)).graph
     backward = ~graph.between.is_odometry & (np.arange(160) % 2 == 0)
     told = []
-    found = run_updates(turned(graph, backward), Peer(), 1e4, 4, advance=lambda: told.append(1))
+    drive = Drive.of(turned(graph, backward))
+    found = run_updates(drive, Peer(), 1e4, 4, advance=lambda: told.append(1))
     assert len(found.ours) == len(told) == 80 and min(found.ours) > 0
     assert found.peer == [0.002] * 50
     assert [now.graph.n_poses for now in found.on_the_way] == [20, 40, 60, 80]

@@ -12,10 +12,8 @@ from node_bench import call, poses_of
 from rosgraph_msgs.msg import Clock
 
 import l1slam_ros as l1
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.bags.from_graph import write_graph_bag
+from bags import write_world
 from l1slam_ros.io.bags.reader import read_raw
-from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.ros.publishing import header
 
 N = 120
@@ -23,15 +21,14 @@ KINDS = {'/odom': Odometry, '/loop_closures': PoseWithCovarianceStamped}
 
 
 def test_a_bag_played_twice_by_a_clock_that_stands_is_the_map_and_the_odometry(bench, tmp_path):
-    world = simulate_world(N, 240, WorldOptions(), np.random.default_rng(3))
-    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, world.odometry, np.arange(N)))
+    graph = write_world(tmp_path / 'bag', N, 240, 3).graph
     messages = list(read_raw(tmp_path / 'bag', KINDS))
     b = bench(use_sim_time=True, **{
         'keyframe.translation': 0.0, 'keyframe.rotation': 0.0, 'keyframe.period': 0.0,
         'odometry.covariance_source': 'increment'})
     clock = b.peer.create_publisher(Clock, '/clock', 10)
     b.until(clock.get_subscription_count, 'the node hears the clock')
-    once = l1.solve(world.graph).poses
+    once = l1.solve(graph).poses
     for turn in 1, 2:
         for number, message in enumerate(messages):
             if not len(messages) / 3 < number < len(messages) / 2:
@@ -42,4 +39,4 @@ def test_a_bag_played_twice_by_a_clock_that_stands_is_the_map_and_the_odometry(b
         # One of before it was optimised may have as many keyframes.
         b.until(lambda turn=turn: len(b.path().poses) == turn * N and np.abs(
             poses_of(b.path())[:N] - once)[:, :2].max() < 0.05, 'the map is published')
-    assert b.status()[2]['refused.repeated'] == str(len(world.graph.between) - N + 1)
+    assert b.status()[2]['refused.repeated'] == str(len(graph.between) - N + 1)

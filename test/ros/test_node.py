@@ -16,13 +16,13 @@ from node_bench import (
     loop,
     odometry,
     poses_of,
-    recorded,
 )
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 from torn import torn_graph
 
+from bags import write_world
 from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
@@ -55,8 +55,8 @@ def assert_near_optimum(bench, graph, optimum, tolerance):
         f'the cost is at most {limit}')
 
 
-def test_a_recorded_world_becomes_its_optimal_map(bench, tmp_path, rng):
-    graph = recorded(tmp_path / 'bag', 300, 500, rng)
+def test_a_recorded_world_becomes_its_optimal_map(bench, tmp_path):
+    graph = write_world(tmp_path / 'bag', 300, 500).graph
     cholesky = cholesky_of(graph)
     seed = seed_poses(graph, cholesky)
     optimum = minimise_interior_point(graph, seed, OptimiserOptions(), cholesky).cost
@@ -116,8 +116,8 @@ def test_intel_survives_repeated_loops_and_absurd_covariances(bench, tmp_path, d
     b.until(lambda: error() < 0.15, 'the map is that of the clean messages')
 
 
-def test_pose_and_transform_agree_with_the_path(bench, tmp_path, rng):
-    recorded(tmp_path / 'bag', 120, 200, rng)
+def test_pose_and_transform_agree_with_the_path(bench, tmp_path):
+    write_world(tmp_path / 'bag', 120, 200)
     b = bench(**EVERY_MESSAGE)
     b.play(tmp_path / 'bag')
     b.until(lambda: len(b.path().poses) == 120, 'all keyframes are in the Path')
@@ -200,8 +200,8 @@ def test_a_saved_map_is_loaded_and_odometry_goes_on_from_its_end(bench, tmp_path
     assert b.received['pose'][-1].pose.position.x == pytest.approx(3.1)
 
 
-def test_optimize_answers_with_the_cost_and_a_broken_file_leaves_the_map(bench, tmp_path, rng):
-    recorded(tmp_path / 'bag', 60, 90, rng)
+def test_optimize_answers_with_the_cost_and_a_broken_file_leaves_the_map(bench, tmp_path):
+    write_world(tmp_path / 'bag', 60, 90)
     (tmp_path / 'broken.g2o').write_text('no graph')
     b = bench(save_path=str(tmp_path / 'broken.g2o'), **EVERY_MESSAGE)
     assert call(b, 'optimize').message == 'there are no factors yet'

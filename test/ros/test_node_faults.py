@@ -16,7 +16,7 @@ from node_bench import call, loop
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs import saved_map
 from l1slam_ros.io.messages import conversion
-from l1slam_ros.ros import node
+from l1slam_ros.ros import publishing
 
 FAULTS = ['ValueError', 'MemoryError', 'nan']
 
@@ -139,7 +139,7 @@ def test_a_callback_that_fails(bench, monkeypatch, kind):
 
 
 def test_a_publisher_that_fails(bench, monkeypatch):
-    fault = Fault(monkeypatch, node, 'path_bytes', 'ValueError')
+    fault = Fault(monkeypatch, publishing, 'path_bytes', 'ValueError')
     fault.on = True
     b = bench()
     b.drive(0, 3)

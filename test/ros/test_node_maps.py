@@ -3,7 +3,6 @@
 
 import os
 import signal
-import subprocess
 import threading
 import time
 
@@ -22,7 +21,6 @@ from std_srvs.srv import Trigger
 
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs.saved_map import is_map, load_map
-from l1slam_ros.ros.demo import executable
 
 DEADLINE = 60.0
 
@@ -127,11 +125,9 @@ def test_a_map_that_cannot_be_saved_is_an_error_until_it_can(bench, tmp_path, ca
 class Robot:
     """The node as a process, and a peer that drives and listens."""
 
-    def __init__(self, ros, path):
-        self.process = subprocess.Popen(
-            [executable('backend'), '--ros-args', '-p', f'save_path:={path}', '-p',
-             'autosave_period:=0.2', '-p', 'load_on_start:=true'], stderr=subprocess.PIPE,
-            text=True)
+    def __init__(self, ros, start, path):
+        self.process = start('--ros-args', '-p', f'save_path:={path}', '-p',
+                             'autosave_period:=0.2', '-p', 'load_on_start:=true')
         self.node, self.heard = ros.create_node('robot'), []
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(PathMessage, 'path', self.heard.append, latched)
@@ -155,28 +151,13 @@ class Robot:
         return said
 
 
-@pytest.fixture
-def start(ros):
-    """Start robots that end with the test, however it ends."""
-    robots = []
-
-    def start(path):
-        robots.append(Robot(ros, path))
-        return robots[-1]
-
-    yield start
-    for robot in robots:
-        robot.process.kill()
-        robot.process.wait()
-
-
-def test_a_killed_node_goes_on_where_it_was_and_a_signal_loses_nothing(start, tmp_path):
+def test_a_killed_node_goes_on_where_it_was_and_a_signal_loses_nothing(ros, start, tmp_path):
     path = tmp_path / 'map.g2o'
-    first = start(path)
+    first = Robot(ros, start, path)
     first.drive(0, 10)
     first.until(lambda: keyframes(path) == 10, 'all is saved')
     first.end(signal.SIGKILL)
-    second = start(path)
+    second = Robot(ros, start, path)
     second.until(lambda: second.heard, 'the map is back')
     assert len(second.heard[-1].poses) == 10
     second.drive(10, 20)

@@ -6,13 +6,14 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from node_bench import EVERY_MESSAGE, loop, recorded
+from node_bench import EVERY_MESSAGE, loop
 from rclpy.serialization import deserialize_message
 from systems import dense_covariance
 from visualization_msgs.msg import Marker, MarkerArray
 
+from bags import write_world
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.online.snapshot import (
     ACCEPTED,
@@ -21,9 +22,10 @@ from l1slam_ros.core.online.snapshot import (
     WAITING,
     LoopStates,
 )
-from l1slam_ros.ros.loop_status import LoopStatus
+from l1slam_ros.io.messages.serialisation import header_bytes
+from l1slam_ros.ros.loop_status import LoopStatus, states_bytes
 from l1slam_ros.ros.markers import _array_bytes
-from l1slam_ros.ros.publishing import header_bytes, pose_with_covariance
+from l1slam_ros.ros.publishing import pose_with_covariance
 
 
 class Drawing:
@@ -48,8 +50,8 @@ class Drawing:
         return sizes
 
 
-def test_the_graph_is_drawn_for_who_looks_also_for_who_comes_late(bench, tmp_path, rng):
-    recorded(tmp_path / 'bag', 40, 60, rng)
+def test_the_graph_is_drawn_for_who_looks_also_for_who_comes_late(bench, tmp_path):
+    write_world(tmp_path / 'bag', 40, 60)
     b = bench(**EVERY_MESSAGE)
     early = Drawing(b)
     b.play(tmp_path / 'bag')
@@ -94,6 +96,25 @@ def test_markers_are_what_their_bytes_say(frame, rng):
         assert not marker.text and not marker.mesh_resource and not marker.texture.data
 
 
+# Every remainder modulo 4.
+@pytest.mark.parametrize('name', ['/b', '/ba', '/bac', '/back'])
+def test_ros_reads_the_states_of_loops_that_were_meant(name):
+    stamps = np.array([[1, 2], [10**9 + 5, 7 * 10**9], [3, 4 * 10**9 + 1]])
+    states = LoopStates(np.arange(2), stamps, np.array([ACCEPTED, REJECTED, WAITING]),
+                        np.array([0.5, 12.346, np.nan]))
+    data = states_bytes(name, 5_000_000_007, states, [1, 2])
+    read = deserialize_message(data, DiagnosticArray)
+    assert (read.header.stamp.sec, read.header.stamp.nanosec) == (5, 7)
+    refused, waiting = read.status
+    assert refused.name == f'{name}: loop 1.000000005 - 7.000000000'
+    assert (refused.level, refused.message, refused.hardware_id) == (
+        DiagnosticStatus.WARN, 'rejected', name)
+    assert {value.key: value.value for value in refused.values} == {
+        'reference_stamp': '1.000000005', 'stamp': '7.000000000', 'state': 'rejected',
+        'sigmas': '12.35'}
+    assert waiting.level == DiagnosticStatus.OK and waiting.values[3].value == ''
+
+
 def test_each_loop_is_told_of_when_it_comes_and_when_it_changes(bench):
     b = bench()
     told, status = [], LoopStatus(b.peer)
@@ -114,12 +135,12 @@ def test_each_loop_is_told_of_when_it_comes_and_when_it_changes(bench):
                     [('7', 'waiting')]]
 
 
-def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path, rng):
-    recorded(tmp_path / 'bag', 60, 130, rng)
+def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path):
+    write_world(tmp_path / 'bag', 60, 130)
     b = bench(**EVERY_MESSAGE)
     heard = []
     b.peer.create_subscription(PoseWithCovarianceStamped, 'pose_with_covariance', heard.append, 10)
-    b.until(lambda: b.backend._covariance.get_subscription_count(), 'somebody listens')
+    b.until(lambda: b.backend._map.covariance.get_subscription_count(), 'somebody listens')
     b.play(tmp_path / 'bag')
     b.until(lambda: heard and heard[-1].header.stamp == b.path().poses[-1].header.stamp
             and b.backend._backend.update(0.0) is None, 'the map is done')

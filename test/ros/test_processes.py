@@ -8,7 +8,6 @@ import time
 from collections import Counter
 from contextlib import contextmanager
 
-import numpy as np
 import pytest
 
 rclpy = pytest.importorskip('rclpy')
@@ -20,29 +19,24 @@ from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.bags.from_graph import write_graph_bag
+from bags import write_world
 from l1slam_ros.io.bags.reader import read_raw
-from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.ros.demo import executable
 
 DEADLINE = 300.0  # [s] the solver can have to be compiled first
 
 
 @pytest.fixture
-def backend():
-    process = subprocess.Popen([executable('backend')], stderr=subprocess.PIPE, text=True)
+def backend(start):
+    process = start()
     # The node says when it is ready; before that a signal would meet a half-started process.
     assert 'ready' in process.stderr.readline()
-    yield process
-    process.kill()
-    process.communicate()
+    return process
 
 
 @pytest.fixture
-def bag(tmp_path, rng):
-    world = simulate_world(200, 300, WorldOptions(), rng)
-    write_graph_bag(tmp_path / 'bag', GraphRecord(world.graph, None, np.arange(200)))
+def bag(tmp_path):
+    write_world(tmp_path / 'bag', 200, 300)
     return tmp_path / 'bag'
 
 

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A signal ends the node soon, with exit code 0 and in silence, whatever it is doing."""
 
-import os
 import signal
-import subprocess
 import time
 from pathlib import Path
 
@@ -16,31 +14,11 @@ from std_srvs.srv import Trigger
 
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
-from l1slam_ros.ros.demo import executable
 
 DEADLINE = 60.0
 # [s] Two are promised; a busy machine takes its part.
 SOON = 6.0
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
-
-
-@pytest.fixture
-def start():
-    """Return what starts the node in a session of its own, which must be empty afterwards."""
-    processes = []
-
-    def begin(*arguments, first='', **environment):
-        """Start it, after the shell has done something first."""
-        processes.append(subprocess.Popen(
-            ['sh', '-c', f'{first} exec "$@"', 'sh', executable('backend'), *arguments],
-            stderr=subprocess.PIPE, text=True, start_new_session=True,
-            env={**os.environ, **environment}))
-        return processes[-1]
-
-    yield begin
-    for process in processes:
-        process.kill()
-        process.communicate()
 
 
 def until(condition, what):

@@ -3,7 +3,9 @@
 
 import pytest
 
-from l1slam_ros.ros.inputs.traffic import Traffic
+pytest.importorskip('rclpy')
+
+from l1slam_ros.ros.threads.inputs import Traffic
 
 
 def count(numbers, publishers=1):

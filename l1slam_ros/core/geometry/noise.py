@@ -99,6 +99,17 @@ def usable(covariance: Array) -> Mask:
     return np.asarray(np.logical_not(flawed))
 
 
+def without_unset(covariance: Array) -> Array:
+    """
+    Return covariances (m, d, d) with a variance of 1 in rows and columns of zeros.
+
+    For `usable`: a message may leave z, roll and pitch unset, and its x, y and yaw are as good.
+    What is all zeros stays so.
+    """
+    unset = np.asarray((covariance == 0).all(axis=2))
+    return filled(covariance, unset & ~unset.all(axis=1, keepdims=True))
+
+
 def at_most(covariance: Array, most: float) -> tuple[Array, Mask]:
     """
     Return covariances (m, d, d) without a variance above `most`, and where one was, (m, d).

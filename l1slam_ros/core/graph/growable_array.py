@@ -14,11 +14,12 @@ class GrowingArray:
     ----------
     shape : the shape of one row
     dtype : the type of one entry
+    room : rows that come without moving those before; they take no memory until they do
 
     """
 
-    def __init__(self, shape: tuple[int, ...] = (), dtype: type = np.float64):
-        self._data: np.ndarray = np.empty((0, *shape), dtype)
+    def __init__(self, shape: tuple[int, ...] = (), dtype: type = np.float64, room: int = 0):
+        self._data: np.ndarray = np.empty((room, *shape), dtype)
         self._length = 0
 
     def __len__(self) -> int:

@@ -89,23 +89,29 @@ class Border:
     ----------
     cholesky : holds the factor of H, which must stay
     size, k : keyframes that H has, numbers of the step of each
+    points, rows : so many may come, and none of what is there is moved for it: that takes longer
+        than to append
 
     """
 
-    def __init__(self, cholesky: BlockCholesky, size: int, k: int):
+    def __init__(self, cholesky: BlockCholesky, size: int, k: int, points: int = 0,
+                 rows: int = 0):
         self._cholesky, self._size, self._k = cholesky, size, k
+        places = min(points, size) * cholesky.pattern.depth
         # Points: which old keyframes they are, and which the new ones are; climbs, covariance.
         self._touched: dict[int, int] = {}
         self._new: list[int] = []
         self._begin = GrowingArray((), np.int64)
         self._begin.extend(np.zeros(1, np.int64))
-        self._places, self._values = GrowingArray((), np.int32), GrowingArray()
-        self._covariance, self._mean = GrowingArray((k, k)), GrowingArray((k,))
+        self._places = GrowingArray((), np.int32, places)
+        self._values = GrowingArray(room=places * k * k)
+        self._covariance = GrowingArray((k, k), room=_triangle(points))
+        self._mean = GrowingArray((k,))
         self._parent = GrowingArray((), np.int64)
         self._turn, self._noise = GrowingArray((k, k)), GrowingArray((k, k))
         # The other factors: their points and blocks, F, F^-1 times the right hand side.
         self._ends, self._blocks = GrowingArray((2,), np.int64), GrowingArray((2, k, k))
-        self._factor, self._right = GrowingArray(), GrowingArray()
+        self._factor, self._right = GrowingArray(room=_triangle(rows)), GrowingArray()
         # A' lambda at the first points; nothing pulls at those that came since. Empty: not known.
         self._pulled = np.zeros((0, k))
 
@@ -176,6 +182,20 @@ class Border:
         self._blocks.extend(predicted.blocks[None])
         self._pulled = self._pulled[:0]
 
+    def covariance(self, keyframe: int) -> Array:
+        """Return the covariance of the step of a keyframe, `FIXED` for none, (k, k)."""
+        of_points = (self._begin, self._places, self._values, self._covariance, self._mean,
+                     self._parent, self._turn, self._noise)
+        before, sizes = self.points, [len(array) for array in of_points]
+        blocks = np.stack((np.eye(self._k), np.zeros((self._k, self._k))))
+        covariance = self.predict((keyframe, FIXED), blocks, np.zeros(self._k)).covariance
+        if self.points > before:
+            # No factor touches it: each point makes the next one cost more.
+            del self._touched[keyframe]
+            for array, size in zip(of_points, sizes, strict=True):
+                array.replace(size, array.view()[:0])
+        return covariance
+
     def step(self, keyframes: list[int]) -> Array:
         """Return the steps of some keyframes, (m, k); zero of those that are not here yet."""
         points = np.array([self._point(keyframe) if keyframe < self.keyframes else FIXED
@@ -231,3 +251,8 @@ class Border:
                 kernels.border.pull(self._factor.view(), self._right.view(), self._ends.view(),
                                     self._blocks.view(), self._pulled)
         return self._pulled
+
+
+def _triangle(rows: int) -> int:
+    """Return how many entries a triangle of so many rows has."""
+    return rows * (rows + 1) // 2

@@ -6,22 +6,30 @@ In: a map, what is believed of its factors, and factors as they come. Out: which
 believe, and where all keyframes are. It is two maps: in that of least squares a factor's
 innovation has a known distribution, so it is the gate; that of the weights 1 / sqrt(e^2 + mu^2)
 has its optimum where the L1 norm has it, nearly, so it is the map that is shown.
+
+Jacobians of new factors are taken where their keyframes were first linearised, residuals where
+they are: with Jacobians at poses that have moved since, a map turns for which no factor speaks
+(Huang, Mourikis and Roumeliotis, "Observability-based rules for designing consistent EKF SLAM
+estimators", 2010).
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
-from l1slam_ros.core.graph.linear_system import linearise
-from l1slam_ros.core.incremental.border import Prediction
-from l1slam_ros.core.incremental.growing_map import L1, L2, GrowingMap, Linearised, View
+from l1slam_ros.core.graph.growable_array import GrowingArray
+from l1slam_ros.core.graph.linear_system import anchor, linearise
+from l1slam_ros.core.incremental.border import FIXED, Border, Prediction, Steps
 from l1slam_ros.core.robust.innovation import chi2_quantile, claimed_volume
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.optimality import smoothing
 
+# The two maps.
+L1, L2 = 0, 1
 # Where the weights of the L1 map turn over, in mean |e|.
 _SMOOTHING = 0.1
 # One in so many true loops may be left to the judgement for its noise alone.
@@ -36,34 +44,51 @@ UNKNOWN = -1
 
 
 @dataclass(frozen=True)
-class Gate:
-    """
-    What a factor is tested by.
-
-    variance : (2,) of odometry and loops, in units of what they state; log_odds : of a false loop
-    to a true one; log_volume : that the claims of false loops fill
-    """
-
-    variance: Array
-    log_odds: float
-    log_volume: float
-
-    @staticmethod
-    def of(manifold: Manifold, poses: Array, variance: Array, accepted: int,
-           refused: int) -> 'Gate':
-        """Return the gate of a map, poses (n, p), that so many loops were believed for or not."""
-        volume = claimed_volume(manifold, poses)
-        return Gate(variance, max(0.0, float(np.log((refused + 1) / (accepted + 1)))),
-                    float(volume.sum()))
-
-
-@dataclass(frozen=True)
 class Look:
     """What a first look at a factor says of it; see `Judgement`."""
 
     accepted: bool
     suspect: bool
     sigmas: float
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """
+    New factors, whitened, in both maps.
+
+    ends : (m, 2) what their keyframes are called in the borders; blocks : (m, 2, 2, k, k) by map
+    and side; residual : (m, 2, k) at no step
+    """
+
+    ends: Indices
+    blocks: Array
+    residual: Array
+
+    def of(self, which: int, at: int) -> tuple[tuple[int, int], Array, Array]:
+        """Return the ends, blocks and residual of one of them, in one of the maps."""
+        i, j = self.ends[at].tolist()
+        return (i, j), self.blocks[at, which], self.residual[at, which]
+
+
+@dataclass(frozen=True)
+class View:
+    """
+    One of the maps at one moment, to be worked out at leisure.
+
+    first : (n, p) where the keyframes began; fixed : so many are held fixed; steps : of the others
+    """
+
+    manifold: Manifold
+    first: Array
+    fixed: int
+    steps: Steps
+
+    @cached_property
+    def poses(self) -> Array:
+        """All keyframes, (n, p)."""
+        moved = self.manifold.retract(self.first[self.fixed:], self.steps.all())
+        return np.concatenate((self.first[:self.fixed], moved))
 
 
 class Front:
@@ -75,7 +100,8 @@ class Front:
     part : the factors that are believed
     poses : their L1 map, (n, p), and their L2 map with the noise as it was found
     choleskys : of the part, the second holds the factor of that L2 map; the front keeps them
-    gate : see `Gate`
+    variance : (2,) of odometry and loops, in units of what they state
+    log_odds : of a false loop to a true one
     rows : factors of the graph that grows, when `part` was taken from it
 
     Attributes
@@ -90,46 +116,56 @@ class Front:
     """
 
     def __init__(self, part: FactorGraph, poses: tuple[Array, Array],
-                 choleskys: tuple[BlockCholesky, BlockCholesky], gate: Gate, rows: int):
+                 choleskys: tuple[BlockCholesky, BlockCholesky], variance: Array,
+                 log_odds: float, rows: int):
         self.rows, self.taken, self.closed = rows, 0, False
+        self._manifold, self._fixed = part.manifold, anchor(part)
         system, k = linearise(part, poses[L1]), part.manifold.TANGENT_SIZE
         # What a square stays below, and the log ratio but for what hangs on the factor.
         self._limit = float(chi2_quantile(1 - _REFUSED, np.array([k]))[0])
-        self._volume = (gate.log_volume - k * np.log(2 * np.pi) / 2
-                        - np.log(_SURE - 1) - gate.log_odds)
-        self._variance = np.repeat(gate.variance[:, None], k, axis=1)
+        self._volume = (float(claimed_volume(part.manifold, poses[L1]).sum())
+                        - k * np.log(2 * np.pi) / 2 - np.log(_SURE - 1) - log_odds)
+        self._variance = np.repeat(variance[:, None], k, axis=1)
         self._mu = _SMOOTHING * smoothing(system.b)
         weights = 1 / np.hypot(system.b, self._mu)
         if not choleskys[L1].factorise(system, weights):
             raise GraphError('a part of the graph is not tied to the anchor')
         # Of a keyframe's first factor, whose residual the loops to come will say: it is weighed
         # as the others are in the mean, one without a residual among them.
-        self._usual = 1 / np.append(weights, 1 / self._mu).mean()
-        self._map = GrowingMap(part, poses, choleskys)
+        self._usual = np.full(k, 1 / np.append(weights, 1 / self._mu).mean())
+        self._borders = [Border(cholesky, system.size, k, _MOST_POINTS, _MOST_ROWS)
+                         for cholesky in choleskys]
+        self._first = GrowingArray((2, part.manifold.POSE_SIZE))
+        self._first.extend(np.stack(poses, axis=1))
 
     @property
     def keyframes(self) -> int:
         """How many keyframes it knows."""
-        return len(self._map)
+        # What a factor that failed wanted to see does not count.
+        return self._fixed + self._borders[L1].keyframes
 
     @property
     def border(self) -> int:
         """How many rows have come since it was factored."""
-        return self._map.rows
+        return self._borders[L1].rows
 
     @property
     def views(self) -> tuple[View, View]:
         """The L1 and the L2 map as they are now."""
-        return self._map.views
+        first = self._first.view()[:self.keyframes]
+        return (View(self._manifold, first[:, L1], self._fixed, self._borders[L1].steps()),
+                View(self._manifold, first[:, L2], self._fixed, self._borders[L2].steps()))
 
     @property
     def newest(self) -> Array:
-        """The pose of the last keyframe it knows, (1, p)."""
-        return self._map.newest
+        """The L1 pose of the last keyframe it knows, (1, p)."""
+        last = self.keyframes - 1
+        step = self._borders[L1].step([max(last - self._fixed, FIXED)])
+        return self._manifold.retract(self._first.view()[last:last + 1, L1], step)
 
     def covariance(self, keyframe: int) -> Array:
         """Return the covariance of a keyframe's step from the L2 map, (k, k)."""
-        return self._map.covariance(keyframe)
+        return self._borders[L2].covariance(max(keyframe - self._fixed, FIXED))
 
     def take(self, factors: BetweenFactors, accept: Indices) -> list[Look]:
         """
@@ -142,7 +178,7 @@ class Front:
         self.closed = self._is_beyond(factors, int(accept[0]))
         if self.closed:
             return looks
-        linearised = self._map.linearise(factors, slice(self.rows, self.rows + len(accept)))
+        linearised = self._linearise(factors, slice(self.rows, self.rows + len(accept)))
         for at, known in enumerate(accept.tolist()):
             look = None if self._is_beyond(factors, known) else self._look(
                 factors, linearised, at, known)
@@ -158,11 +194,11 @@ class Front:
         """Tell whether the next factor is for the next map."""
         return (max(factors.i[self.rows], factors.j[self.rows]) > self.keyframes
                 or (known == 1 and self._turns(factors))
-                or self.border > _MOST_ROWS or self._map.points > _MOST_POINTS)
+                or self.border > _MOST_ROWS or self._borders[L2].points > _MOST_POINTS)
 
     def _turns(self, factors: BetweenFactors) -> bool:
         """Tell whether the next factor is the first that names the world: the gauge is another."""
-        return bool(factors.i[self.rows] == WORLD) and self._map.fixed > 0
+        return bool(factors.i[self.rows] == WORLD) and self._fixed > 0
 
     def _look(self, factors: BetweenFactors, new: Linearised, at: int, known: int) -> Look | None:
         """Look at a factor, and make it part of the map where it is accepted; None: it cannot."""
@@ -171,16 +207,17 @@ class Front:
         if not known or (known == UNKNOWN and (self._turns(factors) or not own.all())):
             return Look(False, known == UNKNOWN, np.nan)
         first_seen = self.keyframes in (factors.i[self.rows], factors.j[self.rows])
+        l1, l2 = self._borders
         try:
             if first_seen:
-                self._map.begin(L2, new, at, self._variance[0])
-                self._map.begin(L1, new, at, np.full(len(own), self._usual))
+                l2.begin(*new.of(L2, at), self._variance[0])
+                l1.begin(*new.of(L1, at), self._usual)
                 return Look(True, False, 0.0)
-            variance, predicted = self._variance[1], self._map.predict(L2, new, at)
+            variance, predicted = self._variance[1], l2.predict(*new.of(L2, at))
             look, left = self._test(predicted, own, variance, known == 1)
             if look.accepted:
-                self._map.add(L2, predicted, variance)
-                self._map.add(L1, self._map.predict(L1, new, at), np.hypot(left, self._mu))
+                l2.add(predicted, variance)
+                l1.add(l1.predict(*new.of(L1, at)), np.hypot(left, self._mu))
         except np.linalg.LinAlgError:
             # Beyond double precision: the next map may be able to.
             return None
@@ -201,3 +238,42 @@ class Front:
         accepted = fits and log_ratio > 0
         return Look(accepted, fits and not accepted,
                     sigmas if accepted else float(np.sqrt(square))), left
+
+    def _linearise(self, factors: BetweenFactors, rows: slice) -> Linearised:
+        """
+        Return some factors as the borders want them.
+
+        Those that see keyframes for the first time see them in their order: these are put where
+        the factors want them. After a gap in that order none is returned.
+        """
+        manifold = self._manifold
+        pairs = np.stack((factors.i[rows], factors.j[rows]), axis=1)
+        known = np.maximum.accumulate(np.append(len(self._first) - 1, pairs.max(axis=1)))
+        gaps = np.flatnonzero(np.diff(known) > 1)
+        pairs = pairs[:gaps[0] if len(gaps) else None]
+        Z = factors.measurement[rows][:len(pairs)]
+        for row in np.flatnonzero((pairs >= len(self._first)).any(axis=1)).tolist():
+            if pairs[row].max() == len(self._first):
+                step = Z[row] if pairs[row, 1] == len(self._first) else manifold.inverse(Z[row])
+                self._first.extend(manifold.compose(
+                    self._moved(pairs[row].min(keepdims=True))[2], step))
+        first, steps, poses = self._moved(pairs.T.ravel())
+        p, k = first.shape[2], steps.shape[2]
+        Z, root = np.repeat(Z, 2, axis=0), factors.sqrt_information[rows][:len(pairs), None]
+        J = manifold.residual_jacobians(Z, *first.reshape(2, -1, p))
+        e = manifold.residual(Z, *poses.reshape(2, -1, p)).reshape(-1, 2, k)
+        sides = [root @ side.reshape(-1, 2, k, k) for side in J]
+        residual = (root @ e[..., None])[..., 0]
+        for side, step in zip(sides, steps.reshape(2, -1, 2, k), strict=True):
+            residual -= (side @ step[..., None])[..., 0]
+        return Linearised(
+            np.maximum(pairs - self._fixed, FIXED), np.stack(sides, axis=2), residual)
+
+    def _moved(self, keyframes: Indices) -> tuple[Array, Array, Array]:
+        """Return where keyframes began, their steps and where they are, (m, 2, p or k) each."""
+        manifold = self._manifold
+        first = self._first.view()[keyframes]
+        first[keyframes == WORLD] = manifold.identity(1)
+        ends = np.maximum(keyframes - self._fixed, FIXED).tolist()
+        steps = np.stack([border.step(ends) for border in self._borders], axis=1)
+        return first, steps, manifold.retract(first, steps)

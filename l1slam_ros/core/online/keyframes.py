@@ -83,7 +83,7 @@ class Level:
         return (0.0, 0.0) if even else (float(length), float(angle))
 
 
-class Motion:
+class KeyframeMotion:
     """
     The motion since the last keyframe, grown message by message.
 
@@ -209,7 +209,7 @@ class Motion:
             return None
         total = stated.sum(axis=0, keepdims=True)
         if verbatim:
-            return total[0]
+            return total[0] if noise.usable(total)[0] else None
         known, out = noise.or_model(total, model, noise.MOST_VARIANCE)
         used, large = noise.at_most(known, noise.MOST_OF_ODOMETRY)
         self.bounded = noise.bounds(total, used, out | large)
@@ -220,7 +220,7 @@ class Motion:
         """Return what each message states (k, d, d), seen from an end (1, p); None: see `_sum`."""
         manifold = self._manifold
         stated = np.array(self._stated)
-        if not noise.usable(stated).all():
+        if not noise.usable(noise.without_unset(stated)).all():
             return None
         if len(stated) == 1:
             return stated

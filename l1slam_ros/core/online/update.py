@@ -15,14 +15,18 @@ import numpy as np
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
+from l1slam_ros.core.graph.linear_system import (
+    anchor,
+    keyframes_of,
+    linearise,
+    whitened_residual,
+)
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.incremental.front import Front, Gate
+from l1slam_ros.core.incremental.front import Front
 from l1slam_ros.core.online.snapshot import Optimised, Problem
 from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
-from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.solvers.nonlinear import (
     OptimiserOptions,
     Solution,
@@ -177,24 +181,27 @@ def front_of(problem: Problem, poses: Array, rows: int,
     if not problem.is_sparse or method.cholesky is None:
         return None
     loops = ~problem.graph.between.is_odometry
-    believed = loops & judgement.accepted
-    gate = Gate.of(part.manifold, poses, judgement.variance, int(believed.sum()),
-                   int((loops & ~believed).sum()))
+    refused, believed = (np.count_nonzero(loops & (judgement.accepted == accepted))
+                         for accepted in (False, True))
+    log_odds = max(0.0, float(np.log((refused + 1) / (believed + 1))))
     variance = judgement.found_variance(problem.graph)
     found = part.subset(np.arange(len(variance)), variance)
     starts = [poses, *problem.starts[1:]]
-    l2_poses = min(starts, key=lambda start: l2_cost(whitened_residual(found, start)))
-    system = linearise(found, l2_poses)
-    cholesky = BlockCholesky(method.cholesky.pattern, system.keyframe)
+    costs = [l2_cost(whitened_residual(found, start)) for start in starts]
+    cost, l2_poses = min(costs), starts[costs.index(min(costs))]
+    cholesky = BlockCholesky(method.cholesky.pattern, keyframes_of(found, anchor(found)))
     try:
-        step = weighted_least_squares(system, cholesky, np.ones_like(system.b))
-        # Far from the minimum of chi2 the gate would see ghosts; one above it is none.
-        if step @ system.transposed_times(system.b) > 1:
-            enough = LeastSquaresOptions(_L2_STEPS, 1 / len(part.between))
-            l2_poses = minimise_l2(found, l2_poses, enough, cholesky, lambda *_: check()).poses
-            cholesky.factorise(linearise(found, l2_poses), np.ones_like(system.b))
+        for _ in range(_L2_STEPS):
+            check()
+            system = linearise(found, l2_poses)
+            step = weighted_least_squares(system, cholesky, np.ones_like(system.b))
+            # Far from the minimum of chi2 the gate would see ghosts; one above it is none.
+            if step @ system.transposed_times(system.b) <= 1:
+                break
+            l2_poses, cost = backtrack(found, l2_poses, step, cost, l2_cost)
         check()
-        return Front(part, (poses, l2_poses), (method.cholesky, cholesky), gate, rows)
+        return Front(part, (poses, l2_poses), (method.cholesky, cholesky), judgement.variance,
+                     log_odds, rows)
     except GraphError:
         return None
 

@@ -49,7 +49,6 @@ import numpy as np
 from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.linear_system import anchor
 from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.innovation import chi2_quantile, covariances
 from l1slam_ros.core.robust.judgement import NORM, Doubt, Judgement, doubts, judgement_of
@@ -63,11 +62,11 @@ from l1slam_ros.core.solvers.nonlinear import Solution
 _MOST_ROUNDS = 200
 
 # From the round and the loops accepted so far.
-Report = Callable[[int, int], None]
+OnRound = Callable[[int, int], None]
 
 
 def robust_solve(
-    graph: FactorGraph, report: Report = lambda round_, accepted: None,
+    graph: FactorGraph, report: OnRound = lambda round_, accepted: None,
     check: Callable[[], None] = lambda: None,
 ) -> tuple[Judgement, Array]:
     """
@@ -98,7 +97,7 @@ class RobustMap:
 
 def minimise_robustly(
     graph: FactorGraph, minimise: Callable[[FactorGraph, Array], Solution],
-    report: Report = lambda round_, accepted: None, check: Callable[[], None] = lambda: None,
+    report: OnRound = lambda round_, accepted: None, check: Callable[[], None] = lambda: None,
 ) -> RobustMap:
     """
     Return the map that `minimise` makes of the factors that are accepted.
@@ -109,13 +108,13 @@ def minimise_robustly(
     minimise : from a graph and poses (n, p) to its solution; report, check : see `robust_solve`
     """
     judgement, poses = robust_solve(graph, report, check)
-    whole, seed = _least_squares(graph, judgement, poses, check)
-    solution = minimise(whole, seed)
+    whole, least = _least_squares(graph, judgement, poses, check)
+    solution = minimise(whole, least.poses)
     rows = int(judgement.accepted.sum()) * graph.manifold.TANGENT_SIZE
     check()
-    of_norm = _doubts_of_norm(graph, judgement, (whole, seed), solution.poses)
-    judgement = replace(judgement, doubts=judgement.doubts + of_norm)
-    return RobustMap(replace(solution, dual=solution.dual[:rows]), seed, judgement)
+    judgement = replace(judgement, doubts=judgement.doubts + least.doubts(
+        graph, judgement, solution.poses))
+    return RobustMap(replace(solution, dual=solution.dual[:rows]), least.poses, judgement)
 
 
 def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
@@ -123,37 +122,44 @@ def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
     """Return the doubts that `minimise_robustly` would have of a map, (n, p), by its norm."""
     if not len(graph.between):  # of nothing: compiled loops would go past its arrays
         return ()
-    return _doubts_of_norm(graph, judgement, _least_squares(graph, judgement, poses, check), poses)
+    return _least_squares(graph, judgement, poses, check)[1].doubts(graph, judgement, poses)
+
+
+@dataclass(frozen=True)
+class _LeastSquares:
+    """The L2 map (n, p) of the accepted factors, and its covariances, of all but those held."""
+
+    poses: Array
+    covariances: Array
+
+    def doubts(self, graph: FactorGraph, judgement: Judgement,
+               poses: Array) -> tuple[Doubt, ...]:
+        """
+        Return a doubt where half of a map, (n, p), is further off this one than noise makes it.
+
+        Of normal noise, as it was found, the difference has pi/2 - 1 of the covariance of the L2
+        map at most, which is what L1 pays for it. Of the keyframes of one way all may err
+        together.
+        """
+        manifold, held = graph.manifold, len(poses) - len(self.covariances)
+        step = manifold.local(self.poses, poses)[held:]
+        square = kernels.prediction.normalise(self.covariances, step)[0]
+        explained = (np.pi / 2 - 1) * chi2_quantile(1 - REFUSED, np.array([manifold.TANGENT_SIZE]))
+        if np.count_nonzero(np.isfinite(square) & (square > explained)) <= len(square) / 2:
+            return ()
+        loops = np.count_nonzero(judgement.accepted & ~graph.between.is_odometry)
+        return (Doubt(NORM, int(loops), 0, graph.n_poses - 1),)
 
 
 def _least_squares(graph: FactorGraph, judgement: Judgement, poses: Array,
-                   check: Callable[[], None]) -> tuple[FactorGraph, Array]:
-    """Return the accepted factors, in one piece, and their L2 map (n, p), from poses (n, p)."""
+                   check: Callable[[], None]) -> tuple[FactorGraph, _LeastSquares]:
+    """Return the accepted factors, in one piece, and their L2 map, from poses (n, p)."""
     whole = tied(judgement.believed(graph), poses)
-    return whole, l2_map(whole, poses, cholesky_of(whole), lambda *_: check())
-
-
-def _doubts_of_norm(graph: FactorGraph, judgement: Judgement, least: tuple[FactorGraph, Array],
-                    poses: Array) -> tuple[Doubt, ...]:
-    """
-    Return a doubt where half of a map, (n, p), is further off the L2 map than noise makes it.
-
-    Of normal noise, as it was found, the difference has pi/2 - 1 of the covariance of the L2 map
-    at most, which is what L1 pays for it. Of the keyframes of one way all may err together.
-
-    least : of `_least_squares`
-    """
-    (whole, seed), manifold = least, graph.manifold
+    cholesky = cholesky_of(whole)
+    seed = l2_map(whole, poses, cholesky, lambda *_: check())
     noise = judgement.found_variance(graph)
     noise = np.concatenate((noise, np.ones(len(whole.between) - len(noise))))
-    step = manifold.local(seed, poses)[anchor(whole):]
-    square = kernels.prediction.normalise(
-        covariances(whole, seed, cholesky_of(whole), noise), step)[0]
-    explained = (np.pi / 2 - 1) * chi2_quantile(1 - REFUSED, np.array([manifold.TANGENT_SIZE]))
-    if np.count_nonzero(np.isfinite(square) & (square > explained)) <= len(square) / 2:
-        return ()
-    loops = np.count_nonzero(judgement.accepted & ~graph.between.is_odometry)
-    return (Doubt(NORM, int(loops), 0, graph.n_poses - 1),)
+    return whole, _LeastSquares(seed, covariances(whole, seed, cholesky, noise))
 
 
 def rounds(

@@ -67,6 +67,22 @@ class Pattern:
         return np.repeat(np.arange(len(self.first) - 1, dtype=np.int32), np.diff(self.first))
 
     @cached_property
+    def parent(self) -> Indices:
+        """The panel above each in the elimination tree, (panels,); their number for a root."""
+        width, height = np.diff(self.first), np.diff(self.start)
+        below = np.minimum(self.start[:-1] + width, len(self.rows) - 1)
+        return np.where(width < height, self.owner[self.rows[below]], len(width))
+
+    @property
+    def depth(self) -> int:
+        """Positions on the longest way up the elimination tree."""
+        above, way = np.append(self.parent, len(self.parent)), np.append(np.diff(self.first), 0)
+        while (above < len(self.parent)).any():
+            # Of each the way to the 2nd panel above, the 4th, the 8th ...
+            above, way = above[above], way + way[above]
+        return int(way.max())
+
+    @cached_property
     def halves(self) -> NDArray[np.int8]:
         """
         What to factorise at the same time, 0 and 1, and what after both, 2, (panels,).
@@ -75,10 +91,8 @@ class Pattern:
         descendants on both are 2. Of all cuts the one that takes least time.
         """
         count, width, height = len(self.first) - 1, np.diff(self.first), np.diff(self.start)
-        below = np.minimum(self.start[:-1] + width, len(self.rows) - 1)
-        parent = np.where(width < height, self.owner[self.rows[below]], count).tolist()
         lowest = [*range(count), count]  # the first of each subtree
-        for s, above in enumerate(parent):
+        for s, above in enumerate(self.parent.tolist()):
             lowest[above] = min(lowest[above], lowest[s])
         low, own = np.array(lowest[:-1], np.int64), width * (height - width / 2.0) ** 2
         left = np.concatenate(([0.0], np.cumsum(own)))

@@ -142,16 +142,17 @@ def is_far(before: float, after: float) -> bool:
 
 
 def backtrack(
-    graph: FactorGraph, poses: Array, step: Array, cost: float
+    graph: FactorGraph, poses: Array, step: Array, cost: float,
+    cost_of: Callable[[Array], float] = l1_cost,
 ) -> tuple[Array, float]:
     """
     Return the poses and cost after the longest of step, step/2, ... that lowers the true cost.
 
-    Where none does, the poses and cost are returned as they came.
+    Where none does, the poses and cost are returned as they came. cost_of : of a residual
     """
     for halvings in range(_HALVINGS + 1):
         candidate = step_poses(graph, poses, step / 2**halvings)
-        candidate_cost = l1_cost(whitened_residual(graph, candidate))
+        candidate_cost = cost_of(whitened_residual(graph, candidate))
         if candidate_cost < cost:
             return candidate, candidate_cost
     return poses, cost

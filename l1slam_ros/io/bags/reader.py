@@ -9,7 +9,7 @@ their time to import, so who may do without a bag imports this module only where
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.errors import FileError, L1SlamError
 from l1slam_ros.io.bags.damaged.salvage import (
     METADATA,
     Salvage,
@@ -28,15 +28,21 @@ from l1slam_ros.io.bags.damaged.salvage import (
     directory_metadata,
     storage_files,
 )
-from l1slam_ros.io.bags.damaged.walk import BagMessage, ros1_types
+from l1slam_ros.io.bags.damaged.walk import BagMessage
 from l1slam_ros.io.bags.damaged.walk_mcap import is_indexed, mcap_metadata
 from l1slam_ros.io.bags.damaged.walk_sqlite import has_journal, is_cut, sqlite_metadata
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES
 from l1slam_ros.io.bags.writer import NOTE_KEY
 
+# What types of ROS 1 are made of, as ROS 2 has it.
+_BASIC = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
 _TO_ITS_END = 'expected a bag that can be read to its end'
-# Told of damage, in one sentence.
+# Told of damage, in one sentence, when all that is before it was read.
 OnDamage = Callable[[str], None]
+
+
+def _refuse(damage: str) -> None:
+    raise L1SlamError(damage)
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,7 @@ class BagSummary:
 
 
 def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None = None,
-                  on_damage: OnDamage | None = None) -> Iterator[BagMessage]:
+                  on_damage: OnDamage = _refuse) -> Iterator[BagMessage]:
     """
     Yield the messages of a bag in order of time, decoded.
 
@@ -71,32 +77,29 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
     ----------
     path : a rosbag2 directory, .mcap, .db3 or .bag
     topics : only these, as far as the bag has them; None: all
-    on_damage : told, in the end, why only a part could be read; None: damage is an error
+    on_damage : told, in the end, why only a part could be read; else that is an error
 
     Raises
     ------
-    FileError : nothing in it can be read, or it is damaged and nobody wants to be told.
+    FileError : nothing in it can be read.
 
     """
     count = undecodable = 0
     for raw, types in _messages(path, topics, None, None, on_damage):
         try:
             message = types.deserialize_cdr(raw.data, raw.msgtype)
-        except Exception as error:  # bytes that are no message make the library raise anything
+        except Exception:  # bytes that are no message make the library raise anything
             undecodable += 1
-            if on_damage is None:
-                raise FileError(path, f'a message on {raw.topic} cannot be decoded '
-                                f'({complaint(error)}); {_TO_ITS_END}') from error
             continue
         count += 1
         yield raw._replace(data=message)
-    if undecodable and on_damage is not None:
+    if undecodable:
         on_damage(f'{path} is damaged: {undecodable:,} messages cannot be decoded; '
                   f'{count:,} others were used')
 
 
 def read_raw(path: str | os.PathLike[str], topics: Collection[str] | None = None,
-             on_damage: OnDamage | None = None, *, start: int | None = None,
+             on_damage: OnDamage = _refuse, *, start: int | None = None,
              stop: int | None = None) -> Iterator[BagMessage]:
     """
     Yield the messages of a bag in order of time, as serialised; arguments as `read_messages`.
@@ -213,7 +216,7 @@ class _Place:
 
 
 def _messages(path: str | os.PathLike[str], topics: Collection[str] | None, start: int | None,
-              stop: int | None, on_damage: OnDamage | None) -> Iterator[tuple[BagMessage, Any]]:
+              stop: int | None, on_damage: OnDamage) -> Iterator[tuple[BagMessage, Any]]:
     """Yield the messages of a bag, each with the types to decode it by."""
     bag, place = _bag_path(path), _Place()
     try:
@@ -223,21 +226,18 @@ def _messages(path: str | os.PathLike[str], topics: Collection[str] | None, star
         return
     except Exception as error:  # damaged bags make the library raise anything
         salvage = _salvage(bag, error)
-    damage = salvage.damage
-    if damage is not None and on_damage is None:
-        raise FileError(damage.path, f'damaged{damage.where}; {_TO_ITS_END}')
     types = salvage.types()
     for message in place.rest(salvage.messages(topics, start, stop)):
         place.advance(message)
         yield message, types
-    if damage is not None and on_damage is not None:
-        on_damage(damage.sentence(place.count))
+    if salvage.damage is not None:
+        on_damage(salvage.damage.sentence(place.count))
 
 
 def _by_library(bag: Path, topics: Collection[str] | None, start: int | None,
                 stop: int | None) -> Iterator[tuple[BagMessage, Any]]:
     with _reader(bag) as reader:
-        types = reader.typestore if reader.is2 else ros1_types(reader.typestore.fielddefs)
+        types = reader.typestore if reader.is2 else _ros1_types(reader.typestore.fielddefs)
         connections = [c for c in reader.connections if topics is None or c.topic in topics]
         missing = sum(c.msgcount for c in connections)
         # No connection would mean all of them to the library.
@@ -248,6 +248,15 @@ def _by_library(bag: Path, topics: Collection[str] | None, start: int | None,
         # Within a chunk the library stops at a damaged record without a word.
         if missing > 0 and start is None and stop is None:
             raise LookupError(f'{missing:,} messages are missing')
+
+
+def _ros1_types(fields: Mapping[str, Any]) -> Any:
+    """Return the types by which messages of ROS 1 become CDR, and are decoded from that."""
+    jazzy = get_typestore(Stores.ROS2_JAZZY).fielddefs
+    types = get_typestore(Stores.EMPTY)
+    # In ROS 1 a header has one field more, which the library's conversion leaves out.
+    types.register({**fields, **{name: jazzy[name] for name in _BASIC}})
+    return types
 
 
 @contextmanager
@@ -266,6 +275,9 @@ def _reader(bag: Path) -> Iterator[Any]:
 
 def _salvage(bag: Path, error: Exception) -> Salvage:
     """Return what can be had of a bag that the library gave up on."""
+    if bag.suffix.lower() == '.bag':
+        raise FileError(bag, f'damaged, or no bag ({complaint(error)}); {_TO_ITS_END}: '
+                        '`rosbag reindex` may make one of it') from error
     salvage = Salvage(bag)
     if salvage.counts:
         return salvage

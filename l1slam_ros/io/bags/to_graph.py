@@ -37,11 +37,11 @@ from l1slam_ros.io.bags.from_graph import (
 )
 from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
+from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
 from l1slam_ros.io.trajectory import Reference
-from l1slam_ros.io.wording import counted
 
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 _EVERY = KeyframeOptions(0.0, 0.0, 0.0)

@@ -20,6 +20,7 @@ from l1slam_ros.core.names import QUATERNION
 from l1slam_ros.io.files import (
     LARGEST,
     TextLines,
+    counted,
     first_failure,
     formatted,
     put_lines,
@@ -46,7 +47,6 @@ from l1slam_ros.io.graphs.tags import (
     TAGS_LEFT_OUT,
 )
 from l1slam_ros.io.remarks import Remarks
-from l1slam_ros.io.wording import counted
 
 
 @dataclass(frozen=True)

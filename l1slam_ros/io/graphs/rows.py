@@ -12,10 +12,16 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.names import QUATERNION
-from l1slam_ros.io.files import TextLines, parse_rows, quoted, read_lines, refuse_quaternions
+from l1slam_ros.io.files import (
+    TextLines,
+    counted,
+    parse_rows,
+    quoted,
+    read_lines,
+    refuse_quaternions,
+)
 from l1slam_ros.io.graphs.tags import OFFSET, TAGS, TAGS_LEFT_OUT
 from l1slam_ros.io.remarks import Remarks
-from l1slam_ros.io.wording import counted
 
 # So many lines are named in one sentence.
 _NAMED = 3

@@ -10,7 +10,7 @@ from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.compilation import STEPS, fill_cache, load, with_space
-from l1slam_ros.io.node_options import UpdateOptions
+from l1slam_ros.ros.parameters import NodeParameters
 from l1slam_ros.ros.threads.background import background
 from l1slam_ros.ros.threads.failures import Failures
 
@@ -29,24 +29,27 @@ class SolverThread:
     backend : whose map
     failures : where to tell what an update raised
     logger : of the node
-    options : returns how often to update, and how long one update may work
-    tell : called before and after each update, with what it did, None: nothing; may publish
+    parameters : of the node: how often to update, and how long one update may work
 
     """
 
     def __init__(self, backend: Backend, failures: Failures, logger: Any,
-                 options: Callable[[], UpdateOptions], tell: Callable[[Improvement | None], None]):
+                 parameters: NodeParameters):
         self._backend, self._failures, self._logger = backend, failures, logger
-        self._options, self._tell = options, tell
+        self._parameters = parameters
         self._woken = threading.Event()
         self._paused = self._closing = False
         self._pause, self._not_before = _FIRST_PAUSE, 0.0
         self._behind_since = 0.0
         self.compiling = ''
-        self._thread = background('solver', self._work)
 
-    def start(self) -> None:
-        """Begin; before the first update, what is not in the cache is compiled."""
+    def start(self, tell: Callable[[Improvement | None], None]) -> None:
+        """
+        Begin; before the first update, what is not in the cache is compiled.
+
+        tell : called before and after each update, with what it did, None: nothing; may publish
+        """
+        self._thread = background('solver', lambda: self._work(tell))
         self._thread.start()
 
     def hurry(self) -> None:
@@ -74,12 +77,12 @@ class SolverThread:
         """For how long loops have been waiting to be judged [s]."""
         return time.monotonic() - self._behind_since if self._behind_since else 0.0
 
-    def _work(self) -> None:
+    def _work(self, tell: Callable[[Improvement | None], None]) -> None:
         self._compile()
         due = time.monotonic()
         while True:
             # From beginning to beginning: an update is a part of its period.
-            due = max(due + self._options().period, time.monotonic())
+            due = max(due + self._parameters.options.update.period, time.monotonic())
             self._woken.wait(due - time.monotonic())
             # In this order, or the call to close is lost.
             self._woken.clear()
@@ -89,8 +92,8 @@ class SolverThread:
                 continue
             try:
                 # First what services have made of the map: an update may take long.
-                self._tell(None)
-                self._tell(self._update())
+                tell(None)
+                tell(self._update())
             except Interrupted:
                 continue
             except Exception as error:
@@ -107,7 +110,7 @@ class SolverThread:
             return None
         self._behind_since = self._behind_since or time.monotonic()
         improvement = self._backend.update(
-            self._options().budget, lambda: self._paused or self._closing)
+            self._parameters.options.update.budget, lambda: self._paused or self._closing)
         if improvement is None or improvement.judgement.settled:
             self._behind_since = 0.0
         return improvement

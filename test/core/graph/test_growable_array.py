@@ -10,6 +10,17 @@ def rows(first, count):
     return np.arange(2 * first, 2 * (first + count), dtype=float).reshape(count, 2)
 
 
+def test_rows_that_there_is_room_for_move_none():
+    array = GrowingArray((2,), room=100)
+    home = array.view().__array_interface__['data'][0]
+    assert len(array) == 0
+    for k in range(100):
+        array.extend(rows(k, 1))
+    assert array.view().__array_interface__['data'][0] == home
+    array.extend(rows(100, 1))
+    assert (array.view() == rows(0, 101)).all()
+
+
 def test_appending_moves_the_rows_only_now_and_then():
     array = GrowingArray((2,))
     moves, home = 0, None

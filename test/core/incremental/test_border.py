@@ -117,6 +117,12 @@ def test_a_border_is_the_whole_problem(k, shape, rng):
         some = [i, j, OLD - 1, count]
         assert_allclose(border.step([*some, FIXED, known]),
                         [*steps[some], *np.zeros((2, k))], rtol=1e-6, atol=1e-8)
+    points = border.points
+    for v in range(OLD + NEW):
+        assert_allclose(border.covariance(v), whole.covariance((v, FIXED), np.stack(
+            (np.eye(k), np.zeros((k, k)))), OLD + NEW), rtol=1e-7, atol=1e-9)
+    assert border.points == points
+    assert_allclose(border.steps().all(), steps, rtol=1e-6, atol=1e-8)
     taken = border.steps()
     factor((0, OLD + NEW - 1), OLD + NEW)
     assert_allclose(taken.all(), steps, rtol=1e-6, atol=1e-8)

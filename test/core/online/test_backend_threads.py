@@ -308,6 +308,21 @@ def test_the_background_makes_way(monkeypatch, end):
     assert not of_threads()
 
 
+def test_work_behind_waits_while_there_is_calm_and_makes_way_all_the_same():
+    backend, solved = Backend(EVERY), []
+    drive(backend, 0, 20)
+    with backend.calm:
+        solving = meanwhile(lambda: solved.append(backend.settle()))
+        solving.join(MOMENT)
+        assert not solved
+    solving.join(DEADLINE)
+    assert solved[0] is not None
+    drive(backend, 20, 21)
+    asked = iter([False] * 4)
+    with backend.calm, pytest.raises(Interrupted):
+        backend.settle(lambda: next(asked, True))
+
+
 def test_a_process_that_is_forked_has_a_back_end_at_rest(monkeypatch):
     """Threads do not come along, what they have locked does: numba's lock, for one."""
     begun, numba = threading.Event(), threading.Lock()

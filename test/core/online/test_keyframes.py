@@ -8,8 +8,8 @@ from problems import UNKNOWN, covariance6, odometry, random_information
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.online.keyframes import (
+    KeyframeMotion,
     KeyframeOptions,
-    Motion,
     OdometryOptions,
 )
 
@@ -26,7 +26,7 @@ UNUSABLE_NAMES = ['0', 'diagonal -1', '-1', 'nan', '9999', '1e308', 'one negativ
 def motion_of(increments, options, covariances=None, twists=None, period=0.1):
     """Return the motion of increments (k, 3), one message each."""
     pose = np.zeros((1, 3))
-    motion = Motion(se2, 0, pose)
+    motion = KeyframeMotion(se2, 0, pose)
     none = [UNKNOWN] * len(increments)
     for k, (increment, covariance, twist) in enumerate(
             zip(increments, covariances or none, twists or none, strict=True), 1):
@@ -129,8 +129,18 @@ def test_one_unusable_covariance_and_the_model_speaks_for_the_whole_motion(
     assert_allclose(motion.covariance(options), model)
 
 
+@pytest.mark.parametrize('source', ['increment', 'twist'])
+def test_what_covariances_leave_unset_the_model_says(source):
+    """A planar front end leaves z, roll and pitch at zero; what it says of the rest counts."""
+    options = OdometryOptions(source, 0.1, 0.2, 0.03, 0.04)
+    stated = [covariance6(np.diag([0.01, 0.02, 0]))] * 3
+    motion = motion_of([(1.0, 0, 0)] * 3, options, stated, stated, period=1.0)
+    assert_allclose(motion.covariance(options), np.diag([0.03, 0.06, 0.04**2]))
+    assert motion.bounded == [(0.0, 0.04**2)]
+
+
 def test_a_source_changed_on_the_way_falls_back_to_the_model():
-    motion = Motion(se2, 0, np.zeros((1, 3)))
+    motion = KeyframeMotion(se2, 0, np.zeros((1, 3)))
     for k, options in enumerate([MODEL, INCREMENT], 1):
         motion.add(odometry(k, (k, 0, 0), np.eye(6)), np.array([[float(k), 0, 0]]), options)
     assert_allclose(motion.covariance(MODEL)[0, 0], 0.2**2 + 0.03**2)

@@ -87,12 +87,11 @@ class OdometryTrack:
     @property
     def keyframe_poses(self) -> Array:
         """Poses of the keyframes, (n, p)."""
-        return self._poses.view()[self._keyframes.view()]
+        return self.poses_of(slice(None))
 
-    def keyframe_pose(self, k: int) -> Array:
-        """Return the pose of a keyframe, (1, p)."""
-        sample = int(self._keyframes.view()[k])
-        return self._poses.view()[sample : sample + 1]
+    def poses_of(self, keyframes: Indices | slice) -> Array:
+        """Return the poses of some keyframes, (m, p)."""
+        return self._poses.view()[self._keyframes.view()[keyframes]]
 
     @property
     def gaps(self) -> Indices:
@@ -200,7 +199,7 @@ class OdometryTrack:
             return False
         pose = self._manifold.compose(offset, pose)
         recent = slice(max(int(self._parts.view()[-1, 2]), len(self._keyframes) - _RECENT), None)
-        times, poses = self.keyframe_stamps[recent], self.keyframe_poses[recent]
+        times, poses = self.keyframe_stamps[recent], self.poses_of(recent)
         step = self._manifold.local(np.concatenate((poses[:-1], self.last_pose)),
                                     np.concatenate((poses[1:], pose)))
         way, seconds = self._manifold.motion(step)[0], np.diff(times, append=stamp) * 1e-9
@@ -220,12 +219,14 @@ class OdometryTrack:
 
     def nearest_keyframe(self, times: Indices, known: Indices) -> Indices:
         """Return the keyframe nearest to each time, of its part and up to `known`, (m,)."""
-        keyframes = self._times.view()[self._keyframes.view()]
+        samples, keyframes = self._times.view(), self._keyframes.view()
         first, end = self._part(times, 2, len(keyframes))
-        last = np.minimum(np.searchsorted(keyframes, known, side='right'), end) - 1
-        after = np.clip(np.searchsorted(keyframes, times), first, last)
+        # By the samples: the times of all keyframes would have to be copied together.
+        next_one = np.searchsorted(keyframes, np.searchsorted(samples, times))
+        unknown = np.searchsorted(keyframes, np.searchsorted(samples, known, side='right'))
+        after = np.clip(next_one, first, np.minimum(unknown, end) - 1)
         before = np.maximum(after - 1, first)
-        nearer_before = times - keyframes[before] <= keyframes[after] - times
+        nearer_before = times - samples[keyframes[before]] <= samples[keyframes[after]] - times
         return np.where(nearer_before, before, after)
 
     def at(self, times: Indices) -> Array:

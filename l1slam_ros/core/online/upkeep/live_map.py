@@ -24,8 +24,9 @@ from l1slam_ros.core.solvers.optimality import Status
 
 # A map is factored anew from so many factors on that came since: those of ten keyframes.
 _MANY = 20
-# Factors that a front takes while its lock is held.
-AT_ONCE = 16
+# Factors that a front takes while its lock is held, and between two looks at the clock: on a large
+# map some take two milliseconds each.
+AT_ONCE = 4
 # [s] While loops come none of which fits, they are judged so often.
 _JUDGE_EVERY = 2.0
 
@@ -272,7 +273,7 @@ class LiveMap:
             0 if self.all_judged else len(self._builder.loops.rows) - max(self._judged_loops, 0),
             self._bound if holds else np.nan, now - self._bound_at if holds else np.nan)
 
-    def growth(self) -> tuple[FactorGraph, int, int]:
+    def size(self) -> tuple[FactorGraph, int, int]:
         """Return what changes when something comes."""
         graph = self._builder.graph
         return graph, graph.n_poses, len(graph.between)

@@ -6,6 +6,9 @@ from collections.abc import Callable
 
 from l1slam_ros.core.errors import Interrupted
 
+# [s] How often who waits looks whether to stop.
+LOOK = 0.05
+
 
 def until(over: Callable[[], bool],
           check: Callable[[], None] = lambda: None) -> Callable[[], None]:
@@ -16,6 +19,34 @@ def until(over: Callable[[], bool],
             raise Interrupted
 
     return checked
+
+
+class Calm:
+    """
+    While it lasts, work that nobody waits for makes way for what somebody does.
+
+    The interpreter is one, and to get it back from threads that compute may take longer than the
+    work. For one thread at a time: `with calm:`.
+    """
+
+    def __init__(self) -> None:
+        self._over = threading.Event()
+        self._over.set()
+
+    def __enter__(self) -> None:
+        self._over.clear()
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+
+    def kept(self, check: Callable[[], None]) -> Callable[[], None]:
+        """Return a check that waits for its end, too, unless the other raises."""
+        def checked() -> None:
+            check()
+            while not self._over.wait(LOOK):
+                check()
+
+        return checked
 
 
 class Worker:

@@ -30,7 +30,7 @@ from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
 from l1slam_ros.core.online.update import Improvement, front_of, improve, one_round, optimise
 from l1slam_ros.core.online.upkeep.live_map import AT_ONCE, LiveMap
-from l1slam_ros.core.online.upkeep.threads import Worker, until
+from l1slam_ros.core.online.upkeep.threads import LOOK, Calm, Worker, until
 from l1slam_ros.core.robust.batch import doubts_of_norm, judge, robust_solve
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
@@ -42,8 +42,6 @@ _LEAST_TIME, _LEAST_ROUND = 0.02, 0.1
 _PATIENCE = 4
 # So often a new front takes what came meanwhile, before it is one.
 _PASSES = 3
-# [s] How often who waits looks whether to stop.
-_LOOK = 0.05
 
 
 class Upkeep:
@@ -58,6 +56,7 @@ class Upkeep:
     ----------
     maps : how many maps there were: one more whenever factors were taken into it, and with each
         that was adopted or took another's place
+    calm : what goes on behind waits for its end
 
     """
 
@@ -65,7 +64,7 @@ class Upkeep:
         self._solver, self._robust = solver, robust
         # In the order in which they are taken.
         self._updating, self._front, self._lock = (threading.Lock() for _ in range(3))
-        self._ended = threading.Event()
+        self._ended, self.calm = threading.Event(), Calm()
         self._workers = self._mapper, self._judge = (
             Worker('map', self._on_end), Worker('judge', self._on_end))
         self._make_way = False
@@ -83,7 +82,7 @@ class Upkeep:
         """Begin a map with the graph of a builder; the lock is held."""
         self._builder, self._number = builder, self._number + 1
         self._live = LiveMap(self._number, builder, optimised, self._robust)
-        self._map_to_odom, self._grown = None, self._live.growth()
+        self._map_to_odom, self._grown = None, self._live.size()
         self._changes += 1
 
     @property
@@ -125,7 +124,7 @@ class Upkeep:
             return manifold.identity(1)
         # Asked for with every sample: worked out when an update or a new offset changes it.
         if self._map_to_odom is None or self._map_to_odom[0] is not offset:
-            odometry = self._builder.track.keyframe_pose(last)
+            odometry = self._builder.track.poses_of(np.array([last]))
             to_kept = manifold.compose(pose, manifold.inverse(odometry))
             self._map_to_odom = offset, manifold.compose(to_kept, offset)
         return self._map_to_odom[1]
@@ -155,12 +154,12 @@ class Upkeep:
             live, last = self._live, self._live.last
             self._take(start + max(budget, _LEAST_TIME))
             with self._lock:
-                grown = live.growth()
+                grown = live.size()
                 came, self._grown = grown != self._grown, grown
             idle = not came if idle is None else idle
             check = self._check_of(live, stopped)
-            while self._begin_due(idle, budget, check):
-                self._ended.wait(max(min(_LOOK, start + budget - time.monotonic()), 0.0))
+            while self._begin_due(idle, budget, self.calm.kept(check)):
+                self._ended.wait(max(min(LOOK, start + budget - time.monotonic()), 0.0))
                 self._ended.clear()
                 self._check_workers()
                 check()
@@ -241,11 +240,11 @@ class Upkeep:
         """Look at all loops again; anew: from the graph alone, until more comes."""
         with self._standing() as now:
             live, loops = self._live, self._live.begin_judgement()
-            grown = live.growth()
+            grown = live.size()
         whole = now.problem()
         del now  # as above
         problem = as_one(whole)
-        at_rest = until(lambda: live.growth() != grown, check)
+        at_rest = until(lambda: live.size() != grown, check)
         judgement, poses = robust_solve(problem.graph, check=at_rest) if anew else judge(
             problem.graph, problem.poses, problem.judgement, np.inf, check)
         check()
@@ -276,11 +275,11 @@ class Upkeep:
         with self._alone():
             with self._standing() as now:
                 live, loops = self._live, self._live.begin_judgement()
-                self._grown = live.growth()
+                self._grown = live.size()
             whole = now.problem()
             if not len(whole.graph.between):
                 return None
-            problem, check = as_one(whole), self._check_of(live, stopped)
+            problem, check = as_one(whole), self.calm.kept(self._check_of(live, stopped))
             improvement = optimise(problem, self._solver, check)
             check()
             front = front_of(replace(problem, judgement=improvement.judgement), improvement.poses,

@@ -16,11 +16,11 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import yaml
+import zstandard  # comes with the bag libraries
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from l1slam_ros.io.bags.damaged.walk import DECODERS, BagMessage, BrokenRecordError
+from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError
 from l1slam_ros.io.bags.damaged.walk_mcap import walk_mcap
-from l1slam_ros.io.bags.damaged.walk_rosbag1 import walk_rosbag1
 from l1slam_ros.io.bags.damaged.walk_sqlite import walk_sqlite
 
 METADATA = 'metadata.yaml'
@@ -28,7 +28,7 @@ METADATA = 'metadata.yaml'
 _STORAGE_NAME = re.compile(r'(?P<bag>.+?)(_[0-9]+)?(\.mcap|\.db3)(\.zstd)?')
 # The first bytes of a message that rosbag2 has compressed by itself; of CDR they never are.
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
-_WALKS = {'.mcap': walk_mcap, '.db3': walk_sqlite, '.bag': walk_rosbag1}
+_WALKS = {'.mcap': walk_mcap, '.db3': walk_sqlite}
 _PIECE = 4096  # [bytes] of a compressed file that are decompressed at a time
 _COMPLAINT = 200  # the longest piece of a library's complaint that is passed on
 
@@ -37,12 +37,12 @@ class DamageError(Exception):
     """
     What keeps a bag from being read to its end.
 
-    path : the file or directory; where : words that follow 'damaged'; used : which messages are
+    where : words that follow 'damaged'; used : which messages are
     """
 
     def __init__(self, path: Path, where: str, used: str = 'before that'):
         super().__init__(f'{path} is damaged{where}')
-        self.path, self.where, self.used = path, where, used
+        self.where, self.used = where, used
 
     def sentence(self, count: int) -> str:
         """Say it all, when `count` messages were used."""
@@ -55,7 +55,7 @@ class Salvage:
 
     Parameters
     ----------
-    bag : a rosbag2 directory, .mcap, .db3 or .bag
+    bag : a rosbag2 directory, .mcap or .db3
 
     Attributes
     ----------
@@ -189,7 +189,7 @@ def _decompressed(file: Path) -> Iterator[Path]:
         yield file
         return
     with TemporaryDirectory() as folder:
-        readable, decoder = Path(folder, file.stem), DECODERS['zstd']()
+        readable, decoder = Path(folder, file.stem), zstandard.ZstdDecompressor().decompressobj()
         with file.open('rb') as source, readable.open('wb') as target, suppress(Exception):
             while piece := source.read(_PIECE):
                 target.write(decoder.decompress(piece))
@@ -200,4 +200,5 @@ def _unpacked(message: BagMessage) -> BagMessage:
     """Return a message, decompressed where it was compressed by itself."""
     if not message.data.startswith(_ZSTD_MAGIC):
         return message
-    return message._replace(data=DECODERS['zstd']().decompress(message.data))
+    decoder = zstandard.ZstdDecompressor().decompressobj()
+    return message._replace(data=decoder.decompress(message.data))

@@ -1,18 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the walks through bag files share: each yields messages from the start to the damage."""
 
-import bz2
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from typing import Any, NamedTuple
-
-import lz4.frame  # type: ignore[import-untyped]  # comes with both bag libraries
-import zstandard  # comes with the mcap library
-from rosbags.typesys import Stores, get_typestore
-
-_BASIC = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
-# [bytes] A decoder is given so much at a time: when it fails, what it made of that is lost.
-_PIECE = 64
 
 
 class BagMessage(NamedTuple):
@@ -30,37 +19,3 @@ class BrokenRecordError(Exception):
     def __init__(self, position: int):
         super().__init__(f'no readable record at byte {position}')
         self.position = position
-
-
-def broken_at(position: int, messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
-    """Yield the messages; raise nothing but a BrokenRecordError with that position."""
-    try:
-        yield from messages
-    except Exception as error:  # damaged content makes the readers of records raise anything
-        raise BrokenRecordError(position) from error
-
-
-def ros1_types(fields: Mapping[str, Any]) -> Any:
-    """Return the types by which messages of ROS 1 become CDR, and are decoded from that."""
-    jazzy = get_typestore(Stores.ROS2_JAZZY).fielddefs
-    types = get_typestore(Stores.EMPTY)
-    # In ROS 1 a header has one field more, which the library's conversion leaves out.
-    types.register({**fields, **{name: jazzy[name] for name in _BASIC}})
-    return types
-
-
-# By their names in MCAP and in bags of ROS 1, each for one use.
-DECODERS: dict[str, Callable[[], Any]] = {
-    'zstd': lambda: zstandard.ZstdDecompressor().decompressobj(),
-    'lz4': lz4.frame.LZ4FrameDecompressor, 'bz2': bz2.BZ2Decompressor}
-
-
-def uncompressed(data: bytes, compression: str) -> bytes:
-    """Return the content of a chunk as far as it goes: up to a piece before it is damaged."""
-    if compression in ('', 'none'):
-        return data
-    decoder, parts = DECODERS[compression](), []
-    with suppress(Exception):  # the decoders have no exception in common
-        for start in range(0, len(data), _PIECE):
-            parts.append(decoder.decompress(data[start:start + _PIECE]))
-    return b''.join(parts)

@@ -9,20 +9,18 @@ comes before is decompressed and used.
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import lz4.frame  # type: ignore[import-untyped]  # comes with the bag libraries, as does zstandard
+import zstandard
 from mcap import data_stream, records
 from mcap.reader import make_reader
 
-from l1slam_ros.io.bags.damaged.walk import (
-    BagMessage,
-    BrokenRecordError,
-    broken_at,
-    uncompressed,
-)
+from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError
 
 MAGIC = b'\x89MCAP0\r\n'
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA, _DATA_END = 3, 4, 5, 6, 12, 15
@@ -32,6 +30,10 @@ _HEAD = struct.Struct('<BQ')
 _MESSAGE_HEAD = struct.Struct('<HIQQ')
 _FOOTER = struct.Struct('<BQQQI')
 _CHECKSUM = 4  # [bytes] at the end of the footer
+# By the name of a chunk's compression, each for one use. Of what is cut they give the first part.
+_DECODERS: dict[str, Callable[[], Any]] = {
+    'zstd': lambda: zstandard.ZstdDecompressor().decompressobj(),
+    'lz4': lz4.frame.LZ4FrameDecompressor}
 
 
 def walk_mcap(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
@@ -60,8 +62,11 @@ def walk_mcap(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
             content = file.read(length)
             # The last record of a whole file is none of these: this one is cut.
             position = size if file.tell() == size else start
-            yield from broken_at(position, channels.chunk(content) if opcode == _CHUNK
-                                 else channels.record(opcode, content))
+            read = channels.chunk if opcode == _CHUNK else partial(channels.record, opcode)
+            try:
+                yield from read(content)
+            except Exception as error:  # damaged content makes readers of records raise anything
+                raise BrokenRecordError(position) from error
         file.seek(-min(size, len(MAGIC)), 2)
         if file.read() != MAGIC:
             raise BrokenRecordError(size)
@@ -147,7 +152,9 @@ class _Channels:
     def chunk(self, content: bytes) -> Iterator[BagMessage]:
         """Yield the messages of a chunk, in part where it is damaged."""
         chunk = _parsed('Chunk', content)
-        rows = uncompressed(chunk.data, chunk.compression)
+        rows = chunk.data
+        if chunk.compression:
+            rows = _DECODERS[chunk.compression]().decompress(rows)
         whole = len(rows) == chunk.uncompressed_size
         messages = self._rows(rows)
         if whole and chunk.uncompressed_crc and zlib.crc32(rows) != chunk.uncompressed_crc:

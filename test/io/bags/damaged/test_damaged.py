@@ -4,8 +4,6 @@
 import re
 import shutil
 import struct
-import time
-from collections import Counter
 from contextlib import suppress
 from io import BytesIO
 
@@ -13,9 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
-from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
@@ -23,7 +19,6 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from bags import (
     KINDS,
     NOTE,
-    TYPES,
     mcap_file,
     recording_of,
     ros1_file,
@@ -33,14 +28,12 @@ from bags import (
     write_world,
 )
 from l1slam_ros.cli.main import main
-from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.errors import FileError, L1SlamError
 from l1slam_ros.io.bags.damaged.salvage import Salvage
 from l1slam_ros.io.bags.from_graph import GRAPH_NOTE
 from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note, read_raw
 from l1slam_ros.io.formats import read_input
 from l1slam_ros.io.graphs.graph_file import read_graph_file
-
-LONGEST = 2.0  # [s] a command may take on a damaged bag
 
 
 @pytest.fixture(scope='module')
@@ -70,14 +63,13 @@ def assert_told(said, path, used):
                         rf'{used:,} messages before that were used', said), said
 
 
-@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('kind', [kind for kind in KINDS if not kind.startswith('ROS 1')])
 def test_what_is_whole_is_walked_to_its_end(tmp_path, recording, kind):
     salvage = Salvage(KINDS[kind](tmp_path, recording))
     found = list(salvage.messages(None, None, None))
     assert salvage.damage is None
     assert [m[:3] for m in found] == [m[:3] for m in recording]
-    if not kind.startswith('ROS 1'):
-        assert [m.data for m in found] == [m[3] for m in recording]
+    assert [m.data for m in found] == [m[3] for m in recording]
 
 
 # What the file holds up to a byte, by independent means: kind -> the file's bytes, and where it
@@ -105,17 +97,7 @@ def database(folder, recording):
     return 'a.db3', whole, [(whole.index(data) // 4096 + 1) * 4096 for *_, data in recording]
 
 
-def ros1(folder, recording):
-    whole = ros1_file(folder / 'a.bag', recording).read_bytes()
-    ends, at = [], 0
-    for _, msgtype, _, data in recording:
-        message = bytes(TYPES.cdr_to_ros1(data, msgtype))
-        at = whole.index(message, at) + len(message)
-        ends.append(at)
-    return 'a.bag', whole, ends
-
-
-@pytest.mark.parametrize('kind', [unchunked, uncompressed, database, ros1])
+@pytest.mark.parametrize('kind', [unchunked, uncompressed, database])
 def test_every_message_before_a_cut_is_used_and_no_other(tmp_path, recording, kind, rng):
     name, whole, ends = kind(tmp_path, recording)
     assert len(ends) == len(recording) and sorted(ends) == ends
@@ -131,56 +113,14 @@ def test_every_message_before_a_cut_is_used_and_no_other(tmp_path, recording, ki
         assert len(found) == expected
         assert [m[:3] for m in found] == [m[:3] for m in recording[:expected]]
         assert_told(said, path, expected)
-
-
-def chunk_ends(whole):
-    """Return where the chunk of each message of an MCAP file ends, in the order of writing."""
-    ends = []
-    for chunk in make_reader(BytesIO(whole)).get_summary().chunk_indexes:
-        after = chunk.chunk_start_offset + chunk.chunk_length
-        indexes = whole[after:after + chunk.message_index_length]
-        with suppress(EndOfFile):
-            for record in StreamReader(BytesIO(indexes), skip_magic=True).records:
-                ends += [after] * len(record.records)
-    return ends
-
-
-def test_80_cuts_of_a_bag(tmp_path, rng, capsys):
-    write_world(tmp_path / 'bag', 120, 180)
-    recording = recording_of(tmp_path / 'bag')
-    name, whole = 'a.mcap', (tmp_path / 'bag' / 'bag.mcap').read_bytes()
-    ends = chunk_ends(whole)
-    assert len(ends) == len(recording) and len(set(ends)) > 7
-    path, output = tmp_path / name, tmp_path / 'out.g2o'
-    odometry = np.cumsum([topic == '/odom' for topic, *_ in recording])
-    codes = []
-    for cut in rng.integers(0, len(whole), 80):
-        path.write_bytes(whole[:cut])
-        output.unlink(missing_ok=True)
-        expected = int(np.searchsorted(ends, cut, 'right'))
-        began = time.process_time()
-        codes.append(main(['convert', str(path), str(output)]))
-        assert time.process_time() - began < LONGEST
-        err = capsys.readouterr().err
-        keyframes = int(odometry[expected - 1]) if expected else 0
-        if codes[-1] == 2:
-            assert keyframes < 2 and not output.exists() and err.count('\n') == 1
-            continue
-        assert codes[-1] == 3
-        assert 'is damaged: it breaks off after' in err and 'Traceback' not in err
-        record = read_graph_file(output)
-        # A decoder gives more of a chunk that is cut than nothing.
-        assert keyframes <= record.graph.n_poses <= keyframes + 30
-        assert len(record.graph.between) >= expected - 1
-    assert codes.count(3) > 60
+        assert f': it breaks off after {cut:,} bytes; ' in said
 
 
 def test_damage_is_an_error_to_who_wants_no_part(tmp_path, bag):
     path = tmp_path / 'a.mcap'
     path.write_bytes((bag / 'bag.mcap').read_bytes()[:5000])
     for call in (read_messages, read_raw):
-        with pytest.raises(FileError, match='a.mcap: damaged: it breaks off after 5,000 bytes; '
-                                            'expected a bag that can be read to its end'):
+        with pytest.raises(L1SlamError, match='a.mcap is damaged: it breaks off after 5,000 b'):
             list(call(path))
 
 
@@ -325,34 +265,19 @@ def test_a_message_that_cannot_be_decoded_is_left_out(tmp_path, recording):
     times = [m.time for m in read_messages(path, None, said.append)]
     assert times == [m[2] for k, m in enumerate(recording) if k not in (20, 30)]
     assert said == [f'{path} is damaged: 2 messages cannot be decoded; 299 others were used']
-    with pytest.raises(FileError, match='a message on /.* cannot be decoded'):
+    with pytest.raises(L1SlamError, match='2 messages cannot be decoded; 299 others were used'):
         list(read_messages(path))
     assert read_input(path).damage == said[0]
 
 
-@pytest.mark.parametrize('compression', [None, *Rosbag1Writer.CompressionFormat])
-def test_a_ros1_bag_whose_recorder_was_killed_has_no_index(tmp_path, recording, compression):
-    path = ros1_file(tmp_path / 'a.bag', recording, compression)
+def test_a_ros1_bag_that_is_damaged_is_refused(tmp_path, recording):
+    path = ros1_file(tmp_path / 'a.bag', recording)
     whole = path.read_bytes()
-    path.write_bytes(whole[:len(whole) // 2])
-    found, said = read(path)
-    assert [m[:3] for m in found] == [m[:3] for m in recording[:len(found)]]
-    assert abs(len(found) - len(recording) // 2) < 100
-    assert_told(said, path, len(found))
-
-
-def test_a_ros1_bag_with_a_damaged_chunk(tmp_path, recording):
-    """Of one time, the library reads one topic after the other, whatever the order in the file."""
-    recording = coarse(recording)
-    path = ros1_file(tmp_path / 'a.bag', recording, Rosbag1Writer.CompressionFormat.BZ2)
-    whole = bytearray(path.read_bytes())
-    starts = [found.start() for found in re.finditer(b'BZh91AY', whole)]
-    whole[starts[len(starts) // 2] + 50] ^= 1
-    path.write_bytes(whole)
-    found, said = read(path)
-    assert Counter(m[:3] for m in found) == Counter(m[:3] for m in recording[:len(found)])
-    assert len(recording) // 3 < len(found) < len(recording) * 2 // 3
-    assert_told(said, path, len(found))
+    for damaged in whole[:len(whole) // 2], b'x', whole[:-200] + bytes(200):
+        path.write_bytes(damaged)
+        for call in (lambda: read(path)), (lambda: bag_summary(path)):
+            with pytest.raises(FileError, match=r'a\.bag: damaged, or no bag \(.*rosbag reindex'):
+                call()
 
 
 # What happens to files: bytes are changed, lost or inserted, and the end is lost or zero.

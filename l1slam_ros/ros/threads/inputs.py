@@ -15,7 +15,7 @@ import threading
 import time
 from bisect import bisect_right
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
@@ -38,7 +38,7 @@ from l1slam_ros.io.files import quoted
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
 from l1slam_ros.io.node_options import NodeOptions
-from l1slam_ros.ros.inputs.traffic import Traffic
+from l1slam_ros.ros.robot import RobotPublisher
 from l1slam_ros.ros.threads.failures import Failures, reason
 
 _DEPTH = 1000
@@ -52,6 +52,61 @@ _ANSWERED = 5
 # [s] What raises each time it is called shall not keep a core busy.
 _BREATH = 0.05
 _REPEAT_WARNING = 5.0  # [s]
+# [s] The rate of messages is that of so long.
+_WINDOW = 5.0
+
+
+class Traffic:
+    """
+    The messages of one topic.
+
+    Publishers number their messages, and the numbers come along. So whatever got lost on the way
+    leaves a gap, also what a full queue has dropped: of that Fast DDS does not tell otherwise.
+    The numbers do not say whose they are. With several publishers each message is taken to follow
+    the nearest number before its own: who lost how many may be mixed up by that, the sum is not.
+
+    Parameters
+    ----------
+    publishers : returns how many there are now
+
+    """
+
+    def __init__(self, publishers: Callable[[], int]):
+        self.received = self.lost = 0
+        self.publishers = publishers
+        # The last number of each publisher, of who spoke last in front.
+        self._numbers: list[int] = []
+        self._marks = deque([(time.monotonic(), 0)])
+
+    def note(self, information: Mapping[str, int | None]) -> None:
+        """Count a message; information : what rclpy says about it."""
+        self.received += 1
+        number = information.get('publication_sequence_number')
+        if number is None:
+            return
+        numbers = self._numbers
+        if numbers and number == numbers[0] + 1:
+            numbers[0] = number
+            return
+        before = [last for last in numbers if last < number]
+        if number - 1 not in before and len(numbers) < self.publishers():
+            before = []
+        if before:
+            nearest = max(before)
+            numbers.remove(nearest)
+            self.lost += number - nearest - 1
+        numbers.insert(0, number)
+
+    def values(self) -> dict[str, str]:
+        """Return `received`, `rate` [1/s] and `lost`; to be called about once a second."""
+        del self._numbers[max(self.publishers(), 1):]
+        now = time.monotonic()
+        self._marks.append((now, self.received))
+        while len(self._marks) > 2 and now - self._marks[1][0] >= _WINDOW:
+            self._marks.popleft()
+        since, before = self._marks[0]
+        rate = (self.received - before) / max(now - since, 1e-9)
+        return {'received': str(self.received), 'rate': f'{rate:.1f}', 'lost': str(self.lost)}
 
 
 class _Apart(ReentrantCallbackGroup):  # type: ignore[misc]
@@ -87,21 +142,21 @@ class Inputs:
     backend : to append to
     options : of the node
     failures : where to tell what nobody foresaw
-    moved : called after a sample of the odometry that is used, but not if more wait behind it
-    tick : called after messages, and again after as many seconds as it returns
+    robot : answers a sample of the odometry that is used, but not if more wait behind it; its
+        `tick` is called after messages, and again after as many seconds as it returns
 
     Attributes
     ----------
-    active : whether messages are used, and `tick` is called
+    active : whether messages are used, and transforms are published
     traffic : of each topic by its name
     refused : cause -> how many messages could not be used
 
     """
 
     def __init__(self, node: Node, backend: Backend, options: NodeOptions, failures: Failures,
-                 moved: Callable[[], None], tick: Callable[[], float]):
+                 robot: RobotPublisher):
         self._node, self._backend, self._failures = node, backend, failures
-        self._moved, self._tick = moved, tick
+        self._robot = robot
         self._map_frame, self._odom_frame = options.map_frame, options.odom_frame
         self._group, self.active = _Apart(), False
         self._closing = self._unanswered = False
@@ -151,7 +206,7 @@ class Inputs:
         self._thread.start()
 
     def wake(self) -> None:
-        """Let `tick` be called now."""
+        """Look now whether a transform is to be published."""
         self._guard.trigger()
 
     def look_at_events(self) -> None:
@@ -190,7 +245,7 @@ class Inputs:
                     self._wait(waiting, 0.0 if self._backlog else seconds)
                     self._take()
                     self._use()
-                    seconds = self._tick() if self.active else math.inf
+                    seconds = self._robot.tick() if self.active else math.inf
                     self._failures.over('intake')
                 except Exception as error:
                     self._failures.note('intake', error)
@@ -257,7 +312,7 @@ class Inputs:
     def _answer(self) -> None:
         if self._unanswered:
             self._unanswered = False
-            self._moved()
+            self._robot.answer()
 
     def _on_loop(self, read: Callable[[Any], LoopClosure], message: Any) -> None:
         self._backend.add_loop(read(message))

@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""map -> odom: on `map_to_odom` always, on /tf where tf2_msgs is installed."""
+"""
+Where the robot is: on `pose` with its odometry, and as map -> odom on a clock.
+
+The transform is on `map_to_odom` always, on /tf where tf2_msgs is installed.
+"""
 
 import math
 import time
-from collections.abc import Callable
 
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.node import Node
 
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.snapshot import Robot
-from l1slam_ros.io.node_options import NodeOptions
-from l1slam_ros.ros.publishing import transform_bytes
+from l1slam_ros.io.messages.serialisation import pose_bytes, transform_bytes
+from l1slam_ros.ros.parameters import NodeParameters
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -23,39 +26,49 @@ _SECOND = 1_000_000_000
 _LATEST = 2**31 * _SECOND - 1
 
 
-class MapToOdom:
+class RobotPublisher:
     """
-    Publishes where the odometry frame is in the map, stamped ahead of the newest odometry.
+    Publishes the robot in the map, and where the odometry frame is there.
 
-    A look-up at the time of the newest odometry succeeds so, as long as the next transform comes
-    within the tolerance; with a stamp of its own it would fail until then.
+    The transform is stamped ahead of the newest odometry: a look-up at that time succeeds so, as
+    long as the next transform comes within the tolerance; with a stamp of its own it would fail
+    until then.
 
     Parameters
     ----------
     node : to publish from
     backend : which knows where the robot is
-    options : returns those of the node as they are now
+    parameters : of the node, with the options as they are now
 
     """
 
-    def __init__(self, node: Node, backend: Backend, options: Callable[[], NodeOptions]):
-        self._backend, self._options = backend, options
-        self._publisher = node.create_publisher(TransformStamped, 'map_to_odom', 10)
+    def __init__(self, node: Node, backend: Backend, parameters: NodeParameters):
+        self._backend, self._parameters = backend, parameters
+        self._pose = node.create_publisher(PoseStamped, 'pose', 10)
+        self._transform = node.create_publisher(TransformStamped, 'map_to_odom', 10)
         self._tf = None
-        if options().publish_tf and TFMessage is not None:
+        if parameters.options.publish_tf and TFMessage is not None:
             self._tf = node.create_publisher(TFMessage, '/tf', 100)
         self._newest = self._stamp = self._before = 0
         self._due = 0.0
         # The newest as a pose of the manifold, and as it is published.
         self._last = (backend.manifold.identity(0),) * 2
 
+    def answer(self) -> None:
+        """Publish where the robot is now."""
+        robot, manifold = self._backend.robot(), self._backend.manifold
+        if robot is not None:  # else the map has been emptied meanwhile
+            pose = manifold.compose(robot.map_to_odom, robot.odometry)
+            self._pose.publish(pose_bytes(
+                self._parameters.options.map_frame, robot.stamp, manifold.to_pose3(pose)[0]))
+
     def forget(self) -> None:
-        """Be silent until there is other odometry: its stamps so far are of another time."""
+        """Publish no transform until there is other odometry: its stamps are of another time."""
         self._before = self._newest
 
     def tick(self) -> float:
         """
-        Publish if it is time; return when to call again [s], infinity: with new odometry.
+        Publish the transform if it is time; return when to call again [s], or infinity.
 
         It is time, too, when odometry has come that is newer than the last transform: a bag that
         is played fast, or odometry that comes seldom, outruns the tolerance within a period.
@@ -65,13 +78,13 @@ class MapToOdom:
             return math.inf
         if now >= self._due or robot.stamp > self._stamp:
             self._publish(robot)
-            late, period = now - self._due, self._options().transform_period
+            late, period = now - self._due, self._parameters.options.transform_period
             self._due = now + period - (late if 0 <= late < period else 0.0)
         return self._due - now
 
     def _publish(self, robot: Robot) -> None:
         """Publish the transform as it is now."""
-        options = self._options()
+        options = self._parameters.options
         self._before = 0
         if robot.stamp < self._newest:
             self._stamp = 0  # time itself went back
@@ -83,6 +96,6 @@ class MapToOdom:
             self._last = (robot.map_to_odom,
                           self._backend.manifold.to_pose3(robot.map_to_odom)[0])
         said = options.map_frame, options.odom_frame, self._stamp, self._last[1]
-        self._publisher.publish(transform_bytes(*said))
+        self._transform.publish(transform_bytes(*said))
         if self._tf is not None:
             self._tf.publish(transform_bytes(*said, in_sequence=True))

@@ -1,20 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bytes of a Path made without its objects are the Path that ROS reads."""
+"""Bytes of a message made without its objects are the message that ROS reads."""
 
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Path
 from rclpy.serialization import deserialize_message
 from rosbags.typesys import Stores, get_typestore
 
-from l1slam_ros.core.online.snapshot import ACCEPTED, REJECTED, WAITING, LoopStates
-from l1slam_ros.ros.loop_status import states_bytes
-from l1slam_ros.ros.publishing import path_bytes, pose_bytes, transform_bytes
+from l1slam_ros.io.messages.serialisation import path_bytes, pose_bytes, transform_bytes
 
 
 def numbers(pose):
@@ -61,22 +58,3 @@ def test_ros_reads_the_transform_that_was_meant(rng, parent, child):
                                    'tf2_msgs/msg/TFMessage').transforms
     assert (one.header.frame_id, one.child_frame_id) == (parent, child)
     assert one.transform.rotation.w == pose3[6]
-
-
-# Every remainder modulo 4.
-@pytest.mark.parametrize('name', ['/b', '/ba', '/bac', '/back'])
-def test_ros_reads_the_states_of_loops_that_were_meant(name):
-    stamps = np.array([[1, 2], [10**9 + 5, 7 * 10**9], [3, 4 * 10**9 + 1]])
-    states = LoopStates(np.arange(2), stamps, np.array([ACCEPTED, REJECTED, WAITING]),
-                        np.array([0.5, 12.346, np.nan]))
-    data = states_bytes(name, 5_000_000_007, states, [1, 2])
-    read = deserialize_message(data, DiagnosticArray)
-    assert (read.header.stamp.sec, read.header.stamp.nanosec) == (5, 7)
-    refused, waiting = read.status
-    assert refused.name == f'{name}: loop 1.000000005 - 7.000000000'
-    assert (refused.level, refused.message, refused.hardware_id) == (
-        DiagnosticStatus.WARN, 'rejected', name)
-    assert {value.key: value.value for value in refused.values} == {
-        'reference_stamp': '1.000000005', 'stamp': '7.000000000', 'state': 'rejected',
-        'sigmas': '12.35'}
-    assert waiting.level == DiagnosticStatus.OK and waiting.values[3].value == ''
