@@ -130,8 +130,9 @@ class Front:
         weights = 1 / np.hypot(system.b, self._mu)
         if not choleskys[L1].factorise(system, weights):
             raise GraphError('a part of the graph is not tied to the anchor')
-        # Of a keyframe's first factor, whose residual the loops to come will say: it is weighed
-        # as the others are in the mean, one without a residual among them.
+        # What residual is left of a new factor, those to come will say: till then a keyframe's
+        # first one is weighed as the others are in the mean, one without a residual among them,
+        # and a loop halfway between that and what it says itself.
         self._usual = np.full(k, 1 / np.append(weights, 1 / self._mu).mean())
         self._borders = [Border(cholesky, system.size, k, _MOST_POINTS, _MOST_ROWS)
                          for cholesky in choleskys]
@@ -217,7 +218,8 @@ class Front:
             look, left = self._test(predicted, own, variance, known == 1)
             if look.accepted:
                 l2.add(predicted, variance)
-                l1.add(l1.predict(*new.of(L1, at)), np.hypot(left, self._mu))
+                noise = np.sqrt(self._usual * np.hypot(left, self._mu))
+                l1.add(l1.predict(*new.of(L1, at)), noise)
         except np.linalg.LinAlgError:
             # Beyond double precision: the next map may be able to.
             return None
