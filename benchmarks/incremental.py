@@ -79,11 +79,11 @@ def main() -> None:
     from updates.cells import Row, commit, is_done, measure
     from updates.tables import document
 
-    from l1slam_ros.io.compilation import STEPS, STEPS_IN_SPACE, load
+    from l1slam_ros.io.compilation import IN_SPACE, STEPS, load
     from l1slam_ros.io.files import write_lines
 
     # Each cell is a copy of this process, which has all loops compiled.
-    load((*STEPS, *STEPS_IN_SPACE))
+    load((*STEPS, *IN_SPACE.values()))
     file = arguments.output / 'results' / 'incremental.json'
     file.parent.mkdir(parents=True, exist_ok=True)
     before = json.loads(file.read_text())['rows'] if file.exists() else []

@@ -28,7 +28,7 @@ from updates.tables import LARGE_MEMORY
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.online.snapshot import Growth, Optimised, SavedMap
+from l1slam_ros.core.online.snapshot import BuilderState, Optimised, SavedMap
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.compilation import load
 from l1slam_ros.io.graphs.saved_map import load_map, save_map
@@ -69,7 +69,7 @@ def _save(keyframes: int, edges: int, path: Path) -> None:
     count = keyframes - min(REST, keyframes // 2)
     part, chain = prefix(graph, count), odometry_poses(graph)[:count]
     with Backend(_OPTIONS) as backend:
-        backend.restore(SavedMap(Growth.of_graph(part, chain, invented_stamps(count)),
+        backend.restore(SavedMap(BuilderState.of_graph(part, chain, invented_stamps(count)),
                                  Optimised.nothing(chain), True))
         backend.settle()
         print(save_map(path, backend.saved()), flush=True)

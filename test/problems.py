@@ -238,16 +238,16 @@ def true_loop(poses, reference, sample, covariance=UNKNOWN):
 
 
 def grown(poses, options, covariance=UNKNOWN):
-    """Return the growth after the samples of `poses` (n, 3), one every .1 s from 0."""
-    growth = GraphBuilder(se2, options)
-    drive_on(growth, poses, covariance=covariance)
-    return growth
+    """Return the builder after the samples of `poses` (n, 3), one every .1 s from 0."""
+    builder = GraphBuilder(se2, options)
+    drive_on(builder, poses, covariance=covariance)
+    return builder
 
 
-def drive_on(growth, poses, first=0, covariance=UNKNOWN, start=0.0, period=PERIOD):
+def drive_on(builder, poses, first=0, covariance=UNKNOWN, start=0.0, period=PERIOD):
     """Add the samples of `poses` (n, 3) from `first` on, number k at `start` + k `period`."""
     for k in range(first, len(poses)):
-        growth.add_odometry(odometry(start + k * period, poses[k], covariance))
+        builder.add_odometry(odometry(start + k * period, poses[k], covariance))
 
 
 def straight(n, step=1.0):
@@ -255,21 +255,21 @@ def straight(n, step=1.0):
     return np.arange(n)[:, None] * np.array([step, 0.0, 0.0])
 
 
-def keyframe_samples(growth):
+def keyframe_samples(builder):
     """Return which sample each keyframe is, (n,)."""
-    return np.round(growth.track.keyframe_stamps / seconds(PERIOD)).astype(int)
+    return np.round(builder.track.keyframe_stamps / seconds(PERIOD)).astype(int)
 
 
-def loops_of(growth):
+def loops_of(builder):
     """Return i, j and measurement of all factors that are no odometry."""
-    factors = growth.graph.between
+    factors = builder.graph.between
     rows = ~factors.is_odometry
     return factors.i[rows].tolist(), factors.j[rows].tolist(), factors.measurement[rows]
 
 
-def covariance_of(growth, row):
+def covariance_of(builder, row):
     """Return the covariance of one between factor, (3, 3)."""
-    root = growth.graph.between.sqrt_information[row]
+    root = builder.graph.between.sqrt_information[row]
     return np.linalg.inv(root.T @ root)
 
 

@@ -24,7 +24,7 @@ _BREATH = 0.05
 _TURN = 5e-4
 
 
-class Ending:
+class Signals:
     """
     Waits for a signal in a thread of its own: no other thread need be where it can take one.
 
@@ -79,7 +79,7 @@ def leave(code: int) -> None:
 
 def main() -> None:
     """Run the node until SIGINT or SIGTERM, and leave the process."""
-    ending = Ending()
+    signals = Signals()
     sys.setswitchinterval(_TURN)
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
@@ -94,10 +94,10 @@ def main() -> None:
         print(f'backend: {" ".join(str(error).split())}', file=sys.stderr)
         leave(1)
     node, code = None, 0
-    ending.orderly(rclpy.try_shutdown)
+    signals.orderly(rclpy.try_shutdown)
     try:
         node = BackendNode()
-        ending.saving = node.is_saving
+        signals.saving = node.is_saving
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.get_logger().info('ready: waiting for odometry')

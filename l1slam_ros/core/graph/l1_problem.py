@@ -90,4 +90,4 @@ class LinearProblem:
         """See `GraphProblem`."""
 
 
-Problem = GraphProblem | LinearProblem
+L1Problem = GraphProblem | LinearProblem

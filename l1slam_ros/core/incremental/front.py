@@ -44,28 +44,6 @@ UNKNOWN = -1
 
 
 @dataclass(frozen=True)
-class Gate:
-    """
-    What a factor is tested by.
-
-    variance : (2,) of odometry and loops, in units of what they state; log_odds : of a false loop
-    to a true one; log_volume : that the claims of false loops fill
-    """
-
-    variance: Array
-    log_odds: float
-    log_volume: float
-
-    @staticmethod
-    def of(manifold: Manifold, poses: Array, variance: Array, accepted: int,
-           refused: int) -> 'Gate':
-        """Return the gate of a map, poses (n, p), that so many loops were believed for or not."""
-        volume = claimed_volume(manifold, poses)
-        return Gate(variance, max(0.0, float(np.log((refused + 1) / (accepted + 1)))),
-                    float(volume.sum()))
-
-
-@dataclass(frozen=True)
 class Look:
     """What a first look at a factor says of it; see `Judgement`."""
 
@@ -122,7 +100,8 @@ class Front:
     part : the factors that are believed
     poses : their L1 map, (n, p), and their L2 map with the noise as it was found
     choleskys : of the part, the second holds the factor of that L2 map; the front keeps them
-    gate : see `Gate`
+    variance : (2,) of odometry and loops, in units of what they state
+    log_odds : of a false loop to a true one
     rows : factors of the graph that grows, when `part` was taken from it
 
     Attributes
@@ -137,21 +116,23 @@ class Front:
     """
 
     def __init__(self, part: FactorGraph, poses: tuple[Array, Array],
-                 choleskys: tuple[BlockCholesky, BlockCholesky], gate: Gate, rows: int):
+                 choleskys: tuple[BlockCholesky, BlockCholesky], variance: Array,
+                 log_odds: float, rows: int):
         self.rows, self.taken, self.closed = rows, 0, False
         self._manifold, self._fixed = part.manifold, anchor(part)
         system, k = linearise(part, poses[L1]), part.manifold.TANGENT_SIZE
         # What a square stays below, and the log ratio but for what hangs on the factor.
         self._limit = float(chi2_quantile(1 - _REFUSED, np.array([k]))[0])
-        self._volume = (gate.log_volume - k * np.log(2 * np.pi) / 2
-                        - np.log(_SURE - 1) - gate.log_odds)
-        self._variance = np.repeat(gate.variance[:, None], k, axis=1)
+        self._volume = (float(claimed_volume(part.manifold, poses[L1]).sum())
+                        - k * np.log(2 * np.pi) / 2 - np.log(_SURE - 1) - log_odds)
+        self._variance = np.repeat(variance[:, None], k, axis=1)
         self._mu = _SMOOTHING * smoothing(system.b)
         weights = 1 / np.hypot(system.b, self._mu)
         if not choleskys[L1].factorise(system, weights):
             raise GraphError('a part of the graph is not tied to the anchor')
-        # Of a keyframe's first factor, whose residual the loops to come will say: it is weighed
-        # as the others are in the mean, one without a residual among them.
+        # What residual is left of a new factor, those to come will say: till then a keyframe's
+        # first one is weighed as the others are in the mean, one without a residual among them,
+        # and a loop halfway between that and what it says itself.
         self._usual = np.full(k, 1 / np.append(weights, 1 / self._mu).mean())
         self._borders = [Border(cholesky, system.size, k, _MOST_POINTS, _MOST_ROWS)
                          for cholesky in choleskys]
@@ -237,7 +218,8 @@ class Front:
             look, left = self._test(predicted, own, variance, known == 1)
             if look.accepted:
                 l2.add(predicted, variance)
-                l1.add(l1.predict(*new.of(L1, at)), np.hypot(left, self._mu))
+                noise = np.sqrt(self._usual * np.hypot(left, self._mu))
+                l1.add(l1.predict(*new.of(L1, at)), noise)
         except np.linalg.LinAlgError:
             # Beyond double precision: the next map may be able to.
             return None

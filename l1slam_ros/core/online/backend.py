@@ -117,9 +117,9 @@ class Backend(Upkeep):
         with self._standing() as now:
             if now.graph.between.is_absolute.all():
                 return None
-            growth = self._builder.grown()
+            state = self._builder.grown()
             number = self._graphs
-        return SavedMap(growth, now.known(), now.robust, number)
+        return SavedMap(state, now.known(), now.robust, number)
 
     def restore(self, saved: SavedMap) -> int:
         """
@@ -129,7 +129,7 @@ class Backend(Upkeep):
         """
         saved.require(self.manifold)
         builder = self._new_builder()
-        builder.restore(saved.growth)
+        builder.restore(saved.builder)
         return self._replace(builder, saved.as_judged(self._robust))
 
     def _new_builder(self) -> GraphBuilder:

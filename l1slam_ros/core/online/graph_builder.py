@@ -17,7 +17,12 @@ from l1slam_ros.core.geometry.noise import MOST_OF_ODOMETRY, root_of_inverse
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, Notes, OdometrySample
 from l1slam_ros.core.graph.parts import odometry_gaps
-from l1slam_ros.core.online.keyframes import KeyframeOptions, Level, Motion, OdometryOptions
+from l1slam_ros.core.online.keyframes import (
+    KeyframeMotion,
+    KeyframeOptions,
+    Level,
+    OdometryOptions,
+)
 from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
 from l1slam_ros.core.online.odometry.odometry_stream import (
     UNSEEN_TURN,
@@ -26,7 +31,7 @@ from l1slam_ros.core.online.odometry.odometry_stream import (
     Point,
 )
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
-from l1slam_ros.core.online.snapshot import Growth
+from l1slam_ros.core.online.snapshot import BuilderState
 from l1slam_ros.core.options import Options, option
 
 # What a gap in the odometry is to the map: the cause it is counted by, and what is said of it.
@@ -85,7 +90,7 @@ class GraphBuilder:
         self.base_frame = base_frame or BaseFrame(options.base_frame)
         self.stream = OdometryStream(manifold, self.notes, self.base_frame)
         self.loops = LoopFactors(manifold, self.notes, verbatim)
-        self._motion: Motion
+        self._motion: KeyframeMotion
         self._resumed = False
         self._begin(FactorGraph(manifold))
 
@@ -190,7 +195,7 @@ class GraphBuilder:
         """Begin a part of the map with a keyframe."""
         self.track.append(stamp, pose, is_keyframe=True)
         self.graph.add_poses(1)
-        self._motion = Motion(self.graph.manifold, stamp, pose)
+        self._motion = KeyframeMotion(self.graph.manifold, stamp, pose)
 
     def _forget(self) -> None:
         """Begin anew; loops that came may yet find odometry of their times."""
@@ -198,33 +203,33 @@ class GraphBuilder:
         self._resumed = False
         self.loops.forget()
 
-    def grown(self) -> Growth:
+    def grown(self) -> BuilderState:
         """Return what another builder goes on from; there are keyframes."""
         track, loops = self.track, self.loops
         in_graph, _, expired = loops.stamps
-        return Growth(
+        return BuilderState(
             self.graph.copy(), track.keyframe_stamps, track.keyframe_poses, self.offset,
             track.last_stamp, track.last_pose,
             self._motion.covariance(self.options.odometry, self._verbatim),
             loops.rows, in_graph, expired, loops.waiting.arrivals(track.last), loops.seen())
 
-    def restore(self, growth: Growth) -> None:
+    def restore(self, state: BuilderState) -> None:
         """Go on where a run ended; odometry that begins elsewhere begins a part there."""
-        self._begin(growth.graph)
-        track, stamps = self.track, growth.stamps
+        self._begin(state.graph)
+        track, stamps = self.track, state.stamps
         for part in np.split(np.arange(len(stamps)), odometry_gaps(self.graph) + 1):
-            track.extend_by_part(stamps[part], growth.odometry[part])
-        self.offset = growth.offset
-        self._motion = Motion(self.graph.manifold, track.last_stamp, track.last_pose)
-        if growth.end > track.last_stamp:
-            track.append(growth.end, growth.end_pose, is_keyframe=False)
+            track.extend_by_part(stamps[part], state.odometry[part])
+        self.offset = state.offset
+        self._motion = KeyframeMotion(self.graph.manifold, track.last_stamp, track.last_pose)
+        if state.end > track.last_stamp:
+            track.append(state.end, state.end_pose, is_keyframe=False)
             by_model = self.options.odometry.covariance_source == 'model'
             self._motion.add_known(
-                growth.end, growth.end_pose, None if by_model else growth.end_covariance)
+                state.end, state.end_pose, None if by_model else state.end_covariance)
         self._glued, self._moved, self._resumed = False, True, True
         self.stream = OdometryStream(
             self.graph.manifold, self.notes, self.base_frame, resumed=True)
-        self.loops.restore(growth, track, self.options.loop)
+        self.loops.restore(state, track, self.options.loop)
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Take a loop closure or an absolute pose in, once; see `add_due_loops`."""

@@ -83,7 +83,7 @@ class Level:
         return (0.0, 0.0) if even else (float(length), float(angle))
 
 
-class Motion:
+class KeyframeMotion:
     """
     The motion since the last keyframe, grown message by message.
 

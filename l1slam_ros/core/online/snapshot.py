@@ -88,7 +88,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Growth:
+class BuilderState:
     """
     What a graph builder has made of messages, for another to go on from.
 
@@ -113,12 +113,12 @@ class Growth:
     seen: Mapping[bytes, int]
 
     @staticmethod
-    def of_graph(graph: FactorGraph, poses: Array, stamps: Indices) -> 'Growth':
+    def of_graph(graph: FactorGraph, poses: Array, stamps: Indices) -> 'BuilderState':
         """Return that of a graph alone, whose odometry went from pose to pose (n, p)."""
         d, none = graph.manifold.TANGENT_SIZE, np.zeros((0, 2), np.int64)
         loops = np.flatnonzero(~graph.between.is_odometry)
         ends = np.sort(stamps[graph.between.pairs[loops]], axis=1)
-        return Growth(graph, stamps, poses, graph.manifold.identity(1), int(stamps[-1]),
+        return BuilderState(graph, stamps, poses, graph.manifold.identity(1), int(stamps[-1]),
                       poses[-1:], np.zeros((d, d)), loops, ends, none, (), {})
 
 
@@ -163,14 +163,14 @@ class SavedMap:
     began anew there
     """
 
-    growth: Growth
+    builder: BuilderState
     optimised: Optimised
     robust: bool
     number: int = 0
 
     def require(self, manifold: Manifold) -> None:
         """Refuse, by a `GraphError`, a map whose poses are of another manifold."""
-        found = self.growth.graph.manifold
+        found = self.builder.graph.manifold
         if found is not manifold:
             raise GraphError(f'a map of {found.NAME}, expected one of {manifold.NAME}')
 

@@ -22,7 +22,7 @@ from l1slam_ros.core.graph.linear_system import (
     whitened_residual,
 )
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.incremental.front import Front, Gate
+from l1slam_ros.core.incremental.front import Front
 from l1slam_ros.core.online.snapshot import Optimised, Problem
 from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.robust.judgement import Judgement
@@ -181,9 +181,9 @@ def front_of(problem: Problem, poses: Array, rows: int,
     if not problem.is_sparse or method.cholesky is None:
         return None
     loops = ~problem.graph.between.is_odometry
-    believed = loops & judgement.accepted
-    gate = Gate.of(part.manifold, poses, judgement.variance, int(believed.sum()),
-                   int((loops & ~believed).sum()))
+    refused, believed = (np.count_nonzero(loops & (judgement.accepted == accepted))
+                         for accepted in (False, True))
+    log_odds = max(0.0, float(np.log((refused + 1) / (believed + 1))))
     variance = judgement.found_variance(problem.graph)
     found = part.subset(np.arange(len(variance)), variance)
     starts = [poses, *problem.starts[1:]]
@@ -200,7 +200,8 @@ def front_of(problem: Problem, poses: Array, rows: int,
                 break
             l2_poses, cost = backtrack(found, l2_poses, step, cost, l2_cost)
         check()
-        return Front(part, (poses, l2_poses), (method.cholesky, cholesky), gate, rows)
+        return Front(part, (poses, l2_poses), (method.cholesky, cholesky), judgement.variance,
+                     log_odds, rows)
     except GraphError:
         return None
 

@@ -19,8 +19,7 @@ from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import bridged, odometry_gaps
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import SAME
-from l1slam_ros.core.robust.batch import Report as OnRound
-from l1slam_ros.core.robust.batch import RobustMap, minimise_robustly
+from l1slam_ros.core.robust.batch import OnRound, RobustMap, minimise_robustly
 from l1slam_ros.core.robust.inspection import initial_poses, require_connected
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions

@@ -29,7 +29,7 @@ import numpy as np
 
 from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.graph.l1_problem import Problem
+from l1slam_ros.core.graph.l1_problem import L1Problem
 from l1slam_ros.core.graph.linear_system import LinearSystem
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.nonlinear import Report
@@ -171,7 +171,7 @@ class Curvature:
 
 
 def interior_point(
-    problem: Problem, poses: Array, cholesky: BlockCholesky, iterations: int, tolerance: float,
+    problem: L1Problem, poses: Array, cholesky: BlockCholesky, iterations: int, tolerance: float,
     report: Report = lambda iteration, cost: None,
 ) -> Optimum:
     """
@@ -250,7 +250,7 @@ def feasible_dual(system: LinearSystem, y: Array, slack: Array, norm: Norm,
     return feasible, gap
 
 
-def _start(problem: Problem, poses: Array) -> _Iterate:
+def _start(problem: L1Problem, poses: Array) -> _Iterate:
     """Return the point of the central path of mu = mean |e| for the residual as it is."""
     e = problem.residual(poses)
     system = problem.linearise(poses, e)
@@ -262,7 +262,7 @@ def _start(problem: Problem, poses: Array) -> _Iterate:
     return _Iterate(poses, system, u, v, mu / u, mu / v, e / (mu + root))
 
 
-def _step(problem: Problem, at: _Iterate, cholesky: BlockCholesky, curvature: Curvature) -> bool:
+def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: Curvature) -> bool:
     """Move `at` by one predictor and corrector step; False: there was no direction."""
     n, Q, gap = len(at.y), at.weights, at.gap
     if not curvature.factorise(at.system, Q, problem.curvature(at.poses, at.y), cholesky):
@@ -296,7 +296,8 @@ def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, c1: Array,
     return _Direction(x, moved, y, u, v, primal, dual, gap)
 
 
-def _trusted(problem: Problem, at: _Iterate, direction: _Direction) -> tuple[float, Array, Array]:
+def _trusted(problem: L1Problem, at: _Iterate,
+             direction: _Direction) -> tuple[float, Array, Array]:
     """
     Halve the primal step while the residual departs too far from its linearisation.
 

@@ -101,7 +101,7 @@ class MapFile:
         path = self._path()
         end = _end_of(path)
         saved, sentence, whole = load_map(path)
-        found, expected = saved.growth.graph.manifold, self._backend.manifold
+        found, expected = saved.builder.graph.manifold, self._backend.manifold
         if found is not expected:
             raise FileError(path, f'is a map of {found.NAME}; expected one of {expected.NAME}')
         number = self._backend.restore(saved)

@@ -16,13 +16,13 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.graph.measurements import LoopClosure
-from l1slam_ros.core.online.snapshot import Growth, Optimised, SavedMap
+from l1slam_ros.core.online.snapshot import BuilderState, Optimised, SavedMap
 from l1slam_ros.core.robust.judgement import Doubt, Judgement
 from l1slam_ros.io.files import put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord, graph_lines, read_graph_file
 from l1slam_ros.io.remarks import is_proven, with_remarks
 
-_Record = TypeVar('_Record', Growth, Optimised, Judgement)
+_Record = TypeVar('_Record', BuilderState, Optimised, Judgement)
 
 
 def save_map(path: Path, saved: SavedMap | None) -> str:
@@ -36,7 +36,7 @@ def save_map(path: Path, saved: SavedMap | None) -> str:
     """
     if saved is None:
         raise FileError(path, 'there is no graph yet to be saved')
-    record = GraphRecord(saved.growth.graph, saved.optimised.poses, np.arange(_count(saved)))
+    record = GraphRecord(saved.builder.graph, saved.optimised.poses, np.arange(_count(saved)))
     with replacing(path) as temporary:
         put_lines(temporary, with_remarks(graph_lines(path, record), _remarks(saved)))
         _keep(path)
@@ -116,28 +116,28 @@ def _remove_leftovers(path: Path) -> None:
 
 def _remarks(saved: SavedMap) -> dict[str, Any]:
     """Return by name what g2o has no tag for."""
-    growth, optimised = saved.growth, saved.optimised
+    state, optimised = saved.builder, saved.optimised
     values = {f.name: getattr(record, f.name)
-              for record in (growth, optimised, optimised.judgement) for f in fields(record)}
+              for record in (state, optimised, optimised.judgement) for f in fields(record)}
     for name in 'graph', 'poses', 'judgement':
         del values[name]
     return values | {
         'doubts': [asdict(doubt) for doubt in optimised.judgement.doubts], 'robust': saved.robust,
-        'trusted': growth.graph.between.trusted, 'struck': growth.graph.between.struck,
-        'seen': [[key.hex(), growth.seen[key]] for key in sorted(growth.seen)],
+        'trusted': state.graph.between.trusted, 'struck': state.graph.between.struck,
+        'seen': [[key.hex(), state.seen[key]] for key in sorted(state.seen)],
         'waiting': [[loop.reference_stamp, loop.stamp, loop.trusted, loop.struck, age,
                      loop.pose3.tolist(), loop.covariance.tolist()]
-                    for loop, age in growth.waiting]}
+                    for loop, age in state.waiting]}
 
 
 def _read(path: Path) -> SavedMap:
     record = read_graph_file(path)
     if record.poses is None or record.stamps is None:
         raise FileError(path, 'has no poses or no stamps; expected a saved map')
-    growth = Growth.of_graph(record.graph, record.poses, record.stamps)
+    state = BuilderState.of_graph(record.graph, record.poses, record.stamps)
     optimised, values = Optimised.nothing(record.poses), dict(record.remarks or {})
     if not values:
-        return SavedMap(growth, optimised, True)
+        return SavedMap(state, optimised, True)
     waiting = tuple(
         (LoopClosure(reference, stamp, np.array(pose3), np.array(covariance), trusted, struck),
          age)
@@ -145,7 +145,7 @@ def _read(path: Path) -> SavedMap:
     seen = {bytes.fromhex(key): row for key, row in values.pop('seen')}
     doubts = tuple(Doubt(**doubt) for doubt in values.pop('doubts'))
     judgement = replace(_restored(optimised.judgement, values), doubts=doubts)
-    return SavedMap(replace(_restored(growth, values), waiting=waiting, seen=seen),
+    return SavedMap(replace(_restored(state, values), waiting=waiting, seen=seen),
                     replace(_restored(optimised, values), judgement=judgement),
                     values['robust'])
 

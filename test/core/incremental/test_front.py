@@ -12,7 +12,7 @@ from systems import dense_covariance
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.core.online.snapshot import ACCEPTED, Growth, Optimised, SavedMap
+from l1slam_ros.core.online.snapshot import ACCEPTED, BuilderState, Optimised, SavedMap
 from l1slam_ros.core.online.update import improve
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
@@ -69,9 +69,9 @@ def seen_from_above():
 def test_how_sure_it_is_in_space_and_in_the_world(graph_of, fixed):
     graph = graph_of()
     poses = odometry_poses(graph)
-    growth = Growth.of_graph(graph, poses, np.arange(60) * 10**9)
+    state = BuilderState.of_graph(graph, poses, np.arange(60) * 10**9)
     backend = Backend(EVERY, len(graph.manifold.positions(poses)[0]))
-    backend.restore(SavedMap(growth, Optimised.nothing(poses), True))
+    backend.restore(SavedMap(state, Optimised.nothing(poses), True))
     assert backend.marginal_covariance(59) is None
     backend.settle()
     whole = dense_covariance(backend.snapshot())

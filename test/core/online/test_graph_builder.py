@@ -326,60 +326,60 @@ def absolute(time, pose, variances=(0.04, 0.04, 0.01), **more):
 def test_an_absolute_pose_is_a_factor_from_the_world():
     """At a keyframe as it is stated, whole or in part."""
     poses = curve(30)
-    growth = grown(poses, EVERY)
-    assert added(growth, absolute(1.0, (5, 6, 0.7)),
+    builder = grown(poses, EVERY)
+    assert added(builder, absolute(1.0, (5, 6, 0.7)),
                  absolute(2.0, (8, 9, 0.7), (0.04, 0.09, 0)),
                  absolute(2.5, (1, 2, 0.7), (-1, np.inf, 0.01), trusted=True)) == 3
-    i, j, measurement = loops_of(growth)
+    i, j, measurement = loops_of(builder)
     assert i == [WORLD] * 3 and j == [10, 20, 25]
     # Without a heading, that of the message means nothing, and the axes are those of the map.
     assert_allclose(measurement, [[5, 6, 0.7], [8, 9, 0], [1, 2, 0.7]], atol=1e-9)
-    factors = growth.graph.between
+    factors = builder.graph.between
     assert_allclose(factors.sqrt_information[-3:], [
         np.diag([5, 5, 10]), np.diag([5, 10 / 3, 0]), np.diag([0, 0, 10])], atol=1e-9)
     assert factors.trusted[-3:].tolist() == [False, False, True]
-    in_graph, waiting, _ = growth.loops.stamps
+    in_graph, waiting, _ = builder.loops.stamps
     assert in_graph.tolist() == [[seconds(t)] * 2 for t in (1.0, 2.0, 2.5)] and not len(waiting)
 
 
 def test_between_keyframes_it_is_carried_to_the_nearest(rng):
     poses = curve(60)
-    growth = grown(poses, GraphBuilderOptions())
-    at = keyframe_samples(growth)[3] + 1
+    builder = grown(poses, GraphBuilderOptions())
+    at = keyframe_samples(builder)[3] + 1
     way = se2.between(poses[at:at + 1], poses[at - 1:at])
-    added(growth, *(absolute(at * PERIOD, poses[at], (0.04, 0.09, heading))
+    added(builder, *(absolute(at * PERIOD, poses[at], (0.04, 0.09, heading))
                     for heading in (0.01, 0)))
-    _, j, measurement = loops_of(growth)
+    _, j, measurement = loops_of(builder)
     assert j == [3, 3]
     assert_allclose(measurement[0], poses[at - 1], atol=1e-9)
     Ad = se2.adjoint(se2.inverse(way))[0]
-    rows = len(growth.graph.between) - 2, len(growth.graph.between) - 1
-    assert_allclose(covariance_of(growth, rows[0]), Ad @ np.diag([0.04, 0.09, 0.01]) @ Ad.T)
+    rows = len(builder.graph.between) - 2, len(builder.graph.between) - 1
+    assert_allclose(covariance_of(builder, rows[0]), Ad @ np.diag([0.04, 0.09, 0.01]) @ Ad.T)
     # Where that is from there, nobody knows without a heading: the way is noise.
     assert_allclose(measurement[1], [*poses[at, :2], 0], atol=1e-9)
     lost = (way[0, :2] ** 2).mean()
-    root = growth.graph.between.sqrt_information[rows[1]]
+    root = builder.graph.between.sqrt_information[rows[1]]
     assert_allclose(np.diag(root)[:2] ** -2, [0.04 + lost, 0.09 + lost])
 
 
 def test_absolute_poses_wait_expire_and_come_once():
     poses = curve(30)
-    growth = grown(poses[:10], EVERY)
+    builder = grown(poses[:10], EVERY)
     there = (5, 6, 0.7)
-    assert added(growth, absolute(1.5, there)) == 0 and len(growth.loops.waiting) == 1
-    drive_on(growth, poses, 10)
-    assert added(growth, absolute(1.5, there), absolute(-1.0, there),
+    assert added(builder, absolute(1.5, there)) == 0 and len(builder.loops.waiting) == 1
+    drive_on(builder, poses, 10)
+    assert added(builder, absolute(1.5, there), absolute(-1.0, there),
                  absolute(1.5, there, (0, -1, np.nan)), absolute(1.5, there, (2e6, 0, np.inf)),
                  absolute(90.0, there)) == 1
-    assert growth.notes.refused == {'repeated': 1, 'before_start': 1, 'covariance': 2}
-    drive_on(growth, np.repeat(poses[-1:], 150, axis=0), 30)
-    assert growth.add_due_loops() == 0 and growth.notes.refused['expired'] == 1
+    assert builder.notes.refused == {'repeated': 1, 'before_start': 1, 'covariance': 2}
+    drive_on(builder, np.repeat(poses[-1:], 150, axis=0), 30)
+    assert builder.add_due_loops() == 0 and builder.notes.refused['expired'] == 1
 
 
 def test_a_loop_may_leave_components_unsaid():
-    growth = grown(curve(30), EVERY)
-    added(growth, loop(0.5, 2.0, (1, 2, 0.3), covariance6(np.diag([0.04, np.inf, 0.01]))))
-    assert_allclose(growth.graph.between.sqrt_information[-1], np.diag([5, 0, 10]))
+    builder = grown(curve(30), EVERY)
+    added(builder, loop(0.5, 2.0, (1, 2, 0.3), covariance6(np.diag([0.04, np.inf, 0.01]))))
+    assert_allclose(builder.graph.between.sqrt_information[-1], np.diag([5, 0, 10]))
 
 
 @pytest.mark.parametrize(('manifold', 'slope', 'mounted', 'says'), [

@@ -107,7 +107,7 @@ def test_messages_without_a_keyframe_are_summed_up(rng, monkeypatch, source):
 
     def covariance(at_once):
         monkeypatch.setattr(keyframes, '_SUMMED', at_once)
-        motion = keyframes.Motion(se2, 0, poses[:1])
+        motion = keyframes.KeyframeMotion(se2, 0, poses[:1])
         for k in range(1, len(poses)):
             motion.add(odometry(k / 100, poses[k], stated[k], stated[k]), poses[k : k + 1],
                        options)
@@ -121,7 +121,7 @@ def test_messages_without_a_keyframe_are_summed_up(rng, monkeypatch, source):
 
 def test_one_message_without_a_covariance_is_not_summed_up(monkeypatch):
     monkeypatch.setattr(keyframes, '_SUMMED', 2)
-    motion, pose = keyframes.Motion(se2, 0, np.zeros((1, 3))), np.zeros((1, 3))
+    motion, pose = keyframes.KeyframeMotion(se2, 0, np.zeros((1, 3))), np.zeros((1, 3))
     for k in range(1, 9):
         known = covariance6((k != 3) * np.eye(3))
         motion.add(odometry(float(k), pose[0], known), pose, OdometryOptions('increment'))

@@ -8,8 +8,8 @@ from problems import UNKNOWN, covariance6, odometry, random_information
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.online.keyframes import (
+    KeyframeMotion,
     KeyframeOptions,
-    Motion,
     OdometryOptions,
 )
 
@@ -26,7 +26,7 @@ UNUSABLE_NAMES = ['0', 'diagonal -1', '-1', 'nan', '9999', '1e308', 'one negativ
 def motion_of(increments, options, covariances=None, twists=None, period=0.1):
     """Return the motion of increments (k, 3), one message each."""
     pose = np.zeros((1, 3))
-    motion = Motion(se2, 0, pose)
+    motion = KeyframeMotion(se2, 0, pose)
     none = [UNKNOWN] * len(increments)
     for k, (increment, covariance, twist) in enumerate(
             zip(increments, covariances or none, twists or none, strict=True), 1):
@@ -140,7 +140,7 @@ def test_what_covariances_leave_unset_the_model_says(source):
 
 
 def test_a_source_changed_on_the_way_falls_back_to_the_model():
-    motion = Motion(se2, 0, np.zeros((1, 3)))
+    motion = KeyframeMotion(se2, 0, np.zeros((1, 3)))
     for k, options in enumerate([MODEL, INCREMENT], 1):
         motion.add(odometry(k, (k, 0, 0), np.eye(6)), np.array([[float(k), 0, 0]]), options)
     assert_allclose(motion.covariance(MODEL)[0, 0], 0.2**2 + 0.03**2)

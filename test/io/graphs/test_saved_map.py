@@ -90,7 +90,7 @@ def test_all_comes_back(halfway, tmp_path):
     # It has another number wherever it is loaded.
     assert_equal(replace(saved, number=back.number), back)
     assert [p.name for p in tmp_path.iterdir()] == ['map.g2o']
-    assert len(saved.growth.waiting) == 3 and len(saved.growth.seen) == 19
+    assert len(saved.builder.waiting) == 3 and len(saved.builder.seen) == 19
 
 
 def test_what_is_loaded_goes_on_as_if_nothing_had_been(world, halfway, tmp_path, monkeypatch):
@@ -110,7 +110,7 @@ def test_what_is_loaded_goes_on_as_if_nothing_had_been(world, halfway, tmp_path,
     a, b = (one.saved().optimised for one in (backend, undisturbed))
     np.testing.assert_allclose(a.poses, b.poses, atol=1e-3)
     assert a.cost == pytest.approx(b.cost, rel=1e-6)
-    assert_equal(backend.saved().growth, undisturbed.saved().growth)
+    assert_equal(backend.saved().builder, undisturbed.saved().builder)
     np.testing.assert_array_equal(backend.loop_states().state, undisturbed.loop_states().state)
 
 
@@ -129,7 +129,7 @@ def test_the_motion_after_the_last_keyframe_is_not_lost(tmp_path):
     backends[1].restore(load_map(path)[0])
     for backend in backends:
         drive(backend, 9, 20)
-    assert_equal(*(backend.saved().growth for backend in backends))
+    assert_equal(*(backend.saved().builder for backend in backends))
     # Begun elsewhere, or anew, odometry goes on from where the robot was.
     for time, pose in (30, (40.0, 50.0, 1.0)), (20, (0.0, 0.0, 0.0)), (9000, (8.0, 0.8, 0.16)):
         backends[0].restore(load_map(path)[0])
@@ -310,7 +310,7 @@ def test_what_killed_writers_left_is_removed(two, halfway):
 def test_to_others_it_is_a_graph_with_comments(halfway, tmp_path):
     saved, path, plain = halfway.saved(), tmp_path / 'map.g2o', tmp_path / 'plain.g2o'
     save_map(path, saved)
-    write_graph_file(plain, GraphRecord(saved.growth.graph, saved.optimised.poses, np.arange(50)))
+    write_graph_file(plain, GraphRecord(saved.builder.graph, saved.optimised.poses, np.arange(50)))
     lines = path.read_text().splitlines()
     assert [line for line in lines if not line.startswith('#')] == plain.read_text().splitlines()
     # As long as the shortest of buffers that others read a line into.
@@ -341,6 +341,6 @@ def test_what_is_no_map_is_refused(halfway, tmp_path):
     with pytest.raises(FileError, match='there is no graph yet to be saved'):
         save_map(path, backend.saved())
     saved = halfway.saved()
-    write_graph_file(path, GraphRecord(saved.growth.graph, saved.optimised.poses, np.arange(50)))
+    write_graph_file(path, GraphRecord(saved.builder.graph, saved.optimised.poses, np.arange(50)))
     with pytest.raises(FileError, match='has no poses or no stamps; expected a saved map'):
         load_map(path)

@@ -22,7 +22,7 @@ from l1slam_ros.core.graph.measurements import LoopClosure, Notes
 from l1slam_ros.core.online.keyframes import diagonal_covariance, reduced_covariance
 from l1slam_ros.core.online.loops.waiting_loops import WaitingLoop, WaitingLoops
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
-from l1slam_ros.core.online.snapshot import Growth
+from l1slam_ros.core.online.snapshot import BuilderState
 from l1slam_ros.core.options import Options, option
 
 
@@ -92,14 +92,14 @@ class LoopFactors:
         """Return of each loop that came, by its identity, its factor, -1 for none."""
         return {key: self._row_of.get(key, -1) for key in self._seen}
 
-    def restore(self, growth: Growth, track: OdometryTrack, options: LoopOptions) -> None:
+    def restore(self, state: BuilderState, track: OdometryTrack, options: LoopOptions) -> None:
         """Go on with the loops of an earlier run."""
-        self._note(growth.loop_rows, growth.loop_stamps)
-        self._expired.extend(growth.expired)
-        for loop, age in growth.waiting:
+        self._note(state.loop_rows, state.loop_stamps)
+        self._expired.extend(state.expired)
+        for loop, age in state.waiting:
             self.add(loop, track, options, age)
-        factors = growth.graph.between
-        for key, row in growth.seen.items():
+        factors = state.graph.between
+        for key, row in state.seen.items():
             if row >= 0:
                 self._row_of[key] = row
             self._seen[key] = self._seen.get(key, False) or bool(row >= 0 and factors.trusted[row])

@@ -82,7 +82,7 @@ class Upkeep:
         """Begin a map with the graph of a builder; the lock is held."""
         self._builder, self._number = builder, self._number + 1
         self._live = LiveMap(self._number, builder, optimised, self._robust)
-        self._map_to_odom, self._grown = None, self._live.growth()
+        self._map_to_odom, self._grown = None, self._live.size()
         self._changes += 1
 
     @property
@@ -154,7 +154,7 @@ class Upkeep:
             live, last = self._live, self._live.last
             self._take(start + max(budget, _LEAST_TIME))
             with self._lock:
-                grown = live.growth()
+                grown = live.size()
                 came, self._grown = grown != self._grown, grown
             idle = not came if idle is None else idle
             check = self._check_of(live, stopped)
@@ -240,11 +240,11 @@ class Upkeep:
         """Look at all loops again; anew: from the graph alone, until more comes."""
         with self._standing() as now:
             live, loops = self._live, self._live.begin_judgement()
-            grown = live.growth()
+            grown = live.size()
         whole = now.problem()
         del now  # as above
         problem = as_one(whole)
-        at_rest = until(lambda: live.growth() != grown, check)
+        at_rest = until(lambda: live.size() != grown, check)
         judgement, poses = robust_solve(problem.graph, check=at_rest) if anew else judge(
             problem.graph, problem.poses, problem.judgement, np.inf, check)
         check()
@@ -275,7 +275,7 @@ class Upkeep:
         with self._alone():
             with self._standing() as now:
                 live, loops = self._live, self._live.begin_judgement()
-                self._grown = live.growth()
+                self._grown = live.size()
             whole = now.problem()
             if not len(whole.graph.between):
                 return None
