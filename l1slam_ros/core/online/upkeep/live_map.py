@@ -24,9 +24,9 @@ from l1slam_ros.core.solvers.optimality import Status
 
 # A map is factored anew from so many factors on that came since: those of ten keyframes.
 _MANY = 20
-# Factors that a front takes while its lock is held, and between two looks at the clock: about
-# those of one keyframe. On a large map a loop takes milliseconds.
-_AT_ONCE = 2
+# Factors that a front takes while its lock is held, and between two looks at the clock: on a large
+# map a loop takes milliseconds.
+_AT_ONCE = 4
 # [s] While the front accepts all loops that come, they are judged so often.
 _JUDGE_EVERY = 2.0
 
