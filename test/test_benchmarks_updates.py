@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.paper.updates import Kept
 
 FOLDER = Path(__file__).parents[1] / 'benchmarks'
 sys.path.append(str(FOLDER))
-cells, tables, suite, kinds, cases = (importlib.import_module(name) for name in (
-    'updates.cells', 'updates.tables', 'incremental', 'robust.kinds', 'robust.cases'))
+cells, tables, suite, kinds, cases, in_space = (importlib.import_module(name) for name in (
+    'updates.cells', 'updates.tables', 'incremental', 'robust.kinds', 'robust.cases',
+    'updates.in_space'))
 TINY = cells.Cell('world10k', 'random', 0.3, 100, 1e4)
 
 
@@ -113,8 +115,18 @@ def test_cells_are_chosen_by_graph_kind_and_share(tmp_path, capsys):
         ('manhattan3500', 'grouped', 0.3), ('manhattan3500', 'grouped', 0.5)]
     for words, expected in (([*folder, 'world10k', '--kinds', 'evil'], "'evil' is none of clean"),
                             ([*folder, 'intel'], 'has no intel'),
+                            ([*folder, 'building,hills'], 'has no hills'),
                             ([*folder, 'bicocca25b', '--kinds', 'clean'], 'no such kind'),
                             ([*folder, 'world10k', '--shares', '1'], 'between 0 and 1')):
         with pytest.raises(SystemExit):
             suite.parse(words)
         assert expected in capsys.readouterr().err
+
+
+def test_who_drives_over_hills_goes_where_he_looks_and_up_and_down():
+    way = np.column_stack((0.1 * np.arange(5000), np.zeros(5000), np.zeros(5000)))
+    way = se2.compose(np.tile([[0.0, 0.0, 0.7]], (5000, 1)), way)
+    truth = in_space._over_ground(way, np.random.default_rng(0))
+    steps = se3.between(truth[:-1], truth[1:])
+    assert np.abs(steps[:, 1:3]).max() < 1e-3 and steps[:, 0].min() >= 0.1 - 1e-6
+    assert np.ptp(truth[:, 2]) > 5 and np.abs(np.diff(truth[:, 2])).max() < 0.03

@@ -164,7 +164,12 @@ def _variants() -> list[Kind]:
                               # Its track has no times: of a part of the way it says nothing.
                               *([] if change == 'stretch' else [((BOVISA,), lied)]))),
         *(Kind('variants', f'more-{lies}', (BICOCCA,), lies=lies, shares=(1 / 3,), bar=lied)
-          for lies in LIES)]
+          for lies in LIES),
+        *(Kind('variants', name, (INTEL, FR079), change, amounts, 'random', (0.3,), bar=clean)
+          for name, change, amounts in (('six-times', 'repeated', (6,)),
+                                        ('drift', 'drifting', (0.01, 1.02)))),
+        *(Kind('variants', f'corridor-{times:g}', (INTEL, FR079), 'corridor', (0.3, times),
+               bar=clean) for times in (1.0, 3.0, 10.0))]
 
 
 KINDS = (*_synthetic(), *_aliased(), *_noise(), *_others(), *_in_space(), *_variants())

@@ -3,7 +3,8 @@
 Recordings told otherwise: what is true of them stays, so a judgement that is right stays too.
 
 In: a place. Out: the place as it would have been recorded backwards, in a mirror, in other units,
-for a while only, with fewer keyframes, or without a word on its noise.
+for a while only, with fewer keyframes, or without a word on its noise; with each loop told several
+times, odometry that drifts, or corridors that look alike.
 """
 
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from robust.places import Error, Place
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
-from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.graph.spanning_tree import odometry_poses, pair_key
 
 
 def _backwards(place: Place) -> Place:
@@ -97,9 +98,56 @@ def _unknown(place: Place) -> Place:
                  np.zeros_like(roots) + np.eye(roots.shape[1]))
 
 
+def _repeated(place: Place, times: int) -> Place:
+    """Tell each loop so many times."""
+    factors = place.graph.between
+    rows = np.concatenate((np.arange(len(factors)),
+                           np.repeat(np.flatnonzero(~factors.is_odometry), times - 1)))
+    return _told(place, np.arange(place.graph.n_poses), rows, factors.i[rows], factors.j[rows],
+                 factors.measurement[rows], factors.sqrt_information[rows])
+
+
+def _drifting(place: Place, turn: float, stretch: float) -> Place:
+    """Let the odometry turn so much more on each metre [rad], and stretch it."""
+    graph, manifold, factors = place.graph, place.graph.manifold, place.graph.between
+    Z, odometry = factors.measurement.copy(), factors.is_odometry
+    way = Z[odometry]
+    way[:, manifold.TRANSLATION] *= stretch
+    more = np.zeros((len(way), manifold.TANGENT_SIZE))
+    more[:, manifold.ROTATION.stop - 1] = turn * np.linalg.norm(
+        manifold.positions(way), axis=1)
+    Z[odometry] = manifold.retract(way, more)
+    return _told(place, np.arange(graph.n_poses), np.arange(len(factors)), factors.i, factors.j,
+                 Z, factors.sqrt_information)
+
+
+def _corridor(place: Place, part: float, times: float) -> Place:
+    """
+    Tell a part of the loops once more, from other keyframes, as much as 5 m along the way off.
+
+    times : what the noise of all is said to be, in units of what it was said to be
+    """
+    graph, manifold, factors = place.graph, place.graph.manifold, place.graph.between
+    rng, m, n = np.random.default_rng(0), len(factors), graph.n_poses
+    told = pair_key(factors.i, factors.j, n)
+    loops = np.flatnonzero(~factors.is_odometry & (np.maximum(factors.i, factors.j) < n - 3)
+                           & ~np.isin(pair_key(factors.i + 2, factors.j + 3, n), told))
+    rows = rng.choice(loops, round(part * len(loops)), replace=False)
+    i, j, count = factors.i[rows] + 2, factors.j[rows] + 3, len(rows)
+    along = np.zeros((count, manifold.TANGENT_SIZE))
+    along[:, 0] = rng.choice([-1, 1], count) * rng.uniform(1.0, 5.0, count)
+    Z = manifold.retract(manifold.between(place.best[i], place.best[j]), along)
+    place = _told(place, np.arange(n), np.concatenate((np.arange(m), rows)),
+                 np.concatenate((factors.i, i)), np.concatenate((factors.j, j)),
+                 np.concatenate((factors.measurement, Z)), np.concatenate(
+                     (factors.sqrt_information, factors.sqrt_information[rows])) / times)
+    lies = np.arange(m + count) >= m
+    return replace(place, is_false=place.is_false | lies, is_true=place.is_true & ~lies)
+
+
 VARIANTS: dict[str, Callable[..., Place]] = {
     'backwards': _backwards, 'stretched': _stretched, 'stretch': _stretch, 'every': _every,
-    'unknown': _unknown,
+    'unknown': _unknown, 'repeated': _repeated, 'drifting': _drifting, 'corridor': _corridor,
 }
 
 

@@ -19,6 +19,7 @@ from l1slam_ros.core.robust.pairwise_consistency import (
     ASKED,
     Group,
     agreement,
+    asked,
     spanned,
     strongest_group,
 )
@@ -238,7 +239,7 @@ def _agree_at_a_place(growth: Growth) -> Indices:
     """Return loops from part to part that are left out, and agree with one of their place."""
     rows = growth.joining()
     _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
-    rows = growth.some(rows[count[place] > 1], ASKED)
+    rows = asked(growth, rows[count[place] > 1])
     if len(rows) < 2:
         return rows[:0]
     one, other, _ = agreement(growth, rows)

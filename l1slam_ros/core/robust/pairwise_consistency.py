@@ -15,6 +15,7 @@ import numpy as np
 from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import whiten
+from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.linear_system import with_world
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.innovation import claimed_volume, log_claims, log_likelihood_ratio
@@ -46,18 +47,24 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     Each place counts once, by the best log ratio of its loops, less ln m: each could have agreed
     by chance with any of the m that were asked.
     """
-    rows = growth.some(rows, ASKED)
+    rows = asked(growth, rows)
     if len(rows) < 2:
         return NO_GROUP
     one, other, log_ratio = agreement(growth, rows)
     place, first = np.unique(growth.place[rows], return_index=True, return_inverse=True)[2:0:-1]
     evidence = _evidence(place, one, other, log_ratio)
     best, needed = int(np.argmax(evidence)), np.log(len(rows) / DOUBT)
-    one_each = rows[np.sort(first)]  # in the order of `Growth.some`, whatever places are called
+    one_each = rows[np.sort(first)]  # in the order of `asked`, whatever places are called
     if evidence[best] < needed or evidence[best] < needed + _by_chance(growth, one_each):
         return NO_GROUP
     found = rows[np.concatenate(([best], other[one == best]))]
     return Group(found, np.unique(growth.place[found]))
+
+
+def asked(growth: Growth, rows: Indices) -> Indices:
+    """Return `ASKED` of some loops, as if at random, or all, (k,)."""
+    chosen: Indices = rows[np.argsort(keys(growth.low[rows], growth.high[rows]))[:ASKED]]
+    return chosen
 
 
 def _evidence(place: Indices, one: Indices, other: Indices, log_ratio: Array) -> Array:

@@ -13,14 +13,13 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, turned
 from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import as_sure, bridged, vague_odometry
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.robust.gating import believable, noise_variance
+from l1slam_ros.core.robust.gating import believable, noise_variance, stand_apart
 from l1slam_ros.core.robust.innovation import (
     Innovations,
     Posterior,
@@ -75,7 +74,8 @@ class Growth:
     these; variance : (2,) of odometry and loops in units of what they state; slip_odds : ln
     P(slipped) / P(measured) of the odometry factors that were suspected; drops : (m,) how often
     each was accepted and did not fit; at_their_word : whether factors may be as noisy as they say;
-    check : called before long steps, raises where the work shall stop.
+    in_tail : (m,) bool, not the loops that are too far off for that; check : called before long
+    steps, raises where the work shall stop.
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
@@ -100,6 +100,7 @@ class Growth:
         self.posterior: Posterior
         self.slip_odds: dict[int, float] = {}
         self.drops = np.zeros(len(self.factors), np.int64)
+        self.in_tail = np.ones(len(self.factors), bool)
 
     @cached_property
     def _places(self) -> tuple[Indices, Array]:
@@ -178,9 +179,8 @@ class Growth:
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
         clone = copy.copy(self)
-        clone.accepted, clone.drops = self.accepted.copy(), self.drops.copy()
-        clone.cut, clone.variance = self.cut.copy(), self.variance.copy()
-        clone.slip_odds = self.slip_odds.copy()
+        for name in ('accepted', 'drops', 'cut', 'variance', 'slip_odds'):
+            setattr(clone, name, getattr(self, name).copy())
         return clone
 
     def uncut(self) -> 'Growth':
@@ -213,7 +213,12 @@ class Growth:
         return noise
 
     def take_at_their_word(self) -> None:
-        """From now on let factors be as noisy as they say, if they are not noisier."""
+        """From now on let factors be as noisy as they say; loops, where `stand_apart` has it."""
+        rows, self.in_tail = self.undecided(), np.ones(len(self.factors), bool)
+        own = np.where(self.factors.is_absolute[rows], 1.0,
+                       self.variance_at_their_word()[1] / self.variance[1])
+        self.in_tail[rows] = stand_apart(self.innovations(rows), own, self.gate,
+                                         int((self.accepted & self.is_loop).sum()))
         self.at_their_word = True
         self.drops[:] = 0
 
@@ -333,7 +338,7 @@ class Growth:
         if not len(rows):
             return rows
         found, loops = self.innovations(rows), self.accepted & self.is_loop
-        fits = found.square < self.gate(found.freedom)
+        fits = (found.square < self.gate(found.freedom)) & self.in_tail[rows]
         refused = self.is_loop & ~self.accepted
         refused[rows[fits]] = False
         # Taken at their word all are noisier than they are, so that more fit by chance: then only
@@ -343,8 +348,3 @@ class Growth:
             found, self.posterior, self.gate, fits, int(true), self.place[rows],
             beside_refused(self._mates, refused, loops)[rows])]
         return believed
-
-    def some(self, rows: Indices, count: int) -> Indices:
-        """Return so many of some factors, as if at random, or all, (k,)."""
-        chosen: Indices = rows[np.argsort(keys(self.low[rows], self.high[rows]))[:count]]
-        return chosen

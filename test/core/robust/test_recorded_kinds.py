@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from lies import careful_world, is_false, position_error, spoilt
-from problems import chain_of, graph_of, retold
+from problems import chain_of, graph_of, measure, retold
 from torn import shifted_runs
 
 from l1slam_ros.core.graph.parts import odometry_gaps
@@ -43,6 +43,19 @@ def test_misstated_information_changes_no_decision(world, odometry, loops):
     # In hundreds: how noisy the odometry is shows only where loops check it.
     within = 0.15 if odometry == loops else 1.0
     np.testing.assert_allclose(np.log10(found.variance / [odometry, loops]), 0, atol=within)
+
+
+@pytest.mark.parametrize('times', [1.0, 3.0, 10.0])
+def test_noise_said_to_be_larger_than_it_is_lets_no_lie_in(world, times):
+    """A corridor that looks alike everywhere is wrong by metres, not by the width of the map."""
+    factors, rng = world.graph.between, np.random.default_rng(0)
+    loops = np.flatnonzero(~factors.is_odometry & (np.maximum(factors.i, factors.j) < 390))
+    lies, along = rng.choice(loops, 80, replace=False), np.zeros((80, 3))
+    along[:, 0] = rng.choice([-1, 1], 80) * rng.uniform(1.0, 5.0, 80)
+    graph, root = world.graph.copy(), factors.sqrt_information[loops[0]]
+    measure(graph, world.truth, factors.i[lies] + 2, factors.j[lies] + 3, along, root.T @ root)
+    found, _ = robust_solve(retold(graph, times=times))
+    assert not found.accepted[len(factors):].any() and found.accepted[:len(factors)].all()
 
 
 def test_a_graph_that_says_all_twice_is_believed(world):

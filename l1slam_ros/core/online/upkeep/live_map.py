@@ -25,7 +25,7 @@ from l1slam_ros.core.solvers.optimality import Status
 # A map is factored anew from so many factors on that came since: those of ten keyframes.
 _MANY = 20
 # Factors that a front takes while its lock is held, and between two looks at the clock: on a large
-# map some take two milliseconds each.
+# map a loop takes milliseconds.
 _AT_ONCE = 4
 # [s] While loops come none of which fits, they are judged so often.
 _JUDGE_EVERY = 2.0

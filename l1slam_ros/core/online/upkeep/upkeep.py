@@ -40,8 +40,8 @@ Stopped = Callable[[], bool]
 _LEAST_TIME, _LEAST_ROUND = 0.02, 0.1
 # Of the clock a round may take some times as long.
 _PATIENCE = 4
-# So often a new front takes what came meanwhile, before it is one.
-_PASSES = 3
+# So often a new front takes what came meanwhile, before it is one; so many factors at once.
+_PASSES, _AT_ONCE = 3, 16
 
 
 class Upkeep:
@@ -232,7 +232,7 @@ class Upkeep:
                 factors, accepted = self._builder.graph.between, live.accepted
             while front is not None and not front.closed and front.rows < len(accepted):
                 check()
-                front.take(factors, accepted[front.rows:].astype(int))
+                front.take(factors, accepted[front.rows:front.rows + _AT_ONCE].astype(int))
         check()
         self.adopt(of_all(improvement, whole), front)
 
