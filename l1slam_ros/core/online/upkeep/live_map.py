@@ -27,7 +27,7 @@ _MANY = 20
 # Factors that a front takes while its lock is held, and between two looks at the clock: on a large
 # map a loop takes milliseconds.
 _AT_ONCE = 4
-# [s] While the front accepts all loops that come, they are judged so often.
+# [s] While loops come none of which fits, they are judged so often.
 _JUDGE_EVERY = 2.0
 
 
@@ -88,9 +88,8 @@ class LiveMap:
         # What the last proof says, and of which factors.
         self._bound, self._proved = np.nan, np.zeros(0, bool)
         # The factors that the map is of and their noise, the loops that were judged, and whether
-        # the front left one, and one that fits.
-        self._used, self._noise = np.zeros(0, bool), np.zeros(0)
-        self._left = self._fits = False
+        # one that the front left may be true.
+        self._used, self._noise, self._fits = np.zeros(0, bool), np.zeros(0), False
         known = len(optimised.judgement.accepted)
         self._judged_loops = int(np.count_nonzero(builder.loops.rows < known))
         self._judged_anew = self._judged_loops
@@ -152,7 +151,6 @@ class LiveMap:
         new = np.array([(look.accepted, look.suspect, look.sigmas) for look in looks]).reshape(
             -1, 3)[max(known - first, 0):]
         self.looks.extend(new)
-        self._left |= not new[:, 0].all()
         self._fits |= bool(new[:, 1].any())
         return bool(looks)
 
@@ -186,9 +184,7 @@ class LiveMap:
     def is_judge_due(self, idle: bool, budget: float) -> bool:
         """Return whether to judge all loops; budget : there is so much time for it now [s]."""
         soon = self._fits or self.front is None
-        # After a long way without loops the first ones that are true may be far off.
-        wait = self.judge_took if soon else max(
-            0.0 if self._left else _JUDGE_EVERY, 2 * self.judge_took)
+        wait = self.judge_took if soon else max(_JUDGE_EVERY, 2 * self.judge_took)
         if idle:
             return not self.all_judged_anew
         return not self.all_judged and (budget > self.judge_took
@@ -207,7 +203,7 @@ class LiveMap:
 
     def begin_judgement(self) -> int:
         """Expect a judgement of all loops there are; return how many."""
-        self._left, self._fits, self._judge_began = False, False, time.monotonic()
+        self._fits, self._judge_began = False, time.monotonic()
         return len(self._builder.loops.rows)
 
     def take_judgement(self, judgement: Judgement, poses: Array, loops: int,
