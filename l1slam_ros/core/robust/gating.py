@@ -154,15 +154,15 @@ def _pairs(found: Innovations, posterior: Posterior, rows: Indices, log_ratio: A
             np.tile(both, 2))
 
 
-def stand_apart(found: Innovations, own: Array, gate: Gate, believed: int) -> Mask:
+def stand_apart(found: Innovations, own: float, gate: Gate, believed: int) -> Mask:
     """
     Return which factors may be as noisy as they say: those that stand apart from the false, (m,).
 
     True noise has a tail, of a few, which ends. How far off false ones are has no scale: from any
     distance to twice as far there are some more. Where all hang together, none may.
 
-    own : (m,) the variance that each states, in units of what was found; gate : what squares of
-    true factors stay below; believed : how many others are true for sure
+    own : the variance that they state, in units of what was found; gate : what squares of true
+    factors stay below; believed : how many others are true for sure
     """
     limit = gate(found.freedom)
     off = np.sqrt(found.square_with(own) / limit)

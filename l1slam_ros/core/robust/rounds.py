@@ -214,11 +214,13 @@ class Growth:
 
     def take_at_their_word(self) -> None:
         """From now on let factors be as noisy as they say; loops, where `stand_apart` has it."""
-        rows, self.in_tail = self.undecided(), np.ones(len(self.factors), bool)
-        own = np.where(self.factors.is_absolute[rows], 1.0,
-                       self.variance_at_their_word()[1] / self.variance[1])
-        self.in_tail[rows] = stand_apart(self.innovations(rows), own, self.gate,
-                                         int((self.accepted & self.is_loop).sum()))
+        self.in_tail = np.ones(len(self.factors), bool)
+        more = self.variance_at_their_word()[1] / self.variance[1]
+        rows = self.undecided()
+        rows = rows[~self.factors.is_absolute[rows]]
+        if more > 1:  # else loops say no more than was found
+            self.in_tail[rows] = stand_apart(self.innovations(rows), more, self.gate,
+                                             int((self.accepted & self.is_loop).sum()))
         self.at_their_word = True
         self.drops[:] = 0
 
