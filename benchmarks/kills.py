@@ -46,7 +46,7 @@ _PERIOD = 1.0  # [s] from autosave to autosave
 _RATE = 30.0  # [Hz] of the odometry
 _LONGEST = 3.0  # [s] from the first message to the kill
 _PATIENCE = 300.0  # [s]
-_SAVE = 2e-5  # [s] it takes to save a keyframe
+_SAVE = 5e-6  # [s] it takes at least to save a keyframe
 _AGAIN = 2 * 10**9  # [ns] before the last keyframe: loops since then are sent again
 _KINDS = {ODOMETRY_TOPIC: Odometry, LOOP_TOPIC: PoseWithCovarianceStamped}
 

@@ -81,9 +81,9 @@ class MapServices:
         if doubts:
             stamps = self._backend.snapshot().stamps
             raise DoubtfulError(doubt_sentence(doubts, np.arange(len(stamps)), stamps))
-        odometry, loops = np.sqrt(improvement.judgement.variance)
-        noise = '' if odometry == loops == 1 else (
-            f'; errors are {odometry:.2g} (odometry) and {loops:.2g} (loops) times what is stated')
+        odometry, loops = (f'{times:.2g}' for times in np.sqrt(improvement.judgement.variance))
+        noise = '' if odometry == loops == '1' else (
+            f'; errors are {odometry} (odometry) and {loops} (loops) times what is stated')
         return (f'L1 cost {improvement.cost_before:.6g} -> {improvement.cost:.6g}, '
                 f'{improvement.status.value}, {improvement.seconds:.2f} s{noise}')
 
