@@ -142,8 +142,9 @@ class Robot:
 
     def saved(self) -> tuple[FactorGraph, Indices]:
         """Return the graph of what is accepted in the saved map, and the stamps (n,) [ns]."""
-        growth, optimised = (saved := load_map(self.path)[0]).growth, saved.optimised
-        return growth.graph.subset(optimised.judgement.accepted), growth.stamps
+        saved = load_map(self.path)[0]
+        accepted = saved.optimised.judgement.accepted
+        return saved.builder.graph.subset(accepted), saved.builder.stamps
 
 
 def joined(graph: FactorGraph, stamps: Indices) -> Array | None:
