@@ -10,7 +10,7 @@ import multiprocessing
 import resource
 import subprocess
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -34,7 +34,7 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.paper.updates import Drive, Isam2, Kept, run_updates
+from l1slam_ros.paper.updates import Drive, Kept, isam2, run_updates
 
 CHECKPOINTS = 20
 # Simulated: keyframes and edges of the paper's Manhattan10k, and of a large sparse world.
@@ -73,8 +73,7 @@ class Row:
 
     commit : of the package; n, edges : of the graph; reached : keyframes per second; ours, peer :
     of `spread`; beside : ours, of the updates that the peer had time for, `peer_poses`; behind :
-    [s] of our other threads; memory : the most that the process held then [MiB], the peer and its
-    graph among it.
+    [s] of our other threads; memory : the most that our process held then [MiB].
 
     At the checkpoints, after `keyframes` (c,), and last a second after the end: excess over the
     L1 optimum of what is believed [%]; position error [m] of the map, of the L1 map of all true
@@ -167,15 +166,15 @@ def _place(datasets: Path, cell: Cell) -> Place:
 
 
 def _measured(datasets: Path, cell: Cell, patience: float) -> Row:
-    # Without a peer no graph is made in this process before its memory is known.
-    case = _case(datasets, cell) if patience else None
-    with _played(datasets, cell) as drives:
+    beside = isam2(lambda: _case(datasets, cell).clean, patience) if patience else nullcontext()
+    with _played(datasets, cell) as drives, beside as peer:
         run_updates(next(drives), None, 1e6, 1, cell.robust)
-        drive, peer = next(drives), Isam2(case.clean, patience) if case else None
+        drive = next(drives)
         Path('/proc/self/clear_refs').write_text('5')
         found = run_updates(drive, peer, cell.rate, CHECKPOINTS, cell.robust)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    case = case or _case(datasets, cell)
+    # Only now is a graph made in this process: its memory is that of the back end.
+    case = _case(datasets, cell)
     n = case.graph.n_poses
     row = Row(cell, commit(), n, len(case.graph.between), n / found.elapsed,
               spread(found.ours), found.behind, memory,

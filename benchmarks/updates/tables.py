@@ -34,8 +34,9 @@ def document(recorded: Mapping[str, Any], rows: Sequence[Row]) -> list[str]:
         'Made by `python benchmarks/incremental.py --datasets DIR`. '
         f'{machine["cpu"]}, {machine["used"]} of {machine["cores"]} cores; {named}. Each cell is '
         'a process of its own: the graph comes pose by pose, an update of ours after each, loops '
-        'doubted, and then an update of ISAM2 (L2, linearised again above 0.1, true loops alone) '
-        'in the same thread. Milliseconds of that thread; *behind*: seconds of our other threads. '
+        'doubted, and then an update of ISAM2 (L2, linearised again above 0.1, true loops alone), '
+        'which has a process of its own: here it would hold the lock of the interpreter. '
+        'Milliseconds of the updating threads; *behind*: seconds of our other threads. '
         f'Excess and error from keyframe {YOUNG:,} on, at {_checkpoints(rows)} checkpoints.', '',
         '## Time', '', *_table(_TIME, (_time(row) for row in ordered)),
         '- **/ ISAM2**: p99, longest, sum of the updates, and that sum with what goes on behind, '

@@ -8,9 +8,12 @@ time: others on the machine do not lengthen them, and what goes on behind is cou
 """
 
 import importlib.util
+import multiprocessing
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -38,6 +41,9 @@ _EDGES_PER_POSE = 2.07
 _WARM_UP = 200
 # The batch is solved at so many sizes of the map.
 _BATCHES = 40
+
+# Gives the peer a keyframe; the seconds of its update, [] once its time was up.
+Peer = Callable[[int], list[float]]
 
 
 @dataclass(frozen=True)
@@ -132,6 +138,38 @@ class Isam2:
         return self._Pose(self._gtsam.Rot3.Quaternion(w, x, y, z), pose[:3])
 
 
+@contextmanager
+def isam2(graph_of: Callable[[], FactorGraph], patience: float = float('inf')) -> Iterator[Peer]:
+    """
+    Give ISAM2 in a process of its own, as two back ends would run.
+
+    In this one it would hold the interpreter's lock for all of an update, so that our threads
+    stood still meanwhile, and its memory would count as ours. graph_of : called there.
+    """
+    context = multiprocessing.get_context('fork')
+    here, there = context.Pipe()
+    process = context.Process(target=_serve, args=(there, graph_of, patience), daemon=True)
+    process.start()
+    there.close()
+
+    def update(k: int) -> list[float]:
+        here.send(k)
+        seconds: list[float] = here.recv()
+        return seconds
+
+    here.recv()
+    yield update
+    here.send(None)
+    process.join()
+
+
+def _serve(asked: Connection, graph_of: Callable[[], FactorGraph], patience: float) -> None:
+    peer = Isam2(graph_of(), patience)
+    asked.send('ready')
+    for k in iter(asked.recv, None):
+        asked.send(peer.update(k))
+
+
 @dataclass(frozen=True)
 class Drive:
     """
@@ -154,7 +192,7 @@ class Drive:
         return Drive(graph.n_poses, dimension, recorded(forward, stamps))
 
 
-def run_updates(drive: Drive, peer: Isam2 | None, rate: float, maps: int,
+def run_updates(drive: Drive, peer: Peer | None, rate: float, maps: int,
                 robust: bool = True, advance: Callable[[], None] = lambda: None) -> Updates:
     """
     Feed the back end with a drive, an update after each keyframe, and the peer in turn.
@@ -177,7 +215,7 @@ def run_updates(drive: Drive, peer: Isam2 | None, rate: float, maps: int,
             backend.update(0.0)
             found.ours.append(time.thread_time() - before)
             if peer:
-                found.peer += peer.update(k)
+                found.peer += peer(k)
             if k + 1 in kept:
                 found.on_the_way.append(Kept.of(backend))
             advance()
@@ -203,8 +241,8 @@ def measure_growth(keyframes: int, rate: float, rng: np.random.Generator,
     load()
     run_updates(Drive.of(_world(_WARM_UP, rng)), None, np.inf, 1)
     graph = _world(keyframes, rng)
-    peer = Isam2(graph) if importlib.util.find_spec('gtsam') else None
-    updates = run_updates(Drive.of(graph), peer, rate, _BATCHES, advance=advance)
+    with isam2(lambda: graph) if importlib.util.find_spec('gtsam') else nullcontext() as peer:
+        updates = run_updates(Drive.of(graph), peer, rate, _BATCHES, advance=advance)
     return updates, np.array([_batch_seconds(now) for now in updates.on_the_way])
 
 

@@ -8,11 +8,9 @@ from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.paper.updates import Drive, measure_growth, run_updates
 
 
-class Peer:
-    """Takes 2 ms each, and has no time left after 50."""
-
-    def update(self, k):
-        return [0.002] if k < 50 else []
+def peer(k):
+    """Take 2 ms each, and have no time left after 50."""
+    return [0.002] if k < 50 else []
 
 
 def test_the_back_end_gets_all_of_the_graph_and_the_peer_its_turns():
@@ -20,7 +18,7 @@ def test_the_back_end_gets_all_of_the_graph_and_the_peer_its_turns():
     backward = ~graph.between.is_odometry & (np.arange(160) % 2 == 0)
     told = []
     drive = Drive.of(turned(graph, backward))
-    found = run_updates(drive, Peer(), 1e4, 4, advance=lambda: told.append(1))
+    found = run_updates(drive, peer, 1e4, 4, advance=lambda: told.append(1))
     assert len(found.ours) == len(told) == 80 and min(found.ours) > 0
     assert found.peer == [0.002] * 50
     assert [now.graph.n_poses for now in found.on_the_way] == [20, 40, 60, 80]
