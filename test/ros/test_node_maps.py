@@ -88,25 +88,6 @@ def test_a_settled_map_is_loaded_at_start_and_published_at_once(bench, tmp_path,
     assert not improved
 
 
-def test_a_damaged_map_is_said_and_the_one_before_taken(bench, tmp_path, capfd):
-    path = tmp_path / 'map.g2o'
-    b = bench(save_path=str(path), autosave_period=0.0, load_on_start=True)
-    assert 'the map begins empty: ' in capfd.readouterr().err
-    for count in 3, 5:
-        b.drive(0 if count == 3 else 3, count)
-        b.until(lambda count=count: len(b.path().poses) == count, 'a map')
-        assert call(b, 'save').success
-    path.write_bytes(path.read_bytes()[:-100])
-    capfd.readouterr()
-    bench(save_path=str(path), load_on_start=True)
-    assert capfd.readouterr().err.count('3 keyframes loaded from') == 1
-    answer = call(b, 'load')
-    assert answer.success
-    assert answer.message.startswith(f'3 keyframes loaded from {path}.1, the map before: {path}: ')
-    assert answer.message in capfd.readouterr().err
-    b.until(lambda: len(b.path().poses) == 3, 'the map before')
-
-
 def test_a_map_that_cannot_be_saved_is_an_error_until_it_can(bench, tmp_path, capfd):
     path = tmp_path / 'none' / 'map.g2o'
     b = bench(save_path=str(path), autosave_period=0.2)

@@ -7,7 +7,6 @@ import sys
 import threading
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
@@ -200,23 +199,6 @@ def test_optimize_is_done_though_the_map_is_replaced_meanwhile(bench, monkeypatc
     assert b.backend.set_parameters([Parameter('robust.enabled', value=False)])[0].successful
     b.until(answer.done, 'optimize is answered')
     assert answer.result().success, answer.result().message
-
-
-def test_after_a_load_the_pose_is_right_at_once(bench, tmp_path):
-    """Not only from the next keyframe on."""
-    b = bench(save_path=str(tmp_path / 'map.g2o'))
-    b.drive(0, 3)
-    b.until(lambda: len(b.path().poses) == 3, 'a map')
-    assert call(b, 'save').success and call(b, 'load').success
-    # The robot was switched off meanwhile: its odometry begins at 50 m.
-    b.send('/odom', odometry(10 * 10**9, 50.0))
-    b.send('/odom', odometry(11 * 10**9, 50.1))
-    b.until(lambda: len(b.received['pose']) == 5, 'both are answered')
-    x = [message.pose.position.x for message in b.received['pose'][-2:]]
-    np.testing.assert_allclose(x, [2.0, 2.1], atol=1e-9)
-    b.received['map_to_odom'].clear()
-    b.until(lambda: b.received['map_to_odom'], 'a transform')
-    assert b.received['map_to_odom'][-1].transform.translation.x == pytest.approx(-48.0)
 
 
 @pytest.mark.parametrize('choice', ['new_segment', 'reset', 'ignore'])
