@@ -24,7 +24,6 @@ from l1slam_ros.core.errors import Interrupted, L1SlamError, OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopOptions
@@ -313,9 +312,8 @@ def test_no_lie_is_believed_at_any_time(careful, clean_errors, kind):
 
 def test_at_rest_all_is_judged_from_the_graph_alone(careful, clean_errors):
     """While driving a slip is not looked for, and what was believed of it stays."""
-    graph = slipped(careful.graph, 150, (0.0, 0.0, 0.8))
-    world, backend = replace(careful, odometry=odometry_poses(graph)), Backend(EVERY)
-    drive(world, backend, lambda backend: None)
+    graph, backend = slipped(careful.graph, 150, (0.0, 0.0, 0.8)), Backend(EVERY)
+    drive(replace(careful, graph=graph), backend, lambda backend: None)
     settled(backend)
     now = backend.snapshot()
     assert now.graph.between.i[now.optimised.judgement.slips].tolist() == [150]

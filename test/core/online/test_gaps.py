@@ -43,7 +43,7 @@ def world():
 @pytest.fixture(scope='module')
 def recording(world):
     """Samples and loops of the world, keyframe k at 1 s + k `PERIOD`."""
-    return [*messages(world.graph, world.odometry, start=1.0)]
+    return [*messages(world.graph, start=1.0)]
 
 
 def fed(backend, found):
