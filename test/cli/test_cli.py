@@ -28,9 +28,6 @@ EDGES = ['EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1',
          'EDGE_SE2 0 2 2.1 0 0 1 0 0 1 0 1']
 
 
-# The costs of the odometry as it stands, every loop counted.
-ODOMETRY = ('--no-robust', '--start', 'odometry', '--outer', 0)
-
 
 @pytest.fixture(autouse=True)
 def no_progress(monkeypatch):

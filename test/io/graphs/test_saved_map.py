@@ -152,16 +152,6 @@ def test_what_came_after_the_last_update_is_looked_at(world, tmp_path):
     assert not np.allclose(loaded.poses, load_map(tmp_path / 'map.g2o')[0].optimised.poses)
 
 
-def test_a_loop_that_was_saved_is_known_when_it_is_sent_again(halfway, world, tmp_path):
-    save_map(tmp_path / 'map.g2o', halfway.saved())
-    backend = Backend(EVERY)
-    backend.restore(load_map(tmp_path / 'map.g2o')[0])
-    for _ in range(2):
-        backend.add_loop(loop(0.5, 7.0, (30.0, 40.0, 0.0), 1e-4 * np.eye(6)))
-        backend.add_loop(replace(loop(0.7, 4.1, (3.0, 1.0, 0.5), 0.5 * np.eye(6)), trusted=True))
-    assert backend.counts()[1] == {'repeated': 4}
-
-
 def test_judged_otherwise_it_is_judged_anew(halfway, tmp_path):
     save_map(tmp_path / 'map.g2o', halfway.saved())
     backend = Backend(replace(EVERY, robust=RobustOptions(enabled=False)))
