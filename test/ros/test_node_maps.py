@@ -14,10 +14,9 @@ rclpy = pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
-from node_bench import call, odometry, poses_of
+from node_bench import begin, call, odometry, poses_of
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from std_srvs.srv import Trigger
 
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs.saved_map import is_map, load_map
@@ -61,9 +60,7 @@ def test_the_map_is_saved_whatever_a_service_works_at(bench, tmp_path, monkeypat
     b = bench(save_path=str(path), autosave_period=0.2)
     b.drive(0, 3)
     b.until(lambda: keyframes(path) == 3, 'the map is saved')
-    client = b.peer.create_client(Trigger, '/backend/optimize')
-    b.until(client.service_is_ready, 'optimize is offered')
-    waiting = client.call_async(Trigger.Request())
+    waiting = begin(b, 'optimize')
     b.until(begun.is_set, 'it works')
     b.drive(3, 5)
     b.until(lambda: keyframes(path) == 5, 'the map is saved again')

@@ -11,10 +11,10 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from node_bench import call, loop, odometry, poses_of
+from node_bench import begin, call, loop, odometry, poses_of
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs.saved_map import load_map
@@ -46,9 +46,7 @@ def test_while_the_solver_is_compiled_all_else_is_served(bench, compiling, tmp_p
     assert call(b, 'pause', SetBool.Request(data=False)).success
     assert call(b, 'reset').success and call(b, 'load').success
     b.until(lambda: b.status()[1] == 'compiling the solver: 1 of 2', 'it says how far it is')
-    client = b.peer.create_client(Trigger, '/backend/optimize')
-    b.until(client.service_is_ready, 'optimize is offered')
-    waiting = client.call_async(Trigger.Request())
+    waiting = begin(b, 'optimize')
     b.drive(4, 6)
     b.until(lambda: b.status()[2]['odom.received'] == '6', 'odometry is taken in')
     assert not waiting.done() and not b.received['path']
@@ -192,9 +190,7 @@ def test_optimize_is_done_though_the_map_is_replaced_meanwhile(bench, monkeypatc
         return optimise(problem, options, check)
 
     monkeypatch.setattr(upkeep, 'optimise', interrupted)
-    client = b.peer.create_client(Trigger, '/backend/optimize')
-    b.until(client.service_is_ready, 'optimize is offered')
-    answer = client.call_async(Trigger.Request())
+    answer = begin(b, 'optimize')
     b.until(began.is_set, 'it is at work')
     assert b.backend.set_parameters([Parameter('robust.enabled', value=False)])[0].successful
     b.until(answer.done, 'optimize is answered')
