@@ -417,32 +417,6 @@ def test_each_loop_has_a_state_and_its_own_stamps(careful):
                       (seconds(2.0), seconds(50.0)): WAITING}
 
 
-# An earlier run
-
-
-def test_after_a_restore_odometry_may_begin_anywhere(world):
-    """The robot stands where the first run ended; a loop then ties the new to the old."""
-    first, backend = played(world, 0, 80), Backend(EVERY)
-    settled(first)
-    backend.restore(first.saved())
-    end = backend.poses[79:80]
-    for k in range(5):
-        raw = np.array([[50.0, 60.0 + k, np.pi / 2]])  # 1 m ahead each
-        backend.add_odometry(odometry(100.0 + k, raw[0], 1e-3 * np.eye(6)))
-        there = se2.compose(end, np.array([[float(k), 0.0, 0.0]]))
-        assert_allclose(se2.local(backend.poses[-1:], there), 0, atol=1e-9)
-        moved = se2.compose(backend.snapshot().map_to_odom, raw)
-        assert_allclose(se2.local(moved, there), 0, atol=1e-9)
-    # Half a metre off: nobody would believe it who was not told to.
-    seen = loop(7.9, 104.0, (4.5, 0.0, 0.0), 1e-6 * np.eye(6))
-    backend.add_loop(replace(seen, trusted=True))
-    settled(backend)
-    seen = se2.between(backend.poses[79:80], backend.poses[-1:])
-    assert_allclose(seen, [[4.5, 0.0, 0.0]], atol=1e-2)
-    moved = se2.compose(backend.snapshot().map_to_odom, raw)
-    assert_allclose(se2.local(backend.poses[-1:], moved), 0, atol=1e-9)
-
-
 # The warm start
 
 
