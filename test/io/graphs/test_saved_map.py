@@ -7,7 +7,7 @@ from dataclasses import fields, is_dataclass, replace
 import numpy as np
 import pytest
 from disk import Disk
-from problems import covariance6, loop, odometry, play
+from problems import EVERY, covariance6, loop, odometry, play
 
 from l1slam_ros.cli.main import main
 from l1slam_ros.core.errors import FileError
@@ -21,7 +21,6 @@ from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 from l1slam_ros.io.graphs.saved_map import is_map, load_map, save_map
 
-EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 PLENTY = 60.0
 
 
