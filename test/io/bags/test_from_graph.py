@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from numpy.testing import assert_array_equal
-from problems import add_absolute, random_information, random_poses, retold
+from problems import EVERY, add_absolute, random_information, random_poses, retold
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from bags import TYPES, mcap_file, recording_of
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.noise import covariance_of
@@ -204,6 +205,20 @@ def test_absolute_poses_come_back_as_they_went(tmp_path, rng):
     for name in ('i', 'j', 'measurement', 'sqrt_information'):
         np.testing.assert_allclose(getattr(mine, name)[order[0]], getattr(theirs, name)[order[1]],
                                    atol=1e-9)
+
+
+def test_a_slash_before_the_map_frame_says_nothing(tmp_path, rng):
+    """It was the habit of ROS 1."""
+    record, k = record_of([(0, 1), (1, 2)], rng), np.arange(3)
+    add_absolute(record.graph, k, random_poses(3, rng), random_information(3, rng))
+    write_graph_bag(tmp_path / 'bag', record)
+    recording = []
+    for topic, kind, time, data in recording_of(tmp_path / 'bag'):
+        message = TYPES.deserialize_cdr(data, kind)
+        message.header.frame_id = message.header.frame_id.replace('map', '/map')
+        recording.append((topic, kind, time, bytes(TYPES.serialize_cdr(message, kind))))
+    found = graph_from_bag(mcap_file(tmp_path / 'a.mcap', recording), EVERY, DEFAULT_TOPICS)
+    assert found.skipped == () and found.graph.between.is_absolute.sum() == 3
 
 
 def test_a_single_keyframe(tmp_path):
