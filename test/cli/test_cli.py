@@ -60,6 +60,10 @@ def test_solve_reports_what_it_wrote(capsys, world, tmp_path):
     assert report['rejected'] == [] and report['solver'] == 'interior-point'
     assert report['status'] in ('converged', 'iteration_limit', 'stalled')
     assert 0 < report['ate'] < 0.3
+    still = solve_json(capsys, world, '--no-robust', '--start', 'odometry', '--outer', 0,
+                       '--reference', f'{world}.truth.txt')
+    assert still['outer_iterations'] == 0 and still['final_cost'] == still['initial_cost']
+    assert still['ate'] > 3 * report['ate']
     assert {'world.g2o', 'optimised', 'truth', 'odometry', 'l1 cost', 'iteration',
             f'initial {report["initial_cost"]:.6g}, seed {report["seed_cost"]:.6g}, '
             f'final {report["final_cost"]:.6g}'} <= set(words(picture))

@@ -17,7 +17,8 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.noise import covariance_of
 from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
-from l1slam_ros.io.bags.from_graph import write_graph_bag
+from l1slam_ros.io.bags.from_graph import GRAPH_NOTE, VERBATIM_NOTE, write_graph_bag
+from l1slam_ros.io.bags.reader import read_note
 from l1slam_ros.io.bags.to_graph import DEFAULT_TOPICS, graph_from_bag
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.messages.conversion import loop_closure, odometry_sample
@@ -140,6 +141,15 @@ def test_factors_from_later_keyframes_to_earlier_ones_come_back(tmp_path, rng, m
     np.testing.assert_allclose(back.measurement[rows], of.measurement, atol=1e-12)
     np.testing.assert_allclose(covariance_of(back.sqrt_information)[rows],
                                covariance_of(of.sqrt_information), rtol=1e-9, atol=1e-9)
+
+
+def test_a_loop_that_stands_twice_number_for_number_is_meant(tmp_path, rng):
+    record, path = record_of([(0, 1), (1, 2), (0, 2)], rng), tmp_path / 'bag'
+    of = record.graph.between
+    record.graph.append_between(of.i[2:], of.j[2:], of.measurement[2:], of.sqrt_information[2:])
+    write_graph_bag(path, record)
+    assert read_note(path) == GRAPH_NOTE | VERBATIM_NOTE
+    assert len(graph_from_bag(path, None, DEFAULT_TOPICS).graph.between) == 4
 
 
 def test_the_stamps_of_the_graph_are_kept(tmp_path, rng):

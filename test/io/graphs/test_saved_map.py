@@ -43,6 +43,7 @@ def first_half(world):
     backend.add_loop(replace(loop(0.7, 4.1, (3.0, 1.0, 0.5), 0.5 * np.eye(6)), trusted=True))
     backend.add_loop(replace(loop(0.0, 2.0, (20.0, 0.0, 0.3), 0.1 * np.eye(6)),
                              reference_stamp=None))
+    backend.add_loop(replace(loop(0.5, 4.0, (0.0, 0.0, 0.0)), struck=True))
     settle(backend)
     backend.add_loop(replace(loop(0.0, 6.0, (7.0, 8.0, 0.0), np.diag([1, 1, 0, 0, 0, np.inf])),
                              reference_stamp=None))
@@ -80,6 +81,7 @@ def assert_equal(a, b):
 def test_all_comes_back(halfway, tmp_path):
     saved, path = halfway.saved(), tmp_path / 'map.g2o'
     assert {WAITING, ACCEPTED, REJECTED} <= set(halfway.loop_states().state)
+    assert saved.builder.graph.between.struck.sum() == 1
     doubtful = replace(saved.optimised.judgement, doubts=(Doubt('another map', 3, 4, 5),),
                        variance=np.array([0.1, 2 / 3]), slips=np.array([7, 9]))
     saved = replace(saved, optimised=replace(saved.optimised, judgement=doubtful))
