@@ -109,11 +109,16 @@ def poses_of(path):
         for p in path.poses]).reshape(-1, 7))
 
 
-def call(b, name, request=None):
-    """Call a service of the node and return its answer."""
-    kind = SetBool if name == 'pause' else Trigger
+def begin(b, name, request=None, kind=None):
+    """Call a service of the node; return the future of its answer."""
+    kind = kind or (SetBool if name == 'pause' else Trigger)
     client = b.peer.create_client(kind, f'/backend/{name}')
     b.until(client.service_is_ready, f'{name} is offered')
-    future = client.call_async(request or kind.Request())
+    return client.call_async(request or kind.Request())
+
+
+def call(b, name, request=None, kind=None):
+    """Call a service of the node and return its answer."""
+    future = begin(b, name, request, kind)
     b.until(future.done, f'{name} answers')
     return future.result()

@@ -2,14 +2,16 @@
 """Problems whose answer is known: hand-solved LPs, random systems, tiny graphs, messages."""
 
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
-from l1slam_ros.core.geometry import noise, se2
+from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.recording import recorded
 from l1slam_ros.core.online.backend import BackendOptions
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
@@ -273,21 +275,16 @@ def covariance_of(builder, row):
     return np.linalg.inv(root.T @ root)
 
 
-def messages(graph, poses, first=0, last=None, start=0.0):
+def messages(graph, first=0, last=None, start=0.0):
     """
-    Yield samples of a robot at `poses` (n, 3), and behind each the loops that end there.
+    Yield samples of the odometry of a graph, and behind each the loops that end there.
 
     Of keyframes first to last of the graph; number k is at `start` [s] + k `PERIOD`.
     """
-    factors = graph.between
-    stated = noise.covariance_of(factors.sqrt_information)
-    for k in range(first, graph.n_poses if last is None else last):
-        time, rows = start + k * PERIOD, np.flatnonzero(factors.j == k)
-        covariance = stated[rows[factors.is_odometry[rows]]].sum(axis=0)
-        yield odometry(time, poses[k], covariance6(covariance))
-        for row in rows[~factors.is_odometry[rows]]:
-            yield loop(start + factors.i[row] * PERIOD, time, factors.measurement[row],
-                       covariance6(stated[row]))
+    stamps = [seconds(start + k * PERIOD) for k in range(graph.n_poses)]
+    for sample, loops in islice(recorded(graph, stamps), first, last):
+        yield sample
+        yield from loops
 
 
 def hear(backend, found):
@@ -301,4 +298,4 @@ def hear(backend, found):
 
 def play(backend, world, first=0, last=None):
     """Add keyframes first to last and the loops that end there."""
-    hear(backend, messages(world.graph, world.odometry, first, last))
+    hear(backend, messages(world.graph, first, last))

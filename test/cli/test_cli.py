@@ -28,9 +28,6 @@ EDGES = ['EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1', 'EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1',
          'EDGE_SE2 0 2 2.1 0 0 1 0 0 1 0 1']
 
 
-# The costs of the odometry as it stands, every loop counted.
-ODOMETRY = ('--no-robust', '--start', 'odometry', '--outer', 0)
-
 
 @pytest.fixture(autouse=True)
 def no_progress(monkeypatch):
@@ -52,7 +49,7 @@ def world(tmp_path):
 
 
 def test_solve_reports_what_it_wrote(capsys, world, tmp_path):
-    output, picture = tmp_path / 'out.g2o', tmp_path / 'map.png'
+    output, picture = tmp_path / 'out.g2o', tmp_path / 'map.svg'
     report = solve_json(capsys, world, '--output', output, '--plot', picture,
                         '--reference', f'{world}.truth.txt')
     record = read_graph_file(output)
@@ -63,7 +60,13 @@ def test_solve_reports_what_it_wrote(capsys, world, tmp_path):
     assert report['rejected'] == [] and report['solver'] == 'interior-point'
     assert report['status'] in ('converged', 'iteration_limit', 'stalled')
     assert 0 < report['ate'] < 0.3
-    assert picture.read_bytes().startswith(b'\x89PNG')
+    still = solve_json(capsys, world, '--no-robust', '--start', 'odometry', '--outer', 0,
+                       '--reference', f'{world}.truth.txt')
+    assert still['outer_iterations'] == 0 and still['final_cost'] == still['initial_cost']
+    assert still['ate'] > 3 * report['ate']
+    assert {'world.g2o', 'optimised', 'truth', 'odometry', 'l1 cost', 'iteration',
+            f'initial {report["initial_cost"]:.6g}, seed {report["seed_cost"]:.6g}, '
+            f'final {report["final_cost"]:.6g}'} <= set(words(picture))
 
 
 @pytest.mark.parametrize('solver', ['primal-dual', 'interior-point'])
@@ -327,15 +330,6 @@ def test_a_parameter_file_may_say_that_all_loops_are_believed(capsys, tmp_path, 
     assert len(solve_json(capsys, *asked, '--robust')['rejected']) == 100
 
 
-def test_ate_of_the_odometry_is_that_of_zero_steps(capsys, world):
-    truth = f'{world}.truth.txt'
-    odometry = solve_json(capsys, world, '--no-robust', '--start', 'odometry', '--outer', 0,
-                          '--reference', truth)
-    assert odometry['outer_iterations'] == 0
-    assert odometry['final_cost'] == odometry['initial_cost']
-    assert odometry['ate'] > 3 * solve_json(capsys, world, '--reference', truth)['ate']
-
-
 @pytest.mark.parametrize('start', ['seed', 'file', 'odometry'])
 @pytest.mark.parametrize('norm', ['l1', 'l2', 'huber'])
 def test_every_start_leads_every_norm_to_one_cost(capsys, world, start, norm):
@@ -512,16 +506,6 @@ def test_a_file_of_other_false_loops_is_refused(capsys, tmp_path, line, words, c
     assert err.startswith(f'l1slam: {path}.false.txt') and words in err and err.count('\n') == 1
 
 
-def test_solve_draws_the_costs_beside_the_map(capsys, world, tmp_path):
-    picture = tmp_path / 'map.svg'
-    report = solve_json(capsys, world, '--plot', picture, '--reference', f'{world}.truth.txt')
-    said = words(picture)
-    for word in ('world.g2o', 'optimised', 'truth', 'odometry', 'l1 cost', 'iteration',
-                 f'initial {report["initial_cost"]:.6g}, seed {report["seed_cost"]:.6g}, '
-                 f'final {report["final_cost"]:.6g}'):
-        assert word in said
-
-
 @pytest.fixture
 def odd(world, tmp_path):
     """The world with stamps and with ids 10, 13, 16, ..."""
@@ -620,28 +604,13 @@ def test_a_parameter_file_speaks_to_both_growth_and_solver(capsys, world, tmp_pa
     assert said == pytest.approx(solve_json(capsys, world, '--norm', 'l2')['final_cost'], rel=1e-6)
 
 
-@pytest.mark.parametrize('lines, line, words', [
-    ([*VERTICES, 'EDGE_SE2 0 1 nan 0 0 1 0 0 1 0 1'], 4, 'nan'),
-    ([*VERTICES, *EDGES[:2], 'EDGE_SE2 0 2 2 0 0 1 2 0 1 0 1'], 6, 'positive definite'),
-    (VERTICES, None, 'edge'),
-    (['VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1'], None, 'no edges'),
-    ([*VERTICES, 'VERTEX_SE2 9 0 0 0', *EDGES], None, 'not connected'),
-])
-def test_bad_input_is_one_line_exit_code_2_and_no_output(capsys, tmp_path, lines, line, words):
-    path, output = graph_file(tmp_path, lines), tmp_path / 'out.g2o'
-    out, err = run(capsys, 'solve', path, '--output', output, code=2)
-    assert out == '' and err.count('\n') == 1 and err.startswith(f'l1slam: {path}:')
-    assert words.lower() in err.lower()
-    if line is not None:
-        assert f'{path}:{line}:' in err
-    assert sorted(tmp_path.iterdir()) == [path]
-
-
 @pytest.mark.parametrize('arguments, words', [
     (['solve', 'missing.g2o'], 'no such file'),
     (['solve', 'graph.txt'], 'unknown kind'),
     (['solve', 'graph.g2o', '--start', 'file'], 'no poses'),
     (['solve', 'graph.g2o', '--inner', '0'], 'iterations'),
+    (['solve', 'nan.g2o', '--output', 'out.g2o'], "nan.g2o:2: EDGE_SE2: 'nan' is not a finite"),
+    (['solve', 'lonely.g2o', '--output', 'out.g2o'], 'lonely.g2o: the graph is not connected'),
     (['solve', 'graph.g2o', '--output', 'out.doc'], 'suffix'),
     (['solve', 'graph.g2o', '--output', 'missing/out.g2o'], 'missing is no folder'),
     (['solve', 'graph.g2o', '--output', 'taken.g2o', '--plot', 'a.png'], 'it is a directory'),
@@ -676,10 +645,12 @@ def test_bad_arguments_are_one_line_and_exit_code_2(
     for name in ('other', 'taken.g2o', 'taken.png'):
         (tmp_path / name).mkdir()
     (tmp_path / 'gap.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 0 5 1 '))
+    (tmp_path / 'nan.g2o').write_text('\n'.join(EDGES).replace(' 1 2 1 ', ' 1 2 nan '))
+    (tmp_path / 'lonely.g2o').write_text('\n'.join([*VERTICES, 'VERTEX_SE2 9 0 0 0', *EDGES]))
+    there = sorted(tmp_path.iterdir())
     err = run(capsys, *arguments, code=2)[1]
     assert err.count('\n') == 1 and words in err, err
-    assert sorted(p.name for p in tmp_path.iterdir()) == [
-        'gap.g2o', 'graph.g2o', 'graph.txt', 'other', 'taken.g2o', 'taken.png']
+    assert sorted(tmp_path.iterdir()) == there
 
 
 def test_a_graph_with_gaps_and_without_poses_is_solved_from_its_tree(capsys, tmp_path):

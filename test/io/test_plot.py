@@ -2,7 +2,6 @@
 """Pictures: real files, read back with other libraries."""
 
 import re
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,7 +11,6 @@ from PIL import Image
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.plot import Curve, MapDrawing, plot_curves, plot_maps, plot_solution
 
-ROOT = Path(__file__).parents[2]
 SQUARE = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0], [0.0, 1.0]])
 
 

@@ -24,100 +24,76 @@ import pkgutil
 from dataclasses import replace
 
 import numpy as np
-from lies import careful_world, drive_roundabout, roundabout, seen, spoilt
-from problems import add_absolute, play, retold
+from lies import careful_world, drive_roundabout, roundabout, seen, slipped, spoilt
+from problems import EVERY, add_absolute, play
 
-from l1slam_ros.io import formats
-from l1slam_ros.core.robust import batch_map
-from l1slam_ros.io.compilation import STEPS, fill_cache, with_space
-from l1slam_ros.core.geometry import se3
 from l1slam_ros.core import kernels
-from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
-from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.geometry import se3
+from l1slam_ros.core.graph.linear_system import linearise
+from l1slam_ros.core.names import NORMS
+from l1slam_ros.core.online.backend import Backend, RobustOptions
+from l1slam_ros.core.robust import batch_map
 from l1slam_ros.core.robust.inspection import connected_parts
-from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.solvers.reweighting import weighted_least_squares
-from l1slam_ros.core.graph.linear_system import linearise
-from l1slam_ros.core.names import NORMS, STARTS
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.compilation import STEPS, fill_cache, with_space
 
 MODULES = [importlib.import_module(f'{kernels.__name__}.{module.name}')
            for module in pkgutil.iter_modules(kernels.__path__)]
 
 
 def compiled_here():
-    return {(kernel.py_func.__module__, kernel.py_func.__name__, str(signature))
-            for module in MODULES for kernel in vars(module).values()
-            if hasattr(kernel, 'signatures') for signature in kernel.stats.cache_misses}
+    return sorted((kernel.py_func.__module__, kernel.py_func.__name__, str(signature))
+                  for module in MODULES for kernel in vars(module).values()
+                  if hasattr(kernel, 'signatures') for signature in kernel.stats.cache_misses)
 
 
-def look(what):
-    for module, name, signature in sorted(compiled_here()):
-        print(f'{what}: {module}.{name}{signature}')
+def solved(graph, poses=None, **asked):
+    batch_map.solve(graph, poses, batch_map.SolveOptions(**asked))
 
 
 assert fill_cache(lambda done, total: None, lambda: False)
 assert not compiled_here()
-
-every = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 world = spoilt(careful_world(150, 300), 'grouped', 60)
+graph, odometry = world.graph, world.odometry
 for enabled in (True, False):
-    options = replace(every, robust=RobustOptions(enabled))
-    backend = Backend(options)
+    options = replace(EVERY, robust=RobustOptions(enabled))
+    backend, after = Backend(options), Backend(options)
     for k in range(0, 150, 15):
         play(backend, world, k, k + 15)
         backend.update(0.001 if k % 2 else 60.0)
     backend.loop_states()
-    look(f'updates, robust {enabled}')
     backend.settle()
-    look(f'optimise, robust {enabled}')
-    after = Backend(options)
     after.restore(backend.saved())
     after.update(60.0)
-    look(f'restored, robust {enabled}')
-
-truth = roundabout(220)
-backend = Backend(every)
+backend, truth = Backend(EVERY), roundabout(220)
 drive_roundabout(backend, truth)
 for i, j in ((3, 203), (30, 140)):
     backend.add_loop(seen(truth, i, j))
     backend.update(60.0)
-look('pairs of loops')
-
-def solved(graph, poses, **asked):
-    batch_map.solve(graph, poses, batch_map.SolveOptions(**asked))
-
-slipped = world.graph.between.measurement.copy()
-slipped[np.flatnonzero(world.graph.between.is_odometry)[80]] += [5.0, 0.0, 0.0]
-solved(retold(world.graph, slipped), None, robust=True)
-look('a slip')
-for start, norm, robust in itertools.product(STARTS, NORMS, (False, True)):
-    for poses in (world.odometry, np.asfortranarray(world.odometry)):
-        solved(world.graph, poses, start=start, norm=norm, robust=robust)
-        look(f'{start}, {norm}, robust {robust}')
+solved(slipped(graph, 80, (5.0, 0.0, 0.0)), robust=True)
+starts = ('seed', None), ('file', np.asfortranarray(odometry)), ('odometry', odometry)
+for (start, poses), norm, robust in itertools.product(starts, NORMS, (False, True)):
+    solved(graph, poses, start=start, norm=norm, robust=robust)
 for solver in ('primal-dual', 'interior-point'):
-    solved(world.graph, world.odometry, solver=solver)
-    look(solver)
-
-cholesky = cholesky_of(world.graph)
-system = linearise(world.graph, world.odometry)
+    solved(graph, odometry, solver=solver)
+cholesky, system = cholesky_of(graph), linearise(graph, odometry)
 weighted_least_squares(system, cholesky, np.ones_like(system.b), 0.1)
 scattered = 20 * np.random.default_rng(0).standard_normal((150, 3))
-minimise_l2(world.graph, scattered, LeastSquaresOptions(), cholesky)
-look('damped steps')
-connected_parts(world.graph)
-add_absolute(world.graph, np.array([7]), world.truth[7:8], np.eye(3)[None])
+minimise_l2(graph, scattered, LeastSquaresOptions(), cholesky)
+connected_parts(graph)
+add_absolute(graph, np.array([7]), world.truth[7:8], np.eye(3)[None])
 for norm in NORMS:
-    solved(world.graph, world.odometry, norm=norm)
-look('an absolute factor')
+    solved(graph, odometry, norm=norm)
 assert fill_cache(lambda done, total: None, lambda: False, with_space(STEPS, se3))
 building = simulate_world(120, 300, WorldOptions(), np.random.default_rng(0), 'building')
 for norm in NORMS:
     solved(building.graph, building.odometry, norm=norm)
 solved(building.graph, building.odometry, solver='primal-dual', robust=False)
-look('in space')
+for missing in compiled_here():
+    print(*missing)
 used = [kernel for module in MODULES for kernel in vars(module).values()
         if hasattr(kernel, 'takes') and kernel.stats.cache_hits]
 assert len(used) > 25, 'are the kernels not where this test looks for them?'

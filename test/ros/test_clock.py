@@ -8,7 +8,7 @@ pytest.importorskip('rclpy')
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from node_bench import call, poses_of
+from node_bench import EVERY_MESSAGE, call, poses_of
 from rosgraph_msgs.msg import Clock
 
 import l1slam_ros as l1
@@ -23,9 +23,7 @@ KINDS = {'/odom': Odometry, '/loop_closures': PoseWithCovarianceStamped}
 def test_a_bag_played_twice_by_a_clock_that_stands_is_the_map_and_the_odometry(bench, tmp_path):
     graph = write_world(tmp_path / 'bag', N, 240, 3).graph
     messages = list(read_raw(tmp_path / 'bag', KINDS))
-    b = bench(use_sim_time=True, **{
-        'keyframe.translation': 0.0, 'keyframe.rotation': 0.0, 'keyframe.period': 0.0,
-        'odometry.covariance_source': 'increment'})
+    b = bench(use_sim_time=True, **EVERY_MESSAGE)
     clock = b.peer.create_publisher(Clock, '/clock', 10)
     b.until(clock.get_subscription_count, 'the node hears the clock')
     once = l1.solve(graph).poses

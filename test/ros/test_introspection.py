@@ -12,7 +12,7 @@ pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from node_bench import odometry
+from node_bench import call, odometry
 from rcl_interfaces.srv import DescribeParameters, ListParameters
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosbags.typesys import Stores, get_typestore
@@ -63,23 +63,15 @@ PARAMETERS = {
 }
 
 
-def asked(b, kind, name, request):
-    client = b.peer.create_client(kind, f'/backend/{name}')
-    b.until(client.service_is_ready, f'{name} is offered')
-    future = client.call_async(request)
-    b.until(future.done, f'{name} answers')
-    return future.result()
-
-
 def test_topics_and_services_are_those_of_the_interface(bench):
     b = bench()
 
     def named():
-        return [{name: kind for name, (kind,) in call('backend', '/')
+        return [{name: kind for name, (kind,) in named_by('backend', '/')
                  if not kind.startswith(OF_ROS)}
-                for call in (b.peer.get_subscriber_names_and_types_by_node,
-                             b.peer.get_publisher_names_and_types_by_node,
-                             b.peer.get_service_names_and_types_by_node)]
+                for named_by in (b.peer.get_subscriber_names_and_types_by_node,
+                                 b.peer.get_publisher_names_and_types_by_node,
+                                 b.peer.get_service_names_and_types_by_node)]
 
     b.until(lambda: named() == [INPUTS, OUTPUTS, SERVICES], 'this is found, and nothing else')
     for topic in INPUTS:
@@ -109,14 +101,13 @@ def test_the_readme_names_each_topic_and_its_type(way, topics):
 
 def test_parameters_are_described_with_unit_and_range(bench):
     b = bench()
-    listed = set(asked(b, ListParameters, 'list_parameters',
-                       ListParameters.Request()).result.names)
+    listed = set(call(b, 'list_parameters', kind=ListParameters).result.names)
     assert listed >= PARAMETERS.keys()
     names = [name for name in sorted(listed)
              if not name.startswith('qos_overrides.') and name not in (
                  'use_sim_time', 'start_type_description_service')]
-    answer = asked(b, DescribeParameters, 'describe_parameters',
-                   DescribeParameters.Request(names=names))
+    answer = call(b, 'describe_parameters', DescribeParameters.Request(names=names),
+                  DescribeParameters)
     for name, described in zip(names, answer.descriptors, strict=True):
         value = b.backend.get_parameter(name).value
         assert described.description, name
@@ -196,11 +187,11 @@ def test_foxglove_plots_fields_that_there_are():
 
 def change(b, transition):
     request = ChangeState.Request(transition=Transition(id=transition))
-    return asked(b, ChangeState, 'change_state', request).success
+    return call(b, 'change_state', request, ChangeState).success
 
 
 def state(b):
-    return asked(b, GetState, 'get_state', GetState.Request()).current_state.label
+    return call(b, 'get_state', kind=GetState).current_state.label
 
 
 def test_a_node_that_is_managed_does_as_it_is_told(bench, tmp_path):

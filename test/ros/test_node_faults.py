@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from node_bench import call, loop
+from node_bench import call
 
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs import saved_map
@@ -155,15 +155,3 @@ def test_each_kind_of_failure_is_logged_once_in_full(bench, monkeypatch, capfd):
     b.drive(0, 3)
     b.until(lambda: fault.calls >= 3, 'three failures')
     assert capfd.readouterr().err.count('Traceback') == 1
-
-
-def test_a_refused_message_is_a_warning_and_counted(bench):
-    b = bench()
-    b.drive(0, 2)
-    b.until(lambda: len(b.path().poses) == 2, 'a map')
-    b.send('/loop_closures', loop(2 * 10**9, math.inf))
-    b.until(lambda: b.status()[2].get('refused.not_finite') == '1', 'it is counted')
-    level, sentence, values = b.status()
-    assert level == DiagnosticStatus.WARN and '1 not_finite' in sentence
-    assert values['refused.not_finite.last_minute'] == '1'
-    assert (values['odom.received'], values['loop_closures.received']) == ('2', '1')

@@ -14,10 +14,9 @@ rclpy = pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
-from node_bench import call, odometry, poses_of
+from node_bench import begin, call, odometry, poses_of
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from std_srvs.srv import Trigger
 
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs.saved_map import is_map, load_map
@@ -61,9 +60,7 @@ def test_the_map_is_saved_whatever_a_service_works_at(bench, tmp_path, monkeypat
     b = bench(save_path=str(path), autosave_period=0.2)
     b.drive(0, 3)
     b.until(lambda: keyframes(path) == 3, 'the map is saved')
-    client = b.peer.create_client(Trigger, '/backend/optimize')
-    b.until(client.service_is_ready, 'optimize is offered')
-    waiting = client.call_async(Trigger.Request())
+    waiting = begin(b, 'optimize')
     b.until(begun.is_set, 'it works')
     b.drive(3, 5)
     b.until(lambda: keyframes(path) == 5, 'the map is saved again')
@@ -86,25 +83,6 @@ def test_a_settled_map_is_loaded_at_start_and_published_at_once(bench, tmp_path,
     second.received['/diagnostics'].clear()
     second.until(lambda: len(second.received['/diagnostics']) == 2, 'a second later')
     assert not improved
-
-
-def test_a_damaged_map_is_said_and_the_one_before_taken(bench, tmp_path, capfd):
-    path = tmp_path / 'map.g2o'
-    b = bench(save_path=str(path), autosave_period=0.0, load_on_start=True)
-    assert 'the map begins empty: ' in capfd.readouterr().err
-    for count in 3, 5:
-        b.drive(0 if count == 3 else 3, count)
-        b.until(lambda count=count: len(b.path().poses) == count, 'a map')
-        assert call(b, 'save').success
-    path.write_bytes(path.read_bytes()[:-100])
-    capfd.readouterr()
-    bench(save_path=str(path), load_on_start=True)
-    assert capfd.readouterr().err.count('3 keyframes loaded from') == 1
-    answer = call(b, 'load')
-    assert answer.success
-    assert answer.message.startswith(f'3 keyframes loaded from {path}.1, the map before: {path}: ')
-    assert answer.message in capfd.readouterr().err
-    b.until(lambda: len(b.path().poses) == 3, 'the map before')
 
 
 def test_a_map_that_cannot_be_saved_is_an_error_until_it_can(bench, tmp_path, capfd):

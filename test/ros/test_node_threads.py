@@ -7,15 +7,14 @@ import sys
 import threading
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
 
-from node_bench import call, loop, odometry, poses_of
+from node_bench import begin, call, loop, odometry, poses_of
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs.saved_map import load_map
@@ -47,9 +46,7 @@ def test_while_the_solver_is_compiled_all_else_is_served(bench, compiling, tmp_p
     assert call(b, 'pause', SetBool.Request(data=False)).success
     assert call(b, 'reset').success and call(b, 'load').success
     b.until(lambda: b.status()[1] == 'compiling the solver: 1 of 2', 'it says how far it is')
-    client = b.peer.create_client(Trigger, '/backend/optimize')
-    b.until(client.service_is_ready, 'optimize is offered')
-    waiting = client.call_async(Trigger.Request())
+    waiting = begin(b, 'optimize')
     b.drive(4, 6)
     b.until(lambda: b.status()[2]['odom.received'] == '6', 'odometry is taken in')
     assert not waiting.done() and not b.received['path']
@@ -193,30 +190,11 @@ def test_optimize_is_done_though_the_map_is_replaced_meanwhile(bench, monkeypatc
         return optimise(problem, options, check)
 
     monkeypatch.setattr(upkeep, 'optimise', interrupted)
-    client = b.peer.create_client(Trigger, '/backend/optimize')
-    b.until(client.service_is_ready, 'optimize is offered')
-    answer = client.call_async(Trigger.Request())
+    answer = begin(b, 'optimize')
     b.until(began.is_set, 'it is at work')
     assert b.backend.set_parameters([Parameter('robust.enabled', value=False)])[0].successful
     b.until(answer.done, 'optimize is answered')
     assert answer.result().success, answer.result().message
-
-
-def test_after_a_load_the_pose_is_right_at_once(bench, tmp_path):
-    """Not only from the next keyframe on."""
-    b = bench(save_path=str(tmp_path / 'map.g2o'))
-    b.drive(0, 3)
-    b.until(lambda: len(b.path().poses) == 3, 'a map')
-    assert call(b, 'save').success and call(b, 'load').success
-    # The robot was switched off meanwhile: its odometry begins at 50 m.
-    b.send('/odom', odometry(10 * 10**9, 50.0))
-    b.send('/odom', odometry(11 * 10**9, 50.1))
-    b.until(lambda: len(b.received['pose']) == 5, 'both are answered')
-    x = [message.pose.position.x for message in b.received['pose'][-2:]]
-    np.testing.assert_allclose(x, [2.0, 2.1], atol=1e-9)
-    b.received['map_to_odom'].clear()
-    b.until(lambda: b.received['map_to_odom'], 'a transform')
-    assert b.received['map_to_odom'][-1].transform.translation.x == pytest.approx(-48.0)
 
 
 @pytest.mark.parametrize('choice', ['new_segment', 'reset', 'ignore'])

@@ -120,13 +120,6 @@ def test_services_are_answered_when_they_are_done(backend, ros):
     node.destroy_node()
 
 
-@pytest.mark.parametrize('name', ['SIGINT', 'SIGTERM'])
-def test_signals_end_backend_with_exit_code_0(backend, name):
-    backend.send_signal(getattr(signal, name))
-    assert backend.wait(DEADLINE) == 0
-    assert 'Traceback' not in backend.stderr.read()
-
-
 def test_replay_waits_for_subscribers_and_loses_neither_the_first_nor_the_last(bag, ros):
     with waiting_replay(bag, '--rate', '20') as process:
         node, heard = ros.create_node('late'), Counter()

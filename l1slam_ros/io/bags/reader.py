@@ -8,10 +8,10 @@ their time to import, so who may do without a bag imports this module only where
 
 import math
 import os
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -187,51 +187,26 @@ def _bag_path(path: str | os.PathLike[str]) -> Path:
     return bag
 
 
-class _Place:
-    """How far the messages of a bag have been read: `count` of them."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._time = -math.inf
-        # At that very time: the library may have another order than the file.
-        self._read: Counter[tuple[str, bytes]] = Counter()
-
-    def advance(self, message: BagMessage) -> None:
-        """Count a message."""
-        if message.time != self._time:
-            self._read.clear()
-        self._time = message.time
-        self._read[message.topic, message.data] += 1
-        self.count += 1
-
-    def rest(self, messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
-        """Yield those of all messages, in order of time, that have not been read yet."""
-        time, read = self._time, self._read.copy()
-        for message in messages:
-            key = (message.topic, message.data)
-            if message.time == time and read[key]:
-                read[key] -= 1
-            elif message.time >= time:
-                yield message
-
-
 def _messages(path: str | os.PathLike[str], topics: Collection[str] | None, start: int | None,
               stop: int | None, on_damage: OnDamage) -> Iterator[tuple[BagMessage, Any]]:
     """Yield the messages of a bag, each with the types to decode it by."""
-    bag, place = _bag_path(path), _Place()
+    bag, count, last = _bag_path(path), 0, -math.inf
     try:
-        for message, types in _by_library(bag, topics, start, stop):
-            place.advance(message)
-            yield message, types
+        # All of one time or none: the library may have another order than the file.
+        for time, group in groupby(_by_library(bag, topics, start, stop), lambda m: m[0].time):
+            messages = list(group)
+            count, last = count + len(messages), time
+            yield from messages
         return
     except Exception as error:  # damaged bags make the library raise anything
         salvage = _salvage(bag, error)
     types = salvage.types()
-    for message in place.rest(salvage.messages(topics, start, stop)):
-        place.advance(message)
-        yield message, types
+    for message in salvage.messages(topics, start, stop):
+        if message.time > last:
+            count += 1
+            yield message, types
     if salvage.damage is not None:
-        on_damage(salvage.damage.sentence(place.count))
+        on_damage(salvage.damage.sentence(count))
 
 
 def _by_library(bag: Path, topics: Collection[str] | None, start: int | None,

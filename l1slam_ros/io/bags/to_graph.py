@@ -36,7 +36,12 @@ from l1slam_ros.io.bags.from_graph import (
     VERBATIM_NOTE,
 )
 from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note
-from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
+from l1slam_ros.io.bags.topics import (
+    ABSOLUTE_TOPIC,
+    DEFAULT_TOPICS,
+    TRUSTED_LOOP_TOPIC,
+    Topics,
+)
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.messages import conversion
@@ -116,13 +121,13 @@ class _Growing:
                 raise MessageError('type', f'{message.msgtype} on {topic}; expected {expected}')
             elif topic == self._topics.odometry:
                 self._builder.add_odometry(conversion.odometry_sample(message.data))
-            elif topic == self._topics.absolute:
+            elif topic == ABSOLUTE_TOPIC:
                 # The map is the frame that the first one names.
                 self._builder.add_loop(conversion.absolute_pose(message.data, self._map_frame))
-                self._map_frame = message.data.header.frame_id
+                self._map_frame = message.data.header.frame_id.removeprefix('/')
             else:
                 self._builder.add_loop(conversion.loop_closure(
-                    message.data, self._builder.base_frame.name, topic == self._topics.trusted))
+                    message.data, self._builder.base_frame.name, topic == TRUSTED_LOOP_TOPIC))
         except MessageError as error:
             notes.refuse(error.cause, str(error))
         except (AttributeError, TypeError, ValueError):

@@ -15,16 +15,14 @@ _POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 @dataclass(frozen=True)
 class Topics:
-    """Where a bag has its odometry, loop closures, those somebody vouches for, absolute poses."""
+    """Where a bag has its odometry and loop closures; the other topics have no other names."""
 
     odometry: str = ODOMETRY_TOPIC
     loops: str = LOOP_TOPIC
-    trusted: str = TRUSTED_LOOP_TOPIC
-    absolute: str = ABSOLUTE_TOPIC
 
     def types(self) -> dict[str, str]:
         """Return the topics with the types of their messages."""
-        return {self.loops: _POSE, self.trusted: _POSE, self.absolute: _POSE,
+        return {self.loops: _POSE, TRUSTED_LOOP_TOPIC: _POSE, ABSOLUTE_TOPIC: _POSE,
                 self.odometry: 'nav_msgs/msg/Odometry'}
 
 

@@ -156,12 +156,11 @@ def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, e
                remarks: Remarks) -> None:
     i, j = _index(path, ids, edges).T
     i, none = np.where(edges.alone, WORLD, i), np.zeros(len(edges), bool)
-    doubted = BetweenFactors(i, j, edges.pose, _roots(path, edges), none, none)
-    trusted = remarks['trusted'] if remarks else (
-        named_loops(path, 'trusted', ids, doubted))
-    graph.add_between(i, j, edges.pose, edges.scaled, trusted)
-    if remarks:
-        graph.say(np.flatnonzero(remarks['struck']), trusted=False)
+    roots = _roots(path, edges)
+    doubted = BetweenFactors(i, j, edges.pose, roots, none, none)
+    trusted, struck = (remarks['trusted'], remarks['struck']) if remarks else (
+        named_loops(path, 'trusted', ids, doubted), none)
+    graph.append_between(i, j, edges.pose, roots, trusted, struck)
 
 
 def _index(path: object, ids: Indices, rows: Rows) -> Indices:

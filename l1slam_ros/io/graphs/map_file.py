@@ -11,6 +11,7 @@ from pathlib import Path
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.snapshot import SavedMap
+from l1slam_ros.io.formats import named
 from l1slam_ros.io.graphs.saved_map import keep_as, load_map, save_map
 from l1slam_ros.io.node_options import NodeOptions
 
@@ -101,10 +102,8 @@ class MapFile:
         path = self._path()
         end = _end_of(path)
         saved, sentence, whole = load_map(path)
-        found, expected = saved.builder.graph.manifold, self._backend.manifold
-        if found is not expected:
-            raise FileError(path, f'is a map of {found.NAME}; expected one of {expected.NAME}')
-        number = self._backend.restore(saved)
+        with named(path):
+            number = self._backend.restore(saved)
         self._known = path, self._backend.version
         # What could not be read may be of use to somebody yet.
         self._ours = (path, end, number) if whole else ()

@@ -24,7 +24,6 @@ from l1slam_ros.core.errors import Interrupted, L1SlamError, OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopOptions
@@ -313,9 +312,8 @@ def test_no_lie_is_believed_at_any_time(careful, clean_errors, kind):
 
 def test_at_rest_all_is_judged_from_the_graph_alone(careful, clean_errors):
     """While driving a slip is not looked for, and what was believed of it stays."""
-    graph = slipped(careful.graph, 150, (0.0, 0.0, 0.8))
-    world, backend = replace(careful, odometry=odometry_poses(graph)), Backend(EVERY)
-    drive(world, backend, lambda backend: None)
+    graph, backend = slipped(careful.graph, 150, (0.0, 0.0, 0.8)), Backend(EVERY)
+    drive(replace(careful, graph=graph), backend, lambda backend: None)
     settled(backend)
     now = backend.snapshot()
     assert now.graph.between.i[now.optimised.judgement.slips].tolist() == [150]
@@ -417,32 +415,6 @@ def test_each_loop_has_a_state_and_its_own_stamps(careful):
     others = dict(zip(map(tuple, states.stamps[loops:]), states.state[loops:], strict=True))
     assert others == {(0, seconds(1e6)): EXPIRED, (seconds(1.0), seconds(20.0)): EXPIRED,
                       (seconds(2.0), seconds(50.0)): WAITING}
-
-
-# An earlier run
-
-
-def test_after_a_restore_odometry_may_begin_anywhere(world):
-    """The robot stands where the first run ended; a loop then ties the new to the old."""
-    first, backend = played(world, 0, 80), Backend(EVERY)
-    settled(first)
-    backend.restore(first.saved())
-    end = backend.poses[79:80]
-    for k in range(5):
-        raw = np.array([[50.0, 60.0 + k, np.pi / 2]])  # 1 m ahead each
-        backend.add_odometry(odometry(100.0 + k, raw[0], 1e-3 * np.eye(6)))
-        there = se2.compose(end, np.array([[float(k), 0.0, 0.0]]))
-        assert_allclose(se2.local(backend.poses[-1:], there), 0, atol=1e-9)
-        moved = se2.compose(backend.snapshot().map_to_odom, raw)
-        assert_allclose(se2.local(moved, there), 0, atol=1e-9)
-    # Half a metre off: nobody would believe it who was not told to.
-    seen = loop(7.9, 104.0, (4.5, 0.0, 0.0), 1e-6 * np.eye(6))
-    backend.add_loop(replace(seen, trusted=True))
-    settled(backend)
-    seen = se2.between(backend.poses[79:80], backend.poses[-1:])
-    assert_allclose(seen, [[4.5, 0.0, 0.0]], atol=1e-2)
-    moved = se2.compose(backend.snapshot().map_to_odom, raw)
-    assert_allclose(se2.local(backend.poses[-1:], moved), 0, atol=1e-9)
 
 
 # The warm start

@@ -29,10 +29,6 @@ DEADLINE = 30.0
 MOMENT = 0.3
 
 
-def go_on():
-    return False
-
-
 class Meeting:
     """A place in one thread where another one is let in; if a lock holds it off, not for long."""
 
@@ -80,7 +76,7 @@ def test_nobody_sees_a_keyframe_without_its_odometry(monkeypatch):
 def test_nobody_sees_the_front_of_one_map_with_the_poses_of_another(monkeypatch):
     backend, meeting = Backend(EVERY), Meeting()
     drive(backend, 0, 30)
-    backend.update(DEADLINE, go_on)
+    backend.update(DEADLINE)
     backend.add_loop(loop(1.0, 30.0, (28.9, 0.0, 0.0), 1e-8 * np.eye(6)))
 
     class Slow(Improvement):
@@ -95,7 +91,7 @@ def test_nobody_sees_the_front_of_one_map_with_the_poses_of_another(monkeypatch)
 
     monkeypatch.setattr(upkeep, 'improve', slowly)
     # The first one leaves the loop to the front.
-    updating = meanwhile(lambda: [backend.update(DEADLINE, go_on) for _ in range(2)])
+    updating = meanwhile(lambda: [backend.update(DEADLINE) for _ in range(2)])
     seen = meeting.look(backend.snapshot)
     updating.join()
     after = backend.snapshot()
@@ -107,7 +103,7 @@ def test_nobody_sees_the_front_of_one_map_with_the_poses_of_another(monkeypatch)
 def test_nobody_sees_the_front_of_a_map_that_was_replaced(monkeypatch):
     backend, views = Backend(EVERY), Front.views.fget
     drive(backend, 0, 5)
-    while backend.update(DEADLINE, go_on) is not None:
+    while backend.update(DEADLINE) is not None:
         pass
 
     def slowly(front):
@@ -132,7 +128,7 @@ def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):
 
     def update():
         try:
-            ended.append(backend.update(DEADLINE, go_on))
+            ended.append(backend.update(DEADLINE))
         except Interrupted as interrupted:
             ended.append(interrupted)
 
@@ -169,7 +165,7 @@ def test_an_update_is_interrupted_at_once(monkeypatch, interrupt):
     drive(backend, 5, 6)
     assert backend.counts()[0]['keyframes'] == 6 and updating.is_alive()
     if interrupt == 'settle':
-        assert backend.settle(go_on).cost == pytest.approx(0.0, abs=1e-6)
+        assert backend.settle().cost == pytest.approx(0.0, abs=1e-6)
     elif interrupt == 'restore':
         backend.restore(now)
     elif interrupt == 'reset':
@@ -186,7 +182,7 @@ def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
 
     def settle():
         for count in range(100):
-            if backend.update(DEADLINE, go_on) is None:
+            if backend.update(DEADLINE) is None:
                 return count
         raise AssertionError('never at rest')
 
@@ -197,7 +193,7 @@ def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
     version = backend.version
     backend.counts()
     looked.clear()
-    assert backend.update(DEADLINE, go_on) is None
+    assert backend.update(DEADLINE) is None
     backend.counts()
     assert not looked and backend.version == version
     backend.add_loop(loop(1.0, 30.0, (28.9, 0.0, 0.0), 1e-4 * np.eye(6)))
@@ -221,7 +217,7 @@ def test_a_map_of_nothing_is_not_asked_whether_it_hangs_on_its_norm(monkeypatch)
     backend = Backend(EVERY)
     for count in 5, 0, 1:
         drive(backend, 0, count)
-        while backend.update(DEADLINE, go_on) is not None:
+        while backend.update(DEADLINE) is not None:
             pass
         backend.reset()
     assert asked == [5]

@@ -32,7 +32,7 @@ from l1slam_ros.io.graphs.graph_file import read_graph_file
 def backend_after(graph, options, every=50, copies=1, spoil=lambda k, covariance: covariance):
     """Return the back end that heard a graph pose by pose and was updated, then settled."""
     backend = Backend(options)
-    for message in messages(graph, odometry_poses(graph)):
+    for message in messages(graph):
         if isinstance(message, LoopClosure):
             hear(backend, copies * [message])
             continue

@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags as robots and tools write them: every kind, other topics, odd orders, no note of ours."""
 
-
 import numpy as np
 import pytest
+from problems import EVERY
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bags import KINDS, TYPES, mcap_file, recording_of, rosbag2_directory, write_world
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
-from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.io.bags.reader import read_messages, read_raw
 from l1slam_ros.io.bags.to_graph import Topics
 from l1slam_ros.io.formats import read_input
 
-EVERY = GraphBuilderOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))
 ODOMETRY = 'nav_msgs/msg/Odometry'
 SECOND = 10**9
 

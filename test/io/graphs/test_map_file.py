@@ -199,7 +199,7 @@ def test_a_map_of_another_dimension_is_refused(tmp_path):
     path.write_text('VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\n'
                     'EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n')
     beside(path, 'stamps').write_text('1\n2\n')
-    with pytest.raises(FileError, match='map.g2o: is a map of SE3; expected one of SE2'):
+    with pytest.raises(FileError, match='map.g2o: a map of SE3, expected one of SE2'):
         robot.map_file.load()
 
 

@@ -8,9 +8,10 @@ missing in its middle a wrong one.
 """
 
 import re
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -87,18 +88,13 @@ class Salvage:
 
         topics : only these; None: all; start, stop : only from start [ns] on and before stop [ns]
         """
-        order = sorted(range(len(self.times)), key=self.times.__getitem__)
-        rank = [0] * len(order)
-        for position, k in enumerate(order):
-            rank[k] = position
+        order = deque(sorted(range(len(self.times)), key=self.times.__getitem__))
         waiting: dict[int, BagMessage] = {}
-        position = 0
-        # `rank` first: it ends before the walk comes to the damage.
-        for k, message in zip(rank, self._walk(), strict=False):
+        # So many: it ends before the walk comes to the damage.
+        for k, message in enumerate(islice(self._walk(), len(order))):
             waiting[k] = message
-            while position in waiting:
-                due = waiting.pop(position)
-                position += 1
+            while order and order[0] in waiting:
+                due = waiting.pop(order.popleft())
                 if ((topics is None or due.topic in topics)
                         and (start is None or due.time >= start)
                         and (stop is None or due.time < stop)):
