@@ -85,7 +85,8 @@ def _measure(backend: Backend, path: Path) -> None:
     driven.start()
     answers: dict[str, list[float]] = {'save': [], 'poses': [], 'loops': []}
     while driven.is_alive():
-        answers['save'].append(_seconds(lambda: save_map(path, backend.saved())))
+        with backend.calm:
+            answers['save'].append(_seconds(lambda: save_map(path, backend.saved())))
         answers['poses'].append(_seconds(lambda: backend.poses))
         answers['loops'].append(_seconds(backend.loop_states))
         time.sleep(_PAUSE)

@@ -1,7 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """An array that grows at its end."""
 
+import mmap
+
 import numpy as np
+
+# Memory of this process alone; elsewhere it is so anyway.
+_PRIVATE = ({'flags': mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, 'MAP_PRIVATE')
+            else {})
 
 
 class GrowingArray:
@@ -19,7 +25,7 @@ class GrowingArray:
     """
 
     def __init__(self, shape: tuple[int, ...] = (), dtype: type = np.float64, room: int = 0):
-        self._data: np.ndarray = np.empty((room, *shape), dtype)
+        self._data = _reserved((room, *shape), dtype) if room else np.empty((0, *shape), dtype)
         self._length = 0
 
     def __len__(self) -> int:
@@ -51,3 +57,17 @@ class GrowingArray:
         clone._data = self.view()
         clone._length = self._length
         return clone
+
+
+def _reserved(shape: tuple[int, ...], dtype: type) -> np.ndarray:
+    """
+    Return an array of zeros whose small pages come as they are written to.
+
+    For large arrays NumPy asks for huge pages, and the first write to one may wait for
+    milliseconds, until the system has found one.
+    """
+    count = int(np.prod(shape))
+    memory = mmap.mmap(-1, max(count, 1) * np.dtype(dtype).itemsize, **_PRIVATE)
+    if hasattr(mmap, 'MADV_NOHUGEPAGE'):
+        memory.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(memory, dtype, count).reshape(shape)

@@ -25,7 +25,8 @@ class Tiles:
     def __init__(self, keyframe: Indices, size: int, lanes: int):
         self._lanes = lanes
         self._order = np.argsort(keyframe[:, 0] * (size + 1) + keyframe[:, 1], kind='stable')
-        self._place = np.argsort(self._order)
+        self._place = np.empty_like(self._order)
+        self._place[self._order] = np.arange(len(keyframe))
         keyframes = self._side_by_side(keyframe, np.uint32, size)
         self.keyframes = keyframes.reshape(-1, 2 * lanes)
 

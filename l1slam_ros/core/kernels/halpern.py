@@ -21,27 +21,31 @@ from l1slam_ros.core.kernels.compiled import compiled, for_sizes
 # One cache line of single precision. Below 16 the loop vectoriser takes a loop for a short one,
 # where it does not check that arrays are apart, and gives up.
 LANES = 16
+# Part of a keyframe's scale by which a direction that no factor measures is held.
+_UNMEASURED = 1e-12
 # Blocks of angles, positions and poses in the plane.
 _SIZES = tuple(f'UniTuple(i8, {k})' for k in (1, 2, 3))
 
 
-@for_sizes('i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]', plane=_SIZES)
-def add_squares(keyframe, blocks, gram, K):
-    """Add 2 A_fv'A_fv of every factor to its keyframes' gram (size + 1, k, k)."""
+@for_sizes('i8[:, ::1], f8[:, :, :, ::1], i8', plane=_SIZES)
+def scale(keyframe, blocks, size, K):
+    """
+    Return the blocks in scaled unknowns (m, 2, k, k), and R_v^-1 of each keyframe.
+
+    (size + 1, k, k), the last one zero: what is held fixed has no unknowns.
+    """
     k = len(K)
+    inverse, scaled = np.zeros((size + 1, k, k)), np.empty_like(blocks)
     for f in range(len(keyframe)):
         for side in range(2):
-            block, total = blocks[f, side], gram[keyframe[f, side]]
+            block, total = blocks[f, side], inverse[keyframe[f, side]]
             for a in range(k):
                 for b in range(k):
                     for r in range(k):
                         total[a, b] += 2 * block[r, a] * block[r, b]
-
-
-@for_sizes('i8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1], f8[:, :, :, ::1]', plane=_SIZES)
-def scale(keyframe, blocks, inverse, scaled, K):
-    """Set each block of `scaled` to that of `blocks` times its keyframe's inverse."""
-    k = len(K)
+    for v in range(size):
+        _invert_root(inverse[v], K)
+    inverse[size] = 0.0
     for f in range(len(keyframe)):
         for side in range(2):
             block, factor = blocks[f, side], inverse[keyframe[f, side]]
@@ -51,6 +55,35 @@ def scale(keyframe, blocks, inverse, scaled, K):
                     for a in range(k):
                         total += block[r, a] * factor[a, c]
                     scaled[f, side, r, c] = total
+    return scaled, inverse
+
+
+@compiled
+def _invert_root(gram, K):
+    """Turn R'R into R^-1, R upper triangular, a little more than R'R where nothing is measured."""
+    k, trace = len(K), 0.0
+    for a in range(k):
+        trace += gram[a, a]
+    for a in range(k):
+        gram[a, a] += _UNMEASURED * trace if trace > 0 else 1.0
+    # The lower triangle becomes R'.
+    for a in range(k):
+        for b in range(a + 1):
+            total = gram[a, b]
+            for c in range(b):
+                total -= gram[a, c] * gram[b, c]
+            gram[a, b] = np.sqrt(total) if a == b else total / gram[b, b]
+    # Column by column of R'^-1, which is written to the rows of the upper one.
+    for b in range(k):
+        gram[b, b] = 1 / gram[b, b]
+        for a in range(b + 1, k):
+            total = 0.0
+            for c in range(b, a):
+                total -= gram[a, c] * gram[b, c]
+            gram[b, a] = total / gram[a, a]
+    for a in range(k):
+        for b in range(a):
+            gram[a, b] = 0.0
 
 
 @for_sizes('f4[:, ::1], u4[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], f8, i8, i8', plane=_SIZES)

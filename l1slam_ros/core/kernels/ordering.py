@@ -28,14 +28,16 @@ _WHOLE, _LEAST = 120, 0.2
 _SEARCHES = 4
 
 
-@loop('(i4[::1], i4[::1], i8, i4[::1])')
-def minimum_degree(start, adjacent, limit, stage):
+@loop('(i4[::1], i4[::1], i8, i4[::1], i4[::1], i8[::1], i4[::1])')
+def minimum_degree(start, adjacent, limit, stage, order_begun, column_begun, rows_begun):
     """
     Order the nodes of a graph; stop when the factor would have more than `limit` blocks.
 
     start, adjacent : the neighbours of node k are adjacent[start[k]:start[k + 1]], each once, both
     ways round, k itself left out; int32.
     stage : (n,) from 0; nodes of a higher one come later, whatever their degree
+    order_begun, column_begun, rows_begun : as returned, of the first nodes to eliminate: none, or
+        what `symbolic.untouched` left of an elimination
 
     Returns
     -------
@@ -43,26 +45,25 @@ def minimum_degree(start, adjacent, limit, stage):
     column : (n + 1,) and rows : the nodes below the diagonal in each column, as eliminated
 
     """
-    n = len(start) - 1
-    lists = adjacent.copy()  # of each node: variables, then elements
-    n_variables, n_elements = np.empty(n, np.int32), np.empty(n, np.int32)
+    n, done = len(start) - 1, len(order_begun)
     # The lists of nodes by stage and degree.
     stages = 1 + (stage.max() if n else 0)
-    degree, head = np.empty(n, np.int32), np.full(n * stages, -1, np.int32)
+    head = np.full(n * stages, -1, np.int32)
     after, before = np.empty(n, np.int32), np.empty(n, np.int32)
-    seen, absorbed = np.empty(n, np.int32), np.empty(n, np.bool_)
-    outside, counted = np.empty(n, np.int32), np.empty(n, np.int32)
-    order, place = np.empty(n, np.int32), np.empty(n, np.int32)
-    column, rows = np.empty(n + 1, np.int64), np.empty(limit, np.int32)
-    column[0] = 0
+    seen, counted = np.full(n, -1, np.int32), np.full(n, -1, np.int32)
+    outside = np.zeros(n, np.int32)
+    order, column, rows = np.empty(n, np.int32), np.empty(n + 1, np.int64), np.empty(
+        limit, np.int32)
+    order[:done], column[:done + 1] = order_begun, column_begun
+    rows[:column[done]] = rows_begun[:column[done]]
+    place, absorbed = _places(n, order[:done], column, rows)
+    start, lists, n_variables, n_elements, degree = _quotient(
+        start, adjacent, order[:done], column, rows, place, absorbed)
     for k in range(n):
-        degree[k] = n_variables[k] = start[k + 1] - start[k]
-        n_elements[k], outside[k], absorbed[k] = 0, 0, False
-        seen[k] = counted[k] = place[k] = -1
-    for k in range(n):
-        _put(head, after, before, k, stage[k] * n + degree[k])
+        if place[k] < 0:
+            _put(head, after, before, k, stage[k] * n + degree[k])
     lowest = 0
-    for step in range(n):
+    for step in range(done, n):
         while head[lowest] < 0:
             lowest += 1
         pivot = head[lowest]
@@ -83,7 +84,52 @@ def minimum_degree(start, adjacent, limit, stage):
             degree[k] = min(n - step - 2, degree[k] + size - 1, bound + size - 1)
             _put(head, after, before, k, stage[k] * n + degree[k])
             lowest = min(lowest, stage[k] * n + degree[k])
-    return order, column, rows[: column[n]]
+    # Of the room that there was for rows nothing is kept.
+    return order, column, rows[: column[n]].copy()
+
+
+@compiled
+def _places(n, order, column, rows):
+    """Return the step of each node, -1 if it is to come, and whether its element is absorbed."""
+    place, absorbed = np.full(n, -1, np.int32), np.zeros(n, np.bool_)
+    for step in range(len(order)):
+        place[order[step]] = step
+    for step in range(len(order)):
+        for k in rows[column[step]:column[step + 1]]:
+            absorbed[order[step]] |= place[k] >= 0
+    return place, absorbed
+
+
+@compiled
+def _quotient(start, adjacent, order, column, rows, place, absorbed):
+    """Return where the lists of each node that is left begin, the lists, and its degree."""
+    n = len(place)
+    n_variables, n_elements = np.zeros(n, np.int32), np.zeros(n, np.int32)
+    degree, first = np.zeros(n, np.int32), np.zeros(n + 1, np.int32)
+    for k in range(n):
+        for v in adjacent[start[k]:start[k + 1]]:
+            n_variables[k] += place[v] < 0
+        degree[k] = n_variables[k]
+    for step in range(len(order)):
+        if not absorbed[order[step]]:
+            for k in rows[column[step]:column[step + 1]]:
+                n_elements[k] += 1
+                degree[k] = min(degree[k] + column[step + 1] - column[step] - 1,
+                                n - len(order) - 1)
+    for k in range(n):
+        first[k + 1] = first[k] + n_variables[k] + n_elements[k]
+    lists, end = np.empty(first[n], np.int32), first.copy()
+    for k in range(n):
+        for v in adjacent[start[k]:start[k + 1]]:
+            if place[v] < 0:
+                lists[end[k]] = v
+                end[k] += 1
+    for step in range(len(order)):
+        if not absorbed[order[step]]:
+            for k in rows[column[step]:column[step + 1]]:
+                lists[end[k]] = order[step]
+                end[k] += 1
+    return first, lists, n_variables, n_elements, degree
 
 
 @compiled

@@ -25,6 +25,7 @@ def lay_out(order, column, rows):
     position : (n,) of each node in the new order
     first : (supernodes + 1,), see `supernodes`
     start, pattern : see `panel_rows`
+    halves : (supernodes,), see `halves`
     work : multiplications of entries that one factorisation takes
 
     """
@@ -34,7 +35,7 @@ def lay_out(order, column, rows):
     work = 0.0
     for k in range(len(below)):
         work += (below[k] + 1.0) ** 2 / 2
-    return position, first, start, pattern, work
+    return position, first, start, pattern, halves(first, start, pattern), work
 
 
 @compiled
@@ -159,6 +160,83 @@ def panel_rows(first, column, rows, old, position):
             end[s] += 1
             at += 1
     return start, pattern
+
+
+@compiled
+def halves(first, start, pattern):
+    """
+    Return what to factorise at the same time, 0 and 1, and what after both, 2, (supernodes,).
+
+    A cut through the postorder leaves whole subtrees on either side, 0 and 1; the supernodes with
+    descendants on both are 2. Of all cuts the one that takes least time.
+    """
+    count = len(first) - 1
+    owner, lowest = np.empty(first[count], np.int64), np.arange(count + 1)
+    own, crossing = np.empty(count), np.zeros(count + 2)
+    for s in range(count):
+        owner[first[s]:first[s + 1]] = s
+        width, height = first[s + 1] - first[s], start[s + 1] - start[s]
+        own[s] = width * (height - width / 2.0) ** 2
+    whole = 0.0
+    for s in range(count):
+        # The first of its subtree is known by now.
+        below = start[s] + first[s + 1] - first[s]
+        if below < start[s + 1]:
+            above = owner[pattern[below]]
+            lowest[above] = min(lowest[above], lowest[s])
+        crossing[lowest[s] + 1] += own[s]
+        crossing[s + 1] -= own[s]
+        whole += own[s]
+    cut, least, left, after = 0, np.inf, 0.0, 0.0
+    for s in range(count + 1):
+        after += crossing[s]
+        if max(left, whole - left - after) + after < least:
+            cut, least = s, max(left, whole - left - after) + after
+        if s < count:
+            left += own[s]
+    sides = np.zeros(count, np.int8)
+    for s in range(cut, count):
+        sides[s] = 1 if lowest[s] >= cut else 2
+    return sides
+
+
+@loop('(i4[::1], i4[::1], i4[::1], i8[::1], i4[::1])')
+def untouched(start, adjacent, order, column, rows):
+    """
+    Return what stays of an elimination of fewer nodes or neighbours: order, column and rows.
+
+    start, adjacent : the neighbours of each node by now; other arguments as of `postorder`. A
+    column stays that has all of its node's neighbours, if all below it in the elimination tree do.
+    """
+    n, old = len(start) - 1, len(order)
+    place, seen = np.full(n, old, np.int32), np.full(n, -1, np.int32)
+    for step in range(old):
+        place[order[step]] = step
+    touched = np.zeros(old + 1, np.bool_)
+    kept = np.empty(old, np.int32)
+    count, end = 0, 0
+    for step in range(old):
+        v, above = order[step], old
+        for k in rows[column[step]:column[step + 1]]:
+            seen[k] = step
+            above = min(above, place[k])
+        for k in adjacent[start[v]:start[v + 1]]:
+            if place[k] > step and seen[k] != step:
+                touched[step] = touched[place[k]] = True
+        if touched[step]:
+            touched[above] = True
+        else:
+            kept[count] = step
+            count += 1
+            end += column[step + 1] - column[step]
+    own_order, own_column = np.empty(count, np.int32), np.empty(count + 1, np.int64)
+    own_rows, own_column[0] = np.empty(end, np.int32), 0
+    for at in range(count):
+        step = kept[at]
+        own_order[at] = order[step]
+        own_column[at + 1] = own_column[at] + column[step + 1] - column[step]
+        own_rows[own_column[at]:own_column[at + 1]] = rows[column[step]:column[step + 1]]
+    return own_order, own_column, own_rows
 
 
 @loop('(i8[:, ::1], i4[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8)')

@@ -18,6 +18,7 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.incremental.front import View
 from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.solvers.block_cholesky import Pattern
 from l1slam_ros.core.solvers.optimality import Status
 from l1slam_ros.core.solvers.solve import AUTO, PRIMAL_DUAL, Method, choose
 
@@ -53,7 +54,7 @@ class Problem:
     last_cost : the cost that the last update left, for as many factors as there are now; gaps :
     (g,) keyframes that no odometry joins to the ones before; starts : poses to start from, `poses`
     the first; judgement : of all factors; robust : loops may be doubted; settled : nothing has
-    come since an update that converged.
+    come since an update that converged; pattern : of the last factor, None: there was none.
     """
 
     map: int
@@ -65,6 +66,7 @@ class Problem:
     robust: bool
     last_cost: float
     settled: bool
+    pattern: Pattern | None = None
 
     @property
     def poses(self) -> Array:
@@ -79,7 +81,7 @@ class Problem:
     @cached_property
     def method(self) -> Method:
         """What to solve them by."""
-        return choose(AUTO, self.part)
+        return choose(AUTO, self.part, before=self.pattern)
 
     @property
     def is_sparse(self) -> bool:
@@ -199,7 +201,7 @@ class Snapshot:
     the front says of the factors after those that are judged: accepted, suspect, sigmas;
     all_judged : no loop is among them; judged : (k, p) the L2 map of the judgement, None: there is
     none; stale : the map is not of the factors that are accepted; views : the L1 and L2 map of the
-    front, where there is one.
+    front, where there is one; pattern : see `Problem`.
     """
 
     map: int
@@ -218,6 +220,7 @@ class Snapshot:
     judged: Array | None
     stale: bool
     views: tuple[View, ...]
+    pattern: Pattern | None
 
     @cached_property
     def poses(self) -> Array:
@@ -260,7 +263,7 @@ class Snapshot:
         grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
         settled = not (grown or self.stale) and self.judgement.settled and last.at_rest
         return Problem(self.map, self.graph, self.gaps, starts, dual, self.judgement, self.robust,
-                       last.cost * rows / max(len(last.dual), 1), settled)
+                       last.cost * rows / max(len(last.dual), 1), settled, self.pattern)
 
     def known(self) -> Optimised:
         """Return what was made, of all keyframes and factors that there are."""

@@ -119,23 +119,23 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
     """
     start = time.monotonic()
     graph, method, deadline = problem.part, problem.method, start + budget
-    poses, before, cost = _nearest(problem)
+    poses, residual, before = _nearest(problem)
     if exact and problem.is_sparse:
         solution, _ = minimise_by(method, graph, poses, options, lambda *_: check())
         return _improvement(solution, problem, problem.judgement, before, 0, start)
-    dual = _dual_of(problem, poses)
+    dual, cost = _dual_of(problem, residual), l1_cost(residual)
     steps, far = 0, not fits_exactly(cost, len(dual)) and is_far(cost, problem.last_cost)
     while method.cholesky and far and (not steps or time.monotonic() < deadline):
         check()
-        system = linearise(graph, poses)
+        system = linearise(graph, poses, residual)
         mu = max(_SMOOTHING * _SHARPER**steps, _SHARPEST) * smoothing(system.b)
         try:
             step, dual = reweighted_step(system, method.cholesky, system.b, mu)
         except GraphError:  # sharper weights are beyond double precision
             break
         previous = cost
-        poses, cost = backtrack(graph, poses, step, cost)
-        steps += 1
+        poses, residual = backtrack(graph, poses, residual, step)
+        steps, cost = steps + 1, l1_cost(residual)
         far = is_far(previous, cost)
     solution = minimise(graph, poses, options, method.cholesky if steps else None, dual, deadline,
                         lambda *_: check())
@@ -150,19 +150,26 @@ def one_round(options: OptimiserOptions, sparse: bool) -> OptimiserOptions:
     return replace(options, outer_iterations=min(options.outer_iterations, 1), inner=inner)
 
 
-def _nearest(problem: Problem) -> tuple[Array, float, float]:
-    """Return the best poses to start from, the cost where the map is, and theirs."""
+def _nearest(problem: Problem) -> tuple[Array, Array, float]:
+    """Return the best poses to start from, their residual, and the cost where the map is."""
     graph, starts = problem.part, problem.starts
     if graph.between.is_absolute.any():
         # The map may not have come to the world yet.
         starts = [*starts, placed(graph, problem.poses)]
-    costs = [l1_cost(whitened_residual(graph, poses)) for poses in starts]
-    return starts[costs.index(min(costs))], costs[0], min(costs)
+    return _best(graph, starts, l1_cost)
 
 
-def _dual_of(problem: Problem, poses: Array) -> Array:
+def _best(graph: FactorGraph, starts: list[Array],
+          cost_of: Callable[[Array], float]) -> tuple[Array, Array, float]:
+    """Return the best of some poses, their residual, and the cost of the first ones."""
+    residuals = [whitened_residual(graph, poses) for poses in starts]
+    costs = [cost_of(residual) for residual in residuals]
+    best = costs.index(min(costs))
+    return starts[best], residuals[best], costs[0]
+
+
+def _dual_of(problem: Problem, e: Array) -> Array:
     """Return the dual to start from, (rows,): what is kept, else what the residual asks for."""
-    e = whitened_residual(problem.part, poses)
     dual = problem.dual.reshape(-1, problem.graph.manifold.TANGENT_SIZE)
     kept = dual[problem.judgement.accepted]
     asked = (e / np.hypot(e, smoothing(e))).reshape(kept.shape)
@@ -187,18 +194,17 @@ def front_of(problem: Problem, poses: Array, rows: int,
     variance = judgement.found_variance(problem.graph)
     found = part.subset(np.arange(len(variance)), variance)
     starts = [poses, *problem.starts[1:]]
-    costs = [l2_cost(whitened_residual(found, start)) for start in starts]
-    cost, l2_poses = min(costs), starts[costs.index(min(costs))]
+    l2_poses, residual, _ = _best(found, starts, l2_cost)
     cholesky = BlockCholesky(method.cholesky.pattern, keyframes_of(found, anchor(found)))
     try:
         for _ in range(_L2_STEPS):
             check()
-            system = linearise(found, l2_poses)
+            system = linearise(found, l2_poses, residual)
             step = weighted_least_squares(system, cholesky, np.ones_like(system.b))
             # Far from the minimum of chi2 the gate would see ghosts; one above it is none.
             if step @ system.transposed_times(system.b) <= 1:
                 break
-            l2_poses, cost = backtrack(found, l2_poses, step, cost, l2_cost)
+            l2_poses, residual = backtrack(found, l2_poses, residual, step, l2_cost)
         check()
         return Front(part, (poses, l2_poses), (method.cholesky, cholesky), judgement.variance,
                      log_odds, rows)

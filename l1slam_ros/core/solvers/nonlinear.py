@@ -106,7 +106,7 @@ def minimise(
         if fits_exactly(history[-1], len(residual)):
             status, gap = Status.CONVERGED, 0.0
             break
-        system = linearise(graph, poses)
+        system = linearise(graph, poses, residual)
         if cholesky and (dual is None or (outer and is_far(*history[-2:]))):
             x, dual = reweighted_start(system, cholesky)
         else:
@@ -115,9 +115,9 @@ def minimise(
         effort = options.inner.iterations * _MORE_EFFORT**small_steps
         solution = minimise_l1_halpern(system, x, dual, replace(options.inner, iterations=effort),
                                        weight, deadline)
-        inner += solution.iterations
         dual, gap, weight = solution.y, solution.gap, solution.weight
-        poses, cost = backtrack(graph, poses, solution.x, history[-1])
+        poses, residual = backtrack(graph, poses, residual, solution.x)
+        inner, cost = inner + solution.iterations, l1_cost(residual)
         history.append(cost)
         report(outer + 1, cost)
         # A failed step is not the end: with the better dual, and more iterations, the next one may
@@ -142,17 +142,18 @@ def is_far(before: float, after: float) -> bool:
 
 
 def backtrack(
-    graph: FactorGraph, poses: Array, step: Array, cost: float,
+    graph: FactorGraph, poses: Array, residual: Array, step: Array,
     cost_of: Callable[[Array], float] = l1_cost,
-) -> tuple[Array, float]:
+) -> tuple[Array, Array]:
     """
-    Return the poses and cost after the longest of step, step/2, ... that lowers the true cost.
+    Return poses and residual after the longest of step, step/2, ... that lowers the cost.
 
-    Where none does, the poses and cost are returned as they came. cost_of : of a residual
+    Where none does, both are returned as they came. cost_of : of a residual
     """
+    cost = cost_of(residual)
     for halvings in range(_HALVINGS + 1):
         candidate = step_poses(graph, poses, step / 2**halvings)
-        candidate_cost = cost_of(whitened_residual(graph, candidate))
-        if candidate_cost < cost:
-            return candidate, candidate_cost
-    return poses, cost
+        found = whitened_residual(graph, candidate)
+        if cost_of(found) < cost:
+            return candidate, found
+    return poses, residual

@@ -55,8 +55,6 @@ _BALANCE = 0.1
 _WEIGHT_RANGE = 3.0
 # [sigma] A mean |A x - b| below is as good as none; the weight must stay finite.
 _EXACT = 1e-6
-# Part of a keyframe's scale by which a direction that no factor measures is held.
-_UNMEASURED = 1e-12
 
 
 def scaled_system(system: LinearSystem) -> tuple[LinearSystem, Array]:
@@ -65,17 +63,9 @@ def scaled_system(system: LinearSystem) -> tuple[LinearSystem, Array]:
 
     x = R_v^-1 x_scaled of each keyframe; one without factors keeps its own scale.
     """
-    k, size, K = system.block_size, system.size, (0,) * system.block_size
-    summed = np.zeros((size + 1, k, k))
-    kernels.halpern.add_squares(system.keyframe, system.blocks, summed, K)
-    gram = summed[:size]
-    trace = np.trace(gram, axis1=1, axis2=2)[:, None, None]
-    gram += np.where(trace > 0, _UNMEASURED * trace, 1.0) * np.eye(k)
-    # Factors reach for the keyframe that is held fixed too; it has no columns.
-    inverse, scaled = np.zeros((size + 1, k, k)), np.empty(system.blocks.shape)
-    inverse[:size] = np.linalg.inv(np.linalg.cholesky(gram)).transpose(0, 2, 1)
-    kernels.halpern.scale(system.keyframe, system.blocks, inverse, scaled, K)
-    return replace(system, blocks=scaled), inverse[:size]
+    scaled, inverse = kernels.halpern.scale(
+        system.keyframe, system.blocks, system.size, (0,) * system.block_size)
+    return replace(system, blocks=scaled), inverse[:-1]
 
 
 def minimise_l1_halpern(

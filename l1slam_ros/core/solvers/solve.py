@@ -11,7 +11,7 @@ from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.names import NORMS, SAME, SOLVERS
-from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, cholesky_of
+from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, Pattern, cholesky_of
 from l1slam_ros.core.solvers.exact import minimise_interior_point
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, gauss_newton
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution, minimise
@@ -64,11 +64,12 @@ def norm_for(graph: FactorGraph, norm: str, loop_norm: str, delta: float) -> Smo
                   (norm_of(loop_norm, k, delta, 0.5), ~is_odometry)))
 
 
-def choose(solver: str, graph: FactorGraph, norm: str = L1_NORM, loop_norm: str = SAME) -> Method:
+def choose(solver: str, graph: FactorGraph, norm: str = L1_NORM, loop_norm: str = SAME,
+           before: Pattern | None = None) -> Method:
     """
     Resolve one of `SOLVERS`: `auto` goes by the predicted work of a factorisation.
 
-    Norms other than L1 have one solver each, and mixed ones another.
+    Norms other than L1 have one solver each, and mixed ones another. before : see `find_pattern`
 
     Raises
     ------
@@ -82,7 +83,7 @@ def choose(solver: str, graph: FactorGraph, norm: str = L1_NORM, loop_norm: str 
         found_by = PRIMAL_DUAL_NEWTON if norm == GROUP_L1_NORM else GAUSS_NEWTON
         return Method(cholesky_of(graph), found_by, f'the norm is {norm}', norm=norm)
     try:
-        cholesky = cholesky_of(graph)
+        cholesky = cholesky_of(graph, before)
     except FillError:
         if solver == INTERIOR_POINT:
             raise

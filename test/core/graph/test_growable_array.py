@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """An array that grows: views stay valid, copies part ways, the cost stays linear."""
 
+import re
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from l1slam_ros.core.graph.growable_array import GrowingArray
 
@@ -19,6 +23,17 @@ def test_rows_that_there_is_room_for_move_none():
     assert array.view().__array_interface__['data'][0] == home
     array.extend(rows(100, 1))
     assert (array.view() == rows(0, 101)).all()
+
+
+@pytest.mark.skipif(not Path('/proc/self/smaps').exists(), reason='asks Linux for its pages')
+def test_rows_come_into_small_pages():
+    """A huge one may take milliseconds to be had."""
+    array = GrowingArray((2,), room=10**6)
+    home = array.view().__array_interface__['data'][0]
+    maps = re.split(r'\n(?=[0-9a-f]+-)', Path('/proc/self/smaps').read_text())
+    own = next(text for text in maps if int(text.split('-')[0], 16) <= home
+               < int(re.split('[- ]', text, maxsplit=2)[1], 16))
+    assert re.search(r'VmFlags:.* nh', own) or 'VmFlags' not in own
 
 
 def test_appending_moves_the_rows_only_now_and_then():

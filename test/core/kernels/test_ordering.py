@@ -11,11 +11,14 @@ from scipy.spatial import Delaunay
 from systems import PLENTY, SHAPES
 
 from l1slam_ros.core.kernels import ordering
-from l1slam_ros.core.kernels.symbolic import postorder
+from l1slam_ros.core.kernels.symbolic import postorder, untouched
+
+NOTHING = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32)
 
 
-def minimum_degree(start, adjacent, limit):
-    return ordering.minimum_degree(start, adjacent, limit, np.zeros(len(start) - 1, np.int32))
+def minimum_degree(start, adjacent, limit, begun=NOTHING):
+    stage = np.zeros(len(start) - 1, np.int32)
+    return ordering.minimum_degree(start, adjacent, limit, stage, *begun)
 
 
 def adjacency_of(pairs, n):
@@ -108,6 +111,29 @@ def test_the_limit_is_exact(rng):
         assert_array_equal(short[1], column[: len(short[1])])
 
 
+def test_what_new_neighbours_do_not_touch_stays(rng):
+    """As a map grows: nodes come, and neighbours of old ones; the columns are exact, few more."""
+    pairs = np.array(planar(400, rng))
+    rng.shuffle(pairs)
+    found, begun, stayed = NOTHING, NOTHING, []
+    for n in range(300, 401, 10):
+        known = pairs[:-(400 - n) // 10 or None]
+        graph = adjacency_of(known.tolist(), n)
+        begun = untouched(*graph, *found)
+        found = minimum_degree(*graph, PLENTY, begun)
+        assert_array_equal(found[0][:len(begun[0])], begun[0])
+        assert_array_equal(np.sort(found[0]), np.arange(n))
+        for k, expected in enumerate(eliminate(*graph, found[0])):
+            own = found[2][found[1][k]:found[1][k + 1]].tolist()
+            assert set(own) == expected and len(own) == len(expected)
+        stayed.append(len(begun[0]) / n)
+    assert len(found[2]) < 1.2 * len(minimum_degree(*graph, PLENTY)[2])
+    assert min(stayed[1:]) > 0.3
+    # Of neighbours that are there no more, columns keep what they filled in.
+    fewer = adjacency_of(known[:-100].tolist(), n)
+    assert_array_equal(untouched(*fewer, *found)[0], found[0])
+
+
 # Dissection
 
 
@@ -127,7 +153,7 @@ def test_what_is_cut_leaves_small_parts_that_come_first(rng):
     labels = connected_components(coo_array((np.ones(len(whole)), np.transpose(whole)),
                                             shape=(900, 900)))[1]
     assert np.bincount(labels[stage[:900] == 0]).max() <= 120
-    order, _, rows = ordering.minimum_degree(*graph, PLENTY, stage)
+    order, _, rows = ordering.minimum_degree(*graph, PLENTY, stage, *NOTHING)
     assert_array_equal(np.sort(order), np.arange(1800))
     assert (np.diff(stage[order]) >= 0).all() and len(np.unique(stage)) > 3
     assert len(rows) == sum(map(len, eliminate(*graph, order)))

@@ -253,6 +253,25 @@ def test_in_the_background_what_comes_is_judged_and_the_thread_ends():
     assert backend.update() is not None
 
 
+def test_what_goes_on_behind_keeps_its_order_while_the_map_grows():
+    """Five keyframes with a loop each are enough for the next map, and it is not ordered anew."""
+    with Backend(EVERY) as backend:
+        drive(backend, 0, 60)
+        settled, found = backend.settle(), backend._live.front.pattern.found
+        drive(backend, 60, 64)
+        backend.update(MOMENT)
+        assert backend._live.last is settled
+        for k in range(60, 65):
+            backend.add_loop(loop(float(k - 20), float(k), (20.0, 0.0, 0.0), 1e-4 * np.eye(6)))
+        drive(backend, 64, 65)
+        deadline = time.monotonic() + DEADLINE
+        while backend._live.last is settled and time.monotonic() < deadline:
+            backend._update(MOMENT, go_on, idle=False)
+        assert backend._live.last is not settled
+        front = backend._live.front
+        assert (front.keyframes, front.pattern.found) == (65, found)
+
+
 def test_the_background_looks_again_when_nothing_comes_any_more():
     calls = []
     background = Background(lambda idle, _: calls.append(idle), 0.01)

@@ -304,6 +304,22 @@ def test_large_blocks_are_worth_the_search_for_a_better_order():
     assert_array_equal(np.sort(better.position), np.arange(2500))
 
 
+def test_a_graph_that_grows_keeps_its_order_for_a_while(rng):
+    """Until it has a tenth more keyframes, or if all that is kept would be too much."""
+    pairs = np.array(random_loops(N))
+    first = find_pattern(pairs[(pairs < 20).all(axis=1)], 20, PLENTY)
+    for n, kept in ((21, True), (22, False), (19, False)):
+        system = random_system(pairs[(pairs < n).all(axis=1)].tolist(), n, 3, rng)
+        pattern = find_pattern(system.keyframe, n, PLENTY, 3, first)
+        assert (pattern.found, len(pattern.position)) == (20 if kept else n, n)
+        cholesky, right = BlockCholesky(pattern, system.keyframe), rng.standard_normal(3 * n)
+        assert cholesky.factorise(system, np.ones(len(system.b)), 0.1)
+        x = cholesky.solve(right)
+        assert_allclose(system.transposed_times(system.times(x)) + 0.1 * x, right, atol=1e-9)
+    least = len(first.columns[-1]) - 1
+    assert len(find_pattern(np.array([(0, 1)]), 20, least, 3, first).columns[-1]) == 1
+
+
 def test_too_much_fill_is_refused():
     keyframe = np.array([(i, j) for i in range(20) for j in range(i)])
     below = 20 * 19 // 2

@@ -165,9 +165,10 @@ def test_a_step_that_lowers_the_cost_is_taken_whole(world):
     start = solve(graph, truth, OptimiserOptions(outer_iterations=1)).poses
     system = linearise(graph, start)
     _, step = linprog_l1(system.A, system.b, box=0.01)
-    poses, value = backtrack(graph, start, step, cost(graph, start))
+    poses, residual = backtrack(graph, start, whitened_residual(graph, start), step)
     assert_array_equal(poses, step_poses(graph, start, step))
-    assert value == cost(graph, poses) < cost(graph, start)
+    assert_array_equal(residual, whitened_residual(graph, poses))
+    assert l1_cost(residual) < cost(graph, start)
 
 
 @pytest.mark.parametrize('length, taken', [
@@ -175,16 +176,18 @@ def test_a_step_that_lowers_the_cost_is_taken_whole(world):
 def test_a_step_too_long_is_halved(length, taken):
     """The best is at 1; at 2 the cost is that of the start, which is no gain."""
     graph, start = parallel(1.0), np.zeros((2, 3))
-    poses, value = backtrack(graph, start, np.array([length, 0.0, 0.0]), 1.0)
+    residual = whitened_residual(graph, start)
+    poses, residual = backtrack(graph, start, residual, np.array([length, 0.0, 0.0]))
     assert_array_equal(poses, [[0, 0, 0], [taken, 0, 0]])
-    assert value == abs(taken - 1)
+    assert l1_cost(residual) == abs(taken - 1)
 
 
 @pytest.mark.parametrize('step', [[-1.0, 0, 0], [64.0, 0, 0], [0.0, 0, 0], [np.nan, 0, 0]])
 def test_a_direction_that_is_no_good_is_given_up(step):
     graph, start = parallel(1.0), np.zeros((2, 3))
-    poses, value = backtrack(graph, start, np.array(step), 1.0)
-    assert poses is start and value == 1.0
+    before = whitened_residual(graph, start)
+    poses, residual = backtrack(graph, start, before, np.array(step))
+    assert poses is start and residual is before
 
 
 def test_far_is_more_than_a_hundredth():

@@ -22,8 +22,9 @@ from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.core.robust.judgement import Doubt, Judgement
 from l1slam_ros.core.solvers.optimality import Status
 
-# A map is factored anew from so many factors on that came since: those of ten keyframes.
-_MANY = 20
+# A map is factored anew from so many factors on that came since: those of five keyframes. On a
+# small map nothing else holds the next round back.
+_MANY = 10
 # Factors that a front takes while its lock is held, and between two looks at the clock: on a large
 # map a loop takes milliseconds.
 _AT_ONCE = 4

@@ -114,7 +114,8 @@ class Upkeep:
                     live.number, self._version(), self._builder.graph.copy(), track.gaps,
                     track.keyframe_stamps, track.keyframe_poses, self._map_to_odom_now(),
                     loops.rows, loops.stamps, live.optimised, live.robust, live.looks.view(),
-                    live.all_judged, live.judged, live.stale, views if live.front is front else ())
+                    live.all_judged, live.judged, live.stale, views if live.front is front else (),
+                    front.pattern if front else None)
 
     def _map_to_odom_now(self) -> Array:
         """Return the odometry frame seen from the map: what its last keyframe says."""
