@@ -37,6 +37,7 @@ from l1slam_ros.core.online.snapshot import (
     WAITING,
 )
 from l1slam_ros.core.online.update import improve, optimise
+from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.core.robust.judgement import NORM
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, minimise
@@ -359,8 +360,12 @@ def test_a_trusted_loop_is_accepted_however_absurd(careful):
     assert np.abs(error).max() < 0.1
 
 
-def test_a_loop_is_suspect_until_others_vouch_for_it():
-    """Loops beside each other may be one mistake; one at another place says they are none."""
+def test_a_loop_is_suspect_until_others_vouch_for_it(monkeypatch):
+    """
+    Loops beside each other may be one mistake; one at another place says they are none.
+
+    What is believed then is told with the map of it; what is made of less makes way.
+    """
     backend, truth = Backend(EVERY), roundabout(220)
     drive_roundabout(backend, truth)
     settled(backend)
@@ -371,8 +376,19 @@ def test_a_loop_is_suspect_until_others_vouch_for_it():
         states = backend.loop_states()
         assert (states.state == SUSPECT).all() and (states.sigmas < 4).all()
         assert position_error(backend.poses, truth) == pytest.approx(drifted, rel=1e-6)
+    told = []
+
+    def improving(problem, options, budget, check, exact):
+        while not problem.judgement.accepted.all():
+            check()
+        made = improve(problem, options, budget, check, exact)
+        told.append((backend.loop_states().state, position_error(backend.poses, truth)))
+        return made
+
+    monkeypatch.setattr(upkeep, 'improve', improving)
     backend.add_loop(seen(truth, 30, 140))
     settled(backend)
+    assert (told[0][0] == SUSPECT).all() and told[0][1] == pytest.approx(drifted, rel=1e-6)
     assert (backend.loop_states().state == ACCEPTED).all()
     assert position_error(backend.poses, truth) < 0.5 * drifted
 

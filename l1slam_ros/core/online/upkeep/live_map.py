@@ -65,7 +65,9 @@ class LiveMap:
     looks : (k, 3) what fronts said of the factors after those that are judged: accepted, suspect,
         sigmas
     judged : (n, p) the L2 map of the judgement, None: there is none
-    stale : the map is not of the factors that are accepted
+    verdict : the last judgement, where the map is not of what it accepts: until it is, all that
+        is asked is told of map and judgement before; None: there is none
+    stale : the map is not of the factors that are accepted, or are to be
     last : the last improvement, None: there was none
     newest : the last keyframe of the map, and its pose (1, p)
     judge_took : [s] time of the last judgement
@@ -79,6 +81,7 @@ class LiveMap:
         self.front: Front | None = None
         self.judged: Array | None = None
         self.asked: Array | None = None
+        self.verdict: Judgement | None = None
         self.stale = False
         self.last: Improvement | None = None
         self.newest: tuple[int, Array]
@@ -127,8 +130,7 @@ class LiveMap:
         if (after == before).all():
             return
         known = len(judgement.accepted)
-        self.optimised = replace(self.optimised, judgement=replace(
-            judgement, accepted=after[:known], suspect=judgement.suspect & ~after[:known]))
+        self.optimised = replace(self.optimised, judgement=self._told(judgement))
         looks, self.looks = self.looks.view().copy(), GrowingArray((3,))
         looks[:, 0] = after[known:]
         self.looks.extend(looks)
@@ -209,25 +211,41 @@ class LiveMap:
     def take_judgement(self, judgement: Judgement, poses: Array, loops: int,
                        anew: bool) -> None:
         """
-        Take over what is accepted of the first factors, so many loops, and its L2 map.
+        Take over what was found of the first factors, so many loops, and its L2 map.
+
+        What is accepted now that was not, or the other way round, waits for a map of it.
 
         anew : from the graph alone
         """
-        looks, before = self.looks.view(), len(self.optimised.judgement.accepted)
-        self.looks = GrowingArray((3,))
-        self.looks.extend(looks[len(judgement.accepted) - before:])
-        self.optimised = replace(self.optimised, judgement=judgement)
         self._judged_loops, self.judged, self.asked = loops, poses, None
         self._judge_at = time.monotonic()
         if anew:
             self._judged_anew = loops
         else:
             self.judge_took = self._judge_at - self._judge_began
-        self._compare()
+        known = self.accepted[:len(judgement.accepted)]
+        if self.verdict or not np.array_equal(judgement.accepted, known):
+            self.verdict, self.stale = judgement, True
+        else:
+            self._believe(judgement)
 
-    def adopt(self, improvement: Improvement, front: Front | None, tolerance: float) -> None:
+    def _believe(self, judgement: Judgement) -> None:
+        """Take over what was found of the first factors."""
+        looks, before = self.looks.view(), len(self.optimised.judgement.accepted)
+        self.looks = GrowingArray((3,))
+        self.looks.extend(looks[len(judgement.accepted) - before:])
+        self.optimised = replace(self.optimised, judgement=self._told(judgement))
+
+    def _told(self, judgement: Judgement) -> Judgement:
+        """Return a judgement in which the last word is a person's."""
+        factors, known = self._builder.graph.between, len(judgement.accepted)
+        accepted = (judgement.accepted | factors.trusted[:known]) & ~factors.struck[:known]
+        return replace(judgement, accepted=accepted, suspect=judgement.suspect & ~accepted)
+
+    def adopt(self, improvement: Improvement, front: Front | None, tolerance: float,
+              verdict: Judgement | None) -> None:
         """
-        Take over a map; see `Improvement.taken_over`.
+        Take over a map, and the verdict that it was made by; see `Improvement.taken_over`.
 
         Raises
         ------
@@ -235,6 +253,9 @@ class LiveMap:
 
         """
         self.optimised = improvement.taken_over(self.optimised, tolerance)
+        if verdict:
+            self._believe(verdict)
+            self.verdict = None if self.verdict is verdict else self.verdict
         judgement = improvement.judgement
         self._factored_at = time.monotonic()
         if improvement.gap < np.inf:
@@ -282,4 +303,4 @@ class LiveMap:
         """Find out whether the map is of the factors that are accepted."""
         used, accepted = self._used, self.accepted
         both = min(len(used), len(accepted))
-        self.stale = bool((used[:both] != accepted[:both]).any())
+        self.stale = self.verdict is not None or bool((used[:both] != accepted[:both]).any())

@@ -32,6 +32,7 @@ from l1slam_ros.core.online.update import Improvement, front_of, improve, one_ro
 from l1slam_ros.core.online.upkeep.live_map import LiveMap
 from l1slam_ros.core.online.upkeep.threads import LOOK, Calm, Worker, until
 from l1slam_ros.core.robust.batch import doubts_of_norm, judge, robust_solve
+from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
 # Asked on the way, often: whether to stop.
@@ -114,7 +115,8 @@ class Upkeep:
                     live.number, self._version(), self._builder.graph.copy(), track.gaps,
                     track.keyframe_stamps, track.keyframe_poses, self._map_to_odom_now(),
                     loops.rows, loops.stamps, live.optimised, live.robust, live.looks.view(),
-                    live.all_judged, live.judged, live.stale, views if live.front is front else ())
+                    live.all_judged and not live.verdict, live.judged, live.verdict, live.stale,
+                    views if live.front is front else ())
 
     def _map_to_odom_now(self) -> Array:
         """Return the odometry frame seen from the map: what its last keyframe says."""
@@ -216,9 +218,12 @@ class Upkeep:
         with self._standing() as now:
             live, solver = self._live, self._solver
             exact = live.is_exact_due(idle)
-        whole = now.problem()
+        whole, verdict = now.problem(), now.verdict
         del now  # holds the factors of a front that may be replaced meanwhile
         problem = as_one(whole)
+        if not verdict:
+            # What is made of less than is believed by then, would be late.
+            check = until(lambda: live.verdict is not None, check)
         if exact:
             check = until(lambda: live.is_late, check)
         else:
@@ -234,7 +239,7 @@ class Upkeep:
                 check()
                 front.take(factors, accepted[front.rows:front.rows + _AT_ONCE].astype(int))
         check()
-        self.adopt(of_all(improvement, whole), front)
+        self.adopt(of_all(improvement, whole), front, verdict)
 
     def _judge_all(self, anew: bool, check: Callable[[], None]) -> None:
         """Look at all loops again; anew: from the graph alone, until more comes."""
@@ -286,18 +291,17 @@ class Upkeep:
                              len(whole.graph.between), check)
             improvement = of_all(improvement, whole)
             with self._front, self._lock:
-                if live is not self._live:
-                    raise Interrupted
                 live.take_judgement(improvement.judgement, improvement.poses, loops, True)
-                self._adopt(improvement, front)
+            self.adopt(improvement, front, improvement.judgement)
         self._on_end()
         return improvement
 
-    def adopt(self, improvement: Improvement, front: Front | None = None) -> None:
+    def adopt(self, improvement: Improvement, front: Front | None = None,
+              verdict: Judgement | None = None) -> None:
         """
         Take over a map that was made of a snapshot; keyframes since then follow along.
 
-        front : made of it, None: it cannot be factored
+        front : made of it, None: it cannot be factored; verdict : of the snapshot
 
         Raises
         ------
@@ -308,12 +312,9 @@ class Upkeep:
         with self._front, self._lock:
             if improvement.map != self._live.number:
                 raise Interrupted
-            self._adopt(improvement, front)
-
-    def _adopt(self, improvement: Improvement, front: Front | None) -> None:
-        before = self._map_to_odom_now()
-        self._live.adopt(improvement, front, self._solver.outer_tolerance)
-        self._note_map(before)
+            before = self._map_to_odom_now()
+            self._live.adopt(improvement, front, self._solver.outer_tolerance, verdict)
+            self._note_map(before)
 
     def _note_map(self, before: Array) -> None:
         """Note that the map is another now; before : map -> odom until then."""
