@@ -7,15 +7,16 @@ keyframe is, what is accepted, and whether map or judgement are due. Its owner h
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
-from l1slam_ros.core.incremental.front import UNKNOWN, Front
+from l1slam_ros.core.incremental.front import UNKNOWN, Front, Look
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.snapshot import Optimised
 from l1slam_ros.core.online.update import Improvement
@@ -136,6 +137,20 @@ class LiveMap:
         self.looks.extend(looks)
         self._judged_loops, self.stale = -1, True
 
+    def to_accept(self, part: Mask, verdict: Judgement | None) -> tuple[BetweenFactors, Indices]:
+        """
+        Return the factors, and which of them a new front is to accept, as far as one looked.
+
+        part : which of the first ones it begins with; verdict : for which it was made: beside what
+        is believed now, what did not fit may, and the front finds out
+        """
+        factors, known = self._builder.graph.between, self.accepted
+        accept = np.append(known, np.zeros(max(len(part) - len(known), 0))).astype(int)
+        if verdict:
+            accept[(accept == 0) & ~factors.struck[:len(accept)]] = UNKNOWN
+            accept[:len(part)][part] = 0
+        return factors, accept
+
     def take_some(self, factors: BetweenFactors) -> bool:
         """Let the front take a few of the graph's factors; return whether it did."""
         front = self.front
@@ -243,9 +258,11 @@ class LiveMap:
         return replace(judgement, accepted=accepted, suspect=judgement.suspect & ~accepted)
 
     def adopt(self, improvement: Improvement, front: Front | None, tolerance: float,
-              verdict: Judgement | None) -> None:
+              verdict: Judgement | None, looks: Sequence[Look]) -> None:
         """
         Take over a map, and the verdict that it was made by; see `Improvement.taken_over`.
+
+        looks : of the front at factors after those of the verdict
 
         Raises
         ------
@@ -267,8 +284,22 @@ class LiveMap:
         first = len(self.optimised.judgement.accepted) + len(self.looks)
         self.looks.extend(np.column_stack(
             (judgement.accepted, judgement.suspect, judgement.sigmas))[first:])
+        if verdict and looks:
+            self._look_again(looks)
         self._compare()
         self.note_newest()
+
+    def _look_again(self, looks: Sequence[Look]) -> None:
+        """Take over looks at the first factors that are not judged, but at what is accepted."""
+        seen = np.array([(look.accepted, look.suspect, look.sigmas) for look in looks])
+        first, before = len(self.optimised.judgement.accepted), self.looks.view()
+        again = np.where(before[:len(seen), :1] > 0, before[:len(seen)], seen)
+        used = self._used[first:first + len(again)]
+        self._used = np.concatenate((self._used[:first], used | (again[:len(used), 0] > 0),
+                                     self._used[first + len(again):]))
+        self.looks = GrowingArray((3,))
+        self.looks.extend(np.concatenate((again, before[len(again):])))
+        self._fits |= bool(again[:, 1].any())
 
     def note_newest(self) -> None:
         """Remember the last keyframe of the map, which keyframes to come follow."""

@@ -16,7 +16,7 @@ map that is replaced, or that `settle` is to solve, is told to stop, and its res
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.incremental.front import Front
+from l1slam_ros.core.incremental.front import Front, Look
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
@@ -228,18 +228,18 @@ class Upkeep:
             check = until(lambda: live.is_late, check)
         else:
             solver = one_round(solver, problem.is_sparse)
-        check()
         improvement = improve(problem, solver, _PATIENCE * max(budget, _LEAST_ROUND), check, exact)
         check()
-        front = front_of(problem, improvement.poses, len(whole.graph.between), check)
+        judgement, looks = whole.judgement, list[Look]()
+        front = front_of(problem, improvement.poses, len((verdict or judgement).accepted), check)
         for _ in range(_PASSES):
             with self._front, self._lock:
-                factors, accepted = self._builder.graph.between, live.accepted
-            while front is not None and not front.closed and front.rows < len(accepted):
+                factors, accept = live.to_accept(judgement.accepted, verdict)
+            while front is not None and not front.closed and front.rows < len(accept):
                 check()
-                front.take(factors, accepted[front.rows:front.rows + _AT_ONCE].astype(int))
+                looks += front.take(factors, accept[front.rows:front.rows + _AT_ONCE])
         check()
-        self.adopt(of_all(improvement, whole), front, verdict)
+        self.adopt(of_all(improvement, whole), front, verdict, looks)
 
     def _judge_all(self, anew: bool, check: Callable[[], None]) -> None:
         """Look at all loops again; anew: from the graph alone, until more comes."""
@@ -297,11 +297,12 @@ class Upkeep:
         return improvement
 
     def adopt(self, improvement: Improvement, front: Front | None = None,
-              verdict: Judgement | None = None) -> None:
+              verdict: Judgement | None = None, looks: Sequence[Look] = ()) -> None:
         """
         Take over a map that was made of a snapshot; keyframes since then follow along.
 
-        front : made of it, None: it cannot be factored; verdict : of the snapshot
+        front : made of it, None: it cannot be factored; verdict : of it; looks : of the front at
+        what the verdict is not of
 
         Raises
         ------
@@ -313,7 +314,7 @@ class Upkeep:
             if improvement.map != self._live.number:
                 raise Interrupted
             before = self._map_to_odom_now()
-            self._live.adopt(improvement, front, self._solver.outer_tolerance, verdict)
+            self._live.adopt(improvement, front, self._solver.outer_tolerance, verdict, looks)
             self._note_map(before)
 
     def _note_map(self, before: Array) -> None:
