@@ -199,9 +199,10 @@ class Snapshot:
     `Problem`; stamps (n,) [ns] and odometry (n, p) of the keyframes; map_to_odom : (1, p);
     loop_rows, loop_stamps : see `LoopFactors`; robust : loops may be doubted; looks : (k, 3) what
     the front says of the factors after those that are judged: accepted, suspect, sigmas;
-    all_judged : no loop is among them; judged : (k, p) the L2 map of the judgement, None: there is
-    none; stale : the map is not of the factors that are accepted; views : the L1 and L2 map of the
-    front, where there is one; pattern : see `Problem`.
+    all_judged : no loop is among them; judged : (k, p) the L2 map of the last judgement, None:
+    there is none; verdict : that judgement, where it waits for a map; stale : the map is not of
+    the factors that are accepted, or are to be; views : the L1 and L2 map of the front, where
+    there is one; pattern : see `Problem`.
     """
 
     map: int
@@ -218,6 +219,7 @@ class Snapshot:
     looks: Array
     all_judged: bool
     judged: Array | None
+    verdict: Judgement | None
     stale: bool
     views: tuple[View, ...]
     pattern: Pattern | None
@@ -240,14 +242,18 @@ class Snapshot:
 
     @cached_property
     def judgement(self) -> Judgement:
-        """What is believed of all factors."""
-        last = self.optimised.judgement
-        accepted, suspect, sigmas = self.looks.T
+        """What is believed of all factors, as the map has it."""
+        return self._of_all(self.optimised.judgement)
+
+    def _of_all(self, judged: Judgement) -> Judgement:
+        """Return a judgement of the first factors, with what the front says of the others."""
+        new = len(judged.accepted) - len(self.optimised.judgement.accepted)
+        accepted, suspect, sigmas = self.looks[new:].T
         looked = replace(
-            last, accepted=np.concatenate((last.accepted, accepted > 0)),
-            suspect=np.concatenate((last.suspect, suspect > 0)),
-            sigmas=np.concatenate((last.sigmas, sigmas)),
-            settled=not self.robust or (last.settled and self.all_judged))
+            judged, accepted=np.concatenate((judged.accepted, accepted > 0)),
+            suspect=np.concatenate((judged.suspect, suspect > 0)),
+            sigmas=np.concatenate((judged.sigmas, sigmas)),
+            settled=not self.robust or (judged.settled and self.all_judged))
         return looked.extended(self.graph, self.robust)
 
     def problem(self) -> Problem:
@@ -261,15 +267,16 @@ class Snapshot:
             # After a loop has closed, the L2 map of the judgement is nearer.
             starts.append(self._followed(self.judged, self.poses))
         grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
-        settled = not (grown or self.stale) and self.judgement.settled and last.at_rest
-        return Problem(self.map, self.graph, self.gaps, starts, dual, self.judgement, self.robust,
+        judgement = self._of_all(self.verdict) if self.verdict else self.judgement
+        settled = not (grown or self.stale) and judgement.settled and last.at_rest
+        return Problem(self.map, self.graph, self.gaps, starts, dual, judgement, self.robust,
                        last.cost * rows / max(len(last.dual), 1), settled, self.pattern)
 
     def known(self) -> Optimised:
         """Return what was made, of all keyframes and factors that there are."""
         problem, last = self.problem(), self.optimised
         same = len(last.poses) == len(problem.poses) and len(last.dual) == len(problem.dual)
-        return replace(last, poses=problem.poses, dual=problem.dual, judgement=problem.judgement,
+        return replace(last, poses=problem.poses, dual=problem.dual, judgement=self.judgement,
                        status=last.status if same else Status.OUT_OF_TIME,
                        quiet_updates=last.quiet_updates if same else 0)
 

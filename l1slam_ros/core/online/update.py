@@ -112,10 +112,10 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
 
     exact : to the end instead, where that is done by factorisations
 
-    Without: where the cost is far above what the last map left (a loop has closed), reweighted
-    least squares steps carry the long-range part: one factorisation bends the whole chain, where a
-    first-order method moves it a few keyframes per iteration. Then, always, Algorithm 4 from the
-    kept dual.
+    Without: reweighted least squares steps carry the long-range part: one factorisation bends the
+    whole chain, where a first-order method moves it a few keyframes per iteration. One is always
+    taken, more where the cost is far above what the last map left (a loop has closed) and still
+    falls. Then, always, Algorithm 4 from the kept dual.
     """
     start = time.monotonic()
     graph, method, deadline = problem.part, problem.method, start + budget
@@ -124,19 +124,21 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
         solution, _ = minimise_by(method, graph, poses, options, lambda *_: check())
         return _improvement(solution, problem, problem.judgement, before, 0, start)
     dual, cost = _dual_of(problem, residual), l1_cost(residual)
-    steps, far = 0, not fits_exactly(cost, len(dual)) and is_far(cost, problem.last_cost)
-    while method.cholesky and far and (not steps or time.monotonic() < deadline):
+    exactly = fits_exactly(cost, len(dual))
+    steps, far = 0, not exactly and is_far(cost, problem.last_cost)
+    mu = _SMOOTHING if far else _SHARPEST
+    while method.cholesky and not exactly and (
+            not steps or (far and time.monotonic() < deadline)):
         check()
         system = linearise(graph, poses, residual)
-        mu = max(_SMOOTHING * _SHARPER**steps, _SHARPEST) * smoothing(system.b)
         try:
-            step, dual = reweighted_step(system, method.cholesky, system.b, mu)
+            step, _ = reweighted_step(system, method.cholesky, system.b, mu * smoothing(system.b))
         except GraphError:  # sharper weights are beyond double precision
             break
         previous = cost
         poses, residual = backtrack(graph, poses, residual, step)
-        steps, cost = steps + 1, l1_cost(residual)
-        far = is_far(previous, cost)
+        cost = l1_cost(residual)
+        steps, mu, far = steps + 1, max(_SHARPER * mu, _SHARPEST), is_far(previous, cost)
     solution = minimise(graph, poses, options, method.cholesky if steps else None, dual, deadline,
                         lambda *_: check())
     return _improvement(solution, problem, problem.judgement, before, steps, start)

@@ -266,7 +266,7 @@ def test_what_goes_on_behind_keeps_its_order_while_the_map_grows():
         drive(backend, 64, 65)
         deadline = time.monotonic() + DEADLINE
         while backend._live.last is settled and time.monotonic() < deadline:
-            backend._update(MOMENT, go_on, idle=False)
+            backend._update(MOMENT, lambda: False, idle=False)
         assert backend._live.last is not settled
         front = backend._live.front
         assert (front.keyframes, front.pattern.found) == (65, found)

@@ -7,15 +7,16 @@ keyframe is, what is accepted, and whether map or judgement are due. Its owner h
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
-from l1slam_ros.core.incremental.front import UNKNOWN, Front
+from l1slam_ros.core.incremental.front import UNKNOWN, Front, Look
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.snapshot import Optimised
 from l1slam_ros.core.online.update import Improvement
@@ -66,7 +67,9 @@ class LiveMap:
     looks : (k, 3) what fronts said of the factors after those that are judged: accepted, suspect,
         sigmas
     judged : (n, p) the L2 map of the judgement, None: there is none
-    stale : the map is not of the factors that are accepted
+    verdict : the last judgement, where the map is not of what it accepts: until it is, all that
+        is asked is told of map and judgement before; None: there is none
+    stale : the map is not of the factors that are accepted, or are to be
     last : the last improvement, None: there was none
     newest : the last keyframe of the map, and its pose (1, p)
     judge_took : [s] time of the last judgement
@@ -80,6 +83,7 @@ class LiveMap:
         self.front: Front | None = None
         self.judged: Array | None = None
         self.asked: Array | None = None
+        self.verdict: Judgement | None = None
         self.stale = False
         self.last: Improvement | None = None
         self.newest: tuple[int, Array]
@@ -128,12 +132,25 @@ class LiveMap:
         if (after == before).all():
             return
         known = len(judgement.accepted)
-        self.optimised = replace(self.optimised, judgement=replace(
-            judgement, accepted=after[:known], suspect=judgement.suspect & ~after[:known]))
+        self.optimised = replace(self.optimised, judgement=self._told(judgement))
         looks, self.looks = self.looks.view().copy(), GrowingArray((3,))
         looks[:, 0] = after[known:]
         self.looks.extend(looks)
         self._judged_loops, self.stale = -1, True
+
+    def to_accept(self, part: Mask, verdict: Judgement | None) -> tuple[BetweenFactors, Indices]:
+        """
+        Return the factors, and which of them a new front is to accept, as far as one looked.
+
+        part : which of the first ones it begins with; verdict : for which it was made: beside what
+        is believed now, what did not fit may, and the front finds out
+        """
+        factors, known = self._builder.graph.between, self.accepted
+        accept = np.append(known, np.zeros(max(len(part) - len(known), 0))).astype(int)
+        if verdict:
+            accept[(accept == 0) & ~factors.struck[:len(accept)]] = UNKNOWN
+            accept[:len(part)][part] = 0
+        return factors, accept
 
     def take_some(self, factors: BetweenFactors) -> bool:
         """Let the front take a few of the graph's factors; return whether it did."""
@@ -210,25 +227,43 @@ class LiveMap:
     def take_judgement(self, judgement: Judgement, poses: Array, loops: int,
                        anew: bool) -> None:
         """
-        Take over what is accepted of the first factors, so many loops, and its L2 map.
+        Take over what was found of the first factors, so many loops, and its L2 map.
+
+        What is accepted now that was not, or the other way round, waits for a map of it.
 
         anew : from the graph alone
         """
-        looks, before = self.looks.view(), len(self.optimised.judgement.accepted)
-        self.looks = GrowingArray((3,))
-        self.looks.extend(looks[len(judgement.accepted) - before:])
-        self.optimised = replace(self.optimised, judgement=judgement)
         self._judged_loops, self.judged, self.asked = loops, poses, None
         self._judge_at = time.monotonic()
         if anew:
             self._judged_anew = loops
         else:
             self.judge_took = self._judge_at - self._judge_began
-        self._compare()
+        known = self.accepted[:len(judgement.accepted)]
+        if self.verdict or not np.array_equal(judgement.accepted, known):
+            self.verdict, self.stale = judgement, True
+        else:
+            self._believe(judgement)
 
-    def adopt(self, improvement: Improvement, front: Front | None, tolerance: float) -> None:
+    def _believe(self, judgement: Judgement) -> None:
+        """Take over what was found of the first factors."""
+        looks, before = self.looks.view(), len(self.optimised.judgement.accepted)
+        self.looks = GrowingArray((3,))
+        self.looks.extend(looks[len(judgement.accepted) - before:])
+        self.optimised = replace(self.optimised, judgement=self._told(judgement))
+
+    def _told(self, judgement: Judgement) -> Judgement:
+        """Return a judgement in which the last word is a person's."""
+        factors, known = self._builder.graph.between, len(judgement.accepted)
+        accepted = (judgement.accepted | factors.trusted[:known]) & ~factors.struck[:known]
+        return replace(judgement, accepted=accepted, suspect=judgement.suspect & ~accepted)
+
+    def adopt(self, improvement: Improvement, front: Front | None, tolerance: float,
+              verdict: Judgement | None, looks: Sequence[Look]) -> None:
         """
-        Take over a map; see `Improvement.taken_over`.
+        Take over a map, and the verdict that it was made by; see `Improvement.taken_over`.
+
+        looks : of the front at factors after those of the verdict
 
         Raises
         ------
@@ -236,6 +271,9 @@ class LiveMap:
 
         """
         self.optimised = improvement.taken_over(self.optimised, tolerance)
+        if verdict:
+            self._believe(verdict)
+            self.verdict = None if self.verdict is verdict else self.verdict
         judgement = improvement.judgement
         self._factored_at = time.monotonic()
         if improvement.gap < np.inf:
@@ -247,8 +285,22 @@ class LiveMap:
         first = len(self.optimised.judgement.accepted) + len(self.looks)
         self.looks.extend(np.column_stack(
             (judgement.accepted, judgement.suspect, judgement.sigmas))[first:])
+        if verdict and looks:
+            self._look_again(looks)
         self._compare()
         self.note_newest()
+
+    def _look_again(self, looks: Sequence[Look]) -> None:
+        """Take over looks at the first factors that are not judged, but at what is accepted."""
+        seen = np.array([(look.accepted, look.suspect, look.sigmas) for look in looks])
+        first, before = len(self.optimised.judgement.accepted), self.looks.view()
+        again = np.where(before[:len(seen), :1] > 0, before[:len(seen)], seen)
+        used = self._used[first:first + len(again)]
+        self._used = np.concatenate((self._used[:first], used | (again[:len(used), 0] > 0),
+                                     self._used[first + len(again):]))
+        self.looks = GrowingArray((3,))
+        self.looks.extend(np.concatenate((again, before[len(again):])))
+        self._fits |= bool(again[:, 1].any())
 
     def note_newest(self) -> None:
         """Remember the last keyframe of the map, which keyframes to come follow."""
@@ -283,4 +335,4 @@ class LiveMap:
         """Find out whether the map is of the factors that are accepted."""
         used, accepted = self._used, self.accepted
         both = min(len(used), len(accepted))
-        self.stale = bool((used[:both] != accepted[:both]).any())
+        self.stale = self.verdict is not None or bool((used[:both] != accepted[:both]).any())

@@ -16,7 +16,7 @@ map that is replaced, or that `settle` is to solve, is told to stop, and its res
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.incremental.front import Front
+from l1slam_ros.core.incremental.front import Front, Look
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
@@ -32,6 +32,7 @@ from l1slam_ros.core.online.update import Improvement, front_of, improve, one_ro
 from l1slam_ros.core.online.upkeep.live_map import LiveMap
 from l1slam_ros.core.online.upkeep.threads import LOOK, Calm, Worker, until
 from l1slam_ros.core.robust.batch import doubts_of_norm, judge, robust_solve
+from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
 # Asked on the way, often: whether to stop.
@@ -114,8 +115,8 @@ class Upkeep:
                     live.number, self._version(), self._builder.graph.copy(), track.gaps,
                     track.keyframe_stamps, track.keyframe_poses, self._map_to_odom_now(),
                     loops.rows, loops.stamps, live.optimised, live.robust, live.looks.view(),
-                    live.all_judged, live.judged, live.stale, views if live.front is front else (),
-                    front.pattern if front else None)
+                    live.all_judged and not live.verdict, live.judged, live.verdict, live.stale,
+                    views if live.front is front else (), front.pattern if front else None)
 
     def _map_to_odom_now(self) -> Array:
         """Return the odometry frame seen from the map: what its last keyframe says."""
@@ -217,25 +218,28 @@ class Upkeep:
         with self._standing() as now:
             live, solver = self._live, self._solver
             exact = live.is_exact_due(idle)
-        whole = now.problem()
+        whole, verdict = now.problem(), now.verdict
         del now  # holds the factors of a front that may be replaced meanwhile
         problem = as_one(whole)
+        if not verdict:
+            # What is made of less than is believed by then, would be late.
+            check = until(lambda: live.verdict is not None, check)
         if exact:
             check = until(lambda: live.is_late, check)
         else:
             solver = one_round(solver, problem.is_sparse)
-        check()
         improvement = improve(problem, solver, _PATIENCE * max(budget, _LEAST_ROUND), check, exact)
         check()
-        front = front_of(problem, improvement.poses, len(whole.graph.between), check)
+        judgement, looks = whole.judgement, list[Look]()
+        front = front_of(problem, improvement.poses, len((verdict or judgement).accepted), check)
         for _ in range(_PASSES):
             with self._front, self._lock:
-                factors, accepted = self._builder.graph.between, live.accepted
-            while front is not None and not front.closed and front.rows < len(accepted):
+                factors, accept = live.to_accept(judgement.accepted, verdict)
+            while front is not None and not front.closed and front.rows < len(accept):
                 check()
-                front.take(factors, accepted[front.rows:front.rows + _AT_ONCE].astype(int))
+                looks += front.take(factors, accept[front.rows:front.rows + _AT_ONCE])
         check()
-        self.adopt(of_all(improvement, whole), front)
+        self.adopt(of_all(improvement, whole), front, verdict, looks)
 
     def _judge_all(self, anew: bool, check: Callable[[], None]) -> None:
         """Look at all loops again; anew: from the graph alone, until more comes."""
@@ -287,18 +291,18 @@ class Upkeep:
                              len(whole.graph.between), check)
             improvement = of_all(improvement, whole)
             with self._front, self._lock:
-                if live is not self._live:
-                    raise Interrupted
                 live.take_judgement(improvement.judgement, improvement.poses, loops, True)
-                self._adopt(improvement, front)
+            self.adopt(improvement, front, improvement.judgement)
         self._on_end()
         return improvement
 
-    def adopt(self, improvement: Improvement, front: Front | None = None) -> None:
+    def adopt(self, improvement: Improvement, front: Front | None = None,
+              verdict: Judgement | None = None, looks: Sequence[Look] = ()) -> None:
         """
         Take over a map that was made of a snapshot; keyframes since then follow along.
 
-        front : made of it, None: it cannot be factored
+        front : made of it, None: it cannot be factored; verdict : of it; looks : of the front at
+        what the verdict is not of
 
         Raises
         ------
@@ -309,12 +313,9 @@ class Upkeep:
         with self._front, self._lock:
             if improvement.map != self._live.number:
                 raise Interrupted
-            self._adopt(improvement, front)
-
-    def _adopt(self, improvement: Improvement, front: Front | None) -> None:
-        before = self._map_to_odom_now()
-        self._live.adopt(improvement, front, self._solver.outer_tolerance)
-        self._note_map(before)
+            before = self._map_to_odom_now()
+            self._live.adopt(improvement, front, self._solver.outer_tolerance, verdict, looks)
+            self._note_map(before)
 
     def _note_map(self, before: Array) -> None:
         """Note that the map is another now; before : map -> odom until then."""
