@@ -7,6 +7,7 @@ whose odometry says all of every step. Out: each keyframe's odometry, and the lo
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -34,7 +35,8 @@ def recorded(graph: FactorGraph,
     """
     Yield each keyframe's odometry and the loops that end there; stamps : (n,) of keyframes [ns].
 
-    Covariances are those of the factors; what is left unsaid has an infinite variance.
+    A loop that is struck out is told, and then that it is false. Covariances are those of the
+    factors; what is left unsaid has an infinite variance.
     """
     factors, to_pose3 = graph.between, graph.manifold.to_pose3
     steps, loops = steps_of(graph), loops_of(graph)
@@ -44,10 +46,13 @@ def recorded(graph: FactorGraph,
     still = np.zeros((6, 6))
     for k, stamp in enumerate(stamps):
         sample = OdometrySample(stamp, poses[k], covariances[steps[k - 1]] if k else still, still)
-        yield sample, [
-            LoopClosure(None if factors.i[row] == WORLD else stamps[factors.i[row]], stamp,
-                        measured[row], covariances[row], bool(factors.trusted[row]))
-            for row in loops[ends[k]:ends[k + 1]]]
+        rows = loops[ends[k]:ends[k + 1]]
+        said = [LoopClosure(None if factors.i[row] == WORLD else stamps[factors.i[row]], stamp,
+                            measured[row], covariances[row], bool(factors.trusted[row]))
+                for row in rows]
+        yield sample, said + [replace(loop, struck=True)
+                              for loop, struck in zip(said, factors.struck[rows], strict=True)
+                              if struck]
 
 
 def _chain(graph: FactorGraph, steps: Indices) -> Array:

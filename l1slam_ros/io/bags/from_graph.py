@@ -4,7 +4,8 @@ A graph as the messages of a bag, such that it can be had back exactly.
 
     /odom            one nav_msgs/Odometry per keyframe: the odometry factors, chained
     /loop_closures   one geometry_msgs/PoseWithCovarianceStamped per other factor;
-                     /trusted_loop_closures for those that are never doubted
+                     /trusted_loop_closures for those that are never doubted,
+                     and again /false_loop_closures for those that are struck out
     /absolute_poses  the same per absolute factor
     /ground_truth    geometry_msgs/PoseStamped, where the truth is known
 
@@ -28,6 +29,7 @@ from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.graph.recording import loops_of, recorded, steps_of
 from l1slam_ros.io.bags.topics import (
     ABSOLUTE_TOPIC,
+    FALSE_LOOP_TOPIC,
     LOOP_TOPIC,
     ODOMETRY_TOPIC,
     TRUSTED_LOOP_TOPIC,
@@ -79,7 +81,8 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
     graph = turned(record.graph, backward)
     factors, to_pose3 = graph.between, graph.manifold.to_pose3
     topics = {LOOP_TOPIC: True, ABSOLUTE_TOPIC: factors.is_absolute.any(),
-              TRUSTED_LOOP_TOPIC: (factors.trusted & ~factors.is_odometry).any()}
+              TRUSTED_LOOP_TOPIC: (factors.trusted & ~factors.is_odometry).any(),
+              FALSE_LOOP_TOPIC: factors.struck.any()}
     with new_bag(path, _note(graph, stamps) | _turned_note(graph, backward)) as writer:
         messages = _Messages(writer.types)
         writer.add_topic(ODOMETRY_TOPIC, _ODOMETRY)
@@ -99,7 +102,8 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
             for loop in loops:
                 topic, frame = ABSOLUTE_TOPIC, 'map'
                 if loop.reference_stamp is not None:
-                    topic = TRUSTED_LOOP_TOPIC if loop.trusted else LOOP_TOPIC
+                    topic = (FALSE_LOOP_TOPIC if loop.struck else
+                             TRUSTED_LOOP_TOPIC if loop.trusted else LOOP_TOPIC)
                     frame = reference_frame_id(_BASE_FRAME, loop.reference_stamp)
                 writer.write(topic, stamp, messages.stamped(
                     _LOOP, frame, stamp, messages.pose(loop.pose3, loop.covariance)))

@@ -39,6 +39,7 @@ from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note
 from l1slam_ros.io.bags.topics import (
     ABSOLUTE_TOPIC,
     DEFAULT_TOPICS,
+    FALSE_LOOP_TOPIC,
     TRUSTED_LOOP_TOPIC,
     Topics,
 )
@@ -125,6 +126,9 @@ class _Growing:
                 # The map is the frame that the first one names.
                 self._builder.add_loop(conversion.absolute_pose(message.data, self._map_frame))
                 self._map_frame = message.data.header.frame_id.removeprefix('/')
+            elif topic == FALSE_LOOP_TOPIC:
+                self._builder.add_loop(conversion.false_loop(
+                    message.data, self._builder.base_frame.name))
             else:
                 self._builder.add_loop(conversion.loop_closure(
                     message.data, self._builder.base_frame.name, topic == TRUSTED_LOOP_TOPIC))

@@ -75,7 +75,7 @@ class GraphRecord:
 def read_graph_file(path: str | os.PathLike[str],
                     rotation_information: str = QUATERNION) -> GraphRecord:
     """
-    Read a g2o or TORO file, and in it or beside it the stamps and which loops are trusted.
+    Read a g2o or TORO file, and in it or beside it the stamps and what a person said of loops.
 
     Vertices may stand anywhere and in any order, or not at all: then they are those the edges
     name, and `poses` is None. Whether the graph is connected is not looked at.
@@ -133,8 +133,8 @@ def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
     """
     Write a graph as g2o with its own ids, every number such that it reads back the same.
 
-    Stamps and trusted loops, if any, go to side files; those of a former graph of this name are
-    removed with that graph.
+    Stamps, trusted and struck-out loops, if any, go to side files; those of a former graph of this
+    name are removed with that graph.
 
     Raises
     ------
@@ -159,7 +159,7 @@ def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, e
     roots = _roots(path, edges)
     doubted = BetweenFactors(i, j, edges.pose, roots, none, none)
     trusted, struck = (remarks['trusted'], remarks['struck']) if remarks else (
-        named_loops(path, 'trusted', ids, doubted), none)
+        named_loops(path, name, ids, doubted) for name in ('trusted', 'struck'))
     graph.append_between(i, j, edges.pose, roots, trusted, struck)
 
 

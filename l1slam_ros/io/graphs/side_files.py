@@ -4,6 +4,7 @@ What lies beside a graph because no graph format has a place for it.
 
     <path>.stamps.txt    `id seconds`, one line for each vertex; or `seconds` alone, in their order
     <path>.trusted.txt   `i j`, the vertex ids of each loop that is never doubted
+    <path>.struck.txt    `i j`, of each loop that a person struck out
     <path>.truth.txt     `id x y theta`, true poses; see `trajectory`
     <path>.false.txt     `i j`, the vertex ids of each edge known to be a false loop
 """
@@ -40,10 +41,10 @@ def beside(path: str | os.PathLike[str], what: str) -> Path:
 def write_beside(path: str | os.PathLike[str], ids: Indices, stamps: Indices | None,
                  factors: BetweenFactors) -> None:
     """
-    Write the files beside a graph: ids, stamps [ns] (n,), and its factors, for trusted loops.
+    Write the files beside a graph: ids, stamps [ns] (n,), and its factors, for what a person said.
 
-    Without stamps, or without a trusted loop, there will be no such file. Odometry is no loop, and
-    trusted anyway.
+    Where there is nothing to say there will be no such file. Odometry is no loop, and trusted
+    anyway.
 
     Raises
     ------
@@ -51,10 +52,12 @@ def write_beside(path: str | os.PathLike[str], ids: Indices, stamps: Indices | N
 
     """
     stamp_lines = [] if stamps is None else _stamp_lines(ids, stamps)
-    trusted = ids[factors.pairs][factors.trusted & ~factors.is_odometry]
+    pairs = ids[factors.pairs]
+    trusted = pair_lines(pairs[factors.trusted & ~factors.is_odometry])
     with (_replaced(beside(path, 'stamps'), stamp_lines),
-          _replaced(beside(path, 'trusted'), pair_lines(trusted))):
-        pass  # both are on the disk before either takes its place
+          _replaced(beside(path, 'trusted'), trusted),
+          _replaced(beside(path, 'struck'), pair_lines(pairs[factors.struck]))):
+        pass  # all are on the disk before any takes its place
 
 
 @contextmanager
@@ -108,8 +111,8 @@ def named_loops(path: str | os.PathLike[str], what: str, ids: Indices,
     """
     Return which factors of a graph are loops that a file beside it names, (m,) bool.
 
-    All loops between two vertices that it names are, either way round. what : `trusted` or
-    `false`; ids : (n,) of the keyframes.
+    All loops between two vertices that it names are, either way round. what : `trusted`,
+    `struck` or `false`; ids : (n,) of the keyframes.
 
     Raises
     ------
@@ -150,5 +153,5 @@ def read_pairs(path: str | os.PathLike[str], what: str) -> tuple[Indices, list[i
 
 
 def pair_lines(pairs: Indices) -> list[str]:
-    """Return the lines of a file of loops, false or trusted: pairs (k, 2) of vertex ids."""
+    """Return the lines of a file of loops: pairs (k, 2) of vertex ids."""
     return [f'{i} {j}' for i, j in pairs.tolist()]

@@ -108,17 +108,19 @@ def test_a_graph_comes_back(tmp_path, rng, read):
     assert set(frames) == {('odom', 'base_link')}
 
 
-def test_loops_that_are_trusted_have_their_own_topic(tmp_path, rng):
+def test_loops_that_are_trusted_or_struck_out_have_their_own_topics(tmp_path, rng):
     record = record_of([(0, 1), (1, 2), (0, 2), (2, 3), (1, 3)], rng)
     trusting = retold(record.graph, trusted=np.array([True, False, False, False, True]))
+    trusting.say(np.array([2]), trusted=False)
     write_graph_bag(tmp_path / 'bag', replace(record, graph=trusting))
     topics = [topic for topic, _, _ in read_with_rosbags(tmp_path / 'bag')]
-    assert topics == ['/odom', '/odom', '/odom', '/loop_closures', '/odom',
+    assert topics == ['/odom', '/odom', '/odom', '/loop_closures', '/false_loop_closures', '/odom',
                       '/trusted_loop_closures']
     read = graph_from_bag(tmp_path / 'bag', None, DEFAULT_TOPICS).graph.between
     pairs = zip(read.i.tolist(), read.j.tolist(), strict=True)
-    loops = dict(zip(pairs, read.trusted.tolist(), strict=True))
-    assert loops[0, 2] is False and loops[1, 3] is True
+    said = dict(zip(pairs, zip(read.trusted.tolist(), read.struck.tolist(), strict=True),
+                    strict=True))
+    assert said[0, 2] == (False, True) and said[1, 3] == (True, False)
 
 
 @pytest.mark.parametrize('manifold', [se2, se3])

@@ -237,21 +237,25 @@ def with_trust(record, rows):
     return replace(record, graph=retold(record.graph, trusted=trusted))
 
 
-def test_trust_comes_back_with_the_graph(tmp_path, rng):
+def test_trust_and_strikes_come_back_with_the_graph(tmp_path, rng):
     path, record = tmp_path / 'a.g2o', random_record(rng)
     factors = record.graph.between
     pairs = np.stack((factors.i, factors.j), axis=1)
     rows = [row for row in range(len(factors) - 1, 39, -7)  # loops that nothing runs along
             if (pairs == pairs[row]).all(axis=1).sum() == 1]
     assert len(rows) > 3
-    write_graph_file(path, with_trust(record, [0, *rows]))  # row 0 is odometry
+    told = with_trust(record, [0, *rows])  # row 0 is odometry
+    struck = rows.pop()
+    told.graph.say(np.array([struck]), trusted=False)
+    write_graph_file(path, told)
     assert sorted(p.name for p in tmp_path.iterdir()) == [
-        'a.g2o', 'a.g2o.stamps.txt', 'a.g2o.trusted.txt']
+        'a.g2o', 'a.g2o.stamps.txt', 'a.g2o.struck.txt', 'a.g2o.trusted.txt']
     assert sorted(tuple(map(int, line.split()))
                   for line in beside(path, 'trusted').read_text().splitlines()) == sorted(
         map(tuple, record.ids[pairs[rows]].tolist()))
     back = read_graph_file(path)
     assert sorted(rows) == np.flatnonzero(back.graph.between.trusted).tolist()
+    assert np.flatnonzero(back.graph.between.struck).tolist() == [struck]
     assert (back.poses == record.poses).all() and (back.stamps == record.stamps).all()
 
 
