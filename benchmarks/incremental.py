@@ -29,7 +29,8 @@ HERE = Path(__file__).resolve().parent
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
     """Return the arguments, with the cells that they ask for as `cells`."""
-    from robust.kinds import BICOCCA, LIES
+    from robust.kinds import BICOCCA, KITTI, LIES
+    from robust.places import graph_file
     from updates.cells import CLEAN, GRAPHS, RECORDED, WORLDS, cells
     from updates.in_space import BUILDING, HILLS
 
@@ -38,7 +39,8 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument('--datasets', type=Path, default=Path(),
                         help='folder of the public graphs, of NAME.truth.txt, and of real/')
     parser.add_argument('--graphs', type=words_of, default=GRAPHS, metavar='NAME,...',
-                        help=f'{", ".join(GRAPHS)}, or NAME of a file NAME.g2o in the folder')
+                        help=f'{", ".join(GRAPHS)}, fr079, kitti_00, torus3D, or NAME of a file '
+                        'NAME.g2o in the folder')
     parser.add_argument('--kinds', type=words_of, default=kinds, metavar='NAME,...',
                         help=f'of {", ".join(kinds)}, which is that of {BICOCCA} alone')
     parser.add_argument('--shares', type=shares_of, default=(), metavar='P,...',
@@ -61,9 +63,8 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
         robust=not arguments.no_robust)]
     if not arguments.cells:
         parser.error('there is no such kind on these graphs')
-    needed = {BICOCCA: Path('real'), HILLS: Path('real')}
     for graph in set(arguments.graphs) - {*WORLDS, BUILDING}:
-        if not (arguments.datasets / needed.get(graph, Path(f'{graph}.g2o'))).exists():
+        if not graph_file(arguments.datasets, KITTI if graph == HILLS else graph).exists():
             parser.error(f'--datasets: {arguments.datasets} has no {graph}')
     return arguments
 
