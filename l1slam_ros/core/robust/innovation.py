@@ -96,7 +96,7 @@ def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
 
     """
     system = (replace(solved, b=-whitened_residual(graph, poses)) if solved
-              else _factorised(graph, poses, cholesky))
+              else factorised(graph, poses, cholesky))
     # A map that is to within its noise is no optimum to a factor that others hardly check.
     step = cholesky.solve(system.transposed_times(system.b))
     system = replace(system, b=system.b - system.times(step))
@@ -112,13 +112,14 @@ def covariances(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
 
     variance : (m,) of the noise that there is, in units of what each factor states
     """
-    system = _factorised(graph, poses, cholesky)
+    system = factorised(graph, poses, cholesky)
     noisy = replace(system, blocks=system.blocks * np.sqrt(variance)[:, None, None, None])
     samples = _steps(graph, noisy, cholesky)[1][:-1]
     return samples @ samples.transpose(0, 2, 1) / kernels.prediction.SAMPLES
 
 
-def _factorised(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> LinearSystem:
+def factorised(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> LinearSystem:
+    """Return the linear system of a graph about poses (n, p), which `cholesky` has factored."""
     system = linearise(graph, poses)
     if not cholesky.factorise(system, np.ones_like(system.b)):
         raise GraphError('the normal matrix is singular: a part of the graph is not tied to '
@@ -183,13 +184,6 @@ class Innovations:
         """Return how much likelier each residual is if its factor is true, (m,) logarithms."""
         return log_likelihood_ratio(self.square, self.log_det, self.log_claim, self.freedom,
                                     self.system.block_size)
-
-    def square_with(self, noise: float) -> Array:
-        """Return the squares if their own variance is so many times what it is, (m,)."""
-        k = self.system.block_size
-        square: Array = kernels.prediction.normalise(
-            self.spread + noise * np.eye(k), -self.system.b.reshape(-1, k))[0]
-        return square
 
     def joint(self, posterior: Posterior, first: Indices, second: Indices) -> tuple[Array, Array]:
         """
