@@ -154,20 +154,22 @@ def _pairs(found: Innovations, posterior: Posterior, rows: Indices, log_ratio: A
             np.tile(both, 2))
 
 
-def stand_apart(found: Innovations, gate: Gate, believed: int) -> Mask:
+def stand_apart(found: Innovations, own: float, gate: Gate, believed: int) -> Mask:
     """
     Return which factors may be as noisy as they say: those that stand apart from the false, (m,).
 
     True noise has a tail, of a few, which ends. How far off false ones are has no scale: from any
     distance to half as far again there are some more. Where all hang together, none may.
 
-    gate : what squares of true factors stay below; believed : how many others are true for sure
+    own : the variance that they state, in units of what was found; gate : what squares of true
+    factors stay below; believed : how many others are true for sure
     """
-    off = np.sqrt(found.square / gate(found.freedom))
+    limit = gate(found.freedom)
+    off = np.sqrt(found.square_with(own) / limit)
     tail = np.append(1.0, np.sort(off[off > 1]))
     end = tail[np.argmax(np.append(tail[1:], np.inf) > _APART * tail)]
-    few = np.count_nonzero((off > 1) & (off <= end)) <= _TAIL * believed
-    apart: Mask = off <= (end if few else 1.0)
+    few = np.count_nonzero((found.square > limit) & (off <= end)) <= _TAIL * believed
+    apart: Mask = off <= end if few else found.square <= limit
     return apart
 
 
