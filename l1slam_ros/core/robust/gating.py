@@ -34,7 +34,7 @@ _LEAST_START = 1e-9
 _DECADE_COSTS = 5.0
 # The tail of the noise ends where the next factor is so many times further off; it is of no more
 # than this part of the believed ones.
-_APART, _TAIL = 1.5, 0.1
+_APART, _TAIL = 2.0, 0.1
 # Pairs are formed of so many factors that fit best.
 _CANDIDATES = 200
 
@@ -159,7 +159,7 @@ def stand_apart(found: Innovations, own: float, gate: Gate, believed: int) -> Ma
     Return which factors may be as noisy as they say: those that stand apart from the false, (m,).
 
     True noise has a tail, of a few, which ends. How far off false ones are has no scale: from any
-    distance to half as far again there are some more. Where all hang together, none may.
+    distance to twice as far there are some more. Where all hang together, none may.
 
     own : the variance that they state, in units of what was found; gate : what squares of true
     factors stay below; believed : how many others are true for sure

@@ -214,13 +214,13 @@ class Growth:
 
     def take_at_their_word(self) -> None:
         """From now on let factors be as noisy as they say; loops, where `stand_apart` has it."""
-        self.in_tail, self.drops[:] = np.ones(len(self.factors), bool), 0  # the dropped, too
+        self.in_tail = np.ones(len(self.factors), bool)
         more = self.variance_at_their_word()[1] / self.variance[1]
         rows = self._open(self.may_be_predicted & ~self.across() & ~self.factors.is_absolute)
         if more > 1:  # else loops say no more than was found
             self.in_tail[rows] = stand_apart(self.innovations(rows), more, self.gate,
                                              int((self.accepted & self.is_loop).sum()))
-        self.at_their_word = True
+        self.at_their_word, self.drops[:] = True, 0
 
     def undecided(self) -> Indices:
         """Return the loops within a part that may yet be accepted, (k,)."""
