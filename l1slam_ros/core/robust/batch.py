@@ -31,6 +31,9 @@ A slip
     The sides of it are right in themselves, so the true loops across agree with each other. A slip
     is one explanation of loops that do not fit, lies are the other: `slips` compares their odds,
     with half a gate for each place that one of them calls a lie.
+A drift
+    is an error of all steps, the same on each metre. Where a slip would be believed, or most loops
+    are left out, it is a third explanation: loops are judged by odometry rid of it (`motion`).
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt

@@ -96,7 +96,7 @@ def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
 
     """
     system = (replace(solved, b=-whitened_residual(graph, poses)) if solved
-              else _factorised(graph, poses, cholesky))
+              else factorised(graph, poses, cholesky))
     # A map that is to within its noise is no optimum to a factor that others hardly check.
     step = cholesky.solve(system.transposed_times(system.b))
     system = replace(system, b=system.b - system.times(step))
@@ -112,13 +112,14 @@ def covariances(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
 
     variance : (m,) of the noise that there is, in units of what each factor states
     """
-    system = _factorised(graph, poses, cholesky)
+    system = factorised(graph, poses, cholesky)
     noisy = replace(system, blocks=system.blocks * np.sqrt(variance)[:, None, None, None])
     samples = _steps(graph, noisy, cholesky)[1][:-1]
     return samples @ samples.transpose(0, 2, 1) / kernels.prediction.SAMPLES
 
 
-def _factorised(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> LinearSystem:
+def factorised(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> LinearSystem:
+    """Return the linear system of a graph about poses (n, p), which `cholesky` has factored."""
     system = linearise(graph, poses)
     if not cholesky.factorise(system, np.ones_like(system.b)):
         raise GraphError('the normal matrix is singular: a part of the graph is not tied to '

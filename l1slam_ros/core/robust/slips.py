@@ -11,7 +11,8 @@ gate for each place that is won and that nothing else explains, less one for eac
 slip is believed if that makes it likelier than not, and if three places span it where it is only
 places that say so. Loops do not make a robot jump: the slip repaired, it has to move as at some
 other step, or rather so than as measured. What fits the loops that came in without it did not
-slip: a lie had bent the map.
+slip: a lie had bent the map. And odometry that errs alike on each metre did not slip either: where
+a slip would be believed, or most loops are left out, a drift is compared by the same odds.
 """
 
 from collections.abc import Iterator
@@ -26,6 +27,7 @@ from l1slam_ros.core.robust.motion import (
     Motion,
     log_odds_of_slips,
     steps_of,
+    straightened,
     unwhitening,
     usual_motion,
 )
@@ -78,7 +80,8 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     """
     Return a state in which an odometry factor is cut that slipped; None: there is none.
 
-    Or one that a lie does not bend any more, because an odometry factor was out for a while.
+    Or one that a lie does not bend any more, because an odometry factor was out for a while; or
+    one whose odometry does not drift any more.
 
     as_stated : the state where all may be as noisy as they say; what that explains needs no slip
     """
@@ -100,6 +103,14 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
                 or (usual and all(_spans(state, step) for step in steps))):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
+    half = np.count_nonzero(growth.is_loop) / 2
+    if found or len(as_stated.undecided()) > half:
+        # A drift errs at all steps, and many places show it: no slip need be, nor most loops lie.
+        state, odds = straightened(growth)
+        state.solve()
+        _accept_more(state)
+        if odds + _gain(growth, as_stated, state) > most and len(state.undecided()) < half:
+            found = state
     if not found and growth.cut.any():
         # In the end more is known than when it was cut.
         now = log_odds_of_slips(growth, motion)

@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from lies import careful_world, slipped, spoilt
+from lies import careful_world, position_error, slipped, spoilt
 from problems import chain_of, graph_of, retold, straight
 from test_pairwise_consistency import STEP, TURN, grown
 
@@ -69,6 +69,18 @@ def test_what_fits_the_loops_that_come_in_without_it_did_not_slip(bad):
     found = without_slip(growth, growth)
     assert not found.cut.any() and found.accepted[across].all()
     assert max(growth.slip_odds.values()) < -SURE
+
+
+@pytest.mark.parametrize('seed, turn', [(0, 0.01), (1, 0.02)])
+def test_odometry_that_drifts_did_not_slip(seed, turn):
+    """A hundredth of a radian more on each metre; of twice that most loops were refused."""
+    world = careful_world(400, 440, seed)
+    odometry = world.graph.between.is_odometry
+    way = np.linalg.norm(world.graph.between.measurement[odometry, :2], axis=1)
+    drift = slipped(world.graph, np.arange(399), way[:, None] * [0.0, 0.0, turn])
+    judgement, poses = robust_solve(drift)
+    assert judgement.accepted.all() and not judgement.doubts
+    assert position_error(poses, world.truth) < 0.3
 
 
 @pytest.mark.parametrize('keyframe', [106, 276])
