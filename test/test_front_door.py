@@ -73,6 +73,19 @@ def test_the_refused_are_the_false_and_a_start_is_begun_from(world):
     assert from_there.inliers.all()
 
 
+@pytest.mark.parametrize('robust', [True, False])
+def test_what_a_person_struck_out_is_there_for_nobody(world, robust):
+    graph, _ = l1.read_graph(world)
+    loops = np.flatnonzero(~graph.between.is_odometry)[:50]
+    left = np.delete(np.arange(len(graph.between)), loops)
+    without = l1.solve(graph.subset(left), robust=robust)
+    graph.say(loops, trusted=False)
+    solution = l1.solve(graph, robust=robust)
+    np.testing.assert_array_equal(solution.poses, without.poses)
+    assert not solution.inliers[loops].any()
+    np.testing.assert_array_equal(solution.inliers[left], without.inliers)
+
+
 def test_every_door_takes_a_norm_of_loops_alone(world, tmp_path, capsys):
     graph, _ = l1.read_graph(world)
     solution = l1.solve(graph, norm='l2', loop_norm='group-l1', robust=False)

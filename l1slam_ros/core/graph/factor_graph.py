@@ -114,6 +114,11 @@ class FactorGraph:
         clone._factors = self._factors
         return clone
 
+    @property
+    def not_struck(self) -> Indices:
+        """The between factors that no person struck out, rows."""
+        return np.flatnonzero(~self._between[-1].view())
+
     def subset(self, chosen: Indices | Mask, variance: Array | None = None) -> 'FactorGraph':
         """
         Return a graph of all keyframes and some of the factors.

@@ -23,11 +23,10 @@ _HEADING = 1.0
 
 def as_one(problem: Problem) -> Problem:
     """Return the problem whose graph is of one piece."""
-    rows = _rows(problem.graph)
+    rows = problem.graph.not_struck
     g, d = len(problem.gaps), problem.graph.manifold.TANGENT_SIZE
-    if not g and rows is None:
+    if not g and len(rows) == len(problem.graph.between):
         return problem
-    rows = np.arange(len(problem.graph.between)) if rows is None else rows
     judgement = problem.judgement
     return replace(
         problem, graph=_tied(problem.graph.subset(rows), problem.poses, problem.gaps),
@@ -41,38 +40,16 @@ def as_one(problem: Problem) -> Problem:
 
 def of_all(improvement: Improvement, problem: Problem) -> Improvement:
     """Return what was made of `as_one(problem)`, for the factors of the problem."""
-    d = problem.graph.manifold.TANGENT_SIZE
-    dual = _spread(improvement.dual.reshape(-1, d), problem, 0.0).ravel()
-    return replace(improvement, dual=dual,
+    rows, d = problem.graph.not_struck, problem.graph.manifold.TANGENT_SIZE
+    dual = np.zeros((len(problem.graph.between), d))
+    dual[rows] = improvement.dual.reshape(-1, d)[:len(rows)]
+    return replace(improvement, dual=dual.ravel(),
                    judgement=judgement_of_all(improvement.judgement, problem))
 
 
 def judgement_of_all(judgement: Judgement, problem: Problem) -> Judgement:
     """Return a judgement of the factors of `as_one(problem)`, for those of the problem."""
-    rows = _rows(problem.graph)
-    slips = judgement.slips[judgement.slips < len(problem.graph.between)]
-    return replace(
-        judgement, accepted=_spread(judgement.accepted, problem, False),
-        suspect=_spread(judgement.suspect, problem, False),
-        sigmas=_spread(judgement.sigmas, problem, np.nan),
-        noise=_spread(judgement.noise, problem, 1.0),
-        slips=slips if rows is None else rows[slips[slips < len(rows)]])
-
-
-def _spread(values: np.ndarray, problem: Problem, rest: float) -> np.ndarray:
-    """Return values of the factors of `as_one(problem)` as those of the problem's."""
-    rows, m = _rows(problem.graph), len(problem.graph.between)
-    if rows is None:
-        return values[:m]
-    whole = np.full((m, *values.shape[1:]), rest, values.dtype)
-    whole[rows] = values[:len(rows)]
-    return whole
-
-
-def _rows(graph: FactorGraph) -> Indices | None:
-    """Return the factors that no one struck out; None: all."""
-    struck = graph.between.struck
-    return np.flatnonzero(~struck) if struck.any() else None
+    return judgement.of_all(problem.graph.not_struck, len(problem.graph.between))
 
 
 def _tied(graph: FactorGraph, poses: Array, keyframes: Indices) -> FactorGraph:

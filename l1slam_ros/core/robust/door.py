@@ -72,7 +72,7 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
     outcome = batch_map.solve(graph, start, asked)
     judgement, status = outcome.judgement, outcome.solution.status.value
     if judgement is None:
-        inliers = np.ones(len(graph.between), bool)
+        inliers = ~graph.between.struck
     else:
         inliers = judgement.accepted
         status = 'doubtful' if judgement.doubt else status

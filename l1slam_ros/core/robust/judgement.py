@@ -9,6 +9,7 @@ for a loop, strike one out, or state the noise as it is.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -98,6 +99,23 @@ class Judgement:
     def is_noise_stated(self) -> bool:
         """Whether factors are as noisy as they say."""
         return bool((self.noise == 1).all())
+
+    def of_all(self, rows: Indices, m: int) -> 'Judgement':
+        """
+        Return the judgement of m factors, those in `rows` as they were judged here, one by one.
+
+        The others are those that a person struck out: nothing is said of them.
+        """
+        k = len(rows)
+
+        def spread(values: Any, rest: float) -> Any:
+            whole = np.full(m, rest, values.dtype)
+            whole[rows] = values[:k]
+            return whole
+
+        return replace(self, accepted=spread(self.accepted, False),
+                       suspect=spread(self.suspect, False), sigmas=spread(self.sigmas, np.nan),
+                       noise=spread(self.noise, 1.0), slips=rows[self.slips[self.slips < k]])
 
     def believed(self, graph: FactorGraph) -> FactorGraph:
         """Return the accepted factors of a graph, as noisy as they are."""

@@ -231,8 +231,7 @@ class Growth:
         return self._open(self.across())
 
     def _open(self, some: Mask) -> Indices:
-        still: Indices = np.flatnonzero(
-            some & ~self.accepted & ~self.factors.struck & (self.drops < _CHANCES))
+        still: Indices = np.flatnonzero(some & ~self.accepted & (self.drops < _CHANCES))
         return still
 
     def across(self) -> Mask:
