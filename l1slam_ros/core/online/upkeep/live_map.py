@@ -23,9 +23,10 @@ from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.core.robust.judgement import Doubt, Judgement
 from l1slam_ros.core.solvers.optimality import Status
 
-# A map is factored anew from so many factors on that came since: those of five keyframes. On a
-# small map nothing else holds the next round back.
-_MANY = 10
+# A map is factored anew from so many factors on that came since, those of five keyframes; on a
+# large one, from one for so many keyframes on: what goes on behind costs each keyframe the same,
+# however large the map is.
+_FEWEST, _KEYFRAMES_EACH = 10, 250
 # Factors that a front takes while its lock is held, and between two looks at the clock: on a large
 # map a loop takes milliseconds.
 _AT_ONCE = 4
@@ -192,7 +193,9 @@ class LiveMap:
     @property
     def is_late(self) -> bool:
         """Whether the front has more to carry than it should."""
-        return self.front is None or self.front.closed or self.front.taken >= _MANY
+        front = self.front
+        return front is None or front.closed or front.taken >= max(
+            _FEWEST, front.keyframes // _KEYFRAMES_EACH)
 
     def is_exact_due(self, idle: bool) -> bool:
         """Return whether the next map is to be solved to the end: this one is of all there is."""
