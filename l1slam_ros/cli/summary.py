@@ -15,8 +15,6 @@ from l1slam_ros.core.robust import inspection
 from l1slam_ros.io.files import NANOSECONDS, counted, stamp_text
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 
-# Errors that many times as large, or as small, as their information says are worth a sentence.
-_OFF_SCALE = 3.0
 # A reading of the rotations' information fits where their errors are as large as it says, to this
 # logarithm: half of what it is to the other reading.
 _FITS = math.log(2) / 2
@@ -129,13 +127,18 @@ def _on_noise(record: GraphRecord) -> Iterator[str]:
         yield f'the noise cannot be judged: {error}'
         return
     yield from _on_rotations(record, scales.turns)
+    if scales.offset is not None:
+        length, angle = record.graph.manifold.motion(scales.offset[None])
+        yield (f'loops share an offset of {length[0]:.2g} m and {math.degrees(angle[0]):.2g} '
+               'degrees, more than noise explains: look at the mount of the sensor, or at the '
+               'times that loops name')
     # Of too few factors nothing can be said.
     both = {'odometry': scales.odometry, 'loops': scales.loops}
     found = {name: scale for name, scale in both.items() if not math.isnan(scale)}
-    if all(1 / _OFF_SCALE <= scale <= _OFF_SCALE for scale in found.values()):
+    if all(1 / inspection.OFF_SCALE <= scale <= inspection.OFF_SCALE for scale in found.values()):
         return
     most = max(found.values())
-    reason = 'too large, or some loops are false' if most > _OFF_SCALE else 'too small'
+    reason = 'too large, or some loops are false' if most > inspection.OFF_SCALE else 'too small'
     times = ' and '.join(f'{scale:.2g} ({name})' for name, scale in found.items())
     yield (f'errors at the L2 map of vertices {record.ids[scales.first]} to '
            f'{record.ids[scales.last]} are {times} times what the information says; expected '

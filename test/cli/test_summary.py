@@ -8,6 +8,7 @@ import pytest
 from problems import retold
 
 from l1slam_ros.cli.summary import complaints, numbers
+from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
@@ -88,6 +89,16 @@ def test_information_off_by_scale(rng, odometry, loops, reason):
     assert ratios[3] == reason
     assert float(ratios[1]) * odometry == pytest.approx(1, rel=0.1)
     assert float(ratios[2]) * loops == pytest.approx(1, rel=0.1)
+
+
+def test_an_offset_that_loops_share_is_one_sentence(rng):
+    graph = simulate_world(400, 1000, WorldOptions(), rng).graph
+    off = np.where(graph.between.is_odometry[:, None], 0.0, [-0.3, 0.4, 0.05])
+    shifted = retold(graph, se2.retract(graph.between.measurement, off))
+    sentence = complaints(GraphRecord(shifted, None, np.arange(400)))[0]
+    found = re.match(r'loops share an offset of (.*) m and (.*) degrees, more than', sentence)
+    assert float(found[1]) == pytest.approx(0.5, abs=0.05)
+    assert float(found[2]) == pytest.approx(2.9, abs=0.3)
 
 
 def test_the_repeated_edges_of_intel(datasets):

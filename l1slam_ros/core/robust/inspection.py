@@ -12,7 +12,8 @@ import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import whiten
+from l1slam_ros.core.geometry.noise import Mask, whiten
+from l1slam_ros.core.geometry.quantiles import gamma_quantile
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.graph.linear_system import (
     LinearSystem,
@@ -38,6 +39,11 @@ _ROUNDS = 8
 # most, each halved so often, and the part of chi2 that no longer matters; nor the ratios.
 _STEPS, _HALVINGS, _TOLERANCE = 20, 5, 1e-3
 _SAME_RATIO = 0.01
+# Errors that many times as large, or as small, as their information says are worth a sentence.
+OFF_SCALE = 3.0
+# An offset that loops share is one that noise makes in so few graphs, and larger than the noise of
+# one loop; where a smaller part of it shows in the residuals, the map bends as well.
+_CHANCE, _SHOWS = 1e-3, 0.1
 
 
 def repeated_factors(graph: FactorGraph) -> Indices:
@@ -106,7 +112,8 @@ class NoiseScales:
 
     odometry, loops : ratios of standard deviations, NaN where too few factors are left to tell;
     first, last : the keyframes between which this was found; turns : how many times that of
-    translations the ratio of rotations is.
+    translations the ratio of rotations is; offset : (k,) the step that all loops lack, None where
+    noise explains it, see `_shared_offset`.
     """
 
     odometry: float
@@ -114,6 +121,7 @@ class NoiseScales:
     first: int
     last: int
     turns: float
+    offset: Array | None = None
 
 
 def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
@@ -147,7 +155,49 @@ def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
         if (np.abs(ratio - 1) < _SAME_RATIO).all():
             break
     odometry, loops = np.where(spare >= _FEWEST_SPARE, np.sqrt(variance), np.nan).tolist()
-    return NoiseScales(odometry, loops, *ends, _turns(part.manifold, left))
+    known = (spare >= _FEWEST_SPARE).all()
+    offset = _shared_offset(part, is_loop, system, variance) if known else None
+    return NoiseScales(odometry, loops, *ends, _turns(part.manifold, left), offset)
+
+
+def _shared_offset(
+    graph: FactorGraph, is_loop: Mask, system: LinearSystem, variance: Array,
+) -> Array | None:
+    """
+    Return the step d [m, rad] that all loops lack, (k,): Z v2t(d) fits; None if noise explains it.
+
+    Z is the later keyframe seen from the earlier. With G (rows, k) the derivatives of what d adds,
+    the map and d minimise |A x - b - G d|^2, weighted by the variances (2,) of odometry and of
+    loops. G_p and r are what the map leaves of G and b: S = G_p'W G_p is the information of d,
+    d = -S^-1 G_p'W r, chi2 = d'S d. Directions in which the map follows are not asked for. The
+    noise is that of loops after d; where it is off scale, false loops may make an offset, so None.
+    """
+    manifold, factors = graph.manifold, graph.between
+    k = manifold.TANGENT_SIZE
+    # What is listed from the later end lacks v2t(d)^-1 on the left.
+    backward = -manifold.adjoint(manifold.inverse(factors.measurement))
+    lacked = np.where((factors.i > factors.j)[:, None, None], backward, np.eye(k))
+    G = (is_loop[:, None, None] * factors.sqrt_information @ lacked).reshape(-1, k)
+    weights = 1 / np.repeat(variance[is_loop.astype(np.int64)], k)
+    both = np.column_stack((system.b, G))
+    left = both - system.A @ _least_squares(system, both, weights)
+    weighted = weights[:, None] * G
+    M, S, z = G.T @ weighted, left[:, 1:].T @ weighted, weighted.T @ left[:, 0]
+    scale = np.sqrt(np.where(np.diag(M) > 0, np.diag(M), 1.0))
+    share, V = np.linalg.eigh(S / np.outer(scale, scale))
+    V, share = V[:, share > _SHOWS**2] / scale[:, None], share[share > _SHOWS**2]
+    if not len(share):
+        return None
+    d = -V @ (V.T @ z / share)
+    before = left[np.repeat(is_loop, k)]
+    after = before[:, 0] + before[:, 1:] @ d
+    # Multiplied out: exact measurements leave nothing to divide by.
+    found, noise = before[:, 0] @ before[:, 0], after @ after
+    likely = 2 * gamma_quantile(len(share) / 2, 1 - _CHANCE)
+    is_sure = d @ S @ d * found > likely * noise
+    is_large = d @ M @ d * found > is_loop.sum() * noise
+    fits = variance[1] * noise <= OFF_SCALE**2 * found
+    return d if fits and is_sure and is_large else None
 
 
 def _turns(manifold: Manifold, left: Array) -> float:

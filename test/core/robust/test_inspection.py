@@ -8,7 +8,7 @@ import pytest
 from problems import add_absolute, retold
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.robust.inspection import (
@@ -106,6 +106,24 @@ def test_false_loops_look_like_noise(world, rng):
     loops = random_false_loops(world.graph, world.truth, 30, rng)
     found = noise_scales(insert_loops(world.graph, loops), rng)
     assert max(found.odometry, found.loops) > 3
+
+
+@pytest.mark.parametrize('shape', ['streets', 'torus'])
+def test_an_offset_that_loops_share_is_found(rng, shape):
+    """Whichever way round they are listed; false loops that agree on nothing make none."""
+    world = simulate_world(400, 1000, WorldOptions(), rng, shape)
+    graph, manifold = world.graph, world.graph.manifold
+    is_loop = ~graph.between.is_odometry
+    backward = is_loop & (rng.random(len(is_loop)) < 0.5)
+    shared = np.zeros(manifold.TANGENT_SIZE)
+    shared[[0, -1]] = 0.2, 0.03
+    lies = random_false_loops(graph, world.truth, 200, rng)
+    for good in graph, turned(graph, backward), insert_loops(graph, lies):
+        assert noise_scales(good, rng).offset is None
+    off = np.where(is_loop[:, None], -shared, 0.0)
+    shifted = retold(graph, manifold.retract(graph.between.measurement, off))
+    for bad in shifted, turned(shifted, backward):
+        np.testing.assert_allclose(noise_scales(bad, rng).offset, shared, atol=0.04)
 
 
 def test_a_chain_and_a_loop_tell_nothing_of_noise(rng):
