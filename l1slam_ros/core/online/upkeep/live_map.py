@@ -99,6 +99,7 @@ class LiveMap:
         known = len(optimised.judgement.accepted)
         self._judged_loops = int(np.count_nonzero(builder.loops.rows < known))
         self._judged_anew = self._judged_loops
+        self._anew_at = self._anew_took = 0.0
         self.note_newest()
 
     @property
@@ -211,6 +212,19 @@ class LiveMap:
         return not self.all_judged and (budget > self.judge_took
                                         or time.monotonic() > self._judge_at + wait)
 
+    def is_anew_due(self, idle: bool) -> bool:
+        """
+        Return whether the next judgement is to be from the graph alone.
+
+        At rest what the last one went on from is asked, too; and before, where it doubts itself: a
+        lie that was likely when it came may keep out the true ones that came after it.
+        """
+        if idle:
+            return self.all_judged
+        return (bool((self.verdict or self.optimised.judgement).doubts)
+                and self._judged_anew != self._judged_loops
+                and time.monotonic() > self._anew_at + max(_JUDGE_EVERY, 2 * self._anew_took))
+
     def is_norm_due(self, idle: bool) -> bool:
         """Return whether to ask if the map hangs on its norm: for now it is the last one."""
         return (self.robust and idle and not self.is_map_due(idle) and self.all_judged_anew
@@ -239,7 +253,8 @@ class LiveMap:
         self._judged_loops, self.judged, self.asked = loops, poses, None
         self._judge_at = time.monotonic()
         if anew:
-            self._judged_anew = loops
+            self._judged_anew, self._anew_at = loops, self._judge_at
+            self._anew_took = self._judge_at - self._judge_began
         else:
             self.judge_took = self._judge_at - self._judge_began
         known = self.accepted[:len(judgement.accepted)]

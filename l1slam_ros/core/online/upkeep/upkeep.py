@@ -205,10 +205,10 @@ class Upkeep:
         with self._lock:
             if self._live.is_map_due(idle):
                 self._mapper.start(lambda: self._map_anew(idle, budget, check))
-            if self._live.is_judge_due(idle, budget):
-                # First what is the sooner over, and all there is to find out most of the time.
-                anew = idle and self._live.all_judged
-                self._judge.start(lambda: self._judge_all(anew, check))
+            # First what is the sooner over, and all there is to find out most of the time.
+            anew = self._live.is_anew_due(idle)
+            if self._live.is_judge_due(idle, budget) or (anew and not idle):
+                self._judge.start(lambda: self._judge_all(anew, idle, check))
             elif self._live.is_norm_due(idle):
                 self._judge.start(lambda: self._ask_norm(check))
             return self._mapper.busy or self._judge.busy
@@ -241,16 +241,16 @@ class Upkeep:
         check()
         self.adopt(of_all(improvement, whole), front, verdict, looks)
 
-    def _judge_all(self, anew: bool, check: Callable[[], None]) -> None:
-        """Look at all loops again; anew: from the graph alone, until more comes."""
+    def _judge_all(self, anew: bool, idle: bool, check: Callable[[], None]) -> None:
+        """Look at all loops again; anew: from the graph alone; idle: that until more comes."""
         with self._standing() as now:
             live, loops = self._live, self._live.begin_judgement()
             grown = live.size()
         whole = now.problem()
         del now  # as above
         problem = as_one(whole)
-        at_rest = until(lambda: live.size() != grown, check)
-        judgement, poses = robust_solve(problem.graph, check=at_rest) if anew else judge(
+        alone = until(lambda: live.size() != grown, check) if idle else check
+        judgement, poses = robust_solve(problem.graph, check=alone) if anew else judge(
             problem.graph, problem.poses, problem.judgement, np.inf, check)
         check()
         with self._front, self._lock:
