@@ -22,6 +22,7 @@ from l1slam_ros.core.online.update import Improvement, improve
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.core.online.upkeep.threads import Background
 from l1slam_ros.core.robust import batch
+from l1slam_ros.core.robust.judgement import MOSTLY_REFUSED
 from l1slam_ros.core.solvers.optimality import l1_cost
 
 DEADLINE = 30.0
@@ -270,6 +271,23 @@ def test_what_goes_on_behind_keeps_its_order_while_the_map_grows():
         assert backend._live.last is not settled
         front = backend._live.front
         assert (front.keyframes, front.pattern.found) == (65, found)
+
+
+def test_a_judgement_that_doubts_itself_is_followed_by_one_from_the_graph_alone(monkeypatch):
+    """Not only at rest: what was believed early may keep out what came after it."""
+    anew, solve = [], upkeep.robust_solve
+    monkeypatch.setattr(
+        upkeep, 'robust_solve', lambda *given, **how: anew.append(1) or solve(*given, **how))
+    covariance = 1e-4 * np.eye(6)
+    with Backend(EVERY) as backend:
+        for k, aside in enumerate([0.0] * 20 + [6.0] * 60):
+            drive(backend, k, k + 1)
+            if k >= 15:  # five that are true, and many that are not, nor alike
+                backend.add_loop(loop(float(k - 10), float(k), (10.0, aside * k, 0.0), covariance))
+        deadline = time.monotonic() + DEADLINE
+        while not anew and time.monotonic() < deadline:
+            backend._update(MOMENT, lambda: False, idle=False)
+        assert anew and backend.snapshot().judgement.doubt.kind == MOSTLY_REFUSED
 
 
 def test_the_background_looks_again_when_nothing_comes_any_more():
