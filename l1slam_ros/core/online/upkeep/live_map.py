@@ -20,7 +20,7 @@ from l1slam_ros.core.incremental.front import UNKNOWN, Front, Look
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.snapshot import Optimised
 from l1slam_ros.core.online.update import Improvement
-from l1slam_ros.core.robust.judgement import Doubt, Judgement
+from l1slam_ros.core.robust.judgement import MOSTLY_REFUSED, OTHER_MAP, Doubt, Judgement
 from l1slam_ros.core.solvers.optimality import Status
 
 # A map is factored anew from so many factors on that came since, those of five keyframes; on a
@@ -216,12 +216,14 @@ class LiveMap:
         """
         Return whether the next judgement is to be from the graph alone.
 
-        At rest what the last one went on from is asked, too; and before, where it doubts itself: a
-        lie that was likely when it came may keep out the true ones that came after it.
+        At rest what the last one went on from is asked, too; and before, where loops that it
+        refused make it doubtful: a lie that was likely when it came may keep out the true ones
+        that came after it.
         """
         if idle:
             return self.all_judged
-        return (bool((self.verdict or self.optimised.judgement).doubts)
+        last = self.verdict or self.optimised.judgement
+        return (any(doubt.kind in (MOSTLY_REFUSED, OTHER_MAP) for doubt in last.doubts)
                 and self._judged_anew != self._judged_loops
                 and time.monotonic() > self._anew_at + max(_JUDGE_EVERY, 2 * self._anew_took))
 
