@@ -17,8 +17,7 @@ from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, requ
 from l1slam_ros.core.names import OF_THE_NODE
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame
-from l1slam_ros.core.online.snapshot import LoopStates, Optimised, Robot, SavedMap
-from l1slam_ros.core.online.upkeep.live_map import Behind
+from l1slam_ros.core.online.snapshot import Behind, LoopStates, Optimised, Robot, SavedMap
 from l1slam_ros.core.online.upkeep.threads import Background
 from l1slam_ros.core.online.upkeep.upkeep import Stopped as Stopped
 from l1slam_ros.core.online.upkeep.upkeep import Upkeep

@@ -191,6 +191,23 @@ class Robot:
 
 
 @dataclass(frozen=True)
+class Behind:
+    """
+    What goes on behind updates.
+
+    age : [s] of the map that was factored, NaN: there is none; rows : of loops that came since;
+    loops : not judged yet; bound : what no map of the accepted factors that is near this one has
+    less L1 cost than, and its age [s], NaN: nothing was proved of them.
+    """
+
+    age: float
+    rows: int
+    loops: int
+    bound: float
+    bound_age: float
+
+
+@dataclass(frozen=True)
 class Snapshot:
     """
     What a back end knows.

@@ -8,7 +8,7 @@ keyframe is, what is accepted, and whether map or judgement are due. Its owner h
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.incremental.front import UNKNOWN, Front, Look
 from l1slam_ros.core.online.graph_builder import GraphBuilder
-from l1slam_ros.core.online.snapshot import Optimised
+from l1slam_ros.core.online.snapshot import Behind, Optimised
 from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.core.robust.judgement import MOSTLY_REFUSED, OTHER_MAP, Doubt, Judgement
 from l1slam_ros.core.solvers.optimality import Status
@@ -32,23 +32,6 @@ _FEWEST, _KEYFRAMES_EACH = 10, 250
 _AT_ONCE = 4
 # [s] While loops come none of which fits, they are judged so often.
 _JUDGE_EVERY = 2.0
-
-
-@dataclass(frozen=True)
-class Behind:
-    """
-    What goes on behind updates.
-
-    age : [s] of the map that was factored, NaN: there is none; rows : of loops that came since;
-    loops : not judged yet; bound : what no map of the accepted factors that is near this one has
-    less L1 cost than, and its age [s], NaN: nothing was proved of them.
-    """
-
-    age: float
-    rows: int
-    loops: int
-    bound: float
-    bound_age: float
 
 
 class LiveMap:
