@@ -79,7 +79,7 @@ class Updates:
     at_rest: Kept | None = None
 
 
-class Isam2:
+class _Isam2:
     """
     The peer: L2, every loop of the graph believed.
 
@@ -164,7 +164,7 @@ def isam2(graph_of: Callable[[], FactorGraph], patience: float = float('inf')) -
 
 
 def _serve(asked: Connection, graph_of: Callable[[], FactorGraph], patience: float) -> None:
-    peer = Isam2(graph_of(), patience)
+    peer = _Isam2(graph_of(), patience)
     asked.send('ready')
     for k in iter(asked.recv, None):
         asked.send(peer.update(k))

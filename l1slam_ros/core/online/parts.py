@@ -15,7 +15,6 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.online.snapshot import Problem
 from l1slam_ros.core.online.update import Improvement
-from l1slam_ros.core.robust.judgement import Judgement
 
 # [rad] Of the heading of a part: that it is not known. Its place is, to the extent of the map.
 _HEADING = 1.0
@@ -44,12 +43,7 @@ def of_all(improvement: Improvement, problem: Problem) -> Improvement:
     dual = np.zeros((len(problem.graph.between), d))
     dual[rows] = improvement.dual.reshape(-1, d)[:len(rows)]
     return replace(improvement, dual=dual.ravel(),
-                   judgement=judgement_of_all(improvement.judgement, problem))
-
-
-def judgement_of_all(judgement: Judgement, problem: Problem) -> Judgement:
-    """Return a judgement of the factors of `as_one(problem)`, for those of the problem."""
-    return judgement.of_all(problem.graph.not_struck, len(problem.graph.between))
+                   judgement=improvement.judgement.of_all(problem.graph))
 
 
 def _tied(graph: FactorGraph, poses: Array, keyframes: Indices) -> FactorGraph:

@@ -217,7 +217,7 @@ class Snapshot:
     loop_rows, loop_stamps : see `LoopFactors`; robust : loops may be doubted; looks : (k, 3) what
     the front says of the factors after those that are judged: accepted, suspect, sigmas;
     all_judged : no loop is among them; judged : (k, p) the L2 map of the last judgement, None:
-    there is none; verdict : that judgement, where it waits for a map; stale : the map is not of
+    there is none; pending : that judgement, where it waits for a map; stale : the map is not of
     the factors that are accepted, or are to be; views : the L1 and L2 map of the front, where
     there is one; pattern : see `Problem`.
     """
@@ -236,7 +236,7 @@ class Snapshot:
     looks: Array
     all_judged: bool
     judged: Array | None
-    verdict: Judgement | None
+    pending: Judgement | None
     stale: bool
     views: tuple[View, ...]
     pattern: Pattern | None
@@ -284,7 +284,7 @@ class Snapshot:
             # After a loop has closed, the L2 map of the judgement is nearer.
             starts.append(self._followed(self.judged, self.poses))
         grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
-        judgement = self._of_all(self.verdict) if self.verdict else self.judgement
+        judgement = self._of_all(self.pending) if self.pending else self.judgement
         settled = not (grown or self.stale) and judgement.settled and last.at_rest
         return Problem(self.map, self.graph, self.gaps, starts, dual, judgement, self.robust,
                        last.cost * rows / max(len(last.dual), 1), settled, self.pattern)

@@ -93,9 +93,9 @@ def solve(
 
     """
     ids = np.arange(graph.n_poses) if ids is None else ids
-    # What a person struck out is there for nobody.
-    rows, m = graph.not_struck, len(graph.between)
-    graph = graph.subset(rows)
+    whole = graph
+    if graph.between.struck.any():  # what a person struck out is there for nobody
+        graph = graph.subset(graph.not_struck)
     _require_start(graph, stored, asked, ids)
     seed = None
     initial = (odometry_poses(graph) if asked.start == 'odometry'
@@ -119,7 +119,7 @@ def solve(
     if not np.isfinite([cost(initial), seed_cost or 0.0, solution.cost]).all():
         raise GraphError('the cost leaves double precision: measurements and information of the '
                          'graph are too large, or too different from each other')
-    judgement = robust.judgement.of_all(rows, m) if robust else None
+    judgement = robust.judgement.of_all(whole) if robust else None
     return Outcome(solution, minimiser.solver, minimiser.reason, cost(initial), seed_cost, seconds,
                    judgement, unjudged, int(component_labels(graph).max()) + 1)
 

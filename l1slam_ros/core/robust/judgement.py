@@ -100,16 +100,17 @@ class Judgement:
         """Whether factors are as noisy as they say."""
         return bool((self.noise == 1).all())
 
-    def of_all(self, rows: Indices, m: int) -> 'Judgement':
+    def of_all(self, graph: FactorGraph) -> 'Judgement':
         """
-        Return the judgement of m factors, those in `rows` as they were judged here, one by one.
+        Return the judgement of all factors of a graph, from this one of those that are not struck.
 
-        The others are those that a person struck out: nothing is said of them.
+        Of the others it says nothing. What it judged beside those of the graph, ties, is left out.
         """
+        rows = graph.not_struck
         k = len(rows)
 
         def spread(values: Any, rest: float) -> Any:
-            whole = np.full(m, rest, values.dtype)
+            whole = np.full(len(graph.between), rest, values.dtype)
             whole[rows] = values[:k]
             return whole
 

@@ -51,8 +51,8 @@ class LiveMap:
     looks : (k, 3) what fronts said of the factors after those that are judged: accepted, suspect,
         sigmas
     judged : (n, p) the L2 map of the judgement, None: there is none
-    verdict : the last judgement, where the map is not of what it accepts: until it is, all that
-        is asked is told of map and judgement before; None: there is none
+    pending : the last judgement, where the map is not of what it accepts: until it is, map and
+        judgement are those before; None: there is none
     stale : the map is not of the factors that are accepted, or are to be
     last : the last improvement, None: there was none
     newest : the last keyframe of the map, and its pose (1, p)
@@ -67,7 +67,7 @@ class LiveMap:
         self.front: Front | None = None
         self.judged: Array | None = None
         self.asked: Array | None = None
-        self.verdict: Judgement | None = None
+        self.pending: Judgement | None = None
         self.stale = False
         self.last: Improvement | None = None
         self.newest: tuple[int, Array]
@@ -123,16 +123,16 @@ class LiveMap:
         self.looks.extend(looks)
         self._judged_loops, self.stale = -1, True
 
-    def to_accept(self, part: Mask, verdict: Judgement | None) -> tuple[BetweenFactors, Indices]:
+    def to_accept(self, part: Mask, pending: Judgement | None) -> tuple[BetweenFactors, Indices]:
         """
         Return the factors, and which of them a new front is to accept, as far as one looked.
 
-        part : which of the first ones it begins with; verdict : for which it was made: beside what
-        is believed now, what did not fit may, and the front finds out
+        part : which of the first ones it begins with; pending : the judgement that it was made
+        for: beside what that accepts a loop may fit that did not before, and the front finds out
         """
         factors, known = self._builder.graph.between, self.accepted
         accept = np.append(known, np.zeros(max(len(part) - len(known), 0))).astype(int)
-        if verdict:
+        if pending:
             accept[(accept == 0) & ~factors.struck[:len(accept)]] = UNKNOWN
             accept[:len(part)][part] = 0
         return factors, accept
@@ -192,8 +192,8 @@ class LiveMap:
         wait = self.judge_took if soon else max(_JUDGE_EVERY, 2 * self.judge_took)
         if idle:
             return not self.all_judged_anew
-        return not self.all_judged and (budget > self.judge_took
-                                        or time.monotonic() > self._judge_at + wait)
+        waited = budget > self.judge_took or time.monotonic() > self._judge_at + wait
+        return self.is_anew_due(idle) or (waited and not self.all_judged)
 
     def is_anew_due(self, idle: bool) -> bool:
         """
@@ -205,7 +205,7 @@ class LiveMap:
         """
         if idle:
             return self.all_judged
-        last = self.verdict or self.optimised.judgement
+        last = self.pending or self.optimised.judgement
         return (any(doubt.kind in (MOSTLY_REFUSED, OTHER_MAP) for doubt in last.doubts)
                 and self._judged_anew != self._judged_loops
                 and time.monotonic() > self._anew_at + max(_JUDGE_EVERY, 2 * self._anew_took))
@@ -243,12 +243,12 @@ class LiveMap:
         else:
             self.judge_took = self._judge_at - self._judge_began
         known = self.accepted[:len(judgement.accepted)]
-        if self.verdict or not np.array_equal(judgement.accepted, known):
-            self.verdict, self.stale = judgement, True
+        if self.pending or not np.array_equal(judgement.accepted, known):
+            self.pending, self.stale = judgement, True
         else:
-            self._believe(judgement)
+            self._commit(judgement)
 
-    def _believe(self, judgement: Judgement) -> None:
+    def _commit(self, judgement: Judgement) -> None:
         """Take over what was found of the first factors."""
         looks, before = self.looks.view(), len(self.optimised.judgement.accepted)
         self.looks = GrowingArray((3,))
@@ -262,11 +262,11 @@ class LiveMap:
         return replace(judgement, accepted=accepted, suspect=judgement.suspect & ~accepted)
 
     def adopt(self, improvement: Improvement, front: Front | None, tolerance: float,
-              verdict: Judgement | None, looks: Sequence[Look]) -> None:
+              pending: Judgement | None, looks: Sequence[Look]) -> None:
         """
-        Take over a map, and the verdict that it was made by; see `Improvement.taken_over`.
+        Take over a map; see `Improvement.taken_over`.
 
-        looks : of the front at factors after those of the verdict
+        pending : the judgement that it was made for; looks : of the front at factors after its own
 
         Raises
         ------
@@ -274,9 +274,9 @@ class LiveMap:
 
         """
         self.optimised = improvement.taken_over(self.optimised, tolerance)
-        if verdict:
-            self._believe(verdict)
-            self.verdict = None if self.verdict is verdict else self.verdict
+        if pending:
+            self._commit(pending)
+            self.pending = None if self.pending is pending else self.pending
         judgement = improvement.judgement
         self._factored_at = time.monotonic()
         if improvement.gap < np.inf:
@@ -288,7 +288,7 @@ class LiveMap:
         first = len(self.optimised.judgement.accepted) + len(self.looks)
         self.looks.extend(np.column_stack(
             (judgement.accepted, judgement.suspect, judgement.sigmas))[first:])
-        if verdict and looks:
+        if pending and looks:
             self._look_again(looks)
         self._compare()
         self.note_newest()
@@ -338,4 +338,4 @@ class LiveMap:
         """Find out whether the map is of the factors that are accepted."""
         used, accepted = self._used, self.accepted
         both = min(len(used), len(accepted))
-        self.stale = self.verdict is not None or bool((used[:both] != accepted[:both]).any())
+        self.stale = self.pending is not None or bool((used[:both] != accepted[:both]).any())

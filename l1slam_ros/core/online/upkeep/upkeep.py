@@ -26,7 +26,7 @@ from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.incremental.front import Front, Look
 from l1slam_ros.core.online.graph_builder import GraphBuilder
-from l1slam_ros.core.online.parts import as_one, judgement_of_all, of_all
+from l1slam_ros.core.online.parts import as_one, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
 from l1slam_ros.core.online.update import Improvement, front_of, improve, one_round, optimise
 from l1slam_ros.core.online.upkeep.live_map import LiveMap
@@ -115,7 +115,7 @@ class Upkeep:
                     live.number, self._version(), self._builder.graph.copy(), track.gaps,
                     track.keyframe_stamps, track.keyframe_poses, self._map_to_odom_now(),
                     loops.rows, loops.stamps, live.optimised, live.robust, live.looks.view(),
-                    live.all_judged and not live.verdict, live.judged, live.verdict, live.stale,
+                    live.all_judged and not live.pending, live.judged, live.pending, live.stale,
                     views if live.front is front else (), front.pattern if front else None)
 
     def _map_to_odom_now(self) -> Array:
@@ -205,9 +205,9 @@ class Upkeep:
         with self._lock:
             if self._live.is_map_due(idle):
                 self._mapper.start(lambda: self._map_anew(idle, budget, check))
-            # First what is the sooner over, and all there is to find out most of the time.
-            anew = self._live.is_anew_due(idle)
-            if self._live.is_judge_due(idle, budget) or (anew and not idle):
+            if self._live.is_judge_due(idle, budget):
+                # At rest first what is the sooner over, and all there is to find out mostly.
+                anew = self._live.is_anew_due(idle)
                 self._judge.start(lambda: self._judge_all(anew, idle, check))
             elif self._live.is_norm_due(idle):
                 self._judge.start(lambda: self._ask_norm(check))
@@ -218,12 +218,12 @@ class Upkeep:
         with self._standing() as now:
             live, solver = self._live, self._solver
             exact = live.is_exact_due(idle)
-        whole, verdict = now.problem(), now.verdict
+        whole, pending = now.problem(), now.pending
         del now  # holds the factors of a front that may be replaced meanwhile
         problem = as_one(whole)
-        if not verdict:
+        if not pending:
             # What is made of less than is believed by then, would be late.
-            check = until(lambda: live.verdict is not None, check)
+            check = until(lambda: live.pending is not None, check)
         if exact:
             check = until(lambda: live.is_late, check)
         else:
@@ -231,15 +231,15 @@ class Upkeep:
         improvement = improve(problem, solver, _PATIENCE * max(budget, _LEAST_ROUND), check, exact)
         check()
         judgement, looks = whole.judgement, list[Look]()
-        front = front_of(problem, improvement.poses, len((verdict or judgement).accepted), check)
+        front = front_of(problem, improvement.poses, len((pending or judgement).accepted), check)
         for _ in range(_PASSES):
             with self._front, self._lock:
-                factors, accept = live.to_accept(judgement.accepted, verdict)
+                factors, accept = live.to_accept(judgement.accepted, pending)
             while front is not None and not front.closed and front.rows < len(accept):
                 check()
                 looks += front.take(factors, accept[front.rows:front.rows + _AT_ONCE])
         check()
-        self.adopt(of_all(improvement, whole), front, verdict, looks)
+        self.adopt(of_all(improvement, whole), front, pending, looks)
 
     def _judge_all(self, anew: bool, idle: bool, check: Callable[[], None]) -> None:
         """Look at all loops again; anew: from the graph alone; idle: that until more comes."""
@@ -254,7 +254,7 @@ class Upkeep:
             problem.graph, problem.poses, problem.judgement, np.inf, check)
         check()
         with self._front, self._lock:
-            live.take_judgement(judgement_of_all(judgement, whole), poses, loops, anew)
+            live.take_judgement(judgement.of_all(whole.graph), poses, loops, anew)
             self._changes += 1
 
     def _ask_norm(self, check: Callable[[], None]) -> None:
@@ -297,12 +297,11 @@ class Upkeep:
         return improvement
 
     def adopt(self, improvement: Improvement, front: Front | None = None,
-              verdict: Judgement | None = None, looks: Sequence[Look] = ()) -> None:
+              pending: Judgement | None = None, looks: Sequence[Look] = ()) -> None:
         """
         Take over a map that was made of a snapshot; keyframes since then follow along.
 
-        front : made of it, None: it cannot be factored; verdict : of it; looks : of the front at
-        what the verdict is not of
+        front : made of it, None: it cannot be factored; pending, looks : see `LiveMap.adopt`
 
         Raises
         ------
@@ -314,7 +313,7 @@ class Upkeep:
             if improvement.map != self._live.number:
                 raise Interrupted
             before = self._map_to_odom_now()
-            self._live.adopt(improvement, front, self._solver.outer_tolerance, verdict, looks)
+            self._live.adopt(improvement, front, self._solver.outer_tolerance, pending, looks)
             self._note_map(before)
 
     def _note_map(self, before: Array) -> None:
