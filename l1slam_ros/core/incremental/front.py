@@ -52,6 +52,10 @@ class Look:
     sigmas: float
 
 
+# At what is left to the judgement, or was taken before.
+_LEFT = Look(False, False, np.nan)
+
+
 @dataclass(frozen=True)
 class Linearised:
     """
@@ -106,7 +110,7 @@ class Front:
 
     Attributes
     ----------
-    rows : how many of them it knows; taken : of these have come since it was made
+    rows : how many of them it knows; taken : of these it was to take, or to look at
     closed : it takes no more
     pattern : of its factors
 
@@ -178,37 +182,43 @@ class Front:
         one cannot be, and it takes no more.
         """
         looks: list[Look] = []
-        self.closed = self._is_beyond(factors, int(accept[0]))
+        asked = np.flatnonzero(accept)
+        if not len(asked):
+            self.rows += len(accept)
+            return len(accept) * [_LEFT]
+        self.closed = self._is_beyond(factors, self.rows + asked[0], accept[asked[0]])
         if self.closed:
             return looks
-        linearised = self._linearise(factors, slice(self.rows, self.rows + len(accept)))
-        for at, known in enumerate(accept.tolist()):
-            look = None if self._is_beyond(factors, known) else self._look(
-                factors, linearised, at, known)
+        # Only these: each keyframe that is touched makes the next one cost more.
+        linearised = self._linearise(factors, self.rows + asked)
+        for known, at in zip(accept.tolist(), np.cumsum(accept != 0).tolist(), strict=True):
+            look = (_LEFT if not known else
+                    None if self._is_beyond(factors, self.rows, known) else
+                    self._look(factors, linearised, at - 1, known))
             self.closed = look is None
             if look is None:
                 break
             self.rows += 1
-            self.taken += 1
+            self.taken += known != 0
             looks.append(look)
         return looks
 
-    def _is_beyond(self, factors: BetweenFactors, known: int) -> bool:
-        """Tell whether the next factor is for the next map."""
-        return (max(factors.i[self.rows], factors.j[self.rows]) > self.keyframes
-                or (known == 1 and self._turns(factors))
+    def _is_beyond(self, factors: BetweenFactors, row: int, known: int) -> bool:
+        """Tell whether a factor is for the next map."""
+        return (max(factors.i[row], factors.j[row]) > self.keyframes
+                or (known == 1 and self._turns(factors, row))
                 or self.border > _MOST_ROWS or self._borders[L2].points > _MOST_POINTS)
 
-    def _turns(self, factors: BetweenFactors) -> bool:
-        """Tell whether the next factor is the first that names the world: the gauge is another."""
-        return bool(factors.i[self.rows] == WORLD) and self._fixed > 0
+    def _turns(self, factors: BetweenFactors, row: int) -> bool:
+        """Tell whether a factor is the first that names the world: the gauge is another."""
+        return bool(factors.i[row] == WORLD) and self._fixed > 0
 
     def _look(self, factors: BetweenFactors, new: Linearised, at: int, known: int) -> Look | None:
         """Look at a factor, and make it part of the map where it is accepted; None: it cannot."""
         own = np.diag(factors.sqrt_information[self.rows])
-        # What is silent of some component is for the judgement, too.
-        if not known or (known == UNKNOWN and (self._turns(factors) or not own.all())):
-            return Look(False, known == UNKNOWN, np.nan)
+        # What is silent of some component is for the judgement.
+        if known == UNKNOWN and (self._turns(factors, self.rows) or not own.all()):
+            return Look(False, True, np.nan)
         first_seen = self.keyframes in (factors.i[self.rows], factors.j[self.rows])
         l1, l2 = self._borders
         try:
@@ -243,7 +253,7 @@ class Front:
         return Look(accepted, fits and not accepted,
                     sigmas if accepted else float(np.sqrt(square))), left
 
-    def _linearise(self, factors: BetweenFactors, rows: slice) -> Linearised:
+    def _linearise(self, factors: BetweenFactors, rows: Indices) -> Linearised:
         """
         Return some factors as the borders want them.
 

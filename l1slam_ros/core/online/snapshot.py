@@ -273,6 +273,12 @@ class Snapshot:
             settled=not self.robust or (judged.settled and self.all_judged))
         return looked.extended(self.graph, self.robust)
 
+    @property
+    def looked(self) -> int:
+        """How many factors the front looked at; without one all are for the judge."""
+        known = len(self.optimised.judgement.accepted) + len(self.looks)
+        return known if self.views else len(self.graph.between)
+
     def problem(self) -> Problem:
         """Return what an update begins with: the graph, and the warm start for all of it."""
         last, rows = self.optimised, len(self.graph.between) * self.graph.manifold.TANGENT_SIZE

@@ -121,6 +121,31 @@ def test_the_gate_lets_no_lie_in(world, kind):
     assert accepted[loops & ~false].mean() > 0.7
 
 
+def test_what_it_is_not_to_take_costs_a_front_nothing(world):
+    backend = alone(world)
+    play(backend, world, KNOWN, LAST)
+    front, factors = backend._live.front, backend.snapshot().graph.between
+    new = slice(front.rows, front.rows + 20)
+    odometry = factors.is_odometry[new]
+    looks = front.take(factors, odometry.astype(int))
+    assert [look.accepted for look in looks] == odometry.tolist() and not odometry.all()
+    # What is touched: the last keyframe it knew and the new ones, not the far ends of loops.
+    assert [border.points for border in front._borders] == 2 * [1 + odometry.sum()]
+    assert front.rows == new.stop and front.taken == odometry.sum()
+
+
+def test_loops_that_come_before_a_map_is_made_are_looked_at_by_its_front(world):
+    backend = alone(world)
+    begun = len(backend.snapshot().graph.between)
+    play(backend, world, KNOWN, LAST)
+    # No update lets the last front look at them.
+    assert len(backend._live.looks) == 0
+    backend._map_anew(False, 10.0, lambda: None)
+    now = backend.snapshot()
+    assert backend._live.front.rows == len(now.graph.between) > begun + 2 * (LAST - KNOWN) / 3
+    assert now.judgement.accepted[begun:].mean() > 0.9
+
+
 def test_a_front_that_fails_is_closed_and_moves_nothing(world, monkeypatch):
     backend = alone(world)
     front = backend._live.front

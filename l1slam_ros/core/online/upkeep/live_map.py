@@ -118,23 +118,23 @@ class LiveMap:
             return
         known = len(judgement.accepted)
         self.optimised = replace(self.optimised, judgement=self._told(judgement))
-        looks, self.looks = self.looks.view().copy(), GrowingArray((3,))
-        looks[:, 0] = after[known:]
-        self.looks.extend(looks)
+        self._say(np.column_stack((after[known:], self.looks.view()[:, 1:])))
         self._judged_loops, self.stale = -1, True
 
     def to_accept(self, part: Mask, pending: Judgement | None) -> tuple[BetweenFactors, Indices]:
         """
         Return the factors, and which of them a new front is to accept, as far as one looked.
 
-        part : which of the first ones it begins with; pending : the judgement that it was made
-        for: beside what that accepts a loop may fit that did not before, and the front finds out
+        part : which of the first ones it begins with, at the others nobody may have looked yet;
+        pending : the judgement that it was made for: beside what that accepts a loop may fit that
+        did not before, and the front finds out
         """
         factors, known = self._builder.graph.between, self.accepted
-        accept = np.append(known, np.zeros(max(len(part) - len(known), 0))).astype(int)
+        accept = np.append(known, np.full(max(len(part) - len(known), 0), UNKNOWN))
         if pending:
-            accept[(accept == 0) & ~factors.struck[:len(accept)]] = UNKNOWN
-            accept[:len(part)][part] = 0
+            accept[:len(known)][~known] = UNKNOWN
+        accept[factors.struck[:len(accept)]] = 0
+        accept[:len(part)][part] = 0
         return factors, accept
 
     def take_some(self, factors: BetweenFactors) -> bool:
@@ -250,9 +250,8 @@ class LiveMap:
 
     def _commit(self, judgement: Judgement) -> None:
         """Take over what was found of the first factors."""
-        looks, before = self.looks.view(), len(self.optimised.judgement.accepted)
-        self.looks = GrowingArray((3,))
-        self.looks.extend(looks[len(judgement.accepted) - before:])
+        before = len(self.optimised.judgement.accepted)
+        self._say(self.looks.view()[len(judgement.accepted) - before:])
         self.optimised = replace(self.optimised, judgement=self._told(judgement))
 
     def _told(self, judgement: Judgement) -> Judgement:
@@ -283,27 +282,36 @@ class LiveMap:
             self._bound_at, self._proved = self._factored_at, judgement.accepted
             self._bound = improvement.cost - improvement.gap
         self.front, self.last = front, improvement
-        self._used, self._noise = judgement.accepted, judgement.variance
-        # What the front begins with, no other may have looked at.
-        first = len(self.optimised.judgement.accepted) + len(self.looks)
-        self.looks.extend(np.column_stack(
-            (judgement.accepted, judgement.suspect, judgement.sigmas))[first:])
-        if pending and looks:
-            self._look_again(looks)
+        self._noise = judgement.variance
+        self._hear_front(judgement, looks, pending is not None)
         self._compare()
         self.note_newest()
 
-    def _look_again(self, looks: Sequence[Look]) -> None:
-        """Take over looks at the first factors that are not judged, but at what is accepted."""
-        seen = np.array([(look.accepted, look.suspect, look.sigmas) for look in looks])
-        first, before = len(self.optimised.judgement.accepted), self.looks.view()
-        again = np.where(before[:len(seen), :1] > 0, before[:len(seen)], seen)
-        used = self._used[first:first + len(again)]
-        self._used = np.concatenate((self._used[:first], used | (again[:len(used), 0] > 0),
-                                     self._used[first + len(again):]))
+    def _hear_front(self, made_of: Judgement, looks: Sequence[Look], again: bool) -> None:
+        """
+        Take over what a new front says of the factors that are not judged.
+
+        looks : at the last it knows, but for what it was made of; again : at what was left, too
+        """
+        said = np.column_stack((made_of.accepted, made_of.suspect, made_of.sigmas))
+        self._used = made_of.accepted.copy()
+        if self.front:
+            begun, end = self.front.rows - len(looks), self.front.rows
+            seen = np.array([(look.accepted, look.suspect, look.sigmas) for look in looks])
+            seen, part = seen.reshape(-1, 3), self._used[begun:end]
+            seen[:len(part)][part] = said[begun:end][part]
+            said = np.concatenate((said[:begun], seen))
+            self._used[:end] |= said[:len(self._used), 0].astype(bool)
+            self._fits |= any(look.suspect for look in looks)
+        before, said = self.looks.view(), said[len(self.optimised.judgement.accepted):]
+        kept, now = before[:len(said)], said[:len(before)]
+        now[:] = np.where((kept[:, :1] > 0) | (not again), kept, now)
+        self._say(np.concatenate((said, before[len(said):])))
+
+    def _say(self, looks: Array) -> None:
+        """Take over looks at the factors that are not judged; those before are not written to."""
         self.looks = GrowingArray((3,))
-        self.looks.extend(np.concatenate((again, before[len(again):])))
-        self._fits |= bool(again[:, 1].any())
+        self.looks.extend(looks)
 
     def note_newest(self) -> None:
         """Remember the last keyframe of the map, which keyframes to come follow."""
