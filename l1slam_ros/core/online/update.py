@@ -41,7 +41,7 @@ from l1slam_ros.core.solvers.optimality import (
     l2_cost,
     smoothing,
 )
-from l1slam_ros.core.solvers.reweighting import reweighted_step, weighted_least_squares
+from l1slam_ros.core.solvers.reweighting import warm_step, weighted_least_squares
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 
@@ -112,10 +112,10 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
 
     exact : to the end instead, where that is done by factorisations
 
-    Without: reweighted least squares steps carry the long-range part: one factorisation bends the
-    whole chain, where a first-order method moves it a few keyframes per iteration. One is always
-    taken, more where the cost is far above what the last map left (a loop has closed) and still
-    falls. Then, always, Algorithm 4 from the kept dual.
+    Without: reweighted least squares steps, warm from the kept dual, carry the long-range part:
+    one factorisation bends the whole chain, where a first-order method moves it a few keyframes
+    per iteration. One is always taken, more where the cost is far above what the last map left (a
+    loop has closed) and still falls. Then, always, Algorithm 4 from the kept dual.
     """
     start = time.monotonic()
     graph, method, deadline = problem.part, problem.method, start + budget
@@ -132,7 +132,7 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
         check()
         system = linearise(graph, poses, residual)
         try:
-            step, _ = reweighted_step(system, method.cholesky, system.b, mu * smoothing(system.b))
+            step = warm_step(system, method.cholesky, dual, mu * smoothing(system.b))
         except GraphError:  # sharper weights are beyond double precision
             break
         previous = cost

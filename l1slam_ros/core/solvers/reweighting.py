@@ -6,6 +6,7 @@ In: a linear system. Out: the step that minimises a weighted sum of squares.
 """
 
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from l1slam_ros.core.solvers.optimality import smoothing
 # Ten halvings bring the smoothing a thousand times below the mean residual, well under the
 # percent that the primal-dual iterations then have to mend; each costs one factorisation.
 _SMOOTHING_STEPS = 10
+# So much of a kept dual counts: with all of it the matrix is next to singular, and steps may fail.
+_KEPT = 0.7
 
 
 def weighted_least_squares(
@@ -59,6 +62,28 @@ def reweighted_step(
     weights = 1 / np.sqrt(r * r + mu * mu)
     x = weighted_least_squares(system, cholesky, weights)
     return x, np.clip(weights * (system.times(x) - system.b), -1, 1)
+
+
+def warm_step(system: LinearSystem, cholesky: BlockCholesky, y: Array, mu: float) -> Array:
+    """
+    Return a step from x = 0 towards |A x - b|_1, (columns,), by a dual y (rows,) that was kept.
+
+    It is Newton's on sum R, R = sqrt(r^2 + mu^2), where the curvature of a root is
+
+        W = (1 - (r / R)^2) / R,    A'W A x = -A'(r / R),    r = -b,
+
+    with y in the place of one r / R: y is near that of the optimum, and the system stays nearly
+    linear for small mu (Chan, Golub and Mulet, see `primal_dual_newton`). So what is off a corner,
+    and is to stay off, is free to move, where reweighting, W = 1 / R, holds it.
+
+    Raises
+    ------
+    GraphError : see `weighted_least_squares`
+
+    """
+    R = np.hypot(system.b, mu)
+    free = 1 + _KEPT * y * system.b / R
+    return weighted_least_squares(replace(system, b=system.b / free), cholesky, free / R)
 
 
 def reweighted_start(system: LinearSystem, cholesky: BlockCholesky) -> tuple[Array, Array]:

@@ -13,6 +13,7 @@ from l1slam_ros.core.solvers.optimality import duality_gap, l1_cost
 from l1slam_ros.core.solvers.reweighting import (
     reweighted_start,
     reweighted_step,
+    warm_step,
     weighted_least_squares,
 )
 
@@ -52,6 +53,20 @@ def test_a_step_by_hand():
     x, y = reweighted_step(system, cholesky, system.times(np.array([2.0])) - system.b, mu=0.0)
     assert_allclose(x, [16 / 11])
     assert_allclose(y, [8 / 11, 5 / 11, -1.0])
+
+
+def test_a_warm_step_by_hand():
+    """
+    The same, x = 2 being the origin, from the dual (1, 0, -1) that keeps what is off a corner.
+
+    Of the weights (1/2, 1, 1/3) the first and last count 3/10: (.15, 1, .1). The signs of the
+    residuals add up to 1, so the step is -1 / 1.25. It ends at 1.2, and the optimum is 1, where
+    weights alone end at 16/11. Without a dual it is theirs.
+    """
+    system = system_of(median().A, median().b - 2 * median().A.toarray()[:, 0])
+    cholesky = cholesky_of_system(system)
+    assert_allclose(warm_step(system, cholesky, np.array([1.0, 0.0, -1.0]), 0.0), [-0.8])
+    assert_allclose(warm_step(system, cholesky, np.zeros(3), 0.0), [16 / 11 - 2])
 
 
 def test_a_part_that_is_not_tied_to_the_anchor_is_named():
