@@ -17,8 +17,8 @@ import numpy as np
 from l1slam_ros.core.kernels.compiled import compiled, loop
 
 
-@loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i4[::1], i8, i8)')
-def climb(panels, first, start, pattern, offset, owner, at, k):
+@loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1], i4[::1], i8, i8)')
+def climb(panels, first, start, pattern, offset, stride, owner, at, k):
     """
     Return the positions (p,) on the way from position `at` to the root, and L^-1 e_at there.
 
@@ -44,8 +44,9 @@ def climb(panels, first, start, pattern, offset, owner, at, k):
         values[q, q] = 1.0
     done, s, begin = 0, owner[at], at
     while s >= 0:
-        _climb_panel(panels[offset[s]:offset[s + 1]], pattern[start[s]:start[s + 1]],
-                     first[s + 1] - first[s], begin - first[s], where, values, done * k)
+        _climb_panel(panels[offset[s]:offset[s + 1]], stride[s],
+                     pattern[start[s]:start[s + 1]], first[s + 1] - first[s], begin - first[s],
+                     where, values, done * k)
         done += first[s + 1] - begin
         s = _parent(first, start, pattern, owner, s)
         begin = first[s]
@@ -60,7 +61,7 @@ def _parent(first, start, pattern, owner, s):
 
 
 @compiled
-def _climb_panel(panel, rows, columns, skip, where, values, own):
+def _climb_panel(panel, stride, rows, columns, skip, where, values, own):
     """Solve for a supernode's own rows, the first `skip` of which are zero, and go below."""
     k = len(values)
     width, none = columns * k, skip * k
@@ -68,7 +69,7 @@ def _climb_panel(panel, rows, columns, skip, where, values, own):
     for q in range(0, k, 3):
         x, y, z = values[q, own:], values[q + 1, own:], values[q + 2, own:]
         for r in range(none, width):
-            line = panel[r * width + none:(r + 1) * width]
+            line = panel[r * stride + none:r * stride + width]
             of_x, of_y, of_z = _dot_three(line, r - none, x, y, z)
             pivot = line[r - none]
             x[r - none] = (x[r - none] - of_x) / pivot
@@ -77,7 +78,8 @@ def _climb_panel(panel, rows, columns, skip, where, values, own):
         for b in range(columns, len(rows)):
             target = where[rows[b]] * k
             for a in range(k):
-                line = panel[(b * k + a) * width + none:(b * k + a + 1) * width]
+                begin = (b * k + a) * stride
+                line = panel[begin + none:begin + width]
                 of_x, of_y, of_z = _dot_three(line, width - none, x, y, z)
                 values[q, target + a] -= of_x
                 values[q + 1, target + a] -= of_y

@@ -2,7 +2,7 @@
 """
 Supernodal Cholesky of a sparse matrix of k x k blocks: assembly and factorisation.
 
-Panels are dense, row after row: entry (r, c) of panel s is panels[offset[s] + r width + c].
+Panels are dense, row after row: entry (r, c) of panel s is panels[offset[s] + r stride[s] + c].
 Left-looking: each supernode gathers what all earlier ones subtract from it, then is factored; all
 the work is done in tiles of 2 x 3 inner products, which reuse what they load and suit blocks of
 three and of six. (Of 3 x 3, the compiler makes code that is half as fast, or worse where rows are
@@ -23,7 +23,7 @@ from l1slam_ros.core.kernels.compiled import ANY_SIZE, compiled, for_sizes
 _SINGULAR = 1e-13
 
 
-_PANELS = 'f8[::1], i4[::1], i8[::1], i4[::1], i8[::1]'
+_PANELS = 'f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1]'
 _FACTORS = ('f8[::1], i8[:, ::1], i8[:, ::1], b1[::1], i8[::1], i8[::1], f8[:, :, :, ::1], '
             'f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8')
 
@@ -37,9 +37,9 @@ def assemble(panels, address, width, turned, corner, stride, blocks, weights, di
     blocks : (m, 2, k, k) J_i and J_j; weights : (m, k); diagonal : (n, k)
     curvature : (m', 2 k, 2 k) of the first m' factors, C is their sum
     address, width : (m, 3) where the blocks (i, i), (j, j) and the one between i and j lie, and
-    the width of their panels; address -1: there is none
+    the stride of their panels; address -1: there is none
     turned : (m,) bool, the block between them is that of row i and column j
-    corner, stride : (n,) where each keyframe's own block begins, and its panel's width
+    corner, stride : (n,) where each keyframe's own block begins, and its panel's stride
     """
     k = len(size)
     for at in range(len(panels)):
@@ -59,7 +59,7 @@ def assemble(panels, address, width, turned, corner, stride, blocks, weights, di
             left = part if part < 2 else (0 if turned[f] else 1)
             right = part if part < 2 else 1 - left
             for r in range(k):
-                for c in range(k):
+                for c in range(r + 1 if part < 2 else k):
                     total = 0.0
                     for a in range(k):
                         total += blocks[f, left, a, r] * scaled[right, a, c]
@@ -69,7 +69,8 @@ def assemble(panels, address, width, turned, corner, stride, blocks, weights, di
 
 
 @for_sizes(_PANELS + ', i4[::1], i1[::1], i8, i4[:, ::1], i8[::1]', ANY_SIZE)
-def factorise(panels, first, start, pattern, offset, owner, share, mine, lists, reach, size):
+def factorise(panels, first, start, pattern, offset, stride, owner, share, mine, lists, reach,
+              size):
     """
     Turn the lower triangle in `panels` into its Cholesky factor, for one share of the supernodes.
 
@@ -93,28 +94,29 @@ def factorise(panels, first, start, pattern, offset, owner, share, mine, lists, 
             continue
         width = (first[s + 1] - first[s]) * d
         for k in range(start[s], start[s + 1]):
-            local[pattern[k]] = offset[s] + (k - start[s]) * d * width
+            local[pattern[k]] = offset[s] + (k - start[s]) * d * stride[s]
         for c in range(width):
-            least[c] = _SINGULAR * panels[offset[s] + c * (width + 1)]
+            least[c] = _SINGULAR * panels[offset[s] + c * (stride[s] + 1)]
         source = lists[0, s]
         while source >= 0:
             next_source = lists[1, source]
             rows = pattern[start[source] + reach[source]:start[source + 1]]
             inner = (first[source + 1] - first[source]) * d
-            top = offset[source] + reach[source] * d * inner
+            top = offset[source] + reach[source] * d * stride[source]
             columns = _within(rows, first[s + 1])
             for k in range(len(rows)):
                 for a in range(d):
-                    place[k * d + a] = local[rows[k]] + a * width
+                    place[k * d + a] = local[rows[k]] + a * stride[s]
             for k in range(columns):
                 for a in range(d):
                     target[k * d + a] = (rows[k] - first[s]) * d + a
-            _subtract(panels, top, inner, len(rows) * d, columns * d, place, target, size)
+            _subtract(panels[top:], stride[source], inner, len(rows) * d, columns * d, panels,
+                      place, target, size)
             reach[source] += columns
             _enqueue(source, reach, start, pattern, owner, share, mine, lists)
             source = next_source
         panel = panels[offset[s]:offset[s + 1]]
-        bad = _factorise_panel(panel, (start[s + 1] - start[s]) * d, width, least)
+        bad = _factorise_panel(panel, stride[s], (start[s + 1] - start[s]) * d, width, least)
         if bad < width:
             return first[s] + bad // d
         reach[s] = first[s + 1] - first[s]
@@ -147,21 +149,20 @@ def _enqueue(source, reach, start, pattern, owner, share, mine, lists):
 
 
 @compiled
-def _subtract(panels, top, inner, height, columns, place, target, size):
+def _subtract(source, stride, inner, height, columns, panels, place, target, size):
     """
     Subtract products of a source's rows, from `top` on, from the panel that they belong to.
 
     place : (height,) where each of the rows begins in the target's panel; target : (columns,) the
     column of that panel that belongs to each of the first rows
     """
-    source = panels[top:top + height * inner]
     for c in range(0, columns, 3):
         c1, c2 = min(c + 1, columns - 1), min(c + 2, columns - 1)
-        right = (source[c * inner:(c + 1) * inner], source[c1 * inner:(c1 + 1) * inner],
-                 source[c2 * inner:(c2 + 1) * inner])
+        right = (source[c * stride:c * stride + inner], source[c1 * stride:c1 * stride + inner],
+                 source[c2 * stride:c2 * stride + inner])
         for r in range(c, height, 2):
             r1 = min(r + 1, height - 1)
-            left = source[r * inner:(r + 1) * inner], source[r1 * inner:(r1 + 1) * inner]
+            left = source[r * stride:r * stride + inner], source[r1 * stride:r1 * stride + inner]
             # Most panels of sparse graphs are as wide as a block.
             tile = _tile(left, right, size) if inner == len(size) else _tile(left, right, left[0])
             _write(panels[place[r]:], target[c], target[c1], target[c2], c1 > c, c2 > c1, tile[0])
@@ -203,7 +204,7 @@ def _tile(left, right, along):
 
 
 @compiled
-def _factorise_panel(panel, height, width, least):
+def _factorise_panel(panel, stride, height, width, least):
     """
     Factor the diagonal block of a panel and solve for the rest; return the bad column.
 
@@ -212,50 +213,50 @@ def _factorise_panel(panel, height, width, least):
     for c in range(0, width, 3):
         strip = min(3, width - c)
         if c:
-            _update_strip(panel, height, width, c, strip)
-        at = c * width + c
+            _update_strip(panel, stride, height, width, c, strip)
+        at = c * stride + c
         for k in range(strip):
-            pivot = panel[at + k * width + k]
+            pivot = panel[at + k * stride + k]
             for q in range(k):
-                pivot -= panel[at + k * width + q] ** 2
+                pivot -= panel[at + k * stride + q] ** 2
             if not pivot > max(least[c + k], 0.0):
                 return c + k
-            panel[at + k * width + k] = np.sqrt(pivot)
+            panel[at + k * stride + k] = np.sqrt(pivot)
             for r in range(k + 1, strip):
-                value = panel[at + r * width + k]
+                value = panel[at + r * stride + k]
                 for q in range(k):
-                    value -= panel[at + r * width + q] * panel[at + k * width + q]
-                panel[at + r * width + k] = value / panel[at + k * width + k]
-        _solve_strip(panel[at + strip * width:], panel[at:], height - c - strip, width, strip)
+                    value -= panel[at + r * stride + q] * panel[at + k * stride + q]
+                panel[at + r * stride + k] = value / panel[at + k * stride + k]
+        _solve_strip(panel[at + strip * stride:], panel[at:], height - c - strip, stride, strip)
     return width
 
 
 @compiled
-def _update_strip(panel, height, width, c, strip):
+def _update_strip(panel, stride, height, width, c, strip):
     """Subtract from up to three columns what the columns before them do."""
     c1, c2 = min(c + 1, width - 1), min(c + 2, width - 1)
-    right = (panel[c * width:c * width + c], panel[c1 * width:c1 * width + c],
-             panel[c2 * width:c2 * width + c])
+    right = (panel[c * stride:c * stride + c], panel[c1 * stride:c1 * stride + c],
+             panel[c2 * stride:c2 * stride + c])
     for r in range(c, height, 2):
         r1 = min(r + 1, height - 1)
-        left = panel[r * width:r * width + c], panel[r1 * width:r1 * width + c]
+        left = panel[r * stride:r * stride + c], panel[r1 * stride:r1 * stride + c]
         tile = _tile(left, right, left[0])
-        _write(panel[r * width:], c, c1, c2, strip > 1, strip > 2, tile[0])
+        _write(panel[r * stride:], c, c1, c2, strip > 1, strip > 2, tile[0])
         if r1 > r:
-            _write(panel[r1 * width:], c, c1, c2, strip > 1, strip > 2, tile[1])
+            _write(panel[r1 * stride:], c, c1, c2, strip > 1, strip > 2, tile[1])
 
 
 @compiled
-def _solve_strip(below, diagonal, height, width, strip):
+def _solve_strip(below, diagonal, height, stride, strip):
     """Solve for the rows below a factored block of one to three columns."""
     f00, f10, f11, f20, f21, f22 = 1 / diagonal[0], 0.0, 0.0, 0.0, 0.0, 0.0
     if strip > 1:
-        f10, f11 = diagonal[width], 1 / diagonal[width + 1]
+        f10, f11 = diagonal[stride], 1 / diagonal[stride + 1]
     if strip > 2:
-        f20, f21 = diagonal[2 * width], diagonal[2 * width + 1]
-        f22 = 1 / diagonal[2 * width + 2]
+        f20, f21 = diagonal[2 * stride], diagonal[2 * stride + 1]
+        f22 = 1 / diagonal[2 * stride + 2]
     for r in range(height):
-        row = below[r * width:r * width + strip]
+        row = below[r * stride:r * stride + strip]
         x = row[0] * f00
         row[0] = x
         if strip > 1:

@@ -33,22 +33,22 @@ def gather(keyframe, blocks, y, product):
                     _add(z, r, J[r:r + 3, c:c + 3].T, 1.0, to, at + c)
 
 
-@loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i4[::1], f8[:, :, ::1])')
-def solve_many(panels, first, start, pattern, offset, position, right):
+@loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1], i4[::1], f8[:, :, ::1])')
+def solve_many(panels, first, start, pattern, offset, stride, position, right):
     """Turn right hand sides, (n, k, q) in the order of the keyframes, into L'^-1 L^-1 right."""
     n, k, _ = right.shape
     x, row = right.ravel(), np.empty(n, np.int64)
     for f in range(n):
         row[position[f]] = f * k
     for s in range(len(first) - 1):
-        panel, rows = _panel(panels, first, start, pattern, offset, s, k)
+        panel, rows = _panel(panels, first, start, pattern, offset, stride, s, k)
         for c in range(0, panel.shape[1], 3):
             own = row[first[s] + c // k] + c % k
             _solve_three(panel[c:c + 3, c:c + 3], x, own)
             for r in range(c + 3, len(panel), 3):
                 _add(x, own, panel[r:r + 3, c:c + 3], -1.0, x, row[rows[r // k]] + r % k)
     for s in range(len(first) - 2, -1, -1):
-        panel, rows = _panel(panels, first, start, pattern, offset, s, k)
+        panel, rows = _panel(panels, first, start, pattern, offset, stride, s, k)
         for c in range(panel.shape[1] - 3, -1, -3):
             own = row[first[s] + c // k] + c % k
             for r in range(c + 3, len(panel), 3):
@@ -57,10 +57,11 @@ def solve_many(panels, first, start, pattern, offset, position, right):
 
 
 @compiled
-def _panel(panels, first, start, pattern, offset, s, k):
+def _panel(panels, first, start, pattern, offset, stride, s, k):
     """Return panel s as a matrix, and its rows."""
-    width = (first[s + 1] - first[s]) * k
-    return panels[offset[s]:offset[s + 1]].reshape(-1, width), pattern[start[s]:start[s + 1]]
+    rows, width = pattern[start[s]:start[s + 1]], (first[s + 1] - first[s]) * k
+    panel = panels[offset[s]:offset[s] + len(rows) * k * stride[s]].reshape(-1, stride[s])
+    return panel[:, :width], rows
 
 
 @compiled

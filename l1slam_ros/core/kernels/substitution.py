@@ -10,8 +10,8 @@ import numpy as np
 from l1slam_ros.core.kernels.compiled import compiled, loop
 
 
-@loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i4[::1], f8[:, ::1])')
-def solve(panels, first, start, pattern, offset, position, right):
+@loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1], i4[::1], f8[:, ::1])')
+def solve(panels, first, start, pattern, offset, stride, position, right):
     """Return the solution of L L' x = right; both (n, k) in the order of the keyframes."""
     n, k = right.shape
     x = np.empty(n * k)
@@ -25,11 +25,11 @@ def solve(panels, first, start, pattern, offset, position, right):
     for s in range(len(first) - 1):
         height = _write_places(pattern[start[s]:start[s + 1]], k, place)
         own = x[first[s] * k:first[s + 1] * k]
-        _forward(panels[offset[s]:offset[s + 1]], place[:height], own, x)
+        _forward(panels[offset[s]:offset[s + 1]], stride[s], place[:height], own, x)
     for s in range(len(first) - 2, -1, -1):
         height = _write_places(pattern[start[s]:start[s + 1]], k, place)
         own = x[first[s] * k:first[s + 1] * k]
-        _backward(panels[offset[s]:offset[s + 1]], place[:height], own, x)
+        _backward(panels[offset[s]:offset[s + 1]], stride[s], place[:height], own, x)
     solution = np.empty((n, k))
     for f in range(n):
         for a in range(k):
@@ -47,18 +47,18 @@ def _write_places(rows, k, place):
 
 
 @compiled
-def _forward(panel, place, own, x):
+def _forward(panel, stride, place, own, x):
     """Solve for the supernode's own rows, and subtract what they do to the rows below."""
     width, height = len(own), len(place)
     for r in range(width):
-        row, total = panel[r * width:(r + 1) * width], 0.0
+        row, total = panel[r * stride:r * stride + width], 0.0
         for c in range(r):
             total += row[c] * own[c]
         own[r] = (own[r] - total) / row[r]
     for r in range(width, height, 3):
         r1, r2 = min(r + 1, height - 1), min(r + 2, height - 1)
-        row0, row1 = panel[r * width:(r + 1) * width], panel[r1 * width:(r1 + 1) * width]
-        row2 = panel[r2 * width:(r2 + 1) * width]
+        row0, row1 = panel[r * stride:r * stride + width], panel[r1 * stride:r1 * stride + width]
+        row2 = panel[r2 * stride:r2 * stride + width]
         s0 = s1 = s2 = 0.0
         for c in range(width):
             s0 += row0[c] * own[c]
@@ -72,19 +72,19 @@ def _forward(panel, place, own, x):
 
 
 @compiled
-def _backward(panel, place, own, x):
+def _backward(panel, stride, place, own, x):
     """Solve with the transpose for the supernode's own rows, once all below are known."""
     width, height = len(own), len(place)
     for r in range(width, height, 3):
         r1, r2 = min(r + 1, height - 1), min(r + 2, height - 1)
-        row0, row1 = panel[r * width:(r + 1) * width], panel[r1 * width:(r1 + 1) * width]
-        row2 = panel[r2 * width:(r2 + 1) * width]
+        row0, row1 = panel[r * stride:r * stride + width], panel[r1 * stride:r1 * stride + width]
+        row2 = panel[r2 * stride:r2 * stride + width]
         x0, x1, x2 = x[place[r]], x[place[r1]], x[place[r2]]
         x1, x2 = x1 if r1 > r else 0.0, x2 if r2 > r1 else 0.0
         for c in range(width):
             own[c] -= row0[c] * x0 + row1[c] * x1 + row2[c] * x2
     for r in range(width - 1, -1, -1):
-        row = panel[r * width:(r + 1) * width]
+        row = panel[r * stride:r * stride + width]
         own[r] /= row[r]
         for c in range(r):
             own[c] -= row[c] * own[r]

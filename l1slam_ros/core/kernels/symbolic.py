@@ -239,8 +239,8 @@ def untouched(start, adjacent, order, column, rows):
     return own_order, own_column, own_rows
 
 
-@loop('(i8[:, ::1], i4[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8)')
-def block_addresses(keyframe, position, first, start, pattern, offset, k):
+@loop('(i8[:, ::1], i4[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1], i8)')
+def block_addresses(keyframe, position, first, start, pattern, offset, stride, k):
     """
     Find where the blocks of a matrix of k x k blocks lie in the panels.
 
@@ -250,11 +250,11 @@ def block_addresses(keyframe, position, first, start, pattern, offset, k):
     -------
     address, width, turned : of the three blocks of each factor, (m, 3), (m, 3) and (m,), see
         `cholesky.assemble`
-    corner, stride : where each keyframe's own block begins and its panel's width, (n,)
+    corner, own : where each keyframe's own block begins and its panel's stride, (n,)
 
     """
     n, m = len(position), len(keyframe)
-    corner, stride = np.empty(n, np.int64), np.empty(n, np.int64)
+    corner, own = np.empty(n, np.int64), np.empty(n, np.int64)
     owner = np.empty(n, np.int64)
     for s in range(len(first) - 1):
         for column in range(first[s], first[s + 1]):
@@ -262,8 +262,8 @@ def block_addresses(keyframe, position, first, start, pattern, offset, k):
     for v in range(n):
         column = position[v]
         s = owner[column]
-        stride[v] = (first[s + 1] - first[s]) * k
-        corner[v] = offset[s] + (column - first[s]) * k * (stride[v] + 1)
+        own[v] = stride[s]
+        corner[v] = offset[s] + (column - first[s]) * k * (own[v] + 1)
     address, width = np.empty((m, 3), np.int64), np.empty((m, 3), np.int64)
     turned = np.empty(m, np.bool_)
     for f in range(m):
@@ -272,7 +272,7 @@ def block_addresses(keyframe, position, first, start, pattern, offset, k):
             v = keyframe[f, side]
             address[f, side], width[f, side] = -1, 0
             if v < n:
-                address[f, side], width[f, side] = corner[v], stride[v]
+                address[f, side], width[f, side] = corner[v], own[v]
         i, j = keyframe[f, 0], keyframe[f, 1]
         if i < n and j < n:
             turned[f] = position[i] > position[j]
@@ -285,7 +285,7 @@ def block_addresses(keyframe, position, first, start, pattern, offset, k):
                     low = middle + 1
                 else:
                     high = middle
-            width[f, 2] = stride[v]
-            address[f, 2] = (offset[s] + (low - start[s]) * k * stride[v]
+            width[f, 2] = own[v]
+            address[f, 2] = (offset[s] + (low - start[s]) * k * own[v]
                              + (position[v] - first[s]) * k)
-    return address, width, turned, corner, stride
+    return address, width, turned, corner, own

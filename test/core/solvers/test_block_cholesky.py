@@ -22,6 +22,7 @@ from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise
+from l1slam_ros.core.kernels.prediction import SAMPLES
 from l1slam_ros.core.solvers import block_cholesky
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, cholesky_of, find_pattern
 
@@ -79,6 +80,25 @@ def test_dense_panels_of_many_columns(rng):
         assert cholesky.factorise(system, np.ones(len(system.b)))
         check_solution(cholesky, normal(system, np.ones(len(system.b))), rng)
         assert cholesky.pattern.first.tolist() == [0, 23]
+
+
+def test_rows_of_wide_panels_are_whole_lines_of_the_cache(rng):
+    """Their end is padding, which no solution knows of."""
+    pairs = [(i, j) for i in range(23) for j in range(i)] + [(0, 23)]
+    system = random_system(pairs, 23, 3, rng)
+    cholesky = cholesky_of_system(system)
+    assert cholesky.factorise(system, np.ones(len(system.b)))
+    layout = cholesky._factored
+    assert layout.shape[-1].tolist() == [72] and layout.panels.ctypes.data % 64 == 0
+    layout.panels.reshape(69, 72)[:, 69:] = np.nan
+    H = normal(system, np.ones(len(system.b)))
+    check_solution(cholesky, H, rng)
+    _, columns = cholesky.climb(0)
+    assert_allclose(columns @ columns.T, np.linalg.inv(H)[:3, :3], atol=1e-9)
+    many = rng.standard_normal((23, 3, SAMPLES))
+    expected = np.linalg.solve(H, many.reshape(69, -1))
+    cholesky.solve_many(many)
+    assert_allclose(many.reshape(69, -1), expected, atol=1e-9)
 
 
 @pytest.fixture(scope='module')
