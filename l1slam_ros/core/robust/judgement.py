@@ -259,8 +259,6 @@ def _agree_at_a_place(growth: Growth) -> Indices:
     rows = growth.joining()
     _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
     rows = asked(growth, rows[count[place] > 1])
-    if len(rows) < 2:
-        return rows[:0]
     one, other, _ = agreement(growth, rows)
     agree: Indices = rows[np.unique(one[growth.place[rows[one]] == growth.place[rows[other]]])]
     return agree
