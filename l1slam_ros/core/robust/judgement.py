@@ -259,8 +259,6 @@ def _agree_at_a_place(growth: Growth) -> Indices:
     rows = growth.joining()
     _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
     rows = asked(growth, rows[count[place] > 1])
-    if len(rows) < 2:
-        return rows[:0]
     one, other, _ = agreement(growth, rows)
     agree: Indices = rows[np.unique(one[growth.place[rows[one]] == growth.place[rows[other]]])]
     return agree
@@ -276,11 +274,9 @@ def _other_map(growth: Growth) -> list[Doubt]:
         len(outside) / ASKED, 1.0)
     trusted, against = (_against(growth, group, rows)
                         for rows in (accepted & growth.trusted, accepted))
-    # What is trusted is right, whatever else speaks against it. Beside a slip, which is a guess of
-    # what happened, all of the loops across should agree.
-    slipped = (growth.cut & ~growth.gap).any()
+    # What is trusted is right, whatever else speaks against it.
     few = len(group.places) < SPANNING and against
-    if trusted or few or (size < _AGAINST * against and not slipped):
+    if trusted or few or size < _AGAINST * against:
         return []
     return [_doubt(growth, OTHER_MAP, group.rows)]
 

@@ -101,8 +101,6 @@ def beside_refused(pairs: tuple[Indices, Indices], refused: Mask, true: Mask) ->
     count, against = (np.bincount(one, weights, len(refused))
                       for weights in (None, refused[other]))
     beside = against > count / 2
-    if not beside.any():
-        return np.zeros(len(refused))
     of_false, of_true = ((np.count_nonzero(beside & some) + 1)
                          / (np.count_nonzero((count > 0) & some) + 1) for some in (refused, true))
     return np.where(beside, max(float(np.log(of_false / of_true)), 0.0), 0.0)

@@ -7,7 +7,6 @@ In: a graph and what is accepted of it. Out: the same with more loops accepted. 
 
 import copy
 from collections.abc import Callable
-from functools import cached_property
 
 import numpy as np
 
@@ -69,13 +68,13 @@ class Growth:
     graph : the one given in the order of time, and an odometry factor for each gap, which is cut;
     size : factors given; accepted, is_loop, trusted : (m,) bool of the between factors; gap, cut :
     (m,) bool, odometry that says nothing: where there is none, and there or where it slipped; low,
-    high : (m,) the earlier and the later keyframe of each; place : (m,) see `places`; part : (n,)
-    number of the part of each keyframe; poses : (n, p) the L2 map of the accepted; posterior : of
-    these; variance : (2,) of odometry and loops in units of what they state; slip_odds : ln
-    P(slipped) / P(measured) of the odometry factors that were suspected; drops : (m,) how often
-    each was accepted and did not fit; at_their_word : whether factors may be as noisy as they say;
-    in_tail : (m,) bool, not the loops that are too far off for that; check : called before long
-    steps, raises where the work shall stop.
+    high : (m,) the earlier and the later keyframe of each; place : (m,), mates : see `places`, of
+    loops; part : (n,) number of the part of each keyframe; poses : (n, p) the L2 map of the
+    accepted; posterior : of these; variance : (2,) of odometry and loops in units of what they
+    state; slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
+    drops : (m,) how often each was accepted and did not fit; at_their_word : whether factors may
+    be as noisy as they say; in_tail : (m,) bool, not the loops that are too far off for that;
+    check : called before long steps, raises where the work shall stop.
     """
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None] = lambda: None):
@@ -92,7 +91,12 @@ class Growth:
         self.is_loop: Mask = ~self.factors.is_odometry
         self.cut: Mask = self.gap.copy()
         self.accepted: Mask = ~self.is_loop | self.trusted
-        self.poses = placed(self.graph.subset(self.accepted), odometry_poses(self.graph))
+        chain = odometry_poses(self.graph)
+        self.place, ends = places(self.graph, chain)
+        loops = np.flatnonzero(self.is_loop)
+        one, other = mates(self.place[loops], ends[loops])
+        self.mates = loops[one], loops[other]
+        self.poses = placed(self.graph.subset(self.accepted), chain)
         self.part = np.zeros(graph.n_poses, np.int64)
         self.variance = np.ones(2)
         self._learnt_of = np.zeros(0, bool)
@@ -101,21 +105,6 @@ class Growth:
         self.slip_odds: dict[int, float] = {}
         self.drops = np.zeros(len(self.factors), np.int64)
         self.in_tail = np.ones(len(self.factors), bool)
-
-    @cached_property
-    def _places(self) -> tuple[Indices, Array]:
-        return places(self.graph, odometry_poses(self.graph))
-
-    @cached_property
-    def _mates(self) -> tuple[Indices, Indices]:
-        rows = np.flatnonzero(self.is_loop)
-        one, other = mates(self.place[rows], self._places[1][rows])
-        return rows[one], rows[other]
-
-    @property
-    def place(self) -> Indices:
-        """The number of the place of each factor, (m,)."""
-        return self._places[0]
 
     def begin(self) -> None:
         """Solve for what is accepted, and learn from the loops how large the noise is."""
@@ -179,7 +168,7 @@ class Growth:
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
         clone = copy.copy(self)
-        for name in ('accepted', 'drops', 'cut', 'variance', 'slip_odds'):
+        for name in ('accepted', 'drops', 'cut', 'in_tail', 'variance', 'slip_odds'):
             setattr(clone, name, getattr(self, name).copy())
         return clone
 
@@ -196,8 +185,6 @@ class Growth:
         variance = np.where(self.factors.is_absolute[rows], 1.0,
                             noise[self.is_loop[rows].astype(np.int64)])
         cut = self.cut[rows]
-        if not cut.any():
-            return self.graph.subset(rows, variance)
         # Where loops hold both sides, the odometry between them hardly matters; where nothing
         # does, it is all there is. Either way it says that the keyframes are where they are.
         low, high = self.factors.i[rows[cut]], self.factors.j[rows[cut]]
@@ -214,7 +201,6 @@ class Growth:
 
     def take_at_their_word(self) -> None:
         """From now on let factors be as noisy as they say; loops, where `stand_apart` has it."""
-        self.in_tail = np.ones(len(self.factors), bool)
         more = self.variance_at_their_word()[1] / self.variance[1]
         rows = self._open(self.may_be_predicted & ~self.across() & ~self.factors.is_absolute)
         if more > 1:  # else loops say no more than was found
@@ -345,5 +331,5 @@ class Growth:
         true = 0 if self.at_their_word else np.count_nonzero(loops)
         believed: Indices = rows[believable(
             found, self.posterior, self.gate, fits, int(true), self.place[rows],
-            beside_refused(self._mates, refused, loops)[rows])]
+            beside_refused(self.mates, refused, loops)[rows])]
         return believed

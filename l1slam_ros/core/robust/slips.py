@@ -249,15 +249,12 @@ def _cut_at(state: Growth, cut: int, step: int) -> Growth:
     state = state.copy()
     state.cut[[cut, step]] = False, True
     # What lies between goes over to the other side.
-    side, first, last = ((state.low[cut], state.high[cut], state.low[step])
-                         if state.low[step] > state.low[cut] else
-                         (state.high[cut], state.high[step], state.low[cut]))
-    between = np.arange(first, last + 1)
+    side = state.low[cut] if state.low[step] > state.low[cut] else state.high[cut]
+    between = np.arange(*np.sort(state.high[[cut, step]]))
     chain, manifold = odometry_poses(state.graph), state.graph.manifold
+    here, start = (np.tile(poses[side], (len(between), 1)) for poses in (state.poses, chain))
     state.poses = state.poses.copy()
-    state.poses[between] = manifold.compose(
-        np.tile(state.poses[side], (len(between), 1)),
-        manifold.between(np.tile(chain[side], (len(between), 1)), chain[between]))
+    state.poses[between] = manifold.compose(here, manifold.between(start, chain[between]))
     state.solve()
     _accept_more(state)
     return state
