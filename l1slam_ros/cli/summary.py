@@ -46,7 +46,8 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
     is_loop = ~factors.is_odometry & ~factors.is_absolute
     parallel = int(is_loop[inspection.parallel_factors(graph)].sum())
     beside = f', {parallel:,} of them beside another edge' if parallel else ''
-    struck = f', {factors.struck.sum():,} of them struck out' if factors.struck.any() else ''
+    out = int(is_loop[factors.struck].sum())
+    struck = f', {out:,} of them struck out' if out else ''
     length = inspection.step_lengths(graph).sum()
     rows = [
         ('poses', f'{graph.n_poses:,} in {graph.manifold.NAME}, ids {ids[0]} to {ids[-1]}'),
