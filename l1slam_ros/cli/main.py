@@ -4,6 +4,7 @@
 
 import argparse
 import os
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -46,6 +47,8 @@ installed (pip install argcomplete, or the package python3-argcomplete):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit code, see `l1slam --help`."""
     try:
+        if arguments is None:  # a process of our own, which is to leave nothing half written
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             return _answer(arguments)
         finally:

@@ -3,6 +3,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,24 +46,27 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
     is_loop = ~factors.is_odometry & ~factors.is_absolute
     parallel = int(is_loop[inspection.parallel_factors(graph)].sum())
     beside = f', {parallel:,} of them beside another edge' if parallel else ''
+    out = int(is_loop[factors.struck].sum())
+    struck = f', {out:,} of them struck out' if out else ''
     length = inspection.step_lengths(graph).sum()
     rows = [
         ('poses', f'{graph.n_poses:,} in {graph.manifold.NAME}, ids {ids[0]} to {ids[-1]}'),
         ('odometry', f'{int(factors.is_odometry.sum()):,}, {length:,.1f} m'),
-        ('loops', f'{int(is_loop.sum()):,}{beside}'),
+        ('loops', f'{int(is_loop.sum()):,}{beside}{struck}'),
         ('components', f'{len(inspection.connected_parts(graph)):,}')]
     if absolute:
         rows.insert(3, ('absolute', f'{absolute:,}'))
     if record.stamps is not None:
         rows.append(('time', f'{(record.stamps[-1] - record.stamps[0]) / NANOSECONDS:,.1f} s'))
     if record.poses is not None:
-        cost = inspection.cost_at(graph, record.poses)
+        cost = inspection.cost_at(graph.subset(graph.not_struck), record.poses)
         rows.append(('l1 cost', f'{cost:.6g} at the stored poses'))
     return rows
 
 
 def complaints(record: GraphRecord) -> list[str]:
-    """Return one sentence on each thing that looks wrong with a graph."""
+    """Return a sentence on each thing that looks wrong with a graph but for what is struck out."""
+    record = replace(record, graph=record.graph.subset(record.graph.not_struck))
     checks: tuple[Callable[[GraphRecord], Iterator[str]], ...] = (
         _on_ids, _on_parts, _on_gaps, _on_repetitions, _on_steps, _on_noise)
     return [sentence for check in checks for sentence in check(record)]

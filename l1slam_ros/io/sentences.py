@@ -67,10 +67,11 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
     pairs = record.ids[factors.pairs]
     for row in judgement.slips.tolist():
         yield _SLIP.format(pair=_named(pairs[row]), sigmas=judgement.sigmas[row])
-    refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect)
+    refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect & ~factors.struck)
     suspect = np.flatnonzero(is_loop & judgement.suspect)
     if is_loop.any():
-        yield f'{len(refused):,} of {doubted(factors)} refused'
+        struck = f', {factors.struck.sum():,} struck out' if factors.struck.any() else ''
+        yield f'{len(refused):,} of {doubted(factors)} refused{struck}'
     worst = refused[np.argsort(-judgement.sigmas[refused], kind='stable')]
     for row in worst[:_NAMED].tolist():
         yield f'  {_named(pairs[row])}: {judgement.sigmas[row]:.1f} sigmas off the accepted ones'

@@ -102,6 +102,15 @@ def test_a_full_disk_is_one_line(graph, arguments):
     assert (done.returncode, done.stderr) == (2, 'l1slam: No space left on device\n')
 
 
+@pytest.mark.parametrize('name', ['SIGINT', 'SIGTERM'])
+def test_a_signal_leaves_nothing_half_written(graph, name):
+    code = ('import os, signal; from l1slam_ros.io.bags import from_graph; '
+            f'from_graph.recorded = lambda *_: os.kill(os.getpid(), signal.{name}); {RUN}')
+    done = l1slam('convert', 'graph.g2o', 'bag', code=code, cwd=graph.parent)
+    assert (done.returncode, done.stderr) == (130, '')
+    assert [path.name for path in graph.parent.iterdir()] == ['graph.g2o']
+
+
 def test_a_notebook_may_draw(graph):
     inline = os.environ | {'MPLBACKEND': 'of_another_environment'}
     done = l1slam('plot', graph, '--output', graph.with_suffix('.png'), env=inline)

@@ -118,6 +118,19 @@ def test_the_numbers_of_a_graph_with_everything(record_of, tmp_path):
         'absolute': '1', 'components': '1', 'time': '4.0 s'}
 
 
+def test_what_a_person_struck_out_is_counted_and_asked_no_more(rng):
+    world = simulate_world(200, 500, WorldOptions(), rng)
+    record = GraphRecord(world.graph, world.truth, np.arange(200))
+    cost, lies = dict(numbers(record))['l1 cost'], 10
+    world.graph.append_between(*(np.repeat(column[-1:], lies, axis=0) for column in (
+        np.array([3]), np.array([180]), np.array([[9.0, 9.0, 1.0]]), 100 * np.eye(3)[None])))
+    assert complaints(record) and dict(numbers(record))['l1 cost'] != cost
+    world.graph.say(len(world.graph.between) - 1 - np.arange(lies), trusted=False)
+    assert complaints(record) == []
+    found = dict(numbers(record))
+    assert found['loops'].endswith(', 10 of them struck out') and found['l1 cost'] == cost
+
+
 def test_the_cost_is_that_which_is_minimised(record_of, rng):
     vertices = [f'VERTEX_SE2 {k} {rng.normal()} {rng.normal()} {rng.normal()}'
                 for k in range(10, 15)]

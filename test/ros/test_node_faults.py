@@ -4,6 +4,7 @@
 import math
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs import saved_map
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.ros import publishing
+from l1slam_ros.ros.threads import inputs
 
 FAULTS = ['ValueError', 'MemoryError', 'nan']
 
@@ -136,6 +138,19 @@ def test_a_callback_that_fails(bench, monkeypatch, kind):
     b.drive(5, 7)
     b.until(lambda: len(b.path().poses) == 5 and is_ok(b), 'it is over')
     assert_all_finite(b)
+
+
+def test_an_intake_that_fails(bench, monkeypatch):
+    """At its begin, as where a signal shuts ROS down just then."""
+    ros = SimpleNamespace(WaitSet=inputs.rclpy_implementation.WaitSet)
+    monkeypatch.setattr(inputs, 'rclpy_implementation', ros)
+    fault = Fault(monkeypatch, ros, 'WaitSet', 'MemoryError')
+    fault.on = True
+    b = bench()
+    b.until(lambda: 'intake' in b.backend.failures.lasting, 'it fails')
+    fault.on = False
+    b.drive(0, 3)
+    b.until(lambda: len(b.path().poses) == 3 and is_ok(b), 'it is over')
 
 
 def test_a_publisher_that_fails(bench, monkeypatch):

@@ -25,9 +25,14 @@ def steps_of(graph: FactorGraph) -> Indices:
 
 
 def loops_of(graph: FactorGraph) -> Indices:
-    """Return the other factors in the order of the keyframes where they end, (l,)."""
-    rows = np.flatnonzero(~graph.between.is_odometry)
-    return rows[np.argsort(graph.between.j[rows], kind='stable')]
+    """
+    Return the other factors in the order of the keyframes where they end, (l,).
+
+    Of one end what is struck out is first: a strike means all loops of the same keyframes, and who
+    vouches for one of them has the last word.
+    """
+    factors, rows = graph.between, np.flatnonzero(~graph.between.is_odometry)
+    return rows[np.lexsort((~factors.struck[rows], factors.j[rows]))]
 
 
 def recorded(graph: FactorGraph,
@@ -50,9 +55,9 @@ def recorded(graph: FactorGraph,
         said = [LoopClosure(None if factors.i[row] == WORLD else stamps[factors.i[row]], stamp,
                             measured[row], covariances[row], bool(factors.trusted[row]))
                 for row in rows]
-        yield sample, said + [replace(loop, struck=True)
-                              for loop, struck in zip(said, factors.struck[rows], strict=True)
-                              if struck]
+        count = np.count_nonzero(factors.struck[rows])
+        yield sample, [*said[:count], *(replace(loop, struck=True) for loop in said[:count]),
+                       *said[count:]]
 
 
 def _chain(graph: FactorGraph, steps: Indices) -> Array:

@@ -211,7 +211,8 @@ class GraphBuilder:
             self.graph.copy(), track.keyframe_stamps, track.keyframe_poses, self.offset,
             track.last_stamp, track.last_pose,
             self._motion.covariance(self.options.odometry, self._verbatim),
-            loops.rows, in_graph, expired, loops.waiting.arrivals(track.last), loops.seen())
+            loops.rows, in_graph, expired, loops.waiting.arrivals(track.last), loops.seen(),
+            loops.struck_pairs)
 
     def restore(self, state: BuilderState) -> None:
         """Go on where a run ended; odometry that begins elsewhere begins a part there."""

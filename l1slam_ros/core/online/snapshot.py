@@ -98,7 +98,8 @@ class BuilderState:
     `GraphBuilder`; end : stamp [ns] of the last sample, end_pose (1, p) and end_covariance (d, d)
     of the motion to it from the last keyframe; loop_rows (k,), loop_stamps (k, 2) and expired
     (l, 2) [ns] : see `GraphBuilder`; waiting : loops, and how long each has waited [ns]; seen : of
-    each loop that came, by its identity, its factor, -1 for none.
+    each loop that came, by its identity, its factor, -1 for none; struck_pairs (s, 2) : the
+    keyframes between which loops are struck out, those to come too.
     """
 
     graph: FactorGraph
@@ -113,6 +114,7 @@ class BuilderState:
     expired: Indices
     waiting: tuple[tuple[LoopClosure, int], ...]
     seen: Mapping[bytes, int]
+    struck_pairs: Indices
 
     @staticmethod
     def of_graph(graph: FactorGraph, poses: Array, stamps: Indices) -> 'BuilderState':
@@ -120,8 +122,9 @@ class BuilderState:
         d, none = graph.manifold.TANGENT_SIZE, np.zeros((0, 2), np.int64)
         loops = np.flatnonzero(~graph.between.is_odometry)
         ends = np.sort(stamps[graph.between.pairs[loops]], axis=1)
+        struck = np.sort(graph.between.pairs[graph.between.struck], axis=1)
         return BuilderState(graph, stamps, poses, graph.manifold.identity(1), int(stamps[-1]),
-                      poses[-1:], np.zeros((d, d)), loops, ends, none, (), {})
+                      poses[-1:], np.zeros((d, d)), loops, ends, none, (), {}, struck)
 
 
 @dataclass(frozen=True)

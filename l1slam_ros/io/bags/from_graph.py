@@ -171,10 +171,10 @@ def _require_sayable(record: GraphRecord) -> None:
     if len(unsaid):
         raise GraphError(f'the odometry from vertex {ids[unsaid[0]]} leaves a component unsaid; '
                          'in a bag it says all')
-    trusted = factors.j[factors.is_absolute & factors.trusted]
-    if len(trusted):
-        raise GraphError(f'a trusted absolute pose of vertex {ids[trusted[0]]}; in a bag it would '
-                         'be doubted')
+    told = factors.j[factors.is_absolute & (factors.trusted | factors.struck)]
+    if len(told):
+        raise GraphError(f'an absolute pose of vertex {ids[told[0]]} that is trusted or struck '
+                         'out; in a bag it would be doubted')
 
 
 def _backward(record: GraphRecord) -> Mask:

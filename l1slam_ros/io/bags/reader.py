@@ -150,11 +150,11 @@ def read_note(path: str | os.PathLike[str]) -> dict[str, str]:
     bag = _bag_path(path)
     for file in [bag] if bag.is_file() else [bag, *storage_files(bag)]:
         try:
-            note = _note_in(file)
-        except Exception:  # damaged files make the libraries raise anything
+            note = {str(key): str(value) for key, value in _note_in(file).items()}
+        except Exception:  # damaged files, and notes that are none, make anything raise
             continue
         if note:
-            return {str(key): str(value) for key, value in note.items()}
+            return note
     return {}
 
 

@@ -213,10 +213,10 @@ def _noted_turns(graph: FactorGraph, note: dict[str, str]) -> Mask:
     odometry = graph.between.is_odometry
     turns = np.zeros(len(odometry), bool)
     for name, kind in (TURNED_STEPS, odometry), (TURNED_LOOPS, ~odometry):
-        numbers = np.array(note.get(name, '').split(), np.int64)
         rows = np.flatnonzero(kind)
+        numbers = [int(word) for word in note.get(name, '').split() if word.isdecimal()]
         # Of a damaged bag the last ones may be missing.
-        turns[rows[numbers[numbers < len(rows)]]] = True
+        turns[rows[[number for number in numbers if number < len(rows)]]] = True
     return turns
 
 

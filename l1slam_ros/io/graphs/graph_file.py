@@ -160,7 +160,7 @@ def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, e
     doubted = BetweenFactors(i, j, edges.pose, roots, none, none)
     trusted, struck = (remarks['trusted'], remarks['struck']) if remarks else (
         named_loops(path, name, ids, doubted) for name in ('trusted', 'struck'))
-    graph.append_between(i, j, edges.pose, roots, trusted, struck)
+    graph.append_between(i, j, edges.pose, roots, trusted & ~struck, struck & ~trusted)
 
 
 def _index(path: object, ids: Indices, rows: Rows) -> Indices:

@@ -114,7 +114,7 @@ class MapFile:
         try:
             sentence, well = self._loaded()
         except FileError as error:
-            sentence, well = f'the map begins empty: {error}', not self._path().exists()
+            sentence, well = f'the map begins empty: {error}', not os.path.exists(self._path())
         (tell if well else self._warn)(sentence)
 
     def is_due(self) -> bool:
@@ -139,9 +139,10 @@ def unusable_path(save_path: str) -> str:
     if not save_path:
         return ''
     path = _absolute(save_path)
-    if not path.parent.is_dir():
+    # Not the functions of `Path`: those raise where a name is too long.
+    if not os.path.isdir(path.parent):
         return f'save_path is {save_path!r}, but there is no folder {path.parent}'
-    return f'save_path is {save_path!r}, which is a folder' if path.is_dir() else ''
+    return f'save_path is {save_path!r}, which is a folder' if os.path.isdir(path) else ''
 
 
 def _absolute(path: str) -> Path:
@@ -151,7 +152,7 @@ def _absolute(path: str) -> Path:
 
 def _end_of(path: Path) -> bytes:
     """Return the last bytes of a file, of a saved map its checksum; none: there is no file."""
-    if not path.is_file():
+    if not os.path.isfile(path):
         return b''
     with path.open('rb') as file:
         file.seek(max(file.seek(0, os.SEEK_END) - _END, 0))

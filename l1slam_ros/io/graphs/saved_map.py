@@ -59,7 +59,7 @@ def load_map(path: Path) -> tuple[SavedMap, str, bool]:
     try:
         saved, which, whole = _read(path), f'{path}', True
     except FileError as error:
-        if not before.exists():
+        if not os.path.exists(before):
             raise
         try:
             saved, which, whole = _read(before), f'{before}, the map before: {error}', False
@@ -103,7 +103,7 @@ def _count(saved: SavedMap) -> int:
 def _keep(path: Path) -> None:
     """Let a file be that before it, too, unless it is damaged and that is not."""
     before = _before(path)
-    if path.exists() and (is_map(path) or not is_map(before)):
+    if os.path.exists(path) and (is_map(path) or not is_map(before)):
         keep_as(path, before)
 
 

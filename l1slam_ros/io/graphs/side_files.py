@@ -4,7 +4,8 @@ What lies beside a graph because no graph format has a place for it.
 
     <path>.stamps.txt    `id seconds`, one line for each vertex; or `seconds` alone, in their order
     <path>.trusted.txt   `i j`, the vertex ids of each loop that is never doubted
-    <path>.struck.txt    `i j`, of each loop that a person struck out
+    <path>.struck.txt    `i j`, of each loop that a person struck out; in both, loops are doubted:
+                         one of several between two vertices was struck out, another trusted
     <path>.truth.txt     `id x y theta`, true poses; see `trajectory`
     <path>.false.txt     `i j`, the vertex ids of each edge known to be a false loop
 """

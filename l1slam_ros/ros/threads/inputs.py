@@ -237,11 +237,11 @@ class Inputs:
     def _work(self) -> None:
         context = self._node.context
         with context.handle, self._guard.handle:
-            waiting = rclpy_implementation.WaitSet(
-                len(self._topics), 1, 0, 0, 0, 0, context.handle)
-            seconds = math.inf
+            waiting, seconds = None, math.inf
             while not self._closing and context.ok():
                 try:
+                    waiting = waiting or rclpy_implementation.WaitSet(
+                        len(self._topics), 1, 0, 0, 0, 0, context.handle)
                     self._wait(waiting, 0.0 if self._backlog else seconds)
                     self._take()
                     self._use()

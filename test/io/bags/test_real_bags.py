@@ -51,6 +51,13 @@ def test_the_note_is_found_in_every_kind_that_can_have_one(tmp_path, world, kind
     assert_same_graph(read_input(KINDS[kind](tmp_path, world[1])), world[2])
 
 
+@pytest.mark.parametrize('note', [
+    'a word', '[1, 2]', '{turned_loops: a -1 99999999999999999999, turned_steps: [3]}'])
+def test_a_note_that_says_nothing_is_none(tmp_path, world, note):
+    path = rosbag2_directory(tmp_path / 'a', world[1], StoragePlugin.MCAP, note=note)
+    assert_same_graph(read_input(path, EVERY), world[2])
+
+
 def test_a_robot_without_our_note_goes_by_the_defaults_of_the_node(tmp_path, world):
     # 16 messages a metre and 20 a second, straight on; no word on their errors.
     template = TYPES.deserialize_cdr(world[1][0][3], ODOMETRY)

@@ -270,6 +270,14 @@ def test_trust_joins_loops_either_way_round_and_leaves_odometry(write):
     assert not read_graph_file(path).graph.between.trusted.any()
 
 
+def test_what_is_said_of_one_of_two_loops_between_the_same_keyframes_is_no_word_on_both(write):
+    path = write(f'{SQUARE}EDGE_SE2 9 3 1 0 0 1 0 0 1 0 1\n')
+    for name in 'trusted', 'struck':
+        beside(path, name).write_text('3 9\n')
+    factors = read_graph_file(path).graph.between
+    assert not (factors.trusted | factors.struck).any()
+
+
 @pytest.mark.parametrize(('text', 'message'), [
     ('3 9\n\n3 x\n', ":3: trusted loop: 'x' is not a whole number of 64 bits; expected 2 whole"),
     ('3 9 1\n', ':1: trusted loop: 3 fields; expected 2 whole numbers'),

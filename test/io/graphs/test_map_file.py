@@ -208,6 +208,14 @@ def test_where_no_file_can_be_is_said(tmp_path):
     assert unusable_path('~no one/map.g2o').endswith('there is no folder ' + str(
         Path('~no one').absolute()))
     assert unusable_path(str(tmp_path)) == f"save_path is '{tmp_path}', which is a folder"
+    # Too long a name is said by whoever reads or writes it, and ends nothing.
+    robot = Robot(tmp_path / f'{"m" * 300}.g2o')
+    assert not unusable_path(robot.options.save_path)
+    assert robot.load_at_start().endswith(': File name too long')
+    robot.drive(3)
+    for call in robot.map_file.save, robot.map_file.autosave, robot.map_file.load:
+        with pytest.raises(FileError, match='File name too long'):
+            call()
 
 
 def test_without_a_name_nothing_is_loaded(tmp_path):

@@ -22,6 +22,8 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_
 from l1slam_ros.io.graphs.saved_map import is_map, load_map, save_map
 
 PLENTY = 60.0
+# Struck out before it comes.
+TO_COME = loop(0.6, 3.2, (3.0, 1.0, 0.5))
 
 
 @pytest.fixture(scope='module')
@@ -45,6 +47,7 @@ def first_half(world):
                              reference_stamp=None))
     for struck in False, True:
         backend.add_loop(replace(loop(0.3, 3.5, (3.0, 1.0, 0.5)), struck=struck))
+    backend.add_loop(replace(TO_COME, struck=True))
     settle(backend)
     backend.add_loop(replace(loop(0.0, 6.0, (7.0, 8.0, 0.0), np.diag([1, 1, 0, 0, 0, np.inf])),
                              reference_stamp=None))
@@ -107,8 +110,10 @@ def test_what_is_loaded_goes_on_as_if_nothing_had_been(world, halfway, tmp_path,
         patch.setattr(upkeep, 'improve', None)
         assert backend.update(PLENTY) is None
     for one in backend, undisturbed:
+        one.add_loop(TO_COME)
         play(one, world, 50)
         settle(one)
+        assert one.snapshot().graph.between.struck.sum() == 2
     a, b = (one.saved().optimised for one in (backend, undisturbed))
     np.testing.assert_allclose(a.poses, b.poses, atol=1e-3)
     assert a.cost == pytest.approx(b.cost, rel=1e-6)

@@ -65,10 +65,10 @@ class LoopFactors:
         """Begin with an empty graph; loops that wait may yet find odometry of their times."""
         # The clock that they came by was none, or goes otherwise now.
         self.waiting.begin_anew(lambda stamp: stamp, 0)
-        # Of each loop by its identity, whether it is trusted; and its row once it is a factor.
-        self._seen = {one.key: one.loop.trusted for one in self.waiting.all()}
+        # The loops that came, by their identities; and their rows once they are factors.
+        self._seen = {one.key for one in self.waiting.all() if not one.loop.struck}
         self._row_of: dict[bytes, int] = {}
-        # Keyframes of the loops that are struck out, and the stamps they were named by.
+        # Keyframes of the loops that are struck out, those to come too.
         self._struck: set[tuple[int, int]] = set()
         self._expired = GrowingArray((2,), np.int64)
         self._stamps = GrowingArray((2,), np.int64)
@@ -88,6 +88,11 @@ class LoopFactors:
         """Which between factors of the graph are loops, (k,)."""
         return self._rows.view()
 
+    @property
+    def struck_pairs(self) -> Indices:
+        """The keyframes between which loops are struck out, those to come too, (k, 2)."""
+        return np.array(sorted(self._struck), np.int64).reshape(-1, 2)
+
     def seen(self) -> dict[bytes, int]:
         """Return of each loop that came, by its identity, its factor, -1 for none."""
         return {key: self._row_of.get(key, -1) for key in self._seen}
@@ -98,12 +103,9 @@ class LoopFactors:
         self._expired.extend(state.expired)
         for loop, age in state.waiting:
             self.add(loop, track, options, age)
-        factors = state.graph.between
-        for key, row in state.seen.items():
-            if row >= 0:
-                self._row_of[key] = row
-            self._seen[key] = self._seen.get(key, False) or bool(row >= 0 and factors.trusted[row])
-        self._struck.update(map(tuple, factors.pairs[factors.struck].tolist()))
+        self._seen.update(state.seen)
+        self._row_of.update({key: row for key, row in state.seen.items() if row >= 0})
+        self._struck.update(map(tuple, state.struck_pairs.tolist()))
 
     def add(self, loop: LoopClosure, track: OdometryTrack, options: LoopOptions,
             age: int = 0) -> None:
@@ -113,12 +115,12 @@ class LoopFactors:
             return
         measurement = _said(self._manifold, loop, covariance)
         key = noise.loop_identity(*loop.stamps, measurement, covariance)
+        # Of what a person says the last word counts, though it was said before.
         if not loop.struck:
-            known = self._seen.get(key)
-            if known is not None and known >= loop.trusted and not self._verbatim:
+            if key in self._seen and not (loop.trusted or self._verbatim):
                 self._refuse('repeated', loop, 'was sent before; expected each loop once')
                 return
-            self._seen[key] = loop.trusted
+            self._seen.add(key)
         begin, end = map(track.time, loop.stamps)
         arrival = track.last - age if len(track) else 0
         self.waiting.add(WaitingLoop(loop, arrival, begin, end, measurement, covariance, key))
@@ -135,7 +137,7 @@ class LoopFactors:
             self._refuse('expired', one.loop, f'waited for odometry until {track.last_stamp} ns; '
                          'expected odometry of its times')
             # Sent again when odometry has come that far, it is welcome.
-            self._seen.pop(one.key, None)
+            self._seen.discard(one.key)
         return self._add_due(due, graph, track, options) if due else 0
 
     def _add_due(self, due: list[WaitingLoop], graph: FactorGraph, track: OdometryTrack,
