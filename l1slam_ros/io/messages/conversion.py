@@ -17,6 +17,7 @@ Covariances pass as they come: `graph_builder` decides what they are worth.
 """
 
 import re
+from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -136,6 +137,14 @@ def absolute_pose(message: Any, map_frame: str) -> LoopClosure:
     if silent_components(covariance[None], absolute=True)[0, 3:].all():
         rotation = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
     return LoopClosure(None, stamp, checked_pose3(position, rotation), covariance)
+
+
+# Topic -> what a PoseWithCovarianceStamped on it says, by the frames of the robot and of the map.
+LOOPS: dict[str, Callable[[Any, str, str], LoopClosure]] = {
+    'loop_closures': lambda message, base, _: loop_closure(message, base, False),
+    'trusted_loop_closures': lambda message, base, _: loop_closure(message, base, True),
+    'false_loop_closures': lambda message, base, _: false_loop(message, base),
+    'absolute_poses': lambda message, _, of_map: absolute_pose(message, of_map)}
 
 
 def stamped_pose(message: Any) -> tuple[int, Array]:

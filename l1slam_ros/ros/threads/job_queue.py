@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from rclpy.node import Node
 from rclpy.task import Future
+from std_srvs.srv import Trigger
 
 from l1slam_ros.core.errors import Interrupted, L1SlamError
 from l1slam_ros.ros.threads.background import background
@@ -14,14 +15,6 @@ from l1slam_ros.ros.threads.failures import Failures, reason
 
 # [s] A service that failed may not be called again: its failure is told for so long.
 _REMEMBERED = 60.0
-
-
-@dataclass(frozen=True)
-class Answer:
-    """What a service replies."""
-
-    success: bool
-    message: str
 
 
 @dataclass(frozen=True)
@@ -56,7 +49,7 @@ class JobQueue:
         self._thread.start()
 
     def put(self, name: str, work: Callable[[], str]) -> Future:
-        """Queue some work, which returns a sentence; the future's result is an `Answer`."""
+        """Queue some work, which returns a sentence; the future's result is the answer."""
         future = Future(executor=self._node.executor)
         self._queue.put(_Job(name, work, future))
         return future
@@ -73,17 +66,16 @@ class JobQueue:
             if (executor := self._node.executor) is not None:
                 executor.wake()  # it looks whether the answer is there only when it is up
 
-    def _carry_out(self, job: _Job) -> Answer:
+    def _carry_out(self, job: _Job) -> Trigger.Response:
         try:
-            answer = Answer(True, job.work())
+            sentence = job.work()
             self._done()
         except Interrupted:
-            return Answer(False, 'the node is ending')
-        except (L1SlamError, OSError) as error:
-            # The caller is told: the fault lies with the call, not with the node.
-            return Answer(False, reason(error))
+            return Trigger.Response(success=False, message='the node is ending')
         except Exception as error:
-            self._failures.note(job.name, error, _REMEMBERED)
-            return Answer(False, reason(error))
+            # Of ours the caller is told: the fault lies with the call, not with the node.
+            if not isinstance(error, L1SlamError | OSError):
+                self._failures.note(job.name, error, _REMEMBERED)
+            return Trigger.Response(success=False, message=reason(error))
         self._failures.over(job.name)
-        return answer
+        return Trigger.Response(success=True, message=sentence)
