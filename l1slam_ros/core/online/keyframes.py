@@ -210,9 +210,8 @@ class KeyframeMotion:
         total = stated.sum(axis=0, keepdims=True)
         if verbatim:
             return total[0] if noise.usable(total)[0] else None
-        known, out = noise.or_model(total, model, noise.MOST_VARIANCE)
-        used, large = noise.at_most(known, noise.MOST_OF_ODOMETRY)
-        self.bounded = noise.bounds(total, used, out | large)
+        used, self.bounded = noise.within_bounds(
+            total, model, noise.MOST_OF_ODOMETRY, noise.MOST_VARIANCE)
         # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
         return used[0] if len(stated) == 1 or noise.usable(used)[0] else None
 
