@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l1slam_ros.core.errors import NoiseError
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Manifold
 
 Mask = NDArray[np.bool_]
 
@@ -146,6 +146,13 @@ def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Ar
     digits = np.rint(1e6 * np.concatenate((np.log(sigma), correlation.ravel()))).astype(np.int64)
     whole = b'%d %d ' % (reference, stamp) + measurement.tobytes() + digits.tobytes()
     return blake2b(whole, digest_size=16).digest()
+
+
+def sigmas(manifold: Manifold, translation: float, rotation: float) -> Array:
+    """Return the standard deviations of a step, (d,), of two for all axes [m], [rad]."""
+    sigma = np.zeros(manifold.TANGENT_SIZE)
+    sigma[manifold.TRANSLATION], sigma[manifold.ROTATION] = translation, rotation
+    return sigma
 
 
 def root_of_inverse(covariance: Array) -> Array:

@@ -48,10 +48,7 @@ class OdometryOptions(Options):
 
 def diagonal_covariance(manifold: Manifold, translation: float, rotation: float) -> Array:
     """Return diag(translation^2, ..., rotation^2, ...), (d, d), from two sigmas [m], [rad]."""
-    sigma = np.zeros(manifold.TANGENT_SIZE)
-    sigma[manifold.TRANSLATION] = translation
-    sigma[manifold.ROTATION] = rotation
-    return np.diag(sigma**2)
+    return np.diag(noise.sigmas(manifold, translation, rotation) ** 2)
 
 
 def reduced_covariance(manifold: Manifold, covariance: Array) -> Array:

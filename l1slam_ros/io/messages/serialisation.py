@@ -71,7 +71,7 @@ def path_bytes(frame: str, stamp: int, stamps: Indices, pose3: Array) -> bytes:
 
 
 def pose_bytes(frame: str, stamp: int, pose3: Array) -> bytes:
-    """Return a serialised geometry_msgs/PoseStamped: one pose (7,) at one time [ns]."""
+    """Return a serialised PoseStamped: a pose (7,) at a time [ns]; or WithCovariance, (43,)."""
     return cdr((4, header_bytes(frame, stamp)), (8, pose3.tobytes()))
 
 
