@@ -99,7 +99,7 @@ def pose_with_covariance(frame: str, stamp: int, manifold: Manifold, pose: Array
     Ad = manifold.adjoint(manifold.from_pose3(turn))[0]
     rows, whole = np.array(manifold.COVARIANCE_ROWS), np.zeros((6, 6))
     whole[rows[:, None], rows] = Ad @ covariance @ Ad.T
-    return pose_bytes(frame, stamp, np.concatenate((pose3[0], whole.ravel())))
+    return pose_bytes(frame, stamp, pose3[0], whole)
 
 
 def header(frame: str, stamp: int) -> Header:
