@@ -156,8 +156,7 @@ def _measured(
         sigmas(manifold, options.odometry_sigma_translation, options.odometry_sigma_rotation),
         sigmas(manifold, options.loop_sigma_translation, options.loop_sigma_rotation)))
     noise = sigma[is_loop] * rng.standard_normal((len(i), manifold.TANGENT_SIZE))
-    graph = FactorGraph(manifold)
-    graph.add_poses(len(truth))
+    graph = FactorGraph(manifold, len(truth))
     graph.add_between(i, j, manifold.retract(manifold.between(truth[i], truth[j]), noise),
                       (sigma[:, :, None] ** -2 * np.eye(manifold.TANGENT_SIZE))[is_loop])
     return graph

@@ -98,8 +98,7 @@ def read_graph_file(path: str | os.PathLike[str],
         kept = ~np.isin(ids, anchors)
         ids, vertices = ids[kept], vertices.chosen(kept) if len(vertices) else vertices
         edges = edges.chosen(np.flatnonzero(np.isin(edges.ids, anchors).sum(axis=1) == 0))
-    graph = FactorGraph(manifold)
-    graph.add_poses(len(ids))
+    graph = FactorGraph(manifold, len(ids))
     _add_edges(path, graph, ids, edges, remarks)
     return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
                        _stamps(path, ids, remarks), (*skipped, *_skipped(groups, ids, anchors)),
