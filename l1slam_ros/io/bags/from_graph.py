@@ -35,11 +35,10 @@ from l1slam_ros.io.bags.topics import (
     TRUTH_TOPIC,
 )
 from l1slam_ros.io.bags.writer import new_bag
-from l1slam_ros.io.files import NANOSECONDS
+from l1slam_ros.io.files import LAST_STAMP
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.messages.conversion import reference_frame_id
 from l1slam_ros.io.messages.serialisation import odometry_bytes, pose_bytes
-from l1slam_ros.io.trajectory import invented_stamps
 
 # What `reader.read_note` returns for a graph.
 GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
@@ -53,8 +52,6 @@ TURNED_STEPS, TURNED_LOOPS = 'turned_steps', 'turned_loops'
 _BASE_FRAME = 'base_link'
 _ODOMETRY, _TRUTH = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped'
 _LOOP = 'geometry_msgs/msg/PoseWithCovarianceStamped'
-# builtin_interfaces/Time holds its seconds in 32 bits.
-_LAST_STAMP = 2**31 * NANOSECONDS - 1
 
 
 def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
@@ -168,11 +165,11 @@ def _turned_note(graph: FactorGraph, backward: Mask) -> dict[str, str]:
 
 def _stamps(record: GraphRecord) -> list[int]:
     """Return the stamps [ns], each after the one before."""
-    stamps = invented_stamps(len(record.ids)) if record.stamps is None else record.stamps
+    stamps = record.times
     if not len(stamps):
         raise GraphError('a graph without vertices; expected one at least')
     bad = np.flatnonzero(np.diff(stamps, prepend=0) <= 0)
-    if len(bad) or stamps[-1] > _LAST_STAMP:
+    if len(bad) or stamps[-1] > LAST_STAMP:
         k = bad[0] if len(bad) else -1
         raise GraphError(f'vertex {record.ids[k]} has the stamp {stamps[k]} ns; expected one '
                          'after 0, after that of the vertex before, and before the year 2038')

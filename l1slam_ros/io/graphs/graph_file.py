@@ -23,6 +23,7 @@ from l1slam_ros.io.files import (
     counted,
     first_failure,
     formatted,
+    invented_stamps,
     put_lines,
     quoted,
     replacing,
@@ -70,6 +71,11 @@ class GraphRecord:
     damage: str = ''
     rotation_information: str = QUATERNION
     remarks: Remarks = None
+
+    @property
+    def times(self) -> Indices:
+        """The stamps [ns], (n,), invented where there are none."""
+        return invented_stamps(self.graph.n_poses) if self.stamps is None else self.stamps
 
 
 def read_graph_file(path: str | os.PathLike[str],
