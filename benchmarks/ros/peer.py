@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-# Their own domain: nobody else's messages are counted.
-os.environ.setdefault('ROS_DOMAIN_ID', '94')
+# A domain of its own, which its children share: nobody else's messages are counted.
+os.environ.setdefault('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 import rclpy
