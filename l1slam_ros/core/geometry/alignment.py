@@ -8,7 +8,7 @@ In: poses, or positions [m]. Out: the truth at the times of the estimate; the er
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
-from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold, interpolate
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 
 
 def poses_at(
@@ -34,7 +34,7 @@ def poses_at(
     rows = np.flatnonzero(inside | (np.minimum(np.abs(since), np.abs(until)) <= tolerance))
     part = np.clip(since[rows] / gap[rows], 0.0, 1.0)
     later = after[rows]
-    return rows, interpolate(manifold, poses[later - 1], poses[later], part)
+    return rows, manifold.interpolate(poses[later - 1], poses[later], part)
 
 
 def align(estimate: Array, truth: Array) -> tuple[Array, Array]:

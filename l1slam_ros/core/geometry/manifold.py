@@ -78,6 +78,9 @@ class Manifold(Protocol):
     def local_jacobian(self, a: Array, b: Array) -> Array:
         """Return J_l_b of `local`, (n, d, d)."""
 
+    def interpolate(self, a: Array, b: Array, fraction: Array) -> Array:
+        """Return the poses at `fraction` (n,) of the way from a to b, (n, p)."""
+
     def motion(self, step: Array) -> tuple[Array, Array]:
         """Return the length [m] and the angle [rad] of each relative pose given as a step."""
 
@@ -95,8 +98,3 @@ class Manifold(Protocol):
 
     def to_pose3(self, pose: Array) -> Array:
         """Return rows x y z qx qy qz qw (ROS order), (n, p) -> (n, 7)."""
-
-
-def interpolate(manifold: Manifold, a: Array, b: Array, fraction: Array) -> Array:
-    """Return the poses at `fraction` (n,) of the way from a to b, as one step goes it, (n, p)."""
-    return manifold.retract(a, fraction[..., None] * manifold.local(a, b))

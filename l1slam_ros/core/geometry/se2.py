@@ -125,6 +125,11 @@ def local_jacobian(a: Array, b: Array) -> Array:
     return J
 
 
+def interpolate(a: Array, b: Array, fraction: Array) -> Array:
+    """Return a v2t(fraction t2v(a^-1 b)), (n, 3)."""
+    return retract(a, fraction[..., None] * local(a, b))
+
+
 def motion(step: Array) -> tuple[Array, Array]:
     """Return the length [m] and the angle [rad] of each relative pose, (n,) and (n,)."""
     return np.hypot(step[..., 0], step[..., 1]), np.abs(step[..., 2])

@@ -181,6 +181,11 @@ def local_jacobian(a: Array, b: Array) -> Array:
     return J
 
 
+def interpolate(a: Array, b: Array, fraction: Array) -> Array:
+    """Return the poses along a straight line and at an even turn, (n, 7)."""
+    return retract(a, fraction[..., None] * local(a, b))
+
+
 def motion(step: Array) -> tuple[Array, Array]:
     """Return the length [m] and the angle [rad] of each relative pose, (n,) and (n,)."""
     return np.linalg.norm(step[..., :3], axis=-1), np.linalg.norm(step[..., 3:], axis=-1)

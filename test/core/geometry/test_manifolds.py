@@ -7,7 +7,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from l1slam_ros.core.geometry import se2, se3
-from l1slam_ros.core.geometry.manifold import interpolate
 
 MANIFOLDS = [se2, se3]
 N = 20
@@ -177,12 +176,12 @@ def test_local_jacobian_equals_differences(manifold, triple, error, rng):
 
 def test_interpolation_goes_from_end_to_end_by_equal_parts(manifold, triple):
     a, b, _ = triple
-    parts = [interpolate(manifold, a, b, np.full(N, t)) for t in (0.0, 0.25, 1.0)]
+    parts = [manifold.interpolate(a, b, np.full(N, t)) for t in (0.0, 0.25, 1.0)]
     assert_same(manifold, parts[0], a)
     assert_same(manifold, parts[2], b)
     assert_allclose(manifold.local(a, parts[1]), manifold.local(a, b) / 4, atol=1e-12)
     fraction = np.linspace(0, 1, N)
-    each = manifold.local(a, interpolate(manifold, a, b, fraction))
+    each = manifold.local(a, manifold.interpolate(a, b, fraction))
     assert_allclose(each, fraction[:, None] * manifold.local(a, b), atol=1e-12)
 
 

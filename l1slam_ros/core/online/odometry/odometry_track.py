@@ -12,7 +12,7 @@ interpolation between their neighbours would miss by more than any measurement m
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold, interpolate
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import LEAST_VARIANCE, Mask
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.measurements import LONGEST_PAUSE
@@ -169,8 +169,8 @@ class OdometryTrack:
             ends = np.flatnonzero(rest)
             after = np.clip(np.searchsorted(ends, np.arange(len(times))), 1, None)
             i, j = ends[after - 1], ends[after]
-            found = interpolate(manifold, poses[i], poses[j],
-                                (times - times[i]) / (times[j] - times[i]))
+            found = manifold.interpolate(
+                poses[i], poses[j], (times - times[i]) / (times[j] - times[i]))
             metres, radians = manifold.motion(manifold.local(found, poses))
             missed = np.zeros(len(ends), bool)
             missed[after[np.maximum(metres, radians) > _MISSED]] = True
@@ -237,7 +237,7 @@ class OdometryTrack:
         before = np.maximum(after - 1, first)
         span = np.maximum(samples[after] - samples[before], 1)
         fraction = np.minimum((times - samples[before]) / span, 1.0)
-        return interpolate(self._manifold, poses[before], poses[after], fraction)
+        return self._manifold.interpolate(poses[before], poses[after], fraction)
 
     def _part(self, times: Indices, column: int, count: int) -> tuple[Indices, Indices]:
         """Return the first sample or keyframe, and past the last, of the part of each time."""
