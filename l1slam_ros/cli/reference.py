@@ -77,8 +77,6 @@ def _read(source: str, record: GraphRecord, input_path: Path) -> Reference:
         from l1slam_ros.io.bags.to_graph import read_truth_topic
 
         path = input_path if bag == 'bag' and is_bag(input_path) else Path(bag)
-        if not path.exists():
-            raise FileError(path, 'no such file or directory')
         return read_truth_topic(path, f'/{topic}', record.graph.manifold)
     return read_reference(source, record.graph.manifold, by_stamps=record.stamps is not None)
 

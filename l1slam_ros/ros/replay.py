@@ -127,7 +127,8 @@ class Player:
             recorded = (message.time - first) / NANOSECONDS
             while self._clock is not None and next_clock <= recorded:
                 _sleep_until(began + next_clock / rate)
-                self._publish_clock(first + round(next_clock * NANOSECONDS))
+                now = header('', first + round(next_clock * NANOSECONDS)).stamp
+                self._clock.publish(Clock(clock=now))
                 next_clock += _CLOCK_PERIOD
             _sleep_until(began + recorded / rate)
             self.publishers[message.topic].publish(message.data)
@@ -140,10 +141,6 @@ class Player:
         moment = Duration(seconds=_PAUSE)
         while not all(p.wait_for_all_acked(moment) for p in self.publishers.values()):
             _sleep_until(time.monotonic())  # an interrupt is seen between the waits
-
-    def _publish_clock(self, stamp: int) -> None:
-        assert self._clock is not None
-        self._clock.publish(Clock(clock=header('', stamp).stamp))
 
 
 def _sleep_until(moment: float) -> None:

@@ -118,8 +118,8 @@ class KeyframeMotion:
         """
         Continue to a sample; where it makes a keyframe, return the motion, and begin there.
 
-        unseen : how far and by which angle the robot may have gone instead; that is a keyframe:
-        what is published goes by the last one
+        unseen : the sample is at the same place, to which the robot may have gone so far and by
+        such an angle; that is a keyframe: what is published goes by the last one
 
         Returns
         -------
@@ -127,7 +127,8 @@ class KeyframeMotion:
 
         """
         if unseen is not None:
-            self._add_unseen(sample, *unseen)
+            self._unseen = self._unseen + diagonal_covariance(self._manifold, *unseen)
+            self._stamp = sample.stamp
         else:
             self.add(sample, pose, odometry)
             if not self.is_keyframe(keyframe):
@@ -167,11 +168,6 @@ class KeyframeMotion:
         end = self._poses[-1]
         total = self._seen_from(end)
         self._poses, self._stated = [end], None if total is None else [total.sum(axis=0)]
-
-    def _add_unseen(self, sample: OdometrySample, metres: float, radians: float) -> None:
-        """Continue to a sample at the same place, to which the robot may have gone some way."""
-        self._unseen = self._unseen + diagonal_covariance(self._manifold, metres, radians)
-        self._stamp = sample.stamp
 
     def is_keyframe(self, options: KeyframeOptions) -> bool:
         """Tell whether the motion passes any threshold that is on."""

@@ -3,7 +3,6 @@
 
 import queue
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from rclpy.node import Node
 from rclpy.task import Future
@@ -15,13 +14,6 @@ from l1slam_ros.ros.threads.failures import Failures, reason
 
 # [s] A service that failed may not be called again: its failure is told for so long.
 _REMEMBERED = 60.0
-
-
-@dataclass(frozen=True)
-class _Job:
-    name: str
-    work: Callable[[], str]
-    future: Future
 
 
 class JobQueue:
@@ -41,7 +33,9 @@ class JobQueue:
 
     def __init__(self, node: Node, failures: Failures, done: Callable[[], None]):
         self._node, self._failures, self._done = node, failures, done
-        self._queue: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        # What it is called, what is to be done, and where its answer goes; None: the end.
+        self._queue: queue.SimpleQueue[tuple[str, Callable[[], str], Future] | None] = (
+            queue.SimpleQueue())
         self._thread = background('services', self._work)
 
     def start(self) -> None:
@@ -51,7 +45,7 @@ class JobQueue:
     def put(self, name: str, work: Callable[[], str]) -> Future:
         """Queue some work, which returns a sentence; the future's result is the answer."""
         future = Future(executor=self._node.executor)
-        self._queue.put(_Job(name, work, future))
+        self._queue.put((name, work, future))
         return future
 
     def close(self, seconds: float) -> bool:
@@ -62,20 +56,21 @@ class JobQueue:
 
     def _work(self) -> None:
         while (job := self._queue.get()) is not None:
-            job.future.set_result(self._carry_out(job))
+            name, work, future = job
+            future.set_result(self._carry_out(name, work))
             if (executor := self._node.executor) is not None:
                 executor.wake()  # it looks whether the answer is there only when it is up
 
-    def _carry_out(self, job: _Job) -> Trigger.Response:
+    def _carry_out(self, name: str, work: Callable[[], str]) -> Trigger.Response:
         try:
-            sentence = job.work()
+            sentence = work()
             self._done()
         except Interrupted:
             return Trigger.Response(success=False, message='the node is ending')
         except Exception as error:
             # Of ours the caller is told: the fault lies with the call, not with the node.
             if not isinstance(error, L1SlamError | OSError):
-                self._failures.note(job.name, error, _REMEMBERED)
+                self._failures.note(name, error, _REMEMBERED)
             return Trigger.Response(success=False, message=reason(error))
-        self._failures.over(job.name)
+        self._failures.over(name)
         return Trigger.Response(success=True, message=sentence)
