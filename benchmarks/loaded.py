@@ -31,8 +31,8 @@ from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.snapshot import BuilderState, Optimised, SavedMap
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.compilation import load
+from l1slam_ros.io.files import invented_stamps
 from l1slam_ros.io.graphs.saved_map import load_map, save_map
-from l1slam_ros.io.trajectory import invented_stamps
 from l1slam_ros.paper.updates import Drive
 
 KEYFRAMES, EDGES, REST, RATE = 50_000, 80_000, 1_000, 100.0

@@ -146,8 +146,7 @@ def chain_of(n):
 
 def graph_of(truth, pairs, noise=0.0, information=USUAL):
     """Return the graph that measures the pairs (m, 2) of the poses `truth` (n, 3)."""
-    graph = FactorGraph(se2)
-    graph.add_poses(len(truth))
+    graph = FactorGraph(se2, len(truth))
     measure(graph, truth, *np.array(pairs).T, noise, information)
     return graph
 

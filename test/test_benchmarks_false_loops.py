@@ -103,8 +103,7 @@ def test_a_session_begins_anywhere(place, name, parts):
                          if each.suite == 'variants' and not each.lies))
 def test_what_is_told_otherwise_is_as_true(place, name):
     truth, factors = place.best, place.graph.between
-    exact = FactorGraph(se2)
-    exact.add_poses(len(truth))
+    exact = FactorGraph(se2, len(truth))
     exact.append_between(factors.i, factors.j, se2.between(truth[factors.i], truth[factors.j]),
                          factors.sqrt_information)
     told = places.place_of('world', exact, None, places.error_by_time(truth[:, :2]))

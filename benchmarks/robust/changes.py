@@ -177,8 +177,7 @@ CHANGES: dict[str, Callable[..., Changed]] = {
 def _with(graph: FactorGraph, measurement: Array | None = None,
           information: Array | None = None) -> FactorGraph:
     factors = graph.between
-    new = FactorGraph(graph.manifold)
-    new.add_poses(graph.n_poses)
+    new = FactorGraph(graph.manifold, graph.n_poses)
     new.add_between(factors.i, factors.j, factors.measurement if measurement is None
                     else measurement, information_of(graph) if information is None
                     else information)

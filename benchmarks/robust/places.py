@@ -179,8 +179,7 @@ def _ring() -> Place:
 def _measured(truth: Array, i: Indices, j: Indices) -> FactorGraph:
     sigma, rng = np.array([0.05, 0.05, 0.005]), np.random.default_rng(0)
     exact = se2.between(truth[i], truth[j])
-    graph = FactorGraph(se2)
-    graph.add_poses(len(truth))
+    graph = FactorGraph(se2, len(truth))
     graph.add_between(i, j, se2.retract(exact, sigma * rng.standard_normal(exact.shape)),
                       np.broadcast_to(np.diag(sigma**-2), (len(i), 3, 3)))
     return graph

@@ -160,8 +160,7 @@ def _covariance(roots: Array) -> Array:
 def _told(place: Place, keyframes: Indices, rows: Indices, i: Indices, j: Indices, Z: Array,
           roots: Array, times: Array | float = 1.0) -> Place:
     """Return a place of some keyframes of another, each factor one of its rows told otherwise."""
-    graph = FactorGraph(place.graph.manifold)
-    graph.add_poses(len(keyframes))
+    graph = FactorGraph(place.graph.manifold, len(keyframes))
     graph.add_between(i, j, Z, roots.transpose(0, 2, 1) @ roots)
     error = place.truth_error
     return Place(place.name, graph, None, place.is_false[rows], place.is_true[rows],

@@ -20,30 +20,18 @@ one step of it is never told: what the loops allow is how far the undisturbed ma
 solved without that step, end from what they say with it.
 """
 
-import argparse
-import os
-import signal
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-# Its own domain: nobody else's messages are counted.
-os.environ.setdefault('ROS_DOMAIN_ID', '96')
-os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from nav_msgs.msg import Path as PathMessage
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from peer import KINDS, Peer, arguments
 from rclpy.serialization import deserialize_message, serialize_message
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import Trigger
 
 import l1slam_ros as l1
 from l1slam_ros.core.geometry import se2
@@ -56,17 +44,14 @@ from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
 from l1slam_ros.io.graphs.saved_map import load_map
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.io.messages.conversion import stamp_of, stamped_pose
-from l1slam_ros.ros.demo import executable
 from l1slam_ros.ros.publishing import header
 
 BAG, RATE = Path('bags/demo'), 20.0
 _SECOND = 10**9  # [ns]
-_KINDS = {ODOMETRY_TOPIC: Odometry, LOOP_TOPIC: PoseWithCovarianceStamped}
 _TICK = _SECOND // 20  # [ns] from one message on /clock to the next
 _PAUSE, _BACK = 3.0, 20 * _SECOND  # [s], [ns]
 _EXACT = 1e-4  # [m], [rad] what is nearer is the same
 _NEAR = 0.05  # [m]
-_PATIENCE = 300.0  # [s]
 
 # What comes when, in the order it is sent: time on the clock [ns], topic, None: only the clock.
 Event = tuple[int, str | None, bytes]
@@ -81,34 +66,13 @@ class Undisturbed:
     stamps: Indices
 
 
-class Robot:
-    """The node as a process, and a peer that plays to it."""
+class Robot(Peer):
+    """A peer that plays, by a clock of its own where that is wanted."""
 
     def __init__(self, sim_time: bool, path: Path):
         self.path = path
-        self.process = subprocess.Popen([
-            executable('backend'), '--ros-args', '--log-level', 'error',
-            '-p', f'save_path:={path}', '-p', f'use_sim_time:={str(sim_time).lower()}'])
-        self.node = rclpy.create_node('player')
-        self.maps: list[PathMessage] = []
-        self.said: dict[str, str] = {}
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.node.create_subscription(PathMessage, 'path', self.maps.append, latched)
-        self.node.create_subscription(
-            DiagnosticArray, '/diagnostics',
-            lambda m: self.said.update({v.key: v.value for v in m.status[0].values}), 10)
-        self.publishers = {topic: self.node.create_publisher(kind, topic, QoSProfile(depth=1000))
-                           for topic, kind in _KINDS.items()}
+        super().__init__({'save_path': path, 'use_sim_time': str(sim_time).lower()})
         self.clock = self.node.create_publisher(Clock, '/clock', 10) if sim_time else None
-        self.until(lambda: bool(self.said) and all(
-            p.get_subscription_count() for p in self.publishers.values()))
-
-    def until(self, condition: Callable[[], bool]) -> None:
-        """Listen until something holds."""
-        deadline = time.monotonic() + _PATIENCE
-        while not condition():
-            assert time.monotonic() < deadline, f'waited {_PATIENCE} s in vain: {self.said}'
-            rclpy.spin_once(self.node, timeout_sec=0.02)
 
     def play(self, events: Iterator[Event], rate: float) -> None:
         """Send events, so much faster than the clock in them runs."""
@@ -116,7 +80,7 @@ class Robot:
         for now, topic, data in events:
             due += max(now - (now if before is None else before), 0) / _SECOND / rate
             before = now
-            self.until(lambda due=due: time.monotonic() >= due)  # type: ignore[misc]
+            self.listen(due - time.monotonic())
             if topic is not None:
                 self.publishers[topic].publish(data)
             elif self.clock is not None:
@@ -125,17 +89,9 @@ class Robot:
     def finish(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return stamps (n,) and poses (n, 3) of the map once all that was sent is in it."""
         self.until(lambda: int(self.said['odom.received']) == count)
-        client = self.node.create_client(Trigger, '/backend/optimize')
-        self.until(client.service_is_ready)
-        future = client.call_async(Trigger.Request())
-        self.until(future.done)
-        seen = ''
-        while seen != self.said['updates']:
-            seen, end = self.said['updates'], time.monotonic() + 2.5
-            self.until(lambda end=end: time.monotonic() > end)  # type: ignore[misc]
-        self.process.send_signal(signal.SIGINT)
-        assert self.process.wait(_PATIENCE) == 0
-        self.node.destroy_node()
+        self.call('optimize')
+        self.until_calm('updates')
+        assert self.end() == 0
         poses = self.maps[-1].poses
         pose3 = np.array([stamped_pose(pose)[1] for pose in poses])
         return np.array([stamp_of(pose.header) for pose in poses]), se2.from_pose3(pose3)
@@ -218,14 +174,10 @@ def moved(messages: list[Event], frame: tuple[float, float, float],
 
 def main() -> None:
     """Measure, and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('bag', type=Path, nargs='?', default=BAG)
-    parser.add_argument('rate', type=float, nargs='?', default=RATE)
-    given = parser.parse_args()
+    given = arguments(__doc__, bag=BAG, rate=RATE)
     bag, rate = given.bag, given.rate
     rclpy.init()
-    messages: list[Event] = [(m.time, m.topic, m.data) for m in read_raw(bag, _KINDS)]
+    messages: list[Event] = [(m.time, m.topic, m.data) for m in read_raw(bag, KINDS)]
     plays: dict[str, tuple[bool, Callable[[], Iterator[Event]]]] = {
         'once, the yardstick': (False, lambda: iter(messages)),
         'once again': (False, lambda: iter(messages)),
@@ -241,7 +193,7 @@ def main() -> None:
         'and has no loops': (False, lambda: moved(messages, (5e8, 1e5, 1.0), loops=False)),
     }
     truth = dict(stamped_pose(m.data) for m in read_messages(bag, [TRUTH_TOPIC]))
-    measured = {}
+    measured: dict[int, tuple[Array, ...]] = {}
     for _, topic, data in messages:
         if topic == ODOMETRY_TOPIC:
             sample = conversion.odometry_in(data)[1]
@@ -250,9 +202,9 @@ def main() -> None:
     folder = tempfile.TemporaryDirectory()
     for name, (sim_time, events) in plays.items():
         found = list(events())
-        robot = Robot(sim_time, Path(folder.name) / 'map.g2o')
-        robot.play(iter(found) if 'pause' not in name else events(), rate)
-        stamps, poses = robot.finish(sum(topic == ODOMETRY_TOPIC for _, topic, _ in found))
+        with Robot(sim_time, Path(folder.name) / 'map.g2o') as robot:
+            robot.play(iter(found) if 'pause' not in name else events(), rate)
+            stamps, poses = robot.finish(sum(topic == ODOMETRY_TOPIC for _, topic, _ in found))
         undisturbed = undisturbed or Undisturbed(dict(zip(stamps.tolist(), poses, strict=True)),
                                                  *robot.saved())
         _tell(name, stamps, poses, undisturbed, measured, robot)

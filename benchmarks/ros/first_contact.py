@@ -11,41 +11,31 @@ simulated world (50,000 poses, 80,000 edges) is loaded, services are called whil
 SIGTERM ends the node amid an update. The node is a process, run as shipped.
 """
 
-import argparse
-import os
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-# Its own domain: nobody else's messages are counted.
-os.environ.setdefault('ROS_DOMAIN_ID', '94')
-os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
+from peer import Peer, arguments, cpu_seconds
 from rclpy.qos import QoSProfile
-from std_srvs.srv import SetBool, Trigger
-from throughput import cpu_seconds
+from std_srvs.srv import SetBool
 
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 from l1slam_ros.io.messages.conversion import reference_frame_id
-from l1slam_ros.ros.demo import executable
 from l1slam_ros.ros.publishing import header
 
 LOOPS, POSES, EDGES = 20_000, 50_000, 80_000
 _SECOND = 10**9  # [ns]
-_PATIENCE = 900.0  # [s]
 _QUIET = 10.0  # [s] without an update: the map has settled
 _WATCHED = 15.0  # [s] over which processor's time is taken
 _PACE = 1e-3  # [s] from loop to loop
@@ -55,51 +45,13 @@ _WAIT = 11  # [s] longer than loops wait
 _MOMENTS = (0.0, 1.0, 4.0, 15.0, 30.0)
 
 
-class Running:
-    """The node as a process, with the file of `~/load` and `~/save`, and a peer to talk to it."""
-
-    def __init__(self, node: Any, path: Path, process: 'subprocess.Popen[bytes]'):
-        self.node, self.path, self.process = node, path, process
-        self.said: dict[str, str] = {}
-        self.message = ''
-        qos = QoSProfile(depth=1000)
-        self.odometry = node.create_publisher(Odometry, 'odom', qos)
-        self.loops = node.create_publisher(PoseWithCovarianceStamped, 'loop_closures', qos)
-        node.create_subscription(DiagnosticArray, '/diagnostics', self._hear, 10)
-        self.until(lambda: bool(self.said) and self.loops.get_subscription_count() == 1
-                   and 'compiling' not in self.message)
-
-    def _hear(self, message: DiagnosticArray) -> None:
-        (status,) = message.status
-        self.message = status.message
-        self.said = {value.key: value.value for value in status.values}
-
-    def until(self, condition: Callable[[], bool]) -> None:
-        """Listen until something holds."""
-        deadline = time.monotonic() + _PATIENCE
-        while not condition():
-            assert time.monotonic() < deadline, f'waited {_PATIENCE} s in vain: {self.said}'
-            rclpy.spin_once(self.node, timeout_sec=0.1)
-
-    def listen(self, seconds: float) -> None:
-        """Listen for some time."""
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            rclpy.spin_once(self.node, timeout_sec=left)
-
-    def call(self, name: str, request: Any = None) -> tuple[float, str]:
-        """Return how long a service took to answer [s], and its sentence."""
-        kind = SetBool if name == 'pause' else Trigger
-        client = self.node.create_client(kind, f'/backend/{name}')
-        self.until(client.service_is_ready)
-        began = time.monotonic()
-        future = client.call_async(request or kind.Request())
-        self.until(future.done)
-        return time.monotonic() - began, future.result().message
+class Running(Peer):
+    """A peer of a node with a saved map, and how busy that is."""
 
     def send_odometry(self, stamp: int) -> None:
         """Tell, at a time [ns], that the robot stands."""
-        self.odometry.publish(Odometry(header=header('odom', stamp), child_frame_id='base_link'))
+        self.publishers[ODOMETRY_TOPIC].publish(
+            Odometry(header=header('odom', stamp), child_frame_id='base_link'))
 
     def busy(self, seconds: float, work: Callable[[], None] = lambda: None,
              every: float = 0.1) -> float:
@@ -112,46 +64,26 @@ class Running:
         return (cpu_seconds(self.process.pid) - cpu) / spent * 100
 
 
-@contextmanager
-def running(path: Path) -> Iterator[Running]:
-    """Run the node on a saved map; it may be ended within."""
-    process = subprocess.Popen([executable('backend'), '--ros-args', '--log-level', 'warn',
-                                '-p', f'save_path:={path}'])
-    node = rclpy.create_node('robot')
-    try:
-        yield Running(node, path, process)
-        process.send_signal(signal.SIGINT)
-        process.wait(_QUIET)
-    finally:
-        process.kill()
-        process.wait()
-        node.destroy_node()
-
-
 def main() -> None:
     """Measure, and print."""
     if sys.argv[1:] == ['bare']:
         _answer()
         return
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('graph', type=Path)
-    parser.add_argument('poses', type=int, nargs='?', default=POSES)
-    parser.add_argument('edges', type=int, nargs='?', default=EDGES)
-    given = parser.parse_args()
+    given = arguments(__doc__, graph=Path, poses=POSES, edges=EDGES)
     rclpy.init()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'map.g2o'
         record = read_graph_file(given.graph)
         write_graph_file(path, replace(record, stamps=_stamps(len(record.ids))))
-        with running(path) as backend:
+        with Running({'save_path': path}) as backend:
             _at_rest(backend, len(record.ids))
+            backend.end()
         _bare()
         world = simulate_world(
             given.poses, given.edges, WorldOptions(), np.random.default_rng(0))
         write_graph_file(path, GraphRecord(
             world.graph, world.odometry, np.arange(given.poses), _stamps(given.poses)))
-        with running(path) as backend:
+        with Running({'save_path': path}) as backend:
             _at_work(backend)
 
 
@@ -163,7 +95,7 @@ def _at_rest(backend: Running, count: int) -> None:
     """Print the processor's time of a settled map, before and after loops have expired."""
     began = time.monotonic()
     _tell('load', *backend.call('load'))
-    _settle(backend)
+    backend.until_calm('updates', _QUIET)
     said = ', '.join(f'{backend.said[name]} {name}' for name in (
         'keyframes', 'accepted_loops', 'rejected_loops', 'suspect_loops', 'updates'))
     print(f'settled within {time.monotonic() - began - _QUIET:.0f} s: {said}', flush=True)
@@ -186,7 +118,7 @@ def _at_rest(backend: Running, count: int) -> None:
             header=header(reference_frame_id('base_link', 1000 * _SECOND), far))
         loop.pose.pose.position.x = 1.0 + k / LOOPS
         loop.pose.pose.orientation.w = 1.0
-        backend.loops.publish(loop)
+        backend.publishers[LOOP_TOPIC].publish(loop)
         backend.listen(_PACE)
     backend.until(lambda: int(backend.said['waiting_loops']) == LOOPS)
     now[0] += _WAIT * _SECOND
@@ -194,7 +126,7 @@ def _at_rest(backend: Running, count: int) -> None:
     stand()
     stand()
     backend.until(lambda: int(backend.said['expired_loops']) == LOOPS)
-    _settle(backend)
+    backend.until_calm('updates', _QUIET)
     measured(f'{LOOPS} loops expired')
 
 
@@ -229,14 +161,6 @@ def _answer() -> None:
     rclpy.spin(node)
 
 
-def _settle(backend: Running) -> None:
-    """Wait until there has been no update for some time."""
-    seen = ''
-    while seen != backend.said['updates']:
-        seen = backend.said['updates']
-        backend.listen(_QUIET)
-
-
 def _at_work(backend: Running) -> None:
     """Print how soon services answer while a large map is judged, and how soon SIGTERM ends it."""
     _tell('load', *backend.call('load'))
@@ -250,8 +174,7 @@ def _at_work(backend: Running) -> None:
     _tell('load', *backend.call('load'))
     print(f'SIGTERM, with {backend.busy(4.0):.0f} % of a core at work')
     began = time.monotonic()
-    backend.process.send_signal(signal.SIGTERM)
-    code = backend.process.wait(_PATIENCE)
+    code = backend.end(signal.SIGTERM)
     print(f'ended after {time.monotonic() - began:.2f} s with exit code {code}')
 
 

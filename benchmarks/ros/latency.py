@@ -11,34 +11,27 @@ kind gave together, and how much as noise alone: the turns in which nobody looke
 against the rest.
 """
 
-import argparse
 import os
-import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 from pathlib import Path
-from typing import Any
-
-# Its own domain: nobody else's odometry is counted.
-os.environ.setdefault('ROS_DOMAIN_ID', '94')
-os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
+from peer import Peer, arguments
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
-from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+from l1slam_ros.io.bags.topics import ODOMETRY_TOPIC
 from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
 from l1slam_ros.io.messages.conversion import stamp_of
-from l1slam_ros.ros.demo import executable
 from l1slam_ros.ros.publishing import header
 
 KEYFRAMES, SECONDS, TURNS = 10_000, 5.0, 12
@@ -49,9 +42,8 @@ _RATE, _STEP = 50.0, 0.05  # [1/s], [m]: five keyframes a second
 class Probe:
     """Sends odometry and notes when its pose comes, and how old each transform is."""
 
-    def __init__(self) -> None:
-        self.node = rclpy.create_node('probe')
-        self._odometry = self.node.create_publisher(Odometry, 'odom', QoSProfile(depth=1000))
+    def __init__(self, peer: Peer):
+        self.node, self._odometry = peer.node, peer.publishers[ODOMETRY_TOPIC]
         self.node.create_subscription(PoseStamped, 'pose', self._on_pose, 1000)
         self.node.create_subscription(TransformStamped, 'map_to_odom', self._on_transform, 1000)
         self._sent: dict[int, float] = {}
@@ -84,12 +76,7 @@ def main() -> int:
     """Measure and print."""
     if sys.argv[1:] == ['look']:
         return _look()
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('keyframes', type=int, nargs='?', default=KEYFRAMES)
-    parser.add_argument('seconds', type=float, nargs='?', default=SECONDS)
-    parser.add_argument('turns', type=int, nargs='?', default=TURNS)
-    given = parser.parse_args()
+    given = arguments(__doc__, keyframes=KEYFRAMES, seconds=SECONDS, turns=TURNS)
     n = given.keyframes
     rclpy.init()
     with tempfile.TemporaryDirectory() as folder:
@@ -97,20 +84,18 @@ def main() -> int:
         world = simulate_world(n, 2 * n, WorldOptions(), np.random.default_rng(0))
         stamps = 10**9 + np.arange(n) * 10**8
         write_graph_file(path, GraphRecord(world.graph, world.truth, np.arange(n), stamps))
-        backend = subprocess.Popen([executable('backend'), '--ros-args',
-                                    '-p', f'save_path:={path}', '-p', 'autosave_period:=0.0'])
         looker = subprocess.Popen([sys.executable, __file__, 'look'], stdin=subprocess.PIPE,
                                   stdout=subprocess.PIPE, text=True)
         try:
-            probe = Probe()
-            _load(probe.node)
-            probe.drive(4 * _BETWEEN)
-            _tell(*_measure(probe, looker, given.seconds, given.turns))
-            print(looker.communicate('end\n')[0].strip())
+            with Peer({'save_path': path, 'autosave_period': 0.0}) as peer:
+                probe = Probe(peer)
+                print(peer.call('load')[1])
+                probe.drive(4 * _BETWEEN)
+                _tell(*_measure(probe, looker, given.seconds, given.turns))
+                print(looker.communicate('end\n')[0].strip())
+                peer.end()
         finally:
             looker.kill()
-            backend.send_signal(signal.SIGINT)
-            backend.wait()
     return 0
 
 
@@ -139,14 +124,6 @@ def _tell(late: list[list[float]], old: list[bool]) -> None:
     print(f'p99 {p99["somebody looks"] / p99["nobody looks"]:.2f} times that without; noise alone '
           f'{p99["one half"] / p99["the other"]:.2f}')
     print(f'{sum(old)} of {len(old)} transforms older than the newest odometry')
-
-
-def _load(node: Any) -> None:
-    client = node.create_client(Trigger, '/backend/load')
-    client.wait_for_service()
-    answer = client.call_async(Trigger.Request())
-    rclpy.spin_until_future_complete(node, answer)
-    print(answer.result().message)
 
 
 def _look() -> int:

@@ -10,7 +10,6 @@ colours, sizes, panels and scale, on which background. Neither program is asked:
 what a layout leaves to them are like theirs at best.
 """
 
-import argparse
 import json
 from collections import deque
 from pathlib import Path
@@ -27,6 +26,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Ellipse
 from nav_msgs.msg import Path as PathMessage
+from peer import arguments
 from PIL import Image
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from visualization_msgs.msg import Marker, MarkerArray
@@ -232,10 +232,7 @@ def _write(axes: Axes, lines: list[tuple[str, Any, str]]) -> None:
 
 def main() -> None:
     """Play, listen and draw."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('png', type=Path, nargs='?', default=PNG)
-    png = parser.parse_args().png
+    png = arguments(__doc__, png=PNG).png
     rclpy.init()
     listener = Listener(rclpy.create_node('onlooker'), read_recording(BAG))
     seen = Seen(listener.node)

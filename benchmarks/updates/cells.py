@@ -273,8 +273,7 @@ def _rows(graph: FactorGraph, poses: int) -> Indices:
 def prefix(graph: FactorGraph, poses: int) -> FactorGraph:
     """Return the graph of the first keyframes."""
     factors, rows = graph.between, _rows(graph, poses)
-    part = FactorGraph(graph.manifold)
-    part.add_poses(poses)
+    part = FactorGraph(graph.manifold, poses)
     part.append_between(factors.i[rows], factors.j[rows], factors.measurement[rows],
                         factors.sqrt_information[rows])
     return part

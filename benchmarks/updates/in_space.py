@@ -36,8 +36,7 @@ def hills(datasets: Path) -> tuple[FactorGraph, Array]:
     rng, flat = np.random.default_rng(0), place(datasets, KITTI)
     truth, factors = _over_ground(flat.best, rng), flat.graph.between
     sigma = np.where(factors.is_odometry[:, None], _ODOMETRY, _LOOP)
-    graph = FactorGraph(se3)
-    graph.add_poses(len(truth))
+    graph = FactorGraph(se3, len(truth))
     graph.add_between(
         factors.i, factors.j, se3.retract(se3.between(truth[factors.i], truth[factors.j]),
                                           sigma * rng.standard_normal(sigma.shape)),

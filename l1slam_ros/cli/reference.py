@@ -11,7 +11,7 @@ from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, align,
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.io.files import NANOSECONDS, counted
-from l1slam_ros.io.formats import is_bag, stamps_of
+from l1slam_ros.io.formats import is_bag
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import named_loops
 from l1slam_ros.io.trajectory import Reference, read_reference
@@ -53,7 +53,7 @@ def read_truth(source: str, record: GraphRecord, input_path: Path) -> Truth:
 
     """
     reference = _read(source, record, input_path)
-    keys = stamps_of(record) if reference.stamped else record.ids
+    keys = record.times if reference.stamped else record.ids
     if reference.stamped:
         rows, poses, gaps = _at_stamps(record, reference, keys)
     else:
@@ -77,8 +77,6 @@ def _read(source: str, record: GraphRecord, input_path: Path) -> Reference:
         from l1slam_ros.io.bags.to_graph import read_truth_topic
 
         path = input_path if bag == 'bag' and is_bag(input_path) else Path(bag)
-        if not path.exists():
-            raise FileError(path, 'no such file or directory')
         return read_truth_topic(path, f'/{topic}', record.graph.manifold)
     return read_reference(source, record.graph.manifold, by_stamps=record.stamps is not None)
 

@@ -24,6 +24,8 @@ from l1slam_ros.core.graph.measurements import QUATERNION_NORM_ERROR
 from l1slam_ros.io.remarks import Remarks, read_remarks
 
 NANOSECONDS = 10**9
+# [ns] builtin_interfaces/Time holds its seconds in 32 bits.
+LAST_STAMP = 2**31 * NANOSECONDS - 1
 # No pose or information is beyond this, and with less no square of one leaves the doubles.
 LARGEST = 1e30
 # The longest piece of a damaged file that is quoted in an error.
@@ -219,6 +221,11 @@ def first_failure(count: int, works: Callable[[slice], bool]) -> int:
         else:
             high = middle
     return low
+
+
+def invented_stamps(n: int) -> Indices:
+    """Return stamps [ns] for n poses that have none: 1000 s, then ten poses a second, (n,)."""
+    return 1000 * NANOSECONDS + np.arange(n, dtype=np.int64) * (NANOSECONDS // 10)
 
 
 def stamp_text(stamp: int) -> str:

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from l1slam_ros.core.errors import FileError, GraphError, OptionError
-from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.names import QUATERNION, ROTATION_INFORMATION
 from l1slam_ros.core.robust.inspection import initial_poses
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES, DEFAULT_TOPICS, Topics
 from l1slam_ros.io.files import require_file, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
-from l1slam_ros.io.trajectory import invented_stamps, write_tum
+from l1slam_ros.io.trajectory import write_tum
 
 if TYPE_CHECKING:
     from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
@@ -92,11 +92,6 @@ def named(path: Path | str) -> Iterator[None]:
         raise FileError(path, str(error)) from error
 
 
-def stamps_of(record: GraphRecord) -> Indices:
-    """Return the stamps of the keyframes, (n,) [ns], invented where the input has none."""
-    return record.stamps if record.stamps is not None else invented_stamps(record.graph.n_poses)
-
-
 def check_output(path: Path) -> None:
     """Refuse, before any work is done, an output that could not be written in the end."""
     if path.suffix.lower() not in ('.g2o', '.tum', ''):
@@ -134,7 +129,7 @@ def write_output(path: Path, record: GraphRecord, truth: Array | None = None) ->
     if path.suffix.lower() == '.g2o':
         write_graph_file(path, record)
     elif path.suffix.lower() == '.tum':
-        write_tum(path, stamps_of(record), stored_poses(record), record.graph.manifold)
+        write_tum(path, record.times, stored_poses(record), record.graph.manifold)
     else:
         from l1slam_ros.io.bags.from_graph import write_graph_bag
 

@@ -15,7 +15,6 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.io.files import (
-    NANOSECONDS,
     TextLines,
     counted,
     parse_rows,
@@ -44,11 +43,6 @@ class Reference:
     poses: Array
     stamped: bool
     skipped: tuple[str, ...] = ()
-
-
-def invented_stamps(n: int) -> Indices:
-    """Return stamps [ns] for n poses that have none: 1000 s, then ten poses a second, (n,)."""
-    return 1000 * NANOSECONDS + np.arange(n, dtype=np.int64) * (NANOSECONDS // 10)
 
 
 def write_tum(path: str | os.PathLike[str], stamps: Indices, poses: Array,

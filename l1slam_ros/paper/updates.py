@@ -29,7 +29,7 @@ from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.compilation import load
-from l1slam_ros.io.trajectory import invented_stamps
+from l1slam_ros.io.files import invented_stamps
 
 # [m or rad] ISAM2 linearises again what has moved by more, after each pose.
 _RELINEARISE = 0.1

@@ -34,7 +34,7 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.io.bags.to_graph import read_truth_topic
 from l1slam_ros.io.bags.topics import TRUTH_TOPIC
 from l1slam_ros.io.files import stamp_from_text
-from l1slam_ros.io.formats import read_input, stamps_of
+from l1slam_ros.io.formats import read_input
 from l1slam_ros.io.graphs.side_files import read_pairs
 from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.io.plot import MapDrawing, plot_maps
@@ -87,7 +87,7 @@ def read_recording(path: Path) -> Recording:
     positions, loops = graph.manifold.positions, graph.between.pairs[~graph.between.is_odometry]
     false, _ = read_pairs(path, 'false')
     is_false = (loops[:, None] == false).all(axis=2).any(axis=1)
-    return Recording(stamps_of(record), positions(odometry_poses(graph)), positions(truth.poses),
+    return Recording(record.times, positions(odometry_poses(graph)), positions(truth.poses),
                      loops, is_false)
 
 

@@ -13,7 +13,7 @@ from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.files import NANOSECONDS
-from l1slam_ros.io.messages.serialisation import path_bytes
+from l1slam_ros.io.messages.serialisation import path_bytes, pose_bytes
 from l1slam_ros.ros.diagnostics import Diagnostics
 from l1slam_ros.ros.loop_status import LoopStatus
 from l1slam_ros.ros.markers import GraphMarkers
@@ -87,23 +87,19 @@ class MapPublisher:
 
 
 def pose_with_covariance(frame: str, stamp: int, manifold: Manifold, pose: Array,
-                         covariance: Array) -> PoseWithCovarianceStamped:
+                         covariance: Array) -> bytes:
     """
-    Return a pose (1, p) with its covariance in the axes of the frame, as ROS has it.
+    Return a serialised PoseWithCovarianceStamped: a pose (1, p), and how well it is known.
 
-    covariance : (d, d) in the axes of the pose, what the manifold has no components for is known
+    covariance : (d, d) in the axes of the pose, where ROS has those of the frame; what the
+    manifold has no components for is known
     """
     pose3 = manifold.to_pose3(pose)
-    message = PoseWithCovarianceStamped(header=header(frame, stamp))
-    position, orientation = message.pose.pose.position, message.pose.pose.orientation
-    position.x, position.y, position.z = pose3[0, :3].tolist()
-    orientation.x, orientation.y, orientation.z, orientation.w = pose3[0, 3:].tolist()
-    pose3[:, :3] = 0.0
-    Ad = manifold.adjoint(manifold.from_pose3(pose3))[0]
+    turn = pose3 * [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]
+    Ad = manifold.adjoint(manifold.from_pose3(turn))[0]
     rows, whole = np.array(manifold.COVARIANCE_ROWS), np.zeros((6, 6))
     whole[rows[:, None], rows] = Ad @ covariance @ Ad.T
-    message.pose.covariance = whole.ravel()
-    return message
+    return pose_bytes(frame, stamp, pose3[0], whole)
 
 
 def header(frame: str, stamp: int) -> Header:

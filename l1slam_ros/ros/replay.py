@@ -24,6 +24,7 @@ from rosgraph_msgs.msg import Clock
 from l1slam_ros.core.errors import FileError, L1SlamError, OptionError
 from l1slam_ros.io.bags.damaged.walk import BagMessage
 from l1slam_ros.io.bags.reader import BagSummary, bag_summary, read_raw
+from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.ros.publishing import header
 from l1slam_ros.ros.threads.failures import reason
@@ -31,7 +32,6 @@ from l1slam_ros.ros.threads.failures import reason
 _BAD_INPUT = 2
 _DAMAGED = 3
 _DEPTH = 1000
-_SECOND = 1_000_000_000
 # A publisher sends nothing to whom it has not met. A node is met one subscription at a time, so
 # once there is any, no other has come for this long [s] before messages go out.
 _REST = 1.0
@@ -124,10 +124,11 @@ class Player:
         first, began, shown, next_clock = None, time.monotonic(), 0.0, 0.0
         for message in messages:
             first = message.time if first is None else first
-            recorded = (message.time - first) / _SECOND
+            recorded = (message.time - first) / NANOSECONDS
             while self._clock is not None and next_clock <= recorded:
                 _sleep_until(began + next_clock / rate)
-                self._publish_clock(first + round(next_clock * _SECOND))
+                now = header('', first + round(next_clock * NANOSECONDS)).stamp
+                self._clock.publish(Clock(clock=now))
                 next_clock += _CLOCK_PERIOD
             _sleep_until(began + recorded / rate)
             self.publishers[message.topic].publish(message.data)
@@ -140,10 +141,6 @@ class Player:
         moment = Duration(seconds=_PAUSE)
         while not all(p.wait_for_all_acked(moment) for p in self.publishers.values()):
             _sleep_until(time.monotonic())  # an interrupt is seen between the waits
-
-    def _publish_clock(self, stamp: int) -> None:
-        assert self._clock is not None
-        self._clock.publish(Clock(clock=header('', stamp).stamp))
 
 
 def _sleep_until(moment: float) -> None:
@@ -169,13 +166,13 @@ def _message_class(msgtype: str) -> type | None:
 def _play(arguments: argparse.Namespace, tell: Callable[[str], None]) -> None:
     """Play a bag once, or again and again with --loop; tell : is given what is damaged."""
     summary = bag_summary(arguments.bag)
-    if arguments.start * _SECOND > summary.duration:
+    if arguments.start * NANOSECONDS > summary.duration:
         raise OptionError(f'--start is {arguments.start:g}, expected at most the '
-                          f'{summary.duration / _SECOND:g} s of the bag')
-    start = summary.start + round(arguments.start * _SECOND)
+                          f'{summary.duration / NANOSECONDS:g} s of the bag')
+    start = summary.start + round(arguments.start * NANOSECONDS)
     stop = None
     if arguments.duration is not None:
-        stop = start + round(arguments.duration * _SECOND)
+        stop = start + round(arguments.duration * NANOSECONDS)
     # Without /rosout: a line that is logged just when a signal comes would be an error there.
     node = rclpy.create_node('replay', enable_rosout=False)
     try:
@@ -183,7 +180,7 @@ def _play(arguments: argparse.Namespace, tell: Callable[[str], None]) -> None:
         if not player.publishers:
             raise FileError(arguments.bag, 'no topic of this bag can be played')
         player.wait_for_subscribers(arguments.wait)
-        seconds = max(summary.duration / _SECOND - arguments.start, 0)
+        seconds = max(summary.duration / NANOSECONDS - arguments.start, 0)
         again = True
         while again:
             messages = read_raw(arguments.bag, list(player.publishers), tell, start=start,

@@ -13,6 +13,7 @@ from rclpy.node import Node
 
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.snapshot import Robot
+from l1slam_ros.io.files import LAST_STAMP, NANOSECONDS
 from l1slam_ros.io.messages.serialisation import pose_bytes, transform_bytes
 from l1slam_ros.ros.parameters import NodeParameters
 
@@ -20,10 +21,6 @@ try:
     from tf2_msgs.msg import TFMessage
 except ImportError:  # the ROS wheels on PyPI have none
     TFMessage = None
-
-_SECOND = 1_000_000_000
-# [ns] No stamp of ROS says a later time.
-_LATEST = 2**31 * _SECOND - 1
 
 
 class RobotPublisher:
@@ -90,8 +87,8 @@ class RobotPublisher:
             self._stamp = 0  # time itself went back
         self._newest = robot.stamp
         # tf2 ignores a second transform of one time, and warns of it.
-        self._stamp = min(max(robot.stamp + int(options.transform_tolerance * _SECOND),
-                              self._stamp + 1), _LATEST)
+        self._stamp = min(max(robot.stamp + int(options.transform_tolerance * NANOSECONDS),
+                              self._stamp + 1), LAST_STAMP)
         if robot.map_to_odom is not self._last[0]:
             self._last = (robot.map_to_odom,
                           self._backend.manifold.to_pose3(robot.map_to_odom)[0])

@@ -60,10 +60,8 @@ class MapServices:
     def _trigger(
         self, name: str, work: Callable[[], str]
     ) -> Callable[[Trigger.Request, Trigger.Response], Awaitable[Trigger.Response]]:
-        async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            result = await self._jobs.put(f'~/{name}', work)
-            response.success, response.message = result.success, result.message
-            return response
+        async def answer(_: Trigger.Request, __: Trigger.Response) -> Trigger.Response:
+            return await self._jobs.put(f'~/{name}', work)
 
         return answer
 

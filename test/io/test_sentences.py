@@ -28,8 +28,7 @@ N, LOOPS = 30, 27  # keyframes k with the ids 10 + 3 k; loops (k, k + 2)
 
 @pytest.fixture
 def record():
-    graph = FactorGraph(se2)
-    graph.add_poses(N)
+    graph = FactorGraph(se2, N)
     first = np.concatenate((np.arange(N - 1), np.arange(LOOPS)))
     last = first + np.repeat([1, 2], [N - 1, LOOPS])
     m = len(first)

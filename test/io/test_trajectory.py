@@ -6,13 +6,8 @@ import pytest
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.io.files import write_lines
-from l1slam_ros.io.trajectory import (
-    invented_stamps,
-    read_reference,
-    truth_lines,
-    write_tum,
-)
+from l1slam_ros.io.files import invented_stamps, write_lines
+from l1slam_ros.io.trajectory import read_reference, truth_lines, write_tum
 
 
 def write(tmp_path, text):

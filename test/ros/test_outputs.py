@@ -146,7 +146,8 @@ def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path):
             and b.backend._backend.update(0.0) is None, 'the map is done')
     now = b.backend._backend.snapshot()
     dense = dense_covariance(now)[-1, :, -1]
-    expected = pose_with_covariance('map', int(now.stamps[-1]), se2, now.poses[-1:], dense)
+    expected = deserialize_message(pose_with_covariance(
+        'map', int(now.stamps[-1]), se2, now.poses[-1:], dense), PoseWithCovarianceStamped)
 
     def agrees():
         return np.allclose(heard[-1].pose.covariance, expected.pose.covariance, rtol=1e-6)

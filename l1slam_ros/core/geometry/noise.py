@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l1slam_ros.core.errors import NoiseError
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Manifold
 
 Mask = NDArray[np.bool_]
 
@@ -110,42 +110,27 @@ def without_unset(covariance: Array) -> Array:
     return filled(covariance, unset & ~unset.all(axis=1, keepdims=True))
 
 
-def at_most(covariance: Array, most: float) -> tuple[Array, Mask]:
+def within_bounds(
+    covariance: Array, model: Array, most: float, silent: float = np.inf
+) -> tuple[Array, list[tuple[float, float]]]:
     """
-    Return covariances (m, d, d) without a variance above `most`, and where one was, (m, d).
+    Return covariances (m, d, d) with variances of measurements, and those found and used instead.
 
-    It becomes that; correlations are kept.
+    Below `LEAST_VARIANCE` it would nail whatever it stands at, above `silent` it says nothing: the
+    model, (d, d), speaks for its component. Above `most` it becomes that, correlations are kept.
     """
+    found = np.diagonal(covariance, axis1=1, axis2=2)
+    out = (found < LEAST_VARIANCE) | (found > silent)
+    if out.any():
+        modelled = (out * np.diagonal(model))[:, :, None] * np.eye(len(model))
+        covariance = silenced(covariance, out) + modelled
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     large = variance > most
     if large.any():
         scale = np.where(large, np.sqrt(most) / np.sqrt(variance), 1.0)
         covariance = scale[:, :, None] * covariance * scale[:, None, :]
-    return covariance, large
-
-
-def or_model(covariance: Array, model: Array, most: float = np.inf) -> tuple[Array, Mask]:
-    """
-    Return covariances (m, d, d) with variances of measurements, and which others were, (m, d).
-
-    Below `LEAST_VARIANCE` it would nail whatever it stands at, above `most` it says nothing: the
-    model, (d, d), speaks for its component.
-    """
-    variance = np.diagonal(covariance, axis1=1, axis2=2)
-    out = (variance < LEAST_VARIANCE) | (variance > most)
-    if out.any():
-        kept = np.where(out, 0.0, 1.0)
-        covariance = kept[:, :, None] * covariance * kept[:, None, :]
-        covariance = covariance + (out * np.diagonal(model))[:, :, None] * np.eye(len(model))
-    return covariance, out
-
-
-def bounds(found: Array, used: Array, out: Mask) -> list[tuple[float, float]]:
-    """Return the variances that are out of bounds, out (m, d), as found and as used instead."""
-    if not out.any():
-        return []
-    variances = [np.diagonal(part, axis1=1, axis2=2)[out].tolist() for part in (found, used)]
-    return list(zip(*variances, strict=True))
+    used, out = np.diagonal(covariance, axis1=1, axis2=2), out | large
+    return covariance, list(zip(found[out].tolist(), used[out].tolist(), strict=True))
 
 
 def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Array) -> bytes:
@@ -161,6 +146,13 @@ def loop_identity(reference: int, stamp: int, measurement: Array, covariance: Ar
     digits = np.rint(1e6 * np.concatenate((np.log(sigma), correlation.ravel()))).astype(np.int64)
     whole = b'%d %d ' % (reference, stamp) + measurement.tobytes() + digits.tobytes()
     return blake2b(whole, digest_size=16).digest()
+
+
+def sigmas(manifold: Manifold, translation: float, rotation: float) -> Array:
+    """Return the standard deviations of a step, (d,), of two for all axes [m], [rad]."""
+    sigma = np.zeros(manifold.TANGENT_SIZE)
+    sigma[manifold.TRANSLATION], sigma[manifold.ROTATION] = translation, rotation
+    return sigma
 
 
 def root_of_inverse(covariance: Array) -> Array:

@@ -82,6 +82,7 @@ class FactorGraph:
     Parameters
     ----------
     manifold : the module the poses live on, e.g. `se2`
+    n_poses : how many keyframes exist already
 
     Attributes
     ----------
@@ -90,9 +91,8 @@ class FactorGraph:
 
     """
 
-    def __init__(self, manifold: Manifold):
-        self.manifold = manifold
-        self.n_poses = self.said = 0
+    def __init__(self, manifold: Manifold, n_poses: int = 0):
+        self.manifold, self.n_poses, self.said = manifold, n_poses, 0
         p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
         self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
                          GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_),
@@ -108,8 +108,7 @@ class FactorGraph:
 
     def copy(self) -> 'FactorGraph':
         """Return a graph that shares all factors so far; either may grow without the other."""
-        clone = FactorGraph(self.manifold)
-        clone.n_poses = self.n_poses
+        clone = FactorGraph(self.manifold, self.n_poses)
         clone._between = [column.copy() for column in self._between]
         clone._factors = self._factors
         return clone
@@ -129,8 +128,7 @@ class FactorGraph:
         variance : (k,) by which to multiply the covariance of each, none: as they are
 
         """
-        part = FactorGraph(self.manifold)
-        part.n_poses = self.n_poses
+        part = FactorGraph(self.manifold, self.n_poses)
         i, j, measurement, root, trusted, struck = (
             column.view()[chosen] for column in self._between)
         if variance is not None:
@@ -270,7 +268,6 @@ def turned(graph: FactorGraph, rows: Indices | Mask) -> FactorGraph:
     upper = np.linalg.qr(roots[rows] @ manifold.adjoint(Z[rows]), mode='r')
     signs = np.where(np.diagonal(upper, axis1=1, axis2=2) < 0, -1.0, 1.0)
     roots[rows] = signs[:, :, None] * upper
-    other = FactorGraph(manifold)
-    other.add_poses(graph.n_poses)
+    other = FactorGraph(manifold, graph.n_poses)
     other.append_between(i, j, Z, roots, factors.trusted, factors.struck)
     return other

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from weakref import WeakSet
 
-from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.errors import GraphError, OptionError
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_sound
@@ -126,10 +126,12 @@ class Backend(Upkeep):
 
         Return the number of its graph in this one, see `SavedMap`.
         """
-        saved.require(self.manifold)
+        found, made = saved.builder.graph.manifold, saved.optimised
+        if found is not self.manifold:
+            raise GraphError(f'a map of {found.NAME}, expected one of {self.manifold.NAME}')
         builder = self._new_builder()
         builder.restore(saved.builder)
-        return self._replace(builder, saved.as_judged(self._robust))
+        return self._replace(builder, made if saved.robust == self._robust else made.unjudged())
 
     def _new_builder(self) -> GraphBuilder:
         return GraphBuilder(self.manifold, self._options, base_frame=self.base_frame)

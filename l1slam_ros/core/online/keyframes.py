@@ -48,10 +48,7 @@ class OdometryOptions(Options):
 
 def diagonal_covariance(manifold: Manifold, translation: float, rotation: float) -> Array:
     """Return diag(translation^2, ..., rotation^2, ...), (d, d), from two sigmas [m], [rad]."""
-    sigma = np.zeros(manifold.TANGENT_SIZE)
-    sigma[manifold.TRANSLATION] = translation
-    sigma[manifold.ROTATION] = rotation
-    return np.diag(sigma**2)
+    return np.diag(noise.sigmas(manifold, translation, rotation) ** 2)
 
 
 def reduced_covariance(manifold: Manifold, covariance: Array) -> Array:
@@ -121,8 +118,8 @@ class KeyframeMotion:
         """
         Continue to a sample; where it makes a keyframe, return the motion, and begin there.
 
-        unseen : how far and by which angle the robot may have gone instead; that is a keyframe:
-        what is published goes by the last one
+        unseen : the sample is at the same place, to which the robot may have gone so far and by
+        such an angle; that is a keyframe: what is published goes by the last one
 
         Returns
         -------
@@ -130,7 +127,8 @@ class KeyframeMotion:
 
         """
         if unseen is not None:
-            self._add_unseen(sample, *unseen)
+            self._unseen = self._unseen + diagonal_covariance(self._manifold, *unseen)
+            self._stamp = sample.stamp
         else:
             self.add(sample, pose, odometry)
             if not self.is_keyframe(keyframe):
@@ -171,11 +169,6 @@ class KeyframeMotion:
         total = self._seen_from(end)
         self._poses, self._stated = [end], None if total is None else [total.sum(axis=0)]
 
-    def _add_unseen(self, sample: OdometrySample, metres: float, radians: float) -> None:
-        """Continue to a sample at the same place, to which the robot may have gone some way."""
-        self._unseen = self._unseen + diagonal_covariance(self._manifold, metres, radians)
-        self._stamp = sample.stamp
-
     def is_keyframe(self, options: KeyframeOptions) -> bool:
         """Tell whether the motion passes any threshold that is on."""
         passed = ((options.translation, self._distance), (options.rotation, self._turn),
@@ -210,9 +203,8 @@ class KeyframeMotion:
         total = stated.sum(axis=0, keepdims=True)
         if verbatim:
             return total[0] if noise.usable(total)[0] else None
-        known, out = noise.or_model(total, model, noise.MOST_VARIANCE)
-        used, large = noise.at_most(known, noise.MOST_OF_ODOMETRY)
-        self.bounded = noise.bounds(total, used, out | large)
+        used, self.bounded = noise.within_bounds(
+            total, model, noise.MOST_OF_ODOMETRY, noise.MOST_VARIANCE)
         # A heading nearly unknown, at the end of a long lever, leaves rounding where position was.
         return used[0] if len(stated) == 1 or noise.usable(used)[0] else None
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import sigmas
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.online.snapshot import Problem
 from l1slam_ros.core.online.update import Improvement
@@ -50,8 +51,7 @@ def _tied(graph: FactorGraph, poses: Array, keyframes: Indices) -> FactorGraph:
     """Return the graph with keyframes k > 0 tied to k - 1 as they stand in poses (n, p)."""
     manifold, d = graph.manifold, graph.manifold.TANGENT_SIZE
     extent = float(np.ptp(manifold.positions(poses), axis=0).max()) if len(poses) else 0.0
-    sigma = np.full(d, 1.0 + extent)
-    sigma[manifold.ROTATION] = _HEADING
+    sigma = sigmas(manifold, 1.0 + extent, _HEADING)
     graph.append_between(
         keyframes - 1, keyframes, manifold.between(poses[keyframes - 1], poses[keyframes]),
         np.broadcast_to(np.diag(1 / sigma), (len(keyframes), d, d)))

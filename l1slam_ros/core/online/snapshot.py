@@ -12,8 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from l1slam_ros.core.errors import GraphError
-from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.incremental.front import View
@@ -172,16 +171,6 @@ class SavedMap:
     optimised: Optimised
     robust: bool
     number: int = 0
-
-    def require(self, manifold: Manifold) -> None:
-        """Refuse, by a `GraphError`, a map whose poses are of another manifold."""
-        found = self.builder.graph.manifold
-        if found is not manifold:
-            raise GraphError(f'a map of {found.NAME}, expected one of {manifold.NAME}')
-
-    def as_judged(self, robust: bool) -> Optimised:
-        """Return what updates have made, unjudged where loops were judged otherwise."""
-        return self.optimised if self.robust == robust else self.optimised.unjudged()
 
 
 @dataclass(frozen=True)

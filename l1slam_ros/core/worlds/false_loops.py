@@ -15,6 +15,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.noise import sigmas
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.spanning_tree import odometry_poses, pair_key
 from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS
@@ -55,8 +56,7 @@ def insert_loops(graph: FactorGraph, loops: Loops) -> FactorGraph:
     factors = graph.between
     ends = np.maximum.accumulate(np.maximum(factors.i, factors.j))
     place = np.searchsorted(ends, loops.j, side='right')
-    longer = FactorGraph(graph.manifold)
-    longer.add_poses(graph.n_poses)
+    longer = FactorGraph(graph.manifold, graph.n_poses)
     longer.add_between(
         np.insert(factors.i, place, loops.i), np.insert(factors.j, place, loops.j),
         np.insert(factors.measurement, place, loops.measurement, axis=0),
@@ -134,8 +134,7 @@ def _require_room(graph: FactorGraph, count: int) -> None:
 
 def _small_offsets(manifold: Manifold, count: int, rng: np.random.Generator) -> Array:
     """Return random poses near the identity, (count, p)."""
-    sigma = np.empty(manifold.TANGENT_SIZE)
-    sigma[manifold.TRANSLATION], sigma[manifold.ROTATION] = _SIGMA_TRANSLATION, _SIGMA_ROTATION
+    sigma = sigmas(manifold, _SIGMA_TRANSLATION, _SIGMA_ROTATION)
     noise = sigma * rng.standard_normal((count, manifold.TANGENT_SIZE))
     return manifold.retract(manifold.identity(count), noise)
 

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.noise import sigmas
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import WORLDS
@@ -151,14 +152,11 @@ def _measured(
     options: WorldOptions, rng: np.random.Generator,
 ) -> FactorGraph:
     """Return the graph of noisy measurements; is_loop : (m,) 0 for odometry, 1 for a loop."""
-    sigma = np.empty((2, manifold.TANGENT_SIZE))
-    sigma[:, manifold.TRANSLATION] = [[options.odometry_sigma_translation],
-                                      [options.loop_sigma_translation]]
-    sigma[:, manifold.ROTATION] = [[options.odometry_sigma_rotation],
-                                   [options.loop_sigma_rotation]]
+    sigma = np.stack((
+        sigmas(manifold, options.odometry_sigma_translation, options.odometry_sigma_rotation),
+        sigmas(manifold, options.loop_sigma_translation, options.loop_sigma_rotation)))
     noise = sigma[is_loop] * rng.standard_normal((len(i), manifold.TANGENT_SIZE))
-    graph = FactorGraph(manifold)
-    graph.add_poses(len(truth))
+    graph = FactorGraph(manifold, len(truth))
     graph.add_between(i, j, manifold.retract(manifold.between(truth[i], truth[j]), noise),
                       (sigma[:, :, None] ** -2 * np.eye(manifold.TANGENT_SIZE))[is_loop])
     return graph

@@ -15,7 +15,6 @@ a pose is seen from an earlier one: factors the other way are turned, and the no
 """
 
 import os
-from typing import Any
 
 import numpy as np
 
@@ -36,10 +35,10 @@ from l1slam_ros.io.bags.topics import (
     TRUTH_TOPIC,
 )
 from l1slam_ros.io.bags.writer import new_bag
-from l1slam_ros.io.files import NANOSECONDS
+from l1slam_ros.io.files import LAST_STAMP
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.messages.conversion import reference_frame_id
-from l1slam_ros.io.trajectory import invented_stamps
+from l1slam_ros.io.messages.serialisation import odometry_bytes, pose_bytes
 
 # What `reader.read_note` returns for a graph.
 GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
@@ -53,8 +52,6 @@ TURNED_STEPS, TURNED_LOOPS = 'turned_steps', 'turned_loops'
 _BASE_FRAME = 'base_link'
 _ODOMETRY, _TRUTH = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped'
 _LOOP = 'geometry_msgs/msg/PoseWithCovarianceStamped'
-# builtin_interfaces/Time holds its seconds in 32 bits.
-_LAST_STAMP = 2**31 * NANOSECONDS - 1
 
 
 def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
@@ -84,7 +81,6 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
               TRUSTED_LOOP_TOPIC: (factors.trusted & ~factors.is_odometry).any(),
               FALSE_LOOP_TOPIC: factors.struck.any()}
     with new_bag(path, _note(graph, stamps) | _turned_note(graph, backward)) as writer:
-        messages = _Messages(writer.types)
         writer.add_topic(ODOMETRY_TOPIC, _ODOMETRY)
         for topic in sorted(topic for topic, used in topics.items() if used):
             writer.add_topic(topic, _LOOP)
@@ -93,46 +89,17 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
             true = to_pose3(truth)
         for k, (sample, loops) in enumerate(recorded(graph, stamps)):
             stamp = sample.stamp
-            writer.write(ODOMETRY_TOPIC, stamp, messages.stamped(
-                _ODOMETRY, 'odom', stamp, _BASE_FRAME,
-                messages.pose(sample.pose3, sample.covariance), messages.standing))
+            writer.write(ODOMETRY_TOPIC, stamp, odometry_bytes(
+                'odom', _BASE_FRAME, stamp, sample.pose3, sample.covariance))
             if truth is not None:
-                writer.write(TRUTH_TOPIC, stamp, messages.stamped(
-                    _TRUTH, 'map', stamp, messages.pose(true[k])))
+                writer.write(TRUTH_TOPIC, stamp, pose_bytes('map', stamp, true[k]))
             for loop in loops:
                 topic, frame = ABSOLUTE_TOPIC, 'map'
                 if loop.reference_stamp is not None:
                     topic = (FALSE_LOOP_TOPIC if loop.struck else
                              TRUSTED_LOOP_TOPIC if loop.trusted else LOOP_TOPIC)
                     frame = reference_frame_id(_BASE_FRAME, loop.reference_stamp)
-                writer.write(topic, stamp, messages.stamped(
-                    _LOOP, frame, stamp, messages.pose(loop.pose3, loop.covariance)))
-
-
-class _Messages:
-    """Makes messages of stamps [ns], poses x y z qx qy qz qw and covariances (6, 6)."""
-
-    def __init__(self, types: dict[str, Any]):
-        self._types = types
-        zero = self._geometry('Vector3', 0.0, 0.0, 0.0)
-        self.standing = self._geometry(
-            'TwistWithCovariance', self._geometry('Twist', zero, zero), np.zeros(36))
-
-    def stamped(self, msgtype: str, frame: str, stamp: int, *fields: Any) -> Any:
-        """Return a message of a header and some fields."""
-        time = self._types['builtin_interfaces/msg/Time'](*divmod(stamp, NANOSECONDS))
-        return self._types[msgtype](self._types['std_msgs/msg/Header'](time, frame), *fields)
-
-    def pose(self, pose3: Array, covariance: Array | None = None) -> Any:
-        """Return a Pose, or a PoseWithCovariance."""
-        numbers = pose3.tolist()
-        pose = self._geometry('Pose', self._geometry('Point', *numbers[:3]),
-                              self._geometry('Quaternion', *numbers[3:]))
-        return pose if covariance is None else self._geometry(
-            'PoseWithCovariance', pose, covariance.ravel())
-
-    def _geometry(self, name: str, *fields: Any) -> Any:
-        return self._types[f'geometry_msgs/msg/{name}'](*fields)
+                writer.write(topic, stamp, pose_bytes(frame, stamp, loop.pose3, loop.covariance))
 
 
 def _note(graph: FactorGraph, stamps: list[int]) -> dict[str, str]:
@@ -198,11 +165,11 @@ def _turned_note(graph: FactorGraph, backward: Mask) -> dict[str, str]:
 
 def _stamps(record: GraphRecord) -> list[int]:
     """Return the stamps [ns], each after the one before."""
-    stamps = invented_stamps(len(record.ids)) if record.stamps is None else record.stamps
+    stamps = record.times
     if not len(stamps):
         raise GraphError('a graph without vertices; expected one at least')
     bad = np.flatnonzero(np.diff(stamps, prepend=0) <= 0)
-    if len(bad) or stamps[-1] > _LAST_STAMP:
+    if len(bad) or stamps[-1] > LAST_STAMP:
         k = bad[0] if len(bad) else -1
         raise GraphError(f'vertex {record.ids[k]} has the stamp {stamps[k]} ns; expected one '
                          'after 0, after that of the vertex before, and before the year 2038')

@@ -39,8 +39,7 @@ from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note
 from l1slam_ros.io.bags.topics import (
     ABSOLUTE_TOPIC,
     DEFAULT_TOPICS,
-    FALSE_LOOP_TOPIC,
-    TRUSTED_LOOP_TOPIC,
+    LOOP_TOPIC,
     Topics,
 )
 from l1slam_ros.io.files import counted
@@ -122,16 +121,12 @@ class _Growing:
                 raise MessageError('type', f'{message.msgtype} on {topic}; expected {expected}')
             elif topic == self._topics.odometry:
                 self._builder.add_odometry(conversion.odometry_sample(message.data))
-            elif topic == ABSOLUTE_TOPIC:
-                # The map is the frame that the first one names.
-                self._builder.add_loop(conversion.absolute_pose(message.data, self._map_frame))
-                self._map_frame = message.data.header.frame_id.removeprefix('/')
-            elif topic == FALSE_LOOP_TOPIC:
-                self._builder.add_loop(conversion.false_loop(
-                    message.data, self._builder.base_frame.name))
             else:
-                self._builder.add_loop(conversion.loop_closure(
-                    message.data, self._builder.base_frame.name, topic == TRUSTED_LOOP_TOPIC))
+                name = LOOP_TOPIC if topic == self._topics.loops else topic
+                self._builder.add_loop(conversion.LOOPS[name.removeprefix('/')](
+                    message.data, self._builder.base_frame.name, self._map_frame))
+                if topic == ABSOLUTE_TOPIC:  # the map is the frame that the first one names
+                    self._map_frame = message.data.header.frame_id.removeprefix('/')
         except MessageError as error:
             notes.refuse(error.cause, str(error))
         except (AttributeError, TypeError, ValueError):

@@ -37,7 +37,7 @@ _QOS = {'history': 'keep_last', 'depth': 1000, 'reliability': 'reliable', 'durab
 
 
 class BagWriter:
-    """Writes messages into a new bag; `types` holds the classes of all ROS 2 messages by name."""
+    """Writes serialised messages into a new bag."""
 
     def __init__(self, writer: Any, typestore: Any):
         self._writer, self._typestore = writer, typestore
@@ -46,7 +46,6 @@ class BagWriter:
         self._msgtypes: dict[str, str] = {}
         self._counts: Counter[str] = Counter()
         self._times = (_NEVER, 0)
-        self.types: dict[str, Any] = typestore.types
 
     def add_topic(self, topic: str, msgtype: str) -> None:
         """Announce a topic: reliable, volatile, the last 1000 messages kept."""
@@ -60,10 +59,9 @@ class BagWriter:
                 'offered_qos_profiles': _yaml([_QOS]),
                 'topic_type_hash': self._typestore.hash_rihs01(msgtype)})
 
-    def write(self, topic: str, time: int, message: Any) -> None:
-        """Write a message at a time [ns]."""
-        data = self._typestore.serialize_cdr(message, self._msgtypes[topic])
-        self._writer.add_message(self._channels[topic], time, bytes(data), time)
+    def write(self, topic: str, time: int, data: bytes) -> None:
+        """Write a message (CDR) at a time [ns]."""
+        self._writer.add_message(self._channels[topic], time, data, time)
         self._counts[topic] += 1
         self._times = (min(self._times[0], time), max(self._times[1], time))
 

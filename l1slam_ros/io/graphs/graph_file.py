@@ -23,6 +23,7 @@ from l1slam_ros.io.files import (
     counted,
     first_failure,
     formatted,
+    invented_stamps,
     put_lines,
     quoted,
     replacing,
@@ -71,6 +72,11 @@ class GraphRecord:
     rotation_information: str = QUATERNION
     remarks: Remarks = None
 
+    @property
+    def times(self) -> Indices:
+        """The stamps [ns], (n,), invented where there are none."""
+        return invented_stamps(self.graph.n_poses) if self.stamps is None else self.stamps
+
 
 def read_graph_file(path: str | os.PathLike[str],
                     rotation_information: str = QUATERNION) -> GraphRecord:
@@ -98,8 +104,7 @@ def read_graph_file(path: str | os.PathLike[str],
         kept = ~np.isin(ids, anchors)
         ids, vertices = ids[kept], vertices.chosen(kept) if len(vertices) else vertices
         edges = edges.chosen(np.flatnonzero(np.isin(edges.ids, anchors).sum(axis=1) == 0))
-    graph = FactorGraph(manifold)
-    graph.add_poses(len(ids))
+    graph = FactorGraph(manifold, len(ids))
     _add_edges(path, graph, ids, edges, remarks)
     return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
                        _stamps(path, ids, remarks), (*skipped, *_skipped(groups, ids, anchors)),

@@ -52,7 +52,8 @@ def write_beside(path: str | os.PathLike[str], ids: Indices, stamps: Indices | N
     FileError : one of them cannot be written or removed.
 
     """
-    stamp_lines = [] if stamps is None else _stamp_lines(ids, stamps)
+    stamp_lines = [] if stamps is None else formatted(
+        '%d %d.%09d', np.column_stack((ids, *np.divmod(stamps, NANOSECONDS))))
     pairs = ids[factors.pairs]
     trusted = pair_lines(pairs[factors.trusted & ~factors.is_odometry])
     with (_replaced(beside(path, 'stamps'), stamp_lines),
@@ -72,10 +73,6 @@ def _replaced(path: Path, lines: list[str]) -> Iterator[None]:
     yield
     with reported(path, 'removed'):
         path.unlink(missing_ok=True)
-
-
-def _stamp_lines(ids: Indices, stamps: Indices) -> list[str]:
-    return formatted('%d %d.%09d', np.column_stack((ids, *np.divmod(stamps, NANOSECONDS))))
 
 
 def read_stamps(path: str | os.PathLike[str], ids: Indices) -> Indices | None:

@@ -27,17 +27,13 @@ write its files know; TORO's information is of the angles.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.names import QUATERNION
-
-
-def _same(values: Array) -> Array:
-    return values
 
 
 def _from_angles(values: Array) -> Array:
@@ -68,7 +64,7 @@ class Tag:
     ids: int
     values: int
     information: tuple[tuple[int, int], ...] = ()
-    read: Callable[[Array], Array] = field(default=_same)
+    read: Callable[[Array], Array] = np.asarray
 
     @property
     def vertices(self) -> int:

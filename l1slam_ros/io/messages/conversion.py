@@ -17,6 +17,7 @@ Covariances pass as they come: `graph_builder` decides what they are worth.
 """
 
 import re
+from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -28,12 +29,10 @@ from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import silent_components
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, sound_pose3
-from l1slam_ros.io.files import NANOSECONDS, quoted, stamp_text
+from l1slam_ros.io.files import LAST_STAMP, NANOSECONDS, quoted, stamp_text
 
 _REFERENCE_FRAME = re.compile(
     r'/?(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
-# builtin_interfaces/Time holds its seconds in 32 bits.
-_MAX_SECONDS = 2**31 - 1
 
 
 def odometry_sample(message: Any) -> OdometrySample:
@@ -138,6 +137,14 @@ def absolute_pose(message: Any, map_frame: str) -> LoopClosure:
     return LoopClosure(None, stamp, checked_pose3(position, rotation), covariance)
 
 
+# Topic -> what a PoseWithCovarianceStamped on it says, by the frames of the robot and of the map.
+LOOPS: dict[str, Callable[[Any, str, str], LoopClosure]] = {
+    'loop_closures': lambda message, base, _: loop_closure(message, base, False),
+    'trusted_loop_closures': lambda message, base, _: loop_closure(message, base, True),
+    'false_loop_closures': lambda message, base, _: false_loop(message, base),
+    'absolute_poses': lambda message, _, of_map: absolute_pose(message, of_map)}
+
+
 def stamped_pose(message: Any) -> tuple[int, Array]:
     """
     Return the stamp [ns] and x y z qx qy qz qw (7,) of a message with a pose or a transform.
@@ -204,12 +211,13 @@ def _reference_stamp(frame_id: str, base_frame: str) -> int:
     """Return the stamp [ns] that a reference frame names."""
     match = _REFERENCE_FRAME.fullmatch(frame_id)
     expected = f'{base_frame or "<base_frame>"}@<sec>.<nanosec, 9 digits>'
-    if match is None or int(match['seconds']) > _MAX_SECONDS:
+    if match is None or (
+            stamp := int(match['seconds'] + match['nanoseconds'])) > LAST_STAMP:
         raise MessageError('frame', f'frame {quoted(frame_id)} of a loop; expected {expected}')
     if base_frame and match['base'] != base_frame:
         raise MessageError('frame', f'frame {quoted(frame_id)} of a loop is of '
                            f'{quoted(match["base"])}; expected {expected}')
-    return int(match['seconds']) * NANOSECONDS + int(match['nanoseconds'])
+    return stamp
 
 
 def _pose3(pose: Any) -> Array:

@@ -126,8 +126,7 @@ class PoseGraphs:
         covariance = reduced_covariance(
             manifold, np.array([edge.covariance for edge in edges]).reshape(-1, 6, 6))
         covariance = np.where(usable(covariance)[:, None, None], covariance, model)
-        graph = FactorGraph(manifold)
-        graph.add_poses(len(ids))
+        graph = FactorGraph(manifold, len(ids))
         graph.append_between(
             ends[:, 0], ends[:, 1],
             manifold.from_pose3(np.array([edge.pose3 for edge in edges]).reshape(-1, 7)),

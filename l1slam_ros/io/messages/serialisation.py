@@ -2,7 +2,8 @@
 """
 Poses -> bytes of ROS messages (CDR, little endian), from arrays and stamps, without ROS.
 
-For what is published often, or is large: to make the objects of its message takes too long.
+For what is published often, or is large, and for bags: to make the objects of its message takes
+too long.
 """
 
 import struct
@@ -70,9 +71,21 @@ def path_bytes(frame: str, stamp: int, stamps: Indices, pose3: Array) -> bytes:
     return cdr(*start, (4, header_bytes(frame, int(stamps[0]))), (8, body))
 
 
-def pose_bytes(frame: str, stamp: int, pose3: Array) -> bytes:
-    """Return a serialised geometry_msgs/PoseStamped: one pose (7,) at one time [ns]."""
-    return cdr((4, header_bytes(frame, stamp)), (8, pose3.tobytes()))
+def pose_bytes(frame: str, stamp: int, pose3: Array, covariance: Array | None = None) -> bytes:
+    """
+    Return a serialised geometry_msgs/PoseStamped: one pose (7,) at one time [ns].
+
+    covariance : (6, 6), then it is a PoseWithCovarianceStamped
+    """
+    rest = b'' if covariance is None else covariance.tobytes()
+    return cdr((4, header_bytes(frame, stamp)), (8, pose3.tobytes() + rest))
+
+
+def odometry_bytes(frame: str, child: str, stamp: int, pose3: Array, covariance: Array) -> bytes:
+    """Return a serialised nav_msgs/Odometry: a pose (7,), its covariance (6, 6), no velocity."""
+    # It begins like a TransformStamped.
+    return transform_bytes(frame, child, stamp, np.concatenate(
+        (pose3, covariance.ravel(), np.zeros(6 + 36))))
 
 
 def transform_bytes(parent: str, child: str, stamp: int, pose3: Array,

@@ -171,15 +171,8 @@ class Inputs:
         self.traffic = {topic.name: topic.traffic for topic in self._topics}
 
     def _subscribe_all(self) -> None:
-        base_frame = self._backend.base_frame
-        for name, read in (
-            ('loop_closures', lambda m: conversion.loop_closure(m, base_frame.name, False)),
-            ('trusted_loop_closures',
-             lambda m: conversion.loop_closure(m, base_frame.name, True)),
-            ('false_loop_closures', lambda m: conversion.false_loop(m, base_frame.name)),
-            ('absolute_poses', lambda m: conversion.absolute_pose(m, self._map_frame)),
-        ):
-            self._subscribe(PoseWithCovarianceStamped, name, partial(self._on_loop, read))
+        for name in conversion.LOOPS:
+            self._subscribe(PoseWithCovarianceStamped, name, partial(self._on_loop, name))
         # Pose graphs of other front ends, where their messages are installed.
         for msgtype, name in (MAP_GRAPH, 'map_graph'), (POSE_GRAPH, 'pose_graph'):
             package, _, kind = msgtype.split('/')
@@ -314,8 +307,9 @@ class Inputs:
             self._unanswered = False
             self._robot.answer()
 
-    def _on_loop(self, read: Callable[[Any], LoopClosure], message: Any) -> None:
-        self._backend.add_loop(read(message))
+    def _on_loop(self, name: str, message: Any) -> None:
+        self._backend.add_loop(conversion.LOOPS[name](
+            message, self._backend.base_frame.name, self._map_frame))
 
     def _on_pose_graph(self, graphs: PoseGraphs, message: Any) -> None:
         for found in graphs.take(message):

@@ -3,10 +3,10 @@
 
 import queue
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from rclpy.node import Node
 from rclpy.task import Future
+from std_srvs.srv import Trigger
 
 from l1slam_ros.core.errors import Interrupted, L1SlamError
 from l1slam_ros.ros.threads.background import background
@@ -14,21 +14,6 @@ from l1slam_ros.ros.threads.failures import Failures, reason
 
 # [s] A service that failed may not be called again: its failure is told for so long.
 _REMEMBERED = 60.0
-
-
-@dataclass(frozen=True)
-class Answer:
-    """What a service replies."""
-
-    success: bool
-    message: str
-
-
-@dataclass(frozen=True)
-class _Job:
-    name: str
-    work: Callable[[], str]
-    future: Future
 
 
 class JobQueue:
@@ -48,7 +33,9 @@ class JobQueue:
 
     def __init__(self, node: Node, failures: Failures, done: Callable[[], None]):
         self._node, self._failures, self._done = node, failures, done
-        self._queue: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        # What it is called, what is to be done, and where its answer goes; None: the end.
+        self._queue: queue.SimpleQueue[tuple[str, Callable[[], str], Future] | None] = (
+            queue.SimpleQueue())
         self._thread = background('services', self._work)
 
     def start(self) -> None:
@@ -56,9 +43,9 @@ class JobQueue:
         self._thread.start()
 
     def put(self, name: str, work: Callable[[], str]) -> Future:
-        """Queue some work, which returns a sentence; the future's result is an `Answer`."""
+        """Queue some work, which returns a sentence; the future's result is the answer."""
         future = Future(executor=self._node.executor)
-        self._queue.put(_Job(name, work, future))
+        self._queue.put((name, work, future))
         return future
 
     def close(self, seconds: float) -> bool:
@@ -69,21 +56,21 @@ class JobQueue:
 
     def _work(self) -> None:
         while (job := self._queue.get()) is not None:
-            job.future.set_result(self._carry_out(job))
+            name, work, future = job
+            future.set_result(self._carry_out(name, work))
             if (executor := self._node.executor) is not None:
                 executor.wake()  # it looks whether the answer is there only when it is up
 
-    def _carry_out(self, job: _Job) -> Answer:
+    def _carry_out(self, name: str, work: Callable[[], str]) -> Trigger.Response:
         try:
-            answer = Answer(True, job.work())
+            sentence = work()
             self._done()
         except Interrupted:
-            return Answer(False, 'the node is ending')
-        except (L1SlamError, OSError) as error:
-            # The caller is told: the fault lies with the call, not with the node.
-            return Answer(False, reason(error))
+            return Trigger.Response(success=False, message='the node is ending')
         except Exception as error:
-            self._failures.note(job.name, error, _REMEMBERED)
-            return Answer(False, reason(error))
-        self._failures.over(job.name)
-        return answer
+            # Of ours the caller is told: the fault lies with the call, not with the node.
+            if not isinstance(error, L1SlamError | OSError):
+                self._failures.note(name, error, _REMEMBERED)
+            return Trigger.Response(success=False, message=reason(error))
+        self._failures.over(name)
+        return Trigger.Response(success=True, message=sentence)

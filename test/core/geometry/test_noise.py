@@ -9,13 +9,13 @@ from problems import random_information
 from l1slam_ros.core.errors import L1SlamError, NoiseError
 from l1slam_ros.core.geometry.noise import (
     LEAST_VARIANCE,
+    MOST_OF_ODOMETRY,
     MOST_VARIANCE,
-    at_most,
-    or_model,
     root_of_inverse,
     square_root_information,
     usable,
     whiten,
+    within_bounds,
 )
 
 ASYMMETRIC = np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -95,22 +95,19 @@ def test_a_root_of_the_inverse_whitens_as_that_of_the_information(rng):
 MODEL = np.diag([0.4, 0.5, 0.6])
 
 
-@pytest.mark.parametrize('stated, most, model', [
-    (1e300, MOST_VARIANCE, 1e300), (1e-300, 1e-300, 0.5), (1e-9, 1e-9, 0.5),
-    (1.1 * MOST_VARIANCE, MOST_VARIANCE, 1.1 * MOST_VARIANCE), (MOST_VARIANCE,) * 3,
+@pytest.mark.parametrize('stated, of_loop, of_odometry', [
+    (1e300, MOST_VARIANCE, 0.5), (1e-300, 0.5, 0.5), (1e-9, 0.5, 0.5),
+    (1.1 * MOST_VARIANCE, MOST_VARIANCE, 0.5), (MOST_VARIANCE, MOST_VARIANCE, MOST_OF_ODOMETRY),
     (LEAST_VARIANCE,) * 3])
-def test_variances_are_bounded_and_the_others_stay(stated, most, model):
+def test_variances_are_bounded_and_the_others_stay(stated, of_loop, of_odometry):
     """One component, correlated with the others by a half."""
-    sigma = np.array([2.0, np.sqrt(stated), 3.0])
-    covariance = np.outer(sigma, sigma) * (0.5 + 0.5 * np.eye(3))
-    cut, large = at_most(covariance[None], MOST_VARIANCE)
-    expected = np.array([2.0, np.sqrt(most), 3.0])
-    assert_allclose(cut[0], np.outer(expected, expected) * (0.5 + 0.5 * np.eye(3)), rtol=1e-12)
-    assert large.tolist() == [[False, stated != most, False]]
-    modelled, out = or_model(covariance[None], MODEL)
-    correlation = 0.5 if stated == model else 0.0
-    expected = np.array([2.0, np.sqrt(model), 3.0])
-    shape = np.eye(3) + (1 - np.eye(3)) * [[0, correlation, 0.5], [correlation, 0, correlation],
-                                           [0.5, correlation, 0]]
-    assert_allclose(modelled[0], np.outer(expected, expected) * shape, rtol=1e-12)
-    assert out.tolist() == [[False, stated != model, False]]
+    def correlated(variance, by):
+        sigma = np.array([2.0, np.sqrt(variance), 3.0])
+        return np.outer(sigma, sigma) * ([1, by, 0.5], [by, 1, by], [0.5, by, 1])
+
+    for used, bounds in ((of_loop, (MOST_VARIANCE,)), (of_odometry, (MOST_OF_ODOMETRY,
+                                                                     MOST_VARIANCE))):
+        found, bounded = within_bounds(correlated(stated, 0.5)[None], MODEL, *bounds)
+        assert_allclose(found[0], correlated(used, 0.0 if used == 0.5 else 0.5), rtol=1e-12)
+        assert_allclose(np.reshape(bounded, (-1, 2)),
+                        [(stated, used)] if stated != used else np.zeros((0, 2)))

@@ -26,8 +26,7 @@ def between(i, j):
 
 
 def graph_with(n, pairs):
-    graph = FactorGraph(se2)
-    graph.add_poses(n)
+    graph = FactorGraph(se2, n)
     for i, j in pairs:
         graph.add_between(i, j, np.array([[i, j, 0.0]]), np.eye(3)[None])
     return graph
@@ -38,8 +37,7 @@ def pairs_of(graph):
 
 
 def test_factors_are_kept_in_the_order_they_came(rng):
-    graph = FactorGraph(se2)
-    graph.add_poses(2)
+    graph = FactorGraph(se2, 2)
     graph.add_poses()
     measurement, information = random_poses(4, rng), random_information(4, rng)
     graph.add_between(np.array([0, 2, 1]), np.array([1, 0, 2]), measurement[:3], information[:3])

@@ -73,8 +73,7 @@ def test_the_gauge_is_fixed_by_keyframe_0_or_by_the_world(case, rng):
 
 @pytest.mark.parametrize('n, columns', [(0, 0), (1, 0), (3, 6)])
 def test_keyframes_without_factors_are_empty_columns(n, columns):
-    graph = FactorGraph(se2)
-    graph.add_poses(n)
+    graph = FactorGraph(se2, n)
     system = linearise(graph, se2.identity(n))
     assert system.A.shape == (0, columns) and system.A.nnz == 0 and system.b.shape == (0,)
     stepped = step_poses(graph, se2.identity(n), [0] * columns)

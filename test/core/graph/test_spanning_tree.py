@@ -33,8 +33,7 @@ def test_odometry_is_the_chain_composed_one_by_one(rng):
 
 
 def test_odometry_takes_the_first_of_parallel_factors():
-    graph = FactorGraph(se2)
-    graph.add_poses(2)
+    graph = FactorGraph(se2, 2)
     for x in 1.0, 2.0:
         graph.add_between(1, 0, np.array([[-x, 0, 0]]), np.eye(3)[None])
     graph.add_between(0, 1, np.array([[3.0, 0, 0]]), np.eye(3)[None])

@@ -28,8 +28,7 @@ def world(rng):
 
 def chain_graph(n):
     """A drive of n poses straight on, without loops."""
-    graph = FactorGraph(se2)
-    graph.add_poses(n)
+    graph = FactorGraph(se2, n)
     k = np.arange(n - 1)
     graph.add_between(k, k + 1, np.tile([1.0, 0.0, 0.0], (n - 1, 1)),
                       np.tile(np.diag([4.0, 4.0, 9.0]), (n - 1, 1, 1)))
@@ -127,8 +126,7 @@ def test_too_many_are_refused(kind, rng):
 
 @pytest.mark.parametrize('kind', FALSE_LOOPS)
 def test_a_graph_without_factors_is_refused(kind, rng):
-    graph = FactorGraph(se2)
-    graph.add_poses(100)
+    graph = FactorGraph(se2, 100)
     poses = np.stack([np.arange(100.0)] * 3, axis=1)
     with pytest.raises(GraphError, match='factor'):
         FALSE_LOOPS[kind](graph, poses, 20, rng)
@@ -136,8 +134,7 @@ def test_a_graph_without_factors_is_refused(kind, rng):
 
 def test_inserting_keeps_what_was_there(rng):
     """Also an order that is not that of time, parallel factors and an absolute one."""
-    graph = FactorGraph(se2)
-    graph.add_poses(9)
+    graph = FactorGraph(se2, 9)
     i, j = np.array([0, 1, 7, 1, 2]), np.array([1, 2, 8, 2, 0])
     z = rng.normal(size=(5, 3))
     information = np.stack([np.eye(3) * k for k in range(1, 6)])

@@ -31,8 +31,7 @@ def record_of(pairs, rng, n=None, stamps=None):
     """Return a graph with random measurements between the pairs of keyframes; vertex ids 10 k."""
     i, j = np.array(pairs).T
     n = n or int(max(i.max(), j.max())) + 1
-    graph = FactorGraph(se2)
-    graph.add_poses(n)
+    graph = FactorGraph(se2, n)
     A = rng.normal(size=(len(i), 3, 3))
     graph.add_between(i, j, rng.normal(size=(len(i), 3)),
                       A @ A.transpose(0, 2, 1) + 0.1 * np.eye(3))
@@ -133,8 +132,7 @@ def test_factors_from_later_keyframes_to_earlier_ones_come_back(tmp_path, rng, m
                       (4, 2)])
     d, trusted = manifold.TANGENT_SIZE, np.arange(len(pairs)) == 4
     A = rng.normal(size=(len(pairs), d, d))
-    graph = FactorGraph(manifold)
-    graph.add_poses(5)
+    graph = FactorGraph(manifold, 5)
     Z = manifold.retract(manifold.identity(len(pairs)), 0.8 * rng.normal(size=(len(pairs), d)))
     graph.add_between(*pairs.T, Z, A @ A.transpose(0, 2, 1) + 0.1 * np.eye(d), trusted)
     write_graph_bag(tmp_path / 'bag', GraphRecord(graph, None, np.arange(5)))
@@ -240,7 +238,6 @@ def test_a_slash_before_the_map_frame_says_nothing(tmp_path, rng):
 
 
 def test_a_single_keyframe(tmp_path):
-    graph = FactorGraph(se2)
-    graph.add_poses(1)
+    graph = FactorGraph(se2, 1)
     write_graph_bag(tmp_path / 'bag', GraphRecord(graph, None, np.array([0])))
     assert [topic for topic, _, _ in read_with_rosbags(tmp_path / 'bag')] == ['/odom']

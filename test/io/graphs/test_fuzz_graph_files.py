@@ -142,8 +142,7 @@ def records(draw):
     number = st.floats(-1e30, 1e30) | st.sampled_from([0.0, -0.0, 1 / 3])
     A = rng.normal(size=(len(i), 3, 3))
     information = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(3)
-    graph = FactorGraph(se2)
-    graph.add_poses(n)
+    graph = FactorGraph(se2, n)
     graph.add_between(i, (i + rng.integers(1, n, len(i))) % n,
                       draw(arrays(float, (len(i), 3), elements=number)),
                       information * 10.0 ** rng.integers(-20, 20, (len(i), 1, 1)))

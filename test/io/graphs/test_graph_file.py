@@ -157,8 +157,7 @@ def test_no_file_and_a_directory(tmp_path):
 
 
 def random_record(rng, n=40):
-    graph = FactorGraph(se2)
-    graph.add_poses(n)
+    graph = FactorGraph(se2, n)
     i = np.concatenate((np.arange(n - 1), rng.integers(0, n - 5, 60)))
     j = np.concatenate((np.arange(1, n), i[n - 1:] + rng.integers(1, 5, 60)))
     A = rng.normal(size=(len(i), 3, 3))

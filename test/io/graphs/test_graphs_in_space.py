@@ -42,8 +42,7 @@ def information_of(graph):
 
 
 def random_record(rng, rotation_information=QUATERNION, n=8):
-    graph = FactorGraph(se3)
-    graph.add_poses(n)
+    graph = FactorGraph(se3, n)
     A = rng.normal(size=(n - 1, 6, 6))
 
     def anywhere(count):

@@ -170,18 +170,24 @@ def test_a_pose_graph_tells_the_times_and_whose_they_are(truth):
 def bag(tmp_path, truth):
     """A bag with odometry, and the graphs of RTAB-Map and of pose_graph_tools."""
     with new_bag(tmp_path / 'bag', {}) as writer:
-        writer._typestore.register(FIELDS)
+        types = writer._typestore
+        types.register(FIELDS)
+
+        def write(topic, seconds, message):
+            writer.write(topic, seconds * SECOND,
+                         bytes(types.serialize_cdr(message, message.__msgtype__)))
+
         writer.add_topic('/odom', 'nav_msgs/msg/Odometry')
         writer.add_topic('/rtabmap/mapGraph', MAP_GRAPH)
         writer.add_topic('/kimera/pose_graph', POSE_GRAPH)
         closing = [link(6, 1, GLOBAL, truth)]
         for k, message in enumerate(growing(truth, closing)):
             numbers = se2.to_pose3(se2.between(truth[:1], truth[k : k + 1]))[0].tolist()
-            writer.write('/odom', (10 + k) * SECOND, odometry(
+            write('/odom', 10 + k, odometry(
                 of_rosbags, header(10 + k), position=numbers[:3], quaternion=numbers[3:],
                 covariance=np.zeros(36)))
-            writer.write('/rtabmap/mapGraph', (10 + k) * SECOND, message)
-        writer.write('/kimera/pose_graph', 20 * SECOND, pose_graph(
+            write('/rtabmap/mapGraph', 10 + k, message)
+        write('/kimera/pose_graph', 20, pose_graph(
             20, [(k, 9.0 + k) for k in range(1, 7)],
             [edge(k, k + 1, ODOM, truth) for k in range(1, 6)] + [edge(1, 6, LOOPCLOSE, truth)]))
     return tmp_path / 'bag'

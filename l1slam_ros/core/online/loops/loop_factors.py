@@ -295,10 +295,10 @@ def _loop_covariance(stated: Array, model: Array | None,
         return None if model is None else model[None], []
     if verbatim:
         return noise.silenced(stated, silent), []
-    cut, large = noise.at_most(whole, noise.MOST_VARIANCE)
-    least = noise.LEAST_VARIANCE * np.eye(len(cut[0]))
-    used, small = noise.or_model(cut, least if model is None else model)
-    return noise.silenced(used, silent), noise.bounds(whole, used, large | small)
+    least = noise.LEAST_VARIANCE * np.eye(len(whole[0]))
+    used, bounded = noise.within_bounds(
+        whole, least if model is None else model, noise.MOST_VARIANCE)
+    return noise.silenced(used, silent), bounded
 
 
 def _said(manifold: Manifold, loop: LoopClosure, covariance: Array) -> Array:

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`backend` as a process of its own, and a peer that plays to it, hears it and calls it."""
+
+import argparse
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+# A domain of its own, which its children share: nobody else's messages are counted.
+os.environ.setdefault('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_srvs.srv import SetBool, Trigger
+
+from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC
+from l1slam_ros.ros.demo import executable
+
+KINDS = {ODOMETRY_TOPIC: Odometry, LOOP_TOPIC: PoseWithCovarianceStamped}
+PATIENCE = 900.0  # [s] the solver may have to be compiled
+AnyPeer = TypeVar('AnyPeer', bound='Peer')
+
+
+class Peer:
+    """
+    The node as a process, with some parameters, and who talks to it; a context manager.
+
+    Attributes
+    ----------
+    maps : all Paths that came; said : by name, what the last diagnostics say, their sentence is
+    `message`; publishers : of `KINDS`, by topic
+
+    """
+
+    def __init__(self, parameters: Mapping[str, object]):
+        self.process = subprocess.Popen([
+            executable('backend'), '--ros-args', '--log-level', 'error',
+            *(part for name, value in parameters.items() for part in ('-p', f'{name}:={value}'))])
+        self.node = rclpy.create_node('peer')
+        self.maps: list[PathMessage] = []
+        self.said: dict[str, str] = {}
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(PathMessage, 'path', self.maps.append, latched)
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._hear, 10)
+        self.publishers = {topic: self.node.create_publisher(kind, topic, QoSProfile(depth=1000))
+                           for topic, kind in KINDS.items()}
+        self.until(lambda: 'compiling' not in self.said.get('message', 'compiling') and all(
+            p.get_subscription_count() for p in self.publishers.values()))
+
+    def __enter__(self: AnyPeer) -> AnyPeer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def _hear(self, message: DiagnosticArray) -> None:
+        (status,) = message.status
+        self.said = {value.key: value.value for value in status.values}
+        self.said['message'] = status.message
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        """Listen until something holds."""
+        deadline = time.monotonic() + PATIENCE
+        while not condition():
+            assert self.process.poll() is None, 'the node has ended'
+            assert time.monotonic() < deadline, f'waited {PATIENCE} s in vain: {self.said}'
+            rclpy.spin_once(self.node, timeout_sec=0.02)
+
+    def listen(self, seconds: float) -> None:
+        """Listen for some time."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            rclpy.spin_once(self.node, timeout_sec=left)
+
+    def until_calm(self, name: str, seconds: float = 2.5) -> None:
+        """Listen until the diagnostics have said the same for some time."""
+        seen = ''
+        while seen != self.said[name]:
+            seen = self.said[name]
+            self.listen(seconds)
+
+    def call(self, name: str, request: Any = None) -> tuple[float, str]:
+        """Return how long a service took to answer [s], and its sentence."""
+        kind = SetBool if name == 'pause' else Trigger
+        client = self.node.create_client(kind, f'/backend/{name}')
+        self.until(client.service_is_ready)
+        began = time.monotonic()
+        future = client.call_async(request or kind.Request())
+        self.until(future.done)
+        return time.monotonic() - began, future.result().message
+
+    def end(self, number: int = signal.SIGINT) -> int:
+        """End the node by a signal, and the peer; return the exit code."""
+        self.process.send_signal(number)
+        code = self.process.wait(PATIENCE)
+        self.node.destroy_node()
+        return code
+
+
+def cpu_seconds(process: int) -> float:
+    """Return the processor's time that a process has taken [s]."""
+    with open(f'/proc/{process}/stat') as file:
+        fields = file.read().rsplit(')', 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def arguments(text: str | None, **defaults: Any) -> argparse.Namespace:
+    """
+    Return the arguments of a command.
+
+    text : what it does; defaults : of what may be left out, of the others what they are
+    """
+    parser = argparse.ArgumentParser(
+        description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, default in defaults.items():
+        if isinstance(default, type):
+            parser.add_argument(name, type=default)
+        else:
+            parser.add_argument(name, type=type(default), nargs='?', default=default)
+    return parser.parse_args()
