@@ -132,8 +132,8 @@ def _count() -> int:
     """Take messages until SIGINT; print how many, and how old they were."""
     rclpy.init()
     node = rclpy.create_node('bare')
-    odometry, loops = (_heard(node, kind, topic) for topic, kind in KINDS.items())
-    _spin(node)
+    odometry, loops = (heard(node, kind, topic) for topic, kind in KINDS.items())
+    spin(node)
     print(len(odometry), len(loops))
     print(f'bare subscriber: {_late(odometry)}')
     return 0
@@ -143,22 +143,23 @@ def _listen() -> int:
     """Note until SIGINT when poses come; print it."""
     rclpy.init()
     node = rclpy.create_node('ear')
-    poses = _heard(node, PoseStamped, 'pose')
-    _spin(node)
+    poses = heard(node, PoseStamped, 'pose')
+    spin(node)
     print(f'pose: {_late(poses)}')
     return 0
 
 
-def _heard(node: Any, kind: Any, topic: str) -> list[tuple[int, int]]:
+def heard(node: Any, kind: Any, topic: str) -> list[tuple[int, int]]:
     """Return what will hold when each message was sent, or what it answers, and when it came."""
-    heard: list[tuple[int, int]] = []
+    notes: list[tuple[int, int]] = []
     node.create_subscription(
-        kind, topic, lambda m: heard.append((stamp_of(m.header), time.monotonic_ns())),
+        kind, topic, lambda m: notes.append((stamp_of(m.header), time.monotonic_ns())),
         QoSProfile(depth=1000))
-    return heard
+    return notes
 
 
-def _spin(node: Any) -> None:
+def spin(node: Any) -> None:
+    """Let a node work until a signal."""
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
 
