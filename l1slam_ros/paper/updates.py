@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import cached_property
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -60,6 +61,14 @@ class Kept:
         now = backend.snapshot()
         return Kept(now.graph, now.judgement.accepted, now.poses)
 
+    def first(self, accepted: Mask, poses: Array) -> 'Kept':
+        """Return it as it was with fewer factors, accepted (k,), and poses (n, p)."""
+        graph, factors, rows = self.graph, self.graph.between, slice(len(accepted))
+        part = FactorGraph(graph.manifold, len(poses))
+        part.append_between(factors.i[rows], factors.j[rows], factors.measurement[rows],
+                            factors.sqrt_information[rows])
+        return Kept(part, accepted, poses)
+
 
 @dataclass
 class Updates:
@@ -67,16 +76,26 @@ class Updates:
     What was measured of one graph.
 
     ours, peer : seconds of each update; the peer's time may have been up before the end; behind :
-    seconds of our other threads; elapsed : wall time [s]; on_the_way : maps at regular distances,
-    the last one at the last keyframe; at_rest : a second later.
+    seconds of our other threads; elapsed : wall time [s]; marks : what was accepted at regular
+    distances, and the poses; at_rest : a second after the last keyframe.
     """
 
     ours: list[float] = field(default_factory=list)
     peer: list[float] = field(default_factory=list)
     behind: float = 0.0
     elapsed: float = 0.0
-    on_the_way: list[Kept] = field(default_factory=list)
+    marks: list[tuple[Mask, Array]] = field(default_factory=list)
     at_rest: Kept | None = None
+
+    @cached_property
+    def on_the_way(self) -> list[Kept]:
+        """
+        The maps at the marks, the last one at the last keyframe.
+
+        Made when asked for: each graph of a growing one that is kept holds all its arrays, and
+        they would be counted as the back end's memory.
+        """
+        return [self.at_rest.first(*mark) for mark in self.marks] if self.at_rest else []
 
 
 class _Isam2:
@@ -217,7 +236,9 @@ def run_updates(drive: Drive, peer: Peer | None, rate: float, maps: int,
             if peer:
                 found.peer += peer(k)
             if k + 1 in kept:
-                found.on_the_way.append(Kept.of(backend))
+                now = backend.snapshot()
+                found.marks.append((now.judgement.accepted, now.poses))
+                del now
             advance()
             due = max(due + 1 / rate, time.perf_counter() - _LAG)
             time.sleep(max(due - time.perf_counter(), 0.0))

@@ -233,6 +233,7 @@ class Growth:
         """Solve for the accepted factors, drop what does not fit any more, measure the noise."""
         noise_fits = self._knows_noise
         while True:
+            vars(self).pop('posterior', None)  # nearly as large as the factor that is made now
             if self.cut.any():
                 self.part = component_labels(self.graph.subset(self.accepted & ~self.cut))
             rows = np.flatnonzero(self.accepted)
@@ -246,7 +247,6 @@ class Growth:
             residual = whitened_residual(subgraph, self.poses).reshape(len(rows), -1)
             misfits = self._misfits(rows, residual) if noise_fits else rows[:0]
             if not len(misfits):
-                vars(self).pop('posterior', None)  # as large as the one that takes its place
                 self.posterior = sample_posterior(subgraph, self.poses, cholesky, solved)
                 if self._is_noisier(rows):
                     continue
