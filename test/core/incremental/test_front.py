@@ -11,6 +11,7 @@ from systems import dense_covariance
 
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.incremental import front
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.snapshot import ACCEPTED, BuilderState, Optimised, SavedMap
 from l1slam_ros.core.online.update import improve
@@ -144,6 +145,22 @@ def test_loops_that_come_before_a_map_is_made_are_looked_at_by_its_front(world):
     now = backend.snapshot()
     assert backend._live.front.rows == len(now.graph.between) > begun + 2 * (LAST - KNOWN) / 3
     assert now.judgement.accepted[begun:].mean() > 0.9
+
+
+def test_a_front_that_is_full_leaves_loops_to_the_next_one(world, monkeypatch):
+    backend = alone(world)
+    begun = len(backend.snapshot().graph.between)
+    play(backend, world, KNOWN, LAST)
+    with monkeypatch.context() as patched:
+        patched.setattr(front, '_MOST_POINTS', -1)
+        backend._map_anew(False, 10.0, lambda: None)
+    assert backend._live.front.closed and backend.behind().bound > 0
+    now = backend.snapshot()
+    new = now.graph.between.is_odometry[begun:]
+    assert now.judgement.accepted[begun:].tolist() == new.tolist()
+    assert now.judgement.suspect[begun:].tolist() == (~new).tolist()
+    backend._map_anew(False, 10.0, lambda: None)
+    assert backend.snapshot().judgement.accepted[begun:].mean() > 0.9
 
 
 def test_a_front_that_fails_is_closed_and_moves_nothing(world, monkeypatch):

@@ -331,7 +331,8 @@ class LiveMap:
     def behind(self) -> Behind:
         """Return what goes on behind updates. A factor more takes nothing from a bound."""
         now, accepted, front = time.monotonic(), self.accepted, self.front
-        holds = not (self._proved & ~accepted[:len(self._proved)]).any()
+        proved = self._proved[:len(accepted)]  # at the others nobody has looked since
+        holds = not (proved & ~accepted[:len(proved)]).any()
         return Behind(
             now - self._factored_at if front else np.nan, front.border if front else 0,
             0 if self.all_judged else len(self._builder.loops.rows) - max(self._judged_loops, 0),
