@@ -198,6 +198,17 @@ def test_a_word_counts_for_the_loops_that_came_before_it(late):
     assert factors.trusted[rows].tolist() == [False, True, False]
 
 
+def test_a_strike_that_waits_or_expires_is_no_loop():
+    poses = curve(100)
+    builder = grown(poses[:20], GraphBuilderOptions(loop=LoopOptions(wait=2.0)))
+    added(builder, replace(true_loop(poses, 3, 95), struck=True))
+    assert len(builder.loops.waiting) == 1 and not any(map(len, builder.loops.stamps))
+    drive_on(builder, poses[:50], 20)
+    builder.add_due_loops()
+    assert not len(builder.loops.waiting) and not any(map(len, builder.loops.stamps))
+    assert builder.notes.sentences()[0].startswith('1 message refused: a strike from 300000000 ns')
+
+
 # The same loop again
 
 

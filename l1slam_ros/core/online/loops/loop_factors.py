@@ -134,7 +134,8 @@ class LoopFactors:
         due = self.waiting.due(now)
         since = now - int(options.wait * 1e9)
         for one in self.waiting.expired(since) if track.first < since else ():
-            self._expired.extend(np.array([one.loop.stamps]))
+            if not one.loop.struck:
+                self._expired.extend(np.array([one.loop.stamps]))
             self._refuse('expired', one.loop, f'waited for odometry until {track.last_stamp} ns; '
                          'expected odometry of its times')
             # Sent again when odometry has come that far, it is welcome.
@@ -213,7 +214,8 @@ class LoopFactors:
         self._stamps.extend(stamps)
 
     def _refuse(self, cause: str, loop: LoopClosure, why: str) -> None:
-        what = 'an absolute pose at' if loop.is_absolute else f'a loop from {loop.stamps[0]} ns to'
+        kind = 'a strike' if loop.struck else 'a loop'
+        what = 'an absolute pose at' if loop.is_absolute else f'{kind} from {loop.stamps[0]} ns to'
         self._notes.refuse(cause, f'{what} {loop.stamp} ns {why}')
 
     def _covariance(self, loop: LoopClosure, options: LoopOptions) -> Array | None:
