@@ -165,8 +165,9 @@ def _print_report(report: dict[str, object], record: GraphRecord, cost_name: str
     solution = outcome.solution
     seed = f'seed {outcome.seed_cost:.6g}, ' if outcome.seed_cost is not None else ''
     factors = record.graph.between
+    struck = f', {factors.struck.sum():,} struck out' if factors.struck.any() else ''
     print(f'{counted(len(solution.poses), "pose")}, {counted(len(factors), "factor")}, '
-          f'{doubted(factors)}')
+          f'{doubted(factors)}{struck}')
     print(f'{cost_name}: initial {outcome.initial_cost:.6g}, {seed}final {solution.cost:.6g}')
     inner = f', {counted(solution.inner_iterations, "inner one")}' if (
         solution.inner_iterations) else ''

@@ -70,8 +70,7 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
     refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect & ~factors.struck)
     suspect = np.flatnonzero(is_loop & judgement.suspect)
     if is_loop.any():
-        struck = f', {factors.struck.sum():,} struck out' if factors.struck.any() else ''
-        yield f'{len(refused):,} of {doubted(factors)} refused{struck}'
+        yield f'{len(refused):,} of {doubted(factors)} refused'
     worst = refused[np.argsort(-judgement.sigmas[refused], kind='stable')]
     for row in worst[:_NAMED].tolist():
         yield f'  {_named(pairs[row])}: {judgement.sigmas[row]:.1f} sigmas off the accepted ones'
