@@ -24,7 +24,13 @@ from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.node_options import read_params_file
 from l1slam_ros.io.progress import Progress
-from l1slam_ros.io.sentences import DOUBTFUL, doubt_sentence, doubted, judgement_sentences
+from l1slam_ros.io.sentences import (
+    DOUBTFUL,
+    doubt_sentence,
+    doubted,
+    judgement_sentences,
+    offset_sentence,
+)
 
 
 def solve(arguments: argparse.Namespace) -> Ending:
@@ -40,7 +46,7 @@ def solve(arguments: argparse.Namespace) -> Ending:
         known_false(arguments.input, record)  # damaged, it is refused before the work
     compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
     outcome = _solved(arguments, record, asked)
-    remarks = list(_remarks(outcome))
+    remarks = [*_remarks(outcome), *offset_sentence(record.graph.manifold, outcome.offset)]
     warn(remarks, arguments.quiet)
     judgement = outcome.judgement
     ending = Ending(record.damage, doubt_sentence(
@@ -165,8 +171,9 @@ def _print_report(report: dict[str, object], record: GraphRecord, cost_name: str
     solution = outcome.solution
     seed = f'seed {outcome.seed_cost:.6g}, ' if outcome.seed_cost is not None else ''
     factors = record.graph.between
+    struck = f', {factors.struck.sum():,} struck out' if factors.struck.any() else ''
     print(f'{counted(len(solution.poses), "pose")}, {counted(len(factors), "factor")}, '
-          f'{doubted(factors)}')
+          f'{doubted(factors)}{struck}')
     print(f'{cost_name}: initial {outcome.initial_cost:.6g}, {seed}final {solution.cost:.6g}')
     inner = f', {counted(solution.inner_iterations, "inner one")}' if (
         solution.inner_iterations) else ''

@@ -15,6 +15,7 @@ from l1slam_ros.core.names import ANGLE, QUATERNION
 from l1slam_ros.core.robust import inspection
 from l1slam_ros.io.files import NANOSECONDS, counted, stamp_text
 from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.sentences import offset_sentence
 
 # A reading of the rotations' information fits where their errors are as large as it says, to this
 # logarithm: half of what it is to the other reading.
@@ -131,11 +132,7 @@ def _on_noise(record: GraphRecord) -> Iterator[str]:
         yield f'the noise cannot be judged: {error}'
         return
     yield from _on_rotations(record, scales.turns)
-    if scales.offset is not None:
-        length, angle = record.graph.manifold.motion(scales.offset[None])
-        yield (f'loops share an offset of {length[0]:.2g} m and {math.degrees(angle[0]):.2g} '
-               'degrees, more than noise explains: look at the mount of the sensor, or at the '
-               'times that loops name')
+    yield from offset_sentence(record.graph.manifold, scales.offset)
     # Of too few factors nothing can be said.
     both = {'odometry': scales.odometry, 'loops': scales.loops}
     found = {name: scale for name, scale in both.items() if not math.isnan(scale)}

@@ -65,6 +65,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     """
     target = Path(os.path.realpath(path))
+    if kind := other_kind(target):
+        raise FileError(path, f'cannot be written: it is {kind}')
     # Not `tempfile`: its files are for their owner only, whatever the umask says.
     temporary = target.parent / f'.{target.name}.{secrets.token_hex(4)}.tmp'
     try:
@@ -107,8 +109,16 @@ def require_folder(path: str | os.PathLike[str]) -> None:
 def require_file(path: str | os.PathLike[str]) -> None:
     """Refuse, before any work is done, to write a file where none can be."""
     require_folder(path)
-    if Path(path).is_dir():
-        raise FileError(path, 'cannot be written: it is a directory')
+    if kind := other_kind(path):
+        raise FileError(path, f'cannot be written: it is {kind}')
+
+
+def other_kind(path: str | os.PathLike[str]) -> str:
+    """Return what is in the place of a file that is none to be replaced, or read to its end."""
+    # Not the functions of `Path`: those raise where a name is too long.
+    if os.path.isfile(path) or not os.path.exists(path):
+        return ''
+    return 'a directory' if os.path.isdir(path) else 'no regular file'
 
 
 def put_lines(path: Path, lines: Iterable[str]) -> None:

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a robust solve refused, and what it found of the noise, in sentences for people."""
 
+import math
 from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import BetweenFactors
 from l1slam_ros.core.robust.judgement import (
     MOSTLY_REFUSED,
@@ -70,8 +71,7 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
     refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect & ~factors.struck)
     suspect = np.flatnonzero(is_loop & judgement.suspect)
     if is_loop.any():
-        struck = f', {factors.struck.sum():,} struck out' if factors.struck.any() else ''
-        yield f'{len(refused):,} of {doubted(factors)} refused{struck}'
+        yield f'{len(refused):,} of {doubted(factors)} refused'
     worst = refused[np.argsort(-judgement.sigmas[refused], kind='stable')]
     for row in worst[:_NAMED].tolist():
         yield f'  {_named(pairs[row])}: {judgement.sigmas[row]:.1f} sigmas off the accepted ones'
@@ -86,6 +86,15 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
             yield sentence.format(times=times)
     if not judgement.is_noise_stated:
         yield _TOGETHER
+
+
+def offset_sentence(manifold: Manifold, offset: Array | None) -> Iterator[str]:
+    """Yield that loops lack a step (k,); None: they lack nothing."""
+    if offset is not None:
+        length, angle = manifold.motion(offset[None])
+        yield (f'loops share an offset of {length[0]:.2g} m and {math.degrees(angle[0]):.2g} '
+               'degrees, more than noise explains: look at the mount of the sensor, or at the '
+               'times that loops name')
 
 
 def doubted(factors: BetweenFactors) -> str:

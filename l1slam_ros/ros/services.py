@@ -18,8 +18,9 @@ from std_srvs.srv import SetBool, Trigger
 from l1slam_ros.core.errors import DoubtfulError, Interrupted
 from l1slam_ros.core.online.backend import Backend, Stopped
 from l1slam_ros.core.online.update import Improvement
+from l1slam_ros.core.robust.batch_map import shared_offset
 from l1slam_ros.io.graphs.map_file import MapFile
-from l1slam_ros.io.sentences import doubt_sentence
+from l1slam_ros.io.sentences import doubt_sentence, offset_sentence
 from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.job_queue import JobQueue
 
@@ -75,15 +76,19 @@ class MapServices:
         improvement = self._settled()
         if improvement is None:
             return 'there are no factors yet'
-        doubts = improvement.judgement.doubts
-        if doubts:
-            stamps = self._backend.snapshot().stamps
+        judgement, now = improvement.judgement, self._backend.snapshot()
+        if doubts := judgement.doubts:
+            stamps = now.stamps
             raise DoubtfulError(doubt_sentence(doubts, np.arange(len(stamps)), stamps))
-        odometry, loops = (f'{times:.2g}' for times in np.sqrt(improvement.judgement.variance))
+        odometry, loops = (f'{times:.2g}' for times in np.sqrt(judgement.variance))
         noise = '' if odometry == loops == '1' else (
             f'; errors are {odometry} (odometry) and {loops} (loops) times what is stated')
-        return (f'L1 cost {improvement.cost_before:.6g} -> {improvement.cost:.6g}, '
-                f'{improvement.status.value}, {improvement.seconds:.2f} s{noise}')
+        graph = now.graph.subset(np.arange(len(judgement.accepted)))
+        offset = shared_offset(graph, improvement.poses, judgement)
+        return '; '.join([
+            f'L1 cost {improvement.cost_before:.6g} -> {improvement.cost:.6g}, '
+            f'{improvement.status.value}, {improvement.seconds:.2f} s{noise}',
+            *offset_sentence(graph.manifold, offset)])
 
     def _settled(self) -> Improvement | None:
         """Return what solving the map there is to the end did, though others take its place."""

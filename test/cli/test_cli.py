@@ -185,11 +185,15 @@ def test_people_are_told_and_shown_which_loops_were_refused_and_why(capsys, lies
     sigmas = [float(match[3]) for match in named]
     assert sigmas == sorted(sigmas, reverse=True) and sigmas[-1] > 4
     assert said[at + 21 :] == ['  and 80 more; `--json` lists all']
-    assert 'refused' not in run(capsys, 'solve', lies, '--no-robust')[0]
     assert run(capsys, 'solve', lies, '--quiet', '--plot', tmp_path / 'map.svg') == ('', '')
     drawn = words(tmp_path / 'map.svg')
     assert 'refused loops' in drawn and 'false loops' not in drawn
     assert any('300 poses, 401 loops (100 refused)' in word for word in drawn)
+    Path(f'{lies}.struck.txt').write_text(f'{named[0][1]} {named[0][2]}\n')
+    (first, *_, worst), (believed, *rest) = (
+        run(capsys, 'solve', lies, *more)[0].splitlines() for more in ((), ('--no-robust',)))
+    assert first == believed and first.endswith(', 401 loops, 1 struck out')
+    assert worst == '  and 79 more; `--json` lists all' and 'refused' not in ''.join(rest)
 
 
 @pytest.mark.parametrize('lies', ['random'], indirect=True)

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from command import solve_json
 from problems import retold
 
 from l1slam_ros.cli.summary import complaints, numbers
@@ -12,7 +13,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file
+from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 
 # Vertices 10, 11, 12, 13, 14 in a row, and a loop.
 LINES = [f'EDGE_SE2 {k} {k + 1} 1 0 0 1 0 0 1 0 1' for k in range(10, 14)]
@@ -91,14 +92,20 @@ def test_information_off_by_scale(rng, odometry, loops, reason):
     assert float(ratios[2]) * loops == pytest.approx(1, rel=0.1)
 
 
-def test_an_offset_that_loops_share_is_one_sentence(rng):
+def test_an_offset_that_loops_share_is_one_sentence(rng, tmp_path, capsys):
+    """The same of `info` and `solve`; noise makes none."""
     graph = simulate_world(400, 1000, WorldOptions(), rng).graph
     off = np.where(graph.between.is_odometry[:, None], 0.0, [-0.3, 0.4, 0.05])
     shifted = retold(graph, se2.retract(graph.between.measurement, off))
-    sentence = complaints(GraphRecord(shifted, None, np.arange(400)))[0]
-    found = re.match(r'loops share an offset of (.*) m and (.*) degrees, more than', sentence)
-    assert float(found[1]) == pytest.approx(0.5, abs=0.05)
-    assert float(found[2]) == pytest.approx(2.9, abs=0.3)
+    write_graph_file(tmp_path / 'a.g2o', GraphRecord(graph, None, np.arange(400)))
+    assert solve_json(capsys, tmp_path / 'a.g2o')['warnings'] == []
+    write_graph_file(tmp_path / 'b.g2o', GraphRecord(shifted, None, np.arange(400)))
+    sentence, = solve_json(capsys, tmp_path / 'b.g2o')['warnings']
+    assert solve_json(capsys, tmp_path / 'b.g2o', '--no-robust')['warnings'] == []
+    for said in sentence, complaints(GraphRecord(shifted, None, np.arange(400)))[0]:
+        found = re.match(r'loops share an offset of (.*) m and (.*) degrees, more than', said)
+        assert float(found[1]) == pytest.approx(0.5, abs=0.05)
+        assert float(found[2]) == pytest.approx(2.9, abs=0.3)
 
 
 def test_the_repeated_edges_of_intel(datasets):

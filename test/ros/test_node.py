@@ -8,6 +8,7 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from node_bench import EVERY_MESSAGE, Bench, call, loop, odometry, poses_of
+from problems import retold
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 from torn import torn_graph
@@ -15,6 +16,7 @@ from torn import torn_graph
 import l1slam_ros as l1
 from bags import write_world
 from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.snapshot import ACCEPTED
@@ -170,6 +172,18 @@ def test_no_update_while_paused(bench):
     assert not b.received['path']
     assert call(b, 'pause', SetBool.Request(data=False)).success
     b.until(lambda: len(b.path().poses) == 1, 'the update is made up for')
+
+
+def test_an_offset_that_loops_share_is_in_the_answer(bench, tmp_path, rng):
+    graph = simulate_world(400, 1000, WorldOptions(), rng).graph
+    off = np.where(graph.between.is_odometry[:, None], 0.0, [-0.3, 0.4, 0.05])
+    graph = retold(graph, se2.retract(graph.between.measurement, off))
+    write_graph_file(tmp_path / 'map.g2o', GraphRecord(
+        graph, odometry_poses(graph), np.arange(400), 10**9 + np.arange(400)))
+    b = bench(save_path=str(tmp_path / 'map.g2o'))
+    assert call(b, 'load').success
+    answer = call(b, 'optimize')
+    assert answer.success and '; loops share an offset of 0.' in answer.message
 
 
 def test_the_solver_never_starves_the_callbacks(bench, tmp_path, rng):

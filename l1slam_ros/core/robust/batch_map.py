@@ -15,13 +15,20 @@ import numpy as np
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
-from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.parts import bridged, odometry_gaps
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch import OnRound, RobustMap, minimise_robustly
-from l1slam_ros.core.robust.inspection import initial_poses, require_connected
+from l1slam_ros.core.robust.inspection import (
+    FEWEST_SPARE,
+    densest_part,
+    initial_poses,
+    lacked_step,
+    require_connected,
+)
 from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
 from l1slam_ros.core.solvers.seed import seed_poses
@@ -56,7 +63,8 @@ class Outcome:
 
     solver : what found the solution, by its name; reason : a clause that says why it; judgement :
     of a robust solve, whose costs count the accepted factors; unjudged : why there is none though
-    nobody said so, else empty; parts : of the graph, joined by nothing that is believed.
+    nobody said so, else empty; parts : of the graph, joined by nothing that is believed; offset :
+    see `shared_offset`.
     """
 
     solution: Solution
@@ -68,6 +76,7 @@ class Outcome:
     judgement: Judgement | None
     unjudged: str
     parts: int
+    offset: Array | None
 
 
 def solve(
@@ -120,8 +129,9 @@ def solve(
         raise GraphError('the cost leaves double precision: measurements and information of the '
                          'graph are too large, or too different from each other')
     judgement = robust.judgement.of_all(whole) if robust else None
+    offset = shared_offset(whole, solution.poses, judgement) if judgement else None
     return Outcome(solution, minimiser.solver, minimiser.reason, cost(initial), seed_cost, seconds,
-                   judgement, unjudged, int(component_labels(graph).max()) + 1)
+                   judgement, unjudged, int(component_labels(graph).max()) + 1, offset)
 
 
 def _robust_map(graph: FactorGraph, asked: SolveOptions, minimiser: '_Minimiser',
@@ -165,6 +175,24 @@ class _Minimiser:
         if self.solver != method.solver:
             self.reason = f'it went on where {method.solver} came no further'
         return solution
+
+
+def shared_offset(graph: FactorGraph, poses: Array, judgement: Judgement) -> Array | None:
+    """Return the step (k,) that accepted loops lack in a map (n, p); see `lacked_step`."""
+    rows = judgement.accepted
+    part, keyframes, is_loop = densest_part(
+        graph.subset(rows, judgement.noise[rows] * judgement.found_variance(graph)))
+    if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < FEWEST_SPARE:
+        return None
+    cholesky, system = cholesky_of(part), linearise(part, poses[keyframes])
+    if not cholesky.factorise(system, np.ones_like(system.b)):
+        return None
+
+    def left_of(b: Array, _: Array) -> Array:
+        return np.stack([one - system.times(cholesky.solve(system.transposed_times(one)))
+                         for one in b.T], axis=1)
+
+    return lacked_step(part, is_loop, system.b, np.ones(2), left_of)
 
 
 def cost_function(graph: FactorGraph, asked: SolveOptions) -> Callable[[Array], float]:

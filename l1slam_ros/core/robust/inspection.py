@@ -6,6 +6,7 @@ In: a graph. Out: which keyframes and factors are suspicious, and by how much; s
 of them elsewhere. All but `noise_scales` look at each factor once.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +34,7 @@ _LONG = 10.0
 # Noise is judged in a part of the graph: a dense graph of 50,000 poses takes minutes to solve.
 _PART = 2000
 # Fewer spare measurements than this tell nothing of their noise.
-_FEWEST_SPARE = 20
+FEWEST_SPARE = 20
 _ROUNDS = 8
 # The poses need not be exact for their residuals to have the right size: steps of Gauss-Newton at
 # most, each halved so often, and the part of chi2 that no longer matters; nor the ratios.
@@ -113,7 +114,7 @@ class NoiseScales:
     odometry, loops : ratios of standard deviations, NaN where too few factors are left to tell;
     first, last : the keyframes between which this was found; turns : how many times that of
     translations the ratio of rotations is; offset : (k,) the step that all loops lack, None where
-    noise explains it, see `_shared_offset`.
+    noise explains it, see `lacked_step`.
     """
 
     odometry: float
@@ -137,9 +138,9 @@ def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
     GraphError : what was looked at cannot be solved.
 
     """
-    part, keyframes, is_loop = _densest_part(graph)
+    part, keyframes, is_loop = densest_part(graph)
     ends = int(keyframes[0]), int(keyframes[-1])
-    if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < _FEWEST_SPARE:
+    if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < FEWEST_SPARE:
         return NoiseScales(np.nan, np.nan, *ends, np.nan)
     system = _system(part, _l2_poses(part))
     group = np.repeat(is_loop.astype(np.int64), graph.manifold.TANGENT_SIZE)
@@ -150,21 +151,24 @@ def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
         left = both - system.A @ _least_squares(system, both, 1 / variance[group])
         found, drawn = (np.bincount(group, column**2, minlength=2) for column in left.T)
         spare = drawn / variance
-        ratio = np.divide(found, drawn, out=np.ones(2), where=spare >= _FEWEST_SPARE)
+        ratio = np.divide(found, drawn, out=np.ones(2), where=spare >= FEWEST_SPARE)
         variance = np.clip(variance * ratio, 1e-12, 1e12)
         if (np.abs(ratio - 1) < _SAME_RATIO).all():
             break
-    odometry, loops = np.where(spare >= _FEWEST_SPARE, np.sqrt(variance), np.nan).tolist()
-    known = (spare >= _FEWEST_SPARE).all()
-    offset = _shared_offset(part, is_loop, system, variance) if known else None
+    odometry, loops = np.where(spare >= FEWEST_SPARE, np.sqrt(variance), np.nan).tolist()
+    known = (spare >= FEWEST_SPARE).all()
+    offset = lacked_step(
+        part, is_loop, system.b, variance,
+        lambda b, weights: b - system.A @ _least_squares(system, b, weights)) if known else None
     return NoiseScales(odometry, loops, *ends, _turns(part.manifold, left), offset)
 
 
-def _shared_offset(
-    graph: FactorGraph, is_loop: Mask, system: LinearSystem, variance: Array,
-) -> Array | None:
+def lacked_step(graph: FactorGraph, is_loop: Mask, b: Array, variance: Array,
+                left_of: Callable[[Array, Array], Array]) -> Array | None:
     """
     Return the step d [m, rad] that all loops lack, (k,): Z v2t(d) fits; None if noise explains it.
+
+    left_of : returns what a map leaves of (rows, k + 1), weighted by (rows,)
 
     Z is the later keyframe seen from the earlier. With G (rows, k) the derivatives of what d adds,
     the map and d minimise |A x - b - G d|^2, weighted by the variances (2,) of odometry and of
@@ -179,8 +183,7 @@ def _shared_offset(
     lacked = np.where((factors.i > factors.j)[:, None, None], backward, np.eye(k))
     G = (is_loop[:, None, None] * factors.sqrt_information @ lacked).reshape(-1, k)
     weights = 1 / np.repeat(variance[is_loop.astype(np.int64)], k)
-    both = np.column_stack((system.b, G))
-    left = both - system.A @ _least_squares(system, both, weights)
+    left = left_of(np.column_stack((b, G)), weights)
     weighted = weights[:, None] * G
     M, S, z = G.T @ weighted, left[:, 1:].T @ weighted, weighted.T @ left[:, 0]
     scale = np.sqrt(np.where(np.diag(M) > 0, np.diag(M), 1.0))
@@ -193,7 +196,8 @@ def _shared_offset(
     after = before[:, 0] + before[:, 1:] @ d
     # Multiplied out: exact measurements leave nothing to divide by.
     found, noise = before[:, 0] @ before[:, 0], after @ after
-    likely = 2 * gamma_quantile(len(share) / 2, 1 - _CHANCE)
+    spare = is_loop.sum() * k - len(share)  # the ratio of likelihoods, as the noise is found, too
+    likely = spare * np.expm1(2 * gamma_quantile(len(share) / 2, 1 - _CHANCE) / spare)
     is_sure = d @ S @ d * found > likely * noise
     is_large = d @ M @ d * found > is_loop.sum() * noise
     fits = variance[1] * noise <= OFF_SCALE**2 * found
@@ -311,7 +315,7 @@ def _least_squares(system: LinearSystem, b: Array, weights: Array | float = 1.0)
     return factor.solve(A.T @ b)
 
 
-def _densest_part(graph: FactorGraph) -> tuple[FactorGraph, Indices, np.ndarray]:
+def densest_part(graph: FactorGraph) -> tuple[FactorGraph, Indices, np.ndarray]:
     """
     Return a connected part of some consecutive keyframes, with as many factors as may be.
 
@@ -337,9 +341,7 @@ def _restricted(graph: FactorGraph, keyframes: Indices) -> tuple[FactorGraph, In
     index[keyframes] = np.arange(len(keyframes))
     i, j = index[factors.i], index[factors.j]
     rows = np.flatnonzero((i >= 0) & (j >= 0))
-    roots = factors.sqrt_information[rows]
-    part = FactorGraph(graph.manifold)
-    part.add_poses(len(keyframes))
-    part.add_between(i[rows], j[rows], factors.measurement[rows],
-                     roots.transpose(0, 2, 1) @ roots)
+    part = FactorGraph(graph.manifold, len(keyframes))
+    part.append_between(i[rows], j[rows], factors.measurement[rows],
+                        factors.sqrt_information[rows])
     return part, rows

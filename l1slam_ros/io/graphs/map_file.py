@@ -11,6 +11,7 @@ from pathlib import Path
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.snapshot import SavedMap
+from l1slam_ros.io.files import other_kind
 from l1slam_ros.io.formats import named
 from l1slam_ros.io.graphs.saved_map import keep_as, load_map, save_map
 from l1slam_ros.io.node_options import NodeOptions
@@ -139,10 +140,10 @@ def unusable_path(save_path: str) -> str:
     if not save_path:
         return ''
     path = _absolute(save_path)
-    # Not the functions of `Path`: those raise where a name is too long.
-    if not os.path.isdir(path.parent):
+    if not os.path.isdir(path.parent):  # `Path.is_dir` raises where a name is too long
         return f'save_path is {save_path!r}, but there is no folder {path.parent}'
-    return f'save_path is {save_path!r}, which is a folder' if os.path.isdir(path) else ''
+    kind = other_kind(path)
+    return f'save_path is {save_path!r}, which is {kind}' if kind else ''
 
 
 def _absolute(path: str) -> Path:

@@ -18,7 +18,7 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.online.snapshot import BuilderState, Optimised, SavedMap
 from l1slam_ros.core.robust.judgement import Doubt, Judgement
-from l1slam_ros.io.files import put_lines, replacing
+from l1slam_ros.io.files import other_kind, put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord, graph_lines, read_graph_file
 from l1slam_ros.io.remarks import is_proven, with_remarks
 
@@ -131,6 +131,8 @@ def _remarks(saved: SavedMap) -> dict[str, Any]:
 
 
 def _read(path: Path) -> SavedMap:
+    if kind := other_kind(path):  # some devices have no end
+        raise FileError(path, f'cannot be read: it is {kind}')
     record = read_graph_file(path)
     if record.poses is None or record.stamps is None:
         raise FileError(path, 'has no poses or no stamps; expected a saved map')

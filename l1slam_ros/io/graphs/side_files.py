@@ -114,7 +114,8 @@ def named_loops(path: str | os.PathLike[str], what: str, ids: Indices,
 
     Raises
     ------
-    FileError : naming the line, when the file is damaged or names vertices without an edge.
+    FileError : naming the line, when the file is damaged or names vertices without an edge, or
+        to strike out odometry.
 
     """
     named, numbers = read_pairs(path, what)
@@ -124,11 +125,13 @@ def named_loops(path: str | os.PathLike[str], what: str, ids: Indices,
     both = np.sort(np.concatenate((ids[factors.pairs], named)), axis=1)
     number = np.unique(both, axis=0, return_inverse=True)[1].ravel()  # NumPy 2.0: (m, 1)
     edges, chosen = number[:len(factors)], number[len(factors):]
-    unknown = ~np.isin(chosen, edges)
+    # Odometry is trusted anyway; that it is struck out would go unheard.
+    kind, known = ('loop', edges[~factors.is_odometry]) if what == 'struck' else ('edge', edges)
+    unknown = ~np.isin(chosen, known)
     if unknown.any():
         k = int(np.argmax(unknown))
-        raise FileError(beside(path, what), f'no edge between {named[k, 0]} and {named[k, 1]} in '
-                        f'{path}; expected its {what} loops, or no such file', numbers[k])
+        raise FileError(beside(path, what), f'no {kind} between {named[k, 0]} and {named[k, 1]} '
+                        f'in {path}; expected its {what} loops, or no such file', numbers[k])
     return np.asarray(np.isin(edges, chosen) & ~factors.is_odometry)
 
 

@@ -182,6 +182,33 @@ def test_loops_that_wait_and_loops_that_expired_keep_their_stamps():
     assert +builder.notes.refused == {'expired': 2} and len(builder.loops.waiting) == 1
 
 
+@pytest.mark.parametrize('late', [False, True])
+def test_a_word_counts_for_the_loops_that_came_before_it(late):
+    """Though all of them waited for odometry, and become factors together."""
+    poses = curve(50)
+    builder = grown(poses[:20 if late else 50], GraphBuilderOptions())
+    one = true_loop(poses, 3, 30)
+    for word in ({}, {'struck': True}, {'trusted': True, 'pose3': odometry(0, (1, 0, 0)).pose3},
+                 {'pose3': odometry(0, (2, 0, 0)).pose3}):
+        added(builder, replace(one, **word))
+    drive_on(builder, poses, 20 if late else 50)
+    builder.add_due_loops()
+    factors, rows = builder.graph.between, builder.loops.rows
+    assert factors.struck[rows].tolist() == [True, False, False]
+    assert factors.trusted[rows].tolist() == [False, True, False]
+
+
+def test_a_strike_that_waits_or_expires_is_no_loop():
+    poses = curve(100)
+    builder = grown(poses[:20], GraphBuilderOptions(loop=LoopOptions(wait=2.0)))
+    added(builder, replace(true_loop(poses, 3, 95), struck=True))
+    assert len(builder.loops.waiting) == 1 and not any(map(len, builder.loops.stamps))
+    drive_on(builder, poses[:50], 20)
+    builder.add_due_loops()
+    assert not len(builder.loops.waiting) and not any(map(len, builder.loops.stamps))
+    assert builder.notes.sentences()[0].startswith('1 message refused: a strike from 300000000 ns')
+
+
 # The same loop again
 
 

@@ -291,6 +291,12 @@ def test_damaged_trust_is_named(write, text, message):
     assert message_of(path).startswith(f'.trusted.txt{message}')
 
 
+def test_odometry_that_is_struck_out_is_named(write):
+    path = write(SQUARE)
+    beside(path, 'struck').write_text('3 9\n9 7\n')
+    assert message_of(path).startswith('.struck.txt:2: no loop between 9 and 7 in ')
+
+
 def test_a_graph_is_not_lent_the_stamps_or_the_trust_of_its_predecessor(tmp_path, rng):
     path, record = tmp_path / 'a.g2o', random_record(rng)
     write_graph_file(path, with_trust(record, [50, 60]))

@@ -207,7 +207,7 @@ def test_where_no_file_can_be_is_said(tmp_path):
     assert not unusable_path('') and not unusable_path(f'{tmp_path}/map.g2o')
     assert unusable_path('~no one/map.g2o').endswith('there is no folder ' + str(
         Path('~no one').absolute()))
-    assert unusable_path(str(tmp_path)) == f"save_path is '{tmp_path}', which is a folder"
+    assert unusable_path(str(tmp_path)) == f"save_path is '{tmp_path}', which is a directory"
     # Too long a name is said by whoever reads or writes it, and ends nothing.
     robot = Robot(tmp_path / f'{"m" * 300}.g2o')
     assert not unusable_path(robot.options.save_path)
@@ -215,6 +215,13 @@ def test_where_no_file_can_be_is_said(tmp_path):
     robot.drive(3)
     for call in robot.map_file.save, robot.map_file.autosave, robot.map_file.load:
         with pytest.raises(FileError, match='File name too long'):
+            call()
+    # A device may be read without end, and is nothing to be replaced by a file.
+    robot.options = replace(robot.options, save_path=str(tmp_path / 'map.g2o'))
+    (tmp_path / 'map.g2o').symlink_to('/dev/full')
+    assert unusable_path(robot.options.save_path).endswith('which is no regular file')
+    for call in robot.map_file.save, robot.map_file.autosave, robot.map_file.load:
+        with pytest.raises(FileError, match='map.g2o: cannot be (read|written): it is no regular'):
             call()
 
 

@@ -9,6 +9,7 @@ names one, the other end of its factor is the world.
 A person may vouch for a loop or strike it out, before it comes or after: the last word counts.
 """
 
+from bisect import bisect_right
 from dataclasses import dataclass
 
 import numpy as np
@@ -133,7 +134,8 @@ class LoopFactors:
         due = self.waiting.due(now)
         since = now - int(options.wait * 1e9)
         for one in self.waiting.expired(since) if track.first < since else ():
-            self._expired.extend(np.array([one.loop.stamps]))
+            if not one.loop.struck:
+                self._expired.extend(np.array([one.loop.stamps]))
             self._refuse('expired', one.loop, f'waited for odometry until {track.last_stamp} ns; '
                          'expected odometry of its times')
             # Sent again when odometry has come that far, it is welcome.
@@ -147,7 +149,7 @@ class LoopFactors:
         pairs = track.nearest_keyframe(times.ravel(), np.repeat(known, 2)).reshape(-1, 2)
         can = np.flatnonzero(self._can_be_factors(due, pairs, track.first)).tolist()
         new: list[int] = []
-        before = len(graph.between)
+        before, came = len(graph.between), len(self.rows)
         for k in can:
             # One that is there is vouched for by now: no second factor.
             if not due[k].loop.struck and (self._verbatim or due[k].key not in self._row_of):
@@ -156,7 +158,9 @@ class LoopFactors:
         if new:
             self._append([due[k] for k in new], pairs[new], graph, track, options)
         for k in can:
-            self._say(due[k], (int(pairs[k, 0]), int(pairs[k, 1])), graph)
+            # A word is of loops that came before it, though others become factors with them.
+            self._say(due[k], (int(pairs[k, 0]), int(pairs[k, 1])), graph,
+                      came + bisect_right(new, k))
         return len(new)
 
     def _append(self, loops: list[WaitingLoop], pairs: Indices, graph: FactorGraph,
@@ -175,14 +179,16 @@ class LoopFactors:
         rows = len(graph.between) + np.arange(-m, 0)
         self._note(rows, np.array([one.loop.stamps for one in loops]))
 
-    def _say(self, one: WaitingLoop, pair: tuple[int, int], graph: FactorGraph) -> None:
-        """Let what a person says of a loop between two keyframes count, now or before."""
+    def _say(self, one: WaitingLoop, pair: tuple[int, int], graph: FactorGraph,
+             came: int) -> None:
+        """Let what a person says of a loop count; came : how many loops have, with this one."""
         loop = one.loop
         if loop.struck:
             self._struck.add(pair)
-            factors = graph.between.pairs[self.rows]
-            graph.say(self.rows[(factors == pair).all(axis=1) | (factors == pair[::-1]).all(axis=1)
-                                | (self._stamps.view() == loop.stamps).all(axis=1)], trusted=False)
+            rows, stamps = self.rows[:came], self._stamps.view()[:came]
+            factors = graph.between.pairs[rows]
+            graph.say(rows[(factors == pair).all(axis=1) | (factors == pair[::-1]).all(axis=1)
+                           | (stamps == loop.stamps).all(axis=1)], trusted=False)
         elif loop.trusted:
             self._struck.discard(pair)
             graph.say(np.array([self._row_of[one.key]]), trusted=True)
@@ -208,7 +214,8 @@ class LoopFactors:
         self._stamps.extend(stamps)
 
     def _refuse(self, cause: str, loop: LoopClosure, why: str) -> None:
-        what = 'an absolute pose at' if loop.is_absolute else f'a loop from {loop.stamps[0]} ns to'
+        kind = 'a strike' if loop.struck else 'a loop'
+        what = 'an absolute pose at' if loop.is_absolute else f'{kind} from {loop.stamps[0]} ns to'
         self._notes.refuse(cause, f'{what} {loop.stamp} ns {why}')
 
     def _covariance(self, loop: LoopClosure, options: LoopOptions) -> Array | None:

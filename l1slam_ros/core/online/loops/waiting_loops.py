@@ -92,10 +92,10 @@ class WaitingLoops:
         return tuple((one.loop, now - one.arrival) for one in self._loops.values())
 
     def stamps(self) -> Indices:
-        """Return reference and end [ns] of each, (k, 2)."""
+        """Return reference and end [ns] of each that is no strike of one, (k, 2)."""
         if self._stamps is None:
-            self._stamps = np.array(
-                [one.loop.stamps for one in self._loops.values()], np.int64).reshape(-1, 2)
+            self._stamps = np.array([one.loop.stamps for one in self._loops.values()
+                                     if not one.loop.struck], np.int64).reshape(-1, 2)
         return self._stamps
 
     def _take(self, number: int) -> WaitingLoop:
