@@ -27,10 +27,11 @@ A place
     adds up (`pairwise_consistency`).
 A slip
     is an odometry factor that says anything, while the robot moved on as ever (`motion`); of all
-    of them one is expected to be. A gap, or the seam of two sessions, is one whose place is known.
-    The sides of it are right in themselves, so the true loops across agree with each other. A slip
-    is one explanation of loops that do not fit, lies are the other: `slips` compares their odds,
-    with half a gate for each place that one of them calls a lie.
+    of them one is expected to be; and one is a motion like no other, which is none. A gap, or the
+    seam of two sessions, is one whose place is known. The sides of it are right in themselves, so
+    the true loops across agree with each other. A slip is one explanation of loops that do not
+    fit, lies are the other: `slips` compares their odds, with half a gate for each place that one
+    of them calls a lie.
 A drift
     is an error of all steps, the same on each metre. Where a slip would be believed, or most loops
     are left out, it is a third explanation: loops are judged by odometry rid of it (`motion`).

@@ -36,7 +36,9 @@ class Motion:
 
     step : (n, k) those of the odometry; mean, covariance : of these; of a share 1 / sqrt(n) the
     squared distance is beyond `start`, where it falls off by a power (B. M. Hill, A simple general
-    approach to inference about the tail of a distribution, 1975).
+    approach to inference about the tail of a distribution, 1975). One of all is like no other:
+    rare : (k, k) its covariance, as wide each way as all are long, with any rotation. To back up
+    or turn round but once is as rare as a slip, so that it is no evidence of one.
     """
 
     step: Array
@@ -44,11 +46,11 @@ class Motion:
     covariance: Array
     start: float
     power: float
+    rare: Array
 
     def square(self, step: Array, spread: Array | float = 0.0) -> tuple[Array, Array]:
         """Return how unusual steps (m, k) are, squared, and ln det of their covariances, (m,)."""
-        covariance = np.zeros((len(step), *self.covariance.shape)) + self.covariance + spread
-        return kernels.prediction.normalise(covariance, step - self.mean)
+        return _square(step - self.mean, self.covariance + spread)
 
     def log_density(self, step: Array, spread: Array | float = 0.0) -> Array:
         """Return the logarithm of the density of steps (m, k), known to spread (m, k, k), (m,)."""
@@ -58,7 +60,9 @@ class Motion:
         tail = (np.log(self.power / np.sqrt(len(self.step))) + self.power * np.log(self.start)
                 - (self.power + k / 2) * np.log(np.maximum(square, self.start))
                 + lgamma(k / 2) - k / 2 * np.log(np.pi))
-        return np.maximum(normal, tail) - log_det / 2
+        (square, wide), n = _square(step, self.rare + spread), len(self.step)
+        rare = -(square + wide + k * np.log(2 * np.pi)) / 2 - np.log(n)
+        return np.logaddexp(np.maximum(normal, tail) - log_det / 2, rare)
 
     def distance(self, step: Array, spread: Array) -> Array:
         """Return the squared distances of a step (k,), known to spread (k, k), to all, (n,)."""
@@ -79,12 +83,21 @@ def usual_motion(growth: Growth) -> Motion:
     """Return how the robot moves by its odometry."""
     step = steps_of(growth, np.flatnonzero(~growth.is_loop & ~growth.cut))
     least = np.diag(_GRAIN**2 * (step**2).mean(axis=0) + _TINY)
-    motion = Motion(step, step.mean(axis=0), np.cov(step.T) + least, np.inf, 1.0)
+    translation, width = growth.graph.manifold.TRANSLATION, np.full(len(least), np.pi**2 / 3)
+    width[translation] = (step[:, translation] ** 2).mean()
+    motion = Motion(step, step.mean(axis=0), np.cov(step.T) + least, np.inf, 1.0,
+                    np.diag(width) + least)
     square, few = np.sort(motion.square(step)[0]), int(np.sqrt(len(step)))
     start = max(float(square[-few - 1]), float(len(least)))
     # The one at the start is for steps that are all alike.
     power = few / (1 + np.log(np.maximum(square[-few:] / start, 1.0)).sum())
     return replace(motion, start=start, power=power)
+
+
+def _square(error: Array, covariance: Array) -> tuple[Array, Array]:
+    """Return e'C^-1 e of errors (m, k) and ln det C, (m,); C (m, k, k), or of all (k, k)."""
+    m, k = error.shape
+    return kernels.prediction.normalise(np.broadcast_to(covariance, (m, k, k)).copy(), error)
 
 
 def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:

@@ -126,6 +126,20 @@ def test_a_robot_does_not_jump_because_lies_say_so(bad):
     assert repaired(graph) is None
 
 
+@pytest.mark.parametrize('seed', [0, 5])
+def test_a_robot_that_backs_up_but_once_did_not_slip(seed):
+    """It is like no other step, and of few loops hardly one can tell; but so the robot moved."""
+    world = careful_world(800, 825, seed)
+    truth, factors = world.truth.copy(), world.graph.between
+    ends = factors.i, factors.j
+    noise = se2.local(se2.between(*(truth[end] for end in ends)), factors.measurement)
+    heading = truth[STEP + 1, 2]
+    truth[STEP + 1:, :2] -= 2 * np.array([np.cos(heading), np.sin(heading)])
+    Z = se2.retract(se2.between(*(truth[end] for end in ends)), noise)
+    judgement, _ = robust_solve(retold(world.graph, Z))
+    assert judgement.accepted.all() and not judgement.doubts
+
+
 def test_steps_all_alike_leave_no_tail():
     motion = usual_motion(grown(graph_of(straight(31), chain_of(31), 0.0, np.eye(3))))
     like, jump = motion.log_density(np.array([[1.0, 0, 0], [9.0, 0, 0]]))
