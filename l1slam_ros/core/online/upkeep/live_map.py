@@ -26,7 +26,7 @@ from l1slam_ros.core.solvers.optimality import Status
 # A map is factored anew from so many factors on that came since, those of five keyframes; on a
 # large one, from one for so many keyframes on: what goes on behind costs each keyframe the same,
 # however large the map is.
-_FEWEST, _KEYFRAMES_EACH = 10, 250
+_FEWEST, _KEYFRAMES_EACH = 10, 200
 # Factors that a front takes while its lock is held, and between two looks at the clock: on a large
 # map a loop takes milliseconds.
 _AT_ONCE = 4
