@@ -190,7 +190,7 @@ def shared_offset(graph: FactorGraph, poses: Array, judgement: Judgement) -> Arr
 
     def left_of(b: Array, _: Array) -> Array:
         return np.stack([one - system.times(cholesky.solve(system.transposed_times(one)))
-                         for one in b.T], axis=1)
+                         for one in np.ascontiguousarray(b.T)], axis=1)
 
     return lacked_step(part, is_loop, system.b, np.ones(2), left_of)
 
