@@ -17,6 +17,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.core.errors import DoubtfulError, Interrupted
 from l1slam_ros.core.online.backend import Backend, Stopped
+from l1slam_ros.core.online.snapshot import Snapshot
 from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.core.robust.batch_map import shared_offset
 from l1slam_ros.io.graphs.map_file import MapFile
@@ -73,10 +74,10 @@ class MapServices:
         return response
 
     def _optimise(self) -> str:
-        improvement = self._settled()
+        improvement, now = self._settled()
         if improvement is None:
             return 'there are no factors yet'
-        judgement, now = improvement.judgement, self._backend.snapshot()
+        judgement = improvement.judgement
         if doubts := judgement.doubts:
             stamps = now.stamps
             raise DoubtfulError(doubt_sentence(doubts, np.arange(len(stamps)), stamps))
@@ -90,14 +91,18 @@ class MapServices:
             f'{improvement.status.value}, {improvement.seconds:.2f} s{noise}',
             *offset_sentence(graph.manifold, offset)])
 
-    def _settled(self) -> Improvement | None:
-        """Return what solving the map there is to the end did, though others take its place."""
+    def _settled(self) -> tuple[Improvement | None, Snapshot]:
+        """Return what solving the map to the end did, and it; others may take its place."""
         while True:
             try:
-                return self._backend.settle(self._stopped)
+                improvement = self._backend.settle(self._stopped)
             except Interrupted:
                 if self._stopped():
                     raise
+                continue
+            now = self._backend.snapshot()
+            if improvement is None or improvement.map == now.map:
+                return improvement, now
 
     def _reset(self) -> str:
         self._backend.reset()

@@ -16,6 +16,7 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
+from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.io.graphs.saved_map import load_map
 from l1slam_ros.io.messages import conversion
@@ -195,6 +196,22 @@ def test_optimize_is_done_though_the_map_is_replaced_meanwhile(bench, monkeypatc
     assert b.backend.set_parameters([Parameter('robust.enabled', value=False)])[0].successful
     b.until(answer.done, 'optimize is answered')
     assert answer.result().success, answer.result().message
+
+
+def test_optimize_answers_of_the_map_there_is_where_one_is_emptied_behind_it(bench, monkeypatch):
+    b = bench()
+    b.drive(0, 3)
+    b.until(lambda: len(b.path().poses) == 3, 'a map')
+    settle = Backend.settle
+
+    def settled(backend, stopped):
+        improvement = settle(backend, stopped)
+        if improvement is not None:
+            backend.reset()
+        return improvement
+
+    monkeypatch.setattr(Backend, 'settle', settled)
+    assert call(b, 'optimize').message == 'there are no factors yet'
 
 
 @pytest.mark.parametrize('choice', ['new_segment', 'reset', 'ignore'])
