@@ -7,6 +7,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, TypeVar
 
 # A domain of its own, which its children share: nobody else's messages are counted.
@@ -18,10 +19,12 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
+from rclpy.executors import ExternalShutdownException
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC
+from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.ros.demo import executable
 
 KINDS = {ODOMETRY_TOPIC: Odometry, LOOP_TOPIC: PoseWithCovarianceStamped}
@@ -104,6 +107,21 @@ class Peer:
         code = self.process.wait(PATIENCE)
         self.node.destroy_node()
         return code
+
+
+def heard(node: Any, kind: Any, topic: str) -> list[tuple[int, int]]:
+    """Return what will hold when each message was sent, or what it answers, and when it came."""
+    notes: list[tuple[int, int]] = []
+    node.create_subscription(
+        kind, topic, lambda m: notes.append((stamp_of(m.header), time.monotonic_ns())),
+        QoSProfile(depth=1000))
+    return notes
+
+
+def spin(node: Any) -> None:
+    """Let a node work until a signal."""
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(node)
 
 
 def cpu_seconds(process: int) -> float:

@@ -22,8 +22,7 @@ import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path as PathMessage
-from peer import KINDS, Peer, arguments, cpu_seconds
-from throughput import heard, spin
+from peer import KINDS, Peer, arguments, cpu_seconds, heard, spin
 
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
@@ -33,6 +32,7 @@ from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 from l1slam_ros.io.bags.from_graph import write_graph_bag
 from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC
 from l1slam_ros.io.graphs.graph_file import read_graph_file
+from l1slam_ros.io.messages.conversion import stamped_pose
 from l1slam_ros.ros.demo import executable
 
 RATE = 400.0
@@ -81,10 +81,7 @@ def _play(peer: Peer, graph: FactorGraph, bag: Path, rate: float) -> None:
 
 def _tell_map(path: PathMessage, graph: FactorGraph, when: str) -> None:
     """Print how far a map is above the optimum that is near it."""
-    poses = graph.manifold.from_pose3(np.array([
-        [getattr(part, name) for part, names in ((at.pose.position, 'xyz'),
-                                                 (at.pose.orientation, 'xyzw')) for name in names]
-        for at in path.poses]))
+    poses = graph.manifold.from_pose3(np.array([stamped_pose(at)[1] for at in path.poses]))
     if len(poses) < graph.n_poses:
         print(f'{when}: a Path of {len(poses)} poses, expected {graph.n_poses}')
         return

@@ -17,23 +17,19 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from peer import KINDS, Peer, arguments, cpu_seconds
-from rclpy.executors import ExternalShutdownException
-from rclpy.qos import QoSProfile
+from peer import KINDS, Peer, arguments, cpu_seconds, heard, spin
 from rclpy.serialization import serialize_message
 
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC
 from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
-from l1slam_ros.io.messages.conversion import reference_frame_id, stamp_of
+from l1slam_ros.io.messages.conversion import reference_frame_id
 from l1slam_ros.ros.publishing import header
 
 SECONDS, RATE, LOOPS, KEYFRAMES = 60.0, 1_000.0, 100.0, 10_000
@@ -147,21 +143,6 @@ def _listen() -> int:
     spin(node)
     print(f'pose: {_late(poses)}')
     return 0
-
-
-def heard(node: Any, kind: Any, topic: str) -> list[tuple[int, int]]:
-    """Return what will hold when each message was sent, or what it answers, and when it came."""
-    notes: list[tuple[int, int]] = []
-    node.create_subscription(
-        kind, topic, lambda m: notes.append((stamp_of(m.header), time.monotonic_ns())),
-        QoSProfile(depth=1000))
-    return notes
-
-
-def spin(node: Any) -> None:
-    """Let a node work until a signal."""
-    with suppress(KeyboardInterrupt, ExternalShutdownException):
-        rclpy.spin(node)
 
 
 def _late(heard: list[tuple[int, int]]) -> str:

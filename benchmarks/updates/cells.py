@@ -34,7 +34,7 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
-from l1slam_ros.paper.updates import Drive, Kept, isam2, run_updates
+from l1slam_ros.paper.updates import Drive, Kept, first_of, isam2, run_updates
 
 CHECKPOINTS = 20
 # Simulated: keyframes and edges of the paper's Manhattan10k, and of a large sparse world.
@@ -272,11 +272,7 @@ def _rows(graph: FactorGraph, poses: int) -> Indices:
 
 def prefix(graph: FactorGraph, poses: int) -> FactorGraph:
     """Return the graph of the first keyframes."""
-    factors, rows = graph.between, _rows(graph, poses)
-    part = FactorGraph(graph.manifold, poses)
-    part.append_between(factors.i[rows], factors.j[rows], factors.measurement[rows],
-                        factors.sqrt_information[rows])
-    return part
+    return first_of(graph, poses, _rows(graph, poses))
 
 
 def spread(seconds: Sequence[float]) -> dict[str, float]:

@@ -60,14 +60,14 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
     if record.stamps is not None:
         rows.append(('time', f'{(record.stamps[-1] - record.stamps[0]) / NANOSECONDS:,.1f} s'))
     if record.poses is not None:
-        cost = inspection.cost_at(graph.subset(graph.not_struck), record.poses)
+        cost = inspection.cost_at(graph.without_struck(), record.poses)
         rows.append(('l1 cost', f'{cost:.6g} at the stored poses'))
     return rows
 
 
 def complaints(record: GraphRecord) -> list[str]:
     """Return a sentence on each thing that looks wrong with a graph but for what is struck out."""
-    record = replace(record, graph=record.graph.subset(record.graph.not_struck))
+    record = replace(record, graph=record.graph.without_struck())
     checks: tuple[Callable[[GraphRecord], Iterator[str]], ...] = (
         _on_ids, _on_parts, _on_gaps, _on_repetitions, _on_steps, _on_noise)
     return [sentence for check in checks for sentence in check(record)]

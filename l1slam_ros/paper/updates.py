@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
@@ -63,10 +63,7 @@ class Kept:
 
     def first(self, accepted: Mask, poses: Array) -> 'Kept':
         """Return it as it was with fewer factors, accepted (k,), and poses (n, p)."""
-        graph, factors, rows = self.graph, self.graph.between, slice(len(accepted))
-        part = FactorGraph(graph.manifold, len(poses))
-        part.append_between(factors.i[rows], factors.j[rows], factors.measurement[rows],
-                            factors.sqrt_information[rows])
+        part = first_of(self.graph, len(poses), np.arange(len(accepted)))
         return Kept(part, accepted, poses)
 
 
@@ -187,6 +184,14 @@ def _serve(asked: Connection, graph_of: Callable[[], FactorGraph], patience: flo
     asked.send('ready')
     for k in iter(asked.recv, None):
         asked.send(peer.update(k))
+
+
+def first_of(graph: FactorGraph, poses: int, rows: Indices) -> FactorGraph:
+    """Return the graph of the first keyframes, and of factors (k,) between them."""
+    factors, part = graph.between, FactorGraph(graph.manifold, poses)
+    part.append_between(factors.i[rows], factors.j[rows], factors.measurement[rows],
+                        factors.sqrt_information[rows])
+    return part
 
 
 @dataclass(frozen=True)

@@ -118,6 +118,10 @@ class FactorGraph:
         """The between factors that no person struck out, rows."""
         return np.flatnonzero(~self._between[-1].view())
 
+    def without_struck(self) -> 'FactorGraph':
+        """Return the graph without what a person struck out, itself where there is nothing."""
+        return self.subset(self.not_struck) if self.between.struck.any() else self
+
     def subset(self, chosen: Indices | Mask, variance: Array | None = None) -> 'FactorGraph':
         """
         Return a graph of all keyframes and some of the factors.

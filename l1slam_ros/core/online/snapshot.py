@@ -267,7 +267,9 @@ class Snapshot:
 
     @property
     def looked(self) -> int:
-        """How many factors the front looked at; without one all are for the judge."""
+        """How many factors the next front does not look at; without one all are for the judge."""
+        if self.pending:
+            return len(self.pending.accepted)
         known = len(self.optimised.judgement.accepted) + len(self.looks)
         return known if self.views else len(self.graph.between)
 

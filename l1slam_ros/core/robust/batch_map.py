@@ -102,9 +102,7 @@ def solve(
 
     """
     ids = np.arange(graph.n_poses) if ids is None else ids
-    whole = graph
-    if graph.between.struck.any():  # what a person struck out is there for nobody
-        graph = graph.subset(graph.not_struck)
+    whole, graph = graph, graph.without_struck()  # what is struck out is there for nobody
     _require_start(graph, stored, asked, ids)
     seed = None
     initial = (odometry_poses(graph) if asked.start == 'odometry'
@@ -188,7 +186,7 @@ def shared_offset(graph: FactorGraph, poses: Array, judgement: Judgement) -> Arr
     if not cholesky.factorise(system, np.ones_like(system.b)):
         return None
 
-    def left_of(b: Array, _: Array) -> Array:
+    def left_of(b: Array) -> Array:
         return np.stack([one - system.times(cholesky.solve(system.transposed_times(one)))
                          for one in np.ascontiguousarray(b.T)], axis=1)
 

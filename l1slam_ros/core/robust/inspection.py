@@ -146,9 +146,12 @@ def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
     group = np.repeat(is_loop.astype(np.int64), graph.manifold.TANGENT_SIZE)
     noise = rng.standard_normal(len(group)) * part.between.speaks.ravel()
     variance, spare = np.ones(2), np.zeros(2)
+
+    def left_of(b: Array) -> Array:
+        return b - system.A @ _least_squares(system, b, 1 / variance[group])
+
     for _ in range(_ROUNDS):
-        both = np.stack((system.b, np.sqrt(variance)[group] * noise), axis=1)
-        left = both - system.A @ _least_squares(system, both, 1 / variance[group])
+        left = left_of(np.stack((system.b, np.sqrt(variance)[group] * noise), axis=1))
         found, drawn = (np.bincount(group, column**2, minlength=2) for column in left.T)
         spare = drawn / variance
         ratio = np.divide(found, drawn, out=np.ones(2), where=spare >= FEWEST_SPARE)
@@ -157,18 +160,16 @@ def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
             break
     odometry, loops = np.where(spare >= FEWEST_SPARE, np.sqrt(variance), np.nan).tolist()
     known = (spare >= FEWEST_SPARE).all()
-    offset = lacked_step(
-        part, is_loop, system.b, variance,
-        lambda b, weights: b - system.A @ _least_squares(system, b, weights)) if known else None
+    offset = lacked_step(part, is_loop, system.b, variance, left_of) if known else None
     return NoiseScales(odometry, loops, *ends, _turns(part.manifold, left), offset)
 
 
 def lacked_step(graph: FactorGraph, is_loop: Mask, b: Array, variance: Array,
-                left_of: Callable[[Array, Array], Array]) -> Array | None:
+                left_of: Callable[[Array], Array]) -> Array | None:
     """
     Return the step d [m, rad] that all loops lack, (k,): Z v2t(d) fits; None if noise explains it.
 
-    left_of : returns what a map leaves of (rows, k + 1), weighted by (rows,)
+    left_of : returns what a map, weighted by the variances, leaves of (rows, k + 1)
 
     Z is the later keyframe seen from the earlier. With G (rows, k) the derivatives of what d adds,
     the map and d minimise |A x - b - G d|^2, weighted by the variances (2,) of odometry and of
@@ -183,7 +184,7 @@ def lacked_step(graph: FactorGraph, is_loop: Mask, b: Array, variance: Array,
     lacked = np.where((factors.i > factors.j)[:, None, None], backward, np.eye(k))
     G = (is_loop[:, None, None] * factors.sqrt_information @ lacked).reshape(-1, k)
     weights = 1 / np.repeat(variance[is_loop.astype(np.int64)], k)
-    left = left_of(np.column_stack((b, G)), weights)
+    left = left_of(np.column_stack((b, G)))
     weighted = weights[:, None] * G
     M, S, z = G.T @ weighted, left[:, 1:].T @ weighted, weighted.T @ left[:, 0]
     scale = np.sqrt(np.where(np.diag(M) > 0, np.diag(M), 1.0))

@@ -218,7 +218,7 @@ class Upkeep:
         with self._standing() as now:
             live, solver = self._live, self._solver
             exact = live.is_exact_due(idle)
-        whole, pending, known = now.problem(), now.pending, now.looked
+        whole, pending, looked = now.problem(), now.pending, now.looked
         del now  # holds the factors of a front that may be replaced meanwhile
         problem = as_one(whole)
         if not pending:
@@ -231,8 +231,7 @@ class Upkeep:
         improvement = improve(problem, solver, _PATIENCE * max(budget, _LEAST_ROUND), check, exact)
         check()
         judgement, looks = whole.judgement, list[Look]()
-        front = front_of(problem, improvement.poses, len(pending.accepted) if pending else known,
-                         check)
+        front = front_of(problem, improvement.poses, looked, check)
         for _ in range(_PASSES):
             with self._front, self._lock:
                 factors, accept = live.to_accept(judgement.accepted, pending)
