@@ -20,7 +20,9 @@ The same run solves a linear problem (the two of Algorithm 3): one whose lineari
 
 Source: Mehrotra (1992) for the predictor and corrector, which fail where bounds leave the
 predictor hardly a step (Cartis, "Some disadvantages of a Mehrotra-type primal-dual corrector
-interior point algorithm", 2009); the rest is ours, defended by `test_interior_point.py`.
+interior point algorithm", 2009); Gondzio, "Multiple centrality corrections in a primal-dual method
+for linear programming" (1996), for what keeps bounds further off; the rest is ours, defended by
+`test_interior_point.py`.
 """
 
 from dataclasses import dataclass, replace
@@ -47,8 +49,12 @@ _SMALLEST_SLACK = 1e-15
 # A step is shortened while the residual departs from its linearisation by more than this part of
 # the gap, but not below the last number.
 _DEPARTURE, _SHORTEST = 0.5, 1e-4
-# Of the curvature: how much of it is wanted, and how fast that is taken up again once refused.
-_CURVATURE, _RECOVERY = 0.7, 1.3
+# Products u s and v t shall end within this part of mu and its inverse.
+_ALIKE = 0.1
+# Of the curvature: how much of it is wanted; once refused, what is tried at once (a try that is
+# refused takes as long as any, for it fails at its end) and the next time; and how fast it is
+# taken up again.
+_CURVATURE, _REFUSED, _NEXT, _RECOVERY = 0.7, 0.25, 0.5, 1.3
 # Part of its diagonal that J'QJ gets where rounding leaves it indefinite: ten times what is taken
 # for rounding there, and so many times more each time that it is so again.
 _ROUNDING, _MORE = 1e-12, 100.0
@@ -157,10 +163,9 @@ class Curvature:
     def factorise(self, system: LinearSystem, weights: Array, C: Array | None,
                   cholesky: BlockCholesky) -> bool:
         """Factor J'QJ + kappa C, with less of C while it is not definite; False: it never is."""
-        wanted = self._kappa
-        for share in (1.0, 0.5, 0.25, 0.0):
-            self._kappa = share * wanted
-            if cholesky.factorise(system, weights, 0.0, C, self._kappa):
+        wanted, self._kappa = self._kappa, _NEXT * self._kappa
+        for share in (1.0, _REFUSED, 0.0):
+            if cholesky.factorise(system, weights, 0.0, C, share * wanted):
                 if share == 1:
                     self._kappa = min(_CURVATURE, _RECOVERY * max(wanted, _CURVATURE / 10))
                 self._rounding = _ROUNDING
@@ -269,8 +274,11 @@ def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: 
         return False
     predictor = _direction(at, cholesky, Q, np.zeros(n), np.zeros(n))
     mu = gap / (2 * n) * (predictor.gap / gap) ** 3
-    direction = _direction(at, cholesky, Q, mu + predictor.u * predictor.y,
-                           mu - predictor.v * predictor.y)
+    c1, c2 = mu + predictor.u * predictor.y, mu - predictor.v * predictor.y
+    direction = _direction(at, cholesky, Q, c1, c2)
+    if not at.is_torn:  # else bends hold a step back rather than bounds
+        aligned = _direction(at, cholesky, Q, *_aligned(direction, c1, c2, mu))
+        direction = max(direction, aligned, key=lambda direction: direction.reach)
     if direction.reach < _SHORT:
         # Some products u s and v t are far smaller than others: first make them equal.
         mean = np.full(n, gap / (2 * n))
@@ -282,6 +290,26 @@ def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: 
     at.system = problem.linearise(at.poses, residual)
     at.advance(direction, primal)
     return True
+
+
+def _aligned(direction: _Direction, c1: Array, c2: Array, mu: float) -> list[Array]:
+    """
+    Return c1, c2 that bring the products at the end of a direction into line with mu.
+
+    Meant to become c1 and c2, they end as c1 - du dy and c2 + dv dy. Of those far too large no
+    more is taken than the most they may be, or they would rule the step.
+    """
+    least, most = _ALIKE * mu, mu / _ALIKE
+    ends = c1 - direction.u * direction.y, c2 + direction.v * direction.y
+    wanted = []
+    for c, end in zip((c1, c2), ends, strict=True):
+        # In place: memory that is new each time takes longer than the sums.
+        shift = np.clip(end, least, most)
+        shift -= end
+        np.maximum(shift, -most, out=shift)
+        shift += c
+        wanted.append(shift)
+    return wanted
 
 
 def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, c1: Array,
