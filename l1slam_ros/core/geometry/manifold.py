@@ -65,10 +65,8 @@ class Manifold(Protocol):
     def residual(self, measurement: Array, pose_i: Array, pose_j: Array) -> Array:
         """Return t2v(Z^-1 Xi^-1 Xj), (n, d)."""
 
-    def residual_jacobians(
-        self, measurement: Array, pose_i: Array, pose_j: Array
-    ) -> tuple[Array, Array]:
-        """Return J_r_i and J_r_j of `residual`, each (n, d, d)."""
+    def residual_jacobians(self, measurement: Array, pose_i: Array, pose_j: Array) -> Array:
+        """Return J_r_i and J_r_j of `residual`, (n, 2, d, d)."""
 
     def residual_curvature(
         self, measurement: Array, pose_i: Array, pose_j: Array, dual: Array

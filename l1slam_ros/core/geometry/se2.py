@@ -92,9 +92,9 @@ def residual(measurement: Array, pose_i: Array, pose_j: Array) -> Array:
     return e
 
 
-def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> tuple[Array, Array]:
+def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> Array:
     """
-    Return J_r_i and J_r_j, each (n, 3, 3).
+    Return J_r_i and J_r_j, (n, 2, 3, 3).
 
     With t = Ri'(tj - ti): `J_r_i = [[-Rz', Rz'(t_y, -t_x)'], [0, -1]]` and
     `J_r_j = [[Rz' Ri' Rj, 0], [0, 1]]`.

@@ -140,9 +140,9 @@ def residual(measurement: Array, pose_i: Array, pose_j: Array) -> Array:
     return kernels.se3.residual(measurement, pose_i, pose_j)
 
 
-def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> tuple[Array, Array]:
+def residual_jacobians(measurement: Array, pose_i: Array, pose_j: Array) -> Array:
     """
-    Return J_r_i and J_r_j, each (n, 6, 6).
+    Return J_r_i and J_r_j, (n, 2, 6, 6).
 
     With p = Ri'(tj - ti), Rij = Ri'Rj, q the quaternion of the error and M = q_w I + [q_v]x:
     `J_r_i = [[-Rz', Rz'[p]x], [0, -M Rij']]` and `J_r_j = [[Rz' Rij, 0], [0, M]]`.

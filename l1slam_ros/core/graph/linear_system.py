@@ -82,9 +82,9 @@ class LinearSystem:
 
     def weighted(self, roots: Array) -> 'LinearSystem':
         """Return the system with the rows of each factor multiplied by its root (m, k, k)."""
-        k, roots = self.block_size, np.ascontiguousarray(roots)
-        pair = np.ascontiguousarray(self.blocks.transpose(1, 0, 2, 3))
-        return replace(self, blocks=kernels.blocks.whiten_blocks(roots, *pair, (0,) * k),
+        k, roots, blocks = self.block_size, np.ascontiguousarray(roots), self.blocks.copy()
+        kernels.blocks.whiten_blocks(roots, blocks, (0,) * k)
+        return replace(self, blocks=blocks,
                        b=kernels.blocks.whiten(roots, self.b.reshape(-1, k), (0,) * k).ravel())
 
     def part(self, entries: slice) -> 'LinearSystem':
@@ -152,9 +152,9 @@ def linearise(graph: FactorGraph, poses: Array, residual: Array | None = None,
 
     """
     factors = graph.between
-    pair = graph.manifold.residual_jacobians(factors.measurement, *ends(graph, poses))
-    blocks = kernels.blocks.whiten_blocks(
-        factors.sqrt_information, *pair, (0,) * graph.manifold.TANGENT_SIZE)
+    blocks = graph.manifold.residual_jacobians(factors.measurement, *ends(graph, poses))
+    kernels.blocks.whiten_blocks(
+        factors.sqrt_information, blocks, (0,) * graph.manifold.TANGENT_SIZE)
     if residual is None:
         residual = whitened_residual(graph, poses)
     fixed = anchor(graph) if fixed is None else fixed

@@ -274,14 +274,11 @@ class Front:
         first, steps, poses = self._moved(pairs.T.ravel())
         p, k = first.shape[2], steps.shape[2]
         Z, root = np.repeat(Z, 2, axis=0), factors.sqrt_information[rows][:len(pairs), None]
-        J = manifold.residual_jacobians(Z, *first.reshape(2, -1, p))
+        J = manifold.residual_jacobians(Z, *first.reshape(2, -1, p)).reshape(-1, 2, 2, k, k)
         e = manifold.residual(Z, *poses.reshape(2, -1, p)).reshape(-1, 2, k)
-        sides = [root @ side.reshape(-1, 2, k, k) for side in J]
-        residual = (root @ e[..., None])[..., 0]
-        for side, step in zip(sides, steps.reshape(2, -1, 2, k), strict=True):
-            residual -= (side @ step[..., None])[..., 0]
-        return Linearised(
-            np.maximum(pairs - self._fixed, FIXED), np.stack(sides, axis=2), residual)
+        blocks, steps = root[:, None] @ J, steps.reshape(2, -1, 2, k).transpose(1, 2, 0, 3)
+        residual = (root @ e[..., None])[..., 0] - (blocks @ steps[..., None])[..., 0].sum(axis=2)
+        return Linearised(np.maximum(pairs - self._fixed, FIXED), blocks, residual)
 
     def _moved(self, keyframes: Indices) -> tuple[Array, Array, Array]:
         """Return where keyframes began, their steps and where they are, (m, 2, p or k) each."""

@@ -52,18 +52,19 @@ def whiten(roots, vectors, size):
     return product
 
 
-@for_sizes('f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1]')
-def whiten_blocks(roots, J_i, J_j, size):
-    """Return L'J_i and L'J_j for each factor, (m, 2, k, k); roots, J_i, J_j : (m, k, k)."""
+@for_sizes('f8[:, :, ::1], f8[:, :, :, ::1]')
+def whiten_blocks(roots, blocks, size):
+    """Turn J_i and J_j of each factor into L'J_i and L'J_j, (m, 2, k, k); roots : (m, k, k)."""
     k = len(size)
-    blocks = np.empty((len(roots), 2, k, k))
-    for side in range(2):
-        J = J_j if side else J_i
-        for f in range(len(roots)):
+    J = np.empty((k, k))
+    for f in range(len(roots)):
+        for side in range(2):
+            for r in range(k):
+                for c in range(k):
+                    J[r, c] = blocks[f, side, r, c]
             for r in range(k):
                 for c in range(k):
                     total = 0.0
                     for a in range(k):
-                        total += roots[f, r, a] * J[f, a, c]
+                        total += roots[f, r, a] * J[a, c]
                     blocks[f, side, r, c] = total
-    return blocks

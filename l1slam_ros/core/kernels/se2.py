@@ -33,8 +33,9 @@ def residual(z, x_i, x_j):
 
 @loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1])')
 def jacobians(z, x_i, x_j):
-    """Return J_e_i and J_e_j, (m, 3, 3) each."""
-    J_i, J_j = np.zeros((len(x_i), 3, 3)), np.zeros((len(x_i), 3, 3))
+    """Return J_e_i and J_e_j, (m, 2, 3, 3)."""
+    J = np.zeros((len(x_i), 2, 3, 3))
+    J_i, J_j = J[:, 0], J[:, 1]
     for f in range(len(x_i)):
         c, s = np.cos(z[f, 2]), np.sin(z[f, 2])
         phi = x_j[f, 2] - x_i[f, 2] - z[f, 2]
@@ -45,7 +46,7 @@ def jacobians(z, x_i, x_j):
         J_j[f, 0, 0], J_j[f, 0, 1] = np.cos(phi), -np.sin(phi)
         J_j[f, 1, 0], J_j[f, 1, 1] = np.sin(phi), np.cos(phi)
         J_j[f, 2, 2] = 1.0
-    return J_i, J_j
+    return J
 
 
 @loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])')

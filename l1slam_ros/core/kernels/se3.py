@@ -66,8 +66,9 @@ def residual(z, x_i, x_j):
 
 @loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1])')
 def jacobians(z, x_i, x_j):
-    """Return J_e_i and J_e_j, (m, 6, 6) each."""
-    J_i, J_j = np.zeros((len(z), 6, 6)), np.zeros((len(z), 6, 6))
+    """Return J_e_i and J_e_j, (m, 2, 6, 6)."""
+    J = np.zeros((len(z), 2, 6, 6))
+    J_i, J_j = J[:, 0], J[:, 1]
     R_z, R_ij, M = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for f in range(len(z)):
         p, q_ij, q = _seen(z[f], x_i[f], x_j[f])
@@ -87,7 +88,7 @@ def jacobians(z, x_i, x_j):
                 for k in range(3):
                     J_j[f, r, c] += R_z[k, r] * R_ij[k, c]
                     J_i[f, 3 + r, 3 + c] -= M[r, k] * R_ij[c, k]
-    return J_i, J_j
+    return J
 
 
 @compiled
