@@ -41,7 +41,11 @@ from l1slam_ros.core.solvers.optimality import (
     l2_cost,
     smoothing,
 )
-from l1slam_ros.core.solvers.reweighting import warm_step, weighted_least_squares
+from l1slam_ros.core.solvers.reweighting import (
+    reweighted_start,
+    warm_step,
+    weighted_least_squares,
+)
 from l1slam_ros.core.solvers.seed import seed_poses
 from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 
@@ -115,7 +119,9 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
     Without: reweighted least squares steps, warm from the kept dual, carry the long-range part:
     one factorisation bends the whole chain, where a first-order method moves it a few keyframes
     per iteration. One is always taken, more where the cost is far above what the last map left (a
-    loop has closed) and still falls. Then, always, Algorithm 4 from the kept dual.
+    loop has closed) and still falls. Where that loop carries all it closes a long way by, no such
+    step leaves the corner: the path from least squares does. Then, always, Algorithm 4 from the
+    kept dual.
     """
     start = time.monotonic()
     graph, method, deadline = problem.part, problem.method, start + budget
@@ -133,11 +139,13 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
         system = linearise(graph, poses, residual)
         try:
             step = warm_step(system, method.cholesky, dual, mu * smoothing(system.b))
+            moved, after = backtrack(graph, poses, residual, step)
+            if far and moved is poses:
+                step, dual = reweighted_start(system, method.cholesky)
+                moved, after = backtrack(graph, poses, residual, step)
         except GraphError:  # sharper weights are beyond double precision
             break
-        previous = cost
-        poses, residual = backtrack(graph, poses, residual, step)
-        cost = l1_cost(residual)
+        previous, poses, residual, cost = cost, moved, after, l1_cost(after)
         steps, mu, far = steps + 1, max(_SHARPER * mu, _SHARPEST), is_far(previous, cost)
     solution = minimise(graph, poses, options, method.cholesky if steps else None, dual, deadline,
                         lambda *_: check())

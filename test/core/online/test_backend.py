@@ -21,9 +21,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from problems import EVERY, PERIOD, loop, odometry, play, seconds
 
 from l1slam_ros.core.errors import Interrupted, L1SlamError, OptionError
-from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry import se2, se3
+from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopOptions
@@ -34,16 +36,18 @@ from l1slam_ros.core.online.snapshot import (
     REJECTED,
     SUSPECT,
     WAITING,
+    Problem,
 )
-from l1slam_ros.core.online.update import improve, optimise
+from l1slam_ros.core.online.update import improve, one_round, optimise
 from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.core.robust.batch import judge
-from l1slam_ros.core.robust.judgement import NORM
+from l1slam_ros.core.robust.judgement import NORM, Judgement
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, minimise
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
 from l1slam_ros.core.solvers.primal_dual import PrimalDualOptions
 from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 # Every loop is used, however far off.
@@ -245,6 +249,31 @@ def test_several_loops_at_once_bring_a_drifted_drive_back():
         poses[i], poses[i + ROUND]))).max() for poses in (drifted, backend.poses))
     assert before > 5 and error < 0.3
     assert_array_equal(backend.poses[0], drifted[0])
+
+
+def test_a_loop_that_carries_all_it_closes_a_long_way_by_is_no_corner_to_stay_in():
+    """No reweighted step from there lowers the cost: the rounds that followed did nothing."""
+    n, sigma = 300, np.array([0.02, 0.02, 0.02, 0.0005, 0.0005, 0.001])
+    rng, step = np.random.default_rng(2), np.zeros((n - 1, 6))
+    step[:, 0], step[:, 5] = 1.0, 2 * np.pi / n
+    true, chain = (odometry_poses(chained(se3, se3.retract(se3.identity(n - 1), steps), sigma))
+                   for steps in (step, step + sigma * rng.standard_normal(step.shape)))
+    graph = chained(se3, se3.between(chain[:-1], chain[1:]), sigma)
+    graph.add_between(np.array([0]), np.array([n - 1]), se3.between(true[:1], true[-1:]),
+                      np.diag(np.repeat([0.1, 0.005], 3) ** -2.0)[None])
+    problem = Problem(0, graph, np.zeros(0, np.int64), [chain], np.zeros(6 * n),
+                      Judgement.nothing().extended(graph, False), False, 1.0, False)
+    solved = improve(problem, one_round(OptimiserOptions(), True), PLENTY)
+    best = min(minimise_by(choose(AUTO, graph), graph, start, OptimiserOptions())[0].cost
+               for start in (chain, true))
+    assert best < 0.9 * solved.cost_before and solved.cost < 1.05 * best
+
+
+def chained(manifold, measurement, sigma):
+    """Return the graph of odometry alone."""
+    graph, i = FactorGraph(manifold, len(measurement) + 1), np.arange(len(measurement))
+    graph.add_between(i, i + 1, measurement, np.tile(np.diag(sigma ** -2.0), (len(i), 1, 1)))
+    return graph
 
 
 # Lies
