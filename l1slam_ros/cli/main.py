@@ -20,6 +20,8 @@ from l1slam_ros.paper import printed as paper
 
 BAD_INPUT, READ_IN_PART, DOUBTFUL, INTERRUPTED, BROKEN_PIPE = 2, 3, 4, 130, 141
 _INPUT = '.g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1'
+_WORD = ('beside a graph INPUT.trusted.txt and INPUT.struck.txt, lines `i j` of vertex ids, may '
+         'vouch for loops and strike loops out')
 _OUTPUT = '.g2o, .tum, or a name without a suffix for a bag directory'
 _GRAPH_OUTPUT = '.g2o, or a name without a suffix for a bag directory'
 _KIND = ('random: far poses said to be near each other; identity: at the very same place; '
@@ -136,7 +138,7 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
 
 def _add_solve(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add('input', type=Path, metavar='INPUT', help=_INPUT)
+    add('input', type=Path, metavar='INPUT', help=f'{_INPUT}; {_WORD}')
     add('--start', choices=names.STARTS, default=names.STARTS[0],
         help='where from: first poses from the graph alone, the stored poses, or the odometry; '
         'where loops are doubted, always from the graph alone (default: %(default)s)')

@@ -189,6 +189,7 @@ def test_people_are_told_and_shown_which_loops_were_refused_and_why(capsys, lies
     drawn = words(tmp_path / 'map.svg')
     assert 'refused loops' in drawn and 'false loops' not in drawn
     assert any('300 poses, 401 loops (100 refused)' in word for word in drawn)
+    assert 'INPUT.trusted.txt' in (told := help_of(capsys, 'solve')) and 'INPUT.struck.txt' in told
     Path(f'{lies}.struck.txt').write_text(f'{named[0][1]} {named[0][2]}\n')
     (first, *_, worst), (believed, *rest) = (
         run(capsys, 'solve', lies, *more)[0].splitlines() for more in ((), ('--no-robust',)))

@@ -12,8 +12,8 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 
-# A gap: the odometry is so many times vaguer, by the volume of one sigma; and no number is less.
-_VAGUE, _TINY = 1e4, 1e-300
+# A gap: each number of the odometry is so many times vaguer, in the mean; and no number is less.
+_VAGUE, _TINY = 21.5, 1e-300
 
 
 def odometry_gaps(graph: FactorGraph) -> Indices:
@@ -29,8 +29,8 @@ def vague_odometry(graph: FactorGraph) -> Mask:
     diagonal = np.abs(np.diagonal(factors.sqrt_information, axis1=1, axis2=2))
     size = np.where(factors.speaks, np.log(np.maximum(diagonal, _TINY)), 0.0).sum(axis=1)
     odometry = factors.is_odometry
-    return odometry & (size < np.median(size[odometry]) - np.log(_VAGUE)
-                       if odometry.any() else False)
+    vague = np.log(_VAGUE) * graph.manifold.TANGENT_SIZE
+    return odometry & (size < np.median(size[odometry]) - vague if odometry.any() else False)
 
 
 def bridged(graph: FactorGraph) -> FactorGraph:

@@ -88,6 +88,11 @@ class Judgement:
         """The first reason not to rely on the map; None where all is well."""
         return self.doubts[0] if self.doubts else None
 
+    @property
+    def is_refusal_doubted(self) -> bool:
+        """Whether the loops that it refused make it doubtful."""
+        return any(doubt.kind in (MOSTLY_REFUSED, OTHER_MAP) for doubt in self.doubts)
+
     @staticmethod
     def nothing() -> 'Judgement':
         """Return the judgement before there are factors."""

@@ -4,7 +4,7 @@
 import os
 import threading
 import time
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -288,6 +288,15 @@ def test_a_judgement_that_doubts_itself_is_followed_by_one_from_the_graph_alone(
         while not anew and time.monotonic() < deadline:
             backend._update(MOMENT, lambda: False, idle=False)
         assert anew and backend.snapshot().judgement.doubt.kind == MOSTLY_REFUSED
+        with backend._alone():  # what lays the doubt is asked, too, until there are twice as many
+            live, laid = backend._live, replace(backend.snapshot().judgement, doubts=())
+            loops = len(live._builder.loops.rows)
+            for doubted, anew in (loops, False), (loops, True), (loops // 2, False):
+                live._doubted_loops = doubted
+                live.take_judgement(laid, live.judged, loops - 1, True)
+                live.take_judgement(laid, live.judged, loops, anew)
+                live._anew_at = -np.inf
+                assert live.is_anew_due(False) == (doubted == loops and not anew)
 
 
 def test_the_background_looks_again_when_nothing_comes_any_more():

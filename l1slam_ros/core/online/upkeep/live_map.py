@@ -20,7 +20,7 @@ from l1slam_ros.core.incremental.front import UNKNOWN, Front, Look
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.snapshot import Behind, Optimised
 from l1slam_ros.core.online.update import Improvement
-from l1slam_ros.core.robust.judgement import MOSTLY_REFUSED, OTHER_MAP, Doubt, Judgement
+from l1slam_ros.core.robust.judgement import Doubt, Judgement
 from l1slam_ros.core.solvers.optimality import Status
 
 # A map is factored anew from so many factors on that came since, those of five keyframes; on a
@@ -73,7 +73,7 @@ class LiveMap:
         self.newest: tuple[int, Array]
         self.judge_took = self._judge_began = self._judge_at = 0.0
         self._heard = builder.graph.said
-        self._bound_at = self._factored_at = 0.0
+        self._bound_at = self._factored_at = self._anew_at = self._anew_took = 0.0
         # What the last proof says, and of which factors.
         self._bound, self._proved = np.nan, np.zeros(0, bool)
         # The factors that the map is of and their noise, the loops that were judged, and whether
@@ -82,7 +82,7 @@ class LiveMap:
         known = len(optimised.judgement.accepted)
         self._judged_loops = int(np.count_nonzero(builder.loops.rows < known))
         self._judged_anew = self._judged_loops
-        self._anew_at = self._anew_took = 0.0
+        self._doubted_loops = self._judged_loops * optimised.judgement.is_refusal_doubted
         self.note_newest()
 
     @property
@@ -200,13 +200,12 @@ class LiveMap:
         Return whether the next judgement is to be from the graph alone.
 
         At rest what the last one went on from is asked, too; and before, where loops that it
-        refused make it doubtful: a lie that was likely when it came may keep out the true ones
-        that came after it.
+        refused make it doubtful: a lie that came first may keep out true ones. What lays the doubt
+        may be lies that agree: it is asked until there are twice as many loops.
         """
         if idle:
             return self.all_judged
-        last = self.pending or self.optimised.judgement
-        return (any(doubt.kind in (MOSTLY_REFUSED, OTHER_MAP) for doubt in last.doubts)
+        return (len(self._builder.loops.rows) < 2 * self._doubted_loops
                 and self._judged_anew != self._judged_loops
                 and time.monotonic() > self._anew_at + max(_JUDGE_EVERY, 2 * self._anew_took))
 
@@ -236,6 +235,7 @@ class LiveMap:
         anew : from the graph alone
         """
         self._judged_loops, self.judged, self.asked = loops, poses, None
+        self._doubted_loops = loops if judgement.is_refusal_doubted else self._doubted_loops
         self._judge_at = time.monotonic()
         if anew:
             self._judged_anew, self._anew_at = loops, self._judge_at
