@@ -50,6 +50,13 @@ def test_two_slips_are_found_together(bad, steps, offset):
     assert not judgement.doubts
 
 
+def test_far_loops_alone_say_how_the_robot_moved_at_a_slip():
+    """They know it to hundreds of its sigmas; of a map half way there the second was not found."""
+    world = spoilt(careful_world(400, 440, 1), 'random', 15)
+    graph = slipped(world.graph, steps := [160, 200], [[0.0, 0.0, 1.5], [0.0, 0.0, -1.5]])
+    assert graph.between.i[robust_solve(graph)[0].slips].tolist() == steps
+
+
 @pytest.mark.parametrize('stated, turn, named', [(1.0, 0.14, [STEP]), (10.0, 0.14, []),
                                                  (10.0, 0.2, [STEP])])
 def test_what_is_within_the_noise_as_stated_is_no_slip(bad, stated, turn, named):
