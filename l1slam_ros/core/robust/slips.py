@@ -119,40 +119,46 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     return found
 
 
-def _tried(growth: Growth, as_stated: Growth, motion: Motion, more: bool = True
+def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
            ) -> Iterator[tuple[list[int], float, Growth | None, bool]]:
     """
     Yield steps, their log odds to have slipped, the state without them, and whether that is usual.
 
     None: it falls apart. It is usual if the robot, repaired, moves as elsewhere at each of them.
-    Where it is not, a second step may bend what the loops across the first one say: more : try
-    that, too.
+    Where it is not, a second step bends what the loops across the first one say: the likeliest
+    are tried, too, however unlikely each is by itself.
+
+    first : whether nothing else is cut for it
     """
-    odds = log_odds_of_slips(growth, motion)
-    for step in _suspected(growth, odds, as_stated.undecided()):
+    odds, left_out = log_odds_of_slips(growth, motion), as_stated.undecided()
+    # Where loops are left out, one more place may be won.
+    least = max(SURE, _place(growth)) if len(left_out) else SURE
+    for step in _suspected(growth, odds, left_out, least if first else np.inf):
         state, usual = _without(growth, step), False
         if state:
             state, step, usual = _cut_rather(state, step, motion)
         yield [step], float(odds[step]), state, usual
-        if more and state and not usual:
+        if first and state and not usual:
             for second, other, both, usual in _tried(state, state, motion, False):
-                first = step
+                one = step
                 if both:
-                    both, first, moves = _cut_rather(both, step, motion)
+                    both, one, moves = _cut_rather(both, step, motion)
                     usual = usual and moves
-                yield [first, *second], float(odds[first]) + other, both, usual
+                yield [one, *second], float(odds[one]) + other, both, usual
 
 
-def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:
-    """Return the odometry factors that may have slipped: two by their odds, two by groups."""
+def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> list[int]:
+    """
+    Return the odometry factors that may have slipped: two by their odds, two by groups.
+
+    least : how large the odds are against those that are suspected for their own, at most
+    """
     tell = growth.accepted & growth.is_loop
     tell[left_out] = True
     across = spanned(growth.low[tell], growth.high[tell], growth.graph.n_poses)
     # Where no loop can tell, an unusual motion is no more than that.
     told = np.where((across[growth.low] > 0) & ~growth.cut, odds, -np.inf)
     order = np.argsort(-told, kind='stable')[:_TRIED]
-    # Where loops are left out, one more place may be won.
-    least = max(SURE, _place(growth)) if len(left_out) else SURE
     suspects: list[int] = order[told[order] > -least].tolist()
     for _ in range(_TRIED):
         group = strongest_group(growth, left_out)
@@ -273,13 +279,20 @@ def _put_back(state: Growth, steps: list[int], motion: Motion) -> tuple[Growth, 
 
 
 def _moves_as_usual(state: Growth, cut: int, motion: Motion) -> bool:
-    """Return whether the robot, repaired, moves as elsewhere, or rather so than as measured."""
+    """
+    Return whether the robot, repaired, moves as elsewhere, or rather so than as measured.
+
+    A slip is as rare as a mistake that many loops share. So the odds of the one against the other
+    are those of the motion that each leaves.
+    """
     row = np.array([cut])
-    (repaired,), (spread,) = _repaired(state, cut, row)
-    # The nearest step to what was measured is itself.
-    measured = np.sort(motion.distance(steps_of(state, row)[0], spread))[1]
-    gate = state.gate(np.array([len(repaired)]))[0]
-    return bool(motion.distance(repaired, spread).min() < max(gate, measured))
+    repaired, spread = _repaired(state, cut, row)
+    gate = state.gate(np.array([len(motion.mean)]))[0]
+    # All may be as noisy as they turn out, or as they say.
+    said = state.variance_at_their_word()[0] / state.variance[0]
+    density = max(motion.log_density(repaired, noise * spread)[0] for noise in (1.0, said))
+    return bool(motion.distance(repaired[0], spread[0]).min() < gate
+                or density > motion.log_density(steps_of(state, row))[0])
 
 
 def _repaired(state: Growth, cut: int, steps: Indices) -> tuple[Array, Array]:
