@@ -8,11 +8,11 @@ where loops of two places or more do. A slip is suspected where the odds of one 
 (`motion`), or where loops that are left out agree. Then slip and lies are compared: the step is
 cut, the loops across are asked anew, and the rounds go on from there. To the odds comes half a
 gate for each place that is won and that nothing else explains, less one for each that is lost. A
-slip is believed if that makes it likelier than not, and if three places span it where it is only
-places that say so. Loops do not make a robot jump: the slip repaired, it has to move as at some
-other step, or rather so than as measured. What fits the loops that came in without it did not
-slip: a lie had bent the map. And odometry that errs alike on each metre did not slip either: where
-a slip would be believed, or most loops are left out, a drift is compared by the same odds.
+slip is believed if that makes it likelier than not. Loops do not make a robot jump: the slip
+repaired, it has to move as at some other step, or rather so than as measured. What fits the loops
+that came in without it did not slip: a lie had bent the map. And odometry that errs alike on each
+metre did not slip either: where a slip would be believed, or most loops are left out, a drift is
+compared by the same odds.
 """
 
 from collections.abc import Iterator
@@ -34,7 +34,7 @@ from l1slam_ros.core.robust.motion import (
 from l1slam_ros.core.robust.pairwise_consistency import Group, spanned, strongest_group
 from l1slam_ros.core.robust.rounds import Growth
 
-# Places that join two parts, and that span a slip, at least.
+# Places that join two parts, and of a group that makes a slip suspected, at least.
 JOINING, SPANNING = 2, 3
 # So many steps are tried for each reason.
 _TRIED = 2
@@ -98,9 +98,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         evidence = gain if back else odds + gain
         if len(steps) == 1:
             growth.slip_odds[steps[0]] = odds if back else evidence
-        if state and evidence > most and (
-                (odds > 0 and len(steps) == 1)
-                or (usual and all(_spans(state, step) for step in steps))):
+        if state and evidence > most and (usual or (odds > 0 and len(steps) == 1)):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
     half = np.count_nonzero(growth.is_loop) / 2
@@ -205,12 +203,6 @@ def spanning(growth: Growth, step: int) -> Mask:
     span: Mask = growth.is_loop & (growth.low < growth.high[step]) & (
         growth.high > growth.low[step])
     return span
-
-
-def _spans(state: Growth, step: int) -> bool:
-    """Return whether loops of enough places span a step."""
-    places = state.place[state.accepted & spanning(state, step)]
-    return len(np.unique(places)) >= SPANNING
 
 
 def _gain(growth: Growth, as_stated: Growth, cut: Growth) -> float:
