@@ -55,8 +55,9 @@ _NOISIER, _MEDIAN, _CHECKED = 3.0, 0.79, 0.01
 _LATEST = 50
 # What is stated counts in the end up to so many times the variance that was found.
 _WORD = 100.0
-# The variance of an odometry factor that was cut, in units of its own: loops alone decide.
-_CUT = 1e4
+# The variance of an odometry factor that was cut, in units of its own: loops alone decide, and far
+# loops know of a step to some hundred sigmas.
+_CUT = 1e8
 # The noise is learnt of loops of so many places at least: of fewer, errors may be one.
 _FEWEST_PLACES = 3
 

@@ -8,11 +8,11 @@ where loops of two places or more do. A slip is suspected where the odds of one 
 (`motion`), or where loops that are left out agree. Then slip and lies are compared: the step is
 cut, the loops across are asked anew, and the rounds go on from there. To the odds comes half a
 gate for each place that is won and that nothing else explains, less one for each that is lost. A
-slip is believed if that makes it likelier than not, and if three places span it where it is only
-places that say so. Loops do not make a robot jump: the slip repaired, it has to move as at some
-other step, or rather so than as measured. What fits the loops that came in without it did not
-slip: a lie had bent the map. And odometry that errs alike on each metre did not slip either: where
-a slip would be believed, or most loops are left out, a drift is compared by the same odds.
+slip is believed if that makes it likelier than not. Loops do not make a robot jump: the slip
+repaired, it has to move as at some other step, or rather so than as measured. What fits the loops
+that came in without it did not slip: a lie had bent the map. And odometry that errs alike on each
+metre did not slip either: where a slip would be believed, or most loops are left out, a drift is
+compared by the same odds.
 """
 
 from collections.abc import Iterator
@@ -34,7 +34,7 @@ from l1slam_ros.core.robust.motion import (
 from l1slam_ros.core.robust.pairwise_consistency import Group, spanned, strongest_group
 from l1slam_ros.core.robust.rounds import Growth
 
-# Places that join two parts, and that span a slip, at least.
+# Places that join two parts, and of a group that makes a slip suspected, at least.
 JOINING, SPANNING = 2, 3
 # So many steps are tried for each reason.
 _TRIED = 2
@@ -98,9 +98,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         evidence = gain if back else odds + gain
         if len(steps) == 1:
             growth.slip_odds[steps[0]] = odds if back else evidence
-        if state and evidence > most and (
-                (odds > 0 and len(steps) == 1)
-                or (usual and all(_spans(state, step) for step in steps))):
+        if state and evidence > most and (usual or (odds > 0 and len(steps) == 1)):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
     half = np.count_nonzero(growth.is_loop) / 2
@@ -119,40 +117,46 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     return found
 
 
-def _tried(growth: Growth, as_stated: Growth, motion: Motion, more: bool = True
+def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
            ) -> Iterator[tuple[list[int], float, Growth | None, bool]]:
     """
     Yield steps, their log odds to have slipped, the state without them, and whether that is usual.
 
     None: it falls apart. It is usual if the robot, repaired, moves as elsewhere at each of them.
-    Where it is not, a second step may bend what the loops across the first one say: more : try
-    that, too.
+    Where it is not, a second step bends what the loops across the first one say: the likeliest
+    are tried, too, however unlikely each is by itself.
+
+    first : whether nothing else is cut for it
     """
-    odds = log_odds_of_slips(growth, motion)
-    for step in _suspected(growth, odds, as_stated.undecided()):
+    odds, left_out = log_odds_of_slips(growth, motion), as_stated.undecided()
+    # Where loops are left out, one more place may be won.
+    least = max(SURE, _place(growth)) if len(left_out) else SURE
+    for step in _suspected(growth, odds, left_out, least if first else np.inf):
         state, usual = _without(growth, step), False
         if state:
             state, step, usual = _cut_rather(state, step, motion)
         yield [step], float(odds[step]), state, usual
-        if more and state and not usual:
+        if first and state and not usual:
             for second, other, both, usual in _tried(state, state, motion, False):
-                first = step
+                one = step
                 if both:
-                    both, first, moves = _cut_rather(both, step, motion)
+                    both, one, moves = _cut_rather(both, step, motion)
                     usual = usual and moves
-                yield [first, *second], float(odds[first]) + other, both, usual
+                yield [one, *second], float(odds[one]) + other, both, usual
 
 
-def _suspected(growth: Growth, odds: Array, left_out: Indices) -> list[int]:
-    """Return the odometry factors that may have slipped: two by their odds, two by groups."""
+def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> list[int]:
+    """
+    Return the odometry factors that may have slipped: two by their odds, two by groups.
+
+    least : how large the odds are against those that are suspected for their own, at most
+    """
     tell = growth.accepted & growth.is_loop
     tell[left_out] = True
     across = spanned(growth.low[tell], growth.high[tell], growth.graph.n_poses)
     # Where no loop can tell, an unusual motion is no more than that.
     told = np.where((across[growth.low] > 0) & ~growth.cut, odds, -np.inf)
     order = np.argsort(-told, kind='stable')[:_TRIED]
-    # Where loops are left out, one more place may be won.
-    least = max(SURE, _place(growth)) if len(left_out) else SURE
     suspects: list[int] = order[told[order] > -least].tolist()
     for _ in range(_TRIED):
         group = strongest_group(growth, left_out)
@@ -199,12 +203,6 @@ def spanning(growth: Growth, step: int) -> Mask:
     span: Mask = growth.is_loop & (growth.low < growth.high[step]) & (
         growth.high > growth.low[step])
     return span
-
-
-def _spans(state: Growth, step: int) -> bool:
-    """Return whether loops of enough places span a step."""
-    places = state.place[state.accepted & spanning(state, step)]
-    return len(np.unique(places)) >= SPANNING
 
 
 def _gain(growth: Growth, as_stated: Growth, cut: Growth) -> float:
@@ -273,13 +271,20 @@ def _put_back(state: Growth, steps: list[int], motion: Motion) -> tuple[Growth, 
 
 
 def _moves_as_usual(state: Growth, cut: int, motion: Motion) -> bool:
-    """Return whether the robot, repaired, moves as elsewhere, or rather so than as measured."""
+    """
+    Return whether the robot, repaired, moves as elsewhere, or rather so than as measured.
+
+    A slip is as rare as a mistake that many loops share. So the odds of the one against the other
+    are those of the motion that each leaves.
+    """
     row = np.array([cut])
-    (repaired,), (spread,) = _repaired(state, cut, row)
-    # The nearest step to what was measured is itself.
-    measured = np.sort(motion.distance(steps_of(state, row)[0], spread))[1]
-    gate = state.gate(np.array([len(repaired)]))[0]
-    return bool(motion.distance(repaired, spread).min() < max(gate, measured))
+    repaired, spread = _repaired(state, cut, row)
+    gate = state.gate(np.array([len(motion.mean)]))[0]
+    # All may be as noisy as they turn out, or as they say.
+    said = state.variance_at_their_word()[0] / state.variance[0]
+    density = max(motion.log_density(repaired, noise * spread)[0] for noise in (1.0, said))
+    return bool(motion.distance(repaired[0], spread[0]).min() < gate
+                or density > motion.log_density(steps_of(state, row))[0])
 
 
 def _repaired(state: Growth, cut: int, steps: Indices) -> tuple[Array, Array]:

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 from lies import careful_world, position_error, slipped, spoilt
-from problems import chain_of, graph_of, retold, straight
+from problems import chain_of, graph_of, measure, retold, straight
 from test_pairwise_consistency import STEP, TURN, grown
 
 from l1slam_ros.core.geometry import se2
@@ -48,6 +48,30 @@ def test_two_slips_are_found_together(bad, steps, offset):
     judgement, _ = robust_solve(graph)
     assert graph.between.i[judgement.slips].tolist() == steps
     assert not judgement.doubts
+
+
+def test_far_loops_alone_say_how_the_robot_moved_at_a_slip():
+    """They know it to hundreds of its sigmas; of a map half way there the second was not found."""
+    world = spoilt(careful_world(400, 440, 1), 'random', 15)
+    graph = slipped(world.graph, steps := [160, 200], [[0.0, 0.0, 1.5], [0.0, 0.0, -1.5]])
+    assert graph.between.i[robust_solve(graph)[0].slips].tolist() == steps
+
+
+def test_a_slip_of_odometry_that_drifts_within_its_noise():
+    """Loops behind it fit to a third of the noise; those across see it 2 m off for the drift."""
+    rng, ahead = np.random.default_rng(1), np.arange(0, 180, 10)
+    near = [np.stack((ahead + k, ahead + k + 15), axis=1) for k in (0, 205)]
+    across = np.arange(0, 150, 30)
+    far = np.stack((across, 399 - across // 2), axis=1)
+    truth = np.cumsum(rng.normal([1.0, 0.0, 0.0], [0.1, 0.0, 0.0], (400, 3)), axis=0)
+    drifted = truth + np.arange(400)[:, None] * [0.0, 0.006, 0.0]
+    sure = np.diag([400.0, 400.0, 1e5])
+    graph = graph_of(drifted, np.concatenate((chain_of(400), *near)), 0.0, sure)
+    measure(graph, truth, *far.T, 0.0, sure)
+    Z = graph.between.measurement
+    Z += 0.3 * rng.standard_normal(Z.shape) / np.sqrt(np.diag(sure))
+    judgement, _ = robust_solve(slipped(graph, [STEP], [0.0, 0.0, 1.5]))
+    assert graph.between.i[judgement.slips].tolist() == [STEP] and not judgement.doubts
 
 
 @pytest.mark.parametrize('stated, turn, named', [(1.0, 0.14, [STEP]), (10.0, 0.14, []),
