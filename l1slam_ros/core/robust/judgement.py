@@ -38,8 +38,6 @@ MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP, UNFINISHED, NORM = (
 
 # Of fewer loops most may well be refused, and be of one place; most are more than half by some.
 _HANDFUL, _MOST = 5, 0.55
-# A place that joins more than this part of the keyframes is no one mistake.
-_SMALL = 0.5
 # Refused loops that agree count if they are so many for each accepted one across.
 _AGAINST = 0.25
 
@@ -228,11 +226,8 @@ def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
 
 def _carries_all(growth: Growth, accepted: Indices) -> bool:
     """Return whether all accepted loops are of one place, and join but a small part of the way."""
-    if len(accepted) < _HANDFUL or growth.trusted[accepted].any():
-        return False
-    joined = np.ptp(growth.low[accepted]) + np.ptp(growth.high[accepted])
-    return len(np.unique(growth.place[accepted])) == 1 and bool(
-        joined < _SMALL * growth.graph.n_poses)
+    return (len(accepted) >= _HANDFUL and not growth.trusted[accepted].any()
+            and growth.may_err_as_one(accepted, 2))
 
 
 def _joining_alone(growth: Growth) -> Iterator[Indices]:

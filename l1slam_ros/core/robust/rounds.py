@@ -58,8 +58,9 @@ _WORD = 100.0
 # The variance of an odometry factor that was cut, in units of its own: loops alone decide, and far
 # loops know of a step to some hundred sigmas.
 _CUT = 1e8
-# The noise is learnt of loops of so many places at least: of fewer, errors may be one.
-_FEWEST_PLACES = 3
+# The noise is learnt of loops of so many places at least: of fewer, errors may be one. A place
+# that joins more than this part of the keyframes is no one mistake.
+_FEWEST_PLACES, _SMALL = 3, 0.5
 
 
 class Growth:
@@ -114,8 +115,8 @@ class Growth:
         rows = self.undecided()
         # A factor that stands there twice fits itself, whatever the noise.
         rows = np.setdiff1d(rows[~self.factors.is_absolute[rows]], repeated_factors(self.graph))
-        # Loops of fewer places may be one mistake, which the noise learnt of them would fit.
-        if len(np.unique(self.place[rows])) >= _FEWEST_PLACES:
+        # Else the noise that is learnt of them would fit their mistake.
+        if not self.may_err_as_one(rows):
             self.variance = self.variance * noise_variance(self.innovations(rows))
             self._floor = _LEAST_VARIANCE * self.variance
             self.solve()
@@ -134,6 +135,15 @@ class Growth:
             self.solve()
         else:
             self.begin()
+
+    def may_err_as_one(self, loops: Indices, fewest: int = _FEWEST_PLACES) -> bool:
+        """Return whether loops are of fewer places, none of which joins much of the way."""
+        place = self.place[loops]
+        numbers = np.unique(place)
+        each = (loops[place == number] for number in numbers)
+        return len(numbers) < fewest and all(
+            np.ptp(self.low[own]) + np.ptp(self.high[own]) < _SMALL * self.graph.n_poses
+            for own in each)
 
     @property
     def may_be_predicted(self) -> Mask:
@@ -269,7 +279,7 @@ class Growth:
     def _is_noisier(self, rows: Indices) -> bool:
         """Raise the variance where half of the factors say that it is far too small."""
         loops = self.is_loop[rows]
-        if self._knows_noise or len(np.unique(self.place[rows[loops]])) < _FEWEST_PLACES:
+        if self._knows_noise or self.may_err_as_one(rows[loops]):
             return False
         square = (self.posterior.residual**2).sum(axis=1)
         stated = np.trace(self.posterior.moment, axis1=1, axis2=2)

@@ -14,6 +14,7 @@ from l1slam_ros.core.robust.batch import judge, robust_solve
 from l1slam_ros.core.robust.batch_map import SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.robust.judgement import ONE_JOINS, ONE_PLACE, OTHER_MAP, Doubt
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import read_graph_file
 
 
@@ -43,6 +44,12 @@ def test_misstated_information_changes_no_decision(world, odometry, loops):
     # In hundreds: how noisy the odometry is shows only where loops check it.
     within = 0.15 if odometry == loops else 1.0
     np.testing.assert_allclose(np.log10(found.variance / [odometry, loops]), 0, atol=within)
+
+
+def test_noise_is_learnt_where_all_loops_hang_together_as_one_place():
+    """On a sphere each loop is beside the next one, and they join the whole way."""
+    sphere = simulate_world(200, 400, WorldOptions(), np.random.default_rng(0), 'sphere').graph
+    assert robust_solve(retold(sphere, times=100.0))[0].accepted.all()
 
 
 @pytest.mark.parametrize('times', [1.0, 3.0, 10.0])
