@@ -17,7 +17,7 @@ from l1slam_ros.core.solvers.interior_point import interior_point, prove
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
 
-# It leaves the cost some 10^-6 above the optimum, 2 10^-6 in flat valleys and in space.
+# It leaves the cost some 10^-6 above the optimum, in flat valleys and small worlds up to 6 10^-6.
 _TOLERANCE = 2e-5
 _ROUGH_L2 = LeastSquaresOptions(iterations=30, tolerance=1e-3)
 

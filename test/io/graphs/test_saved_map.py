@@ -116,7 +116,8 @@ def test_what_is_loaded_goes_on_as_if_nothing_had_been(world, halfway, tmp_path,
         assert one.snapshot().graph.between.struck.sum() == 2
     a, b = (one.saved().optimised for one in (backend, undisturbed))
     np.testing.assert_allclose(a.poses, b.poses, atol=1e-3)
-    assert a.cost == pytest.approx(b.cost, rel=1e-6)
+    # Each is up to 6e-6 above the optimum (of 120 worlds), wherever it came from.
+    assert a.cost == pytest.approx(b.cost, rel=1e-5)
     assert_equal(backend.saved().builder, undisturbed.saved().builder)
     np.testing.assert_array_equal(backend.loop_states().state, undisturbed.loop_states().state)
 
