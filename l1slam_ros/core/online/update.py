@@ -141,7 +141,7 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
             step = warm_step(system, method.cholesky, dual, mu * smoothing(system.b))
             moved, after = backtrack(graph, poses, residual, step)
             if far and moved is poses:
-                step, dual = reweighted_start(system, method.cholesky)
+                step, dual = reweighted_start(system, method.cholesky, check)
                 moved, after = backtrack(graph, poses, residual, step)
         except GraphError:  # sharper weights are beyond double precision
             break

@@ -5,6 +5,7 @@ Weighted linear least squares by one sparse factorisation, and the start it give
 In: a linear system. Out: the step that minimises a weighted sum of squares.
 """
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 
@@ -86,7 +87,8 @@ def warm_step(system: LinearSystem, cholesky: BlockCholesky, y: Array, mu: float
     return weighted_least_squares(replace(system, b=system.b / free), cholesky, free / R)
 
 
-def reweighted_start(system: LinearSystem, cholesky: BlockCholesky) -> tuple[Array, Array]:
+def reweighted_start(system: LinearSystem, cholesky: BlockCholesky,
+                     check: Callable[[], None] = lambda: None) -> tuple[Array, Array]:
     """
     Return a primal (columns,) and a dual (rows,) near the optimum of |A x - b|_1.
 
@@ -95,6 +97,8 @@ def reweighted_start(system: LinearSystem, cholesky: BlockCholesky) -> tuple[Arr
     their numbers, so costs tie): this path leads to the middle of the optimal face, where a
     first-order method alone ends wherever it came from. It ends early where sharper weights are
     beyond double precision, as on a straight way of kilometres that one weak factor ties.
+
+    check : called before each step, raises where the work shall stop
     """
     x = weighted_least_squares(system, cholesky, np.ones_like(system.b))
     r = system.times(x) - system.b
@@ -102,6 +106,7 @@ def reweighted_start(system: LinearSystem, cholesky: BlockCholesky) -> tuple[Arr
     y = r / np.hypot(r, mu)
     with suppress(GraphError):
         for _ in range(_SMOOTHING_STEPS):
+            check()
             x, y = reweighted_step(system, cholesky, r, mu)
             r = system.times(x) - system.b
             mu /= 2
