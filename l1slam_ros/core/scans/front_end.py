@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The scan front end: scans and the wheels' poses in, keyframes, odometry and loops out.
+
+    points      a scan becomes points with normals
+    odometry    matched with the last few keyframes: where the robot is; is it a keyframe?
+    loops       keyframes whose surroundings are known ask which earlier place they are
+
+It knows no back end: whoever has one tells it with `place` where the keyframes lie in the map.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.options import Options
+from l1slam_ros.core.scans.loops import LoopFinder, LoopOptions, ScanLoop
+from l1slam_ros.core.scans.odometry import ScanKeyframes, ScanOdometry, Step
+from l1slam_ros.core.scans.points import Mount, Scan, points_of
+from l1slam_ros.core.scans.submaps import Keyframe
+
+
+@dataclass(frozen=True)
+class FrontEndOptions(Options):
+    """Everything the scan front end can be told."""
+
+    keyframe: ScanKeyframes = ScanKeyframes()
+    loop: LoopOptions = LoopOptions()
+
+
+class ScanFrontEnd:
+    """
+    Makes odometry and loops of scans.
+
+    Parameters
+    ----------
+    options : see `FrontEndOptions`
+    mount : where the laser is on the robot
+
+    """
+
+    def __init__(self, options: FrontEndOptions = FrontEndOptions(),  # noqa: B008
+                 mount: Mount = Mount()):  # noqa: B008
+        self._mount = mount
+        self._odometry = ScanOdometry(options.keyframe)
+        self._finder = LoopFinder(self._odometry.keyframes, options.loop)
+        self._poses, self._spread = np.zeros((0, 3)), np.zeros((0, 2))
+        self._velocity: Array | None = None
+        self._last: tuple[int, Array] | None = None
+
+    @property
+    def keyframes(self) -> list[Keyframe]:
+        """All keyframes so far."""
+        return self._odometry.keyframes
+
+    def add(self, scan: Scan, wheels: Array) -> Step:
+        """Follow the robot to a scan; wheels : (3,) its pose by the wheels at the scan's stamp."""
+        if self._last is not None:
+            seconds = (scan.stamp - self._last[0]) * 1e-9
+            moved = se2.between(self._last[1][None], wheels[None])[0]
+            self._velocity = moved / seconds if seconds > 0 else None
+        self._last = scan.stamp, wheels
+        return self._odometry.add(scan.stamp, points_of(scan, self._mount, self._velocity), wheels)
+
+    def place(self, poses: Array, spread: Array) -> None:
+        """
+        Hear where the first keyframes lie in the map.
+
+        poses : (n, 3); spread : (n, 2) standard deviation of where each lies from the last of them
+        [m], [rad]; infinite: not known
+        """
+        self._poses, self._spread = poses, spread
+
+    def loops(self) -> list[ScanLoop]:
+        """Return what loops have been found since this was asked before."""
+        due = self._finder.due()
+        if not len(due):
+            return []
+        poses, spread = self._in_map()
+        return [loop for j in due for loop in self._finder.find(int(j), poses, spread)]
+
+    def _in_map(self) -> tuple[Array, Array]:
+        """Return all keyframes in the map (n, 3), those not placed by odometry, and `spread`."""
+        known = len(self._poses)
+        odometry = np.array([keyframe.pose for keyframe in self.keyframes])
+        if not known:
+            return odometry, np.zeros((len(odometry), 2))
+        start = np.broadcast_to(odometry[known - 1], odometry[known:].shape)
+        last = np.broadcast_to(self._poses[-1], odometry[known:].shape)
+        new = se2.compose(last, se2.between(start, odometry[known:]))
+        spread = np.concatenate((self._spread, np.zeros((len(new), 2))))
+        return np.concatenate((self._poses, new)), spread

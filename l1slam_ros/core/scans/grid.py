@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+An occupancy grid of scans and the poses of their keyframes.
+
+Each ray tells the cells it passes that they are free, and the cell where it ends that it is not,
+in log odds (Moravec and Elfes, "High resolution maps from wide angle sonar", 1985). A cell that no
+ray has met is unknown. The grid grows as the map does, and a keyframe that moved is taken out and
+put in again, so that only what moved is drawn anew.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.scans import kernels
+from l1slam_ros.core.scans.points import Points, transformed
+
+# Log odds that one ray adds, and the most that all do.
+_FREE, _OCCUPIED, _MOST = np.float32(0.4), np.float32(0.85), np.float32(100.0)
+# Cells above, and below, are occupied and free: probabilities .65 and .25, as nav2's map server
+# has them.
+OCCUPIED, FREE = np.log(0.65 / 0.35), np.log(0.25 / 0.75)
+# [m] Rays into the open are free so far.
+_OPEN = 8.0
+
+
+@dataclass(frozen=True)
+class Grid:
+    """
+    Occupancy.
+
+    log_odds : (a, b), column of x and row of y, 0 where nothing is known; origin : (2,) the corner
+    of cell (0, 0) [m]; resolution : [m]
+    """
+
+    log_odds: Array
+    origin: Array
+    resolution: float
+
+    @property
+    def occupancy(self) -> Array:
+        """100 occupied, 0 free, -1 unknown, (a, b) int8, as nav_msgs/OccupancyGrid has it."""
+        known = np.where(self.log_odds > OCCUPIED, 100, np.where(self.log_odds < FREE, 0, -1))
+        return known.astype(np.int8)
+
+
+def draw(points: Sequence[Points], poses: Array, resolution: float = 0.05) -> Grid:
+    """
+    Return the grid of scans seen from poses.
+
+    points : of the scans; poses : (n, 3) of the robot in the map; resolution : [m]
+    """
+    rays = [rays_of(seen, pose) for seen, pose in zip(points, poses, strict=True)]
+    ends = np.concatenate([end for _, end, _ in rays]) if rays else np.zeros((1, 2))
+    starts = np.concatenate([start for start, _, _ in rays]) if rays else np.zeros((1, 2))
+    low = np.floor(np.minimum(ends.min(axis=0), starts.min(axis=0)) / resolution - 1) * resolution
+    high = np.maximum(ends.max(axis=0), starts.max(axis=0))
+    shape = np.ceil((high - low) / resolution).astype(int) + 1
+    log_odds = np.zeros((int(shape[0]), int(shape[1])), np.float32)
+    for start, end, hit in rays:
+        kernels.cast_rays(log_odds, low, resolution, start, end, hit, _FREE, _OCCUPIED, _MOST)
+    return Grid(log_odds, low, resolution)
+
+
+def rays_of(seen: Points, pose: Array) -> tuple[Array, Array, Array]:
+    """Return where the rays of a view begin and end (r, 2) [m], and whether there is a surface."""
+    bins = len(seen.view)
+    angles = (np.arange(bins) + 0.5) * (2 * np.pi / bins)
+    hit = np.isfinite(seen.view)
+    looked = hit | np.isposinf(seen.view)
+    reach = np.where(hit, seen.view, _OPEN)[looked]
+    ends = np.stack((np.cos(angles[looked]) * reach, np.sin(angles[looked]) * reach), axis=1)
+    ends = np.ascontiguousarray(transformed(pose, ends + seen.centre))
+    start = transformed(pose, seen.centre[None])
+    return np.ascontiguousarray(np.repeat(start, len(ends), axis=0)), ends, hit[looked]

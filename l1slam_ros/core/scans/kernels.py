@@ -1,0 +1,313 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The compiled loops of the scan front end: fields, matching, search, and views.
+
+A pose is x, y [m] and heading [rad], (3,); it maps points of the moving scan into the frame of the
+map. Points and normals are (n, 2) arrays. Grids are indexed [column of x, row of y].
+"""
+
+import numpy as np
+
+from l1slam_ros.core.kernels.compiled import compiled, loop
+
+
+@loop('(f8[:, ::1], f8[::1], i8[::1], f8, f8)')
+def nearest_points(points, origin, shape, resolution, reach):
+    """
+    Return which point is nearest to the centre of each cell, -1 where none is within `reach`.
+
+    points : (n, 2) [m]; origin : (2,) corner of cell (0, 0) [m]; shape : (2,) cells;
+    resolution, reach : [m]
+    """
+    nearest = np.full((shape[0], shape[1]), -1, np.int32)
+    best = np.full((shape[0], shape[1]), reach * reach)
+    radius = int(np.ceil(reach / resolution))
+    for k in range(len(points)):
+        column = int((points[k, 0] - origin[0]) / resolution)
+        row = int((points[k, 1] - origin[1]) / resolution)
+        for a in range(max(column - radius, 0), min(column + radius + 1, shape[0])):
+            dx = origin[0] + (a + 0.5) * resolution - points[k, 0]
+            for b in range(max(row - radius, 0), min(row + radius + 1, shape[1])):
+                dy = origin[1] + (b + 0.5) * resolution - points[k, 1]
+                square = dx * dx + dy * dy
+                if square < best[a, b]:
+                    best[a, b] = square
+                    nearest[a, b] = k
+    return nearest
+
+
+@loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i4[:, ::1], f8[::1], f8, f8[::1], f8, f8)')
+def normal_equations(points, normals, map_points, map_normals, nearest, origin, resolution, pose,
+                     gate, scale):
+    """
+    Return the sums of one Gauss-Newton step of point-to-line matching.
+
+    The residual of a point p with the map's nearest point m and its normal n is n'(R p + t - m);
+    its Jacobian is taken in the axes of the moving pose. Weights are Cauchy's, 1 / (1 + (e/s)^2).
+
+    gate : [m] farther points, and those whose normals differ by more than 45 degrees, do not match;
+    scale : s [m]
+
+    Returns
+    -------
+    sums : (11,) the upper triangle of H by rows (6), g (3), the number of matches, and the sum of
+        weighted squared residuals [m^2]
+
+    """
+    sums = np.zeros(11)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    for k in range(len(points)):
+        px, py = points[k, 0], points[k, 1]
+        x, y = c * px - s * py + pose[0], s * px + c * py + pose[1]
+        column = int(np.floor((x - origin[0]) / resolution))
+        row = int(np.floor((y - origin[1]) / resolution))
+        if column < 0 or row < 0 or column >= nearest.shape[0] or row >= nearest.shape[1]:
+            continue
+        m = nearest[column, row]
+        if m < 0:
+            continue
+        dx, dy = x - map_points[m, 0], y - map_points[m, 1]
+        if dx * dx + dy * dy > gate * gate:
+            continue
+        nx, ny = map_normals[m, 0], map_normals[m, 1]
+        # The normal, seen from the moving pose.
+        ux, uy = c * nx + s * ny, c * ny - s * nx
+        if ux * normals[k, 0] + uy * normals[k, 1] < 0.7071:
+            continue
+        e = nx * dx + ny * dy
+        turn = uy * px - ux * py
+        w = 1.0 / (1.0 + (e / scale) ** 2)
+        sums[0] += w * ux * ux
+        sums[1] += w * ux * uy
+        sums[2] += w * ux * turn
+        sums[3] += w * uy * uy
+        sums[4] += w * uy * turn
+        sums[5] += w * turn * turn
+        sums[6] += w * ux * e
+        sums[7] += w * uy * e
+        sums[8] += w * turn * e
+        sums[9] += 1.0
+        sums[10] += w * e * e
+    return sums
+
+
+@loop('(f8[:, ::1], f8, f8, f8)')
+def normals_along(points, least_reach, widening, off):
+    """
+    Return the normals of points that follow each other along a scan, (n, 2), turned to (0, 0).
+
+    A line is fitted to the neighbours on both sides that hang together within `least_reach` [m],
+    or within `widening` of the range; zero where one side has none, or where the points are
+    further than `off` [m] from the line (RMS).
+    """
+    n = len(points)
+    normals = np.zeros((n, 2))
+    for k in range(n):
+        first = last = k
+        range_ = np.sqrt(points[k, 0] ** 2 + points[k, 1] ** 2)
+        reach = max(least_reach, widening * range_)
+        while first > 0 and _near(points, first - 1, k, reach) and (
+                _near(points, first - 1, first, 0.5 * reach)):
+            first -= 1
+        while last < n - 1 and _near(points, last + 1, k, reach) and (
+                _near(points, last + 1, last, 0.5 * reach)):
+            last += 1
+        if first == k or last == k:
+            continue
+        count = last - first + 1
+        mx = my = 0.0
+        for j in range(first, last + 1):
+            mx += points[j, 0] / count
+            my += points[j, 1] / count
+        xx = xy = yy = 0.0
+        for j in range(first, last + 1):
+            dx, dy = points[j, 0] - mx, points[j, 1] - my
+            xx += dx * dx / count
+            xy += dx * dy / count
+            yy += dy * dy / count
+        half = 0.5 * (xx - yy)
+        least = 0.5 * (xx + yy) - np.sqrt(half * half + xy * xy)
+        if least > off * off:
+            continue
+        angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the line
+        nx, ny = -np.sin(angle), np.cos(angle)
+        if nx * points[k, 0] + ny * points[k, 1] > 0:
+            nx, ny = -nx, -ny
+        normals[k, 0], normals[k, 1] = nx, ny
+    return normals
+
+
+@compiled
+def _near(points, a, b, reach):
+    dx, dy = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1]
+    return dx * dx + dy * dy <= reach * reach
+
+
+@loop('(f8[:, ::1], f8)')
+def apart(points, spacing):
+    """Return which points of a scan are at least `spacing` [m] from the last one kept, (n,)."""
+    kept = np.zeros(len(points), np.bool_)
+    last = -1
+    for k in range(len(points)):
+        if last < 0 or not _near(points, k, last, spacing):
+            kept[k] = True
+            last = k
+    return kept
+
+
+@loop('(f4[:, :, ::1], i8[::1], i8[:, :, ::1], i8[::1], i8[::1], f8, f8[::1])')
+def branch_and_bound(levels, margin, cells, lowest, highest, least, excluded):
+    """
+    Return the best shift of a scan over a likelihood grid for any of its turns.
+
+    levels : (h + 1, a, b) the likelihood, pooled over 1, 2, 4, ... cells; margin : (2,) cells of
+    the grid before cell (0, 0) of the shifts; cells : (t, n, 2) cells of the points for each turn,
+    unshifted; lowest, highest : (2,) of the shifts, inclusive; least : score to beat; excluded :
+    (6,) turn, shift (2), how many turns and cells around it do not count, and after how many
+    turns they begin anew; fewer than no turns: nothing is excluded
+
+    Returns
+    -------
+    score, turn, column, row; turn -1: none beats `least`
+
+    Source: Hess, Kohler, Rapp, Andor, "Real-time loop closure in 2D LIDAR SLAM", 2016, Algorithm 3.
+
+    """
+    height = len(levels) - 1
+    width = 1 << height
+    best, found = least, np.array([-1, 0, 0])
+    turns, n = cells.shape[0], cells.shape[1]
+    per_turn = ((highest[0] - lowest[0]) // width + 1) * ((highest[1] - lowest[1]) // width + 1)
+    scores = np.empty(turns * per_turn)
+    nodes = np.empty((turns * per_turn, 3), np.int64)
+    count = 0
+    for t in range(turns):
+        for x in range(lowest[0], highest[0] + 1, width):
+            for y in range(lowest[1], highest[1] + 1, width):
+                nodes[count, 0], nodes[count, 1], nodes[count, 2] = t, x, y
+                scores[count] = _score(levels[height], margin, cells[t], n, x, y)
+                count += 1
+    stack = np.empty((4 * height + 4, 4), np.int64)
+    bounds = np.empty(4 * height + 4)
+    for at in np.argsort(-scores[:count]):
+        if scores[at] <= best:
+            break
+        stack[0, 0], stack[0, 1] = nodes[at, 0], nodes[at, 1]
+        stack[0, 2], stack[0, 3] = nodes[at, 2], height
+        bounds[0] = scores[at]
+        depth = 1
+        while depth > 0:
+            depth -= 1
+            if bounds[depth] <= best:
+                continue
+            t, x, y, level = stack[depth, 0], stack[depth, 1], stack[depth, 2], stack[depth, 3]
+            if level == 0:
+                apart = abs(t - excluded[0])
+                far = (excluded[3] < 0 or min(apart, excluded[5] - apart) > excluded[3]
+                       or abs(x - excluded[1]) > excluded[4] or abs(y - excluded[2]) > excluded[4])
+                if far:
+                    best = bounds[depth]
+                    found[0], found[1], found[2] = t, x, y
+                continue
+            half = 1 << (level - 1)
+            first = depth
+            for dx in (0, half):
+                for dy in (0, half):
+                    if x + dx > highest[0] or y + dy > highest[1]:
+                        continue
+                    score = _score(levels[level - 1], margin, cells[t], n, x + dx, y + dy)
+                    if score <= best:
+                        continue
+                    place = depth
+                    while place > first and bounds[place - 1] > score:  # the best one on top
+                        bounds[place] = bounds[place - 1]
+                        for column in range(4):
+                            stack[place, column] = stack[place - 1, column]
+                        place -= 1
+                    bounds[place] = score
+                    stack[place, 0], stack[place, 1] = t, x + dx
+                    stack[place, 2], stack[place, 3] = y + dy, level - 1
+                    depth += 1
+    return best, found[0], found[1], found[2]
+
+
+@compiled
+def _score(likelihood, margin, cells, n, x, y):
+    total = 0.0
+    for k in range(n):
+        column, row = cells[k, 0] + x + margin[0], cells[k, 1] + y + margin[1]
+        if 0 <= column < likelihood.shape[0] and 0 <= row < likelihood.shape[1]:
+            total += likelihood[column, row]
+    return total / n
+
+
+@loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8)')
+def contradictions(points, views, poses, off):
+    """
+    Return how many points the rays of some views agree with, and how many they pass through.
+
+    points : (n, 2) [m]; views : (v, b) the range seen in each of b equal bearings, NaN where none;
+    poses : (v, 3) where they were seen from, in the frame of the points; off : [m] by which a ray
+    must pass a point to contradict it. A point that any view's ray passes through is contradicted,
+    unless another view's ray ends there.
+    """
+    agree = pass_through = 0
+    bins = views.shape[1]
+    for k in range(len(points)):
+        seen = through = False
+        for v in range(len(poses)):
+            dx, dy = points[k, 0] - poses[v, 0], points[k, 1] - poses[v, 1]
+            distance = np.sqrt(dx * dx + dy * dy)
+            bearing = (np.arctan2(dy, dx) - poses[v, 2]) / (2 * np.pi)
+            at = int((bearing - np.floor(bearing)) * bins) % bins
+            seen_range = views[v, at]
+            if np.isnan(seen_range):
+                continue
+            tolerance = off + 0.03 * distance
+            if abs(seen_range - distance) <= tolerance:
+                seen = True
+            elif seen_range > distance + tolerance:
+                # The neighbours must pass, too: at an edge the ray may miss by its width.
+                left, right = views[v, (at - 1) % bins], views[v, (at + 1) % bins]
+                if left > distance + tolerance and right > distance + tolerance:
+                    through = True
+        if seen:
+            agree += 1
+        elif through:
+            pass_through += 1
+    return agree, pass_through
+
+
+@loop('(f4[:, ::1], f8[::1], f8, f8[:, ::1], f8[:, ::1], b1[::1], f4, f4, f4)')
+def cast_rays(log_odds, origin, resolution, starts, ends, hits, free, occupied, most):
+    """
+    Add rays to a grid of log odds, in place: each cell is told once by each scan's ray.
+
+    starts, ends : (r, 2) [m]; hits : (r,) whether there is a surface at the end; free, occupied :
+    what a ray adds to the cells it passes, and to the one it ends in; most : bound of either sign.
+
+    Source: Amanatides and Woo, "A fast voxel traversal algorithm for ray tracing", 1987.
+    """
+    for k in range(len(starts)):
+        x, y = (starts[k, 0] - origin[0]) / resolution, (starts[k, 1] - origin[1]) / resolution
+        u, v = (ends[k, 0] - origin[0]) / resolution, (ends[k, 1] - origin[1]) / resolution
+        dx, dy = u - x, v - y
+        column, row, last_column, last_row = int(x), int(y), int(u), int(v)
+        step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
+        next_x = ((column + (step_x > 0)) - x) / dx if dx != 0 else np.inf
+        next_y = ((row + (step_y > 0)) - y) / dy if dy != 0 else np.inf
+        across_x = abs(1 / dx) if dx != 0 else np.inf
+        across_y = abs(1 / dy) if dy != 0 else np.inf
+        for _ in range(abs(last_column - column) + abs(last_row - row)):
+            if 0 <= column < log_odds.shape[0] and 0 <= row < log_odds.shape[1]:
+                log_odds[column, row] = max(log_odds[column, row] - free, -most)
+            if next_x < next_y:
+                column += step_x
+                next_x += across_x
+            else:
+                row += step_y
+                next_y += across_y
+        if hits[k] and 0 <= last_column < log_odds.shape[0] and (
+                0 <= last_row < log_odds.shape[1]):
+            log_odds[last_column, last_row] = min(
+                log_odds[last_column, last_row] + occupied, most)

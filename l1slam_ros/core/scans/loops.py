@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Loop closures from scans: which keyframes to compare, and whether they show one place.
+
+In: keyframes, where the map has them, and how certain that is. Out: loops with covariances. A
+keyframe asks for the nearest ones in the map and for those that look alike; each is searched for
+without a guess, matched, and believed only if
+
+    the score of the search and the overlap are high,
+    no other place within reach fits nearly as well (two equal rooms, a corridor),
+    the rays of neither pass through what the other saw (a mirrored room),
+    every direction is held by the surfaces that were matched (a corridor).
+
+What is sent is a proposal: the back end doubts it as any other loop.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.options import Options, option
+from l1slam_ros.core.scans import kernels
+from l1slam_ros.core.scans.matching import match
+from l1slam_ros.core.scans.points import transformed
+from l1slam_ros.core.scans.search import search
+from l1slam_ros.core.scans.submaps import AROUND, Keyframe, Submap, Submaps
+
+# Every third keyframe asks: submaps of neighbours show the same.
+_EVERY = 3
+# So many candidates by their place in the map, and so many by their looks.
+_NEAREST, _ALIKE = 2, 2
+# Cosine of two descriptors.
+_LOOKS = 0.75
+# [m] Candidates are neighbours of each other where they are nearer along the way.
+_NEIGHBOURS = 4.0
+# [m], [rad] A search reaches at least so far, and at most; places that look alike are nearer.
+_LEAST_REACH, _MOST_REACH, _LEAST_TURN, _ALIKE_REACH = 1.5, 8.0, 0.5, 4.0
+_SIGMAS = 3.0
+# [m/m], [rad/m] How the odometry's error grows with the way, beyond where the map is known.
+_DRIFT = np.array((0.05, 0.01))
+# What a loop must show; see above.
+_SCORE, _RIVAL, _OVERLAP, _AGREE, _HELD = 0.42, 0.85, 0.3, 0.85, 0.1
+# [m] A match that goes so far from the peak of the search slides.
+_WANDER = 0.4
+# [m] A ray that passes a point by so much contradicts it.
+_PAST = 0.3
+# Of neighbouring keyframes' submaps much is the same: a loop is half as certain as matches say.
+_SHARED = 2.0
+# Errors that no count of points lessens [m, m, rad].
+_FLOOR = np.diag((0.03, 0.03, 0.007)) ** 2
+
+
+@dataclass(frozen=True)
+class LoopOptions(Options):
+    """Which keyframes are compared."""
+
+    apart: float = option(10.0, 'way between two keyframes of a loop, at least', 'm', 0, 1e6)
+
+
+@dataclass(frozen=True)
+class ScanLoop:
+    """
+    A loop: keyframe j seen from keyframe i.
+
+    measurement : (3,); covariance : (3, 3) in its axes; score : of the search, 0 to 1
+    """
+
+    i: int
+    j: int
+    measurement: Array
+    covariance: Array
+    score: float
+
+
+class LoopFinder:
+    """
+    Finds loops among keyframes as they come.
+
+    Parameters
+    ----------
+    keyframes : those of the odometry, which grow
+
+    """
+
+    def __init__(self, keyframes: Sequence[Keyframe],
+                 options: LoopOptions = LoopOptions()):  # noqa: B008
+        self._keyframes, self._options = keyframes, options
+        self._submaps = Submaps(keyframes)
+        self._asked = AROUND
+        self._looks: list[Array] = []
+
+    def due(self) -> Indices:
+        """Return the keyframes that may ask now: their submaps are whole."""
+        first, end = self._asked, len(self._keyframes) - AROUND
+        if end <= first:
+            return np.zeros(0, np.int64)
+        self._asked = end
+        asking = np.arange(first, end)
+        return asking[asking % _EVERY == 0]
+
+    def find(self, j: int, poses: Array, spread: Array) -> list[ScanLoop]:
+        """
+        Return the loops from keyframe j to earlier ones.
+
+        poses : (n, 3) of the keyframes in the map, at least j + 1; spread : (n, 2) standard
+        deviation of where each lies from the last one placed [m], [rad]; see `_sigma`
+        """
+        while len(self._looks) <= j:
+            self._looks.append(self._submaps[len(self._looks)].descriptor)
+        sigma = self._sigma(j, spread)
+        reach = np.clip(_SIGMAS * sigma[:, 0], _LEAST_REACH, _MOST_REACH)
+        turn = np.clip(_SIGMAS * sigma[:, 1], _LEAST_TURN, np.pi)
+        loops = []
+        for i, alike in self._candidates(j, poses, reach):
+            expected = se2.between(poses[i][None], poses[j][None])[0]
+            loop = (self._compare(i, j, np.array([0.0, 0.0, expected[2]]), _ALIKE_REACH, np.pi)
+                    if alike else self._compare(i, j, expected, float(reach[i]), float(turn[i])))
+            if loop is not None:
+                loops.append(loop)
+        return loops
+
+    def _sigma(self, j: int, spread: Array) -> Array:
+        """Return how far keyframe j may lie from where the map has it, seen from each, (j, 2)."""
+        way = np.array([self._keyframes[j].travelled - k.travelled for k in self._keyframes[:j]])
+        known = spread.any(axis=1)
+        placed = int(np.flatnonzero(known)[-1]) if known.any() else -1
+        since = self._keyframes[j].travelled - (
+            self._keyframes[placed].travelled if 0 <= placed < j else np.inf)
+        # By odometry alone from there, or by the map and odometry since, whichever is surer.
+        by_map = np.hypot(np.where(known[:, None], spread, np.inf)[:j], max(since, 0.0) * _DRIFT)
+        return np.fmin(way[:, None] * _DRIFT, by_map)
+
+    def _candidates(self, j: int, poses: Array, reach: Array) -> list[tuple[int, bool]]:
+        """Return keyframes to compare with, and whether for their looks alone."""
+        travelled = np.array([k.travelled for k in self._keyframes[: j + 1]])
+        part = np.array([k.part for k in self._keyframes[: j + 1]])
+        far = np.flatnonzero(
+            (travelled[j] - travelled > self._options.apart) | (part != part[j]))
+        distance = np.hypot(*(poses[far, :2] - poses[j, :2]).T)
+        apart = (part != part[j])[far]
+        near = (distance <= reach[far]) & ~apart
+        chosen: list[tuple[int, bool]] = []
+        self._take(far[near], distance[near], _NEAREST, False, travelled, chosen)
+        looks = np.array([self._looks[i] @ self._looks[j] for i in far])
+        like = (looks > _LOOKS) & ((distance <= 2 * reach[far]) | apart) if len(far) else near
+        self._take(far[like], -looks[like], _ALIKE, True, travelled, chosen)
+        return chosen
+
+    def _take(self, keyframes: Indices, rank: Array, most: int, alike: bool, travelled: Array,
+              chosen: list[tuple[int, bool]]) -> None:
+        """Take the first few by rank that are not neighbours of one that is taken."""
+        taken = 0
+        for i in keyframes[np.argsort(rank, kind='stable')]:
+            if taken == most:
+                return
+            if all(abs(travelled[i] - travelled[other]) > _NEIGHBOURS for other, _ in chosen):
+                chosen.append((int(i), alike))
+                taken += 1
+
+    def _compare(self, i: int, j: int, expected: Array, reach: float, turn: float
+                 ) -> ScanLoop | None:
+        """Return the loop from i to j, None: they are not seen to be one place."""
+        reference, asking = self._submaps[i], self._submaps[j]
+        peak = search(reference.field, asking.xy, expected, reach, turn, _SCORE, _RIVAL)
+        if peak is None or peak.second > _RIVAL * peak.score:
+            return None
+        found = match(reference.field, asking.xy, asking.normals, peak.pose, widest=0.3)
+        away = se2.between(peak.pose[None], found.pose[None])[0]
+        if (found.matched < _OVERLAP or found.curvature < _HELD
+                or np.hypot(away[0], away[1]) > _WANDER):
+            return None
+        back = se2.inverse(found.pose[None])[0]
+        if not (_agrees(asking, reference, found.pose) and _agrees(reference, asking, back)):
+            return None
+        covariance = _SHARED * np.linalg.inv(found.information + 1e-6 * np.eye(3)) + _FLOOR
+        return ScanLoop(i, j, found.pose, covariance, peak.score)
+
+
+def _agrees(seen: Submap, viewer: Submap, pose: Array) -> bool:
+    """Tell whether what is seen at a pose (3,) is where the viewer's rays do not pass through."""
+    points = np.ascontiguousarray(transformed(pose, seen.xy))
+    agree, through = kernels.contradictions(points, viewer.views, viewer.centres, _PAST)
+    return agree >= _AGREE * (agree + through)

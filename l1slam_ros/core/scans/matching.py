@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Point-to-line matching of a scan with a map, and how certain it is.
+
+The step of a pose is in the axes of the moving scan (x, y, heading), as everywhere in this
+package. Minimised is
+
+    sum rho(e_k / sigma) / KAPPA + |t2v(prior^-1 pose)|^2_W,
+
+e_k the distance of point k from the line through the map's nearest one, rho Cauchy's. Neighbouring
+points say nearly the same (the surface between them is one), so KAPPA of them count as one.
+
+Source: Censi, "An ICP variant using a point-to-line metric", 2008; the count of points: ours.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.scans import kernels
+from l1slam_ros.core.scans.field import REACH, RESOLUTION, Field
+
+# [m] Noise of a point off its line, in a map of several scans; where Cauchy's weight turns over.
+SIGMA = 0.03
+_SCALE = 3 * SIGMA
+# So many points along a surface count as one.
+KAPPA = 5.0
+# [m] Points farther than this do not match: by rounds, narrower each time.
+_WIDEST, _NARROWEST, _SHRINK = REACH, 0.15, 0.75
+_MOST_ITERATIONS = 20
+# [m], [rad] A step that is no step any more.
+_STILL = 1e-4
+_UPPER = np.triu_indices(3)
+
+
+@dataclass(frozen=True)
+class Match:
+    """
+    Where a scan lies in a map.
+
+    pose : (3,); information : (3, 3) of the matched points alone, in the axes of the pose, already
+    divided by `KAPPA` and by how much worse they fit than `SIGMA`; matched : part of the points
+    that found the map; curvature : the least eigenvalue of H over the number of matches, H of
+    unit weights with lengths measured in the scan's radius: 0 where a direction is not held
+    """
+
+    pose: Array
+    information: Array
+    matched: float
+    curvature: float
+
+
+def match(field: Field, xy: Array, normals: Array, start: Array, prior: Array | None = None,
+          prior_information: Array | None = None, widest: float = _WIDEST) -> Match:
+    """
+    Match points (n, 2) that have normals (n, 2) with a map, from a pose (3,) on.
+
+    prior : (3,) pose that is expected, with `prior_information` (3, 3) in its axes; widest : gate
+    of the first round [m]
+    """
+    W = np.zeros((3, 3)) if prior_information is None else prior_information
+    prior = start if prior is None else prior
+    pose, gate = start.astype(float), widest
+    H, sums = np.zeros((3, 3)), np.zeros(11)
+    for _ in range(_MOST_ITERATIONS):
+        H, g, sums = _sums(field, xy, normals, pose, gate)
+        expected = se2.between(prior[None], pose[None])[0]
+        J = np.eye(3)
+        c, s = np.cos(expected[2]), np.sin(expected[2])
+        J[:2, :2] = (c, -s), (s, c)
+        scale = KAPPA * SIGMA**2
+        A = H / scale + J.T @ W @ J + 1e-9 * np.eye(3)
+        step = -np.linalg.solve(A, g / scale + J.T @ W @ expected)
+        pose = se2.retract(pose[None], step[None])[0]
+        narrow = gate <= _NARROWEST
+        gate = max(gate * _SHRINK, _NARROWEST)
+        if narrow and abs(step).max() < _STILL:
+            break
+    count = sums[9]
+    radius = float(np.sqrt((xy**2).sum(axis=1).mean())) if len(xy) else 1.0
+    units = np.array([1.0, 1.0, 1.0 / max(radius, 0.1)])
+    curvature = float(np.linalg.eigvalsh(H * np.outer(units, units))[0] / max(count, 1.0))
+    worse = max(1.0, sums[10] / max(count, 1.0) / SIGMA**2)
+    return Match(pose, H / (KAPPA * SIGMA**2 * worse), count / max(len(xy), 1), curvature)
+
+
+def _sums(field: Field, xy: Array, normals: Array, pose: Array, gate: float
+          ) -> tuple[Array, Array, Array]:
+    sums = kernels.normal_equations(
+        xy, normals, field.xy, field.normals, field.nearest, field.origin, RESOLUTION, pose, gate,
+        _SCALE)
+    H = np.zeros((3, 3))
+    H[_UPPER] = sums[:6]
+    H = H + np.triu(H, 1).T
+    return H, sums[6:9], sums

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Odometry from scans: each scan is matched with the map of the last few keyframes.
+
+In: scans with the wheels' pose at their stamps. Out: the robot's pose in a frame of its own, how
+certain the motion since the last keyframe is, and whether scans and wheels can both be right.
+
+The wheels are the prior of each match, with a covariance that grows with the way since the last
+keyframe: along a corridor scans say nothing, and the wheels' part stays in the covariance. Where a
+match is not believed, it is searched for, for wheels slip and lose their sign when a robot backs
+up; where no one place is found, the wheels are taken at their word. A robot that sees plenty and
+again and again nothing that it knows was carried away: a new part begins.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.options import Options, option
+from l1slam_ros.core.scans.field import Field
+from l1slam_ros.core.scans.matching import Match, match
+from l1slam_ros.core.scans.points import Points, rotated, transformed
+from l1slam_ros.core.scans.search import search
+from l1slam_ros.core.scans.submaps import Keyframe, submap_of
+
+# So many keyframes are the map that scans are matched with.
+_MAP = 4
+# A match is believed where so much of a scan finds the map, no farther from the wheels than the
+# 99.9% quantile of chi-square with 3 degrees of freedom.
+_MATCHED, _GATE = 0.4, 16.27
+# So much of a scan must find the map where it was searched for, and no other place come so near.
+_FOUND, _RIVAL = 0.6, 0.85
+# [m], [rad] How far from half the wheels' motion is searched, at least and at most; between, as far
+# as wheels that turned the other way would be off.
+_SEARCH, _SEARCH_TURN, _MOST_SEARCH, _MOST_TURN = 0.3, 0.3, 1.5, 0.8
+# How far from the peak of a search the scan may be, where its surfaces do not say [m, m, rad].
+_NEAR_PEAK = np.diag(1 / np.array((0.2, 0.2, 0.1)) ** 2)
+# What is left unsure of a scan that was searched for.
+_SEARCHED = np.diag((0.1, 0.1, 0.05)) ** 2
+# Fewer points say nothing about where the robot is; so many scans in a row without a match say
+# that it is somewhere else.
+_FEWEST, _LOST_AFTER = 30, 6
+# Wheels: part of the way and of the turn, turn for each metre, and of each scan [m, rad].
+_WAY, _TURN, _TURN_OF_WAY, _STEP, _STEP_TURN = 0.3, 0.2, 0.3, 0.01, 0.01
+# After scans and wheels disagreed, for so many scans the wheels may be wrong by twice their motion:
+# where a driver loses the sign of wheels that turn backwards, it does for a while.
+_DISTRUST, _WRONG = 25, 2.0
+# Errors of a match that no count of points lessens: of the map, of normals [m, m, rad].
+FLOOR = np.diag((0.005, 0.005, 0.002)) ** 2
+
+
+@dataclass(frozen=True)
+class ScanKeyframes(Options):
+    """When a scan is kept."""
+
+    translation: float = option(0.5, 'distance from the last keyframe', 'm', 0.01, 1e3)
+    rotation: float = option(0.35, 'turn since the last keyframe', 'rad', 0.01, 1e3)
+
+
+@dataclass(frozen=True)
+class Step:
+    """
+    What one scan said.
+
+    pose : (3,) of the robot in the frame of this odometry; keyframe : None, or the new one;
+    covariance : (3, 3) of the motion from the keyframe before to the pose, in the axes of the
+    pose; said : what is to be told of it, empty: nothing
+    """
+
+    pose: Array
+    keyframe: Keyframe | None
+    covariance: Array
+    said: str = ''
+
+
+class ScanOdometry:
+    """
+    Follows a robot by its scans.
+
+    Parameters
+    ----------
+    options : when a scan becomes a keyframe
+
+    Attributes
+    ----------
+    keyframes : all so far
+
+    """
+
+    def __init__(self, options: ScanKeyframes = ScanKeyframes()):  # noqa: B008
+        self._options = options
+        self.keyframes: list[Keyframe] = []
+        self._field: Field | None = None
+        self._pose = np.zeros(3)
+        self._covariance = np.zeros((3, 3))
+        self._wheels: Array | None = None
+        self._unmatched = 0
+        self._distrusted = 0
+        self._blind = np.zeros(3)  # motion of the wheels since a scan was matched
+
+    def add(self, stamp: int, points: Points, wheels: Array) -> Step:
+        """Follow the robot to a scan; wheels : (3,) its pose by the wheels at that stamp."""
+        if self._wheels is None or self._field is None:
+            self._wheels = wheels
+            return self._begin(stamp, points, 0)
+        motion = se2.between(self._wheels[None], wheels[None])[0]
+        self._wheels = wheels
+        start = self._pose
+        expected = se2.compose(start[None], motion[None])[0]
+        Ad = se2.adjoint(se2.inverse(motion[None]))[0]
+        predicted = Ad @ self._covariance @ Ad.T + wheel_covariance(motion)
+        if self._distrusted:
+            self._distrusted -= 1
+            predicted = predicted + np.diag((_WRONG * motion) ** 2)
+        said = self._follow(start, expected, motion, predicted, points)
+        if self._unmatched >= _LOST_AFTER:
+            self._unmatched, self._blind = 0, np.zeros(3)
+            return self._begin(stamp, points, self.keyframes[-1].part + 1)
+        return self._step(stamp, points, said)
+
+    def _follow(self, start: Array, expected: Array, motion: Array, predicted: Array,
+                points: Points) -> str:
+        """Find the pose at a scan from what the wheels expect; return what is to be said."""
+        xy, normals = points.surface
+        assert self._field is not None
+        information = np.linalg.inv(predicted)
+        found = match(self._field, xy, normals, expected, expected, information)
+        off = se2.local(expected[None], found.pose[None])[0]
+        said, floor = '', 0 * FLOOR
+        if found.matched < _MATCHED or off @ information @ off > _GATE:
+            searched = self._search(start, motion, points)
+            if searched is None:
+                known = len(xy) >= _FEWEST
+                self._unmatched = self._unmatched + 1 if known else 0
+                self._pose, self._covariance = expected, predicted
+                return ''
+            found, information, floor = searched, _NEAR_PEAK, _SEARCHED
+            said = '' if self._distrusted else (
+                'the scans disagree with the wheels, and are followed')
+            self._distrusted = _DISTRUST
+        self._unmatched, self._blind = 0, np.zeros(3)
+        self._pose = found.pose
+        self._covariance = np.linalg.inv(information + found.information) + floor
+        return said
+
+    def _search(self, start: Array, motion: Array, points: Points) -> Match | None:
+        """Look for a scan around half the wheels' motion; None: there is no one place."""
+        xy, normals = points.surface
+        if len(xy) < _FEWEST or self._field is None:
+            return None
+        half = se2.compose(start[None], 0.5 * motion[None])[0]
+        self._blind = self._blind + abs(motion)
+        reach = min(_SEARCH + float(np.hypot(*self._blind[:2])), _MOST_SEARCH)
+        turn = min(_SEARCH_TURN + float(self._blind[2]), _MOST_TURN)
+        peak = search(self._field, xy, half, reach, turn, _MATCHED, _RIVAL)
+        if peak is None or peak.second > _RIVAL * peak.score:
+            return None
+        found = match(self._field, xy, normals, peak.pose, peak.pose, _NEAR_PEAK, widest=0.3)
+        return found if found.matched >= _FOUND else None
+
+    def _step(self, stamp: int, points: Points, said: str) -> Step:
+        last = self.keyframes[-1]
+        moved = se2.between(last.pose[None], self._pose[None])[0]
+        way = float(np.hypot(moved[0], moved[1]))
+        covariance = self._covariance + FLOOR
+        if way < self._options.translation and abs(moved[2]) < self._options.rotation:
+            return Step(self._pose, None, covariance, said)
+        keyframe = Keyframe(stamp, self._pose, points, last.part, last.travelled + way)
+        self._keep(keyframe)
+        return Step(self._pose, keyframe, covariance, said)
+
+    def _begin(self, stamp: int, points: Points, part: int) -> Step:
+        travelled = self.keyframes[-1].travelled if self.keyframes else 0.0
+        keyframe = Keyframe(stamp, self._pose, points, part, travelled)
+        self._keep(keyframe)
+        said = '' if part == 0 else (
+            'the scans show nothing known any more; a new part of the map begins')
+        return Step(self._pose, keyframe, FLOOR, said)
+
+    def _keep(self, keyframe: Keyframe) -> None:
+        """Take a keyframe into the map that scans are matched with."""
+        self.keyframes.append(keyframe)
+        local = submap_of(self.keyframes, len(self.keyframes) - 1, before=_MAP - 1, after=0)
+        # In the frame of the odometry, where poses are.
+        self._field = Field.of(transformed(keyframe.pose, local.xy),
+                               rotated(keyframe.pose, local.normals))
+        self._covariance = np.zeros((3, 3))
+
+
+def wheel_covariance(motion: Array) -> Array:
+    """Return the covariance of a motion (3,) of the wheels, (3, 3) in the axes of its end."""
+    way, turn = float(np.hypot(motion[0], motion[1])), abs(float(motion[2]))
+    along = (_WAY * way) ** 2 + _STEP**2
+    heading = (_TURN * turn) ** 2 + (_TURN_OF_WAY * way) ** 2 + _STEP_TURN**2
+    return np.diag((along, along, heading))

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+From a laser scan to points with normals, in the frame of the robot.
+
+In: ranges as the laser gave them, where it is mounted, and how the robot moved meanwhile. Out:
+points at equal distances along what was seen, each with the normal of its surface, and the view:
+how far was seen in each direction.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.scans import kernels
+
+# [m] Points are at least so far apart along a scan.
+SPACING = 0.05
+# [m] A normal is of the line through neighbours within so much; RMS distance to that line.
+_NORMAL_REACH, _OFF_LINE = 0.25, 0.03
+# Far away rays are wide apart: neighbours within so many rays' distance.
+_RAYS = 10.0
+# Bearings of a view.
+_BEARINGS = 720
+
+
+@dataclass(frozen=True)
+class Scan:
+    """
+    One turn of a laser.
+
+    stamp : of the first ray [ns]; ranges : (r,) [m]; angle_min, angle_increment : of the rays
+    [rad], counter-clockwise; range_min, range_max : ranges outside are of no surface [m];
+    time_increment : between rays [s]
+    """
+
+    stamp: int
+    ranges: Array
+    angle_min: float
+    angle_increment: float
+    range_min: float = 0.0
+    range_max: float = np.inf
+    time_increment: float = 0.0
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Where the laser is in the robot's frame: x, y [m], yaw [rad]; upside_down : it hangs."""
+
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+    upside_down: bool = False
+
+
+@dataclass(frozen=True)
+class Points:
+    """
+    What a scan has seen, in the robot's frame at the scan's stamp.
+
+    xy : (n, 2) [m]; normals : (n, 2) of length 1, turned to the robot, zero where there is none;
+    centre : (2,) where the laser was [m]; view : (b,) the nearest range from there in each of b
+    equal bearings from 0 to 2 pi [m], infinite where the laser looked and nothing was in range,
+    NaN where it did not look
+    """
+
+    xy: Array
+    normals: Array
+    centre: Array
+    view: Array
+
+    @property
+    def surface(self) -> tuple[Array, Array]:
+        """The points that have a normal, and these normals, (k, 2) each."""
+        has = self.normals.any(axis=1)
+        return self.xy[has], self.normals[has]
+
+
+def points_of(scan: Scan, mount: Mount = Mount(),  # noqa: B008
+              velocity: Array | None = None) -> Points:
+    """
+    Return the points of a scan.
+
+    velocity : (3,) of the robot while it scanned, in its own frame [m/s, m/s, rad/s]: each ray is
+    moved to where its point lies from the robot at the scan's stamp
+    """
+    ranges = np.asarray(scan.ranges, float)
+    turn = -1.0 if mount.upside_down else 1.0
+    angles = mount.yaw + turn * (scan.angle_min + scan.angle_increment * np.arange(len(ranges)))
+    looked = ~np.isnan(ranges) & (ranges > max(scan.range_min, 0.0))
+    hit = looked & (ranges < scan.range_max)
+    reach = np.where(hit, ranges, 0.0)
+    xy = np.stack((mount.x + reach * np.cos(angles), mount.y + reach * np.sin(angles)), axis=1)
+    centre = np.array([mount.x, mount.y])
+    if velocity is not None and scan.time_increment:
+        xy = _at_stamp(xy, velocity, scan.time_increment * np.arange(len(ranges)))
+    view = _view(np.where(hit, ranges, np.inf)[looked], angles[looked])
+    seen = np.ascontiguousarray(xy[hit])
+    if len(seen):
+        seen = np.ascontiguousarray(seen[kernels.apart(seen, SPACING)])
+    normals = kernels.normals_along(
+        seen - centre, _NORMAL_REACH, _RAYS * abs(scan.angle_increment), _OFF_LINE)
+    return Points(seen, normals, centre, view)
+
+
+def _at_stamp(xy: Array, velocity: Array, seconds: Array) -> Array:
+    """Return points seen so many seconds after the stamp, from where the robot was at it."""
+    angle = velocity[2] * seconds
+    c, s = np.cos(angle), np.sin(angle)
+    x = c * xy[:, 0] - s * xy[:, 1] + velocity[0] * seconds
+    y = s * xy[:, 0] + c * xy[:, 1] + velocity[1] * seconds
+    return np.stack((x, y), axis=1)
+
+
+def _view(ranges: Array, angles: Array) -> Array:
+    """Return the least range in each bearing; see `Points`."""
+    view = np.full(_BEARINGS, np.nan)
+    at = np.floor(angles / (2 * np.pi) * _BEARINGS).astype(np.int64) % _BEARINGS
+    np.fmin.at(view, at, ranges)
+    # A bearing between two rays is seen by both.
+    width = max(1, round(_BEARINGS * _spacing_of(angles) / (2 * np.pi)))
+    for _ in range(width - 1):
+        follower = np.roll(view, 1)
+        view = np.where(np.isnan(view), follower, view)
+    return view
+
+
+def _spacing_of(angles: Array) -> float:
+    return float(np.median(abs(np.diff(angles)))) if len(angles) > 1 else 0.0
+
+
+def transformed(pose: Array, xy: Array) -> Array:
+    """Return points (n, 2) of the frame at a pose (3,), in the frame of that pose."""
+    return rotated(pose, xy) + pose[:2]
+
+
+def rotated(pose: Array, vectors: Array) -> Array:
+    """Return vectors (n, 2) of the frame at a pose (3,), turned to that of the pose."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return vectors @ np.array([[c, s], [-s, c]])

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Where in a map a scan fits best, without a guess; and whether it fits nearly as well elsewhere.
+
+Branch and bound over shifts and turns (Hess et al. 2016), on the likelihood of a field.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.scans import kernels
+from l1slam_ros.core.scans.field import RESOLUTION, Field
+from l1slam_ros.core.scans.points import rotated
+
+# [rad] Step of the turns: at 4 m a cell.
+TURN = 0.025
+# So many points are enough to tell a place.
+_MOST_POINTS = 160
+# [m], [rad] Nearer than this another peak is the same one.
+_SAME, _SAME_TURN = 0.6, 0.3
+
+
+@dataclass(frozen=True)
+class Peak:
+    """Where a scan fits: pose (3,), score from 0 to 1; second : that of the best other place."""
+
+    pose: Array
+    score: float
+    second: float
+
+
+def search(field: Field, xy: Array, centre: Array, reach: float, turn: float, least: float,
+           rival: float) -> Peak | None:
+    """
+    Return where points fit best around a pose; None: nowhere better than `least`.
+
+    centre : (3,) pose to search around; reach, turn : so far [m], [rad]; rival : of another place
+    it is found out only whether its score is above so much of the best
+    """
+    if not len(xy) or not len(field.xy):
+        return None
+    xy = xy[np.linspace(0, len(xy) - 1, min(len(xy), _MOST_POINTS)).astype(np.int64)]
+    turns = np.arange(-int(turn / TURN), int(turn / TURN) + 1) * TURN + centre[2]
+    cells = np.stack([np.floor((rotated(np.array([0, 0, a]), xy) + centre[:2] - field.origin)
+                               / RESOLUTION) for a in turns]).astype(np.int64)
+    levels, margin = field.levels
+    most = np.full(2, int(reach / RESOLUTION))
+    nothing = np.full(6, -1.0)
+    score, at, dx, dy = kernels.branch_and_bound(
+        levels, margin, cells, -most, most, least, nothing)
+    if at < 0:
+        return None
+    around = np.array([at, dx, dy, _SAME_TURN / TURN, _SAME / RESOLUTION,
+                       2 * np.pi / TURN])
+    second, other, *_ = kernels.branch_and_bound(
+        levels, margin, cells, -most, most, rival * score, around)
+    pose = np.array([*(centre[:2] + RESOLUTION * np.array([dx, dy])), turns[at]])
+    return Peak(pose, score, second if other >= 0 else 0.0)

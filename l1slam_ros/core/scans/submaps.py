@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes with their scans, and the maps of a few that follow each other."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.scans.field import Field
+from l1slam_ros.core.scans.points import Points, rotated, transformed
+
+# A submap is of so many keyframes before and after its own.
+AROUND = 4
+# [m] Of one cell and one side of a surface one point is kept.
+_CELL = 0.05
+# So many submaps are kept at hand.
+_KEPT = 24
+# Rings and sectors of a descriptor, and how far it sees [m].
+_RINGS, _SECTORS, _SIGHT = 12, 60, 12.0
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """
+    A place that the scan front end has seen.
+
+    stamp : [ns]; pose : (3,) in the frame of the scan-matched odometry; points : its scan; part :
+    of the run; keyframes of two parts have no odometry between them; travelled : the way to it [m]
+    """
+
+    stamp: int
+    pose: Array
+    points: Points
+    part: int
+    travelled: float
+
+
+@dataclass(frozen=True)
+class Submap:
+    """
+    What was seen around a keyframe, in its frame.
+
+    xy, normals : (n, 2) points with normals; views : (v, b), centres : (v, 3) the views of the
+    keyframes and where the laser was
+    """
+
+    xy: Array
+    normals: Array
+    views: Array
+    centres: Array
+
+    @cached_property
+    def field(self) -> Field:
+        """The look-up of the nearest point."""
+        return Field.of(self.xy, self.normals)
+
+    @cached_property
+    def descriptor(self) -> Array:
+        """What the place looks like from whichever heading, (rings x spectrum,), of length 1."""
+        x, y = self.xy.T
+        ring = np.minimum(np.hypot(x, y) / _SIGHT * _RINGS, _RINGS - 1).astype(np.int64)
+        sector = np.floor((np.arctan2(y, x) / (2 * np.pi)) * _SECTORS).astype(np.int64) % _SECTORS
+        seen = np.zeros((_RINGS, _SECTORS))
+        np.add.at(seen, (ring, sector), 1.0)
+        spectrum = abs(np.fft.rfft(np.sqrt(seen), axis=1)).ravel()
+        return spectrum / max(float(np.linalg.norm(spectrum)), 1e-12)
+
+
+def submap_of(keyframes: Sequence[Keyframe], at: int, before: int = AROUND, after: int = AROUND
+              ) -> Submap:
+    """Return the map of the keyframes around one, of its own part only."""
+    own = keyframes[at]
+    near = [keyframe for keyframe in keyframes[max(at - before, 0) : at + after + 1]
+            if keyframe.part == own.part]
+    poses = se2.between(np.tile(own.pose, (len(near), 1)), np.array([k.pose for k in near]))
+    # The own scan first: of the points of a cell the first is kept.
+    order = np.arange(len(near))
+    xy, normals = [], []
+    for k in order:
+        points, normal = near[k].points.surface
+        xy.append(transformed(poses[k], points))
+        normals.append(rotated(poses[k], normal))
+    points, normal = np.concatenate(xy), np.concatenate(normals)
+    side = np.round(np.arctan2(normal[:, 1], normal[:, 0]) / (np.pi / 2)).astype(np.int64) % 4
+    cell = np.floor(points / _CELL).astype(np.int64)
+    _, first = np.unique(np.column_stack((cell, side)), axis=0, return_index=True)
+    kept = np.sort(first)
+    centres = poses.copy()
+    for row, keyframe in zip(centres, near, strict=True):
+        row[:2] = transformed(row, keyframe.points.centre[None])[0]
+    return Submap(np.ascontiguousarray(points[kept]), np.ascontiguousarray(normal[kept]),
+                  np.stack([k.points.view for k in near]), centres)
+
+
+class Submaps:
+    """The submaps of keyframes that are asked for, the last few kept."""
+
+    def __init__(self, keyframes: Sequence[Keyframe]):
+        self._keyframes = keyframes
+        self._kept: OrderedDict[int, Submap] = OrderedDict()
+
+    def __getitem__(self, at: int) -> Submap:
+        """Return the submap of a keyframe; those after it must be there."""
+        if at not in self._kept:
+            self._kept[at] = submap_of(self._keyframes, at)
+            if len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(at)
+        return self._kept[at]
