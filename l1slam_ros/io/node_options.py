@@ -42,8 +42,8 @@ class NodeOptions(BackendOptions):
     transform_period: float = option(
         0.05, 'how often map -> odom is published', 's', 1e-3, 3600, fixed=True)
     transform_tolerance: float = option(
-        0.1, 'how far ahead of the newest odometry map -> odom is stamped: until then it holds',
-        's', 0, 3600)
+        0.1, 'how far at least map -> odom is stamped ahead of the newest odometry; further where '
+        'that comes more seldom', 's', 0, 3600)
     save_path: str = option('', 'the .g2o file of ~/save and ~/load')
     autosave_period: float = option(
         60.0, 'with a save_path, within what time a changed map is saved, and at the end; 0: off',
