@@ -21,6 +21,7 @@ import numpy as np
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.measurements import QUATERNION_NORM_ERROR
+from l1slam_ros.io.bounded import read_text
 from l1slam_ros.io.remarks import Remarks, read_remarks
 
 NANOSECONDS = 10**9
@@ -164,7 +165,7 @@ def read_lines(path: str | os.PathLike[str]) -> TextLines:
 
     """
     with reported(path, 'read'):
-        content = Path(path).read_bytes()
+        content = read_text(Path(path))
     try:
         remarks = read_remarks(path, content)
         text = content.decode('utf-8-sig').replace('\r\n', '\n').replace('\r', '\n')

@@ -12,6 +12,7 @@ from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.names import OF_ROS
 from l1slam_ros.core.online.backend import BackendOptions
 from l1slam_ros.core.options import Options, Scalar, dotted, option
+from l1slam_ros.io.bounded import read_yaml
 
 # The name of the node, unless it was given another.
 _NODE = 'backend'
@@ -75,8 +76,8 @@ def read_params_file(path: Path) -> NodeOptions:
 
     """
     try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        content = read_yaml(path.read_text())
+    except (OSError, ValueError, yaml.YAMLError) as error:
         raise FileError(path, 'expected a YAML file: ' + ' '.join(str(error).split())) from error
     sections = list(_sections(content))
     named = any(name == _NODE for name, _ in sections)
