@@ -250,8 +250,9 @@ class Upkeep:
         del now  # as above
         problem = as_one(whole)
         alone = until(lambda: live.size() != grown, check) if idle else check
-        judgement, poses = robust_solve(problem.graph, check=alone) if anew else judge(
-            problem.graph, problem.poses, problem.judgement, np.inf, check)
+        known = problem.judgement, problem.poses
+        judgement, poses = (robust_solve(problem.graph, check=alone, known=known) if anew
+                            else judge(problem.graph, known[1], known[0], np.inf, check))
         check()
         with self._front, self._lock:
             live.take_judgement(judgement.of_all(whole.graph), poses, loops, anew)
