@@ -37,7 +37,8 @@ _MORE = """\
 exit codes:
   0  done
   2  bad input or arguments, said in one line; nothing written
-  3  done, but the input is damaged and only a part of it was used
+  3  done, but only a part of the input was used: it is damaged, or the loops of a bag did not get
+     in, because most were refused or none of their topics was read
   4  solve: the best map is written, but it is doubtful (also where the code would be 3)
 
 completion of commands and options by the TAB key, in bash and zsh, where argcomplete is

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from l1slam_ros.core.errors import FileError, GraphError, OptionError
+from l1slam_ros.core.errors import FileError, GraphError, OptionError, require
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import FactorGraph, as_poses
 from l1slam_ros.core.names import QUATERNION, ROTATION_INFORMATION
 from l1slam_ros.core.robust.inspection import initial_poses
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES, DEFAULT_TOPICS, Topics
@@ -136,8 +136,9 @@ def write_output(path: Path, record: GraphRecord, truth: Array | None = None) ->
         write_graph_bag(path, record, truth)
 
 
-def read_graph(path: str | os.PathLike[str], *,
-               rotation_information: str = QUATERNION) -> tuple[FactorGraph, Array | None]:
+def read_graph(path: str | os.PathLike[str], *, odom_topic: str = DEFAULT_TOPICS.odometry,
+               loop_topic: str = DEFAULT_TOPICS.loops, rotation_information: str = QUATERNION,
+               ) -> tuple[FactorGraph, Array | None]:
     """
     Return the graph in a file, and the poses (n, p) that it stores, None where none.
 
@@ -149,16 +150,22 @@ def read_graph(path: str | os.PathLike[str], *,
     Parameters
     ----------
     path : .g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1
+    odom_topic, loop_topic : where a bag has its odometry and its loops, or pose graphs of a front
+        end, see `l1slam solve --help`; of a graph file they say nothing
     rotation_information : what the rotation block of the information in a 3D g2o file is of,
         `quaternion`, its vector part, as g2o has it, or `angle`
 
     Raises
     ------
     FileError : naming file and line, what was found and what was expected.
+    OptionError : an argument is of another kind.
 
     """
-    _check_reading(rotation_information)
-    record = read_input(Path(path), rotation_information=rotation_information)
+    _check_reading(path, rotation_information)
+    for name, topic in (('odom_topic', odom_topic), ('loop_topic', loop_topic)):
+        require(str, name, topic, 'the name of a topic')
+    record = read_input(Path(path), topics=Topics(odom_topic, loop_topic),
+                        rotation_information=rotation_information)
     for sentence in filter(None, (*record.skipped, record.damage)):
         warnings.warn(sentence, stacklevel=2)
     return record.graph, record.poses
@@ -178,21 +185,21 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
     ------
     FileError : it cannot be written, or the format has no place for a part of the graph.
     GraphError : poses of another shape, or not finite.
+    OptionError : an argument is of another kind.
 
     """
-    _check_reading(rotation_information)
-    expected = (graph.n_poses, graph.manifold.POSE_SIZE)
-    if np.shape(poses) != expected:
-        raise GraphError(f'poses have the shape {np.shape(poses)}, expected {expected}')
+    _check_reading(path, rotation_information)
+    require(FactorGraph, 'graph', graph, 'a FactorGraph, as read_graph returns first')
+    poses = as_poses(graph, poses, 'poses have')
     if not np.isfinite(poses).all():
         row = int(np.argmin(np.isfinite(poses).all(axis=1)))
-        raise GraphError(f'pose {row} is {np.asarray(poses)[row]}, expected finite numbers')
-    write_output(Path(path), GraphRecord(
-        graph, np.asarray(poses, float), np.arange(graph.n_poses),
-        rotation_information=rotation_information))
+        raise GraphError(f'pose {row} is {poses[row]}, expected finite numbers')
+    write_output(Path(path), GraphRecord(graph, poses, np.arange(graph.n_poses),
+                                         rotation_information=rotation_information))
 
 
-def _check_reading(rotation_information: str) -> None:
+def _check_reading(path: object, rotation_information: str) -> None:
+    require((str, os.PathLike), 'path', path, 'the name of a file')
     if rotation_information not in ROTATION_INFORMATION:
         raise OptionError(f'rotation_information is {rotation_information!r}, expected one of '
                           f'{", ".join(ROTATION_INFORMATION)}')

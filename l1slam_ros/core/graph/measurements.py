@@ -7,12 +7,13 @@ And what is found wrong with them, and made of it: to be counted, logged, told.
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral
 
 import numpy as np
 
-from l1slam_ros.core.errors import MessageError
+from l1slam_ros.core.errors import MessageError, require
+from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import LEAST_VARIANCE
 
@@ -79,15 +80,41 @@ class LoopClosure:
         return self.stamp if self.reference_stamp is None else self.reference_stamp, self.stamp
 
 
-def require_sound(what: OdometrySample | LoopClosure) -> None:
+def in_order(loop: LoopClosure) -> LoopClosure:
     """
-    Refuse what is no measurement: it would spoil all after it.
+    Return a sound loop as the later keyframe, seen from the earlier one.
+
+    Z becomes Z^-1; X = Z exp(e), so X^-1 = Z^-1 exp(-Ad(Z) e), and C becomes Ad(Z) C Ad(Z)'.
 
     Raises
     ------
+    MessageError : `order`, it leads back and leaves a component unsaid, which is none of the
+        turned one.
+
+    """
+    reference = loop.reference_stamp
+    if reference is None or reference <= loop.stamp:
+        return loop
+    if not np.isfinite(loop.covariance).all():
+        raise MessageError('order', f'a loop from {reference} ns back to {loop.stamp} ns leaves a '
+                           'component unsaid; expected its earlier time first')
+    pose = sound_pose3(tuple(loop.pose3[:3].tolist()), tuple(loop.pose3[3:].tolist()))[None]
+    Ad = se3.adjoint(pose)[0]
+    return replace(loop, reference_stamp=loop.stamp, stamp=reference, pose3=se3.inverse(pose)[0],
+                   covariance=Ad @ loop.covariance @ Ad.T)
+
+
+def require_sound(what: OdometrySample | LoopClosure, kind: type) -> None:
+    """
+    Refuse what is no measurement of a kind: it would spoil all after it.
+
+    Raises
+    ------
+    OptionError : it is something else.
     MessageError : with the cause `stamp`, `shape`, `not_finite`, `range` or `quaternion`.
 
     """
+    require(kind, 'the measurement', what, kind.__name__)
     stamps = what.stamps if isinstance(what, LoopClosure) else (what.stamp,)
     if not all(isinstance(stamp, Integral) and -_LATEST <= stamp <= _LATEST
                for stamp in stamps):

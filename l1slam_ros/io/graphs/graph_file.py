@@ -33,6 +33,7 @@ from l1slam_ros.io.graphs.rows import (
     Rows,
     expected_tags,
     lines_by_tag,
+    made_definite,
     manifold_of,
     rows_of,
     vertices_of,
@@ -57,7 +58,8 @@ class GraphRecord:
 
     graph : the factors, in the order of the file; poses : (n, p) the stored start, None when
     the file has none; ids : (n,) vertex ids, ascending: keyframe k is vertex ids[k];
-    stamps : (n,) [ns] or None; skipped : a sentence on each kind of line that was not used;
+    stamps : (n,) [ns] or None; skipped : a sentence on each kind of line that was not used, or
+    not as it stands;
     damage : a sentence where only a part of the input could be read, else empty;
     rotation_information : what the rotation block in a g2o file of it is of, of `names`;
     remarks : of a saved map.
@@ -93,8 +95,9 @@ def read_graph_file(path: str | os.PathLike[str],
     """
     groups, remarks = lines_by_tag(path)
     manifold = manifold_of(path, groups)
-    edges, skipped = without_circles(
+    edges, circles = without_circles(
         rows_of(path, groups, manifold, FACTORS, rotation_information))
+    edges, indefinite = made_definite(edges)
     if edges.alone.all():
         raise FileError(path, f'no edges; expected {expected_tags("between")} lines')
     vertices = vertices_of(path, groups, manifold)
@@ -106,8 +109,9 @@ def read_graph_file(path: str | os.PathLike[str],
         edges = edges.chosen(np.flatnonzero(np.isin(edges.ids, anchors).sum(axis=1) == 0))
     graph = FactorGraph(manifold, len(ids))
     _add_edges(path, graph, ids, edges, remarks)
+    skipped = (*circles, *indefinite, *_skipped(groups, ids, anchors))
     return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
-                       _stamps(path, ids, remarks), (*skipped, *_skipped(groups, ids, anchors)),
+                       _stamps(path, ids, remarks), skipped,
                        rotation_information=rotation_information, remarks=remarks)
 
 

@@ -3,14 +3,14 @@
 
 import os
 from collections import defaultdict
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.geometry.noise import LEAST_EIGENVALUE, Mask, nearest_definite
 from l1slam_ros.core.names import QUATERNION
 from l1slam_ros.io.files import (
     TextLines,
@@ -25,6 +25,7 @@ from l1slam_ros.io.remarks import Remarks
 
 # So many lines are named in one sentence.
 _NAMED = 3
+_MATRICES = 'information matrices'
 
 
 @dataclass(frozen=True)
@@ -158,3 +159,23 @@ def without_circles(edges: Rows) -> tuple[Rows, list[str]]:
     sentence = (f'{counted(len(lines), "edge")} from a vertex to itself not used: '
                 f'{"line" if len(lines) == 1 else "lines"} {", ".join(names)}')
     return edges.chosen(~circle), [sentence]
+
+
+def made_definite(edges: Rows) -> tuple[Rows, list[str]]:
+    """
+    Return the edges with information that is positive definite where it can be, and a sentence.
+
+    See `nearest_definite`, in the units of the residual; there is no sentence where all was.
+    """
+    nearest, least = nearest_definite(edges.scaled)
+    changed = np.flatnonzero(np.isfinite(least))
+    if not len(changed):
+        return edges, []
+    information, units = edges.information.copy(), edges.units[changed]
+    information[changed] = nearest[changed] / (units[:, :, None] * units[:, None, :])
+    worst = changed[np.argmin(least[changed])]
+    sentence = (f'{len(changed):,} of {counted(len(edges), "information matrix", _MATRICES)} not '
+                f'positive definite, the worst at line {edges.lines[worst]:,}: its least '
+                f'eigenvalue is {least[worst]:.2g} times its largest; each is used as the nearest '
+                f'one that has none below {LEAST_EIGENVALUE:g} times its largest')
+    return replace(edges, information=information), [sentence]

@@ -54,12 +54,13 @@ class LoopFactors:
     Attributes
     ----------
     waiting : those that are not in the graph yet, nor refused
+    lost : how many loops will never be in it; not what is sent again, absolute poses and strikes
 
     """
 
     def __init__(self, manifold: Manifold, notes: Notes, verbatim: bool):
         self._manifold, self._notes, self._verbatim = manifold, notes, verbatim
-        self.waiting = WaitingLoops()
+        self.waiting, self.lost = WaitingLoops(), 0
         self.forget()
 
     def forget(self) -> None:
@@ -214,6 +215,7 @@ class LoopFactors:
         self._stamps.extend(stamps)
 
     def _refuse(self, cause: str, loop: LoopClosure, why: str) -> None:
+        self.lost += not (loop.struck or loop.is_absolute or cause == 'repeated')
         kind = 'a strike' if loop.struck else 'a loop'
         what = 'an absolute pose at' if loop.is_absolute else f'{kind} from {loop.stamps[0]} ns to'
         self._notes.refuse(cause, f'{what} {loop.stamp} ns {why}')
