@@ -8,6 +8,8 @@ ODOMETRY_TOPIC = '/odom'
 LOOP_TOPIC = '/loop_closures'
 TRUSTED_LOOP_TOPIC = '/trusted_loop_closures'
 FALSE_LOOP_TOPIC = '/false_loop_closures'
+# Of loops that were not believed: no program but this one listens.
+REJECTED_LOOP_TOPIC = '/rejected_loop_closures'
 ABSOLUTE_TOPIC = '/absolute_poses'
 TRUTH_TOPIC = '/ground_truth'
 
@@ -24,7 +26,7 @@ class Topics:
     def types(self) -> dict[str, str]:
         """Return the topics with the types of their messages."""
         return {self.loops: _POSE, TRUSTED_LOOP_TOPIC: _POSE, FALSE_LOOP_TOPIC: _POSE,
-                ABSOLUTE_TOPIC: _POSE, self.odometry: 'nav_msgs/msg/Odometry'}
+                REJECTED_LOOP_TOPIC: _POSE, ABSOLUTE_TOPIC: _POSE, self.odometry: 'nav_msgs/msg/Odometry'}
 
 
 DEFAULT_TOPICS = Topics()

@@ -257,7 +257,7 @@ def graph_lines(path: Path, record: GraphRecord) -> list[str]:
     lines = [] if record.poses is None else _lines(
         path, record, 'vertex', ids[:, None], record.poses, np.empty((0, d, d)))
     factors, pairs, kinds = graph.between, ids[graph.between.pairs], _kinds(graph)
-    left_out = _left_out(record)
+    left_out = left_out_words(record)
     if factors.is_absolute.any() and graph.manifold is se3:
         lines.append(NO_OFFSET)
     texts = np.empty(len(factors), object)
@@ -271,7 +271,7 @@ def graph_lines(path: Path, record: GraphRecord) -> list[str]:
     return _among(record.comments, lines, commented(texts.tolist(), left_out))
 
 
-def _left_out(record: GraphRecord) -> np.ndarray:
+def left_out_words(record: GraphRecord) -> np.ndarray:
     """Return why each factor is left out, (m,); what a person struck out now is, too."""
     factors = record.graph.between
     words = nothing_left_out(len(factors)) if record.left_out is None else record.left_out.copy()

@@ -57,7 +57,7 @@ def load_map(path: Path) -> tuple[SavedMap, str, bool]:
     FileError : neither is a map.
 
     """
-    before = _before(path)
+    before = before_of(path)
     try:
         saved, which, whole = _read(path), f'{path}', True
     except FileError as error:
@@ -94,7 +94,8 @@ def is_map(path: Path) -> bool:
         return False
 
 
-def _before(path: Path) -> Path:
+def before_of(path: Path) -> Path:
+    """Return the name of the map before the one of a name."""
     return path.with_name(f'{path.name}.1')
 
 
@@ -104,7 +105,7 @@ def _count(saved: SavedMap) -> int:
 
 def _keep(path: Path) -> None:
     """Let a file be that before it, too, unless it is damaged and that is not."""
-    before = _before(path)
+    before = before_of(path)
     if os.path.exists(path) and (is_map(path) or not is_map(before)):
         keep_as(path, before)
 
