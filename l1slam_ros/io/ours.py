@@ -2,7 +2,8 @@
 """
 What this program may replace: what it wrote, told by a mark in it, and nothing else.
 
-    text              the first line, a comment: `MARK`; of a saved map, of `remarks`
+    text              a comment, `MARK`, the first line, of a graph the last: GTSAM reads no edge
+                      behind a comment; of a saved map the lines of `remarks`
     report            the first line, `REPORT_MARK`
     .png, .svg, .pdf  the field for the program that drew the picture
     bag directory     in each .mcap the field for the library that wrote it
@@ -56,7 +57,7 @@ def is_ours(path: str | os.PathLike[str]) -> bool:
                 file.is_file() and (file.name == _METADATA or _ends(file)[0].startswith(_BAG))
                 for file in files) and any(file.name != _METADATA for file in files)
         first, last = _ends(path)
-    return (not first or first.startswith(_FIRST_LINES)
+    return (not first or first.startswith(_FIRST_LINES) or last.endswith(f'\n{MARK}\n'.encode())
             or any(first.startswith(begin) and (mark in first or mark in last)
                    for begin, mark in _PICTURES.items()))
 

@@ -35,8 +35,8 @@ from l1slam_ros.io.bags.topics import (
     ABSOLUTE_TOPIC,
     FALSE_LOOP_TOPIC,
     LOOP_TOPIC,
-    REJECTED_LOOP_TOPIC,
     ODOMETRY_TOPIC,
+    REJECTED_LOOP_TOPIC,
     TRUSTED_LOOP_TOPIC,
     TRUTH_TOPIC,
 )

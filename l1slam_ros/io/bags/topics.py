@@ -26,7 +26,8 @@ class Topics:
     def types(self) -> dict[str, str]:
         """Return the topics with the types of their messages."""
         return {self.loops: _POSE, TRUSTED_LOOP_TOPIC: _POSE, FALSE_LOOP_TOPIC: _POSE,
-                REJECTED_LOOP_TOPIC: _POSE, ABSOLUTE_TOPIC: _POSE, self.odometry: 'nav_msgs/msg/Odometry'}
+                REJECTED_LOOP_TOPIC: _POSE, ABSOLUTE_TOPIC: _POSE,
+                self.odometry: 'nav_msgs/msg/Odometry'}
 
 
 DEFAULT_TOPICS = Topics()

@@ -29,7 +29,7 @@ from l1slam_ros.io.files import (
     replacing,
     rounded,
 )
-from l1slam_ros.io.graphs.left_out import STRUCK, commented, nothing_left_out, words_at
+from l1slam_ros.io.graphs.left_out import STRUCK, commented, in_place, nothing_left_out
 from l1slam_ros.io.graphs.rows import (
     Rows,
     expected_tags,
@@ -48,7 +48,7 @@ from l1slam_ros.io.graphs.tags import (
     TAGS,
     TAGS_LEFT_OUT,
 )
-from l1slam_ros.io.ours import marked
+from l1slam_ros.io.ours import MARK
 from l1slam_ros.io.remarks import Remarks
 
 
@@ -111,9 +111,13 @@ def read_graph_file(path: str | os.PathLike[str],
         ids, vertices = ids[kept], vertices.chosen(kept) if len(vertices) else vertices
         edges = edges.chosen(np.flatnonzero(np.isin(edges.ids, anchors).sum(axis=1) == 0))
     graph = FactorGraph(manifold, len(ids))
-    left_out = words_at(edges.lines, lines.left_out)
+    order, left_out = in_place(edges.lines, lines.left_out)
+    edges = edges.chosen(order)
     _add_edges(path, graph, ids, edges, remarks, left_out == STRUCK)
-    before = np.searchsorted(edges.lines, [number for number, _ in lines.comments]).tolist()
+    used = np.flatnonzero(left_out == '')
+    ends = np.concatenate(([0], used + 1))
+    before = ends[np.searchsorted(
+        edges.lines[used], [number for number, _ in lines.comments])].tolist()
     return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
                        _stamps(path, ids, remarks), (*skipped, *_skipped(groups, ids, anchors)),
                        rotation_information=rotation_information, remarks=remarks,
@@ -160,7 +164,7 @@ def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
     """
     path = Path(path)
     with replacing(path) as temporary:
-        put_lines(temporary, marked(graph_lines(path, record)))
+        put_lines(temporary, [*graph_lines(path, record), MARK])
         # Before the graph takes its place: it must never meet the stamps or the trust of another.
         write_beside(path, record.ids, record.stamps, record.graph.between)
 
@@ -268,7 +272,10 @@ def graph_lines(path: Path, record: GraphRecord) -> list[str]:
         if len(rows) == len(factors) and not left_out.any() and not record.comments:
             return lines + written
         texts[rows] = '\n'.join(written).split('\n')
-    return _among(record.comments, lines, commented(texts.tolist(), left_out))
+    used = left_out == ''
+    comments = tuple((int(used[:before].sum()), text) for before, text in record.comments)
+    return [*_among(comments, lines, texts[used].tolist()),
+            *commented(texts.tolist(), left_out)]
 
 
 def left_out_words(record: GraphRecord) -> np.ndarray:

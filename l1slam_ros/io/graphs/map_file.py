@@ -178,7 +178,7 @@ def _end_of(path: Path) -> bytes:
 
 
 def _kept(path: Path, of: Path) -> list[str]:
-    """Keep a file under the name of its day; return a sentence on it, none if it is kept already."""
+    """Keep a file under the name of its day; return a sentence, none if it is kept already."""
     name, number = f'{of.stem}.{_time_of(path)}', 1
     kept = of.with_name(f'{name}{of.suffix}')
     while os.path.lexists(kept):

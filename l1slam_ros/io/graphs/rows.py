@@ -64,11 +64,12 @@ class GraphLines:
     The lines of a graph file.
 
     groups : those of each tag, without the tag, every tag is known; left_out : number -> why a map
-    was made without the factor on it; remarks : of a saved map; comments : number and text of each.
+    was made without the factor on it, and its place; remarks : of a saved map; comments : numbers
+    and texts.
     """
 
     groups: dict[str, TextLines]
-    left_out: dict[int, str]
+    left_out: dict[int, tuple[str, int]]
     remarks: Remarks
     comments: tuple[tuple[int, str], ...]
 

@@ -34,7 +34,6 @@ from l1slam_ros.io.files import (
 )
 from l1slam_ros.io.ours import marked
 
-
 # All that may lie beside an input, and what is written, or else removed, beside a graph.
 BESIDE = ('stamps', 'trusted', 'struck', 'truth', 'false')
 WRITTEN_BESIDE = BESIDE[:3]
