@@ -8,8 +8,8 @@ Factors that a map was made without: comments for other programs, factors again 
     # struck EDGE_SE2 ...     a loop that a person struck out
 
 So whoever optimises the graph in the file gets the map in it. They stand behind all edges, each
-with its number among the factors: GTSAM reads no edge behind a comment. Of a file that this program
-did not write comments are comments.
+with its number among the factors: GTSAM reads no edge behind a comment. Of a file that this
+program did not write comments are comments.
 """
 
 import re
