@@ -17,7 +17,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError, MessageError
 from l1slam_ros.core.geometry import se2, se3
-from l1slam_ros.core.geometry.manifold import Array, Manifold
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
 from l1slam_ros.core.graph.measurements import LoopClosure
@@ -30,6 +30,7 @@ from l1slam_ros.core.online.keyframes import (
 from l1slam_ros.io.bags.damaged.walk import BagMessage
 from l1slam_ros.io.bags.from_graph import (
     GRAPH_NOTE,
+    LEFT_OUT,
     SPACE_NOTE,
     TURNED_LOOPS,
     TURNED_STEPS,
@@ -42,11 +43,13 @@ from l1slam_ros.io.bags.topics import (
     DEFAULT_TOPICS,
     LOOP_TOPIC,
     ODOMETRY_TYPE,
+    REJECTED_LOOP_TOPIC,
     TRUSTED_LOOP_TOPIC,
     Topics,
 )
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.graphs.left_out import SLIP, nothing_left_out
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
 from l1slam_ros.io.trajectory import Reference
@@ -85,7 +88,8 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
         growing.take(message)
     record = growing.record('; '.join(damage))
     if options.keyframe == _EVERY:
-        record = replace(record, graph=turned(record.graph, _noted_turns(record.graph, note)))
+        record = replace(record, graph=turned(record.graph, _noted_turns(record.graph, note)),
+                         left_out=_noted_left_out(record.graph, note))
     if record.graph.n_poses < 2:
         raise FileError(path, '; '.join([
             f'{counted(record.graph.n_poses, "keyframe")} from {topics.odometry}; '
@@ -127,7 +131,8 @@ class _Growing:
             elif topic == self._topics.odometry:
                 self._builder.add_odometry(conversion.odometry_sample(message.data))
             else:
-                name = LOOP_TOPIC if topic == self._topics.loops else topic
+                is_loop = topic in (self._topics.loops, REJECTED_LOOP_TOPIC)
+                name = LOOP_TOPIC if is_loop else topic
                 self._builder.add_loop(conversion.LOOPS[name.removeprefix('/')](
                     message.data, self._builder.base_frame.name, self._map_frame))
                 if topic == ABSOLUTE_TOPIC:  # the map is the frame that the first one names
@@ -229,11 +234,24 @@ def _noted_turns(graph: FactorGraph, note: dict[str, str]) -> Mask:
     odometry = graph.between.is_odometry
     turns = np.zeros(len(odometry), bool)
     for name, kind in (TURNED_STEPS, odometry), (TURNED_LOOPS, ~odometry):
-        rows = np.flatnonzero(kind)
-        numbers = [int(word) for word in note.get(name, '').split() if word.isdecimal()]
-        # Of a damaged bag the last ones may be missing.
-        turns[rows[[number for number in numbers if number < len(rows)]]] = True
+        turns[_noted_rows(np.flatnonzero(kind), note, name)] = True
     return turns
+
+
+def _noted_left_out(graph: FactorGraph, note: dict[str, str]) -> np.ndarray:
+    """Return why a map was made without each factor, (m,) of `left_out`."""
+    odometry = graph.between.is_odometry
+    words = nothing_left_out(len(odometry))
+    for word, name in LEFT_OUT.items():
+        kind = odometry if word == SLIP else ~odometry
+        words[_noted_rows(np.flatnonzero(kind), note, name)] = word
+    return words
+
+
+def _noted_rows(rows: Indices, note: dict[str, str], name: str) -> Indices:
+    """Return those of the rows whose numbers a note has; a damaged bag may lack the last."""
+    numbers = [int(word) for word in note.get(name, '').split() if word.isdecimal()]
+    return rows[[number for number in numbers if number < len(rows)]]
 
 
 def _alternatives(path: Path, topic: str, *msgtypes: str) -> list[str]:

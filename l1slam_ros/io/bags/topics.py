@@ -8,6 +8,8 @@ ODOMETRY_TOPIC = '/odom'
 LOOP_TOPIC = '/loop_closures'
 TRUSTED_LOOP_TOPIC = '/trusted_loop_closures'
 FALSE_LOOP_TOPIC = '/false_loop_closures'
+# Of loops that were not believed: no program but this one listens.
+REJECTED_LOOP_TOPIC = '/rejected_loop_closures'
 ABSOLUTE_TOPIC = '/absolute_poses'
 TRUTH_TOPIC = '/ground_truth'
 
@@ -25,8 +27,8 @@ class Topics:
     def types(self) -> dict[str, str]:
         """Return the topics with the types of their messages."""
         return {self.loops: POSE_TYPE, TRUSTED_LOOP_TOPIC: POSE_TYPE,
-                FALSE_LOOP_TOPIC: POSE_TYPE, ABSOLUTE_TOPIC: POSE_TYPE,
-                self.odometry: ODOMETRY_TYPE}
+                FALSE_LOOP_TOPIC: POSE_TYPE, REJECTED_LOOP_TOPIC: POSE_TYPE,
+                ABSOLUTE_TOPIC: POSE_TYPE, self.odometry: ODOMETRY_TYPE}
 
 
 DEFAULT_TOPICS = Topics()

@@ -20,6 +20,7 @@ from l1slam_ros.io.files import (
     read_lines,
     refuse_quaternions,
 )
+from l1slam_ros.io.graphs.left_out import restored
 from l1slam_ros.io.graphs.tags import OFFSET, TAGS, TAGS_LEFT_OUT
 from l1slam_ros.io.remarks import Remarks
 
@@ -58,9 +59,25 @@ class Rows:
         return self.units[:, :, None] * self.information * self.units[:, None, :]
 
 
-def lines_by_tag(path: str | os.PathLike[str]) -> tuple[dict[str, TextLines], Remarks]:
-    """Return the lines of each tag, without the tag, and the remarks; every tag is known."""
-    lines = read_lines(path)
+@dataclass(frozen=True)
+class GraphLines:
+    """
+    The lines of a graph file.
+
+    groups : those of each tag, without the tag, every tag is known; left_out : number -> why a map
+    was made without the factor on it, and its place; remarks : of a saved map; comments : numbers
+    and texts.
+    """
+
+    groups: dict[str, TextLines]
+    left_out: dict[int, tuple[str, int]]
+    remarks: Remarks
+    comments: tuple[tuple[int, str], ...]
+
+
+def lines_by_tag(path: str | os.PathLike[str]) -> GraphLines:
+    """Return the lines of a graph file by their tags."""
+    lines, left_out = restored(read_lines(path))
     groups: dict[str, TextLines] = defaultdict(lambda: TextLines([], []))
     for number, text in zip(lines.numbers, lines.texts, strict=True):
         tag, *rest = text.split(None, 1)
@@ -75,7 +92,7 @@ def lines_by_tag(path: str | os.PathLike[str]) -> tuple[dict[str, TextLines], Re
             usual = [name for name in TAGS if TAGS[name].kind in ('vertex', 'between')]
             raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(usual)}',
                             group.numbers[0])
-    return groups, lines.remarks
+    return GraphLines(groups, left_out, lines.remarks, lines.comments)
 
 
 def expected_tags(kind: str) -> str:
