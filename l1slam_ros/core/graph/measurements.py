@@ -37,7 +37,9 @@ class OdometrySample:
 
     stamp : [ns]; pose3 : (7,) x y z qx qy qz qw [m]; covariance, twist_covariance : (6, 6),
     rows x y z rx ry rz, as they came in the message: `graph_builder` decides what they mean;
-    frame : `child_frame_id`, empty: that of the robot.
+    frame : `child_frame_id`, empty: that of the robot; speeds : how fast it moves [m/s] and turns
+    [rad/s] by its twist, zeros where that is not filled in; other_source : it is known to be of
+    another publisher than the sample before.
     """
 
     stamp: int
@@ -45,6 +47,8 @@ class OdometrySample:
     covariance: Array
     twist_covariance: Array
     frame: str = ''
+    speeds: tuple[float, float] = (0.0, 0.0)
+    other_source: bool = False
 
 
 @dataclass(frozen=True)
