@@ -38,11 +38,11 @@ class Laps:
 
     """
 
-    def __init__(self, seed=0, laps=3.0, twist=False, rate=RATE):
+    def __init__(self, seed=0, laps=3.0, twist=False, rate=RATE, speed=1.0):
         rng = np.random.default_rng(seed)
-        self.period = 1 / rate
-        self.times = np.arange(round(laps * LAP * rate)) / rate
-        truth = at(self.times)
+        self.period, self.speed, self.lap = 1 / rate, speed, LAP / speed
+        self.times = np.arange(round(laps * self.lap * rate)) / rate
+        truth = at(self.times * speed)
         steps = se2.between(truth[:-1], truth[1:])
         # Half of it is the same all the way: a wheel's radius, a gyro's scale.
         error = 1 + rng.normal(0, 0.01, 3) + rng.normal(0, 0.01 * np.sqrt(rate), steps.shape)
@@ -50,13 +50,15 @@ class Laps:
         for step in steps * error:
             odometry.append(se2.compose(odometry[-1], step[None]))
         self.odometry = np.concatenate(odometry)
-        self.twist = np.vstack((steps, steps[-1:])) * rate if twist else np.zeros_like(truth)
-        ends = np.arange(LAP, self.times[-1], 0.5)
-        measured = se2.retract(se2.between(at(ends - LAP), at(ends)),
+        length, angle = se2.motion(np.vstack((steps, steps[-1:])) * rate * twist)
+        self.speeds = [*zip(length.tolist(), angle.tolist(), strict=True)]
+        ends = np.arange(self.lap, self.times[-1], 0.5 / speed)
+        begins = ends - self.lap
+        measured = se2.retract(se2.between(at(begins * speed), at(ends * speed)),
                                LOOP_SIGMA * rng.standard_normal((len(ends), 3)))
-        self.loops = [LoopClosure(stamp(end - LAP), stamp(end), se2.to_pose3(Z[None])[0],
+        self.loops = [LoopClosure(stamp(begin), stamp(end), se2.to_pose3(Z[None])[0],
                                   covariance6(np.diag(LOOP_SIGMA**2)))
-                      for end, Z in zip(ends, measured, strict=True)]
+                      for begin, end, Z in zip(begins, ends, measured, strict=True)]
 
 
     def sample(self, k, pose=None, covariance=None):
@@ -64,7 +66,8 @@ class Laps:
         pose3 = se2.to_pose3(self.odometry[k:k + 1] if pose is None else pose)[0]
         none = np.zeros((6, 6))
         return OdometrySample(stamp(self.times[k]), pose3,
-                              none if covariance is None else covariance, none)
+                              none if covariance is None else covariance, none, '',
+                              self.speeds[k])
 
     def samples(self):
         """Return all messages of the odometry."""
@@ -96,7 +99,8 @@ class Laps:
 
     def error(self, snapshot):
         """Return the RMSE of the positions of the keyframes [m]."""
-        return position_error(snapshot.poses, at((snapshot.stamps - stamp(0.0)) * 1e-9))
+        return position_error(
+            snapshot.poses, at((snapshot.stamps - stamp(0.0)) * 1e-9 * self.speed))
 
 
 # In the place of a pose: that of the last message before.

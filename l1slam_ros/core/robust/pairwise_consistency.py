@@ -28,7 +28,9 @@ ASKED = 250
 # Of each one so many pairs are looked at closely, those that differ least.
 _NEAREST = 20
 # A run has so many loops, each agrees with so many others of it, and it is so long [m].
-_RUN, _MATES, _RUN_WAY = 10, 3, 5.0
+_RUN, _MATES, _RUN_WAY = 10, 3, 3.0
+# So many times vaguer than the surest one, a loop says little.
+_VAGUE, _TINY = 10.0, 1e-300
 
 
 @dataclass(frozen=True)
@@ -69,9 +71,12 @@ def longest_run(growth: Growth, rows: Indices) -> Group:
 
     A robot that goes the same way twice sees one place all along it. So many loops that agree in
     pairs, along a way so long at either end, which are most of all, are hardly all false: of
-    recorded runs of ten or more five in six are true.
+    recorded runs of ten or more five in six are true. Of loops that say little, as of times when no
+    odometry came, none is asked.
     """
-    rows = asked(growth, rows)
+    diagonal = np.diagonal(growth.factors.sqrt_information[rows], axis1=1, axis2=2)
+    size = np.log(np.maximum(np.abs(diagonal), _TINY)).mean(axis=1)
+    rows = asked(growth, rows[size > size.max(initial=-np.inf) - np.log(_VAGUE)])
     if len(rows) < _RUN:
         return NO_GROUP
     one, other, _ = agreement(growth, rows)

@@ -26,7 +26,13 @@ from collections.abc import Callable, Iterator
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Manifold
 from l1slam_ros.core.graph.measurements import LONGEST_PAUSE, Notes, OdometrySample
-from l1slam_ros.core.online.odometry.plausibility import UNSEEN, Point, RecentMotion, Step
+from l1slam_ros.core.online.odometry.plausibility import (
+    UNSEEN,
+    UNSEEN_TURN,
+    Point,
+    RecentMotion,
+    Step,
+)
 
 # [s] A clock that is set back is set back so far; messages that overtook each other are nearer.
 _BACK = 0.5
@@ -177,12 +183,9 @@ class OdometryStream:
             if not held.anew:
                 self._explain(last, held, Step(self._manifold, held, point))
             return self._used(held) + self._used(point)
-        if held is not None and held.doubt == 'unsure' and point.stamp > last.stamp:
-            self.held = None
-            if point.stamp < held.stamp:  # it came before, out of turn
-                return [*self._taken(point, *how), *self._taken(held, *how)]
-            self._explain(last, held, None)
-            return self._used(held) + self._taken(point, *how)
+        if held is not None and held.doubt == 'unsure' and last.stamp < point.stamp < held.stamp:
+            self.held = None  # it came before, out of turn
+            return [*self._taken(point, *how), *self._taken(held, *how)]
         point.doubt = self._doubt(last, point)
         if verbatim and point.doubt != 'old_stamp':
             return self._used(point)
@@ -195,6 +198,10 @@ class OdometryStream:
             known = held.stamp if again and held is not None else last.stamp
             raise MessageError('old_stamp', f'odometry stamp {point.stamp} ns is not after the '
                                f'last one, {known} ns')
+        self.held = None
+        if held is not None and held.doubt == 'unsure':  # nothing says that it is a stray
+            self._explain(last, held, None)
+            return self._used(held) + self._taken(point, *how)
         if held is not None:
             self._notes.refuse(held.doubt, self._why(last, held))
         self.held = point if point.doubt else None
@@ -226,7 +233,9 @@ class OdometryStream:
             step = Step(self._manifold, last, point)
             point.seconds = step.seconds
             point.reach = self._recent.reach(step, bool(point.gap))
-            if not point.gap and not point.unsure:
+            if point.unsure:  # it is not known where between the two either
+                point.reach = point.unseen, UNSEEN_TURN * step.seconds
+            elif not point.gap:
                 self._recent.add(step)
         return [point]
 

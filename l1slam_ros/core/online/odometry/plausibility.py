@@ -11,8 +11,11 @@ odometry began again, the less a step may be off:
     begins anew         its pose is where odometry begins, its publisher is another one, or its
                         covariance grows anew: half as much again as the robot moves; and after a
                         silence no further from where it was going than half of that way
-    after a silence     neither half as much again, nor next to nothing while it moved on: of such
-                        a step nobody can tell, so it is as uncertain as the robot may have moved
+    after a silence     three quarters of the way off where it was going
+
+Nobody can tell what the robot did in the step that is too long after a silence, or where samples
+are missing and it made next to no way, though it moved all the time before and after; nor in any
+after which the odometry may have begun again: that is as uncertain as the robot may have moved.
 """
 
 import math
@@ -41,9 +44,13 @@ _TURN = 0.5
 _OFF = 0.5
 # A covariance that begins anew is such a part of the one before, at most.
 _ANEW = 0.25
-# [s] A longer gap, and so many times the usual one, is a silence: what the robot did meanwhile,
-# nobody saw.
-SILENCE, _USUAL = 0.5, 5.0
+# Where it was going in a silence, it may have turned off by such a part of the way.
+_WIDE = 0.75
+# A sample is missing after so many times the usual time; and many are, which is a silence, after so
+# many times, and so long [s]: what the robot did meanwhile, nobody saw.
+_ONE, _MANY, SILENCE = 1.5, 5.0, 0.5
+# [m] A robot turns about so short a radius, whatever its speed.
+_TIGHT = 1.0
 # [m/s] Slower, a robot stands; and in a longer silence [s] any may have stood.
 _STANDS, _STOPS = 0.1, 10.0
 # [s] Stamps are off by so much.
@@ -137,19 +144,19 @@ class RecentMotion:
         return (max(sum(step.metres for step in self._steps) / span, last.metres / last.span),
                 max(sum(step.radians for step in self._steps) / span, last.radians / last.span))
 
-    def _speed_now(self) -> float:
-        """Return how fast the robot was at last [m/s]."""
-        metres = seconds = 0.0
-        for step in reversed(self._steps):
-            metres, seconds = metres + step.metres, seconds + step.seconds
-            if seconds >= SHORTEST_STEP:
-                break
-        return metres / max(seconds, _JITTER)
+    @property
+    def _usual(self) -> float:
+        """The usual time from one sample to the next [s]."""
+        usual = sorted(step.seconds for step in self._steps)
+        return usual[len(usual) // 2] if usual else 0.0
 
     def is_silence(self, seconds: float) -> bool:
-        """Tell whether so long passes between two samples only where some are missing."""
-        usual = sorted(step.seconds for step in self._steps)
-        return seconds > max(SILENCE, _USUAL * usual[len(usual) // 2] if usual else 0.0)
+        """Tell whether so long passes between two samples only where many are missing."""
+        return seconds > max(SILENCE, _MANY * self._usual)
+
+    def is_missing(self, seconds: float) -> bool:
+        """Tell whether so long passes between two samples only where one is missing at least."""
+        return seconds > max(SHORTEST_STEP, self._usual) * _ONE
 
     def jumps(self, last: Point, point: Point, step: Step, after: Step | None = None) -> bool:
         """
@@ -174,35 +181,49 @@ class RecentMotion:
         """
         Return how far the robot may have gone [m] in a step that says little of it; else 0.
 
-        That is one after a silence which is too long for the robot, or too short, as it moves
-        before and after. after : see `jumps`; None: it goes on as before
+        One of next to nothing, where samples are missing, while it moved on; or one after a
+        silence, after which the odometry may have begun again, or is not where it was going.
+        after : see `jumps`; None: it goes on as before
         """
-        if not self._steps or not self.is_silence(step.seconds):
+        if not self._steps or not self.is_missing(step.seconds):
             return 0.0
-        slow, speed = self._speed_now(), self._paces(last, point, after)[0]
+        speed = self._paces(last, point, after)[0]
+        way = speed * step.seconds
+        if self._stood_only_then(step, after):
+            return way
+        if not self.is_silence(step.seconds):
+            return 0.0
+        if self._begins_anew(last, point):
+            return way if way > _SLACK else 0.0
+        off, part = step.metres, _SOME
+        if step.seconds < _STOPS:
+            off, part = self._from_expected(last, point, step.seconds, after)[0], _WIDE
+        return max(way, step.metres) if off > _NEAR + part * way else 0.0
+
+    def _stood_only_then(self, step: Step, after: Step | None) -> bool:
+        """Tell whether the robot made next to no way in a step, but at all before, and after."""
+        speeds = [one.metres / max(one.seconds, _JITTER) for one in self._steps]
+        slow = min(speeds)
         if after:
-            slow = min(slow, after.metres / max(after.seconds, _JITTER))
-        if (slow > _STANDS and step.metres < _NOTHING * slow * step.seconds
-                and step.seconds < _STOPS):
-            return speed * step.seconds
-        return step.metres if step.metres > _NEAR + _SOME * speed * step.seconds else 0.0
+            slow = min(slow, after.metres / max(after.seconds, self._usual / 2))
+        return slow > _STANDS and step.seconds < _STOPS and (
+            step.metres < _NOTHING * slow * step.seconds)
 
     def reach(self, step: Step, is_gap: bool) -> tuple[float, float]:
         """
-        Return how far [m] and by what angle [rad] the robot may be off the middle of a silence.
+        Return how far [m] and by what angle [rad] the robot may be off the middle of a step.
 
         Who goes so far in so long may have been anywhere in an ellipse about both ends. is_gap :
-        it is not known where that ended: how far it may have gone. Zeros : it is no silence.
+        it is not known where that ended: how far it may have gone. Zeros : no sample is missing.
         """
-        if not self.is_silence(step.seconds):
+        if not is_gap and not self.is_missing(step.seconds):
             return 0.0, 0.0
         speed, turn = self.pace()
-        turned = max(_SOME * turn, UNSEEN_TURN) * step.seconds
+        turned = max(_SOME * turn, UNSEEN_TURN, speed / _TIGHT) * step.seconds
         if is_gap:
-            return _SOME * speed * step.seconds, min(turned, math.pi)
+            return _SOME * speed * step.seconds, turned
         way = _SOME * max(speed * step.seconds, step.metres)
-        return (math.sqrt(way**2 - step.metres**2) / 2,
-                min(max(turned - step.radians, 0.0), math.pi) / 2)
+        return math.sqrt(way**2 - step.metres**2) / 2, max(turned - step.radians, 0.0) / 2
 
     def _paces(self, last: Point, point: Point, after: Step | None) -> tuple[float, float]:
         """Return the most that the robot moves [m/s] and turns [rad/s], by all that is known."""
@@ -223,11 +244,24 @@ class RecentMotion:
         before, now = (sum(one.sample.covariance.diagonal()[:3].tolist()) for one in (last, point))
         return 0 < now < _ANEW * before
 
-    def _from_expected(self, last: Point, point: Point, seconds: float) -> tuple[float, float]:
-        """Return how far [m] and by what angle [rad] a sample is off where the robot was going."""
+    def _from_expected(self, last: Point, point: Point, seconds: float,
+                       after: Step | None = None) -> tuple[float, float]:
+        """
+        Return how far [m] and by what angle [rad] a sample is off where the robot was going.
+
+        after : what it does next, from where it may have come; None: not known
+        """
         manifold = self._manifold
-        span = max(sum(step.seconds for step in self._steps), SHORTEST_STEP)
-        way = sum((step.tangent for step in self._steps), np.zeros((1, manifold.TANGENT_SIZE)))
-        expected = manifold.retract(last.pose, way / span * seconds)
-        length, angle = manifold.motion(manifold.local(expected, point.pose))
-        return float(length[0]), float(angle[0])
+        way, span = np.zeros((1, manifold.TANGENT_SIZE)), 0.0
+        for step in reversed(self._steps):
+            way, span = way + step.tangent, span + step.seconds
+            if span >= SHORTEST_STEP:
+                break
+        expected = [manifold.retract(last.pose, way / max(span, SHORTEST_STEP) * seconds)]
+        found = [point.pose]
+        if after:
+            expected.append(manifold.retract(point.pose, -after.tangent / after.span * seconds))
+            found.append(last.pose)
+        length, angle = manifold.motion(manifold.local(
+            np.concatenate(expected), np.concatenate(found)))
+        return float(length.min()), float(angle.min())

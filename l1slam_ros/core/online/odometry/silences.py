@@ -51,4 +51,4 @@ class Silences:
         inside = (begin < times) & (times < end)
         part = np.where(inside, (times - begin) / (end - begin), 0.0)
         grown = np.where(reach[row, 2] > 0, 2 * np.sqrt(part * (1 - part)), part)
-        return _SIGMA * grown[:, None] * reach[row, :2]
+        return _SIGMA * np.minimum(grown[:, None] * reach[row, :2], (np.inf, np.pi))
