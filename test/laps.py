@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A robot on square laps, the loops it sees one lap back, and what drivers do to its odometry."""
 
-from dataclasses import replace
 
 import numpy as np
 from lies import position_error

@@ -127,23 +127,29 @@ class GraphBuilder:
 
     def _put_in_place(self, point: Point) -> bool:
         """
-        Take a sample in that came late; return False: it is none.
+        Take a sample in that came late; return False: that is more than `odometry.reorder`.
 
-        Late is what came within `odometry.reorder` and lies where the robot went by. What is
-        known from one keyframe to the next, stays: a message before the last one is dropped.
+        What is known from one keyframe to the next, stays: a message before the last one is
+        dropped, and so is one of a place that the robot did not go by.
+
+        Raises
+        ------
+        MessageError : `old_stamp`, it is dropped.
+
         """
         track, pose = self.track, point.pose
         behind = (track.last_stamp - point.stamp) * 1e-9
-        if self._verbatim or not self._glued or behind > self.options.odometry.reorder:
+        if self._verbatim or not self._glued or (
+                not 0 < behind <= self.options.odometry.reorder):
             return False
         if self._moved:
             pose = self.graph.manifold.compose(self.offset, pose)
         beside = track.went_by(point.stamp, pose)
-        if beside is None:
-            return False
-        if point.stamp < track.keyframe_stamps[-1]:
+        if beside is None or point.stamp < track.keyframe_stamps[-1]:
+            where = 'after a later keyframe' if beside is not None else (
+                'and says where the robot did not go')
             raise MessageError('old_stamp', f'odometry stamp {point.stamp} ns came {behind:.3g} s '
-                               'late, after a keyframe of a later time; expected it before')
+                               f'late, {where}; expected stamps that rise')
         self._motion.insert(point.sample, pose, beside, self.options.odometry)
         track.insert(point.stamp, pose)
         return True

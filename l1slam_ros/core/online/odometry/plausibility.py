@@ -89,13 +89,14 @@ class Step:
     """
     From one sample to another, by their poses.
 
-    seconds; tangent : (1, d); metres, radians : its length and angle; span : seconds, or what
-    jitter of stamps may make of nothing
+    start; seconds; tangent : (1, d); metres, radians : its length and angle; span : seconds, or
+    what jitter of stamps may make of nothing
     """
 
-    __slots__ = ('metres', 'radians', 'seconds', 'span', 'tangent')
+    __slots__ = ('metres', 'radians', 'seconds', 'span', 'start', 'tangent')
 
     def __init__(self, manifold: Manifold, last: Point, point: Point):
+        self.start = last.stamp
         self.seconds = (point.stamp - last.stamp) * 1e-9
         self.tangent = manifold.local(last.pose, point.pose)
         length, angle = manifold.motion(self.tangent)
@@ -146,9 +147,9 @@ class RecentMotion:
 
     @property
     def _usual(self) -> float:
-        """The usual time from one sample to the next [s]."""
+        """The usual time from one sample to the next [s], some of which may come at once."""
         usual = sorted(step.seconds for step in self._steps)
-        return usual[len(usual) // 2] if usual else 0.0
+        return max(usual[len(usual) // 2], sum(usual) / len(usual)) if usual else 0.0
 
     def is_silence(self, seconds: float) -> bool:
         """Tell whether so long passes between two samples only where many are missing."""
@@ -202,10 +203,13 @@ class RecentMotion:
 
     def _stood_only_then(self, step: Step, after: Step | None) -> bool:
         """Tell whether the robot made next to no way in a step, but at all before, and after."""
-        speeds = [one.metres / max(one.seconds, _JITTER) for one in self._steps]
-        slow = min(speeds)
+        seconds, usual = [one.seconds for one in self._steps], self._usual
+        jitters = min(seconds) < usual / _ONE or max(seconds) > usual * _ONE
+        if jitters and step.seconds < max(SILENCE, _MANY * max(seconds)):
+            return False  # such stamps say as much of any robot
+        slow = min(one.metres / max(one.seconds, _JITTER) for one in self._steps)
         if after:
-            slow = min(slow, after.metres / max(after.seconds, self._usual / 2))
+            slow = min(slow, after.metres / max(after.seconds, usual / 2))
         return slow > _STANDS and step.seconds < _STOPS and (
             step.metres < _NOTHING * slow * step.seconds)
 
@@ -237,10 +241,10 @@ class RecentMotion:
         """Tell whether there is a sign that the odometry began again."""
         if point.sample.other_source:
             return True
-        manifold = self._manifold
-        length, angle = manifold.motion(manifold.local(manifold.identity(1), point.pose))
-        if max(length[0], angle[0]) < _SLACK:
-            return True
+        if math.hypot(*point.position) < _SLACK:
+            manifold = self._manifold
+            if manifold.motion(manifold.local(manifold.identity(1), point.pose))[1][0] < _SLACK:
+                return True
         before, now = (sum(one.sample.covariance.diagonal()[:3].tolist()) for one in (last, point))
         return 0 < now < _ANEW * before
 
