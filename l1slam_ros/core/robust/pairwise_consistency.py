@@ -71,8 +71,8 @@ def longest_run(growth: Growth, rows: Indices) -> Group:
 
     A robot that goes the same way twice sees one place all along it. So many loops that agree in
     pairs, along a way so long at either end, which are most of all, are hardly all false: of
-    recorded runs of ten or more five in six are true. Of loops that say little, as of times when no
-    odometry came, none is asked.
+    recorded runs of ten or more five in six are true. Of loops that say little, as of times when
+    no odometry came, none is asked.
     """
     diagonal = np.diagonal(growth.factors.sqrt_information[rows], axis1=1, axis2=2)
     size = np.log(np.maximum(np.abs(diagonal), _TINY)).mean(axis=1)

@@ -46,8 +46,8 @@ _OFF = 0.5
 _ANEW = 0.25
 # Where it was going in a silence, it may have turned off by such a part of the way.
 _WIDE = 0.75
-# A sample is missing after so many times the usual time; and many are, which is a silence, after so
-# many times, and so long [s]: what the robot did meanwhile, nobody saw.
+# A sample is missing after so many times the usual time; and many are, which is a silence, after
+# so many times, and so long [s]: what the robot did meanwhile, nobody saw.
 _ONE, _MANY, SILENCE = 1.5, 5.0, 0.5
 # [m] A robot turns about so short a radius, whatever its speed.
 _TIGHT = 1.0
@@ -65,7 +65,8 @@ class Point:
 
     seconds : since the sample before; doubt : the cause it was held for, else empty; gap : why no
     motion is known from the sample before, unsure : why it is hardly known, else empty; unseen :
-    how far the robot may have gone [m] meanwhile; reach : see `RecentMotion.reach`; anew : the only sample before it was a stray.
+    how far the robot may have gone [m] meanwhile; reach : see `RecentMotion.reach`; anew : the
+    only sample before it was a stray.
     """
 
     __slots__ = ('anew', 'doubt', 'gap', 'pose', 'position', 'reach', 'sample', 'seconds',
