@@ -6,6 +6,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from laps import LAP, Laps, at, stamp
 from lies import position_error
@@ -86,3 +87,6 @@ def test_another_publisher_makes_a_small_jump_a_restart(bench, capfd, restarts):
     if restarts:
         b.until(lambda: told.extend(said(capfd)) or told, 'it is told of')
         assert 'a new part of the map begins' in told[0]
+        b.until(lambda: b.status()[2].get('odometry.new_part') == '1', 'diagnostics say so')
+        level, sentence, _ = b.status()
+        assert level == DiagnosticStatus.WARN and sentence.endswith('last minute: 1 new_part')

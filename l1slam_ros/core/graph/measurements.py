@@ -131,12 +131,14 @@ class Notes:
     ----------
     refused : cause -> how many messages were not used for it
     warned : cause -> how many were used otherwise than they said
+    told : of those the causes that make another map of all that comes
 
     """
 
     def __init__(self) -> None:
         self.refused: Counter[str] = Counter()
         self.warned: Counter[str] = Counter()
+        self.told: Counter[str] = Counter()
         self._first: dict[str, str] = {}
         self._unsaid: dict[str, str] = {}
 
@@ -153,6 +155,7 @@ class Notes:
     def tell(self, cause: str, sentence: str) -> None:
         """Count what makes another map of all that comes: it is news each time."""
         self.warn(cause, sentence)
+        self.told[cause] += 1
         self._unsaid[cause] = sentence
 
     def warn_bounds(self, what: str, stamp: int, bounded: list[tuple[float, float]],

@@ -287,7 +287,9 @@ class OdometryStream:
         if doubt in ('jump', 'unsure'):
             expected = 'a motion that robots make' if doubt == 'jump' else (
                 'a robot that moves on as before and after')
-            turned = f' and {step.radians:.2g} rad' if step.radians > _TOLD else ''
+            turned = ''
+            if step.is_possible and step.radians > _TOLD:
+                turned = f' and {step.radians:.2g} rad'
             return (f'odometry {step.metres:.6g} m{turned} from one message to the next, '
                     f'{step.seconds:.6g} s later, at stamp {held.stamp} ns; expected {expected}')
         seconds = step.seconds

@@ -9,7 +9,7 @@ odometry began again, the less a step may be off:
 
     no sign             five times as fast as the robot moves, or as one that nobody saw
     begins anew         its pose is where odometry begins, its publisher is another one, or its
-                        covariance grows anew: half as much again as the robot moves; and after a
+                        covariance has grown and does anew: half as much again as the robot moves; and after a
                         silence no further from where it was going than half of that way
     after a silence     three quarters of the way off where it was going
 
@@ -20,6 +20,7 @@ after which the odometry may have begun again: that is as uncertain as the robot
 
 import math
 from collections import deque
+from itertools import pairwise
 
 import numpy as np
 
@@ -80,6 +81,11 @@ class Point:
         self.unseen, self.anew, self.seconds = 0.0, False, 0.0
         self.reach = 0.0, 0.0
 
+    @property
+    def variance(self) -> float:
+        """Of the position, as it is stated [m2]."""
+        return sum(self.sample.covariance.diagonal()[:3].tolist())
+
 
 def is_identity(manifold: Manifold, pose: Array) -> bool:
     """Tell whether a pose (1, p) is where odometry begins."""
@@ -90,14 +96,14 @@ class Step:
     """
     From one sample to another, by their poses.
 
-    start; seconds; tangent : (1, d); metres, radians : its length and angle; span : seconds, or
-    what jitter of stamps may make of nothing
+    seconds; tangent : (1, d); metres, radians : its length and angle; span : seconds, or what
+    jitter of stamps may make of nothing; variance : of the position at its end, as stated [m2]
     """
 
-    __slots__ = ('metres', 'radians', 'seconds', 'span', 'start', 'tangent')
+    __slots__ = ('metres', 'radians', 'seconds', 'span', 'tangent', 'variance')
 
     def __init__(self, manifold: Manifold, last: Point, point: Point):
-        self.start = last.stamp
+        self.variance = point.variance
         self.seconds = (point.stamp - last.stamp) * 1e-9
         self.tangent = manifold.local(last.pose, point.pose)
         length, angle = manifold.motion(self.tangent)
@@ -123,6 +129,7 @@ class RecentMotion:
     def __init__(self, manifold: Manifold):
         self._manifold = manifold
         self._steps: deque[Step] = deque(maxlen=_RECENT)
+        self._fastest_turn = _TURN  # of all steps [rad/s]
 
     def forget(self) -> None:
         """Begin with no step."""
@@ -131,6 +138,7 @@ class RecentMotion:
     def add(self, step: Step) -> None:
         """Take a step in that the robot has made."""
         self._steps.append(step)
+        self._fastest_turn = max(self._fastest_turn, step.radians / step.span)
 
     @property
     def longest(self) -> float:
@@ -169,6 +177,8 @@ class RecentMotion:
         if not step.is_possible:
             return True
         speed, turn = self._paces(last, point, after)
+        if not self._steps and after is None:
+            return False  # nothing is known of it yet
         if step.metres > _NEAR and step.metres > _FAR * max(speed, UNSEEN) * step.span:
             return True
         if not self._begins_anew(last, point):
@@ -177,7 +187,7 @@ class RecentMotion:
         if self.is_silence(step.seconds):
             (metres, radians), off = self._from_expected(last, point, step.seconds), _OFF
         return (metres > _SLACK + off * speed * step.span
-                or radians > _SLACK + off * max(turn, _TURN) * step.span)
+                or radians > _SLACK + off * max(turn, self._fastest_turn) * step.span)
 
     def unsure(self, last: Point, point: Point, step: Step, after: Step | None = None) -> float:
         """
@@ -246,8 +256,11 @@ class RecentMotion:
             manifold = self._manifold
             if manifold.motion(manifold.local(manifold.identity(1), point.pose))[1][0] < _SLACK:
                 return True
-        before, now = (sum(one.sample.covariance.diagonal()[:3].tolist()) for one in (last, point))
-        return 0 < now < _ANEW * before
+        before, now = last.variance, point.variance
+        if not 0 < now < _ANEW * before or len(self._steps) < _RECENT:
+            return False
+        grown = [step.variance for step in self._steps]
+        return grown[0] < grown[-1] and all(a <= b for a, b in pairwise(grown))
 
     def _from_expected(self, last: Point, point: Point, seconds: float,
                        after: Step | None = None) -> tuple[float, float]:
