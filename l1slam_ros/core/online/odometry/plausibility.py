@@ -9,8 +9,8 @@ odometry began again, the less a step may be off:
 
     no sign             five times as fast as the robot moves, or as one that nobody saw
     begins anew         its pose is where odometry begins, its publisher is another one, or its
-                        covariance has grown and does anew: half as much again as the robot moves; and after a
-                        silence no further from where it was going than half of that way
+                        covariance has grown and does anew: half as much again as the robot moves;
+                        after a silence no further from where it was going than half of that way
     after a silence     three quarters of the way off where it was going
 
 Nobody can tell what the robot did in the step that is too long after a silence, or where samples
