@@ -38,7 +38,9 @@ class OdometrySample:
 
     stamp : [ns]; pose3 : (7,) x y z qx qy qz qw [m]; covariance, twist_covariance : (6, 6),
     rows x y z rx ry rz, as they came in the message: `graph_builder` decides what they mean;
-    frame : `child_frame_id`, empty: that of the robot.
+    frame : `child_frame_id`, empty: that of the robot; speeds : how fast it moves [m/s] and turns
+    [rad/s] by its twist, zeros where that is not filled in; other_source : it is known to be of
+    another publisher than the sample before.
     """
 
     stamp: int
@@ -46,6 +48,8 @@ class OdometrySample:
     covariance: Array
     twist_covariance: Array
     frame: str = ''
+    speeds: tuple[float, float] = (0.0, 0.0)
+    other_source: bool = False
 
 
 @dataclass(frozen=True)
@@ -154,12 +158,14 @@ class Notes:
     ----------
     refused : cause -> how many messages were not used for it
     warned : cause -> how many were used otherwise than they said
+    told : of those the causes that make another map of all that comes
 
     """
 
     def __init__(self) -> None:
         self.refused: Counter[str] = Counter()
         self.warned: Counter[str] = Counter()
+        self.told: Counter[str] = Counter()
         self._first: dict[str, str] = {}
         self._unsaid: dict[str, str] = {}
 
@@ -176,6 +182,7 @@ class Notes:
     def tell(self, cause: str, sentence: str) -> None:
         """Count what makes another map of all that comes: it is news each time."""
         self.warn(cause, sentence)
+        self.told[cause] += 1
         self._unsaid[cause] = sentence
 
     def warn_bounds(self, what: str, stamp: int, bounded: list[tuple[float, float]],

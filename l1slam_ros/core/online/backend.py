@@ -172,6 +172,11 @@ class Backend(Upkeep):
             self._counted = version, self.snapshot().sizes()
         return self._counted[1], refused
 
+    def told(self) -> dict[str, int]:
+        """Return how often the odometry did not go on as robots move; see `Notes.told`."""
+        with self._lock:
+            return dict(self._builder.notes.told)
+
     def behind(self) -> Behind:
         """Return what goes on behind updates."""
         with self._lock:

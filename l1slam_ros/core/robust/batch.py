@@ -236,7 +236,7 @@ def rounds(
         growth.accepted[news] = True
         if len(news):
             growth.solve()
-        elif not join(growth):
+        elif not join(growth, by_runs=True):
             if not found:
                 found = growth.copy() if repaired else growth
                 growth.take_at_their_word()
