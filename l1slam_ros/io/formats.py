@@ -225,7 +225,8 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
     path : .g2o, .tum (the poses alone), or a name without a suffix for a bag directory
     rotation_information : see `read_graph`
     inliers : (m,) bool of the factors, as of a `Solution`: the others are written as what was left
-        out, which other programs do not use; None: those that were left out in the file read
+        out, which other programs do not use; None: those of the solution whose poses these are, or
+        else those that were left out in the file read
     force : whether to replace what was there, though this program did not write it
 
     Raises
@@ -238,6 +239,10 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
     """
     _check_reading(path, rotation_information)
     require(FactorGraph, 'graph', graph, 'a FactorGraph, as read_graph returns first')
+    if inliers is None:
+        from l1slam_ros.core.robust.door import believed
+
+        inliers = believed(graph, poses)
     poses = as_poses(graph, poses, 'poses have')
     if not np.isfinite(poses).all():
         row = int(np.argmin(np.isfinite(poses).all(axis=1)))
