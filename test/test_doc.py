@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """README and doc/: links lead somewhere, commands and Python run, recipes are true."""
 
+import json
 import os
 import re
 import shlex
@@ -22,6 +23,8 @@ PAGES = [README, *sorted((ROOT / 'doc').glob('*.md'))]
 RECIPES = ROOT / 'doc' / 'how_to_change_it.md'
 MOST_WORDS, MOST_TERMS = 1200, 30
 
+MINUTES = 'takes minutes; its options are held to its --help'
+PEERS = 'takes minutes, and other solvers from PyPI; its options are held to its --help'
 # Commands of the pages that no test runs as they stand, by how they begin, and why.
 NOT_RUN = {
     'make ': 'makes an environment from PyPI; test_make.py and ros/test_demo.py hold its parts',
@@ -31,7 +34,13 @@ NOT_RUN = {
     'rviz2 ': 'no RViz here; its layout is held to the topics by test/ros',
     'pip install': 'fetches from PyPI; test_builds.py installs what is built',
     'python -m build': 'test_builds.py builds both',
-    'python benchmarks/': 'takes minutes, and some peers from PyPI; its options are held to --help',
+    'python benchmarks/false_loops.py': PEERS,
+    'python benchmarks/gps.py': MINUTES,
+    'python benchmarks/norms.py': MINUTES,
+    'python benchmarks/solvers ': PEERS,
+    'python benchmarks/incremental.py': PEERS,
+    'python benchmarks/cli/startup.py': MINUTES,
+    'python benchmarks/ros/clocks.py': MINUTES,
     'l1slam reproduce': 'takes minutes; test/paper runs its parts',
     'l1slam simulate w.g2o': 'takes minutes and 1.5 GB',
     'l1slam solve w.g2o': 'takes minutes and 1.5 GB',
@@ -76,6 +85,9 @@ def commands(text):
 
 def reason_not_to_run(command):
     return next((reason for begin, reason in NOT_RUN.items() if command.startswith(begin)), '')
+
+
+NEED_ROS = '.venv/bin/backend', '.venv/bin/replay', 'python benchmarks/ros/walk.py'
 
 
 def all_commands():
@@ -159,7 +171,8 @@ def test_a_benchmark_knows_the_options_that_a_page_gives_it(command):
 
 
 # What is `l1slam WORD ...` in a sentence or a table.
-INLINE = sorted({found for page in PAGES for found in re.findall(r'`(l1slam \w[^`]*)`', prose(page))})
+INLINE = sorted({found for page in PAGES
+                 for found in re.findall(r'`(l1slam \w[^`]*)`', prose(page))})
 
 
 @pytest.mark.parametrize('command', INLINE)
@@ -222,8 +235,8 @@ def test_the_commands_of_a_page_run_in_their_order(page, tmp_path):
             run(f'{shlex.quote(sys.executable)} -c {shlex.quote(block.text)}', tmp_path,
                 environment)
         for command in commands(block.text) if block.language == 'sh' else ():
-            runs_node = command.startswith(('.venv/bin/backend', '.venv/bin/replay'))
-            if reason_not_to_run(command) or (runs_node and not has_ros()) or (
+            needs_ros = command.startswith(NEED_ROS)
+            if reason_not_to_run(command) or (needs_ros and not has_ros()) or (
                     '$DATASETS' in command and not Path(environment['DATASETS']).exists()):
                 continue
             if command.startswith('.venv/bin/backend'):
@@ -272,8 +285,24 @@ def carry_out(block, folder):
     return path
 
 
+def assert_the_map_is_good(trials, folder, environment):
+    """Hold the map of the first solve to one of a norm and a solver that are tested elsewhere."""
+    truth = folder / 'world.g2o.truth.txt'
+    asked = next(command for command in trials if command.startswith('l1slam solve'))
+    asked = re.sub(' --(reference|output) \\S+', '', asked)
+    ours, theirs = (
+        json.loads(run(f'{command} --no-robust --json --quiet --reference {truth}', folder,
+                       environment).stdout) for command in (asked, 'l1slam solve world.g2o'))
+    assert ours['status'] == 'converged'
+    assert ours['poses'] == ours['ate_poses'] == 200
+    assert ours['ate'] < 1.5 * theirs['ate']
+    if '--solver' in asked:
+        assert ours['solver'] == 'newton'
+        assert ours['final_cost'] == pytest.approx(theirs['final_cost'], rel=1e-4)
+
+
 @pytest.mark.parametrize('heading, said', [
-    ('Add a norm', 'pseudo-huber'), ('Add a solver', 'reweighting'), ('Add an input', '.edges')])
+    ('Add a norm', 'pseudo-huber'), ('Add a solver', 'newton'), ('Add an input', '.edges')])
 def test_a_recipe_carried_out_as_written_does_what_it_says(heading, said, tmp_path):
     environment = room(tmp_path, package=None)
     copied_package(tmp_path)
@@ -288,6 +317,7 @@ def test_a_recipe_carried_out_as_written_does_what_it_says(heading, said, tmp_pa
     changed = {carry_out(block, tmp_path) for block in ours if block.language != 'sh'}
     for command in trials:
         run(command, tmp_path, environment)
+    assert_the_map_is_good(trials, tmp_path, environment)
     style = [sys.executable, '-m', 'ruff', 'check', '--no-cache', *changed]
     assert subprocess.run(style, cwd=tmp_path, capture_output=True).returncode == 0
 
