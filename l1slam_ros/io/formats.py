@@ -7,7 +7,7 @@ In the end `l1slam_ros.read_graph` and `write_graph`.
 
 import os
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +33,12 @@ from l1slam_ros.io.trajectory import write_tum
 if TYPE_CHECKING:
     from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
 
-GRAPH_SUFFIXES = ('.g2o', '.graph')
+# By the suffix of a file. A reader takes the path and what the rotation block of the information
+# is of, and raises FileError.
+GRAPH_READERS: dict[str, Callable[[Path, str], GraphRecord]] = {
+    '.g2o': read_graph_file,
+    '.graph': read_graph_file,
+}
 
 
 class _Origin(NamedTuple):
@@ -77,9 +82,11 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
         record = graph_from_bag(path, options, topics, dimension)
         return replace(record, rotation_information=rotation_information)
     # The map before the one of that name, too.
-    if path.name.lower().removesuffix('.1').endswith(GRAPH_SUFFIXES):
-        return read_graph_file(path, rotation_information)
-    raise FileError(path, f'unknown kind of file; expected {", ".join(GRAPH_SUFFIXES)}, '
+    name = path.name.lower().removesuffix('.1')
+    for suffix, read in GRAPH_READERS.items():
+        if name.endswith(suffix):
+            return read(path, rotation_information)
+    raise FileError(path, f'unknown kind of file; expected {", ".join(GRAPH_READERS)}, '
                     f'{", ".join(BAG_SUFFIXES)} or a rosbag2 directory')
 
 

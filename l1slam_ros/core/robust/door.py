@@ -13,7 +13,6 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph, as_poses
 from l1slam_ros.core.names import NORMS, SAME
 from l1slam_ros.core.robust import batch_map
 
-
 # Of each graph the poses of its last solution, and what these were made of: who writes them writes
 # what was believed.
 _LAST: WeakKeyDictionary[FactorGraph, tuple[ReferenceType[Array], Mask]] = WeakKeyDictionary()
