@@ -175,7 +175,7 @@ class BackendNode(LifecycleNode):
         counts, refused = self._backend.counts()
         self._diagnostics.publish(
             counts, self._backend.behind(), self._inputs.refused.copy() + Counter(refused),
-            self._twins())
+            Counter(self._backend.told()), self._twins())
 
     def _twins(self) -> str:
         """Return what is wrong where another node has this one's name; else nothing."""

@@ -213,6 +213,28 @@ class FactorGraph:
         self._factors, self.said = None, self.said + 1
 
 
+def as_poses(graph: FactorGraph, values: object, what: str) -> Array:
+    """
+    Return what a caller calls poses as an array (n, p) of numbers, finite or not.
+
+    what : begins the sentence on what is wrong with them, e.g. `poses have`
+
+    Raises
+    ------
+    GraphError : of another shape, or none of numbers.
+
+    """
+    expected = (graph.n_poses, graph.manifold.POSE_SIZE)
+    try:
+        poses = np.asarray(values, float)
+    except (TypeError, ValueError) as error:
+        raise GraphError(f'{what} entries that are no numbers ({error}), expected the shape '
+                         f'{expected}') from error
+    if poses.shape != expected:
+        raise GraphError(f'{what} the shape {poses.shape}, expected {expected}')
+    return poses
+
+
 def component_labels(graph: FactorGraph) -> Indices:
     """
     Return a component number for each keyframe, (n,), in the order of their first keyframes.

@@ -10,10 +10,15 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from weakref import WeakSet
 
-from l1slam_ros.core.errors import GraphError, OptionError
+from l1slam_ros.core.errors import GraphError, OptionError, require
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_sound
+from l1slam_ros.core.graph.measurements import (
+    LoopClosure,
+    OdometrySample,
+    in_order,
+    require_sound,
+)
 from l1slam_ros.core.names import OF_THE_NODE
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame
@@ -67,12 +72,15 @@ class Backend(Upkeep):
 
     Raises
     ------
-    OptionError : there is no such dimension.
+    OptionError : there is no such dimension, or an argument is of another kind.
 
     """
 
     def __init__(self, options: BackendOptions = BackendOptions(),  # noqa: B008
                  dimension: int = 2, background: bool = False):
+        _require_options(options)
+        require(bool, 'background', background, 'True or False')
+        require(int, 'dimension', dimension, '2 or 3')
         if dimension not in _MANIFOLDS:
             raise OptionError(f'dimension is {dimension!r}, expected 2 or 3')
         self.manifold, self._options = _MANIFOLDS[dimension], options
@@ -164,6 +172,11 @@ class Backend(Upkeep):
             self._counted = version, self.snapshot().sizes()
         return self._counted[1], refused
 
+    def told(self) -> dict[str, int]:
+        """Return how often the odometry did not go on as robots move; see `Notes.told`."""
+        with self._lock:
+            return dict(self._builder.notes.told)
+
     def behind(self) -> Behind:
         """Return what goes on behind updates."""
         with self._lock:
@@ -194,6 +207,7 @@ class Backend(Upkeep):
         Where loops are to be doubted that were not before, or the other way round, all are judged
         anew.
         """
+        _require_options(options)
         with self._standing() as now:
             self._changes += 1
             doubted, self._robust = self._robust, options.robust.enabled
@@ -205,7 +219,7 @@ class Backend(Upkeep):
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """Add one sample; return whether it is used, see `GraphBuilder.add_odometry`."""
-        require_sound(sample)
+        require_sound(sample, OdometrySample)
         with self._lock:
             self._samples += 1
             try:
@@ -231,8 +245,9 @@ class Backend(Upkeep):
         self._begin(self._builder, optimised or Optimised.nothing(self.manifold.identity(0)))
 
     def add_loop(self, loop: LoopClosure) -> None:
-        """Add one loop closure; see `GraphBuilder.add_loop`."""
-        require_sound(loop)
+        """Add one loop closure, turned round if it leads back; see `GraphBuilder.add_loop`."""
+        require_sound(loop, LoopClosure)
+        loop = in_order(loop)
         with self._lock:
             self._changes += 1
             self._builder.add_loop(loop)
@@ -246,6 +261,11 @@ class Backend(Upkeep):
         """Tell the background that there may be something to do."""
         if self._background is not None:
             self._background.wake()
+
+
+def _require_options(options: object) -> None:
+    require(BackendOptions, 'options', options,
+            'BackendOptions; BackendOptions.from_mapping makes them of a mapping')
 
 
 _ALL: WeakSet[Backend] = WeakSet()

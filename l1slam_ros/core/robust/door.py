@@ -2,15 +2,20 @@
 """`l1slam_ros.solve`: a graph -> its map, and which loops are in it."""
 
 from dataclasses import dataclass
+from weakref import ReferenceType, WeakKeyDictionary, ref
 
 import numpy as np
 
-from l1slam_ros.core.errors import GraphError, OptionError
+from l1slam_ros.core.errors import GraphError, OptionError, require
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import FactorGraph, as_poses
 from l1slam_ros.core.names import NORMS, SAME
 from l1slam_ros.core.robust import batch_map
+
+# Of each graph the poses of its last solution, and what these were made of: who writes them writes
+# what was believed.
+_LAST: WeakKeyDictionary[FactorGraph, tuple[ReferenceType[Array], Mask]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -48,27 +53,26 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
     ------
     GraphError : the graph is not connected, its odometry has a gap where loops are to be
         judged, or `start` has another shape or is not finite.
-    OptionError : there is no such norm.
+    OptionError : there is no such norm, or an argument is of another kind.
 
     """
+    require(FactorGraph, 'graph', graph, 'a FactorGraph, as read_graph returns first')
+    require((bool, np.bool_), 'robust', robust, 'True or False')
     if norm not in NORMS:
         raise OptionError(f'norm is {norm!r}, expected one of {", ".join(NORMS)}')
     if loop_norm not in (SAME, *NORMS):
         raise OptionError(f'loop_norm is {loop_norm!r}, expected one of '
                           f'{", ".join((SAME, *NORMS))}')
-    expected = (graph.n_poses, graph.manifold.POSE_SIZE)
     if start is not None:
-        if np.shape(start) != expected:
-            raise GraphError(f'start has the shape {np.shape(start)}, expected {expected}')
+        start = as_poses(graph, start, 'start has')
         # A quaternion may have another norm, an angle be of several turns.
         with np.errstate(all='ignore'):
-            start = graph.manifold.compose(
-                graph.manifold.identity(graph.n_poses), np.asarray(start, float))
+            start = graph.manifold.compose(graph.manifold.identity(graph.n_poses), start)
         if not (finite := np.isfinite(start).all(axis=1)).all():
             raise GraphError(f'start of keyframe {int(np.argmin(finite))} is no pose; expected '
                              'finite numbers')
     asked = batch_map.SolveOptions('seed' if start is None else 'file', norm, loop_norm,
-                                   robust=robust)
+                                   robust=bool(robust))
     outcome = batch_map.solve(graph, start, asked)
     judgement, status = outcome.judgement, outcome.solution.status.value
     if judgement is None:
@@ -76,4 +80,12 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
     else:
         inliers = judgement.accepted
         status = 'doubtful' if judgement.doubt else status
+    _LAST[graph] = ref(outcome.solution.poses), inliers
     return Solution(outcome.solution.poses, outcome.solution.cost, status, inliers)
+
+
+def believed(graph: FactorGraph, poses: Array) -> Mask | None:
+    """Return the inliers of the last solution of a graph, if these are its poses; else None."""
+    made_of, inliers = _LAST.get(graph, (None, None))
+    same = made_of is not None and made_of() is poses
+    return inliers if same and len(graph.between) == len(inliers) else None

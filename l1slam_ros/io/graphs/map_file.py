@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a running back end keeps its map: when it is saved, and never over that of another."""
 
+import filecmp
+import math
 import os
 import threading
 import time
@@ -13,7 +15,7 @@ from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.snapshot import SavedMap
 from l1slam_ros.io.files import other_kind
 from l1slam_ros.io.formats import named
-from l1slam_ros.io.graphs.saved_map import keep_as, load_map, save_map
+from l1slam_ros.io.graphs.saved_map import before_of, is_map, keep_as, load_map, save_map
 from l1slam_ros.io.node_options import NodeOptions
 
 # An autosave begins after such a part of its period. Whoever pulls the plug just before it is done
@@ -43,17 +45,22 @@ class MapFile:
                  warn: Callable[[str], object]):
         self._backend, self._options, self._warn = backend, options, warn
         self.is_saving, self._one = False, threading.Lock()
-        self._began = time.monotonic()
+        # The first save is due as soon as there is a map: who restarts a node again and again must
+        # not lose all of it again and again.
+        self._began = -math.inf
         # Where the map was saved or loaded last, and its version then.
         self._known = _absolute(options().save_path), backend.version
-        # The file that we wrote or loaded, its end, and the graph whose map it holds.
+        # The file that we wrote or loaded, its end, and the graph whose map it holds; and of the
+        # one before it the name and the end.
         self._ours: tuple[object, ...] = ()
+        self._ours_before: tuple[object, ...] = ()
 
     def save(self) -> str:
-        """Save the map; return a sentence that says where."""
+        """Save the map; return a sentence that says where, and what of others was kept."""
         with self._at_work(), self._backend.calm:
-            version = self._backend.version
-            return self._write(self._path(), self._backend.saved(), version)
+            version, path, saved = self._backend.version, self._path(), self._backend.saved()
+            kept = self._keep_others(path, saved)
+            return '; '.join([self._write(path, saved, version), *kept])
 
     def autosave(self, taken: Callable[[], None] = lambda: None) -> None:
         """
@@ -66,14 +73,24 @@ class MapFile:
             saved = self._backend.saved() if self._is_to_be_saved() else None
             taken()
             if saved is None:
+                self._began = -math.inf
                 return
             path = self._path()
-            end = _end_of(path)
-            if end and self._ours != (path, end, saved.number):
-                kept = path.with_name(f'{path.stem}.{_time_of(path)}{path.suffix}')
-                keep_as(path, kept)
-                self._warn(f'{path} held another map: it is kept as {kept}')
+            for sentence in self._keep_others(path, saved):
+                self._warn(sentence)
             self._write(path, saved, version)
+
+    def _keep_others(self, path: Path, saved: SavedMap | None) -> list[str]:
+        """Keep what stands in the places of a map and is none of it; return what to say of it."""
+        if saved is None:
+            return []
+        sentences, before, end = [], before_of(path), _end_of(path)
+        end_before = _end_of(before)
+        if end_before and self._ours_before != (before, end_before):
+            sentences += _kept(before, path)
+        if end and self._ours != (path, end, saved.number):
+            sentences += _kept(path, path)
+        return sentences
 
     @contextmanager
     def _at_work(self) -> Iterator[None]:
@@ -89,6 +106,7 @@ class MapFile:
         sentence = save_map(path, saved)
         self._known = path, version
         self._ours = path, _end_of(path), saved.number if saved else 0
+        self._ours_before = before_of(path), _end_of(before_of(path))
         return sentence
 
     def load(self) -> str:
@@ -106,8 +124,11 @@ class MapFile:
         with named(path):
             number = self._backend.restore(saved)
         self._known = path, self._backend.version
-        # What could not be read may be of use to somebody yet.
-        self._ours = (path, end, number) if whole else ()
+        # What could not be read may be of use to somebody yet, and a graph that is no saved map is
+        # somebody's own.
+        self._ours = (path, end, number) if whole and is_map(path) else ()
+        before = before_of(path)
+        self._ours_before = (before, _end_of(before)) if is_map(before) else ()
         return sentence, whole
 
     def load_at_start(self, tell: Callable[[str], object]) -> None:
@@ -158,6 +179,19 @@ def _end_of(path: Path) -> bytes:
     with path.open('rb') as file:
         file.seek(max(file.seek(0, os.SEEK_END) - _END, 0))
         return file.read()
+
+
+def _kept(path: Path, of: Path) -> list[str]:
+    """Keep a file under the name of its day; return a sentence, none if it is kept already."""
+    name, number = f'{of.stem}.{_time_of(path)}', 1
+    kept = of.with_name(f'{name}{of.suffix}')
+    while os.path.lexists(kept):
+        if os.path.isfile(kept) and filecmp.cmp(path, kept, shallow=False):
+            return []
+        number += 1
+        kept = of.with_name(f'{name}.{number}{of.suffix}')
+    keep_as(path, kept)
+    return [f'{path} held another map: it is kept as {kept}']
 
 
 def _time_of(path: Path) -> str:

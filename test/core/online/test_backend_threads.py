@@ -405,3 +405,40 @@ def test_what_fails_in_the_background_is_raised_at_the_end(monkeypatch):
         assert failed.wait(DEADLINE)
     assert not of_threads()
     backend.close()
+
+
+def test_several_threads_may_settle_at_once():
+    backend, found = Backend(EVERY), []
+    drive(backend, 0, 200)
+    backend.add_loop(loop(3.0, 150.0, [147.0, 0.0, 0.0]))
+
+    def settle():
+        try:
+            found.append(backend.settle())
+        except BaseException as error:
+            found.append(error)
+
+    threads = []
+    for _ in range(6):
+        threads.append(meanwhile(settle))
+        time.sleep(0.01)
+    for thread in threads:
+        thread.join(DEADLINE)
+    assert [type(one) for one in found] == 6 * [Improvement]
+    assert [len(one.poses) for one in found] == 6 * [200]
+
+
+def test_who_waits_to_settle_can_be_told_to_stop(monkeypatch):
+    backend, meeting = Backend(EVERY), Meeting()
+    drive(backend, 0, 20)
+    optimise = upkeep.optimise
+    monkeypatch.setattr(upkeep, 'optimise', lambda *given: (meeting(), optimise(*given))[1])
+    first = meanwhile(backend.settle)
+
+    def stopped():
+        with pytest.raises(Interrupted):
+            backend.settle(lambda: True)
+        return first.is_alive()
+
+    assert meeting.look(stopped)
+    first.join(DEADLINE)

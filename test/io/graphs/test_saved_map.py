@@ -2,7 +2,9 @@
 """A saved map: one file that says all, proves itself whole, and keeps the one before it."""
 
 import os
+import re
 from dataclasses import fields, is_dataclass, replace
+from hashlib import sha256
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from l1slam_ros.core.robust.judgement import Doubt
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 from l1slam_ros.io.graphs.saved_map import is_map, load_map, save_map
+from l1slam_ros.io.ours import MARK
 
 PLENTY = 60.0
 # Struck out before it comes.
@@ -231,8 +234,31 @@ def test_the_commands_read_both_and_notice_damage_too(two, capsys):
     assert capsys.readouterr().err.strip().endswith(
         f'{two}: is damaged: its last line is not the checksum of those before; expected a saved '
         'map as it was written')
-    two.write_bytes(content.replace(b'map 2', b'map 3'))
+    two.write_bytes(content.replace(b'map 3', b'map 4'))
     assert not is_map(two)
+
+
+def test_a_map_of_the_version_before_is_read(two, tmp_path):
+    first, _, rest = two.read_text().partition('\n')
+    assert first.endswith(' #L1SLAM map 3')
+    lines = ['#L1SLAM map 2', first.removesuffix(' #L1SLAM map 3'), *rest.split('\n')[:-2]]
+    content = ''.join(f'{line}\n' for line in lines)
+    old = tmp_path / 'old.g2o'
+    old.write_text(f'{content}#L1SLAM sha256 {sha256(content.encode()).hexdigest()}\n')
+    assert is_map(old)
+    saved, known = load_map(old)[0], load_map(two)[0]
+    np.testing.assert_array_equal(saved.optimised.poses, known.optimised.poses)
+    np.testing.assert_array_equal(saved.optimised.judgement.accepted,
+                                  known.optimised.judgement.accepted)
+
+
+def test_others_find_every_believed_edge_before_the_first_comment_line(two, halfway):
+    lines = two.read_text().split('\n')
+    graph = lines[: next(k for k, line in enumerate(lines) if line.startswith('#'))]
+    tags = [line.split()[0] for line in graph]
+    believed = halfway.snapshot().judgement.accepted & ~(
+        halfway.snapshot().graph.between.is_absolute)
+    assert tags.count('EDGE_SE2') == np.count_nonzero(believed)
 
 
 # The disk
@@ -309,9 +335,17 @@ def test_what_killed_writers_left_is_removed(two, halfway):
 def test_to_others_it_is_a_graph_with_comments(halfway, tmp_path):
     saved, path, plain = halfway.saved(), tmp_path / 'map.g2o', tmp_path / 'plain.g2o'
     save_map(path, saved)
-    write_graph_file(plain, GraphRecord(saved.builder.graph, saved.optimised.poses, np.arange(50)))
+    graph, judgement = saved.builder.graph, saved.optimised.judgement
+    write_graph_file(plain, GraphRecord(graph, saved.optimised.poses, np.arange(50)))
     lines = path.read_text().splitlines()
-    assert [line for line in lines if not line.startswith('#')] == plain.read_text().splitlines()
+    def all_of(lines):
+        return sorted(re.sub('^# [a-z]+ (EDGE.*) # factor [0-9]+$', r'\1', line)
+                      for line in lines if not line.startswith('#L') and line != MARK)
+
+    assert all_of(lines) == all_of(plain.read_text().splitlines())
+    used = sum(line.startswith('EDGE') for line in lines)
+    assert used <= int(judgement.accepted.sum()) + (
+        graph.between.is_odometry[len(judgement.accepted):].sum())
     # As long as the shortest of buffers that others read a line into.
     assert max(map(len, lines)) < 81920
 

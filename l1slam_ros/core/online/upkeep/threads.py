@@ -2,7 +2,8 @@
 """Threads of the back end: one piece of work behind an update, and updates without a timer."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from l1slam_ros.core.errors import Interrupted
 
@@ -19,6 +20,17 @@ def until(over: Callable[[], bool],
             raise Interrupted
 
     return checked
+
+
+@contextmanager
+def held(lock: threading.Lock, check: Callable[[], None]) -> Iterator[None]:
+    """Hold a lock; check : called now and then while another thread has it, may raise."""
+    while not lock.acquire(timeout=LOOK):
+        check()
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 class Calm:

@@ -14,11 +14,11 @@ while solving, reading or writing a file. A third one lets one thread at a time 
 map that is replaced, or that `settle` is to solve, is told to stop, and its result never adopted.
 """
 
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from threading import Event, Lock
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from l1slam_ros.core.online.parts import as_one, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot
 from l1slam_ros.core.online.update import Improvement, front_of, improve, one_round, optimise
 from l1slam_ros.core.online.upkeep.live_map import LiveMap
-from l1slam_ros.core.online.upkeep.threads import LOOK, Calm, Worker, until
+from l1slam_ros.core.online.upkeep.threads import LOOK, Calm, Worker, held, until
 from l1slam_ros.core.robust.batch import doubts_of_norm, judge, robust_solve
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
@@ -64,8 +64,8 @@ class Upkeep:
     def __init__(self, solver: OptimiserOptions, robust: bool):
         self._solver, self._robust = solver, robust
         # In the order in which they are taken.
-        self._updating, self._front, self._lock = (threading.Lock() for _ in range(3))
-        self._ended, self.calm = threading.Event(), Calm()
+        self._settling, self._updating, self._front, self._lock = (Lock() for _ in range(4))
+        self._ended, self.calm = Event(), Calm()
         self._workers = self._mapper, self._judge = (
             Worker('map', self._on_end), Worker('judge', self._on_end))
         self._make_way = False
@@ -250,8 +250,9 @@ class Upkeep:
         del now  # as above
         problem = as_one(whole)
         alone = until(lambda: live.size() != grown, check) if idle else check
-        judgement, poses = robust_solve(problem.graph, check=alone) if anew else judge(
-            problem.graph, problem.poses, problem.judgement, np.inf, check)
+        known = problem.judgement, problem.poses
+        judgement, poses = (robust_solve(problem.graph, check=alone, known=known) if anew
+                            else judge(problem.graph, known[1], known[0], np.inf, check))
         check()
         with self._front, self._lock:
             live.take_judgement(judgement.of_all(whole.graph), poses, loops, anew)
@@ -270,14 +271,14 @@ class Upkeep:
         """
         Judge all loops and solve to the end; None: there are no factors yet.
 
-        What is under way makes way.
+        What is under way makes way, but another thread's `settle`, which is waited for.
 
         Raises
         ------
         Interrupted : told to stop, or the map was replaced.
 
         """
-        with self._alone():
+        with held(self._settling, until(stopped)), self._alone():
             with self._standing() as now:
                 live, loops = self._live, self._live.begin_judgement()
                 self._grown = live.size()
