@@ -74,6 +74,7 @@ setup(
     entry_points={
         'console_scripts': [
             'backend = l1slam_ros.ros.executables:backend',
+            'scan_loops = l1slam_ros.ros.executables:scan_loops',
             'replay = l1slam_ros.ros.executables:replay',
             'l1slam = l1slam_ros.cli.main:main',
         ],

@@ -28,7 +28,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PATIENCE = 60.0  # [s] for a node to end
-EXECUTABLES = {'backend', 'replay', 'l1slam'}
+EXECUTABLES = {'backend', 'scan_loops', 'replay', 'l1slam'}
 # EmPy comes without a wheel.
 COLCON = ('colcon-bash', 'colcon-output', 'colcon-ros', 'setuptools<80', '--no-binary=empy')
 

@@ -12,8 +12,8 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = 'l1slam_ros'
 ROS = {
     'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'lifecycle_msgs', 'nav_msgs',
-    'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs',
-    'visualization_msgs',
+    'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs',
+    'tf2_msgs', 'visualization_msgs',
 }
 # From the ground up; what shares a floor does not know of each other. Errors, options and names
 # stand beside the building: all may use them, and they use nothing.

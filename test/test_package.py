@@ -17,7 +17,7 @@ from packaging.requirements import Requirement
 from packaging.version import Version
 
 ROOT = Path(__file__).parents[1]
-EXECUTABLES = {'backend', 'replay', 'l1slam'}
+EXECUTABLES = {'backend', 'scan_loops', 'replay', 'l1slam'}
 
 # Run first in a fresh interpreter: ROS and its messages cannot be imported.
 WITHOUT_ROS = """
@@ -155,7 +155,7 @@ def test_entry_points_exist(wheel):
         assert callable(getattr(importlib.import_module(module), function)), entry
 
 
-@pytest.mark.parametrize('name', ['backend', 'replay'])
+@pytest.mark.parametrize('name', ['backend', 'scan_loops', 'replay'])
 def test_what_needs_ros_says_so_in_one_line(name):
     code = WITHOUT_ROS + f'import l1slam_ros.ros.executables as e; sys.exit(e.{name}())'
     ran = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True,

@@ -1,36 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-`backend`, `replay` and the demo: what comes before ROS is imported.
+`backend`, `scan_loops`, `replay` and the demo: what comes before ROS is imported.
 
-What `backend` cannot be told, a middleware that is not there, and what is said where ROS itself,
+What a node cannot be told, a middleware that is not there, and what is said where ROS itself,
 or anything else they need, is not there.
 """
 
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
 
+from l1slam_ros.core.options import Options
 from l1slam_ros.ros.run_backend import leave
-from l1slam_ros.ros.shell.arguments import backend_help, split
+from l1slam_ros.ros.shell.arguments import help_of, split
 from l1slam_ros.ros.shell.middleware import use_what_is_there
 
 _BAD_INPUT = 2
 
 
 def backend() -> int:
-    """Run the node; return the exit code: 2 where it is told what it does not know."""
-    own, _ = split(sys.argv[1:])
-    if '-h' in own or '--help' in own:
+    """Run the back end; return the exit code: 2 where it is told what it does not know."""
+    def options() -> Options:
         from l1slam_ros.io.node_options import NodeOptions
 
-        with suppress(BrokenPipeError):  # who reads may have seen enough
-            print(backend_help(NodeOptions()))
-        leave(0)
-    if own:
-        print(f'backend: {own[0]!r} is no argument of it; expected those of ROS after --ros-args, '
-              'see backend --help', file=sys.stderr)
-        return _BAD_INPUT
-    return _run('backend', 'run_backend')
+        return NodeOptions()
+
+    return _run_node('backend', 'run_backend', options)
+
+
+def scan_loops() -> int:
+    """Run the scan front end; return the exit code: 2 where it is told what it does not know."""
+    def options() -> Options:
+        from l1slam_ros.ros.scans.options import ScanLoopsOptions
+
+        return ScanLoopsOptions()
+
+    return _run_node('scan_loops', 'scans.run_scan_loops', options)
 
 
 def replay() -> int:
@@ -41,6 +47,20 @@ def replay() -> int:
 def demo() -> int:
     """Run the demo; return the exit code."""
     return _run('demo', 'demo')
+
+
+def _run_node(name: str, module: str, options: Callable[[], Options]) -> int:
+    """Run a node that has no arguments of its own but for --help, which tells its options."""
+    own, _ = split(sys.argv[1:])
+    if '-h' in own or '--help' in own:
+        with suppress(BrokenPipeError):  # who reads may have seen enough
+            print(help_of(name, options()))
+        leave(0)
+    if own:
+        print(f'{name}: {own[0]!r} is no argument of it; expected those of ROS after --ros-args, '
+              f'see {name} --help', file=sys.stderr)
+        return _BAD_INPUT
+    return _run(name, module)
 
 
 def _run(name: str, module: str) -> int:

@@ -60,7 +60,8 @@ class BackendNode(LifecycleNode):
 
     def __init__(self, **keywords: Any):
         super().__init__('backend', **keywords)
-        self._declared = NodeParameters(self, lambda options: self._backend.set_options(options))
+        self._declared = NodeParameters(
+            self, NodeOptions(), lambda options: self._backend.set_options(options))
         options = self.options
         self._backend = Backend(options, options.dimension)
         self.failures = Failures(self.get_logger(), self.context.ok)

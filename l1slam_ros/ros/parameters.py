@@ -3,6 +3,7 @@
 
 from collections.abc import Callable
 from difflib import get_close_matches
+from typing import Generic
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -15,17 +16,17 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from l1slam_ros.core.errors import OptionError
-from l1slam_ros.core.options import Meaning, Scalar, flatten, with_values
-from l1slam_ros.io.node_options import NodeOptions
+from l1slam_ros.core.options import AnyOptions, Meaning, Scalar, flatten, with_values
 
 
-class NodeParameters:
+class NodeParameters(Generic[AnyOptions]):
     """
     The parameters of a node, as one options record that follows every change.
 
     Parameters
     ----------
     node : where to declare them
+    defaults : what there is to declare
     on_change : called with the new options after each accepted change
 
     Raises
@@ -34,14 +35,15 @@ class NodeParameters:
 
     """
 
-    def __init__(self, node: Node, on_change: Callable[[NodeOptions], None]):
+    def __init__(self, node: Node, defaults: AnyOptions,
+                 on_change: Callable[[AnyOptions], None]):
         self._node, self._on_change = node, on_change
         try:
             given = {name: node.declare_parameter(name, value, _descriptor(value, meaning)).value
-                     for name, (value, meaning) in flatten(NodeOptions()).items()}
+                     for name, (value, meaning) in flatten(defaults).items()}
         except ParameterException as error:
             raise OptionError(str(error)) from error
-        self.options = with_values(NodeOptions(), given)
+        self.options = with_values(defaults, given)
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
 
@@ -68,7 +70,7 @@ class NodeParameters:
             self.options = changed
             self._on_change(changed)
 
-    def _changed(self, parameters: list[Parameter]) -> NodeOptions:
+    def _changed(self, parameters: list[Parameter]) -> AnyOptions:
         return with_values(self.options, {parameter.name: parameter.value
                                           for parameter in parameters
                                           if parameter.name in flatten(self.options)})

@@ -14,6 +14,7 @@ from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.messages.serialisation import path_bytes, pose_bytes
+from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.diagnostics import Diagnostics
 from l1slam_ros.ros.loop_status import LoopStatus
 from l1slam_ros.ros.markers import GraphMarkers
@@ -33,7 +34,7 @@ class MapPublisher:
 
     """
 
-    def __init__(self, node: Node, backend: Backend, parameters: NodeParameters,
+    def __init__(self, node: Node, backend: Backend, parameters: NodeParameters[NodeOptions],
                  diagnostics: Diagnostics):
         self._backend, self._diagnostics = backend, diagnostics
         self._frame = parameters.options.map_frame

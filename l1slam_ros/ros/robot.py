@@ -16,6 +16,7 @@ from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.snapshot import Robot
 from l1slam_ros.io.files import LAST_STAMP, NANOSECONDS
 from l1slam_ros.io.messages.serialisation import pose_bytes, transform_bytes
+from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.parameters import NodeParameters
 
 try:
@@ -77,7 +78,7 @@ class RobotPublisher:
 
     """
 
-    def __init__(self, node: Node, backend: Backend, parameters: NodeParameters):
+    def __init__(self, node: Node, backend: Backend, parameters: NodeParameters[NodeOptions]):
         self._backend, self._parameters = backend, parameters
         self._pose = node.create_publisher(PoseStamped, 'pose', 10)
         self._transform = node.create_publisher(TransformStamped, 'map_to_odom', 10)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The process of `backend`: SIGINT, SIGTERM and SIGHUP end it within two seconds, whatever it does.
+The process of a node: SIGINT, SIGTERM and SIGHUP end it within two seconds, whatever it does.
 
 Imported and run before anything heavy, so that this holds while the rest is being imported, too.
 """
@@ -79,7 +79,26 @@ def leave(code: int) -> None:
 
 
 def main() -> None:
-    """Run the node until SIGINT or SIGTERM, and leave the process."""
+    """Run the back end until SIGINT or SIGTERM, and leave the process."""
+    def load() -> Any:
+        from l1slam_ros.ros.node import BackendNode
+
+        return BackendNode
+
+    run('backend', load, 'waiting for odometry')
+
+
+def run(name: str, load: Callable[[], Any], ready: str) -> None:
+    """
+    Run a node until SIGINT or SIGTERM, and leave the process.
+
+    Parameters
+    ----------
+    name : what it is called where it cannot begin
+    load : imports what makes it, and returns that
+    ready : what it says once it is there
+
+    """
     signals = Signals()
     sys.setswitchinterval(_TURN)
     import rclpy
@@ -87,26 +106,26 @@ def main() -> None:
     from rclpy.signals import SignalHandlerOptions
 
     from l1slam_ros.core.errors import L1SlamError
-    from l1slam_ros.ros.node import BackendNode
 
+    make = load()
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # arguments, or a file of parameters, that ROS cannot read
         unknown = type(error).__name__ == 'UnknownROSArgsError'
         said = 'arguments that ROS does not know: ' if unknown else ''
-        print(f'backend: {said}{" ".join(str(error).split())}', file=sys.stderr)
+        print(f'{name}: {said}{" ".join(str(error).split())}', file=sys.stderr)
         leave(_BAD_INPUT if unknown else 1)
     node, code = None, 0
     signals.orderly(rclpy.try_shutdown)
     try:
-        node = BackendNode()
+        node = make()
         signals.saving = node.is_saving
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        node.get_logger().info('ready: waiting for odometry')
+        node.get_logger().info(f'ready: {ready}')
         _spin(executor, node)
     except L1SlamError as error:
-        print(f'backend: {error}', file=sys.stderr)
+        print(f'{name}: {error}', file=sys.stderr)
         code = 1
     except Exception:
         # A signal can shut ROS down under any call; what that call then raises is no failure.

@@ -1,20 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command lines of the executables: what is ROS's of them, and what `backend --help` says."""
+"""The command lines of the executables: what is ROS's of them, and what a node's help says."""
 
 from textwrap import wrap
+from typing import NamedTuple
 
 from l1slam_ros.core.options import Meaning, Options, Scalar, flatten
 
 _WIDTH = 98
-_HEAD = """\
-usage: backend [-h] [--ros-args ...]
+_Rows = tuple[tuple[str, str, str], ...]
 
-Pose-graph SLAM back end: odometry and loop closures in, the optimised map out.
 
-  backend --ros-args --params-file config/backend.yaml -r odom:=/robot/odometry
-"""
-# (name, type, meaning)
-_INPUTS = (
+class _Node(NamedTuple):
+    """What a node is for, an example, and its topics and services: (name, type, meaning) each."""
+
+    what: str
+    example: str
+    inputs: _Rows
+    outputs: _Rows
+    services: _Rows
+
+
+_BACKEND = _Node(
+    'Pose-graph SLAM back end: odometry and loop closures in, the optimised map out.',
+    'backend --ros-args --params-file config/backend.yaml -r odom:=/robot/odometry', (
     ('odom', 'nav_msgs/Odometry', "the robot's pose in the odometry frame"),
     ('loop_closures', 'geometry_msgs/PoseWithCovarianceStamped',
      'the robot at header.stamp, in its frame at the time that header.frame_id = '
@@ -25,8 +33,7 @@ _INPUTS = (
      'the robot in the map frame: GPS, markers, a person'),
     ('map_graph', 'rtabmap_msgs/MapGraph', 'where that package is installed'),
     ('pose_graph', 'pose_graph_tools_msgs/PoseGraph', 'where that package is installed'),
-)
-_OUTPUTS = (
+), (
     ('path', 'nav_msgs/Path', 'the optimised keyframes'),
     ('pose', 'geometry_msgs/PoseStamped', 'the robot now, with its odometry'),
     ('pose_with_covariance', 'geometry_msgs/PoseWithCovarianceStamped',
@@ -36,14 +43,35 @@ _OUTPUTS = (
     ('graph', 'visualization_msgs/MarkerArray', 'keyframes and factors, for RViz and Foxglove'),
     ('loop_status', 'diagnostic_msgs/DiagnosticArray', 'what has become of each loop'),
     ('/diagnostics', 'diagnostic_msgs/DiagnosticArray', 'how the node is, each second'),
-)
-_SERVICES = (
+), (
     ('~/optimize', 'std_srvs/Trigger', 'solve to the end'),
     ('~/reset', 'std_srvs/Trigger', 'empty the map'),
     ('~/save', 'std_srvs/Trigger', 'write the map to save_path'),
     ('~/load', 'std_srvs/Trigger', 'read it from there'),
     ('~/pause', 'std_srvs/SetBool', 'let no update begin, or go on'),
-)
+))
+_SCAN_LOOPS = _Node(
+    'Front end for a 2D lidar: scans and odometry in, loops, better odometry and the map out.',
+    'scan_loops --ros-args --params-file config/scan_loops.yaml -r scan:=/robot/scan', (
+    ('scan', 'sensor_msgs/LaserScan', 'what the laser sees; best effort will do'),
+    ('odom', 'nav_msgs/Odometry', "the robot's pose by its wheels; another frame than scan_odom"),
+    ('path', 'nav_msgs/Path', 'the optimised keyframes, of backend'),
+    ('pose_with_covariance', 'geometry_msgs/PoseWithCovarianceStamped',
+     'how well the newest one is known, of backend'),
+    ('/tf_static', 'tf2_msgs/TFMessage', 'where the laser is, where that package is installed'),
+), (
+    ('loop_closures', 'geometry_msgs/PoseWithCovarianceStamped', 'for backend'),
+    ('scan_odom', 'nav_msgs/Odometry',
+     'for backend, with -r odom:=scan_odom -p odometry.covariance_source:=increment: one message '
+     'a scan; pose.covariance is that of the motion since the message before'),
+    ('map', 'nav_msgs/OccupancyGrid', 'what the scans have seen, where the path has them'),
+    ('/tf', 'tf2_msgs/TFMessage',
+     'where the frame of odom is in that of scan_odom, where that package is installed'),
+    ('/diagnostics', 'diagnostic_msgs/DiagnosticArray', 'how the node is, each second'),
+), (
+    ('~/save_map', 'std_srvs/Trigger', 'write the map to map_path, a .pgm, and its .yaml'),
+))
+_NODES = {'backend': _BACKEND, 'scan_loops': _SCAN_LOOPS}
 
 
 def split(arguments: list[str]) -> tuple[list[str], list[str]]:
@@ -63,16 +91,17 @@ def split(arguments: list[str]) -> tuple[list[str], list[str]]:
     return own, ros
 
 
-def backend_help(options: Options) -> str:
-    """Return what `backend --help` prints; options : of the node, with their defaults."""
-    parts = [_HEAD]
-    for title, rows in (('subscribes to', _INPUTS), ('publishes', _OUTPUTS),
-                        ('services', _SERVICES)):
+def help_of(name: str, options: Options) -> str:
+    """Return what `--help` of a node prints; options : of the node, with their defaults."""
+    node = _NODES[name]
+    parts = [f'usage: {name} [-h] [--ros-args ...]\n\n{node.what}\n\n  {node.example}\n']
+    for title, rows in (('subscribes to', node.inputs), ('publishes', node.outputs),
+                        ('services', node.services)):
         parts.append(f'{title}:\n' + ''.join(
-            _entry(f'{name} ({kind})', meaning) for name, kind, meaning in rows))
+            _entry(f'{topic} ({kind})', meaning) for topic, kind, meaning in rows))
     parts.append('parameters, with their defaults:\n' + ''.join(
-        _entry(f'{name}: {_shown(value)}', _said(meaning))
-        for name, (value, meaning) in flatten(options).items()))
+        _entry(f'{field}: {_shown(value)}', _said(meaning))
+        for field, (value, meaning) in flatten(options).items()))
     parts.append('ended by SIGINT or SIGTERM with exit code 0; by an unknown argument with 2')
     return '\n'.join(parts)
 

@@ -10,6 +10,7 @@ from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.io.compilation import STEPS, fill_cache, load, with_space
+from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.parameters import NodeParameters
 from l1slam_ros.ros.threads.background import background
 from l1slam_ros.ros.threads.failures import Failures
@@ -34,7 +35,7 @@ class SolverThread:
     """
 
     def __init__(self, backend: Backend, failures: Failures, logger: Any,
-                 parameters: NodeParameters):
+                 parameters: NodeParameters[NodeOptions]):
         self._backend, self._failures, self._logger = backend, failures, logger
         self._parameters = parameters
         self._woken = threading.Event()

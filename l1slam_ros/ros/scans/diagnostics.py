@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `scan_loops` says of itself on /diagnostics, once a second."""
+
+from collections import Counter, deque
+from collections.abc import Mapping
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+from l1slam_ros.ros.scans.front_end_thread import FrontEndThread
+from l1slam_ros.ros.scans.map_drawer import MapDrawer
+from l1slam_ros.ros.threads.failures import Failures
+from l1slam_ros.ros.threads.inputs import Traffic
+
+# Seconds, which are as many publications.
+_MINUTE = 60
+_SAID = {'left_out': 'left out, for want of time', 'expired': 'expired, for no odometry surrounds '
+         'them', 'old_stamp': 'of an old stamp'}
+
+
+class ScanDiagnostics:
+    """
+    Publishes the state of the front end.
+
+    Parameters
+    ----------
+    node : whose name and clock it speaks with
+    topics : name -> how its messages come
+    front_end : whose state
+    drawer : of the map
+    failures : what fails now
+
+    """
+
+    def __init__(self, node: Node, topics: Mapping[str, Traffic], front_end: FrontEndThread,
+                 drawer: MapDrawer, failures: Failures):
+        self._node, self._topics, self._front_end = node, topics, front_end
+        self._drawer, self._failures = drawer, failures
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._minute = deque([Counter[str]()], maxlen=_MINUTE)
+
+    def publish(self) -> None:
+        """Publish one status."""
+        front_end, queue = self._front_end, self._front_end.queue
+        lost = queue.counts.copy() + front_end.refused.copy()
+        lately = lost - self._minute[0]
+        self._minute.append(Counter(lost))
+        values: dict[str, object] = {
+            f'{topic}.{name}': value for topic, traffic in self._topics.items()
+            for name, value in traffic.values().items()}
+        values |= {name: front_end.counts[name]
+                   for name in ('scans', 'keyframes', 'parts', 'loops')}
+        values['waiting'] = queue.waiting
+        values |= {f'refused.{cause}': count for cause, count in sorted(lost.items())}
+        median, most = front_end.cost()
+        values |= {'scan_seconds.median': f'{median:.5f}', 'scan_seconds.p99': f'{most:.5f}',
+                   'map.cells': self._drawer.cells}
+        level, sentence = self._judgement(lately)
+        name = self._node.get_fully_qualified_name()
+        message = DiagnosticArray(status=[DiagnosticStatus(
+            level=level, name=f'{name}: scans', message=sentence, hardware_id=name,
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+
+    def _judgement(self, lately: Counter[str]) -> tuple[bytes, str]:
+        """Return the level and all that is wrong now, in one sentence."""
+        if failures := self._failures.lasting:
+            return DiagnosticStatus.ERROR, '; '.join(
+                f'{what} failed: {why}' for what, why in failures.items())
+        wrong = []
+        if lately:
+            wrong.append('messages not used in the last minute: ' + ', '.join(
+                f'{count} {_SAID.get(cause, cause)}' for cause, count in sorted(lately.items())))
+        if (sources := self._topics['odom'].publishers()) > 1:
+            wrong.append(f'odom has {sources} publishers; expected one')
+        missing = [topic for topic in ('scan', 'odom', 'path')
+                   if not self._topics[topic].publishers()]
+        if missing:
+            wrong.append(f'nobody publishes {", ".join(missing)}')
+        return (DiagnosticStatus.WARN, '; '.join(wrong)) if wrong else (DiagnosticStatus.OK, 'ok')

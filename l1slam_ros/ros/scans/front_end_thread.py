@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The thread that does all the work of `scan_loops`: scans first, the map when there are none."""
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Path
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import LaserScan
+
+from l1slam_ros.core.errors import L1SlamError, MessageError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.kernels.compiled import make_ready
+from l1slam_ros.core.scans import kernels
+from l1slam_ros.core.scans.front_end import ScanFrontEnd
+from l1slam_ros.core.scans.odometry import Step
+from l1slam_ros.core.scans.points import Mount, Scan
+from l1slam_ros.io.messages.conversion import odometry_in
+from l1slam_ros.ros.scans.map_drawer import MapDrawer
+from l1slam_ros.ros.scans.messages import covariance_in, path_in, scan_in
+from l1slam_ros.ros.scans.mounting import StaticTransforms
+from l1slam_ros.ros.scans.options import ScanLoopsOptions
+from l1slam_ros.ros.scans.placing import Placing
+from l1slam_ros.ros.scans.publishing import ScanPublisher
+from l1slam_ros.ros.scans.scan_odometry import IncrementalOdometry
+from l1slam_ros.ros.scans.scan_queue import ScanQueue
+from l1slam_ros.ros.threads.failures import Failures
+
+# So many messages are kept until there is time for them.
+_BACKLOG = 20_000
+# [s] How long /tf_static may take to say where the laser is.
+_MOUNTING = 2.0
+# [s] So often, at most, the path is read while there is nothing else to do; and the map looked at.
+_READ, _LOOK = 1.0, 0.1
+_REPEAT_WARNING = 5.0  # [s]
+# [s] What raises each time it is called shall not keep a core busy.
+_BREATH = 0.05
+# Costs of so many scans are kept.
+_COSTS = 1000
+
+
+class FrontEndThread:
+    """
+    Takes messages in the order they came, and publishes what comes of them.
+
+    Parameters
+    ----------
+    node : to log with
+    options : returns them as they are now
+    publisher : of odometry and loops
+    drawer : of the map
+    failures : where to tell what nobody foresaw
+    static : whether /tf_static is heard
+
+    Attributes
+    ----------
+    refused : cause -> how many messages could not be used
+    queue : the scans that wait
+    counts : of what has been made
+    costs : of the last scans [s]
+    ready : whether its loops are compiled
+
+    """
+
+    def __init__(self, node: Node, options: Callable[[], ScanLoopsOptions],
+                 publisher: ScanPublisher, drawer: MapDrawer, failures: Failures, static: bool):
+        self._logger, self._options = node.get_logger(), options
+        self._publisher, self._drawer, self._failures = publisher, drawer, failures
+        self._static = StaticTransforms() if static else None
+        self.refused, self.counts = Counter[str](), Counter[str]()
+        self.costs: deque[float] = deque(maxlen=_COSTS)
+        self._inbox: deque[tuple[str, bytes]] = deque(maxlen=_BACKLOG)
+        self._woken, self._closing = threading.Event(), False
+        self._uses = {'scan': self._on_scan, 'odom': self._on_odometry, 'path': self._on_path,
+                      'pose_with_covariance': self._on_covariance, '/tf_static': self._on_static}
+        self._base, self._wheels_frame, self._laser = options().base_frame, '', ''
+        self._mount: Mount | None = None
+        self._mounting = 0.0
+        self.queue, self.ready = ScanQueue(), False
+        self._thread = threading.Thread(target=self._work, name='front end', daemon=True)
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Begin with no scan seen."""
+        options = self._options()
+        self._front_end = ScanFrontEnd(options, self._mount or Mount())
+        self._told = IncrementalOdometry(options.keyframe)
+        self._placing = Placing()
+        self._path, self._read = b'', 0.0
+        self._restarts = self.queue.restarts
+        self._drawer.begin_anew()
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def put(self, topic: str, data: bytes) -> None:
+        """Leave a serialised message; any thread may call it."""
+        self._inbox.append((topic, data))
+        self._woken.set()
+
+    def close(self, seconds: float) -> bool:
+        """End the thread; return whether it ended within some seconds."""
+        self._closing = True
+        self._woken.set()
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+    def _work(self) -> None:
+        try:
+            for loop in vars(kernels).values():
+                if hasattr(loop, 'takes') and not self._closing:
+                    make_ready(loop, False)
+        except Exception as error:  # what is missing is compiled when it is first called
+            self._failures.note('compiling', error)
+        self.ready = True
+        more = False
+        while not self._closing:
+            self._woken.wait(0.0 if more else _LOOK)
+            self._woken.clear()
+            try:
+                more = self._turn()
+                self._failures.over('front end')
+            except Exception as error:
+                self._failures.note('front end', error)
+                time.sleep(_BREATH)
+
+    def _turn(self) -> bool:
+        """Do the next thing there is to do; return whether there may be more."""
+        while self._inbox:
+            topic, data = self._inbox.popleft()
+            try:
+                self._uses[topic](data)
+            except L1SlamError as error:
+                self._refuse(error)
+        if self.queue.restarts != self._restarts:
+            self._logger.warning('the stamps of odom went back: scans and map begin anew')
+            self._begin_anew()
+        if self._is_mounted() and (taken := self.queue.take(self._options().scan_wait)):
+            self._follow(*taken)
+            return True
+        if self._path and time.monotonic() - self._read > _READ:
+            self._place()
+        return self._drawer.work()
+
+    def _on_scan(self, data: bytes) -> None:
+        message = deserialize_message(data, LaserScan)
+        self.queue.add_scan(scan_in(message, self._options().range_max))
+        self._laser = message.header.frame_id.removeprefix('/')
+
+    def _on_odometry(self, data: bytes) -> None:
+        self._wheels_frame, sample = odometry_in(data)
+        frame = sample.frame.removeprefix('/')
+        self._base = self._base or frame or 'base_link'
+        if frame not in (self._base, ''):
+            raise MessageError('child_frame', f'odometry of {frame!r}; expected that of '
+                               f'{self._base!r}')
+        self.queue.add_wheels(sample.stamp, se2.from_pose3(sample.pose3[None])[0])
+
+    def _on_path(self, data: bytes) -> None:
+        self._path = data
+
+    def _on_covariance(self, data: bytes) -> None:
+        self._placing.add_known(*covariance_in(
+            deserialize_message(data, PoseWithCovarianceStamped)))
+
+    def _on_static(self, data: bytes) -> None:
+        from tf2_msgs.msg import TFMessage
+
+        if self._static is not None:
+            self._static.add(deserialize_message(data, TFMessage))
+
+    def _refuse(self, error: L1SlamError) -> None:
+        self.refused[error.cause if isinstance(error, MessageError) else 'unusable'] += 1
+        self._logger.warning(f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
+
+    def _is_mounted(self) -> bool:
+        """Find out where the laser is, once scans and odometry come; return whether it is."""
+        if self._mount is not None:
+            return True
+        if not self._laser or not self._base:
+            return False
+        now = time.monotonic()
+        self._mounting = self._mounting or now
+        mount, how = self._options().mount(), 'as laser_pose says'
+        if mount is None and self._static is not None:
+            mount, how = self._static.mount(self._base, self._laser), 'as /tf_static says'
+            if mount is None and now - self._mounting < _MOUNTING:
+                return False
+        if mount is None:
+            mount, how = Mount(), 'for neither laser_pose nor /tf_static says otherwise'
+        upside_down = ', upside down' if mount.upside_down else ''
+        self._logger.info(f'the laser {self._laser!r} is at x {mount.x:g} m, y {mount.y:g} m, yaw '
+                          f'{mount.yaw:g} rad{upside_down} of {self._base!r}, {how}')
+        self._mount = mount
+        self._begin_anew()
+        return True
+
+    def _follow(self, scan: Scan, wheels: Array) -> None:
+        """Follow the robot to a scan, and tell what came of it."""
+        began = time.thread_time()
+        keyframes = self._front_end.keyframes
+        before = keyframes[-1].part if keyframes else 0
+        step = self._front_end.add(scan, wheels)
+        begins = self._front_end.keyframes[-1].part != before
+        pose, covariance = self._told.tell(scan.stamp, step, begins)
+        self._publisher.odometry(self._base, scan.stamp, pose, covariance)
+        self._publisher.wheels_frame(self._wheels_frame, scan.stamp, pose, wheels)
+        self._placing.add_odometry(scan.stamp, step.pose)
+        self._say(step, begins)
+        if step.keyframe is not None:
+            self._place()
+            for loop in self._front_end.loops():
+                self._publisher.loop(self._base, self._front_end.keyframes, loop)
+                self.counts['loops'] += 1
+        self.counts['scans'] += 1
+        self.costs.append(time.thread_time() - began)
+        self._count()
+
+    def _say(self, step: Step, begins: bool) -> None:
+        if begins:
+            self._logger.warning(step.said)
+        elif step.said:
+            self._logger.warning(step.said, throttle_duration_sec=_REPEAT_WARNING)
+        if left := self.queue.counts['left_out']:
+            self._logger.warning(f'{left} scans were left out: they come faster than they are '
+                                 'used; expected a laser that is slower, or a machine that is '
+                                 'faster', once=True)
+
+    def _count(self) -> None:
+        keyframes = self._front_end.keyframes
+        self.counts['keyframes'] = len(keyframes)
+        self.counts['parts'] = keyframes[-1].part + 1 if keyframes else 0
+
+    def _place(self) -> None:
+        """Let front end and map know where the path has the keyframes."""
+        if self._path:
+            self._placing.set_path(*path_in(deserialize_message(self._path, Path)))
+            self._path, self._read = b'', time.monotonic()
+        keyframes = self._front_end.keyframes
+        poses = self._placing.place(keyframes)
+        if not len(poses):
+            return
+        placed = keyframes[: len(poses)]
+        self._front_end.place(poses, self._placing.spread(placed))
+        joined = self._placing.joined(placed)
+        self._drawer.follow(self._placing.frame, placed[-1].stamp, {
+            number: (keyframe.points, pose)
+            for number, (keyframe, pose) in enumerate(zip(placed, poses, strict=True))
+            if keyframe.part in joined})
+
+    def cost(self) -> tuple[float, float]:
+        """Return what the last scans cost, median and 99% quantile [s] of a core."""
+        median, most = np.quantile(list(self.costs) or [0.0], (0.5, 0.99)).tolist()
+        return median, most

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`map` and `~/save_map`: the occupancy grid of the scans, where the optimised path has them."""
+
+import threading
+import time
+from array import array
+from collections.abc import Callable
+from pathlib import Path
+
+from geometry_msgs.msg import Point, Pose, Quaternion
+from nav_msgs.msg import MapMetaData, OccupancyGrid
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.scans.live_grid import LiveGrid
+from l1slam_ros.core.scans.points import Points
+from l1slam_ros.io.files import counted
+from l1slam_ros.io.scans.grid_file import write_grid
+from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.scans.options import ScanLoopsOptions
+
+# [s] Scans wait no longer for the map.
+_SLICE = 0.01
+
+
+class MapDrawer:
+    """
+    Draws a map a little at a time, and publishes it when it is whole again.
+
+    Parameters
+    ----------
+    node : to publish from
+    options : returns them as they are now
+
+    Attributes
+    ----------
+    cells : of the map that was published last, for diagnostics
+
+    """
+
+    def __init__(self, node: Node, options: Callable[[], ScanLoopsOptions]):
+        self._options = options
+        self._publisher = node.create_publisher(OccupancyGrid, 'map', QoSProfile(
+            depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        self._lock = threading.Lock()
+        self.cells = 0
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Forget all that is drawn."""
+        with self._lock:
+            self._grid = LiveGrid(self._options().map_resolution)
+            self._frame, self._stamp = 'map', 0
+            self._wanted: dict[int, tuple[Points, Array]] = {}
+            self._to_draw: list[int] = []
+            self._changed, self._due = False, 0.0
+
+    def follow(self, frame: str, stamp: int, placed: dict[int, tuple[Points, Array]]) -> None:
+        """Hear where keyframes lie, by their numbers; stamp : of the newest [ns]."""
+        with self._lock:
+            for keyframe in self._wanted.keys() - placed.keys():
+                self._grid.erase(keyframe)
+                self._changed = True
+            self._frame, self._stamp, self._wanted = frame, stamp, placed
+            self._to_draw = [keyframe for keyframe, (_, pose) in placed.items()
+                             if not self._grid.is_as_drawn(keyframe, pose)]
+
+    def work(self) -> bool:
+        """Draw for a moment, or publish what is due; return whether there is more to draw."""
+        with self._lock:
+            self._draw(time.monotonic() + _SLICE)
+            if self._to_draw:
+                return True
+            now = time.monotonic()
+            if self._changed and now >= self._due:
+                self._publish()
+                self._changed, self._due = False, now + self._options().map_period
+            return False
+
+    def save(self) -> str:
+        """
+        Write the map; return what is to be said of it.
+
+        Raises
+        ------
+        OptionError : no file is named, or there is no map yet.
+        FileError : it cannot be written.
+
+        """
+        path = self._options().map_path
+        if not path:
+            raise OptionError('map_path is empty, expected the name of a .pgm file')
+        with self._lock:
+            self._draw(float('inf'))
+            drawn, grid = len(self._grid), self._grid.grid()
+        if not drawn:
+            raise OptionError('there is no map yet; expected scans, and a path from the back end')
+        write_grid(Path(path), grid)
+        width, height = grid.log_odds.shape
+        return f'{path}: {width} x {height} cells of {counted(drawn, "keyframe")}'
+
+    def _draw(self, until: float) -> None:
+        while self._to_draw and time.monotonic() < until:
+            keyframe = self._to_draw.pop()
+            self._grid.draw(keyframe, *self._wanted[keyframe])
+            self._changed = True
+
+    def _publish(self) -> None:
+        grid = self._grid.grid()
+        width, height = grid.log_odds.shape
+        message = OccupancyGrid(header=header(self._frame, self._stamp))
+        x, y = grid.origin.tolist()
+        message.info = MapMetaData(
+            map_load_time=message.header.stamp, resolution=grid.resolution, width=width,
+            height=height, origin=Pose(position=Point(x=x, y=y, z=0.0),
+                                       orientation=Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)))
+        # Row by row of y, from the lowest.
+        message.data = array('b', grid.occupancy.T.tobytes())
+        self._publisher.publish(message)
+        self.cells = width * height

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages of `scan_loops` -> records, by their attributes, and back."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from l1slam_ros.core.errors import MessageError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.scans.points import Scan
+from l1slam_ros.io.files import NANOSECONDS
+from l1slam_ros.io.messages.conversion import stamp_of
+
+# Fewer rays are no scan, more no laser.
+_FEWEST, _MOST = 2, 100_000
+_ROWS = np.array(se2.COVARIANCE_ROWS)
+
+
+def scan_in(message: Any, range_max: float) -> Scan:
+    """
+    Return what a sensor_msgs/LaserScan says; range_max : [m] besides its own, 0: that alone.
+
+    Raises
+    ------
+    MessageError : its stamp is none, or it holds no rays.
+
+    """
+    stamp, count = stamp_of(message.header), len(message.ranges)
+    numbers = (message.angle_min, message.angle_increment, message.range_min, message.range_max,
+               message.time_increment)
+    if not _FEWEST <= count <= _MOST or any(map(math.isnan, numbers)) or not (
+            0 < abs(message.angle_increment) * (count - 1) <= 4 * math.pi):
+        raise MessageError('scan', f'a scan of {count} rays every '
+                           f'{message.angle_increment:g} rad; expected {_FEWEST} or more within a '
+                           'turn')
+    farthest = [limit for limit in (message.range_max, range_max) if limit > 0]
+    increment = message.time_increment if 0 < message.time_increment < 1 else 0.0
+    return Scan(stamp, np.array(message.ranges, float), message.angle_min,
+                message.angle_increment, max(message.range_min, 0.0),
+                min(farthest, default=math.inf), increment)
+
+
+def path_in(message: Any) -> tuple[str, Indices, Array]:
+    """Return frame, stamps (n,) [ns] and poses (n, 3) of a nav_msgs/Path."""
+    stamps = np.array([pose.header.stamp.sec * NANOSECONDS + pose.header.stamp.nanosec
+                       for pose in message.poses], np.int64)
+    pose3 = np.array([(p.position.x, p.position.y, p.position.z, p.orientation.x, p.orientation.y,
+                       p.orientation.z, p.orientation.w)
+                      for p in (pose.pose for pose in message.poses)]).reshape(-1, 7)
+    return message.header.frame_id, stamps, se2.from_pose3(pose3)
+
+
+def covariance_in(message: Any) -> tuple[int, Array]:
+    """
+    Return the stamp [ns] and covariance (3, 3) of a geometry_msgs/PoseWithCovarianceStamped.
+
+    Raises
+    ------
+    MessageError : its stamp is none, or it holds no covariance.
+
+    """
+    stamp = stamp_of(message.header)
+    covariance = np.array(message.pose.covariance).reshape(6, 6)[_ROWS[:, None], _ROWS]
+    if not np.isfinite(covariance).all():
+        raise MessageError('not_finite', 'a covariance that is not finite; expected one')
+    return stamp, covariance
+
+
+def whole(covariance: Array) -> Array:
+    """Return a covariance (3, 3) of the plane as messages have it, (6, 6)."""
+    found = np.zeros((6, 6))
+    found[_ROWS[:, None], _ROWS] = covariance
+    return found

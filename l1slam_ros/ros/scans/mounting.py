@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the laser is on the robot, by /tf_static."""
+
+from typing import Any
+
+import numpy as np
+
+from l1slam_ros.core.errors import MessageError
+from l1slam_ros.core.geometry import se3
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.scans.points import Mount
+from l1slam_ros.io.messages.conversion import checked_pose3
+
+# More links from a laser to a robot are a circle.
+_LINKS = 100
+# A laser whose axis is farther off the vertical than by this cosine sees no floor plan.
+_LEVEL = 0.9
+
+
+class StaticTransforms:
+    """What has been heard of /tf_static: each frame's pose in its parent."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, Array]] = {}
+
+    def add(self, message: Any) -> None:
+        """Take in a tf2_msgs/TFMessage; what is no transform of it is left out."""
+        for one in message.transforms:
+            try:
+                pose3 = checked_pose3(one.transform.translation, one.transform.rotation)
+            except MessageError:
+                continue
+            self._parents[one.child_frame_id.removeprefix('/')] = (
+                one.header.frame_id.removeprefix('/'), pose3)
+
+    def mount(self, base: str, laser: str) -> Mount | None:
+        """
+        Return where a laser's frame is in that of the robot; None: nobody has said so.
+
+        Raises
+        ------
+        MessageError : the laser does not look along a floor.
+
+        """
+        pose, frame = se3.from_pose3(np.array([[0.0, 0, 0, 0, 0, 0, 1]])), laser
+        for _ in range(_LINKS):
+            if frame == base:
+                return _mount(laser, se3.to_pose3(pose)[0])
+            if frame not in self._parents:
+                return None
+            frame, pose3 = self._parents[frame]
+            pose = se3.compose(se3.from_pose3(pose3[None]), pose)
+        return None
+
+
+def _mount(laser: str, pose3: Array) -> Mount:
+    """Return the mount at a pose (7,): by where the laser's x and z axes point."""
+    x, y, z, w = pose3[3:]
+    ahead = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
+    up = 1 - 2 * (x * x + y * y)
+    if abs(up) < _LEVEL:
+        raise MessageError('laser_pose', f'the axis of {laser!r} is {up:.2g} of upright; expected '
+                           'a laser that looks along the floor')
+    return Mount(float(pose3[0]), float(pose3[1]), float(np.arctan2(ahead[1], ahead[0])), up < 0)

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `scan_loops` can be told."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.names import OF_ROS
+from l1slam_ros.core.options import option
+from l1slam_ros.core.scans.front_end import FrontEndOptions
+from l1slam_ros.core.scans.points import Mount
+
+# [rad] A roll of nothing or of half a turn, as people write it.
+_ROLL = 0.01
+
+
+@dataclass(frozen=True)
+class ScanLoopsOptions(FrontEndOptions):
+    """Everything the node can be told: the front end's options and its own."""
+
+    PASSED_OVER = OF_ROS
+
+    laser_pose: str = option(
+        '', 'x, y [m], yaw [rad] of the laser in the base frame, and roll where it hangs upside '
+        'down (3.1416); empty: from /tf_static where tf2_msgs is installed, else zero', fixed=True)
+    range_max: float = option(
+        0.0, "farther is no surface; 0: as the scan's own range_max says", 'm', 0, 1e6)
+    scan_wait: float = option(
+        2.0, 'how long a scan waits for odometry on both sides of its stamp, by the stamps of '
+        'later scans', 's', 0.01, 60)
+    base_frame: str = option(
+        '', "the robot's frame; empty: the first child_frame_id of odom", fixed=True)
+    odom_frame: str = option(
+        'scan_odom', 'frame of scan_odom; the wheels have another', fixed=True)
+    publish_tf: bool = option(
+        True, 'publish odom_frame -> frame of odom on /tf, where tf2_msgs is installed',
+        fixed=True)
+    map_resolution: float = option(0.05, 'of a cell of the map', 'm', 0.005, 10, fixed=True)
+    map_period: float = option(
+        2.0, 'how often the map is published, where it has changed', 's', 0.1, 3600)
+    map_path: str = option('', 'the .pgm file of ~/save_map; the .yaml stands beside it')
+
+    def __post_init__(self) -> None:
+        """Check every field; a pose may be a list, as ROS has it, or its text."""
+        if not isinstance(self.laser_pose, str) and isinstance(self.laser_pose, Iterable):
+            object.__setattr__(self, 'laser_pose', ', '.join(map(str, self.laser_pose)))
+        super().__post_init__()
+        object.__setattr__(self, 'base_frame', self.base_frame.removeprefix('/'))
+        object.__setattr__(self, 'odom_frame', self.odom_frame.removeprefix('/'))
+        if self.laser_pose:
+            self.mount()
+        if not self.odom_frame:
+            raise OptionError('odom_frame is empty, expected a name')
+        if self.map_path and not self.map_path.endswith('.pgm'):
+            raise OptionError(f'map_path is {self.map_path!r}, expected the name of a .pgm file')
+
+    def mount(self) -> Mount | None:
+        """
+        Return where the laser is by these options; None: they do not say.
+
+        Raises
+        ------
+        OptionError : `laser_pose` is no pose.
+
+        """
+        words = self.laser_pose.strip('[]() ').replace(',', ' ').split()
+        if not words:
+            return None
+        expected = 'x, y, yaw and, where it hangs, a roll of 3.1416'
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError:
+            numbers = []
+        if len(numbers) not in (3, 4) or not all(map(math.isfinite, numbers)):
+            raise OptionError(f'laser_pose is {self.laser_pose!r}, expected {expected}')
+        x, y, yaw, roll = (*numbers, 0.0)[:4]
+        if abs(math.sin(roll)) > _ROLL:
+            raise OptionError(f'laser_pose has a roll of {roll:g}, expected {expected}')
+        return Mount(x, y, yaw, math.cos(roll) < 0)

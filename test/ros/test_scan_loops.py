@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scan front end beside the back end, over DDS, in rooms that are known."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid, Odometry
+from nav_msgs.msg import Path as PathMessage
+from node_bench import poses_of
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rooms import RAYS, WALLS, by_wheels, laps, ranges_from
+from sensor_msgs.msg import LaserScan
+from std_srvs.srv import Trigger
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.ros.node import BackendNode
+from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.scans.node import ScanLoopsNode
+
+DEADLINE = 60.0
+PERIOD = 10**8
+SHIPPED = Path(__file__).parents[2] / 'config' / 'scan_loops.yaml'
+
+
+class Robot:
+    """Both nodes in this process, and a peer that sends what a robot would."""
+
+    def __init__(self, rclpy, **parameters):
+        files = ['--ros-args', '--params-file', str(SHIPPED)]
+        overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+        self.front_end = ScanLoopsNode(parameter_overrides=overrides, cli_args=files)
+        self.backend = BackendNode(cli_args=[*files, '-r', 'odom:=scan_odom'])
+        self.peer = rclpy.create_node('peer')
+        self.executor = SingleThreadedExecutor()
+        for node in (self.front_end, self.backend, self.peer):
+            self.executor.add_node(node)
+        self.scans = self.peer.create_publisher(LaserScan, 'scan', qos_profile_sensor_data)
+        self.wheels = self.peer.create_publisher(Odometry, 'odom', QoSProfile(depth=100))
+        self.received = {}
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        for kind, topic, qos in ((PathMessage, 'path', latched), (OccupancyGrid, 'map', latched),
+                                 (Odometry, 'scan_odom', 1000), (PoseStamped, 'pose', 1000),
+                                 (PoseWithCovarianceStamped, 'loop_closures', 1000),
+                                 (DiagnosticArray, '/diagnostics', 100)):
+            self.received[topic] = []
+            self.peer.create_subscription(kind, topic, self.received[topic].append, qos)
+        self.until(lambda: self.scans.get_subscription_count()
+                   and self.wheels.get_subscription_count(), 'the node subscribes')
+        self.until(self.is_ready, 'its loops are compiled')
+
+    def is_ready(self):
+        return self.front_end._front_end.ready
+
+    @property
+    def used(self):
+        return self.front_end._front_end.counts['scans']
+
+    def until(self, condition, what):
+        deadline = time.monotonic() + DEADLINE
+        while not condition():
+            assert time.monotonic() < deadline, f'waited {DEADLINE} s in vain until {what}'
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def wheels_at(self, k, pose):
+        message = Odometry(header=header('odom', (k + 10) * PERIOD), child_frame_id='base_link')
+        x, y, z, *q = se2.to_pose3(pose[None])[0].tolist()
+        position, turn = message.pose.pose.position, message.pose.pose.orientation
+        position.x, position.y, position.z, (turn.x, turn.y, turn.z, turn.w) = x, y, z, q
+        self.wheels.publish(message)
+
+    def scan_at(self, k, pose, **changes):
+        message = LaserScan(
+            header=header('laser', (k + 10) * PERIOD), angle_min=-np.pi,
+            angle_increment=2 * np.pi / RAYS, range_min=0.05, range_max=8.0)
+        seen = ranges_from(pose) + np.random.default_rng(k).normal(0, 0.01, RAYS)
+        message.ranges = np.where(seen < 8.0, seen, np.inf).tolist()
+        for name, value in changes.items():
+            setattr(message, name, value)
+        self.scans.publish(message)
+
+    def drive(self, truth, wheels, first=0, ahead=2):
+        """Send scans and wheels, no more than a few before they are used."""
+        used = self.used
+        for k in range(len(truth)):
+            self.scan_at(first + k, truth[k])
+            self.wheels_at(first + k, wheels[k])
+            self.until(lambda n=k: self.used - used >= n - ahead, 'scans are used')
+
+    def status(self, name='scans'):
+        """Return level, sentence and values that the front end last said of itself."""
+        for message in reversed(self.received['/diagnostics']):
+            for status in message.status:
+                if status.name.endswith(name):
+                    return status.level, status.message, {
+                        v.key: v.value for v in status.values}
+        return None, '', {}
+
+    def call(self, service):
+        client = self.peer.create_client(Trigger, service)
+        self.until(client.service_is_ready, f'{service} is offered')
+        future = client.call_async(Trigger.Request())
+        self.until(future.done, f'{service} answers')
+        return future.result()
+
+    def close(self):
+        self.executor.shutdown()
+        assert self.front_end.close(), 'its threads end'
+        self.backend.close()
+        self.peer.destroy_node()
+
+
+@pytest.fixture
+def robot(ros):
+    """Return what makes the two nodes with their peer; all are closed after the test."""
+    robots = []
+
+    def make(**parameters):
+        robots.append(Robot(ros, **parameters))
+        return robots[-1]
+
+    yield make
+    for made in robots:
+        made.close()
+
+
+def test_two_laps_make_a_map(robot, tmp_path, rng):
+    truth = laps(2)
+    wheels = by_wheels(truth, rng)
+    r = robot(map_path=str(tmp_path / 'rooms.pgm'), **{'map_period': 0.5})
+    r.drive(truth, wheels)
+    r.until(lambda: r.received['path'] and len(r.received['path'][-1].poses)
+            == r.front_end._front_end.counts['keyframes'], 'the path has every keyframe')
+    r.call('/backend/optimize')
+    print(r.status(), r.status('map'))
+    path = r.received['path'][-1]
+    stamps = np.array([p.header.stamp.sec * 10**9 + p.header.stamp.nanosec for p in path.poses])
+    rows = stamps // PERIOD - 10
+    wrong = absolute_trajectory_error(poses_of(path)[:, :2], truth[rows, :2])
+    print(wrong, absolute_trajectory_error(wheels[rows, :2], truth[rows, :2]))
+    print(len(r.received['loop_closures']), r.backend._backend.counts()[0])
+    print(r.call('/scan_loops/save_map'))
