@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `scan_loops` is made of, each alone: the queue, the odometry it states, mounts, options."""
+
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip('rclpy')
+
+from l1slam_ros.core.errors import MessageError, OptionError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.measurements import OdometrySample
+from l1slam_ros.core.online.backend import Backend, BackendOptions
+from l1slam_ros.core.options import dotted, flatten
+from l1slam_ros.core.scans.odometry import ScanKeyframes, Step
+from l1slam_ros.core.scans.points import Mount, Scan
+from l1slam_ros.core.scans.submaps import Keyframe
+from l1slam_ros.io.node_options import NodeOptions, read_params_file
+from l1slam_ros.ros.demo import executable
+from l1slam_ros.ros.scans.messages import scan_in, whole
+from l1slam_ros.ros.scans.mounting import StaticTransforms
+from l1slam_ros.ros.scans.options import ScanLoopsOptions
+from l1slam_ros.ros.scans.placing import Placing
+from l1slam_ros.ros.scans.scan_odometry import IncrementalOdometry
+from l1slam_ros.ros.scans.scan_queue import ScanQueue
+
+SHIPPED = Path(__file__).parents[2] / 'config' / 'scan_loops.yaml'
+S = 10**9
+
+
+def scan(stamp):
+    return Scan(stamp, np.ones(4), 0.0, 1.0)
+
+
+def at(x, yaw=0.0):
+    return np.array([x, 0.0, yaw])
+
+
+def test_a_scan_gets_the_wheels_of_its_stamp():
+    queue = ScanQueue()
+    queue.add_wheels(1 * S, at(1.0))
+    queue.add_scan(scan(1 * S + S // 4))
+    assert queue.take(2.0) is None and queue.waiting == 1
+    queue.add_wheels(2 * S, at(2.0))
+    taken, wheels = queue.take(2.0)
+    assert taken.stamp == 1 * S + S // 4
+    np.testing.assert_allclose(wheels, at(1.25))
+    assert not queue.counts and queue.take(2.0) is None
+
+
+def test_a_scan_that_no_odometry_surrounds_expires_and_is_counted():
+    queue = ScanQueue()
+    queue.add_wheels(10 * S, at(0.0))
+    queue.add_scan(scan(9 * S))  # before all odometry: nothing older will come
+    assert queue.take(2.0) is None and queue.counts['expired'] == 1
+    queue.add_scan(scan(11 * S))
+    queue.add_scan(scan(13 * S))
+    assert queue.take(2.0) is None and queue.waiting == 2
+    queue.add_scan(scan(13 * S + 1))  # more than two seconds later
+    assert queue.take(2.0) is None and queue.counts['expired'] == 2
+    queue.add_wheels(14 * S, at(1.0))  # but four seconds without odometry are no motion known
+    assert queue.take(2.0) is None and queue.counts['expired'] == 4
+
+
+def test_who_is_behind_gets_the_newest_scan():
+    queue = ScanQueue()
+    for k in range(1, 8):
+        queue.add_wheels(k * S, at(k))
+        queue.add_scan(scan(k * S))
+    taken, _ = queue.take(2.0)
+    assert taken.stamp == 7 * S and queue.counts == {'left_out': 6}
+
+
+def test_three_scans_may_wait_and_are_used_in_turn():
+    queue = ScanQueue()
+    for k in range(1, 4):
+        queue.add_wheels(k * S, at(k))
+        queue.add_scan(scan(k * S))
+    assert [queue.take(2.0)[0].stamp // S for _ in range(3)] == [1, 2, 3]
+    assert not queue.counts
+
+
+def test_time_goes_back_when_two_stamps_say_so():
+    queue = ScanQueue()
+    for stamp in (10, 11, 5, 12):  # one stray stamp
+        queue.add_wheels(stamp * S, at(stamp))
+    assert queue.restarts == 0 and queue.counts == {'old_stamp': 1}
+    queue.add_wheels(3 * S, at(3))
+    queue.add_wheels(4 * S, at(4))
+    queue.add_scan(scan(4 * S))
+    assert queue.restarts == 1
+    assert queue.take(2.0)[0].stamp == 4 * S
+
+
+def steps(rng, count=40):
+    """Yield stamps and what a front end says of a robot that goes along, a metre in ten scans."""
+    options, keyframe, pose = ScanKeyframes(), np.zeros(3), np.zeros(3)
+    for k in range(count):
+        pose = se2.compose(pose[None], np.array([[0.1, 0.0, 0.02]]))[0] if k else pose
+        moved = se2.between(keyframe[None], pose[None])[0]
+        is_keyframe = not k or np.hypot(*moved[:2]) >= options.translation
+        root = rng.normal(0, 0.02, (3, 3)) * (1, 1, 0.3)
+        covariance = root @ root.T + 1e-5 * np.eye(3)
+        made = Keyframe(k, pose, None, 0, 0.0) if is_keyframe else None
+        yield (k + 1) * S // 10, Step(pose, made, covariance)
+        keyframe = pose if is_keyframe else keyframe
+
+
+def test_the_back_end_has_the_keyframes_of_the_scans_and_what_they_know(rng):
+    shipped = read_params_file_of('backend')
+    backend = Backend(BackendOptions.from_mapping(shipped), 2)
+    told, keyframes, stated = IncrementalOdometry(ScanKeyframes()), [], []
+    for stamp, step in steps(rng):
+        pose, covariance = told.tell(stamp, step, begins=False)
+        assert np.linalg.eigvalsh(covariance).min() > 0
+        backend.add_odometry(OdometrySample(
+            stamp, se2.to_pose3(pose[None])[0], whole(covariance), np.zeros((6, 6)), 'base'))
+        if step.keyframe is not None:
+            keyframes.append(stamp)
+            stated.append(step.covariance)
+    now = backend.snapshot()
+    assert now.stamps.tolist() == keyframes and len(keyframes) > 7
+    factors = now.graph.between
+    found = np.linalg.inv(np.einsum('mki,mkj->mij', factors.sqrt_information[:],
+                                    factors.sqrt_information[:]))
+    for covariance, expected in zip(found, stated[1:], strict=True):
+        # No less than the front end knows, in any direction; random ones that shrink add some.
+        assert np.linalg.eigvalsh(covariance - expected).min() > -1e-9
+
+
+def test_a_steady_covariance_is_stated_as_it_is():
+    told, expected = IncrementalOdometry(ScanKeyframes()), np.diag((4e-4, 1e-4, 1e-5))
+    total, last = np.zeros((3, 3)), np.zeros(3)
+    for k in range(6):
+        pose = np.array([0.1 * k, 0.0, 0.0])
+        made = Keyframe(k, pose, None, 0, 0.0) if k in (0, 5) else None
+        _, covariance = told.tell(k + 1, Step(pose, made, expected), begins=False)
+        if k:
+            Ad = se2.adjoint(se2.between(pose[None], last[None]))[0]
+            total = Ad @ total @ Ad.T + covariance
+        last = pose
+    np.testing.assert_allclose(np.diag(total), np.diag(expected), rtol=0.05)
+
+
+def test_a_new_part_is_a_gap_to_the_back_end():
+    told = IncrementalOdometry(ScanKeyframes())
+    backend = Backend(BackendOptions.from_mapping(read_params_file_of('backend')), 2)
+    for k in range(30):
+        pose = np.array([0.1 * k, 0.0, 0.0])
+        made = Keyframe(k, pose, None, k // 15, 0.0) if k in (0, 5, 10, 15, 20, 25) else None
+        pose, covariance = told.tell((k + 1) * S // 10, Step(pose, made, 1e-4 * np.eye(3)),
+                                     begins=k == 15)
+        backend.add_odometry(OdometrySample(
+            (k + 1) * S // 10, se2.to_pose3(pose[None])[0], whole(covariance), np.zeros((6, 6)),
+            'base'))
+    now = backend.snapshot()
+    assert now.stamps.tolist() == [(k + 1) * S // 10 for k in (0, 5, 10, 15, 20, 25)]
+    assert len(now.graph.between) == 4
+    assert backend.told()['new_part'] == 1
+
+
+def transform(parent, child, pose3):
+    t, q = pose3[:3], pose3[3:]
+    return SimpleNamespace(
+        header=SimpleNamespace(frame_id=parent), child_frame_id=child, transform=SimpleNamespace(
+            translation=SimpleNamespace(x=t[0], y=t[1], z=t[2]),
+            rotation=SimpleNamespace(x=q[0], y=q[1], z=q[2], w=q[3])))
+
+
+def test_static_transforms_say_where_the_laser_is():
+    static, half = StaticTransforms(), np.sqrt(0.5)
+    static.add(SimpleNamespace(transforms=[
+        transform('/base', 'mast', (0.1, 0.2, 1.0, 0, 0, half, half)),
+        transform('mast', 'laser', (0.3, 0.0, 0.1, 1.0, 0, 0, 0)),  # rolled by half a turn
+        transform('mast', 'camera', (0, 0, 0, half, 0, 0, half))]))
+    mount = static.mount('base', 'laser')
+    np.testing.assert_allclose((mount.x, mount.y, mount.yaw), (0.1, 0.5, np.pi / 2))
+    assert mount.upside_down
+    assert static.mount('base', 'sonar') is None and static.mount('base', 'base') == Mount()
+    with pytest.raises(MessageError, match='looks along the floor'):
+        static.mount('base', 'camera')
+    circle = StaticTransforms()
+    circle.add(SimpleNamespace(transforms=[transform('a', 'b', (0, 0, 0, 0, 0, 0, 1)),
+                                           transform('b', 'a', (0, 0, 0, 0, 0, 0, 1))]))
+    assert circle.mount('base', 'a') is None
+
+
+@pytest.mark.parametrize('given, expected', [
+    ('0.1, 0, 1.5', Mount(0.1, 0.0, 1.5)), ('[0.1 0.2 -1]', Mount(0.1, 0.2, -1.0)),
+    ([0.1, 0.0, 0.5, 3.14159], Mount(0.1, 0.0, 0.5, True)), ('', None)])
+def test_a_laser_pose_is_a_text_or_a_list(given, expected):
+    assert ScanLoopsOptions(laser_pose=given).mount() == expected
+
+
+@pytest.mark.parametrize('values, said', [
+    ({'laser_pose': '1, 2'}, 'expected x, y, yaw'), ({'laser_pose': 'ahead'}, 'expected x, y'),
+    ({'laser_pose': '0 0 0 1.57'}, 'roll of 1.57'), ({'map_path': '/maps/a.png'}, 'a .pgm file'),
+    ({'odom_frame': ''}, 'odom_frame is empty')])
+def test_nonsense_is_refused(values, said):
+    with pytest.raises(OptionError, match=said):
+        ScanLoopsOptions(**values)
+
+
+def laser_scan(count=10, increment=0.1, **changes):
+    values = {'angle_min': 0.0, 'angle_increment': increment, 'range_min': 0.1, 'range_max': 8.0,
+              'time_increment': 0.0, 'ranges': [1.0] * count}
+    stamp = SimpleNamespace(sec=1, nanosec=0)
+    return SimpleNamespace(header=SimpleNamespace(stamp=stamp), **values | changes)
+
+
+def test_the_nearer_limit_of_the_range_counts():
+    assert scan_in(laser_scan(), 0.0).range_max == 8.0
+    assert scan_in(laser_scan(), 5.0).range_max == 5.0
+    assert scan_in(laser_scan(range_max=0.0), 0.0).range_max == np.inf
+
+
+@pytest.mark.parametrize('bad', [
+    {'count': 1}, {'increment': 0.0}, {'increment': 2.0}, {'angle_min': np.nan}])
+def test_what_is_no_scan_is_refused(bad):
+    with pytest.raises(MessageError, match='a scan of') as caught:
+        scan_in(laser_scan(**bad), 0.0)
+    assert caught.value.cause == 'scan'
+
+
+def test_keyframes_are_placed_by_the_path_and_odometry_from_there():
+    placing = Placing()
+    for k in range(10):
+        placing.add_odometry((k + 1) * S, at(1.0 * k))
+    keyframes = [Keyframe((k + 1) * S, at(1.0 * k), None, 0, 1.0 * k) for k in (0, 3, 5, 9)]
+    assert len(placing.place(keyframes)) == 0
+    # The path turns by a quarter, and has its keyframes elsewhere.
+    placing.set_path('map', np.array([1, 5, 8]) * S, np.array(
+        [(0, 0, np.pi / 2), (0.5, 4, np.pi / 2), (0.5, 7, np.pi / 2)]))
+    np.testing.assert_allclose(placing.place(keyframes)[:, :2], [(0, 0), (0, 3), (0.5, 5)],
+                               atol=1e-12)
+
+
+def test_what_is_not_known_is_infinite():
+    placing = Placing()
+    keyframes = [Keyframe(k * S, at(1.0 * k), None, 0, 1.0 * k) for k in range(1, 4)]
+    assert np.isinf(placing.spread(keyframes)).all()
+    for stamp, sigma in ((1, 0.0), (3, 0.3)):
+        placing.add_known(stamp * S, np.diag((sigma**2 / 2, sigma**2 / 2, 0.01)))
+    np.testing.assert_allclose(placing.spread(keyframes)[:, 0],
+                               [0.3, np.hypot(0.15, 0.3), np.hypot(0.3, 0.3)])
+
+
+def read_params_file_of(name):
+    return yaml.safe_load(SHIPPED.read_text())[f'/**/{name}']['ros__parameters'] | {
+        'odom_frame': 'scan_odom'} if name != 'backend' else {
+        key: value for key, value in yaml.safe_load(SHIPPED.read_text())[
+            '/**/backend']['ros__parameters'].items() if key != 'odom_frame'}
+
+
+def test_the_shipped_file_equals_the_defaults_and_suits_the_back_end():
+    content = yaml.safe_load(SHIPPED.read_text())
+    shipped = dict(dotted(content['/**/scan_loops']['ros__parameters']))
+    assert shipped == {name: value for name, (value, _) in flatten(ScanLoopsOptions()).items()}
+    backend = read_params_file(SHIPPED)
+    front_end = ScanLoopsOptions()
+    assert backend.odometry.covariance_source == 'increment'
+    assert (backend.keyframe.translation, backend.keyframe.rotation) == (
+        front_end.keyframe.translation, front_end.keyframe.rotation)
+    assert backend.odom_frame == front_end.odom_frame != NodeOptions().odom_frame
+    comments = ' '.join(line.strip(' #') for line in SHIPPED.read_text().splitlines()
+                        if line.lstrip().startswith('#'))
+    for name, (_, meaning) in flatten(front_end).items():
+        assert ' '.join(meaning.doc.split()) in comments, name
+
+
+def test_help_lists_topics_services_and_parameters():
+    helped = subprocess.run([executable('scan_loops'), '--help'], capture_output=True, text=True)
+    assert helped.returncode == 0 and not helped.stderr
+    for word in ('scan_odom', '~/save_map', 'laser_pose', 'map_resolution: 0.05', 'covariance'):
+        assert word in helped.stdout
+
+
+def test_an_unknown_argument_starts_nothing():
+    ran = subprocess.run([executable('scan_loops'), '--loops'], capture_output=True, text=True)
+    assert ran.returncode == 2
+    assert ran.stderr.startswith("scan_loops: '--loops' is no argument of it; expected those of")
