@@ -41,6 +41,10 @@ GRAPH_READERS: dict[str, Callable[[Path, str], GraphRecord]] = {
 }
 
 
+# Of CARMEN logs with scans, packed or not.
+LOG_SUFFIXES = ('.clf', '.log', '.bz2', '.gz')
+
+
 class _Origin(NamedTuple):
     """What the file of a graph says besides; see `GraphRecord`."""
 
@@ -93,6 +97,11 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
 def is_bag(path: Path) -> bool:
     """Tell whether an input is taken for a bag."""
     return path.is_dir() or path.suffix.lower() in BAG_SUFFIXES
+
+
+def is_log(path: Path) -> bool:
+    """Tell whether an input is taken for a log of scans, see `io.scans`."""
+    return path.is_file() and path.suffix.lower() in LOG_SUFFIXES
 
 
 def stored_poses(record: GraphRecord) -> Array:

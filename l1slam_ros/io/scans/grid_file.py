@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+An occupancy grid as nav2's map server reads it: a .pgm, and a .yaml of the same name beside it.
+
+Rows of the picture go from the top, the greatest y, down. With `negate: 0` white is free: 254
+free, 205 unknown, 0 occupied.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.scans.grid import Grid
+from l1slam_ros.io.files import replacing, require_file, write_lines
+from l1slam_ros.io.ours import MARK, marked, refuse_others
+
+_FREE, _UNKNOWN, _OCCUPIED = 254, 205, 0
+
+
+def beside(path: Path) -> Path:
+    """Return the name of the .yaml of a .pgm."""
+    return path.with_suffix('.yaml')
+
+
+def check_grid(path: Path, inputs: list[Path], force: bool = False) -> None:
+    """Refuse, before any work is done, a grid that could not be written in the end."""
+    if path.suffix.lower() != '.pgm':
+        raise FileError(path, 'unknown suffix; expected .pgm')
+    for file in (path, beside(path)):
+        require_file(file)
+    refuse_others((path, beside(path)), inputs, force)
+
+
+def write_grid(path: Path, grid: Grid) -> None:
+    """
+    Write a grid: `path` with the suffix .pgm, and the .yaml beside it, each whole or not at all.
+
+    Raises
+    ------
+    FileError : it cannot be written.
+
+    """
+    occupancy = grid.occupancy
+    shade = np.where(occupancy < 0, _UNKNOWN, np.where(occupancy > 0, _OCCUPIED, _FREE))
+    picture = np.ascontiguousarray(shade.astype(np.uint8).T[::-1])
+    height, width = picture.shape
+    with replacing(path) as temporary:
+        temporary.write_bytes(f'P5\n{MARK}\n{width} {height}\n255\n'.encode() + picture.tobytes())
+    x, y = grid.origin.tolist()
+    write_lines(beside(path), marked([
+        f'image: {path.name}', 'mode: trinary', f'resolution: {grid.resolution}',
+        f'origin: [{x:.6f}, {y:.6f}, 0.0]', 'negate: 0', 'occupied_thresh: 0.65',
+        'free_thresh: 0.25']))
