@@ -13,8 +13,9 @@ import bz2
 import gzip
 import math
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.scans.points import Mount, Scan
 from l1slam_ros.io.scans.laser_log import LaserLog
 
-_OPEN = {'.bz2': bz2.open, '.gz': gzip.open}
+_OPEN: dict[str, Callable[[Path, str], Any]] = {'.bz2': bz2.open, '.gz': gzip.open}
 # [m] CARMEN's laser says so, or more, where nothing is in range.
 _FAR = 80.0
 # A longer line is no message of a laser.
@@ -73,7 +74,7 @@ def _in_order(stamps: list[int]) -> list[int]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
-    opened = _OPEN.get(path.suffix.lower(), open)
+    opened = _OPEN.get(path.suffix.lower(), Path.open)
     try:
         with opened(path, 'rb') as file:
             number = 0
