@@ -74,7 +74,9 @@ def read(arguments: argparse.Namespace, path: Path, quiet: bool = False) -> Grap
 
         options = read_params_file(arguments.params_file)
     if is_log(path):
-        return read_scan_map(arguments, path, quiet).record
+        record = read_scan_map(arguments, path, quiet).record
+        warn(record.skipped, quiet)
+        return record
     topics = Topics(arguments.odom_topic, arguments.loop_topic)
     record = formats.read_input(path, options, topics, arguments.rotation_information,
                                 options.dimension if options else 2)
@@ -84,7 +86,7 @@ def read(arguments: argparse.Namespace, path: Path, quiet: bool = False) -> Grap
 
 def read_scan_map(arguments: argparse.Namespace, path: Path, quiet: bool = False,
                   topic: str | None = None) -> 'ScanMap':
-    """Return what the scans of a log, or of a bag's topic, make; warn of what was skipped."""
+    """Return what the scans of a log, or of a bag's topic, make."""
     from l1slam_ros.io.scans.reading import read_scans
 
     compile_now((*SPARSE, *JUDGEMENT), quiet)
@@ -93,9 +95,7 @@ def read_scan_map(arguments: argparse.Namespace, path: Path, quiet: bool = False
             progress.reach(scans, of_all)
             progress.advance(0, counted(loops, 'loop'))
 
-        made = read_scans(path, arguments.odom_topic, topic, report)
-    warn(made.record.skipped, quiet)
-    return made
+        return read_scans(path, arguments.odom_topic, topic, report)
 
 
 def warn(sentences: Sequence[str], quiet: bool = False) -> None:
