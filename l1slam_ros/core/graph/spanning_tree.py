@@ -18,10 +18,13 @@ def odometry_poses(graph: FactorGraph) -> Array:
 
     Raises
     ------
-    GraphError : two consecutive keyframes without a factor between them.
+    GraphError : a keyframe, but the first, without odometry from a predecessor.
 
     """
-    parent = np.maximum(np.arange(graph.n_poses) - 1, 0)
+    parent = graph.parent
+    if (parent[1:] == np.arange(1, graph.n_poses)).any():
+        raise GraphError(f'keyframe {np.flatnonzero(parent == np.arange(graph.n_poses))[1]} has no '
+                         'predecessor; expected odometry that joins all keyframes')
     odometry = np.flatnonzero(graph.between.is_odometry)
     return _compose_along(graph, parent, odometry)
 

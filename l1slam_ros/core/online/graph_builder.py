@@ -14,9 +14,8 @@ import numpy as np
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.geometry.noise import MOST_OF_ODOMETRY, root_of_inverse
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import NO_PREDECESSOR, FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, Notes, OdometrySample
-from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.online.keyframes import (
     KeyframeMotion,
     KeyframeOptions,
@@ -194,7 +193,7 @@ class GraphBuilder:
     def _begin_part(self, stamp: int, pose: Array) -> None:
         """Begin a part of the map with a keyframe."""
         self.track.append(stamp, pose, is_keyframe=True)
-        self.graph.add_poses(1)
+        self.graph.add_poses(1, begins_part=True)
         self._motion = KeyframeMotion(self.graph.manifold, stamp, pose)
 
     def _forget(self) -> None:
@@ -217,8 +216,12 @@ class GraphBuilder:
     def restore(self, state: BuilderState) -> None:
         """Go on where a run ended; odometry that begins elsewhere begins a part there."""
         self._begin(state.graph)
+        # In a file a loop across a gap looks like odometry.
+        steps = self.graph.between.step_to
+        firsts = np.flatnonzero((steps[1:] < 0) | np.isin(steps[1:], state.loop_rows)) + 1
+        self.graph.follow(firsts, NO_PREDECESSOR)
         track, stamps = self.track, state.stamps
-        for part in np.split(np.arange(len(stamps)), odometry_gaps(self.graph) + 1):
+        for part in np.split(np.arange(len(stamps)), firsts):
             track.extend_by_part(stamps[part], state.odometry[part])
         self.offset = state.offset
         self._motion = KeyframeMotion(self.graph.manifold, track.last_stamp, track.last_pose)

@@ -48,10 +48,11 @@ def of_all(improvement: Improvement, problem: Problem) -> Improvement:
 
 
 def _tied(graph: FactorGraph, poses: Array, keyframes: Indices) -> FactorGraph:
-    """Return the graph with keyframes k > 0 tied to k - 1 as they stand in poses (n, p)."""
+    """Return the graph with keyframes k tied to k - 1, of another part, as poses (n, p) have it."""
     manifold, d = graph.manifold, graph.manifold.TANGENT_SIZE
     extent = float(np.ptp(manifold.positions(poses), axis=0).max()) if len(poses) else 0.0
     sigma = sigmas(manifold, 1.0 + extent, _HEADING)
+    graph.follow(keyframes, keyframes - 1)
     graph.append_between(
         keyframes - 1, keyframes, manifold.between(poses[keyframes - 1], poses[keyframes]),
         np.broadcast_to(np.diag(1 / sigma), (len(keyframes), d, d)))

@@ -240,14 +240,21 @@ class Snapshot:
                               self.odometry)
 
     def _followed(self, poses: Array, others: Array) -> Array:
-        """Return poses (k, p) and all keyframes after them, as they follow in others (n, p)."""
+        """
+        Return poses (k, p), and behind them the other keyframes as they follow in others (n, p).
+
+        Each follows the last of its predecessors that is known, the first of a part the last
+        keyframe that is.
+        """
         manifold, known = self.graph.manifold, len(poses)
-        new = others[known:]
-        if known and len(new):
-            start = np.broadcast_to(others[known - 1], new.shape)
-            last = np.broadcast_to(poses[-1], new.shape)
-            new = manifold.compose(last, manifold.between(start, new))
-        return np.concatenate((poses, new))
+        if not known or known == len(others):
+            return np.concatenate((poses, others[known:]))
+        before = np.where(self.graph.parent < np.arange(len(others)), self.graph.parent, known - 1)
+        while (before[known:] >= known).any():
+            before = np.where(before >= known, before[before], before)
+        before = before[known:]
+        way = manifold.between(others[before], others[known:])
+        return np.concatenate((poses, manifold.compose(poses[before], way)))
 
     @cached_property
     def judgement(self) -> Judgement:

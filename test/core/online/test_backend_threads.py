@@ -62,8 +62,8 @@ def test_nobody_sees_a_keyframe_without_its_odometry(monkeypatch):
     backend, meeting, add_poses = Backend(EVERY), Meeting(), FactorGraph.add_poses
     drive(backend, 0, 1)
 
-    def slowly(graph, count=1):
-        add_poses(graph, count)
+    def slowly(graph, *given, **how):
+        add_poses(graph, *given, **how)
         meeting()
 
     monkeypatch.setattr(FactorGraph, 'add_poses', slowly)
