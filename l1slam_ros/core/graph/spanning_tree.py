@@ -22,9 +22,10 @@ def odometry_poses(graph: FactorGraph) -> Array:
 
     """
     parent = graph.parent
-    if (parent[1:] == np.arange(1, graph.n_poses)).any():
-        raise GraphError(f'keyframe {np.flatnonzero(parent == np.arange(graph.n_poses))[1]} has no '
-                         'predecessor; expected odometry that joins all keyframes')
+    roots = np.flatnonzero(parent == np.arange(len(parent)))
+    if len(roots) > 1:
+        raise GraphError(f'keyframe {roots[1]} has no predecessor; expected odometry that joins '
+                         'all keyframes')
     odometry = np.flatnonzero(graph.between.is_odometry)
     return _compose_along(graph, parent, odometry)
 

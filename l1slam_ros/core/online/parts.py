@@ -48,7 +48,7 @@ def of_all(improvement: Improvement, problem: Problem) -> Improvement:
 
 
 def _tied(graph: FactorGraph, poses: Array, keyframes: Indices) -> FactorGraph:
-    """Return the graph with keyframes k tied to k - 1, of another part, as poses (n, p) have it."""
+    """Return the graph with keyframes k tied to k - 1, of other parts, as poses (n, p) say."""
     manifold, d = graph.manifold, graph.manifold.TANGENT_SIZE
     extent = float(np.ptp(manifold.positions(poses), axis=0).max()) if len(poses) else 0.0
     sigma = sigmas(manifold, 1.0 + extent, _HEADING)

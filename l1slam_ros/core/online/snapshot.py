@@ -12,10 +12,10 @@ from functools import cached_property
 
 import numpy as np
 
+from l1slam_ros.core.bordered.front import View
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure
-from l1slam_ros.core.incremental.front import View
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.block_cholesky import Pattern
 from l1slam_ros.core.solvers.optimality import Status

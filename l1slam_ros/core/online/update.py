@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from l1slam_ros.core.bordered.front import Front
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -22,7 +23,6 @@ from l1slam_ros.core.graph.linear_system import (
     whitened_residual,
 )
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.incremental.front import Front
 from l1slam_ros.core.online.snapshot import Optimised, Problem
 from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.robust.judgement import Judgement

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from problems import EVERY, covariance6, drive_on, loop, odometry, straight
 
+from l1slam_ros.core.bordered.front import Front
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
-from l1slam_ros.core.incremental.front import Front
 from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.online.snapshot import ACCEPTED

@@ -12,11 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from l1slam_ros.core.bordered.front import GATE, Front, Look
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
-from l1slam_ros.core.incremental.front import UNKNOWN, Front, Look
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.snapshot import Behind, Optimised
 from l1slam_ros.core.online.update import Improvement
@@ -130,9 +130,9 @@ class LiveMap:
         did not before, and the front finds out
         """
         factors, known = self._builder.graph.between, self.accepted
-        accept = np.append(known, np.full(max(len(part) - len(known), 0), UNKNOWN))
+        accept = np.append(known, np.full(max(len(part) - len(known), 0), GATE))
         if pending:
-            accept[:len(known)][~known] = UNKNOWN
+            accept[:len(known)][~known] = GATE
         accept[factors.struck[:len(accept)]] = 0
         accept[:len(part)][part] = 0
         return factors, accept
@@ -145,7 +145,7 @@ class LiveMap:
         first, judged = front.rows, self.optimised.judgement.accepted
         rows = np.arange(first, min(first + _AT_ONCE, len(factors)))
         known = len(judged) + len(self.looks)
-        accept = np.where(factors.trusted[rows] | (not self.robust), 1, UNKNOWN)
+        accept = np.where(factors.trusted[rows] | (not self.robust), 1, GATE)
         before = rows[rows < known]
         accept[:len(before)] = np.concatenate(
             (judged[first:], self.looks.view()[max(first - len(judged), 0):, 0]))[:len(before)]

@@ -22,9 +22,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from l1slam_ros.core.bordered.front import Front, Look
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.incremental.front import Front, Look
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.parts import as_one, of_all
 from l1slam_ros.core.online.snapshot import Optimised, Snapshot

@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 from problems import EVERY, covariance6, drive_on, play, straight
 from systems import dense_covariance
 
+from l1slam_ros.core.bordered import front
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.incremental import front
 from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.snapshot import ACCEPTED, BuilderState, Optimised, SavedMap
 from l1slam_ros.core.online.update import improve
@@ -131,7 +131,7 @@ def test_what_it_is_not_to_take_costs_a_front_nothing(world):
     looks = front.take(factors, odometry.astype(int))
     assert [look.accepted for look in looks] == odometry.tolist() and not odometry.all()
     # What is touched: the last keyframe it knew and the new ones, not the far ends of loops.
-    assert [border.points for border in front._borders] == 2 * [1 + odometry.sum()]
+    assert [system.points for system in front._systems] == 2 * [1 + odometry.sum()]
     assert front.rows == new.stop and front.taken == odometry.sum()
 
 
@@ -171,7 +171,7 @@ def test_a_front_that_fails_is_closed_and_moves_nothing(world, monkeypatch):
         raise np.linalg.LinAlgError
 
     before = backend.poses
-    monkeypatch.setattr(front._borders[1], 'add', fail)
+    monkeypatch.setattr(front._systems[1], 'add', fail)
     play(backend, world, KNOWN, KNOWN + 5)
     backend.update(10.0)
     assert front.closed
