@@ -118,6 +118,7 @@ class Front:
     rows : how many of them it knows; taken : of those that came since, it was not to skip so many
     closed : it takes no more
     pattern : of its factors
+    variance : (2,) as above
 
     Raises
     ------
@@ -129,7 +130,7 @@ class Front:
                  choleskys: tuple[BlockCholesky, BlockCholesky], variance: Array,
                  log_odds: float, rows: int):
         self.rows, self.taken, self.closed = rows, 0, False
-        self.pattern = choleskys[L1].pattern
+        self.pattern, self.variance = choleskys[L1].pattern, variance
         self._manifold, self._fixed = part.manifold, anchor(part)
         system, k = linearise(part, poses[L1]), part.manifold.TANGENT_SIZE
         # What a square stays below, and the log ratio but for what hangs on the factor.

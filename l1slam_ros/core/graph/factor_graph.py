@@ -100,14 +100,10 @@ class FactorGraph:
     manifold : the module the poses live on, e.g. `se2`
     n_poses : how many keyframes exist already, each the predecessor of the next
 
-    Attributes
-    ----------
-    said : how often a person changed what counts, see `say`
-
     """
 
     def __init__(self, manifold: Manifold, n_poses: int = 0):
-        self.manifold, self.said = manifold, 0
+        self.manifold = manifold
         p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
         self._predecessor, self._robot = GrowingArray((), np.int64), GrowingArray((), np.int64)
         # By robot.
@@ -135,6 +131,11 @@ class FactorGraph:
     def predecessor(self) -> Indices:
         """The keyframe before each one, (n,), `NO_PREDECESSOR`: there is none."""
         return self._predecessor.view()
+
+    @property
+    def firsts(self) -> Indices:
+        """The keyframes that have no predecessor, but for the first one of all, (g,)."""
+        return np.flatnonzero(self.predecessor[1:] == NO_PREDECESSOR) + 1
 
     @property
     def parent(self) -> Indices:
@@ -281,7 +282,7 @@ class FactorGraph:
             # What was seen of the column before stays as it was.
             self._between[column] = GrowingArray((), np.bool_)
             self._between[column].extend(said)
-        self._factors, self.said = None, self.said + 1
+        self._factors = None
 
 
 def component_labels(graph: FactorGraph) -> Indices:

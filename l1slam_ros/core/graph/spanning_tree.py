@@ -22,10 +22,9 @@ def odometry_poses(graph: FactorGraph) -> Array:
 
     """
     parent = graph.parent
-    roots = np.flatnonzero(parent == np.arange(len(parent)))
-    if len(roots) > 1:
-        raise GraphError(f'keyframe {roots[1]} has no predecessor; expected odometry that joins '
-                         'all keyframes')
+    if len(graph.firsts):
+        raise GraphError(f'keyframe {graph.firsts[0]} has no predecessor; expected odometry that '
+                         'joins all keyframes')
     odometry = np.flatnonzero(graph.between.is_odometry)
     return _compose_along(graph, parent, odometry)
 

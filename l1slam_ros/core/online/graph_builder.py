@@ -16,6 +16,7 @@ from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.geometry.noise import MOST_OF_ODOMETRY, root_of_inverse
 from l1slam_ros.core.graph.factor_graph import NO_PREDECESSOR, FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, Notes, OdometrySample
+from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.online.keyframes import (
     KeyframeMotion,
     KeyframeOptions,
@@ -30,7 +31,6 @@ from l1slam_ros.core.online.odometry.odometry_stream import (
     Point,
 )
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
-from l1slam_ros.core.online.snapshot import BuilderState
 from l1slam_ros.core.options import Options, option
 
 # What a gap in the odometry is to the map: the cause it is counted by, and what is said of it.
@@ -62,7 +62,7 @@ class GraphBuilder:
     Parameters
     ----------
     manifold : what the poses live on
-    options : see `GraphBuilderOptions`; may be replaced at any time
+    options : see `GraphBuilderOptions`
     verbatim : the messages are those of a graph: each is a measurement as it is stated, none a
         loop sent again or odometry that jumps
     base_frame : tells whose odometry it is; None: by the options alone
@@ -99,6 +99,10 @@ class GraphBuilder:
         self.track = OdometryTrack(graph.manifold)
         self.offset, self._level = graph.manifold.identity(1), Level(graph.manifold)
         self._moved, self._glued = False, True
+
+    def set_options(self, options: GraphBuilderOptions) -> None:
+        """Go on by other options; what is in the graph stays."""
+        self.options = options
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """

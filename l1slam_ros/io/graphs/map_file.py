@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from l1slam_ros.core.errors import FileError, OptionError
-from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.core.online.snapshot import SavedMap
+from l1slam_ros.core.running.backend import Backend
+from l1slam_ros.core.running.snapshot import SavedMap
 from l1slam_ros.io.files import other_kind
 from l1slam_ros.io.formats import named
 from l1slam_ros.io.graphs.saved_map import keep_as, load_map, save_map
@@ -44,16 +44,16 @@ class MapFile:
         self._backend, self._options, self._warn = backend, options, warn
         self.is_saving, self._one = False, threading.Lock()
         self._began = time.monotonic()
-        # Where the map was saved or loaded last, and its version then.
-        self._known = _absolute(options().save_path), backend.version
-        # The file that we wrote or loaded, its end, and the graph whose map it holds.
+        # Where the map was saved or loaded last, and its revision then.
+        self._known = _absolute(options().save_path), backend.revisions.now
+        # The file that we wrote or loaded, its end, and what names the graph whose map it holds.
         self._ours: tuple[object, ...] = ()
 
     def save(self) -> str:
         """Save the map; return a sentence that says where."""
         with self._at_work(), self._backend.calm:
-            version = self._backend.version
-            return self._write(self._path(), self._backend.saved(), version)
+            revision = self._backend.revisions.now
+            return self._write(self._path(), self._backend.saved(), revision)
 
     def autosave(self, taken: Callable[[], None] = lambda: None) -> None:
         """
@@ -62,18 +62,18 @@ class MapFile:
         taken : called before it is written: what becomes of the map from then on does not matter
         """
         with self._at_work():
-            version = self._backend.version
+            revision = self._backend.revisions.now
             saved = self._backend.saved() if self._is_to_be_saved() else None
             taken()
             if saved is None:
                 return
             path = self._path()
             end = _end_of(path)
-            if end and self._ours != (path, end, saved.number):
+            if end and self._ours != (path, end, saved.graph_began):
                 kept = path.with_name(f'{path.stem}.{_time_of(path)}{path.suffix}')
                 keep_as(path, kept)
                 self._warn(f'{path} held another map: it is kept as {kept}')
-            self._write(path, saved, version)
+            self._write(path, saved, revision)
 
     @contextmanager
     def _at_work(self) -> Iterator[None]:
@@ -84,11 +84,10 @@ class MapFile:
             finally:
                 self.is_saving = False
 
-    def _write(self, path: Path, saved: SavedMap | None,
-               version: tuple[int, int, int]) -> str:
+    def _write(self, path: Path, saved: SavedMap | None, revision: int) -> str:
         sentence = save_map(path, saved)
-        self._known = path, version
-        self._ours = path, _end_of(path), saved.number if saved else 0
+        self._known = path, revision
+        self._ours = path, _end_of(path), saved.graph_began if saved else 0
         return sentence
 
     def load(self) -> str:
@@ -104,10 +103,10 @@ class MapFile:
         end = _end_of(path)
         saved, sentence, whole = load_map(path)
         with named(path):
-            number = self._backend.restore(saved)
-        self._known = path, self._backend.version
+            graph = self._backend.restore(saved)
+        self._known = path, self._backend.revisions.now
         # What could not be read may be of use to somebody yet.
-        self._ours = (path, end, number) if whole else ()
+        self._ours = (path, end, graph) if whole else ()
         return sentence, whole
 
     def load_at_start(self, tell: Callable[[str], object]) -> None:
@@ -126,7 +125,7 @@ class MapFile:
     def _is_to_be_saved(self) -> bool:
         options = self._options()
         return (options.save_path != '' and options.autosave_period > 0
-                and self._known != (_absolute(options.save_path), self._backend.version))
+                and self._known != (_absolute(options.save_path), self._backend.revisions.now))
 
     def _path(self) -> Path:
         path = self._options().save_path

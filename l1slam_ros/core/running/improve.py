@@ -23,9 +23,10 @@ from l1slam_ros.core.graph.linear_system import (
     whitened_residual,
 )
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.online.snapshot import Optimised, Problem
 from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.running.optimised import Optimised
+from l1slam_ros.core.running.problem import Problem
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.nonlinear import (
     OptimiserOptions,
@@ -99,8 +100,16 @@ class Improvement:
                 raise ArithmeticError(f'the {name} of a new map is not finite; the map stays')
         same = len(self.dual) == len(before.dual)
         quiet = same and self.cost_before - self.cost <= tolerance * self.cost
-        return Optimised(self.poses, self.dual, before.judgement, self.cost, self.status,
+        return Optimised(self.poses, self.dual, self.cost, self.status,
                          before.quiet_updates + 1 if quiet else 0)
+
+    def of_all(self, problem: Problem) -> 'Improvement':
+        """Return what was made of `as_one(problem)`, for the factors of the problem."""
+        graph = problem.graph
+        rows, d = graph.not_struck, graph.manifold.TANGENT_SIZE
+        dual = np.zeros((len(graph.between), d))
+        dual[rows] = self.dual.reshape(-1, d)[:len(rows)]
+        return replace(self, dual=dual.ravel(), judgement=self.judgement.of_all(graph))
 
     @property
     def falls(self) -> bool:
