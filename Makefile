@@ -26,7 +26,7 @@ endef
 .PHONY: demo test clean anew
 
 demo: $(STAMP)
-	$(VENV)/bin/python -m l1slam_ros.ros.demo
+	$(VENV)/bin/python -m l1slam_ros.ros.executables
 
 test: $(TESTS)
 	$(VENV)/bin/python -m pytest -n 2 --dist worksteal

@@ -32,6 +32,9 @@ setup(
     maintainer_email='maintainers@l1slam-ros.invalid',
     license='Apache-2.0',
     packages=find_packages(exclude=['test']),
+    # Said though it is so anyway: then an editable install is a path, which type checkers follow,
+    # and not a hook of the import, which they do not.
+    package_dir={'': '.'},
     package_data={package_name: ['py.typed']},  # its annotations are there to be used
     data_files=data_files,
     zip_safe=True,

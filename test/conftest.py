@@ -3,16 +3,30 @@
 
 import os
 import subprocess
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from l1slam_ros.io.compilation import STEPS, compile_now
+from l1slam_ros.ros.shell.domain import go_where_nobody_is
+from l1slam_ros.ros.shell.middleware import use_what_is_there
 
-# A domain of its own, seen on this machine only: no robot nearby hears the tests, nor they it.
-os.environ['ROS_DOMAIN_ID'] = str(os.getpid() % 100 + 1)
-os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+# Whatever the shell says, before anything of ROS is imported, and for all that is started. No
+# robot nearby hears the tests, nor they it.
+_MIDDLEWARE = ''
+with suppress(ImportError):  # there is no ROS
+    _MIDDLEWARE = use_what_is_there()
+go_where_nobody_is()
+# Tests read what ROS logs.
+for _name in [name for name in os.environ if name.startswith('RCUTILS_')]:
+    del os.environ[_name]
+
+
+def pytest_report_header():
+    """Say what is used in place of what the shell names."""
+    return _MIDDLEWARE or None
 
 
 def pytest_sessionstart(session):

@@ -6,9 +6,15 @@ from problems import PERIOD, covariance6, loop, odometry, retold
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
-from l1slam_ros.core.graph.spanning_tree import pair_key
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.spanning_tree import odometry_poses, pair_key
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
+from l1slam_ros.core.worlds.simulate import (
+    World,
+    WorldOptions,
+    simulate_world,
+    with_false_loops,
+)
 
 # Odometry good enough for a drive of some hundred metres to come back near where it was.
 CAREFUL = WorldOptions(odometry_sigma_rotation=0.005)
@@ -17,6 +23,29 @@ CAREFUL = WorldOptions(odometry_sigma_rotation=0.005)
 def careful_world(n, n_edges, seed=0):
     """Return a world whose odometry can tell true loops from false ones."""
     return simulate_world(n, n_edges, CAREFUL, np.random.default_rng(seed))
+
+
+def laps(n, count, n_loops, options, rng):
+    """Return a world of n keyframes, `count` laps of one square; loops see the lap before."""
+    side, chain = n // count // 4, np.arange(n - 1)
+    quarter = np.arange(n) // side % 4
+    heading = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])[quarter]
+    position = np.concatenate((np.zeros((1, 2)), np.cumsum(heading[:-1], axis=0)))
+    truth = np.column_stack((position, se2.wrap(quarter * np.pi / 2)))
+    i = np.sort(rng.choice(n - 4 * side - 1, n_loops, replace=False))
+    j = i + 4 * side + rng.integers(-1, 2, size=n_loops)
+    i, j = np.concatenate((chain, i)), np.concatenate((chain + 1, j))
+    is_loop = np.arange(len(i)) >= n - 1
+    order = np.lexsort((i, is_loop, j))
+    sigma = np.where(is_loop[order, None], [options.loop_sigma_translation] * 2 + [
+        options.loop_sigma_rotation], [options.odometry_sigma_translation] * 2 + [
+        options.odometry_sigma_rotation])
+    i, j = i[order], j[order]
+    graph = FactorGraph(se2, n)
+    graph.add_between(i, j, se2.retract(
+        se2.between(truth[i], truth[j]), sigma * rng.standard_normal((len(i), 3))),
+        np.eye(3) / sigma[:, :, None]**2)
+    return World(graph, truth, odometry_poses(graph), np.zeros((0, 2), np.int64))
 
 
 def spoilt(world, kind, count, seed=1):

@@ -20,6 +20,7 @@ from environments import (
     interpreter,
     lent_variables,
     new_environment,
+    own_variables,
     require_registry,
     run,
 )
@@ -179,6 +180,28 @@ def test_every_python_comes_to_the_same_costs(
     assert found['numpy'].startswith('1.26.' if oldest else '2.')
     # Compilers order sums differently, and a solver stops within 10^-6 of the optimum.
     assert found['costs'] == pytest.approx(smoke['costs'], rel=1e-6)
+
+
+@pytest.mark.parametrize('kind', ['editable', 'wheel'])
+def test_a_type_checker_finds_the_types_in_every_kind_of_install(
+        distributions, source, kind, tmp_path):
+    """As `make` installs it, `--editable`, and as users do; strictly, and by a user's file."""
+    tools = environment('mypy~=2.4.1', 'numpy', 'setuptools>=70.1')
+    fresh = new_environment(tmp_path / 'fresh', sys.executable, below=tools)
+    if kind == 'editable':
+        copy = shutil.copytree(source, tmp_path / 'copy', symlinks=True)
+        fresh.install('--no-deps', '--no-build-isolation', '--editable', copy)
+    else:
+        fresh.install('--no-deps', '--no-index', distributions['wheel'])
+    example = re.search(r'## From Python.*?```python\n(.*?)```', (ROOT / 'README.md').read_text(),
+                        re.S)[1]
+    (tmp_path / 'right.py').write_text(example)
+    (tmp_path / 'wrong.py').write_text(f'{example}\nl1.solve(3)\n')
+    asked = [tools.python, '-m', 'mypy', '--strict', '--python-executable', fresh.python]
+    run(*asked, 'right.py', cwd=tmp_path, env=own_variables())
+    found = subprocess.run([*asked, 'wrong.py'], cwd=tmp_path, env=own_variables(), text=True,
+                           capture_output=True, timeout=PATIENCE)
+    assert found.returncode == 1 and 'has incompatible type "int"' in found.stdout, found.stdout
 
 
 @pytest.fixture(scope='module', params=[[], ['--symlink-install']], ids=['plain', 'symlink'])

@@ -12,10 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from command import solve_json
+from rosbags.highlevel import AnyReader
 
 import l1slam_ros as l1
+from bags import NOTE
 from l1slam_ros.cli.main import main
+from l1slam_ros.io.bags.writer import new_bag
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / 'README.md').read_text()
@@ -145,3 +149,60 @@ def test_what_a_file_says_in_vain_is_warned_of(world):
     path.write_text(f'{world.read_text()}FIX 5\n')
     with pytest.warns(UserWarning, match="FIX '5' is not used"):
         l1.read_graph(path)
+
+
+@pytest.mark.parametrize('call, said', [
+    (lambda graph, _: l1.solve('world.g2o'),
+     "graph is 'world.g2o', expected a FactorGraph, as read_graph returns first"),
+    (lambda graph, poses: l1.solve((graph, poses)), 'graph is (<l1slam_ros.core.graph.factor_gra'),
+    (lambda graph, _: l1.solve(graph, robust='no'), "robust is 'no', expected True or False"),
+    (lambda graph, _: l1.solve(graph, robust=1), 'robust is 1, expected True or False'),
+    (lambda graph, _: l1.solve(graph, norm=['l1']), "norm is ['l1'], expected one of l1, "),
+    (lambda graph, _: l1.solve(graph, start='seed'), 'start has entries that are no numb'),
+    (lambda graph, _: l1.solve(graph, start=[[1, 2], [3]]), 'start has entries that are no numb'),
+    (lambda graph, poses: l1.write_graph('x.g2o', poses, graph), 'graph is array('),
+    (lambda graph, _: l1.write_graph('x.g2o', graph, None), 'poses have the shape (), expected'),
+    (lambda graph, poses: l1.write_graph(3, graph, poses), 'path is 3, expected the name of a f'),
+    (lambda *_: l1.read_graph(None), 'path is None, expected the name of a file'),
+    (lambda *_: l1.read_graph('bag', odom_topic=3), 'odom_topic is 3, expected the name of a top'),
+    (lambda *_: l1.read_graph('bag', loop_topic=['/a']), "loop_topic is ['/a'], expected the na"),
+    (lambda *_: l1.Backend({'keyframe': {'translation': 1.0}}),
+     "options is {'keyframe': {'translation': 1.0}}, expected BackendOptions; BackendOptions.from_"
+     'mapping makes them of a mapping'),
+    (lambda *_: l1.Backend(None), 'options is None, expected BackendOptions; '),
+    (lambda *_: l1.Backend(dimension='2'), "dimension is '2', expected 2 or 3"),
+    (lambda *_: l1.Backend(dimension=[2]), 'dimension is [2], expected 2 or 3'),
+    (lambda *_: l1.Backend(background='yes'), "background is 'yes', expected True or False"),
+    (lambda *_: l1.Backend().set_options({}), 'options is {}, expected BackendOptions; '),
+    (lambda *_: l1.BackendOptions(keyframe={'translation': 1.0}),
+     "keyframe is {'translation': 1.0}, expected KeyframeOptions; KeyframeOptions.from_mapping"),
+    (lambda *_: l1.BackendOptions.from_mapping({'keyfram': {'translation': 1.0}}),
+     'no option is called keyfram.translation'),
+    (lambda *_: l1.BackendOptions.from_mapping({'keyframe': 1.0}), 'no option is called keyframe'),
+    (lambda *_: l1.BackendOptions.from_mapping('keyframe'), "options are 'keyframe', expected a"),
+    (lambda *_: l1.Backend().add_loop(3), 'the measurement is 3, expected LoopClosure'),
+    (lambda *_: l1.Backend().add_odometry(l1.LoopClosure(1, 2, np.zeros(7), np.eye(6))),
+     'the measurement is LoopClosure('),
+])
+def test_what_is_of_another_kind_is_refused_by_its_name(world, call, said):
+    graph, poses = l1.read_graph(world)
+    with pytest.raises(l1.L1SlamError) as caught:
+        call(graph, poses)
+    assert str(caught.value).startswith(said)
+
+
+def test_a_bag_of_another_robot_is_read_by_its_topics(world, tmp_path):
+    main(['convert', str(world), str(tmp_path / 'bag')])
+    with AnyReader([tmp_path / 'bag']) as reader, new_bag(
+            tmp_path / 'other', yaml.safe_load(NOTE)) as writer:
+        for connection in reader.connections:
+            writer.add_topic(f'/r1{connection.topic}', connection.msgtype)
+        for connection, time, data in reader.messages():
+            writer.write(f'/r1{connection.topic}', time, bytes(data))
+    graph, _ = l1.read_graph(tmp_path / 'other', odom_topic='/r1/odom',
+                             loop_topic='/r1/loop_closures')
+    expected, _ = l1.read_graph(tmp_path / 'bag')
+    np.testing.assert_array_equal(graph.between.pairs, expected.between.pairs)
+    assert (~graph.between.is_odometry).sum() > 100
+    with pytest.raises(l1.L1SlamError, match='no messages on /loops; expected geometry_msgs'):
+        l1.read_graph(tmp_path / 'other', odom_topic='/r1/odom', loop_topic='/loops')

@@ -22,7 +22,7 @@ case "$*" in
 esac
 """
 VENV = '-m venv .venv'
-DEMO = ['-m pip install --quiet --editable .[ros]', '-m l1slam_ros.ros.demo']
+DEMO = ['-m pip install --quiet --editable .[ros]', '-m l1slam_ros.ros.executables']
 TEST = ['-m pip install --quiet l1slam_ros[test]', 'setup.py --quiet install_data',
         '-m pytest -n 2 --dist worksteal']
 

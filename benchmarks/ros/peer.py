@@ -10,9 +10,11 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any, TypeVar
 
-# A domain of its own, which its children share: nobody else's messages are counted.
-os.environ.setdefault('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
-os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+from l1slam_ros.ros.shell.domain import go_where_nobody_is
+
+# Its children share it: nobody else's messages are counted.
+if 'ROS_DOMAIN_ID' not in os.environ:
+    go_where_nobody_is()
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray

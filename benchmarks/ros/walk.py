@@ -20,10 +20,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-# Its own domain: nobody else's odometry is counted.
-os.environ.setdefault('ROS_DOMAIN_ID', '95')
-os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
@@ -37,6 +33,7 @@ from l1slam_ros.io.compilation import STEPS, compile_now
 from l1slam_ros.io.messages.conversion import reference_frame_id
 from l1slam_ros.ros.node import BackendNode
 from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.domain import go_where_nobody_is
 
 PACKAGE = Path(l1slam_ros.__file__).parent
 KEYFRAMES, SECOND = 10, 10**9
@@ -112,6 +109,7 @@ def main() -> int:
     argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     compile_now(STEPS)
+    go_where_nobody_is()  # nobody else's odometry is counted
     rclpy.init()
     walk, executor = Walk(), SingleThreadedExecutor()
     node = BackendNode(parameter_overrides=[Parameter('keyframe.translation', value=0.5)])

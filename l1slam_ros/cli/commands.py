@@ -26,10 +26,10 @@ class Ending(NamedTuple):
 
 def convert(arguments: argparse.Namespace) -> Ending:
     """Write what was read in another format."""
-    formats.check_output(arguments.output)
+    formats.check_output(arguments.output, inputs(arguments), arguments.force)
     record = read(arguments, arguments.input)
     with formats.named(arguments.input):
-        formats.write_output(arguments.output, formats.with_poses(record))
+        formats.write_output(arguments.output, formats.with_poses(record), force=arguments.force)
     return Ending(record.damage)
 
 
@@ -45,6 +45,15 @@ def info(arguments: argparse.Namespace) -> Ending:
     if not sentences and not record.damage:
         print('nothing looks wrong')
     return Ending(record.damage)
+
+
+def inputs(arguments: argparse.Namespace, *others: str | Path | None) -> list[Path]:
+    """Return all that a command may read: its inputs, what lies beside them, and others."""
+    named = arguments.input if isinstance(arguments.input, list) else [arguments.input]
+    extra = [arguments.params_file, *others]
+    # A topic of a bag is named after it.
+    return [file for path in named for file in formats.files_of(path)] + [
+        Path(part) for path in extra if path for part in {str(path), str(path).split(':/')[0]}]
 
 
 def _print_rows(rows: list[tuple[str, str]]) -> None:

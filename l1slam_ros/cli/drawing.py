@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from l1slam_ros.cli.commands import Ending, read
+from l1slam_ros.cli.commands import Ending, inputs, read
 from l1slam_ros.cli.reference import Truth, known_false, read_truth, true_path
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
@@ -16,12 +16,14 @@ from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.io import formats
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import beside
+from l1slam_ros.io.ours import refuse_others
 from l1slam_ros.io.plot import Curve, MapDrawing, check_picture, plot_maps, plot_solution
 
 
 def plot(arguments: argparse.Namespace) -> Ending:
     """Draw the stored poses of graphs beside each other."""
     check_picture(arguments.output)
+    refuse_others([arguments.output], inputs(arguments), arguments.force)
     drawings, damages = [], []
     for path in arguments.input:
         record = read(arguments, path)

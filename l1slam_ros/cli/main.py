@@ -37,7 +37,8 @@ _MORE = """\
 exit codes:
   0  done
   2  bad input or arguments, said in one line; nothing written
-  3  done, but the input is damaged and only a part of it was used
+  3  done, but only a part of the input was used: it is damaged, or the loops of a bag did not get
+     in, because most were refused or none of their topics was read
   4  solve: the best map is written, but it is doubtful (also where the code would be 3)
 
 completion of commands and options by the TAB key, in bash and zsh, where argcomplete is
@@ -117,6 +118,12 @@ def _forget_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+def _add_force(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--force', action='store_true',
+                        help='replace what is there, though l1slam did not write it; an input '
+                        'is never replaced')
+
+
 def _add_reading(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group('how to read a 3D g2o file, or a bag').add_argument
     add('--rotation-information', choices=names.ROTATION_INFORMATION,
@@ -161,6 +168,7 @@ def _add_solve(parser: argparse.ArgumentParser) -> None:
         "theta`, or a bag's topic, BAG:/TOPIC, where `bag` is INPUT; interpolated at the "
         'stamps of the poses')
     add('--plot', type=Path, metavar='PNG', help='draw the map and its cost; .svg and .pdf too')
+    _add_force(parser)
     add('--json', action='store_true', help='one object on standard output')
     add('--quiet', action='store_true', help='no progress, no summary, no warning')
     _add_reading(parser)
@@ -169,6 +177,7 @@ def _add_solve(parser: argparse.ArgumentParser) -> None:
 def _add_convert(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('input', type=Path, metavar='INPUT', help=_INPUT)
     parser.add_argument('output', type=Path, metavar='OUTPUT', help=_OUTPUT)
+    _add_force(parser)
     _add_reading(parser)
 
 
@@ -197,6 +206,7 @@ def _add_corrupt(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_randomness(parser: argparse.ArgumentParser) -> None:
+    _add_force(parser)
     parser.add_argument('--kind', choices=names.KINDS_OF_FALSE_LOOPS,
                         default=names.KINDS_OF_FALSE_LOOPS[0], help=_KIND)
     parser.add_argument('--seed', type=int, default=0, metavar='S',
@@ -213,6 +223,7 @@ def _add_plot(parser: argparse.ArgumentParser) -> None:
                         help=f'{_INPUT}; INPUT.truth.txt and INPUT.false.txt are drawn, if there')
     parser.add_argument('--output', type=Path, required=True, metavar='PNG',
                         help='.png, .svg or .pdf')
+    _add_force(parser)
     _add_reading(parser)
 
 
@@ -226,6 +237,7 @@ def _add_reproduce(parser: argparse.ArgumentParser) -> None:
         '50,000 with 700,000, which takes minutes (default: %(default)s)')
     add('--output', type=Path, default=Path('reproduction'), metavar='DIR',
         help='the folder for report.md and its pictures (default: %(default)s)')
+    _add_force(parser)
 
 
 # By name: the module that runs a command, imported only then; what it does; an example; options.

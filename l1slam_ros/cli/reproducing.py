@@ -12,6 +12,7 @@ from l1slam_ros.paper.reproduce import reproduce as run_experiments
 
 def reproduce(arguments: argparse.Namespace) -> Ending:
     """Run the paper's experiments; write the report and say where it is."""
-    run_experiments(arguments.datasets, WORLDS[arguments.worlds], arguments.output, Effort())
+    run_experiments(arguments.datasets, WORLDS[arguments.worlds], arguments.output, Effort(),
+                    arguments.force)
     print(arguments.output / REPORT)
     return Ending()

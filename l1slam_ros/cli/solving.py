@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from l1slam_ros.cli.commands import Ending, read, warn
+from l1slam_ros.cli.commands import Ending, inputs, read, warn
 from l1slam_ros.cli.reference import Truth, known_false, position_error, read_truth
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions
@@ -22,7 +22,9 @@ from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import DENSE, JUDGEMENT, SPARSE, compile_now, with_space
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.graphs.left_out import left_out_by
 from l1slam_ros.io.node_options import read_params_file
+from l1slam_ros.io.ours import refuse_others
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.sentences import (
     DOUBTFUL,
@@ -85,7 +87,9 @@ def _write(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
 
         plot_outcome(arguments, record, outcome, truth, cost_name)
     if arguments.output:
-        formats.write_output(arguments.output, replace(record, poses=outcome.solution.poses))
+        formats.write_output(arguments.output, replace(
+            record, poses=outcome.solution.poses,
+            left_out=left_out_by(outcome.judgement, record.graph.between)), force=arguments.force)
 
 
 def _solved(arguments: argparse.Namespace, record: GraphRecord, asked: SolveOptions) -> Outcome:
@@ -110,12 +114,14 @@ def _steps(asked: SolveOptions) -> tuple[str, ...]:
 
 def _check_outputs(arguments: argparse.Namespace) -> None:
     """Refuse names of outputs before the work is done, not after."""
+    read = inputs(arguments, arguments.reference)
     if arguments.output:
-        formats.check_output(arguments.output)
+        formats.check_output(arguments.output, read, arguments.force)
     if arguments.plot:
         from l1slam_ros.io.plot import check_picture
 
         check_picture(arguments.plot)
+        refuse_others([arguments.plot], read, arguments.force)
 
 
 def _asked(arguments: argparse.Namespace) -> SolveOptions:

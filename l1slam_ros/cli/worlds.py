@@ -2,13 +2,13 @@
 """The commands of `l1slam` that make graphs: simulate and corrupt."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from l1slam_ros.cli.commands import Ending, read
+from l1slam_ros.cli.commands import Ending, inputs, read
 from l1slam_ros.cli.reference import known_false
 from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry.manifold import Indices
@@ -22,13 +22,14 @@ from l1slam_ros.io.compilation import SPARSE, compile_now, with_space
 from l1slam_ros.io.files import put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import beside, pair_lines
+from l1slam_ros.io.ours import marked
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.trajectory import truth_lines
 
 
 def simulate(arguments: argparse.Namespace) -> Ending:
     """Make a world and write its graph, its truth and which of its loops are false."""
-    _check(arguments)
+    _check(arguments, (), ('truth', 'false'))
     output, rng = arguments.output, np.random.default_rng(arguments.seed)
     world = simulate_world(arguments.poses, arguments.edges, WorldOptions(), rng, arguments.world)
     if arguments.false_loops:
@@ -37,9 +38,9 @@ def simulate(arguments: argparse.Namespace) -> Ending:
     ids = np.arange(world.graph.n_poses)
     record = GraphRecord(world.graph, world.odometry, ids)
     with replacing(beside(output, 'truth')) as temporary:
-        put_lines(temporary, truth_lines(ids, world.truth))
+        put_lines(temporary, marked(truth_lines(ids, world.truth)))
         _write(output, world.false_loops,
-               lambda: formats.write_output(output, record, world.truth))
+               lambda: formats.write_output(output, record, world.truth, arguments.force))
     return Ending()
 
 
@@ -51,7 +52,7 @@ def corrupt(arguments: argparse.Namespace) -> Ending:
     raw odometry, whose drift makes places look far apart that are the same, and a 'false' loop
     between them would be true. False loops that are known already are left out of that map.
     """
-    _check(arguments)
+    _check(arguments, inputs(arguments), ('false',))
     record = read(arguments, arguments.input)
     former = known_false(arguments.input, record)
     believed = record.graph.subset(~former)
@@ -66,17 +67,20 @@ def corrupt(arguments: argparse.Namespace) -> Ending:
                                         np.random.default_rng(arguments.seed))
     pairs: Indices = np.concatenate((record.graph.between.pairs[former],
                                      np.stack((loops.i, loops.j), axis=1)))
-    spoiled = formats.with_poses(replace(record, graph=insert_loops(record.graph, loops)))
+    # All its loops are to be doubted again; comments stand between others now.
+    spoiled = formats.with_poses(replace(record, graph=insert_loops(record.graph, loops),
+                                         left_out=None, comments=()))
     # A bag has no vertex ids: read back, it counts its keyframes from 0.
     ids = record.ids[pairs] if arguments.output.suffix else pairs
     with formats.named(arguments.input):
-        _write(arguments.output, ids, lambda: formats.write_output(arguments.output, spoiled))
+        _write(arguments.output, ids, lambda: formats.write_output(
+            arguments.output, spoiled, force=arguments.force))
     return Ending(record.damage)
 
 
-def _check(arguments: argparse.Namespace) -> None:
+def _check(arguments: argparse.Namespace, read: Sequence[Path], also: tuple[str, ...]) -> None:
     """Refuse, before any work is done, an output that holds no graph, and counts below 0."""
-    formats.check_graph_output(arguments.output)
+    formats.check_graph_output(arguments.output, read, arguments.force, also)
     for name in ('seed', 'false_loops'):
         value = getattr(arguments, name)
         if value < 0:
@@ -86,5 +90,5 @@ def _check(arguments: argparse.Namespace) -> None:
 def _write(output: Path, pairs: Indices, write_graph: Callable[[], None]) -> None:
     """Write a graph and its file of false loops, pairs (k, 2) of ids, both or neither."""
     with replacing(beside(output, 'false')) as temporary:
-        put_lines(temporary, pair_lines(pairs))
+        put_lines(temporary, marked(pair_lines(pairs)))
         write_graph()

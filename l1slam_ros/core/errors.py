@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The errors that bad input raises: each says what, the value found and what was expected."""
 
+# So much of a value that is none is shown.
+_SHOWN = 60
+
 
 class L1SlamError(Exception):
     """Base of every error this package raises on purpose."""
@@ -28,6 +31,21 @@ class NoiseError(L1SlamError):
 
 class OptionError(L1SlamError):
     """An option outside its range."""
+
+
+def require(kind: type | tuple[type, ...], name: str, value: object, expected: str) -> None:
+    """
+    Refuse a value that is of another kind.
+
+    Raises
+    ------
+    OptionError : naming it, what was found and what was expected.
+
+    """
+    if not isinstance(value, kind):
+        text = ' '.join(repr(value).split())
+        shown = text if len(text) <= _SHOWN else f'{text[:_SHOWN]}...'
+        raise OptionError(f'{name} is {shown}, expected {expected}')
 
 
 class MessageError(L1SlamError):

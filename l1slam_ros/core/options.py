@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, TypeVar
 
-from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.errors import OptionError, require
 
 Scalar = bool | int | float | str
 AnyOptions = TypeVar('AnyOptions', bound='Options')
@@ -64,6 +64,9 @@ class Options:
         """Check every field; ints are taken for floats, as people write them."""
         for f in fields(self):
             if 'meaning' not in f.metadata:
+                nested = type(f.default)
+                require(nested, f.name, getattr(self, f.name),
+                        f'{nested.__name__}; {nested.__name__}.from_mapping makes it of a mapping')
                 continue
             meaning, value, kind = f.metadata['meaning'], getattr(self, f.name), type(f.default)
             if kind is float and type(value) is int:

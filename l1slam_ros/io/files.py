@@ -21,6 +21,7 @@ import numpy as np
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.measurements import QUATERNION_NORM_ERROR
+from l1slam_ros.io.bounded import read_text
 from l1slam_ros.io.remarks import Remarks, read_remarks
 
 NANOSECONDS = 10**9
@@ -36,11 +37,16 @@ _AT_ONCE = 500
 
 @dataclass(frozen=True)
 class TextLines:
-    """Lines of a file: their numbers, from 1, and their texts; of a saved map, its remarks."""
+    """
+    Lines of a file: their numbers, from 1, and their texts.
+
+    remarks : of a saved map; comments : number and text of each comment line.
+    """
 
     numbers: list[int]
     texts: list[str]
     remarks: Remarks = None
+    comments: tuple[tuple[int, str], ...] = ()
 
 
 @contextmanager
@@ -156,7 +162,7 @@ def write_lines(path: str | os.PathLike[str], lines: Iterable[str]) -> None:
 
 def read_lines(path: str | os.PathLike[str]) -> TextLines:
     """
-    Return the lines of a text file, blank ones and `#` comments left out.
+    Return the lines of a text file, blank ones left out, and `#` comments apart.
 
     Raises
     ------
@@ -164,7 +170,7 @@ def read_lines(path: str | os.PathLike[str]) -> TextLines:
 
     """
     with reported(path, 'read'):
-        content = Path(path).read_bytes()
+        content = read_text(Path(path))
     try:
         remarks = read_remarks(path, content)
         text = content.decode('utf-8-sig').replace('\r\n', '\n').replace('\r', '\n')
@@ -172,8 +178,11 @@ def read_lines(path: str | os.PathLike[str]) -> TextLines:
         found = f'byte 0x{error.object[error.start]:02x} at offset {error.start}'
         raise FileError(path, f'{found}; expected a text file') from error
     kept = [(number, line) for number, line in enumerate(text.split('\n'), 1)
-            if line and not line.isspace() and not line.lstrip().startswith('#')]
-    return TextLines([number for number, _ in kept], [line for _, line in kept], remarks)
+            if line and not line.isspace()]
+    lines = [pair for pair in kept if not pair[1].lstrip().startswith('#')]
+    comments = tuple(pair for pair in kept if pair[1].lstrip().startswith('#'))
+    return TextLines([number for number, _ in lines], [line for _, line in lines], remarks,
+                     comments)
 
 
 def counted(count: int, noun: str, plural: str = '') -> str:

@@ -7,28 +7,47 @@ In the end `l1slam_ros.read_graph` and `write_graph`.
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from l1slam_ros.core.errors import FileError, GraphError, OptionError
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.errors import FileError, GraphError, OptionError, require
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.measurements import as_poses
 from l1slam_ros.core.names import QUATERNION, ROTATION_INFORMATION
 from l1slam_ros.core.robust.inspection import initial_poses
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES, DEFAULT_TOPICS, Topics
 from l1slam_ros.io.files import require_file, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
+from l1slam_ros.io.graphs.left_out import left_out_of, nothing_left_out
+from l1slam_ros.io.graphs.side_files import BESIDE, WRITTEN_BESIDE, beside
+from l1slam_ros.io.ours import refuse_others
 from l1slam_ros.io.trajectory import write_tum
 
 if TYPE_CHECKING:
     from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
 
 GRAPH_SUFFIXES = ('.g2o', '.graph')
+
+
+class _Origin(NamedTuple):
+    """What the file of a graph says besides; see `GraphRecord`."""
+
+    ids: Indices
+    stamps: Indices | None = None
+    left_out: np.ndarray | None = None
+    comments: tuple[tuple[int, str], ...] = ()
+
+
+# By the graphs that `read_graph` returned, which know nothing of files.
+_ORIGINS: WeakKeyDictionary[FactorGraph, _Origin] = WeakKeyDictionary()
 
 
 def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
@@ -92,8 +111,24 @@ def named(path: Path | str) -> Iterator[None]:
         raise FileError(path, str(error)) from error
 
 
-def check_output(path: Path) -> None:
-    """Refuse, before any work is done, an output that could not be written in the end."""
+def files_of(path: Path) -> list[Path]:
+    """Return an input and all that may be read beside it."""
+    return [path, *(beside(path, what) for what in BESIDE)]
+
+
+def check_output(path: Path, inputs: Iterable[Path] = (), force: bool = False,
+                 also: tuple[str, ...] = ()) -> None:
+    """
+    Refuse, before any work is done, an output that could not be written in the end.
+
+    Parameters
+    ----------
+    path : see `write_output`
+    inputs : what is read, and never written
+    force : whether to replace what others wrote
+    also : what will be written beside it besides, as `truth`
+
+    """
     if path.suffix.lower() not in ('.g2o', '.tum', ''):
         raise FileError(path, 'unknown suffix; expected .g2o, .tum, or none for a bag directory')
     if path.suffix:
@@ -103,21 +138,26 @@ def check_output(path: Path) -> None:
 
         require_folder(path)
         refuse_other_than_bag(path)
+    if path.suffix.lower() == '.g2o':
+        also = (*WRITTEN_BESIDE, *also)
+    refuse_others([path, *(beside(path, what) for what in also)], inputs, force)
 
 
-def check_graph_output(path: Path) -> None:
+def check_graph_output(path: Path, inputs: Iterable[Path] = (), force: bool = False,
+                       also: tuple[str, ...] = ()) -> None:
     """Refuse, as `check_output`, an output that does not hold a graph."""
-    check_output(path)
+    check_output(path, inputs, force, also)
     if path.suffix.lower() == '.tum':
         raise FileError(path, 'a trajectory has no edges; expected .g2o, or no suffix for a bag '
                         'directory')
 
 
-def write_output(path: Path, record: GraphRecord, truth: Array | None = None) -> None:
+def write_output(path: Path, record: GraphRecord, truth: Array | None = None,
+                 force: bool = False) -> None:
     """
     Write a graph with its poses, in the format that the suffix names; none: a bag.
 
-    truth : (n, p) poses, which a bag has a topic for
+    truth : (n, p) poses, which a bag has a topic for; force : whether to replace what others wrote
 
     Raises
     ------
@@ -125,7 +165,7 @@ def write_output(path: Path, record: GraphRecord, truth: Array | None = None) ->
     GraphError : the format has no place for a part of the graph.
 
     """
-    check_output(path)
+    check_output(path, force=force)
     if path.suffix.lower() == '.g2o':
         write_graph_file(path, record)
     elif path.suffix.lower() == '.tum':
@@ -136,8 +176,9 @@ def write_output(path: Path, record: GraphRecord, truth: Array | None = None) ->
         write_graph_bag(path, record, truth)
 
 
-def read_graph(path: str | os.PathLike[str], *,
-               rotation_information: str = QUATERNION) -> tuple[FactorGraph, Array | None]:
+def read_graph(path: str | os.PathLike[str], *, odom_topic: str = DEFAULT_TOPICS.odometry,
+               loop_topic: str = DEFAULT_TOPICS.loops, rotation_information: str = QUATERNION,
+               ) -> tuple[FactorGraph, Array | None]:
     """
     Return the graph in a file, and the poses (n, p) that it stores, None where none.
 
@@ -149,50 +190,77 @@ def read_graph(path: str | os.PathLike[str], *,
     Parameters
     ----------
     path : .g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1
+    odom_topic, loop_topic : where a bag has its odometry and its loops, or pose graphs of a front
+        end, see `l1slam solve --help`; of a graph file they say nothing
     rotation_information : what the rotation block of the information in a 3D g2o file is of,
         `quaternion`, its vector part, as g2o has it, or `angle`
 
     Raises
     ------
     FileError : naming file and line, what was found and what was expected.
+    OptionError : an argument is of another kind.
 
     """
-    _check_reading(rotation_information)
-    record = read_input(Path(path), rotation_information=rotation_information)
+    _check_reading(path, rotation_information)
+    for name, topic in (('odom_topic', odom_topic), ('loop_topic', loop_topic)):
+        require(str, name, topic, 'the name of a topic')
+    record = read_input(Path(path), topics=Topics(odom_topic, loop_topic),
+                        rotation_information=rotation_information)
     for sentence in filter(None, (*record.skipped, record.damage)):
         warnings.warn(sentence, stacklevel=2)
+    _ORIGINS[record.graph] = _Origin(record.ids, record.stamps, record.left_out, record.comments)
     return record.graph, record.poses
 
 
 def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, *,
-                rotation_information: str = QUATERNION) -> None:
+                rotation_information: str = QUATERNION, inliers: Mask | None = None,
+                force: bool = False) -> None:
     """
     Write a graph with poses (n, p), whole or not at all.
+
+    A graph of `read_graph` keeps the ids, stamps and comments that it came with, as long as it has
+    as many keyframes.
 
     Parameters
     ----------
     path : .g2o, .tum (the poses alone), or a name without a suffix for a bag directory
     rotation_information : see `read_graph`
+    inliers : (m,) bool of the factors, as of a `Solution`: the others are written as what was left
+        out, which other programs do not use; None: those that were left out in the file read
+    force : whether to replace what was there, though this program did not write it
 
     Raises
     ------
-    FileError : it cannot be written, or the format has no place for a part of the graph.
-    GraphError : poses of another shape, or not finite.
+    FileError : it cannot be written, would replace what others wrote, or the format has no place
+        for a part of the graph.
+    GraphError : poses or inliers of another shape, or poses that are not finite.
+    OptionError : an argument is of another kind.
 
     """
-    _check_reading(rotation_information)
-    expected = (graph.n_poses, graph.manifold.POSE_SIZE)
-    if np.shape(poses) != expected:
-        raise GraphError(f'poses have the shape {np.shape(poses)}, expected {expected}')
+    _check_reading(path, rotation_information)
+    require(FactorGraph, 'graph', graph, 'a FactorGraph, as read_graph returns first')
+    poses = as_poses(graph, poses, 'poses have')
     if not np.isfinite(poses).all():
         row = int(np.argmin(np.isfinite(poses).all(axis=1)))
-        raise GraphError(f'pose {row} is {np.asarray(poses)[row]}, expected finite numbers')
+        raise GraphError(f'pose {row} is {poses[row]}, expected finite numbers')
+    origin, factors = _ORIGINS.get(graph), graph.between
+    if origin is None or len(origin.ids) != graph.n_poses:
+        origin = _Origin(np.arange(graph.n_poses))
+    left_out = origin.left_out
+    if inliers is not None:
+        if np.shape(inliers) != (len(factors),):
+            raise GraphError(f'inliers have the shape {np.shape(inliers)}, expected '
+                             f'{(len(factors),)}')
+        left_out = left_out_of(np.asarray(inliers, bool), factors)
+    elif left_out is not None:  # what was appended since is believed
+        left_out = np.concatenate((left_out, nothing_left_out(len(factors) - len(left_out))))
     write_output(Path(path), GraphRecord(
-        graph, np.asarray(poses, float), np.arange(graph.n_poses),
-        rotation_information=rotation_information))
+        graph, poses, origin.ids, origin.stamps, left_out=left_out,
+        rotation_information=rotation_information, comments=origin.comments), force=force)
 
 
-def _check_reading(rotation_information: str) -> None:
+def _check_reading(path: object, rotation_information: str) -> None:
+    require((str, os.PathLike), 'path', path, 'the name of a file')
     if rotation_information not in ROTATION_INFORMATION:
         raise OptionError(f'rotation_information is {rotation_information!r}, expected one of '
                           f'{", ".join(ROTATION_INFORMATION)}')

@@ -12,6 +12,7 @@ from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.names import OF_ROS
 from l1slam_ros.core.options import Options, Scalar, dotted, option
 from l1slam_ros.core.running.backend import BackendOptions
+from l1slam_ros.io.bounded import read_yaml
 
 # The name of the node, unless it was given another.
 _NODE = 'backend'
@@ -42,8 +43,8 @@ class NodeOptions(BackendOptions):
     transform_period: float = option(
         0.05, 'how often map -> odom is published', 's', 1e-3, 3600, fixed=True)
     transform_tolerance: float = option(
-        0.1, 'how far ahead of the newest odometry map -> odom is stamped: until then it holds',
-        's', 0, 3600)
+        0.1, 'how far at least map -> odom is stamped ahead of the newest odometry; further where '
+        'that comes more seldom', 's', 0, 3600)
     save_path: str = option('', 'the .g2o file of ~/save and ~/load')
     autosave_period: float = option(
         60.0, 'with a save_path, within what time a changed map is saved, and at the end; 0: off',
@@ -75,8 +76,8 @@ def read_params_file(path: Path) -> NodeOptions:
 
     """
     try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        content = read_yaml(path.read_text())
+    except (OSError, ValueError, yaml.YAMLError) as error:
         raise FileError(path, 'expected a YAML file: ' + ' '.join(str(error).split())) from error
     sections = list(_sections(content))
     named = any(name == _NODE for name, _ in sections)

@@ -22,6 +22,7 @@ from matplotlib.transforms import ScaledTranslation
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.io.files import counted, replacing, require_file
+from l1slam_ros.io.ours import PROGRAM
 
 _SUFFIXES = ('.png', '.svg', '.pdf')
 _BLUE, _GREEN, _ORANGE, _RED, _GREY = '#0072B2', '#009E73', '#E69F00', '#D5370E', '#808080'
@@ -161,8 +162,10 @@ def _new_figure(path: str | Path, columns: float, rows: float) -> Figure:
 
 def _save(figure: Figure, path: str | Path) -> None:
     with replacing(path) as temporary:
-        figure.savefig(temporary, format=Path(path).suffix[1:].lower(), bbox_inches='tight',
-                       pad_inches=0.15)
+        kind = Path(path).suffix[1:].lower()
+        # The mark that lets it be replaced; see `ours`.
+        figure.savefig(temporary, format=kind, bbox_inches='tight', pad_inches=0.15,
+                       metadata={'Software' if kind == 'png' else 'Creator': PROGRAM})
 
 
 def _draw_curves(axes: Axes, curves: Sequence[Curve], title: str, note: str = '') -> None:

@@ -24,9 +24,9 @@ from l1slam_ros.core.errors import FileError
 # Name -> value; none where a file is no saved map.
 Remarks = Mapping[str, Any] | None
 
-_KEYWORD = '#L1SLAM '
-_FIRST = f'{_KEYWORD}map 2'
-_PROOF = f'{_KEYWORD}sha256 '
+KEYWORD = '#L1SLAM '
+_FIRST = f'{KEYWORD}map 2'
+_PROOF = f'{KEYWORD}sha256 '
 _LAST = len(_PROOF) + 2 * sha256().digest_size + 1  # bytes of the last line
 # Rows to a line: readers whose lines have an end get through, and other threads their turn.
 _AT_ONCE = 500
@@ -65,7 +65,7 @@ def _unproven(lines: Iterable[str], values: Mapping[str, Any]) -> Iterator[str]:
         if isinstance(value, np.ndarray | list):
             parts = [value[k : k + _AT_ONCE] for k in range(0, max(len(value), 1), _AT_ONCE)]
         for part in parts:
-            yield f'{_KEYWORD}{name} ' + (
+            yield f'{KEYWORD}{name} ' + (
                 f'{part.dtype.str} {b64encode(part.tobytes()).decode()}'
                 if isinstance(part, np.ndarray) else json.dumps(part, separators=(',', ':')))
 
@@ -80,7 +80,7 @@ def is_proven(path: object, content: bytes) -> bool:
 
     """
     last = content[-_LAST:]
-    if not content.startswith(_KEYWORD.encode()) and not last.startswith(_PROOF.encode()):
+    if not content.startswith(KEYWORD.encode()) and not last.startswith(_PROOF.encode()):
         return False
     if last != f'{_PROOF}{sha256(memoryview(content)[:-_LAST]).hexdigest()}\n'.encode():
         raise FileError(path, 'is damaged: its last line is not the checksum of those before; '
@@ -103,7 +103,7 @@ def read_remarks(path: object, content: bytes) -> Remarks:
         return None
     parts: dict[str, list[Any]] = {}
     _, *lines, _ = (line.split(' ', 2)[1:] for line in content.decode().split('\n')
-                    if line.startswith(_KEYWORD))
+                    if line.startswith(KEYWORD))
     for name, text in lines:
         parts.setdefault(name, []).append(_value(text))
     return {name: _joined(of_name) for name, of_name in parts.items()}

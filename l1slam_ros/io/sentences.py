@@ -9,6 +9,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import BetweenFactors
 from l1slam_ros.core.robust.judgement import (
+    FAILED,
     MOSTLY_REFUSED,
     NORM,
     ONE_JOINS,
@@ -16,6 +17,7 @@ from l1slam_ros.core.robust.judgement import (
     OTHER_MAP,
     SLIP,
     UNFINISHED,
+    UNSOLVED,
     Doubt,
     Judgement,
 )
@@ -57,6 +59,10 @@ _REASONS = {
     NORM: 'the map is further from the least squares map of the same {loops} loops than noise '
           'explains, so factors err together or are not what they say; `--norm l2` and `huber` '
           'make other maps',
+    FAILED: 'judging the loops failed ({detail}): the map is of what was believed until then, and '
+            '{loops} loops {where} are left out',
+    UNSOLVED: 'solving for the {loops} loops that are believed failed ({detail}): this is the map '
+              'by which they were judged',
 }
 _REMEDY = 'Vouch for a loop that is right, strike out one that is false, or state the noise'
 
@@ -116,7 +122,8 @@ def doubt_sentence(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None
         if stamps is not None:
             first, last = stamp_text(stamps[doubt.first]), stamp_text(stamps[doubt.last])
             where += f' ({first} s to {last} s)'
-        reasons.append(_REASONS[doubt.kind].format(loops=f'{doubt.loops:,}', where=where))
+        reasons.append(_REASONS[doubt.kind].format(loops=f'{doubt.loops:,}', where=where,
+                                                   detail=doubt.detail))
     return f'{DOUBTFUL}: {"; ".join(reasons)}. {_REMEDY}' if reasons else ''
 
 

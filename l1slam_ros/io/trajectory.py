@@ -26,6 +26,7 @@ from l1slam_ros.io.files import (
     write_lines,
 )
 from l1slam_ros.io.graphs.graph_file import read_vertices
+from l1slam_ros.io.ours import marked
 
 _TUM_COLUMNS = 8
 
@@ -56,8 +57,8 @@ def write_tum(path: str | os.PathLike[str], stamps: Indices, poses: Array,
 
     """
     rows = manifold.to_pose3(poses).tolist()
-    write_lines(path, (f'{stamp_text(stamp)} {" ".join(map(repr, row))}'
-                       for stamp, row in zip(stamps.tolist(), rows, strict=True)))
+    write_lines(path, marked(f'{stamp_text(stamp)} {" ".join(map(repr, row))}'
+                             for stamp, row in zip(stamps.tolist(), rows, strict=True)))
 
 
 def truth_lines(ids: Indices, poses: Array) -> Iterator[str]:

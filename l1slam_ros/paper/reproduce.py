@@ -23,6 +23,7 @@ from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import STEPS, compile_now
 from l1slam_ros.io.files import new_folder_beside, put_lines, reported, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.ours import REPORT_MARK, refuse_others
 from l1slam_ros.io.progress import Progress, say
 from l1slam_ros.paper import figures, report
 from l1slam_ros.paper import printed as paper
@@ -34,7 +35,7 @@ REPORT = 'report.md'
 
 
 def reproduce(datasets: Path | None, worlds: Sequence[PaperGraph], output: Path,
-              effort: Effort) -> None:
+              effort: Effort, force: bool = False) -> None:
     """
     Run the experiments and write the report into the folder `output`, whole or not at all.
 
@@ -44,6 +45,7 @@ def reproduce(datasets: Path | None, worlds: Sequence[PaperGraph], output: Path,
     worlds : which of the paper's simulated worlds to make anew, in their sizes
     output : its other files stay as they are
     effort : how long the experiments run
+    force : whether to replace files of these names that others wrote
 
     Raises
     ------
@@ -54,7 +56,7 @@ def reproduce(datasets: Path | None, worlds: Sequence[PaperGraph], output: Path,
     if not datasets and not worlds:
         raise OptionError('nothing to run: no datasets and no worlds; expected --datasets DIR, '
                           'or --worlds other than none')
-    _check_folder(output)
+    _check_folder(output, force)
     records = read_datasets(datasets) if datasets else {}
     compile_now(STEPS)
     study = Study(measured(records, worlds, effort), effort)
@@ -63,7 +65,7 @@ def reproduce(datasets: Path | None, worlds: Sequence[PaperGraph], output: Path,
         for title, section in SECTIONS.items():
             say(title)
             lines += ['', f'## {title}', '', *section(study, folder)]
-        put_lines(folder / REPORT, lines)
+        put_lines(folder / REPORT, [REPORT_MARK, *lines])
 
 
 def read_datasets(datasets: Path) -> dict[str, GraphRecord]:
@@ -132,13 +134,14 @@ SECTIONS: dict[str, Callable[[Study, Path], list[str]]] = {
     'Left for later: L-infinity': report.future_work}
 
 
-def _check_folder(output: Path) -> None:
+def _check_folder(output: Path, force: bool) -> None:
     """Refuse, before any work is done, a place where no folder can be."""
     require_folder(output)
     if os.path.lexists(output) and not output.is_dir():
         raise FileError(output, 'is no folder; expected one, or nothing there')
     if output.exists():
         require_folder(output / REPORT)
+        refuse_others([output / REPORT, *sorted(output.glob('figure_*.png'))], force=force)
 
 
 @contextmanager

@@ -38,6 +38,7 @@ from l1slam_ros.io.formats import read_input
 from l1slam_ros.io.graphs.side_files import read_pairs
 from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.io.plot import MapDrawing, plot_maps
+from l1slam_ros.ros.shell.domain import go_where_nobody_is
 
 Process = subprocess.Popen[bytes]
 
@@ -282,12 +283,11 @@ def require_the_truth(recording: Recording, heard: Heard) -> None:
 
 def main() -> int:
     """Run the demo from the checkout's top folder; return the exit code."""
-    # A domain of its own: the demo neither hears nor disturbs what else runs here.
-    os.environ.setdefault('ROS_DOMAIN_ID', str(os.getpid() % 100 + 1))
-    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     # What an earlier run drew must not pass for what this one does.
     PICTURE.unlink(missing_ok=True)
     try:
+        # The demo neither hears nor disturbs what else runs here.
+        print(f'demo: in ROS domain {go_where_nobody_is()}, on this machine only', flush=True)
         recording = read_recording(BAG)
         heard = record_map(BAG, recording)
         print(summarise(recording, heard, PICTURE))
@@ -298,7 +298,3 @@ def main() -> int:
     except (KeyboardInterrupt, ExternalShutdownException):
         return _INTERRUPTED
     return 0
-
-
-if __name__ == '__main__':
-    sys.exit(main())

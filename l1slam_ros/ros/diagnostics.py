@@ -45,7 +45,8 @@ class Diagnostics:
         self._last: Improvement | None = None
         self._updates = 0
         self._jump: dict[str, str] = {}
-        self._refused: deque[Counter[str]] = deque([Counter()], maxlen=_MINUTE)
+        # How many messages were refused, and how often the odometry broke off, by causes.
+        self._minute = deque([(Counter[str](), Counter[str]())], maxlen=_MINUTE)
 
     def note(self, improvement: Improvement) -> None:
         """Remember the latest update; the solver's thread calls it."""
@@ -59,15 +60,16 @@ class Diagnostics:
             self._jump = {'jump.translation': f'{metres:.4f}', 'jump.rotation': f'{radians:.5f}'}
 
     def publish(self, counts: Mapping[str, int], behind: Behind, refused: Counter[str],
-                twins: str) -> None:
+                told: Counter[str], twins: str) -> None:
         """
         Publish one status.
 
         counts : sizes of the graph; behind : what goes on behind updates; refused : cause -> how
-        many messages, since the start; twins : what is wrong with the node's name, empty: nothing.
+        many messages, since the start; told : how often the odometry did not go on as robots move,
+        by what was made of it; twins : what is wrong with the node's name, empty: nothing.
         """
-        lately = refused - self._refused[0]
-        self._refused.append(Counter(refused))
+        lately, broken = refused - self._minute[0][0], told - self._minute[0][1]
+        self._minute.append((Counter(refused), Counter(told)))
         values: dict[str, object] = {
             f'{topic}.{name}': value for topic, traffic in self._topics.items()
             for name, value in traffic.values().items()}
@@ -82,7 +84,8 @@ class Diagnostics:
         for cause, count in sorted((+refused).items()):
             values |= {f'refused.{cause}': count,
                        f'refused.{cause}.last_minute': lately[cause]}
-        level, sentence = self._judgement(counts, lately, twins)
+        values |= {f'odometry.{cause}': count for cause, count in sorted(told.items())}
+        level, sentence = self._judgement(counts, lately, broken, twins)
         name = self._node.get_fully_qualified_name()
         status = DiagnosticStatus(
             level=level, name=f'{name}: map', message=sentence, hardware_id=name,
@@ -91,7 +94,7 @@ class Diagnostics:
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
 
-    def _judgement(self, counts: Mapping[str, int], lately: Counter[str],
+    def _judgement(self, counts: Mapping[str, int], lately: Counter[str], broken: Counter[str],
                    twins: str) -> tuple[bytes, str]:
         """Return the level and all that is wrong now, in one sentence."""
         failures = self._failures.lasting
@@ -105,6 +108,10 @@ class Diagnostics:
         if lately:
             wrong.append('refused in the last minute: ' + ', '.join(
                 f'{count} {cause}' for cause, count in sorted(lately.items())))
+        if broken:
+            causes = ', '.join(f'{count} {cause}' for cause, count in sorted(broken.items()))
+            wrong.append('odometry that did not go on as the robot moves, in the last minute: '
+                         f'{causes}')
         rejected = counts['rejected_loops']
         judged = rejected + counts['accepted_loops'] + counts['suspect_loops']
         if judged >= _FEW and rejected > judged / 2:

@@ -1,12 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`backend` and `replay`: what they say where ROS, or anything else they need, is not there."""
+"""
+`backend`, `replay` and the demo: what comes before ROS is imported.
+
+What `backend` cannot be told, a middleware that is not there, and what is said where ROS itself,
+or anything else they need, is not there.
+"""
 
 import sys
+from contextlib import suppress
 from importlib import import_module
+
+from l1slam_ros.ros.run_backend import leave
+from l1slam_ros.ros.shell.arguments import backend_help, split
+from l1slam_ros.ros.shell.middleware import use_what_is_there
+
+_BAD_INPUT = 2
 
 
 def backend() -> int:
-    """Run the node; return the exit code."""
+    """Run the node; return the exit code: 2 where it is told what it does not know."""
+    own, _ = split(sys.argv[1:])
+    if '-h' in own or '--help' in own:
+        from l1slam_ros.io.node_options import NodeOptions
+
+        with suppress(BrokenPipeError):  # who reads may have seen enough
+            print(backend_help(NodeOptions()))
+        leave(0)
+    if own:
+        print(f'backend: {own[0]!r} is no argument of it; expected those of ROS after --ros-args, '
+              'see backend --help', file=sys.stderr)
+        return _BAD_INPUT
     return _run('backend', 'run_backend')
 
 
@@ -15,8 +38,15 @@ def replay() -> int:
     return _run('replay', 'replay')
 
 
+def demo() -> int:
+    """Run the demo; return the exit code."""
+    return _run('demo', 'demo')
+
+
 def _run(name: str, module: str) -> int:
     try:
+        if sentence := use_what_is_there():
+            print(f'{name}: {sentence}', file=sys.stderr, flush=True)
         code: int = import_module(f'l1slam_ros.ros.{module}').main()
     except ImportError as error:
         if (error.name or '').startswith('l1slam_ros'):
@@ -25,3 +55,7 @@ def _run(name: str, module: str) -> int:
               "file, or `pip install '.[ros]'` here", file=sys.stderr)
         return 1
     return code
+
+
+if __name__ == '__main__':  # by `make demo`, as by a command
+    sys.exit(demo())

@@ -172,9 +172,10 @@ class BackendNode(LifecycleNode):
         self._inputs.look_at_events()
         for sentence in self._backend.news():
             self.get_logger().warning(sentence)
-        counts, refused = self._backend.counts()
+        counts = self._backend.counts()
         self._diagnostics.publish(
-            counts, self._backend.behind(), self._inputs.refused.copy() + Counter(refused),
+            counts.sizes, self._backend.behind(),
+            self._inputs.refused.copy() + Counter(counts.refused), Counter(counts.told),
             self._twins())
 
     def _twins(self) -> str:

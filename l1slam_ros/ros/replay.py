@@ -27,6 +27,7 @@ from l1slam_ros.io.bags.reader import BagSummary, bag_summary, read_raw
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.arguments import split
 from l1slam_ros.ros.threads.failures import reason
 
 _BAD_INPUT = 2
@@ -214,7 +215,8 @@ _not_negative = _number('of 0 or more', lambda value: value >= 0)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog='replay', description='Play a bag onto topics.')
+    parser = argparse.ArgumentParser(prog='replay', description='Play a bag onto topics.',
+                                     epilog='What ROS is to know comes after --ros-args.')
     add = parser.add_argument
     add('bag', type=Path, help='.mcap, .db3, .bag (ROS 1) or a rosbag2 directory')
     add('--wait', type=_not_negative, metavar='SECONDS',
@@ -230,12 +232,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Split at `--ros-args`. rclpy's own splitting also takes the old:=new of --remap for its."""
-    at = arguments.index('--ros-args') if '--ros-args' in arguments else len(arguments)
-    return arguments[:at], arguments[at:]
-
-
 def _init(arguments: list[str]) -> None:
     try:
         rclpy.init(args=arguments)
@@ -245,7 +241,7 @@ def _init(arguments: list[str]) -> None:
 
 def main() -> int:
     """Play; return the exit code: 0, 2 for bad input, 3 where only a part could be read."""
-    own, ros = _split(sys.argv[1:])
+    own, ros = split(sys.argv[1:])
     arguments = _parser().parse_args(own)
     arguments.remap = dict(arguments.remap)
     damages: list[str] = []

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Where the robot is: on `pose` with its odometry, and as map -> odom on a clock.
+Where the robot is: as map -> odom and on `pose`, with its odometry; the former on a clock, too.
 
 The transform is on `map_to_odom` always, on /tf where tf2_msgs is installed.
 """
 
 import math
 import time
+from collections import deque
 
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.node import Node
@@ -22,14 +23,51 @@ try:
 except ImportError:  # the ROS wheels on PyPI have none
     TFMessage = None
 
+_LATELY = 20
+# [ns] Taken for the time to the second message of the odometry; seldom is it more.
+_FIRST_GUESS = NANOSECONDS // 5
+# The next message may come later than lately, by so much of that time [1].
+_SPARE = 1.5
+# [ns] Odometry that comes more seldom than every 1.3 s is covered by the tolerance alone: until
+# the newest stamp that is out, what a look-up finds lies between an old transform and the new one.
+_FURTHEST = 2 * NANOSECONDS
+# A transform goes out with odometry unless one that is out reaches nearly as far [1].
+_NEARLY = 0.9
+
+
+class Horizon:
+    """
+    How far ahead of the newest odometry a transform is to be stamped.
+
+    Who hears of a message of the odometry looks up its stamp at once, when the transform that this
+    message will cause is still to come. So the one before must reach to it: as far as from one
+    message to the next. That time is the longest but one of the last twenty, for odometry may have
+    stopped once, and half of it again.
+    """
+
+    def __init__(self) -> None:
+        self._intervals = deque([_FIRST_GUESS], _LATELY)
+        self._newest = 0
+
+    def note(self, stamp: int) -> None:
+        """Note the stamp of odometry that has come [ns]; one that is older begins anew."""
+        if stamp < self._newest:
+            self._intervals = deque([_FIRST_GUESS], _LATELY)
+        elif 0 < self._newest < stamp:
+            self._intervals.append(stamp - self._newest)
+        self._newest = stamp
+
+    def ahead(self, tolerance: float) -> int:
+        """Return how far [ns], `tolerance` [s] at least."""
+        usual = sorted(self._intervals)[-2:][0]
+        return max(int(tolerance * NANOSECONDS), min(int(_SPARE * usual), _FURTHEST))
+
 
 class RobotPublisher:
     """
     Publishes the robot in the map, and where the odometry frame is there.
 
-    The transform is stamped ahead of the newest odometry: a look-up at that time succeeds so, as
-    long as the next transform comes within the tolerance; with a stamp of its own it would fail
-    until then.
+    The transform is stamped ahead of the newest odometry, see `Horizon`.
 
     Parameters
     ----------
@@ -46,18 +84,27 @@ class RobotPublisher:
         self._tf = None
         if parameters.options.publish_tf and TFMessage is not None:
             self._tf = node.create_publisher(TFMessage, '/tf', 100)
+        self._horizon = Horizon()
         self._newest = self._stamp = self._before = 0
         self._due = 0.0
         # The newest as a pose of the manifold, and as it is published.
         self._last = (backend.manifold.identity(0),) * 2
 
     def answer(self) -> None:
-        """Publish where the robot is now."""
-        robot, manifold = self._backend.robot(), self._backend.manifold
-        if robot is not None:  # else the map has been emptied meanwhile
-            pose = manifold.compose(robot.map_to_odom, robot.odometry)
-            self._pose.publish(pose_bytes(
-                self._parameters.options.map_frame, robot.stamp, manifold.to_pose3(pose)[0]))
+        """
+        Publish where the robot is now.
+
+        First the transform: who has heard of this odometry, too, is about to look it up, and what
+        comes next is to find this one there.
+        """
+        robot, manifold = self._look(), self._backend.manifold
+        if robot is None:  # the map has been emptied meanwhile
+            return
+        if robot.stamp != self._before and self._stamp < robot.stamp + _NEARLY * self._ahead():
+            self._publish(robot)
+        pose = manifold.compose(robot.map_to_odom, robot.odometry)
+        self._pose.publish(pose_bytes(
+            self._parameters.options.map_frame, robot.stamp, manifold.to_pose3(pose)[0]))
 
     def forget(self) -> None:
         """Publish no transform until there is other odometry: its stamps are of another time."""
@@ -67,31 +114,46 @@ class RobotPublisher:
         """
         Publish the transform if it is time; return when to call again [s], or infinity.
 
-        It is time, too, when odometry has come that is newer than the last transform: a bag that
-        is played fast, or odometry that comes seldom, outruns the tolerance within a period.
+        It is time, too, when odometry that nobody answered is newer than the last transform.
         """
-        robot, now = self._backend.robot(), time.monotonic()
+        robot, now = self._look(), time.monotonic()
         if robot is None or robot.stamp == self._before:
             return math.inf
         if now >= self._due or robot.stamp > self._stamp:
             self._publish(robot)
-            late, period = now - self._due, self._parameters.options.transform_period
-            self._due = now + period - (late if 0 <= late < period else 0.0)
         return self._due - now
+
+    def _look(self) -> Robot | None:
+        robot = self._backend.robot()
+        if robot is not None:
+            if robot.stamp < self._newest:
+                self._stamp = 0  # time itself went back
+            self._newest = robot.stamp
+            self._horizon.note(robot.stamp)
+        return robot
+
+    def _ahead(self) -> int:
+        return self._horizon.ahead(self._parameters.options.transform_tolerance)
 
     def _publish(self, robot: Robot) -> None:
         """Publish the transform as it is now."""
-        options = self._parameters.options
         self._before = 0
-        if robot.stamp < self._newest:
-            self._stamp = 0  # time itself went back
-        self._newest = robot.stamp
-        # tf2 ignores a second transform of one time, and warns of it.
-        self._stamp = min(max(robot.stamp + int(options.transform_tolerance * NANOSECONDS),
-                              self._stamp + 1), LAST_STAMP)
         if robot.map_to_odom is not self._last[0]:
             self._last = (robot.map_to_odom,
                           self._backend.manifold.to_pose3(robot.map_to_odom)[0])
+        if not self._stamp:
+            # Before the first there is nothing to look up.
+            self._stamp = robot.stamp
+            self._send()
+        # tf2 ignores a second transform of one time, and warns of it.
+        self._stamp = min(max(robot.stamp + self._ahead(), self._stamp + 1), LAST_STAMP)
+        self._send()
+        now = time.monotonic()
+        late, period = now - self._due, self._parameters.options.transform_period
+        self._due = now + period - (late if 0 <= late < period else 0.0)
+
+    def _send(self) -> None:
+        options = self._parameters.options
         said = options.map_frame, options.odom_frame, self._stamp, self._last[1]
         self._transform.publish(transform_bytes(*said))
         if self._tf is not None:

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+_BAD_INPUT = 2
 # [s] A signal leaves that long for an orderly end; the threads of the node get a part of it.
 _PATIENCE, _THREADS = 1.2, 0.9
 # [s] And so much longer for a map that is being saved.
@@ -91,8 +92,10 @@ def main() -> None:
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # arguments, or a file of parameters, that ROS cannot read
-        print(f'backend: {" ".join(str(error).split())}', file=sys.stderr)
-        leave(1)
+        unknown = type(error).__name__ == 'UnknownROSArgsError'
+        said = 'arguments that ROS does not know: ' if unknown else ''
+        print(f'backend: {said}{" ".join(str(error).split())}', file=sys.stderr)
+        leave(_BAD_INPUT if unknown else 1)
     node, code = None, 0
     signals.orderly(rclpy.try_shutdown)
     try:

@@ -55,3 +55,29 @@ def test_the_reading_of_the_rotation_is_kept_and_weighs(capsys, building, tmp_pa
              for more in ((), reading)]
     # The file is g2o's; read as of the angle its rotations weigh four times as much.
     assert costs[1] > 1.5 * costs[0]
+
+
+@pytest.mark.parametrize('reading', ['quaternion', 'angle'])
+def test_information_that_is_not_definite_costs_one_line_and_no_map(capsys, building, reading):
+    """A third of the edges say of one direction that they know less than nothing of it."""
+    truth = ('--reference', f'{building}.truth.txt', '--rotation-information', reading)
+    clean = solve_json(capsys, building, *truth)
+    lines, upper, count = building.read_text().splitlines(), np.triu_indices(6), 0
+    for k, line in enumerate(lines):
+        words = line.split()
+        if words[0] == 'EDGE_SE3:QUAT' and k % 3 == 0:
+            information = np.zeros((6, 6))
+            information[upper] = np.array(words[10:], float)
+            information = information + np.triu(information, 1).T
+            values, vectors = np.linalg.eigh(information)
+            values[count % 3] *= -1e-3
+            information = vectors @ np.diag(values) @ vectors.T
+            lines[k] = ' '.join([*words[:10], *map(repr, information[upper].tolist())])
+            count += 1
+    building.write_text('\n'.join(lines) + '\n')
+    report = solve_json(capsys, building, *truth)
+    warning, = report['warnings']
+    assert count > 100 and warning.startswith(f'{count} of 330 information matrices not positive ')
+    assert report['status'] == 'converged' and report['rejected'] == []
+    assert report['ate'] < 2 * clean['ate'] + 0.1
+    assert f'- {warning}\n' in run(capsys, 'info', building, *truth[2:])[0]

@@ -25,7 +25,8 @@ def test_a_tum_file_has_eight_columns_and_exact_stamps(tmp_path):
     path = tmp_path / 'a.tum'
     stamps = np.array([1305031102175300121, 1305031102175300122])
     write_tum(path, stamps, np.array([[1.25, -2, 0], [0.1, 0.2, np.pi / 2]]), se2)
-    rows = [line.split(' ') for line in path.read_text().splitlines()]
+    mark, *rows = [line.split(' ') for line in path.read_text().splitlines()]
+    assert mark[0] == '#', 'to evo and others a comment'
     assert [row[0] for row in rows] == ['1305031102.175300121', '1305031102.175300122']
     np.testing.assert_allclose(
         np.array(rows, float)[:, 1:],

@@ -48,16 +48,18 @@ def test_a_recorded_world_becomes_its_optimal_map_and_all_topics_agree(bench, tm
     b.until(lambda: b.received['map_to_odom'], 'a transform is repeated')
     # A look-up at the time of the newest odometry finds it.
     ahead = [stamp_of(m.header) - stamp_of(last.header) for m in b.received['map_to_odom']]
-    assert ahead[0] == pytest.approx(10**8, abs=1e4) and (np.diff(ahead) > 0).all()
+    assert ahead[0] >= 10**8 and (np.diff(ahead) > 0).all()
 
 
-def test_odometry_that_outruns_the_transforms_is_covered_at_once(bench):
-    """That of a bag played fast: look-ups at its times would wait for the next period."""
+def test_transforms_reach_to_the_odometry_that_comes_next(bench):
+    """That of a bag played fast, or that comes seldom: by more than the tolerance."""
     b = bench(transform_period=3600.0)
     for k in range(5):
         b.drive(k, k + 1)
-        b.until(lambda k=k: len(b.received['map_to_odom']) == k + 1, 'a transform with a message')
-        assert stamp_of(b.received['map_to_odom'][-1].header) == (k + 1) * 10**9 + 10**8
+        b.until(lambda k=k: len(b.received['map_to_odom']) == k + 2, 'a transform with a message')
+    # tf2 looks up between two: at first, before it is known how seldom, one at the stamp itself.
+    assert [stamp_of(message.header) for message in b.received['map_to_odom']] == [
+        10**9, 13 * 10**8, 23 * 10**8, 45 * 10**8, 55 * 10**8, 65 * 10**8]
 
 
 def test_default_thresholds_make_a_keyframe_every_half_metre(bench):

@@ -49,3 +49,11 @@ def test_who_has_gone_is_forgotten():
         traffic.note({'publication_sequence_number': number})
     assert traffic.lost == 4999
     assert traffic.values()['received'] == '5'
+
+
+def test_numbers_that_begin_anew_are_of_another_publisher():
+    traffic, found = Traffic(lambda: 1), []
+    for number in (7, 8, 12, 1, 2, None, 3):
+        traffic.note({'publication_sequence_number': number})
+        found.append(traffic.other_source)
+    assert found == [False, False, False, True, False, False, False]

@@ -27,6 +27,10 @@ _ASYMMETRY = 1e-4
 _SMALLEST, _LARGEST = 1e-30, 1e30
 # Least eigenvalue of the correlation: below it is rounding, and the root would be noise.
 _SINGULAR = 1e-14
+# Of the largest eigenvalue of an information matrix: less than that is none. Where a matrix says
+# nothing of a direction, or less than nothing, it then knows it a thousand times worse than its
+# best one, which other factors overrule, and maps can still be factored.
+LEAST_EIGENVALUE = 1e-6
 # [m^2], [rad^2] Between these a variance is one of a measurement. Measured on the Intel graph,
 # whose own are 1e-2 or so: with thirty steps at 1e-10 the primal-dual map is .6% above the
 # optimum, with 1e-14 or 1e8 the normal matrix is singular.
@@ -64,6 +68,34 @@ def square_root_information(information: Array) -> Array:
             raise NoiseError(f'matrix {index} is not {expected}: [{rows}]')
     root = np.linalg.cholesky(whole).transpose(0, 2, 1)
     return silenced(root.astype(np.float64, copy=False), silent)
+
+
+def nearest_definite(information: Array) -> tuple[Array, Array]:
+    """
+    Return information matrices (m, d, d), those made definite that are not, and how far they were.
+
+    The nearest matrix, in the Frobenius norm, whose eigenvalues are `LEAST_EIGENVALUE` of its
+    largest one or more (N. J. Higham, Computing a nearest symmetric positive semidefinite matrix,
+    1988). Rows and columns of zeros stay zeros. How far, (m,): the least eigenvalue over the
+    largest, NaN where the matrix stays as it is: it is definite, or has no such neighbour.
+
+    information : (m, d, d) symmetric, in units in which a metre and a radian may be compared
+    """
+    silent = np.asarray((information == 0).all(axis=2))
+    with np.errstate(invalid='ignore'):
+        sound = np.asarray((np.abs(information) <= _LARGEST).all(axis=(1, 2)))
+    rows = np.flatnonzero(sound)
+    rows = rows[~_is_definite(filled(information[rows], silent[rows]))]
+    values, vectors = np.linalg.eigh(information[rows])
+    some = values[:, -1] > 0
+    rows, values, vectors = rows[some], values[some], vectors[some]
+    floor = LEAST_EIGENVALUE * values[:, -1:]
+    definite, least = information.copy(), np.full(len(information), np.nan)
+    definite[rows] = silenced(
+        (vectors * np.maximum(values, floor)[:, None, :]) @ vectors.transpose(0, 2, 1),
+        silent[rows])
+    least[rows] = values[:, 0] / values[:, -1]
+    return definite, least
 
 
 def filled(matrices: Array, silent: Mask) -> Array:

@@ -7,14 +7,16 @@ And what is found wrong with them, and made of it: to be counted, logged, told.
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral
 
 import numpy as np
 
-from l1slam_ros.core.errors import MessageError
+from l1slam_ros.core.errors import GraphError, MessageError, require
+from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import LEAST_VARIANCE
+from l1slam_ros.core.graph.factor_graph import FactorGraph
 
 # [m/s] The speed of sound: no vehicle on the ground has been faster (Thrust SSC, 341 m/s). Stamps
 # nearer to each other than this [s] may be jitter, and say nothing about speed.
@@ -37,7 +39,9 @@ class OdometrySample:
 
     stamp : [ns]; pose3 : (7,) x y z qx qy qz qw [m]; covariance, twist_covariance : (6, 6),
     rows x y z rx ry rz, as they came in the message: `graph_builder` decides what they mean;
-    frame : `child_frame_id`, empty: that of the robot.
+    frame : `child_frame_id`, empty: that of the robot; speeds : how fast it moves [m/s] and turns
+    [rad/s] by its twist, zeros where that is not filled in; other_source : it is known to be of
+    another publisher than the sample before.
     """
 
     stamp: int
@@ -45,6 +49,8 @@ class OdometrySample:
     covariance: Array
     twist_covariance: Array
     frame: str = ''
+    speeds: tuple[float, float] = (0.0, 0.0)
+    other_source: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,15 +85,63 @@ class LoopClosure:
         return self.stamp if self.reference_stamp is None else self.reference_stamp, self.stamp
 
 
-def require_sound(what: OdometrySample | LoopClosure) -> None:
+def in_order(loop: LoopClosure) -> LoopClosure:
     """
-    Refuse what is no measurement: it would spoil all after it.
+    Return a sound loop as the later keyframe, seen from the earlier one.
+
+    Z becomes Z^-1; X = Z exp(e), so X^-1 = Z^-1 exp(-Ad(Z) e), and C becomes Ad(Z) C Ad(Z)'.
 
     Raises
     ------
+    MessageError : `order`, it leads back and leaves a component unsaid, which is none of the
+        turned one.
+
+    """
+    reference = loop.reference_stamp
+    if reference is None or reference <= loop.stamp:
+        return loop
+    if not np.isfinite(loop.covariance).all():
+        raise MessageError('order', f'a loop from {reference} ns back to {loop.stamp} ns leaves a '
+                           'component unsaid; expected its earlier time first')
+    pose = sound_pose3(tuple(loop.pose3[:3].tolist()), tuple(loop.pose3[3:].tolist()))[None]
+    Ad = se3.adjoint(pose)[0]
+    return replace(loop, reference_stamp=loop.stamp, stamp=reference, pose3=se3.inverse(pose)[0],
+                   covariance=Ad @ loop.covariance @ Ad.T)
+
+
+def as_poses(graph: FactorGraph, values: object, what: str) -> Array:
+    """
+    Return what a caller calls poses as an array (n, p) of numbers, finite or not.
+
+    what : begins the sentence on what is wrong with them, e.g. `poses have`
+
+    Raises
+    ------
+    GraphError : of another shape, or none of numbers.
+
+    """
+    expected = (graph.n_poses, graph.manifold.POSE_SIZE)
+    try:
+        poses = np.asarray(values, float)
+    except (TypeError, ValueError) as error:
+        raise GraphError(f'{what} entries that are no numbers ({error}), expected the shape '
+                         f'{expected}') from error
+    if poses.shape != expected:
+        raise GraphError(f'{what} the shape {poses.shape}, expected {expected}')
+    return poses
+
+
+def require_sound(what: OdometrySample | LoopClosure, kind: type) -> None:
+    """
+    Refuse what is no measurement of a kind: it would spoil all after it.
+
+    Raises
+    ------
+    OptionError : it is something else.
     MessageError : with the cause `stamp`, `shape`, `not_finite`, `range` or `quaternion`.
 
     """
+    require(kind, 'the measurement', what, kind.__name__)
     stamps = what.stamps if isinstance(what, LoopClosure) else (what.stamp,)
     if not all(isinstance(stamp, Integral) and -_LATEST <= stamp <= _LATEST
                for stamp in stamps):
@@ -127,12 +181,14 @@ class Notes:
     ----------
     refused : cause -> how many messages were not used for it
     warned : cause -> how many were used otherwise than they said
+    told : of those the causes that make another map of all that comes
 
     """
 
     def __init__(self) -> None:
         self.refused: Counter[str] = Counter()
         self.warned: Counter[str] = Counter()
+        self.told: Counter[str] = Counter()
         self._first: dict[str, str] = {}
         self._unsaid: dict[str, str] = {}
 
@@ -149,6 +205,7 @@ class Notes:
     def tell(self, cause: str, sentence: str) -> None:
         """Count what makes another map of all that comes: it is news each time."""
         self.warn(cause, sentence)
+        self.told[cause] += 1
         self._unsaid[cause] = sentence
 
     def warn_bounds(self, what: str, stamp: int, bounded: list[tuple[float, float]],

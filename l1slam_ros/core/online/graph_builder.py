@@ -7,6 +7,7 @@ new part of the map begins: at the end of the one before, which is a guess that 
 Loops join the parts, if there are any.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,13 +25,9 @@ from l1slam_ros.core.online.keyframes import (
     OdometryOptions,
 )
 from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
-from l1slam_ros.core.online.odometry.odometry_stream import (
-    UNSEEN_TURN,
-    BaseFrame,
-    OdometryStream,
-    Point,
-)
+from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame, OdometryStream
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
+from l1slam_ros.core.online.odometry.plausibility import UNSEEN_TURN, Point
 from l1slam_ros.core.options import Options, option
 
 # What a gap in the odometry is to the map: the cause it is counted by, and what is said of it.
@@ -106,10 +103,10 @@ class GraphBuilder:
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """
-        Add one sample; return whether it is used.
+        Add one sample; return whether the robot is where it says, or a later one.
 
-        If not it is held, as its predecessor does not explain it, see `odometry_stream`: the next
-        one decides.
+        If not it is late and put in its place, see `OdometryOptions`, or it is held, as its
+        predecessor does not explain it, see `odometry_stream`: the next one decides.
 
         Raises
         ------
@@ -122,7 +119,7 @@ class GraphBuilder:
             raise MessageError('old_stamp', f'odometry stamp {sample.stamp} ns is not after the '
                                f'last one, {track.last_stamp} ns')
         used = False
-        for point in self.stream.take(sample, self._verbatim, not ignore):
+        for point in self.stream.take(sample, self._verbatim, not ignore, self._put_in_place):
             self._add(point)
             used = True
         track = self.track  # a new one, maybe
@@ -130,6 +127,35 @@ class GraphBuilder:
         if track.may_be_thinned and not self.loops.waiting.is_due(track.last):
             track.thin()
         return used
+
+    def _put_in_place(self, point: Point) -> bool:
+        """
+        Take a sample in that came late; return False: that is more than `odometry.reorder`.
+
+        What is known from one keyframe to the next, stays: a message before the last one is
+        dropped, and so is one of a place that the robot did not go by.
+
+        Raises
+        ------
+        MessageError : `old_stamp`, it is dropped.
+
+        """
+        track, pose = self.track, point.pose
+        behind = (track.last_stamp - point.stamp) * 1e-9
+        if self._verbatim or not self._glued or (
+                not 0 < behind <= self.options.odometry.reorder):
+            return False
+        if self._moved:
+            pose = self.graph.manifold.compose(self.offset, pose)
+        beside = track.went_by(point.stamp, pose)
+        if beside is None or point.stamp < track.keyframe_stamps[-1]:
+            where = 'after a later keyframe' if beside is not None else (
+                'and says where the robot did not go')
+            raise MessageError('old_stamp', f'odometry stamp {point.stamp} ns came {behind:.3g} s '
+                               f'late, {where}; expected stamps that rise')
+        self._motion.insert(point.sample, pose, beside, self.options.odometry)
+        track.insert(point.stamp, pose)
+        return True
 
     def finish(self) -> None:
         """Use the last sample of all, if it is held for a pause alone; see `held`."""
@@ -162,7 +188,7 @@ class GraphBuilder:
         if self._moved:
             pose = manifold.compose(self.offset, pose)
         if gap and on_gap == 'new_segment':
-            if self.track.begin_part(point.stamp):
+            if self.track.begin_part(point.stamp, point.reach):
                 self.loops.waiting.begin_anew(self.track.time)
             self._begin_part(point.stamp, pose)
         else:
@@ -178,10 +204,15 @@ class GraphBuilder:
 
     def _go_on(self, point: Point, pose: Array) -> None:
         """Continue to a sample at `pose` (1, p); where that makes a keyframe, add its factor."""
-        unseen = (point.unseen, UNSEEN_TURN * point.seconds) if point.gap else None
+        unseen, turned = None, min(UNSEEN_TURN * point.seconds, math.pi)
+        if point.gap or point.unsure:
+            unseen = point.unseen, turned
+        if point.unsure:
+            self.notes.tell('unsure', f'{point.unsure}; it counts as uncertain by '
+                            f'{point.unseen:.3g} m and {turned:.2g} rad')
         motion = self._motion.step(point.sample, pose, self.options.keyframe,
                                    self.options.odometry, self._verbatim, unseen)
-        self.track.append(point.stamp, pose, is_keyframe=motion is not None)
+        self.track.append(point.stamp, pose, motion is not None, point.reach)
         if motion is not None:
             self.notes.warn_bounds('odometry', point.stamp, self._motion.bounded, MOST_OF_ODOMETRY)
             self._note_slope(point.sample)

@@ -44,6 +44,9 @@ class OdometryOptions(Options):
         0.02, 'model: of any motion, added in quadrature', 'm', 1e-9, 1e6)
     floor_rotation: float = option(
         0.02, 'model: of any motion, added in quadrature', 'rad', 1e-9, 1e6)
+    reorder: float = option(
+        1.0, 'a message that comes so late is still put in its place while its keyframe is open, '
+        'and dropped after; no later one waits for it; 0: off', 's', 0, 60)
 
 
 def diagonal_covariance(manifold: Manifold, translation: float, rotation: float) -> Array:
@@ -118,34 +121,54 @@ class KeyframeMotion:
         """
         Continue to a sample; where it makes a keyframe, return the motion, and begin there.
 
-        unseen : the sample is at the same place, to which the robot may have gone so far and by
-        such an angle; that is a keyframe: what is published goes by the last one
+        unseen : how much further the robot may have gone [m], and turned [rad], than the sample
+        says; that is a keyframe: what is published goes by the last one
 
         Returns
         -------
         relative pose (1, p) and covariance (d, d); None: no keyframe
 
         """
+        self.add(sample, pose, odometry)
         if unseen is not None:
             self._unseen = self._unseen + diagonal_covariance(self._manifold, *unseen)
-            self._stamp = sample.stamp
-        else:
-            self.add(sample, pose, odometry)
-            if not self.is_keyframe(keyframe):
-                return None
+        elif not self.is_keyframe(keyframe):
+            return None
         motion = self.pose, self.covariance(odometry, verbatim)
         self.begin(sample.stamp, pose)
         return motion
 
     def add(self, sample: OdometrySample, pose: Array, options: OdometryOptions) -> None:
         """Continue to `pose` (1, p) in the odometry frame, that of a sample."""
-        stated = None
+        seconds = (sample.stamp - self._stamp) * 1e-9
+        self.add_known(sample.stamp, pose, self._states(sample, seconds, options))
+
+    def _states(self, sample: OdometrySample, seconds: float,
+                options: OdometryOptions) -> Array | None:
+        """Return the covariance of the motion to a sample, some seconds, (d, d), as it states."""
+        if options.covariance_source == 'model':
+            return None
         if options.covariance_source == 'increment':
-            stated = sample.covariance
-        elif options.covariance_source == 'twist':
-            stated = sample.twist_covariance * ((sample.stamp - self._stamp) * 1e-9) ** 2
-        self.add_known(sample.stamp, pose, None if stated is None else reduced_covariance(
-            self._manifold, stated))
+            return reduced_covariance(self._manifold, sample.covariance)
+        return reduced_covariance(self._manifold, sample.twist_covariance * seconds**2)
+
+    def insert(self, sample: OdometrySample, pose: Array, beside: Array,
+               options: OdometryOptions) -> None:
+        """
+        Take in a sample at `pose` (1, p) that came after the next one.
+
+        beside : (2, p) the poses of those before and after it in time. The way to the later one
+        has its covariance already, as `twist` states it for all of the time.
+        """
+        manifold = self._manifold
+        length, angle = (values.tolist() for values in manifold.motion(manifold.local(
+            np.concatenate((beside[:1], pose, beside[:1])),
+            np.concatenate((pose, beside[1:], beside[1:])))))
+        self._metres += length[0] + length[1] - length[2]
+        self._radians += angle[0] + angle[1] - angle[2]
+        if options.covariance_source == 'increment' and self._stated is not None:
+            self._poses.insert(0, pose)
+            self._stated.insert(0, reduced_covariance(manifold, sample.covariance))
 
     def add_known(self, stamp: int, pose: Array, covariance: Array | None) -> None:
         """Continue to `pose` (1, p) at a stamp [ns]; the covariance (d, d) is of the way there."""

@@ -51,43 +51,77 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from l1slam_ros.core import kernels
+from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.innovation import chi2_quantile, covariances
-from l1slam_ros.core.robust.judgement import NORM, Doubt, Judgement, doubts, judgement_of
+from l1slam_ros.core.robust.judgement import (
+    NORM,
+    UNSOLVED,
+    Doubt,
+    Judgement,
+    doubt_of,
+    doubts,
+    judgement_of,
+)
 from l1slam_ros.core.robust.rounds import REFUSED, Growth
 from l1slam_ros.core.robust.slips import join, without_slip
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 from l1slam_ros.core.solvers.nonlinear import Solution
+from l1slam_ros.core.solvers.optimality import Status, l1_cost
 
 # Every round accepts a loop, hence there is an end; this one is for the patience of people.
 _MOST_ROUNDS = 200
 
+# What a factorisation, or numbers beyond double precision, end in.
+_FAILURES = (GraphError, np.linalg.LinAlgError)
+
 # From the round and the loops accepted so far.
 OnRound = Callable[[int, int], None]
+# A judgement, and the map (n, p) of what it accepts.
+Believed = tuple[Judgement, Array]
 
 
 def robust_solve(
     graph: FactorGraph, report: OnRound = lambda round_, accepted: None,
-    check: Callable[[], None] = lambda: None,
-) -> tuple[Judgement, Array]:
+    check: Callable[[], None] = lambda: None, known: Believed | None = None,
+) -> Believed:
     """
     Return which loops to accept, from the graph alone, and the L2 map (n, p) of these.
+
+    Where that fails, what was believed so far, doubtful: loops that nobody judged are never taken
+    for true.
 
     Parameters
     ----------
     report : called with the round and the loops accepted so far
     check : called before long steps, raises where the work shall stop
+    known : what was believed before and stays if this fails; None: what was in the last round
 
     """
     first = growth = Growth(graph, check)
-    first.begin()
-    number = 0
-    for number, growth in enumerate(rounds(first, without_slip), 1):
-        report(number, int(np.count_nonzero(growth.accepted & growth.is_loop)))
-    return judgement_of(growth, doubts(growth, number < _MOST_ROUNDS)), growth.poses
+    so_far, number = _so_far(first), 0
+    try:
+        first.begin()
+        for number, growth in enumerate(rounds(first, without_slip), 1):
+            so_far = _so_far(growth)
+            report(number, int(np.count_nonzero(growth.accepted & growth.is_loop)))
+        return judgement_of(growth, doubts(growth, number < _MOST_ROUNDS)), growth.poses
+    except _FAILURES as error:
+        judgement, poses = known or so_far
+        return judgement.broken_off(graph, error), poses
+
+
+def _so_far(growth: Growth) -> Believed:
+    """Return what a state believes, to fall back on; the loops that it left out are suspect."""
+    size, slip = growth.size, growth.cut & ~growth.gap
+    accepted = (growth.accepted & ~slip)[:size]
+    return Judgement(accepted, growth.is_loop[:size] & ~accepted, np.full(size, np.nan),
+                     growth.variance.copy(), np.ones(size), np.flatnonzero(slip[:size])
+                     ), growth.poses
 
 
 @dataclass(frozen=True)
@@ -102,23 +136,41 @@ class RobustMap:
 def minimise_robustly(
     graph: FactorGraph, minimise: Callable[[FactorGraph, Array], Solution],
     report: OnRound = lambda round_, accepted: None, check: Callable[[], None] = lambda: None,
+    known: Believed | None = None,
 ) -> RobustMap:
     """
     Return the map that `minimise` makes of the factors that are accepted.
 
     They are judged in L2, which spreads a doubt over all factors near it, where L1 leaves it on a
-    few.
+    few. Where it cannot be made, the map by which they were judged.
 
-    minimise : from a graph and poses (n, p) to its solution; report, check : see `robust_solve`
+    minimise : from a graph and poses (n, p) to its solution; report, check, known : see
+    `robust_solve`
     """
-    judgement, poses = robust_solve(graph, report, check)
-    whole, least = _least_squares(graph, judgement, poses, check)
-    solution = minimise(whole, least.poses)
+    judgement, poses = robust_solve(graph, report, check, known)
+    try:
+        whole, least = _least_squares(graph, judgement, poses, check)
+        solution, seed = minimise(whole, least.poses), least.poses
+        check()
+        more = least.doubts(graph, judgement, solution.poses)
+    except _FAILURES as error:
+        solution, seed = _standing(judgement.believed(graph), poses), poses
+        more = (_unsolved(graph, judgement, error),)
     rows = int(judgement.accepted.sum()) * graph.manifold.TANGENT_SIZE
-    check()
-    judgement = replace(judgement, doubts=judgement.doubts + least.doubts(
-        graph, judgement, solution.poses))
-    return RobustMap(replace(solution, dual=solution.dual[:rows]), least.poses, judgement)
+    judgement = replace(judgement, doubts=judgement.doubts + more)
+    return RobustMap(replace(solution, dual=solution.dual[:rows]), seed, judgement)
+
+
+def _standing(graph: FactorGraph, poses: Array) -> Solution:
+    """Return poses (n, p) as a solution that nothing was found by."""
+    residual = whitened_residual(graph, poses)
+    cost = l1_cost(residual)
+    return Solution(poses, cost, Status.STALLED, 0, 0, np.array([cost]), np.zeros(len(residual)))
+
+
+def _unsolved(graph: FactorGraph, judgement: Judgement, error: Exception) -> Doubt:
+    rows = judgement.accepted & ~graph.between.is_odometry
+    return doubt_of(graph.between.pairs[rows], graph.n_poses, UNSOLVED, str(error))
 
 
 def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
@@ -126,7 +178,10 @@ def doubts_of_norm(graph: FactorGraph, judgement: Judgement, poses: Array,
     """Return the doubts that `minimise_robustly` would have of a map, (n, p), by its norm."""
     if not len(graph.between):  # of nothing: compiled loops would go past its arrays
         return ()
-    return _least_squares(graph, judgement, poses, check)[1].doubts(graph, judgement, poses)
+    try:
+        return _least_squares(graph, judgement, poses, check)[1].doubts(graph, judgement, poses)
+    except _FAILURES as error:
+        return (_unsolved(graph, judgement, error),)
 
 
 @dataclass(frozen=True)
@@ -181,7 +236,7 @@ def rounds(
         growth.accepted[news] = True
         if len(news):
             growth.solve()
-        elif not join(growth):
+        elif not join(growth, by_runs=True):
             if not found:
                 found = growth.copy() if repaired else growth
                 growth.take_at_their_word()
@@ -198,11 +253,12 @@ def rounds(
 def judge(
     graph: FactorGraph, poses: Array, known: Judgement, deadline: float,
     check: Callable[[], None] = lambda: None,
-) -> tuple[Judgement, Array]:
+) -> Believed:
     """
     Return what is to be accepted, after looking again at all loops that are not, and its L2 map.
 
-    A slip of the odometry is not looked for: that takes too long to do while driving.
+    A slip of the odometry is not looked for: that takes too long to do while driving. Where it
+    fails, what is known stays, doubtful.
 
     Parameters
     ----------
@@ -212,12 +268,15 @@ def judge(
 
     """
     first, settled = Growth(graph, check), True
-    first.resume(poses, known.accepted, known.variance)
     growth = first
-    for growth in rounds(first):
-        # The end is not put off once it is in sight, or short budgets would never get there.
-        if time.monotonic() > deadline and not growth.at_their_word:
-            settled = False
-            break
-    reasons = doubts(growth) if settled else ()
-    return judgement_of(growth, reasons, settled), growth.poses
+    try:
+        first.resume(poses, known.accepted, known.variance)
+        for growth in rounds(first):
+            # The end is not put off once it is in sight, or short budgets would never get there.
+            if time.monotonic() > deadline and not growth.at_their_word:
+                settled = False
+                break
+        reasons = doubts(growth) if settled else ()
+        return judgement_of(growth, reasons, settled), growth.poses
+    except _FAILURES as error:
+        return known.broken_off(graph, error), poses

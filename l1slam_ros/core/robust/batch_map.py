@@ -27,12 +27,19 @@ from l1slam_ros.core.robust.inspection import (
     lacked_step,
     require_connected,
 )
-from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.robust.judgement import UNSOLVED, Judgement
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
 from l1slam_ros.core.solvers.seed import seed_poses
-from l1slam_ros.core.solvers.solve import AUTO, Method, choose, minimise_by, norm_for
+from l1slam_ros.core.solvers.solve import (
+    AUTO,
+    GAUSS_NEWTON,
+    Method,
+    choose,
+    minimise_by,
+    norm_for,
+)
 
 # A graph with more gaps than this part of its steps is none of a robot that kept its odometry.
 _MOST_GAPS = 0.1
@@ -120,8 +127,8 @@ def solve(
     seconds = time.perf_counter() - began
     cost = cost_function(graph, asked)
     seed_cost = None if seed is None else cost(seed)
-    if robust and not robust.judgement.is_noise_stated:
-        # Whatever the noise is: by what the file says of it.
+    if robust:
+        # Whatever the noise is, and whatever failed: of the norm, by what the file says of it.
         solution = replace(solution, cost=cost(solution.poses))
     if not np.isfinite([cost(initial), seed_cost or 0.0, solution.cost]).all():
         raise GraphError('the cost leaves double precision: measurements and information of the '
@@ -140,12 +147,10 @@ def _robust_map(graph: FactorGraph, asked: SolveOptions, minimiser: '_Minimiser'
         unjudged = (f'no edge between the consecutive vertices {ids[gaps[0]]} and '
                     f'{ids[gaps[0] + 1]}, so no chain of odometry to judge loops by')
     elif asked.robust is not False:
-        try:
-            return minimise_robustly(graph, minimiser.minimise, on_round), ''
-        except GraphError as error:
-            if asked.robust:
-                raise
-            unjudged = str(error)
+        robust = minimise_robustly(graph, minimiser.minimise, on_round)
+        if any(doubt.kind == UNSOLVED for doubt in robust.judgement.doubts):
+            minimiser.fail()
+        return robust, ''
     require_connected(graph, ids)
     return None, unjudged
 
@@ -173,6 +178,10 @@ class _Minimiser:
         if self.solver != method.solver:
             self.reason = f'it went on where {method.solver} came no further'
         return solution
+
+    def fail(self) -> None:
+        """Note that the map is another than what was wished for."""
+        self.solver, self.reason = GAUSS_NEWTON, 'the loops were judged by its map'
 
 
 def shared_offset(graph: FactorGraph, poses: Array, judgement: Judgement) -> Array | None:

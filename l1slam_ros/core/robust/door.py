@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l1slam_ros.core.errors import GraphError, OptionError
+from l1slam_ros.core.errors import GraphError, OptionError, require
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.measurements import as_poses
 from l1slam_ros.core.names import NORMS, SAME
 from l1slam_ros.core.robust import batch_map
 
@@ -48,27 +49,26 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
     ------
     GraphError : the graph is not connected, its odometry has a gap where loops are to be
         judged, or `start` has another shape or is not finite.
-    OptionError : there is no such norm.
+    OptionError : there is no such norm, or an argument is of another kind.
 
     """
+    require(FactorGraph, 'graph', graph, 'a FactorGraph, as read_graph returns first')
+    require((bool, np.bool_), 'robust', robust, 'True or False')
     if norm not in NORMS:
         raise OptionError(f'norm is {norm!r}, expected one of {", ".join(NORMS)}')
     if loop_norm not in (SAME, *NORMS):
         raise OptionError(f'loop_norm is {loop_norm!r}, expected one of '
                           f'{", ".join((SAME, *NORMS))}')
-    expected = (graph.n_poses, graph.manifold.POSE_SIZE)
     if start is not None:
-        if np.shape(start) != expected:
-            raise GraphError(f'start has the shape {np.shape(start)}, expected {expected}')
+        start = as_poses(graph, start, 'start has')
         # A quaternion may have another norm, an angle be of several turns.
         with np.errstate(all='ignore'):
-            start = graph.manifold.compose(
-                graph.manifold.identity(graph.n_poses), np.asarray(start, float))
+            start = graph.manifold.compose(graph.manifold.identity(graph.n_poses), start)
         if not (finite := np.isfinite(start).all(axis=1)).all():
             raise GraphError(f'start of keyframe {int(np.argmin(finite))} is no pose; expected '
                              'finite numbers')
     asked = batch_map.SolveOptions('seed' if start is None else 'file', norm, loop_norm,
-                                   robust=robust)
+                                   robust=bool(robust))
     outcome = batch_map.solve(graph, start, asked)
     judgement, status = outcome.judgement, outcome.solution.status.value
     if judgement is None:

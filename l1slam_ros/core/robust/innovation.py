@@ -35,6 +35,9 @@ _beta_quantile, _gamma_quantile = cache(beta_quantile), cache(gamma_quantile)
 # Noise has the tail of Student's distribution with so many degrees of freedom for each number of a
 # step: nobody knows its covariance any better.
 TAIL = 8
+# The variances of odometry and loops are no further apart: beyond, the weights of the one are lost
+# in the rounding of the other, and no map can be factored.
+LEAST_RATIO = 1e-5
 # A factor whose residual has a variance below this part of its noise is checked by no other.
 _REDUNDANT = 1e-6
 
@@ -258,6 +261,36 @@ def log_claims(factors: BetweenFactors, log_volume: Array) -> Array:
     roots = np.diagonal(factors.sqrt_information, axis1=1, axis2=2)
     return (factors.speaks * log_volume).sum(axis=1) + np.log(
         np.where(factors.speaks, roots, 1.0)).sum(axis=1)
+
+
+def stated_variance(factors: BetweenFactors) -> Array:
+    """
+    Return the variance that odometry and loops state, (2,), each in the median of its kind.
+
+    Of a factor with a covariance S of k numbers it is det(S)^(1/k). A kind that has none is as the
+    other one.
+    """
+    diagonal = np.abs(np.diagonal(factors.sqrt_information, axis1=1, axis2=2))
+    log_root = np.where(factors.speaks, np.log(np.where(factors.speaks, diagonal, 1.0)), 0.0)
+    size = np.exp(-2 * log_root.sum(axis=1) / np.maximum(factors.freedom, 1))
+    kinds = [size[(factors.freedom > 0) & ~factors.is_absolute & (factors.is_odometry == odometry)]
+             for odometry in (True, False)]
+    stated = np.array([np.median(kind) if len(kind) else np.nan for kind in kinds])
+    known = stated[np.isfinite(stated)]
+    return np.where(np.isfinite(stated), stated, known[0] if len(known) else 1.0)
+
+
+def within_ratio(variance: Array, stated: Array) -> Array:
+    """
+    Return the variances of odometry and loops, (2,), the less one raised to `LEAST_RATIO`.
+
+    variance, stated : (2,) in units of what they state, and what that is
+    """
+    effective = variance * stated
+    if not np.isfinite(effective).all():
+        return variance
+    raised: Array = np.maximum(effective, LEAST_RATIO * effective.max()) / stated
+    return raised
 
 
 def claimed_volume(manifold: Manifold, poses: Array) -> Array:

@@ -31,10 +31,11 @@ from l1slam_ros.core.robust.slips import JOINING, SPANNING, SURE, common_steps, 
 # Most loops are refused; all that are accepted are of one place; loops of one place alone say how
 # two parts lie to each other; refused loops of several places agree on another map; an odometry
 # factor may have slipped, and it was not believed; there were more rounds to come; another norm of
-# the same factors has another map.
-MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP, UNFINISHED, NORM = (
+# the same factors has another map; judging the loops failed, and what is believed is what was by
+# then; so did solving for what is believed.
+MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP, UNFINISHED, NORM, FAILED, UNSOLVED = (
     'mostly refused', 'one place', 'one place joins', 'another map', 'a slip suspected',
-    'not at an end', 'another norm')
+    'not at an end', 'another norm', 'judging failed', 'solving failed')
 
 # Of fewer loops most may well be refused, and be of one place; most are more than half by some.
 _HANDFUL, _MOST = 5, 0.55
@@ -48,13 +49,14 @@ class Doubt:
     One reason why a map is not to be relied on.
 
     kind : one of the above; loops : how many it is about; first, last : the keyframes between
-    which they lie.
+    which they lie; detail : what failed, where something did.
     """
 
     kind: str
     loops: int
     first: int
     last: int
+    detail: str = ''
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,13 @@ class Judgement:
     def is_noise_stated(self) -> bool:
         """Whether factors are as noisy as they say."""
         return bool((self.noise == 1).all())
+
+    def broken_off(self, graph: FactorGraph, error: Exception) -> 'Judgement':
+        """Return what is believed where judging the loops of a graph came no further."""
+        factors = graph.between
+        left_out = ~factors.is_odometry & ~factors.struck & ~self.accepted
+        doubt = doubt_of(factors.pairs[left_out], graph.n_poses, FAILED, str(error))
+        return replace(self, doubts=(doubt,), settled=True)
 
     def of_all(self, graph: FactorGraph) -> 'Judgement':
         """
@@ -152,6 +161,12 @@ class Judgement:
         return replace(
             self, accepted=accepted, suspect=suspect, sigmas=sigmas, noise=noise,
             settled=not robust or (self.settled and not told and not suspect[known:].any()))
+
+
+def doubt_of(pairs: Indices, n_poses: int, kind: str, detail: str) -> Doubt:
+    """Return a doubt about the loops between pairs of keyframes (k, 2), none: about them all."""
+    first, last = (int(pairs.min()), int(pairs.max())) if len(pairs) else (0, n_poses - 1)
+    return Doubt(kind, len(pairs), first, last, detail)
 
 
 def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),

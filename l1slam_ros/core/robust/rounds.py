@@ -20,13 +20,16 @@ from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.robust.gating import believable, noise_variance, stand_apart
 from l1slam_ros.core.robust.innovation import (
+    LEAST_RATIO,
     Innovations,
     Posterior,
     chi2_quantile,
     claimed_volume,
     innovations,
     sample_posterior,
+    stated_variance,
     student_quantile,
+    within_ratio,
 )
 from l1slam_ros.core.robust.inspection import repeated_factors
 from l1slam_ros.core.robust.places import beside_refused, mates, places
@@ -45,9 +48,6 @@ _KNOWN = 20
 # The noise is learnt to be no less than this part of the variance that was found first: factors
 # that fit exactly, as of a simulator, say of ever less that it is still too much.
 _LEAST_VARIANCE = 1e-3
-# While a map grows the noise that was found first is not known any more; but beyond this ratio of
-# odometry's and loops' weights are soon lost in rounding.
-_LEAST_RATIO = 1e-5
 # Noise that is so many times the variance that was found is measured anew before any loop is
 # dropped for it, by the median of chi2 over its freedom; by factors that others check at all.
 _NOISIER, _MEDIAN, _CHECKED = 3.0, 0.79, 0.01
@@ -100,7 +100,8 @@ class Growth:
         self.mates = loops[one], loops[other]
         self.poses = placed(self.graph.subset(self.accepted), chain)
         self.part = np.zeros(graph.n_poses, np.int64)
-        self.variance = np.ones(2)
+        self._stated = stated_variance(self.factors)
+        self.variance = within_ratio(np.ones(2), self._stated)
         self._learnt_of = np.zeros(0, bool)
         self._floor, self.at_their_word = np.full(2, _LEAST_VARIANCE), False
         self.posterior: Posterior
@@ -117,14 +118,15 @@ class Growth:
         rows = np.setdiff1d(rows[~self.factors.is_absolute[rows]], repeated_factors(self.graph))
         # Else the noise that is learnt of them would fit their mistake.
         if not self.may_err_as_one(rows):
-            self.variance = self.variance * noise_variance(self.innovations(rows))
+            found = self.variance * noise_variance(self.innovations(rows))
+            self.variance = within_ratio(found, self._stated)
             self._floor = _LEAST_VARIANCE * self.variance
             self.solve()
 
     def resume(self, poses: Array, accepted: Mask, variance: Array) -> None:
         """Go on from an earlier state: poses (n, p), accepted (m,), variance (2,)."""
-        self.poses, self.variance = poses, variance.copy()
-        self._floor = np.maximum(_LEAST_RATIO * variance.max(), _LEAST_RATIO**2)
+        self.poses, self.variance = poses, within_ratio(variance, self._stated)
+        self._floor = np.full(2, LEAST_RATIO**2)  # what was found first is not known any more
         self.accepted[: self.size] = accepted | self.trusted[: self.size]
         self.cut |= ~self.accepted & ~self.is_loop
         self.accepted |= self.cut
@@ -171,7 +173,8 @@ class Growth:
             elif len(rows) > count:
                 self.accepted &= ~absolute | self.trusted
                 self.accepted[rows] = True
-                self.variance[0] = max(variance, _LEAST_RATIO)
+                own = np.array([max(variance, LEAST_RATIO), self.variance[1]])
+                self.variance = within_ratio(own, self._stated)
         # A part that no other factor joins is where most of its own absolute factors say.
         placing = (self.accepted | absolute) & ~self.cut if self.cut.any() else self.accepted
         self.poses = placed(self.graph.subset(placing), self.poses)
@@ -207,8 +210,8 @@ class Growth:
 
     def variance_at_their_word(self) -> Array:
         """Return the variance, (2,), where factors are as noisy as they say, or as was found."""
-        noise: Array = np.maximum(self.variance, np.minimum(_WORD * self.variance, 1.0))
-        return noise
+        word = np.minimum(_WORD * self.variance, 1.0)
+        return within_ratio(np.maximum(self.variance, word), self._stated)
 
     def take_at_their_word(self) -> None:
         """From now on let factors be as noisy as they say; loops, where `stand_apart` has it."""
@@ -287,7 +290,7 @@ class Growth:
         scale = np.array([np.median(square[known & kind] / stated[known & kind])
                           if (known & kind).any() else 0.0 for kind in (~loops, loops)]) / _MEDIAN
         noisier = scale > _NOISIER
-        self.variance = np.where(noisier, scale, 1.0) * self.variance
+        self.variance = within_ratio(np.where(noisier, scale, 1.0) * self.variance, self._stated)
         return bool(noisier.any())
 
     def _misfits(self, rows: Indices, residual: Array, against: Array | float = 0.0) -> Indices:
@@ -313,7 +316,7 @@ class Growth:
         found = np.bincount(kind, own * (self.posterior.residual**2).sum(axis=1), 2)
         stated = np.bincount(kind, own * np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
         scale = (found + known) / (stated + known)
-        self.variance = np.maximum(self.variance * scale, self._floor)
+        self.variance = within_ratio(np.maximum(self.variance * scale, self._floor), self._stated)
 
     def innovations(self, rows: Indices) -> Innovations:
         """Return how factors that are not accepted fit the map."""

@@ -31,7 +31,12 @@ from l1slam_ros.core.robust.motion import (
     unwhitening,
     usual_motion,
 )
-from l1slam_ros.core.robust.pairwise_consistency import Group, spanned, strongest_group
+from l1slam_ros.core.robust.pairwise_consistency import (
+    Group,
+    longest_run,
+    spanned,
+    strongest_group,
+)
 from l1slam_ros.core.robust.rounds import Growth
 
 # Places that join two parts, and of a group that makes a slip suspected, at least.
@@ -44,15 +49,24 @@ SURE = float(np.log(1 / DOUBT - 1))
 _FEWEST_STEPS = 20
 
 
-def join(growth: Growth) -> bool:
-    """Move parts to where loops across agree that they are; return whether any was."""
+def join(growth: Growth, by_runs: bool = False) -> bool:
+    """
+    Move parts to where loops across agree that they are; return whether any was.
+
+    by_runs : where loops of two places do not, those of one that is long may
+    """
     joined = False
     while (rows := growth.joining()).size:
         parts = growth.part[np.stack((growth.low[rows], growth.high[rows]))]
         pair = np.sort(parts, axis=0).T @ np.array([growth.graph.n_poses, 1])
         groups = [strongest_group(growth, rows[pair == one]) for one in np.unique(pair)]
         group = max(groups, key=lambda group: len(group.places))
-        if len(group.places) < JOINING:
+        if len(group.places) < JOINING and by_runs:
+            group = max((longest_run(growth, rows[pair == one]) for one in np.unique(pair)),
+                        key=lambda group: len(group.rows))
+        elif len(group.places) < JOINING:
+            return joined
+        if not len(group.rows):
             return joined
         _join_by(growth, group)
         joined = True

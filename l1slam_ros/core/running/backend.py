@@ -11,10 +11,15 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from weakref import WeakSet
 
-from l1slam_ros.core.errors import GraphError, OptionError
+from l1slam_ros.core.errors import GraphError, OptionError, require
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, require_sound
+from l1slam_ros.core.graph.measurements import (
+    LoopClosure,
+    OdometrySample,
+    in_order,
+    require_sound,
+)
 from l1slam_ros.core.names import OF_THE_NODE
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame
@@ -24,7 +29,14 @@ from l1slam_ros.core.running.keeper.keeper import Keeper, Revisions
 from l1slam_ros.core.running.keeper.updates import Updates
 from l1slam_ros.core.running.keeper.workers import Background
 from l1slam_ros.core.running.keeper.workers import Stopped as Stopped
-from l1slam_ros.core.running.snapshot import Behind, LoopStates, Robot, SavedMap, Snapshot
+from l1slam_ros.core.running.snapshot import (
+    Behind,
+    Counts,
+    LoopStates,
+    Robot,
+    SavedMap,
+    Snapshot,
+)
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
 # What poses live on, by the dimension of the world.
@@ -72,12 +84,15 @@ class Backend:
 
     Raises
     ------
-    OptionError : there is no such dimension.
+    OptionError : there is no such dimension, or an argument is of another kind.
 
     """
 
     def __init__(self, options: BackendOptions = BackendOptions(),  # noqa: B008
                  dimension: int = 2, background: bool = False):
+        _require_options(options)
+        require(bool, 'background', background, 'True or False')
+        require(int, 'dimension', dimension, '2 or 3')
         if dimension not in _MANIFOLDS:
             raise OptionError(f'dimension is {dimension!r}, expected 2 or 3')
         self.manifold, self.options = _MANIFOLDS[dimension], options
@@ -113,15 +128,15 @@ class Backend:
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """Add one sample; return whether it is used, see `GraphBuilder.add_odometry`."""
-        require_sound(sample)
+        require_sound(sample, OdometrySample)
         used = self._keeper.add_odometry(sample)
         self._wake()
         return used
 
     def add_loop(self, loop: LoopClosure) -> None:
-        """Add one loop closure; see `GraphBuilder.add_loop`."""
-        require_sound(loop)
-        self._keeper.add_loop(loop)
+        """Add one loop closure, turned round if it leads back; see `GraphBuilder.add_loop`."""
+        require_sound(loop, LoopClosure)
+        self._keeper.add_loop(in_order(loop))
         self._wake()
 
     def set_options(self, options: BackendOptions) -> None:
@@ -131,6 +146,7 @@ class Backend:
         Where loops are to be doubted that were not before, or the other way round, all are judged
         anew.
         """
+        _require_options(options)
         self.options = options
         self._keeper.set_options(options, options.solver, options.robust.enabled)
         self._wake()
@@ -239,13 +255,14 @@ class Backend:
         """Return map -> odom as it was when this was asked before, and as it is, (1, p) each."""
         return self._keeper.moved()
 
-    def counts(self) -> tuple[dict[str, int], dict[str, int]]:
-        """Return the sizes of the graph, and how many loops were refused for which cause."""
+    def counts(self) -> Counts:
+        """Return how large the graph is, and what was noted of messages."""
         with self._keeper.reading() as builder:
-            revision, refused = self.revisions.now, dict(builder.notes.refused)
+            revision, notes = self.revisions.now, builder.notes
+            refused, told = dict(notes.refused), dict(notes.told)
         if self._counted[0] != revision:
             self._counted = revision, self.snapshot().sizes()
-        return self._counted[1], refused
+        return Counts(self._counted[1], refused, told)
 
     def behind(self) -> Behind:
         """Return what goes on behind updates."""
@@ -267,6 +284,11 @@ class Backend:
         the map does not have the keyframe, or its graph is too dense to be factored.
         """
         return self._keeper.covariance(keyframe)
+
+
+def _require_options(options: object) -> None:
+    require(BackendOptions, 'options', options,
+            'BackendOptions; BackendOptions.from_mapping makes them of a mapping')
 
 
 def _builder(backend: Backend) -> GraphBuilder:

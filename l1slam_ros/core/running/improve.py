@@ -242,7 +242,8 @@ def optimise(problem: Problem, options: OptimiserOptions,
     graph, judgement = problem.graph, problem.judgement
     if problem.robust:
         found = minimise_robustly(
-            graph, lambda part, poses: _solved(part, poses, options, check), check=check)
+            graph, lambda part, poses: _solved(part, poses, options, check), check=check,
+            known=(judgement, problem.poses))
         solution, judgement = found.solution, found.judgement
     else:
         starts = (problem.poses, seed_poses(graph, choose(AUTO, graph).cholesky, check=check))

@@ -8,6 +8,7 @@ problem of the next update first of all.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,6 +65,19 @@ class Robot:
     stamp: int
     odometry: Array
     map_to_odom: Array
+
+
+class Counts(NamedTuple):
+    """
+    How large a graph is, and what was noted of messages.
+
+    sizes : keyframes, factors and loops of each state, by name; refused : cause -> how many loops
+    were; told : how often the odometry did not go on as robots move, see `Notes.told`
+    """
+
+    sizes: dict[str, int]
+    refused: dict[str, int]
+    told: dict[str, int]
 
 
 @dataclass(frozen=True)

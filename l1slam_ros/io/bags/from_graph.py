@@ -6,12 +6,17 @@ A graph as the messages of a bag, such that it can be had back exactly.
     /loop_closures   one geometry_msgs/PoseWithCovarianceStamped per other factor;
                      /trusted_loop_closures for those that are never doubted,
                      and again /false_loop_closures for those that are struck out
+                     /rejected_loop_closures for those that were left out of the map
     /absolute_poses  the same per absolute factor
     /ground_truth    geometry_msgs/PoseStamped, where the truth is known
 
 Covariances are those of the factors, in the axes of the measured pose: of an odometry message
 that of the motion since the message before. What is left unsaid has an infinite variance. In a bag
 a pose is seen from an earlier one: factors the other way are turned, and the note says which.
+
+What a map was made without, see `left_out`, the note names, too: nobody but this program listens
+to its loops, which are on a topic of their own. Odometry that slipped is in the odometry still: a
+bag needs that of every keyframe; and so is an absolute pose.
 """
 
 import os
@@ -31,12 +36,14 @@ from l1slam_ros.io.bags.topics import (
     FALSE_LOOP_TOPIC,
     LOOP_TOPIC,
     ODOMETRY_TOPIC,
+    REJECTED_LOOP_TOPIC,
     TRUSTED_LOOP_TOPIC,
     TRUTH_TOPIC,
 )
 from l1slam_ros.io.bags.writer import new_bag
 from l1slam_ros.io.files import LAST_STAMP
-from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.graphs.graph_file import GraphRecord, left_out_words
+from l1slam_ros.io.graphs.left_out import REJECTED, SLIP, SUSPECT
 from l1slam_ros.io.messages.conversion import reference_frame_id
 from l1slam_ros.io.messages.serialisation import odometry_bytes, pose_bytes
 
@@ -48,7 +55,10 @@ VERBATIM_NOTE = {'messages': 'verbatim'}
 SPACE_NOTE = {'dimension': '3'}
 # And where factors led from a later keyframe to an earlier one: the numbers of those turned.
 TURNED_STEPS, TURNED_LOOPS = 'turned_steps', 'turned_loops'
+# The numbers, counted in the same way, of what a map was made without.
+LEFT_OUT = {SLIP: 'slips', REJECTED: 'rejected_loops', SUSPECT: 'suspect_loops'}
 
+_REFUSED = (REJECTED, SUSPECT)
 _BASE_FRAME = 'base_link'
 _ODOMETRY, _TRUTH = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/PoseStamped'
 _LOOP = 'geometry_msgs/msg/PoseWithCovarianceStamped'
@@ -80,7 +90,11 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
     topics = {LOOP_TOPIC: True, ABSOLUTE_TOPIC: factors.is_absolute.any(),
               TRUSTED_LOOP_TOPIC: (factors.trusted & ~factors.is_odometry).any(),
               FALSE_LOOP_TOPIC: factors.struck.any()}
-    with new_bag(path, _note(graph, stamps) | _turned_note(graph, backward)) as writer:
+    words = left_out_words(record)
+    topics[REJECTED_LOOP_TOPIC] = (np.isin(words, _REFUSED) & ~factors.is_absolute).any()
+    note = _note(graph, stamps) | _turned_note(graph, backward) | _left_out_note(graph, words)
+    in_order = iter(words[loops_of(graph)].tolist())
+    with new_bag(path, note) as writer:
         writer.add_topic(ODOMETRY_TOPIC, _ODOMETRY)
         for topic in sorted(topic for topic, used in topics.items() if used):
             writer.add_topic(topic, _LOOP)
@@ -95,8 +109,11 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
                 writer.write(TRUTH_TOPIC, stamp, pose_bytes('map', stamp, true[k]))
             for loop in loops:
                 topic, frame = ABSOLUTE_TOPIC, 'map'
+                # Of one that is struck out the message before told what it is.
+                word = '' if loop.struck else next(in_order)
                 if loop.reference_stamp is not None:
                     topic = (FALSE_LOOP_TOPIC if loop.struck else
+                             REJECTED_LOOP_TOPIC if word in _REFUSED else
                              TRUSTED_LOOP_TOPIC if loop.trusted else LOOP_TOPIC)
                     frame = reference_frame_id(_BASE_FRAME, loop.reference_stamp)
                 writer.write(topic, stamp, pose_bytes(frame, stamp, loop.pose3, loop.covariance))
@@ -161,6 +178,13 @@ def _turned_note(graph: FactorGraph, backward: Mask) -> dict[str, str]:
     rows = {TURNED_STEPS: steps_of(graph), TURNED_LOOPS: loops_of(graph)}
     return {name: ' '.join(map(str, np.flatnonzero(backward[of]).tolist()))
             for name, of in rows.items() if backward[of].any()}
+
+
+def _left_out_note(graph: FactorGraph, words: np.ndarray) -> dict[str, str]:
+    """Return which steps and which loops, in the order of the messages, were left out."""
+    return {name: ' '.join(map(str, np.flatnonzero(said).tolist()))
+            for word, name in LEFT_OUT.items()
+            if (said := words[(steps_of if word == SLIP else loops_of)(graph)] == word).any()}
 
 
 def _stamps(record: GraphRecord) -> list[int]:

@@ -15,11 +15,11 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.core.errors import FileError, L1SlamError
+from l1slam_ros.io.bags.bounds import BombError, require_shallow, require_tables
 from l1slam_ros.io.bags.damaged.salvage import (
     METADATA,
     Salvage,
@@ -30,9 +30,10 @@ from l1slam_ros.io.bags.damaged.salvage import (
 )
 from l1slam_ros.io.bags.damaged.walk import BagMessage
 from l1slam_ros.io.bags.damaged.walk_mcap import is_indexed, mcap_metadata
-from l1slam_ros.io.bags.damaged.walk_sqlite import has_journal, is_cut, sqlite_metadata
+from l1slam_ros.io.bags.damaged.walk_sqlite import has_journal, is_cut, opened, sqlite_metadata
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES
 from l1slam_ros.io.bags.writer import NOTE_KEY
+from l1slam_ros.io.bounded import read_yaml
 
 # What types of ROS 1 are made of, as ROS 2 has it.
 _BASIC = ('std_msgs/msg/Header', 'builtin_interfaces/msg/Time', 'builtin_interfaces/msg/Duration')
@@ -164,14 +165,14 @@ def _note_in(file: Path) -> dict[str, str]:
     if file.is_dir():
         metadata = directory_metadata(file)
     elif file.suffix.lower() == '.db3':
-        metadata = yaml.safe_load(sqlite_metadata(file)) or {}
+        metadata = read_yaml(sqlite_metadata(file)) or {}
     elif file.suffix.lower() == '.mcap':
         for name, entries in mcap_metadata(file):
             if name == NOTE_KEY:
                 return entries
             if name == 'rosbag2':
-                metadata = yaml.safe_load(entries['serialized_metadata'])
-    return yaml.safe_load((metadata.get('custom_data') or {}).get(NOTE_KEY, '{}'))
+                metadata = read_yaml(entries['serialized_metadata'])
+    return read_yaml((metadata.get('custom_data') or {}).get(NOTE_KEY, '{}'))
 
 
 def _bag_path(path: str | os.PathLike[str]) -> Path:
@@ -237,11 +238,18 @@ def _ros1_types(fields: Mapping[str, Any]) -> Any:
 @contextmanager
 def _reader(bag: Path) -> Iterator[Any]:
     """Yield the library's reader of a bag that it can be trusted with."""
+    if bag.is_dir():
+        require_shallow(bag / METADATA)
+        if str(directory_metadata(bag).get('compression_mode') or 'none').lower() != 'none':
+            raise LookupError('compressed by file or message')  # the library has no bounds there
     for file in storage_files(bag) if bag.is_dir() else [bag]:
         if file.suffix == '.mcap' and not is_indexed(file):
             raise LookupError(f'{file.name} has no sound index')
         if file.suffix == '.db3' and (has_journal(file) or is_cut(file)):
             raise LookupError(f'{file.name} is not all there')
+        if file.suffix == '.db3':
+            with opened(file) as database:
+                require_tables(database)
     # The definitions in the bag come first; sqlite bags of older distributions have none.
     typestore = get_typestore(Stores.ROS2_JAZZY)
     with AnyReader([bag], default_typestore=typestore) as reader:
@@ -250,10 +258,15 @@ def _reader(bag: Path) -> Iterator[Any]:
 
 def _salvage(bag: Path, error: Exception) -> Salvage:
     """Return what can be had of a bag that the library gave up on."""
+    if isinstance(error, BombError):
+        raise FileError(bag, str(error)) from error
     if bag.suffix.lower() == '.bag':
         raise FileError(bag, f'damaged, or no bag ({complaint(error)}); {_TO_ITS_END}: '
                         '`rosbag reindex` may make one of it') from error
-    salvage = Salvage(bag)
+    try:
+        salvage = Salvage(bag)
+    except BombError as bomb:
+        raise FileError(bag, str(bomb)) from bomb
     if salvage.counts:
         return salvage
     reason = complaint(error)

@@ -17,7 +17,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError, MessageError
 from l1slam_ros.core.geometry import se2, se3
-from l1slam_ros.core.geometry.manifold import Array, Manifold
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
 from l1slam_ros.core.graph.measurements import LoopClosure
@@ -30,25 +30,30 @@ from l1slam_ros.core.online.keyframes import (
 from l1slam_ros.io.bags.damaged.walk import BagMessage
 from l1slam_ros.io.bags.from_graph import (
     GRAPH_NOTE,
+    LEFT_OUT,
     SPACE_NOTE,
     TURNED_LOOPS,
     TURNED_STEPS,
     VERBATIM_NOTE,
 )
+from l1slam_ros.io.bags.lost_loops import LoopCount
 from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note
 from l1slam_ros.io.bags.topics import (
     ABSOLUTE_TOPIC,
     DEFAULT_TOPICS,
     LOOP_TOPIC,
+    ODOMETRY_TYPE,
+    REJECTED_LOOP_TOPIC,
+    TRUSTED_LOOP_TOPIC,
     Topics,
 )
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.graphs.left_out import SLIP, nothing_left_out
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
 from l1slam_ros.io.trajectory import Reference
 
-_ODOMETRY = 'nav_msgs/msg/Odometry'
 _EVERY = KeyframeOptions(0.0, 0.0, 0.0)
 # What a topic of true poses may be of.
 _POSES = ('geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PoseWithCovarianceStamped',
@@ -83,18 +88,19 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
         growing.take(message)
     record = growing.record('; '.join(damage))
     if options.keyframe == _EVERY:
-        record = replace(record, graph=turned(record.graph, _noted_turns(record.graph, note)))
+        record = replace(record, graph=turned(record.graph, _noted_turns(record.graph, note)),
+                         left_out=_noted_left_out(record.graph, note))
     if record.graph.n_poses < 2:
         raise FileError(path, '; '.join([
             f'{counted(record.graph.n_poses, "keyframe")} from {topics.odometry}; '
             'expected 2 or more',
-            *_alternatives(path, topics.odometry, _ODOMETRY, MAP_GRAPH, POSE_GRAPH),
+            *_alternatives(path, topics.odometry, ODOMETRY_TYPE, MAP_GRAPH, POSE_GRAPH),
             *record.skipped, *damage]))
     for topic in sorted(topics.types().keys() - DEFAULT_TOPICS.types().keys() - growing.seen):
         raise FileError(path, '; '.join([
             f'no messages on {topic}; expected {topics.types()[topic]}',
             *_alternatives(path, topic, topics.types()[topic]), *damage]))
-    return record
+    return replace(record, damage='; '.join([*damage, *growing.lost(path)]))
 
 
 class _Growing:
@@ -106,42 +112,62 @@ class _Growing:
         self._topics, self._types = topics, topics.types()
         self._map_frame = ''
         self._graphs, self._is_graph = PoseGraphs(), False
+        self._loops = LoopCount()
         self.seen: set[str] = set()
 
     def take(self, message: BagMessage) -> None:
         """Use a message, or note why not."""
         topic, expected = message.topic, self._types[message.topic]
         self.seen.add(topic)
-        notes = self._builder.notes
         try:
             if message.msgtype in (MAP_GRAPH, POSE_GRAPH) and topic in (
                     self._topics.odometry, self._topics.loops):
                 self._add_graph(message.data, topic)
-            elif message.msgtype != expected:
+                return
+            if topic in (self._topics.loops, TRUSTED_LOOP_TOPIC):
+                self._loops.came[topic] += 1
+            if message.msgtype != expected:
                 raise MessageError('type', f'{message.msgtype} on {topic}; expected {expected}')
             elif topic == self._topics.odometry:
                 self._builder.add_odometry(conversion.odometry_sample(message.data))
             else:
-                name = LOOP_TOPIC if topic == self._topics.loops else topic
+                is_loop = topic in (self._topics.loops, REJECTED_LOOP_TOPIC)
+                name = LOOP_TOPIC if is_loop else topic
                 self._builder.add_loop(conversion.LOOPS[name.removeprefix('/')](
                     message.data, self._builder.base_frame.name, self._map_frame))
                 if topic == ABSOLUTE_TOPIC:  # the map is the frame that the first one names
                     self._map_frame = message.data.header.frame_id.removeprefix('/')
         except MessageError as error:
-            notes.refuse(error.cause, str(error))
+            self._refuse(topic, error.cause, str(error))
         except (AttributeError, TypeError, ValueError):
             # The bag defines the type otherwise: it is damaged there, or of another ROS.
-            notes.refuse('fields', f'a message on {topic}; expected the fields of {expected}')
+            self._refuse(topic, 'fields',
+                         f'a message on {topic}; expected the fields of {expected}')
+
+    def _refuse(self, topic: str, cause: str, sentence: str) -> None:
+        self._builder.notes.refuse(cause, sentence)
+        if topic in self._loops.came:
+            self._loops.refuse(topic, sentence)
 
     def _add_graph(self, message: Any, topic: str) -> None:
         self._is_graph |= topic == self._topics.odometry
         for found in self._graphs.take(message):
+            self._loops.came[topic] += 1
             if not isinstance(found, LoopClosure):
                 # Of the whole graph no keyframe's time need be known.
                 if not (self._is_graph and found.cause == 'keyframe'):
-                    self._builder.notes.refuse(found.cause, str(found))
+                    self._refuse(topic, found.cause, str(found))
             elif not self._is_graph:
                 self._builder.add_loop(found)
+
+    def lost(self, path: Path) -> list[str]:
+        """Return sentences on loops of the bag that are not in the graph, if these are most."""
+        loops, odometry = self._builder.loops, self._topics.odometry
+        if self._is_graph:  # nothing of another topic is in it
+            self._loops.only(odometry)
+            return list(self._loops.sentences(0, path, {odometry}, odometry))
+        late = sum(not (one.loop.struck or one.loop.is_absolute) for one in loops.waiting.all())
+        return list(self._loops.sentences(loops.lost + late, path, self._types, odometry))
 
     def record(self, damage: str) -> GraphRecord:
         """Return the graph that has grown; damage : of the bag."""
@@ -208,11 +234,24 @@ def _noted_turns(graph: FactorGraph, note: dict[str, str]) -> Mask:
     odometry = graph.between.is_odometry
     turns = np.zeros(len(odometry), bool)
     for name, kind in (TURNED_STEPS, odometry), (TURNED_LOOPS, ~odometry):
-        rows = np.flatnonzero(kind)
-        numbers = [int(word) for word in note.get(name, '').split() if word.isdecimal()]
-        # Of a damaged bag the last ones may be missing.
-        turns[rows[[number for number in numbers if number < len(rows)]]] = True
+        turns[_noted_rows(np.flatnonzero(kind), note, name)] = True
     return turns
+
+
+def _noted_left_out(graph: FactorGraph, note: dict[str, str]) -> np.ndarray:
+    """Return why a map was made without each factor, (m,) of `left_out`."""
+    odometry = graph.between.is_odometry
+    words = nothing_left_out(len(odometry))
+    for word, name in LEFT_OUT.items():
+        kind = odometry if word == SLIP else ~odometry
+        words[_noted_rows(np.flatnonzero(kind), note, name)] = word
+    return words
+
+
+def _noted_rows(rows: Indices, note: dict[str, str], name: str) -> Indices:
+    """Return those of the rows whose numbers a note has; a damaged bag may lack the last."""
+    numbers = [int(word) for word in note.get(name, '').split() if word.isdecimal()]
+    return rows[[number for number in numbers if number < len(rows)]]
 
 
 def _alternatives(path: Path, topic: str, *msgtypes: str) -> list[str]:

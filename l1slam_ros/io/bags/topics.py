@@ -8,10 +8,13 @@ ODOMETRY_TOPIC = '/odom'
 LOOP_TOPIC = '/loop_closures'
 TRUSTED_LOOP_TOPIC = '/trusted_loop_closures'
 FALSE_LOOP_TOPIC = '/false_loop_closures'
+# Of loops that were not believed: no program but this one listens.
+REJECTED_LOOP_TOPIC = '/rejected_loop_closures'
 ABSOLUTE_TOPIC = '/absolute_poses'
 TRUTH_TOPIC = '/ground_truth'
 
-_POSE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+ODOMETRY_TYPE = 'nav_msgs/msg/Odometry'
+POSE_TYPE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 
 @dataclass(frozen=True)
@@ -23,8 +26,9 @@ class Topics:
 
     def types(self) -> dict[str, str]:
         """Return the topics with the types of their messages."""
-        return {self.loops: _POSE, TRUSTED_LOOP_TOPIC: _POSE, FALSE_LOOP_TOPIC: _POSE,
-                ABSOLUTE_TOPIC: _POSE, self.odometry: 'nav_msgs/msg/Odometry'}
+        return {self.loops: POSE_TYPE, TRUSTED_LOOP_TOPIC: POSE_TYPE,
+                FALSE_LOOP_TOPIC: POSE_TYPE, REJECTED_LOOP_TOPIC: POSE_TYPE,
+                ABSOLUTE_TOPIC: POSE_TYPE, self.odometry: ODOMETRY_TYPE}
 
 
 DEFAULT_TOPICS = Topics()

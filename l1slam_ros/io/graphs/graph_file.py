@@ -14,7 +14,7 @@ import numpy as np
 from l1slam_ros.core.errors import FileError, NoiseError
 from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import square_root_information
+from l1slam_ros.core.geometry.noise import Mask, square_root_information
 from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
 from l1slam_ros.core.names import QUATERNION
 from l1slam_ros.io.files import (
@@ -29,10 +29,12 @@ from l1slam_ros.io.files import (
     replacing,
     rounded,
 )
+from l1slam_ros.io.graphs.left_out import STRUCK, commented, in_place, nothing_left_out
 from l1slam_ros.io.graphs.rows import (
     Rows,
     expected_tags,
     lines_by_tag,
+    made_definite,
     manifold_of,
     rows_of,
     vertices_of,
@@ -47,6 +49,7 @@ from l1slam_ros.io.graphs.tags import (
     TAGS,
     TAGS_LEFT_OUT,
 )
+from l1slam_ros.io.ours import MARK
 from l1slam_ros.io.remarks import Remarks
 
 
@@ -57,10 +60,12 @@ class GraphRecord:
 
     graph : the factors, in the order of the file; poses : (n, p) the stored start, None when
     the file has none; ids : (n,) vertex ids, ascending: keyframe k is vertex ids[k];
-    stamps : (n,) [ns] or None; skipped : a sentence on each kind of line that was not used;
+    stamps : (n,) [ns] or None; skipped : a sentence on each kind of line that was not used, or
+    not as it stands;
     damage : a sentence where only a part of the input could be read, else empty;
     rotation_information : what the rotation block in a g2o file of it is of, of `names`;
-    remarks : of a saved map.
+    remarks : of a saved map; left_out : (m,) why a map was made without each factor, of
+    `left_out`, or empty; comments : lines of others, each with how many factors stand before it.
     """
 
     graph: FactorGraph
@@ -71,6 +76,8 @@ class GraphRecord:
     damage: str = ''
     rotation_information: str = QUATERNION
     remarks: Remarks = None
+    left_out: np.ndarray | None = None
+    comments: tuple[tuple[int, str], ...] = ()
 
     @property
     def times(self) -> Indices:
@@ -91,10 +98,12 @@ def read_graph_file(path: str | os.PathLike[str],
     FileError : naming the line, when the file is no such graph or those beside it are of another.
 
     """
-    groups, remarks = lines_by_tag(path)
+    lines = lines_by_tag(path)
+    groups, remarks = lines.groups, lines.remarks
     manifold = manifold_of(path, groups)
-    edges, skipped = without_circles(
+    edges, circles = without_circles(
         rows_of(path, groups, manifold, FACTORS, rotation_information))
+    edges, indefinite = made_definite(edges)
     if edges.alone.all():
         raise FileError(path, f'no edges; expected {expected_tags("between")} lines')
     vertices = vertices_of(path, groups, manifold)
@@ -105,10 +114,20 @@ def read_graph_file(path: str | os.PathLike[str],
         ids, vertices = ids[kept], vertices.chosen(kept) if len(vertices) else vertices
         edges = edges.chosen(np.flatnonzero(np.isin(edges.ids, anchors).sum(axis=1) == 0))
     graph = FactorGraph(manifold, len(ids))
-    _add_edges(path, graph, ids, edges, remarks)
+    order, left_out = in_place(edges.lines, lines.left_out)
+    edges = edges.chosen(order)
+    _add_edges(path, graph, ids, edges, remarks, left_out == STRUCK)
+    used = np.flatnonzero(left_out == '')
+    ends = np.concatenate(([0], used + 1))
+    before = ends[np.searchsorted(
+        edges.lines[used], [number for number, _ in lines.comments])].tolist()
+    skipped = (*circles, *indefinite, *_skipped(groups, ids, anchors))
     return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
-                       _stamps(path, ids, remarks), (*skipped, *_skipped(groups, ids, anchors)),
-                       rotation_information=rotation_information, remarks=remarks)
+                       _stamps(path, ids, remarks), skipped,
+                       rotation_information=rotation_information, remarks=remarks,
+                       left_out=left_out,
+                       comments=tuple(zip(before, (text for _, text in lines.comments),
+                                          strict=True)))
 
 
 def read_vertices(path: str | os.PathLike[str],
@@ -123,7 +142,8 @@ def read_vertices(path: str | os.PathLike[str],
     FileError : the file has none, or is no graph.
 
     """
-    groups, remarks = lines_by_tag(path)
+    lines = lines_by_tag(path)
+    groups, remarks = lines.groups, lines.remarks
     found = manifold_of(path, groups)
     vertices = vertices_of(path, groups, found)
     if not len(vertices):
@@ -138,8 +158,8 @@ def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
     """
     Write a graph as g2o with its own ids, every number such that it reads back the same.
 
-    Stamps, trusted and struck-out loops, if any, go to side files; those of a former graph of this
-    name are removed with that graph.
+    Factors that were left out are comments, see `left_out`. Stamps, trusted and struck-out loops,
+    if any, go to side files; those of a former graph of this name are removed with that graph.
 
     Raises
     ------
@@ -148,7 +168,7 @@ def write_graph_file(path: str | os.PathLike[str], record: GraphRecord) -> None:
     """
     path = Path(path)
     with replacing(path) as temporary:
-        put_lines(temporary, graph_lines(path, record))
+        put_lines(temporary, [*graph_lines(path, record), MARK])
         # Before the graph takes its place: it must never meet the stamps or the trust of another.
         write_beside(path, record.ids, record.stamps, record.graph.between)
 
@@ -158,14 +178,15 @@ def _stamps(path: str | os.PathLike[str], ids: Indices, remarks: Remarks) -> Ind
 
 
 def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, edges: Rows,
-               remarks: Remarks) -> None:
+               remarks: Remarks, struck_here: Mask) -> None:
     i, j = _index(path, ids, edges).T
     i, none = np.where(edges.alone, WORLD, i), np.zeros(len(edges), bool)
     roots = _roots(path, edges)
     doubted = BetweenFactors(i, j, edges.pose, roots, none, none, graph.predecessor)
     trusted, struck = (remarks['trusted'], remarks['struck']) if remarks else (
         named_loops(path, name, ids, doubted) for name in ('trusted', 'struck'))
-    graph.append_between(i, j, edges.pose, roots, trusted & ~struck, struck & ~trusted)
+    graph.append_between(i, j, edges.pose, roots, trusted & ~struck & ~struck_here,
+                         (struck & ~trusted) | struck_here)
 
 
 def _index(path: object, ids: Indices, rows: Rows) -> Indices:
@@ -244,6 +265,7 @@ def graph_lines(path: Path, record: GraphRecord) -> list[str]:
     lines = [] if record.poses is None else _lines(
         path, record, 'vertex', ids[:, None], record.poses, np.empty((0, d, d)))
     factors, pairs, kinds = graph.between, ids[graph.between.pairs], _kinds(graph)
+    left_out = left_out_words(record)
     if factors.is_absolute.any() and graph.manifold is se3:
         lines.append(NO_OFFSET)
     texts = np.empty(len(factors), object)
@@ -251,10 +273,35 @@ def graph_lines(path: Path, record: GraphRecord) -> list[str]:
         rows = np.flatnonzero(kinds == kind)
         written = _lines(path, record, str(kind), pairs[rows], factors.measurement[rows],
                          factors.sqrt_information[rows])
-        if len(rows) == len(factors):
+        if len(rows) == len(factors) and not left_out.any() and not record.comments:
             return lines + written
         texts[rows] = '\n'.join(written).split('\n')
-    return lines + texts.tolist()
+    used = left_out == ''
+    comments = tuple((int(used[:before].sum()), text) for before, text in record.comments)
+    return [*_among(comments, lines, texts[used].tolist()),
+            *commented(texts.tolist(), left_out)]
+
+
+def left_out_words(record: GraphRecord) -> np.ndarray:
+    """Return why each factor is left out, (m,); what a person struck out now is, too."""
+    factors = record.graph.between
+    words = nothing_left_out(len(factors)) if record.left_out is None else record.left_out.copy()
+    words[words == STRUCK] = ''
+    words[factors.struck] = STRUCK
+    return words
+
+
+def _among(comments: tuple[tuple[int, str], ...], head: list[str],
+           lines: list[str]) -> list[str]:
+    """Return head and lines with each comment behind as many of the lines as it was."""
+    texts: list[str] = [text for before, text in comments if before == 0]
+    texts += head
+    done = 0
+    for before, text in comments:
+        if before:
+            texts += [*lines[done:before], text]
+            done = before
+    return texts + lines[done:]
 
 
 def _kinds(graph: FactorGraph) -> np.ndarray:

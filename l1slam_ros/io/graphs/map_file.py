@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a running back end keeps its map: when it is saved, and never over that of another."""
 
+import filecmp
 import os
 import threading
 import time
@@ -13,7 +14,7 @@ from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.core.running.snapshot import SavedMap
 from l1slam_ros.io.files import other_kind
 from l1slam_ros.io.formats import named
-from l1slam_ros.io.graphs.saved_map import keep_as, load_map, save_map
+from l1slam_ros.io.graphs.saved_map import before_of, is_map, keep_as, load_map, save_map
 from l1slam_ros.io.node_options import NodeOptions
 
 # An autosave begins after such a part of its period. Whoever pulls the plug just before it is done
@@ -46,14 +47,18 @@ class MapFile:
         self._began = time.monotonic()
         # Where the map was saved or loaded last, and its revision then.
         self._known = _absolute(options().save_path), backend.revisions.now
-        # The file that we wrote or loaded, its end, and what names the graph whose map it holds.
+        # The file that we wrote or loaded, its end, and what names the graph whose map it holds;
+        # and of the one before it the name and the end.
         self._ours: tuple[object, ...] = ()
+        self._ours_before: tuple[object, ...] = ()
 
     def save(self) -> str:
-        """Save the map; return a sentence that says where."""
+        """Save the map; return a sentence that says where, and what of others was kept."""
         with self._at_work(), self._backend.calm:
-            revision = self._backend.revisions.now
-            return self._write(self._path(), self._backend.saved(), revision)
+            revision, path = self._backend.revisions.now, self._path()
+            saved = self._backend.saved()
+            kept = self._keep_others(path, saved)
+            return '; '.join([self._write(path, saved, revision), *kept])
 
     def autosave(self, taken: Callable[[], None] = lambda: None) -> None:
         """
@@ -68,12 +73,21 @@ class MapFile:
             if saved is None:
                 return
             path = self._path()
-            end = _end_of(path)
-            if end and self._ours != (path, end, saved.graph_began):
-                kept = path.with_name(f'{path.stem}.{_time_of(path)}{path.suffix}')
-                keep_as(path, kept)
-                self._warn(f'{path} held another map: it is kept as {kept}')
+            for sentence in self._keep_others(path, saved):
+                self._warn(sentence)
             self._write(path, saved, revision)
+
+    def _keep_others(self, path: Path, saved: SavedMap | None) -> list[str]:
+        """Keep what stands in the places of a map and is none of it; return what to say of it."""
+        if saved is None:
+            return []
+        sentences, before, end = [], before_of(path), _end_of(path)
+        end_before = _end_of(before)
+        if end_before and self._ours_before != (before, end_before):
+            sentences += _kept(before, path)
+        if end and self._ours != (path, end, saved.graph_began):
+            sentences += _kept(path, path)
+        return sentences
 
     @contextmanager
     def _at_work(self) -> Iterator[None]:
@@ -88,6 +102,7 @@ class MapFile:
         sentence = save_map(path, saved)
         self._known = path, revision
         self._ours = path, _end_of(path), saved.graph_began if saved else 0
+        self._ours_before = before_of(path), _end_of(before_of(path))
         return sentence
 
     def load(self) -> str:
@@ -105,8 +120,11 @@ class MapFile:
         with named(path):
             graph = self._backend.restore(saved)
         self._known = path, self._backend.revisions.now
-        # What could not be read may be of use to somebody yet.
-        self._ours = (path, end, graph) if whole else ()
+        # What could not be read may be of use to somebody yet, and a graph that is no saved map is
+        # somebody's own.
+        self._ours = (path, end, graph) if whole and is_map(path) else ()
+        before = before_of(path)
+        self._ours_before = (before, _end_of(before)) if is_map(before) else ()
         return sentence, whole
 
     def load_at_start(self, tell: Callable[[str], object]) -> None:
@@ -157,6 +175,19 @@ def _end_of(path: Path) -> bytes:
     with path.open('rb') as file:
         file.seek(max(file.seek(0, os.SEEK_END) - _END, 0))
         return file.read()
+
+
+def _kept(path: Path, of: Path) -> list[str]:
+    """Keep a file under the name of its day; return a sentence, none if it is kept already."""
+    name, number = f'{of.stem}.{_time_of(path)}', 1
+    kept = of.with_name(f'{name}{of.suffix}')
+    while os.path.lexists(kept):
+        if os.path.isfile(kept) and filecmp.cmp(path, kept, shallow=False):
+            return []
+        number += 1
+        kept = of.with_name(f'{name}.{number}{of.suffix}')
+    keep_as(path, kept)
+    return [f'{path} held another map: it is kept as {kept}']
 
 
 def _time_of(path: Path) -> str:

@@ -3,14 +3,14 @@
 
 import os
 from collections import defaultdict
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.geometry.noise import LEAST_EIGENVALUE, Mask, nearest_definite
 from l1slam_ros.core.names import QUATERNION
 from l1slam_ros.io.files import (
     TextLines,
@@ -20,11 +20,13 @@ from l1slam_ros.io.files import (
     read_lines,
     refuse_quaternions,
 )
+from l1slam_ros.io.graphs.left_out import restored
 from l1slam_ros.io.graphs.tags import OFFSET, TAGS, TAGS_LEFT_OUT
 from l1slam_ros.io.remarks import Remarks
 
 # So many lines are named in one sentence.
 _NAMED = 3
+_MATRICES = 'information matrices'
 
 
 @dataclass(frozen=True)
@@ -57,9 +59,25 @@ class Rows:
         return self.units[:, :, None] * self.information * self.units[:, None, :]
 
 
-def lines_by_tag(path: str | os.PathLike[str]) -> tuple[dict[str, TextLines], Remarks]:
-    """Return the lines of each tag, without the tag, and the remarks; every tag is known."""
-    lines = read_lines(path)
+@dataclass(frozen=True)
+class GraphLines:
+    """
+    The lines of a graph file.
+
+    groups : those of each tag, without the tag, every tag is known; left_out : number -> why a map
+    was made without the factor on it, and its place; remarks : of a saved map; comments : numbers
+    and texts.
+    """
+
+    groups: dict[str, TextLines]
+    left_out: dict[int, tuple[str, int]]
+    remarks: Remarks
+    comments: tuple[tuple[int, str], ...]
+
+
+def lines_by_tag(path: str | os.PathLike[str]) -> GraphLines:
+    """Return the lines of a graph file by their tags."""
+    lines, left_out = restored(read_lines(path))
     groups: dict[str, TextLines] = defaultdict(lambda: TextLines([], []))
     for number, text in zip(lines.numbers, lines.texts, strict=True):
         tag, *rest = text.split(None, 1)
@@ -74,7 +92,7 @@ def lines_by_tag(path: str | os.PathLike[str]) -> tuple[dict[str, TextLines], Re
             usual = [name for name in TAGS if TAGS[name].kind in ('vertex', 'between')]
             raise FileError(path, f'unknown tag {quoted(tag)}; expected {", ".join(usual)}',
                             group.numbers[0])
-    return groups, lines.remarks
+    return GraphLines(groups, left_out, lines.remarks, lines.comments)
 
 
 def expected_tags(kind: str) -> str:
@@ -158,3 +176,23 @@ def without_circles(edges: Rows) -> tuple[Rows, list[str]]:
     sentence = (f'{counted(len(lines), "edge")} from a vertex to itself not used: '
                 f'{"line" if len(lines) == 1 else "lines"} {", ".join(names)}')
     return edges.chosen(~circle), [sentence]
+
+
+def made_definite(edges: Rows) -> tuple[Rows, list[str]]:
+    """
+    Return the edges with information that is positive definite where it can be, and a sentence.
+
+    See `nearest_definite`, in the units of the residual; there is no sentence where all was.
+    """
+    nearest, least = nearest_definite(edges.scaled)
+    changed = np.flatnonzero(np.isfinite(least))
+    if not len(changed):
+        return edges, []
+    information, units = edges.information.copy(), edges.units[changed]
+    information[changed] = nearest[changed] / (units[:, :, None] * units[:, None, :])
+    worst = changed[np.argmin(least[changed])]
+    sentence = (f'{len(changed):,} of {counted(len(edges), "information matrix", _MATRICES)} not '
+                f'positive definite, the worst at line {edges.lines[worst]:,}: its least '
+                f'eigenvalue is {least[worst]:.2g} times its largest; each is used as the nearest '
+                f'one that has none below {LEAST_EIGENVALUE:g} times its largest')
+    return replace(edges, information=information), [sentence]

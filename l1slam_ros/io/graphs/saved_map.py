@@ -22,6 +22,7 @@ from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.running.snapshot import SavedMap
 from l1slam_ros.io.files import other_kind, put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord, graph_lines, read_graph_file
+from l1slam_ros.io.graphs.left_out import SUSPECT, left_out_by
 from l1slam_ros.io.remarks import is_proven, with_remarks
 
 _Record = TypeVar('_Record', BuilderState, Optimised, Judgement)
@@ -38,7 +39,8 @@ def save_map(path: Path, saved: SavedMap | None) -> str:
     """
     if saved is None:
         raise FileError(path, 'there is no graph yet to be saved')
-    record = GraphRecord(saved.builder.graph, saved.optimised.poses, np.arange(_count(saved)))
+    record = GraphRecord(saved.builder.graph, saved.optimised.poses, np.arange(_count(saved)),
+                         left_out=_left_out(saved))
     with replacing(path) as temporary:
         put_lines(temporary, with_remarks(graph_lines(path, record), _remarks(saved)))
         _keep(path)
@@ -57,7 +59,7 @@ def load_map(path: Path) -> tuple[SavedMap, str, bool]:
     FileError : neither is a map.
 
     """
-    before = _before(path)
+    before = before_of(path)
     try:
         saved, which, whole = _read(path), f'{path}', True
     except FileError as error:
@@ -94,7 +96,8 @@ def is_map(path: Path) -> bool:
         return False
 
 
-def _before(path: Path) -> Path:
+def before_of(path: Path) -> Path:
+    """Return the name of the map before the one of a name."""
     return path.with_name(f'{path.name}.1')
 
 
@@ -104,7 +107,7 @@ def _count(saved: SavedMap) -> int:
 
 def _keep(path: Path) -> None:
     """Let a file be that before it, too, unless it is damaged and that is not."""
-    before = _before(path)
+    before = before_of(path)
     if os.path.exists(path) and (is_map(path) or not is_map(before)):
         keep_as(path, before)
 
@@ -114,6 +117,17 @@ def _remove_leftovers(path: Path) -> None:
     path = Path(os.path.realpath(path))
     for leftover in path.parent.glob(f'.{glob.escape(path.name)}*.tmp'):
         leftover.unlink(missing_ok=True)
+
+
+def _left_out(saved: SavedMap) -> np.ndarray:
+    """Return why each factor is left out; loops that came after the judgement wait for it."""
+    factors, judgement = saved.builder.graph.between, saved.judgement
+    if not saved.robust or not len(judgement.accepted):
+        return left_out_by(None, factors)
+    words = left_out_by(judgement, factors)
+    later = np.arange(len(words)) >= len(judgement.accepted)
+    words[later & ~factors.is_odometry & ~factors.struck] = SUSPECT
+    return words
 
 
 def _remarks(saved: SavedMap) -> dict[str, Any]:

@@ -32,6 +32,11 @@ from l1slam_ros.io.files import (
     reported,
     stamp_from_text,
 )
+from l1slam_ros.io.ours import marked
+
+# All that may lie beside an input, and what is written, or else removed, beside a graph.
+BESIDE = ('stamps', 'trusted', 'struck', 'truth', 'false')
+WRITTEN_BESIDE = BESIDE[:3]
 
 
 def beside(path: str | os.PathLike[str], what: str) -> Path:
@@ -67,7 +72,7 @@ def _replaced(path: Path, lines: list[str]) -> Iterator[None]:
     """Let a file of these lines take its place when the block succeeds; no lines, no file."""
     if lines:
         with replacing(path) as temporary:
-            put_lines(temporary, lines)
+            put_lines(temporary, marked(lines))
             yield
         return
     yield

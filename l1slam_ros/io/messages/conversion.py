@@ -16,6 +16,7 @@ A message that cannot be used raises `MessageError` with one of these causes:
 Covariances pass as they come: `graph_builder` decides what they are worth.
 """
 
+import math
 import re
 from collections.abc import Callable
 from functools import cache
@@ -28,7 +29,12 @@ from rosbags.typesys import Stores, get_typestore
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import silent_components
-from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample, sound_pose3
+from l1slam_ros.core.graph.measurements import (
+    FASTEST,
+    LoopClosure,
+    OdometrySample,
+    sound_pose3,
+)
 from l1slam_ros.io.files import LAST_STAMP, NANOSECONDS, quoted, stamp_text
 
 _REFERENCE_FRAME = re.compile(
@@ -49,7 +55,8 @@ def odometry_sample(message: Any) -> OdometrySample:
         _pose3(message.pose.pose),
         _covariance(message.pose.covariance),
         _covariance(message.twist.covariance),
-        message.child_frame_id)
+        message.child_frame_id,
+        (_size(message.twist.twist.linear), _size(message.twist.twist.angular)))
 
 
 def odometry_in(data: bytes) -> tuple[str, OdometrySample]:
@@ -223,6 +230,12 @@ def _reference_stamp(frame_id: str, base_frame: str) -> int:
 def _pose3(pose: Any) -> Array:
     """Return x y z qx qy qz qw (7,) of a geometry_msgs/Pose, the quaternion normalised."""
     return checked_pose3(pose.position, pose.orientation)
+
+
+def _size(vector: Any) -> float:
+    """Return the length of a geometry_msgs/Vector3, 0 where that is none of a twist."""
+    length = math.hypot(vector.x, vector.y, vector.z)
+    return length if length <= FASTEST else 0.0
 
 
 def _covariance(entries: Any) -> Array:

@@ -18,11 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from l1slam_ros.core.errors import MessageError
-from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import root_of_inverse, usable
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.graph.measurements import LoopClosure, in_order
 from l1slam_ros.core.online.keyframes import reduced_covariance
 from l1slam_ros.io.messages.conversion import checked_pose3, stamp_of
 
@@ -104,14 +103,8 @@ class PoseGraphs:
             if number not in self._stamps:
                 raise MessageError('keyframe', f'a loop of keyframe {number}; expected one whose '
                                    'time a message has told')
-        begin, end, pose, covariance = (
-            self._stamps[edge.i], self._stamps[edge.j], edge.pose3[None], edge.covariance)
-        if begin > end:
-            begin, end = end, begin
-            # X = Z exp(e), so X^-1 = exp(-e) Z^-1 = Z^-1 exp(-Ad(Z) e).
-            Ad = se3.adjoint(pose)[0]
-            pose, covariance = se3.inverse(pose), Ad @ covariance @ Ad.T
-        return LoopClosure(begin, end, pose[0], covariance)
+        return in_order(LoopClosure(
+            self._stamps[edge.i], self._stamps[edge.j], edge.pose3, edge.covariance))
 
     def graph(self, manifold: Manifold, model: Array) -> tuple[FactorGraph, Indices]:
         """

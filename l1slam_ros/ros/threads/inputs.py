@@ -17,6 +17,7 @@ from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from operator import itemgetter
@@ -69,10 +70,17 @@ class Traffic:
     ----------
     publishers : returns how many there are now
 
+    Attributes
+    ----------
+    received, lost : how many messages
+    other_source : whether the numbers began anew with the last one: of another publisher, or of
+        one that was restarted
+
     """
 
     def __init__(self, publishers: Callable[[], int]):
         self.received = self.lost = 0
+        self.other_source = False
         self.publishers = publishers
         # The last number of each publisher, of who spoke last in front.
         self._numbers: list[int] = []
@@ -81,6 +89,7 @@ class Traffic:
     def note(self, information: Mapping[str, int | None]) -> None:
         """Count a message; information : what rclpy says about it."""
         self.received += 1
+        self.other_source = False
         number = information.get('publication_sequence_number')
         if number is None:
             return
@@ -95,6 +104,8 @@ class Traffic:
             nearest = max(before)
             numbers.remove(nearest)
             self.lost += number - nearest - 1
+        else:
+            self.other_source = bool(numbers)
         numbers.insert(0, number)
 
     def values(self) -> dict[str, str]:
@@ -298,6 +309,8 @@ class Inputs:
             self._node.get_logger().warning(
                 f'odometry in frame {quoted(frame)} is used, but {self._map_frame} -> '
                 f'{self._odom_frame} is published; expected odom_frame to be its name', once=True)
+        if self.traffic['odom'].other_source:
+            sample = replace(sample, other_source=True)
         self._unanswered |= self._backend.add_odometry(sample)
         if self._backlog < _ANSWERED:
             self._answer()

@@ -17,7 +17,8 @@ from problems import (
     seconds,
 )
 
-from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.errors import MessageError
+from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
@@ -143,3 +144,49 @@ def test_loops_without_noise_while_the_map_grows(lies, rng):
     used = backend.snapshot().graph.between
     exact = se2.between(truth[used.i[rows]], truth[used.j[rows]])
     assert np.abs(se2.local(exact, used.measurement[rows])).max() < 1e-6
+
+
+def turned_back(loop):
+    """Return a loop as seen from its later end."""
+    Ad, pose = se3.adjoint(loop.pose3[None])[0], se3.inverse(loop.pose3[None])[0]
+    return replace(loop, reference_stamp=loop.stamp, stamp=loop.reference_stamp, pose3=pose,
+                   covariance=Ad @ loop.covariance @ Ad.T)
+
+
+def test_a_loop_that_leads_back_is_turned_round(rng):
+    """The measurement inverted, the covariance seen from its other end: the same factor."""
+    forward = []
+    for message in messages(simulate_world(60, 90, WorldOptions(), rng).graph):
+        if isinstance(message, LoopClosure):
+            root = 0.1 * rng.standard_normal((6, 6))
+            message = replace(message, covariance=root @ root.T)
+        forward.append(message)
+    back = [turned_back(one) if isinstance(one, LoopClosure) else one for one in forward]
+    assert sum(isinstance(one, LoopClosure) for one in back) == 31
+    found = []
+    for heard in (forward, back):
+        hear(backend := Backend(EVERY), heard)
+        backend.settle()
+        found.append(backend.snapshot())
+    one, other = (now.graph.between for now in found)
+    np.testing.assert_array_equal(other.pairs, one.pairs)
+    np.testing.assert_allclose(other.measurement, one.measurement, atol=1e-9)
+    np.testing.assert_allclose(other.sqrt_information, one.sqrt_information, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found[1].poses, found[0].poses, atol=1e-6)
+
+
+def test_a_strike_may_name_its_times_either_way_round():
+    backend = Backend(EVERY)
+    for k in range(12):
+        backend.add_odometry(odometry(k * PERIOD, [k, 0, 0]))
+    backend.add_loop(loop(PERIOD, 9 * PERIOD, [8.0, 0, 0]))
+    backend.add_loop(replace(loop(9 * PERIOD, PERIOD, [0.0, 0, 0]), struck=True))
+    backend.settle()
+    assert backend.snapshot().graph.between.struck.sum() == 1
+
+
+def test_a_loop_that_leads_back_and_leaves_a_component_unsaid_is_refused():
+    covariance = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, np.inf])
+    message = replace(loop(9 * PERIOD, PERIOD, [0.0, 0, 0]), covariance=covariance)
+    with pytest.raises(MessageError, match=' ns leaves a component unsaid; expected its earlier'):
+        Backend(EVERY).add_loop(message)

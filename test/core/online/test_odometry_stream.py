@@ -90,10 +90,10 @@ def test_the_very_first_stamp_is_the_stray(stray):
 
 @pytest.mark.parametrize('pause', [3.0, LONGEST_PAUSE + 1, 10 * 60.0, DAY])
 def test_a_robot_that_pauses_loses_nothing(pause):
-    """Also with drift meanwhile, and when it stands where it stood."""
-    poses = curve(40)
+    """Also with drift meanwhile, and when it stands where it stood: before, and after."""
+    poses = np.insert(curve(36), [20] * 4, curve(21)[20], axis=0)
     for drift in (0.0, 3.0):
-        samples = [(time + (pause if k >= 20 else 0.0), pose + [drift * (k >= 20), 0.0, 0.0])
+        samples = [(time + (pause if k >= 22 else 0.0), pose + [drift * (k >= 22), 0.0, 0.0])
                    for k, (time, pose) in enumerate(timed(poses))]
         builder, _ = fed(samples)
         assert builder.graph.n_poses == 40

@@ -224,31 +224,6 @@ def test_a_map_of_nothing_is_not_asked_whether_it_hangs_on_its_norm(monkeypatch)
     assert asked == [5]
 
 
-def test_six_threads_may_settle_at_once(monkeypatch):
-    """Each has its answer: none makes way for another, whenever it comes."""
-    backend, began, solve = Backend(EVERY), [], updates.optimise
-    drive(backend, 0, 30)
-    backend.add_loop(loop(1.0, 30.0, (28.9, 0.0, 0.0), 1e-4 * np.eye(6)))
-
-    def slowly(problem, options, check):
-        began.append(time.monotonic())
-        while time.monotonic() < began[-1] + 0.05:  # the others call meanwhile
-            check()
-        return solve(problem, options, check)
-
-    monkeypatch.setattr(updates, 'optimise', slowly)
-    found = []
-    threads = []
-    for _ in range(6):
-        threads.append(meanwhile(lambda: found.append(backend.settle())))
-        time.sleep(0.01)
-    for thread in threads:
-        thread.join(DEADLINE)
-    assert len(found) == len(began) == 6
-    assert len({one.cost for one in found}) == 1
-    assert backend.loop_states().state.tolist() == [ACCEPTED]
-
-
 def test_a_settle_lets_a_fork_through_and_comes_to_its_end(monkeypatch):
     backend, begun, solve, calls = Backend(EVERY), threading.Event(), updates.optimise, []
     drive(backend, 0, 5)
@@ -463,3 +438,40 @@ def test_what_fails_in_the_background_is_raised_at_the_end(monkeypatch):
         assert failed.wait(DEADLINE)
     assert not of_threads()
     backend.close()
+
+
+def test_several_threads_may_settle_at_once():
+    backend, found = Backend(EVERY), []
+    drive(backend, 0, 200)
+    backend.add_loop(loop(3.0, 150.0, [147.0, 0.0, 0.0]))
+
+    def settle():
+        try:
+            found.append(backend.settle())
+        except BaseException as error:
+            found.append(error)
+
+    threads = []
+    for _ in range(6):
+        threads.append(meanwhile(settle))
+        time.sleep(0.01)
+    for thread in threads:
+        thread.join(DEADLINE)
+    assert [type(one) for one in found] == 6 * [Improvement]
+    assert [len(one.poses) for one in found] == 6 * [200]
+
+
+def test_who_waits_to_settle_can_be_told_to_stop(monkeypatch):
+    backend, meeting = Backend(EVERY), Meeting()
+    drive(backend, 0, 20)
+    optimise = updates.optimise
+    monkeypatch.setattr(updates, 'optimise', lambda *given: (meeting(), optimise(*given))[1])
+    first = meanwhile(backend.settle)
+
+    def stopped():
+        with pytest.raises(Interrupted):
+            backend.settle(lambda: True)
+        return first.is_alive()
+
+    assert meeting.look(stopped)
+    first.join(DEADLINE)

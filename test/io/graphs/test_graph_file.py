@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from problems import add_absolute, retold
 
 from l1slam_ros.core.errors import FileError
@@ -117,23 +118,56 @@ def test_the_same_square_in_toro(write):
 
 
 @pytest.mark.parametrize(('line', 'message'), [
-    ('EDGE_SE2 3 7 1 0 0 1 2 0 1 0 1',
-     'information [1 2 0 2 1 0 0 0 1]; expected a positive definite matrix'),
-    ('EDGE2 3 7 1 0 0 1 2 1 1 0 0',
-     'information [1 2 0 2 1 0 0 0 1]; expected a positive definite matrix'),
-    # Positive definite in one order, not in the other.
-    ('EDGE2 3 7 1 0 0 1 0 0 1 0 1', 'information [1 0 0 0 0 1 0 1 1]; expected a positive'),
-    ('EDGE_PRIOR_SE2 3 1 0 0 1 0 0 1 0 -1', 'information [1 0 0 0 1 0 0 0 -1]; expected'),
-    ('EDGE_PRIOR_SE2_XY 3 1 0 1 0 -1', 'information [1 0 0 0 -1 0 0 0 0]; expected'),
+    ('EDGE_SE2 3 7 1 0 0 -2 1 0 -3 0 -1',
+     'information [-2 1 0 1 -3 0 0 0 -1]; expected a positive definite matrix'),
+    ('EDGE_PRIOR_SE2 3 1 0 0 -1 0 0 -1 0 -1', 'information [-1 0 0 0 -1 0 0 0 -1]; expected'),
     ('EDGE_PRIOR_SE2_XY 3 1 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected'),
     ('EDGE_SE2 3 7 1 0 0 0 0 0 0 0 0', 'information [0 0 0 0 0 0 0 0 0]; expected a positive'),
-    ('EDGE_SE2 3 7 1 0 0 1 .1 0 0 0 1', 'information [1 0.1 0 0.1 0 0 0 0 1]; expected'),
     ('EDGE_PRIOR_SE2_XY 3 1 0 0 1 0 1', 'EDGE_PRIOR_SE2_XY: 7 fields; expected 1 whole and 5'),
     ('EDGE_PRIOR_SE2 -1 1 0 0 1 0 0 1 0 1', 'vertex -1 is unknown; expected one of the 3'),
     ('EDGE_PRIOR_SE2 3 7 1 0 0 1 0 0 1 0 1', 'EDGE_PRIOR_SE2: 11 fields; expected 1 whole and 9'),
 ])
-def test_each_order_of_the_information_is_its_own(write, line, message):
+def test_an_edge_that_cannot_be_used_is_told(write, line, message):
     assert message_of(write(SQUARE + line + '\n')).startswith(f':9: {message}')
+
+
+@pytest.mark.parametrize(('line', 'least', 'expected'), [
+    ('EDGE_SE2 3 7 1 0 0 1 2 0 1 0 1', '-0.33',
+     [[1.5, 1.5, 0], [1.5, 1.5, 0], [0, 0, 1]]),
+    ('EDGE2 3 7 1 0 0 1 2 1 1 0 0', '-0.33', [[1.5, 1.5, 0], [1.5, 1.5, 0], [0, 0, 1]]),
+    # Positive definite in one order, not in the other.
+    ('EDGE2 3 7 1 0 0 1 0 0 1 0 1', '-0.38', [[1, 0, 0], [0, 0.447, 0.724], [0, 0.724, 1.171]]),
+    ('EDGE_SE2 3 7 1 0 0 1 .1 0 0 0 1', '-0.0098',
+     [[1, 0.098, 0], [0.098, 0.0097, 0], [0, 0, 1]]),
+    ('EDGE_PRIOR_SE2 3 1 0 0 1 0 0 1 0 -1', '-1', [[1, 0, 0], [0, 1, 0], [0, 0, 0]]),
+    # What says nothing says nothing.
+    ('EDGE_PRIOR_SE2_XY 3 1 0 1 0 -1', '-1', [[1, 0, 0], [0, 0, 0], [0, 0, 0]]),
+])
+def test_information_that_is_not_definite_is_used_as_the_nearest_that_is(
+        write, line, least, expected):
+    record = read_graph_file(write(SQUARE + line + '\n'))
+    found = information_of(record.graph.between)[-1]
+    assert_allclose(found, expected, atol=2e-3)
+    values = np.linalg.eigvalsh(found[:2, :2] if 'XY' in line else found)
+    assert values[0] == pytest.approx(1e-6 * values[-1], rel=1e-6)
+    assert record.graph.between.speaks[-1].tolist() == [True, True, 'XY' not in line]
+    count = len(record.graph.between)
+    assert record.skipped[0] == (
+        f'1 of {count} information matrices not positive definite, the worst at line 9: its least '
+        f'eigenvalue is {least} times its largest; each is used as the nearest one that has none '
+        'below 1e-06 times its largest')
+    write_graph_file(path := write('', 'again.g2o'), record)
+    again = read_graph_file(path)
+    assert_allclose(information_of(again.graph.between)[-1], found, rtol=1e-9, atol=1e-15)
+    assert not again.skipped
+
+
+def test_many_matrices_that_are_not_definite_are_one_line_and_the_worst_is_named(write):
+    bad = [f'EDGE_SE2 3 7 {k} 0 0 1 {k} 0 1 0 1' for k in (2, 9, 3)]
+    record = read_graph_file(write(SQUARE + '\n'.join(bad) + '\n'))
+    sentence, = record.skipped
+    assert sentence.startswith('3 of 6 information matrices not positive definite, the worst at '
+                               'line 10: its least eigenvalue is -0.8 times its largest; ')
 
 
 @pytest.mark.parametrize(('content', 'message'), [
@@ -211,7 +245,7 @@ def test_round_trip(tmp_path, rng):
     back = read_graph_file(tmp_path / 'a.g2o')
     assert_same(record, back)
     assert (back.stamps == record.stamps).all()
-    tags = [line.split()[0] for line in (tmp_path / 'a.g2o').read_text().splitlines()]
+    tags = [line.split()[0] for line in (tmp_path / 'a.g2o').read_text().splitlines()[:-1]]
     prior = 'EDGE_PRIOR_SE2'
     assert tags[-5:] == [prior, f'{prior}_XY', prior, prior, 'EDGE_SE2']
     assert {p.name for p in tmp_path.iterdir()} == {'a.g2o', 'a.g2o.stamps.txt'}
@@ -250,7 +284,7 @@ def test_trust_and_strikes_come_back_with_the_graph(tmp_path, rng):
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         'a.g2o', 'a.g2o.stamps.txt', 'a.g2o.struck.txt', 'a.g2o.trusted.txt']
     assert sorted(tuple(map(int, line.split()))
-                  for line in beside(path, 'trusted').read_text().splitlines()) == sorted(
+                  for line in beside(path, 'trusted').read_text().splitlines()[1:]) == sorted(
         map(tuple, record.ids[pairs[rows]].tolist()))
     back = read_graph_file(path)
     assert sorted(rows) == np.flatnonzero(back.graph.between.trusted).tolist()

@@ -44,7 +44,7 @@ SOUND = ['V 7 POSE', 'V 3 POSE', 'E 3 7 POSE INFO', 'V 9 POSE', 'E 7 9 POSE INFO
     ('E 3 7.5 POSE INFO', "E: '7.5' is not a whole number of 64 bits"),
     ('E 3 7 inf TAIL INFO', "E: 'inf' is not a finite number; expected"),
     ('E 3 7 -1e99 TAIL INFO', "E: '-1e99' is beyond 1e+30; expected"),
-    ('E 3 7 POSE -INFO', 'information [-1 0 0'),
+    ('E 3 7 POSE NONE', 'information [0 0 0'),
     ('E 3 8 POSE INFO', 'vertex 8 is unknown; expected one of the 3 vertices'),
     ('E 100 3 POSE INFO', 'vertex 100 is unknown; expected one of the 3 vertices'),
     ('V 7 POSE', 'vertex 7 stands twice, before at line 1; expected each once'),
@@ -55,11 +55,11 @@ SOUND = ['V 7 POSE', 'V 3 POSE', 'E 3 7 POSE INFO', 'V 9 POSE', 'E 7 9 POSE INFO
 def test_each_malformed_line_is_named(tmp_path, name, line, message):
     of, path = FORMATS[name], tmp_path / 'a.g2o'
     words = {'V': of.vertex, 'E': of.edge, 'POSE': of.pose, 'TAIL': of.pose[2:],
-             'INFO': of.information, 'OTHER': of.other}
+             'INFO': of.information, 'NONE': of.information.replace('1', '0'), 'OTHER': of.other}
     pose, edge = len(of.pose.split()), len((of.pose + ' ' + of.information).split())
 
     def written(text):
-        return re.sub(r'\b(V|E|POSE|TAIL|INFO|OTHER)\b', lambda word: words[word[0]], text)
+        return re.sub(r'\b(V|E|POSE|TAIL|INFO|NONE|OTHER)\b', lambda word: words[word[0]], text)
 
     # A good line follows: it is not the last one that is named, nor the first of its tag.
     path.write_text(written('\n'.join([*SOUND, line, 'E 9 3 POSE INFO\n'])))

@@ -51,6 +51,15 @@ def test_odometry(new):
     assert sample.twist_covariance[1, 0] == -6.0
 
 
+def test_how_fast_the_robot_is_by_its_twist(new):
+    message = odometry(new)
+    message.twist.twist.linear = new('geometry_msgs/msg/Vector3', x=3.0, y=-4.0, z=0.0)
+    message.twist.twist.angular = new('geometry_msgs/msg/Vector3', x=0.0, y=0.0, z=-0.5)
+    assert odometry_sample(message).speeds == (5.0, 0.5)
+    message.twist.twist.linear.x, message.twist.twist.angular.z = math.nan, 1e308
+    assert odometry_sample(message).speeds == (0.0, 0.0)
+
+
 def test_a_sample_does_not_change_with_its_message(new):
     message = odometry(new)
     sample = odometry_sample(message)

@@ -208,6 +208,16 @@ def test_from_a_bag_come_the_loops_or_the_whole_graph(bag, truth, topic):
     assert np.allclose(sigma, SIGMA[[0, 1, 5]])
 
 
+def test_who_read_no_loops_is_told_of_the_graphs(bag):
+    assert read_input(bag).damage == (
+        'no loop is in the map, but there are loops in 1 message on /kimera/pose_graph and 6 '
+        'messages on /rtabmap/mapGraph; expected --loop-topic /kimera/pose_graph or --loop-topic '
+        '/rtabmap/mapGraph')
+    for topics in (Topics(loops='/rtabmap/mapGraph'), Topics(odometry='/rtabmap/mapGraph'),
+                   Topics(odometry='/kimera/pose_graph')):
+        assert read_input(bag, topics=topics).damage == ''
+
+
 def test_who_has_no_odometry_is_told_of_the_graph(bag):
     with pytest.raises(FileError, match=f'0 keyframes from /none; .*{MAP_GRAPH} is on /rtabmap'):
         read_input(bag, topics=Topics(odometry='/none'))

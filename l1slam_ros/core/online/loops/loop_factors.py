@@ -54,12 +54,13 @@ class LoopFactors:
     Attributes
     ----------
     waiting : those that are not in the graph yet, nor refused
+    lost : how many loops will never be in it; not what is sent again, absolute poses and strikes
 
     """
 
     def __init__(self, manifold: Manifold, notes: Notes, verbatim: bool):
         self._manifold, self._notes, self._verbatim = manifold, notes, verbatim
-        self.waiting = WaitingLoops()
+        self.waiting, self.lost = WaitingLoops(), 0
         self.forget()
 
     def forget(self) -> None:
@@ -171,7 +172,9 @@ class LoopFactors:
         at, keyframes = track.at(np.append(begin, end)), track.poses_of(pairs.T.ravel())
         ways = manifold.between(np.concatenate((keyframes[:m], at[m:])),
                                 np.concatenate((at[:m], keyframes[m:])))
-        measurement, covariance, sound = _carried(manifold, loops, ways[:m], ways[m:])
+        unseen = track.unseen(np.append(begin, end))
+        measurement, covariance, sound = _carried(
+            manifold, loops, ways[:m], ways[m:], unseen.reshape(2, m, 2))
         covariance = np.where(sound[:, None, None], covariance, self._model(options))
         i = np.where([one.loop.is_absolute for one in loops], WORLD, pairs[:, 0])
         graph.append_between(i, pairs[:, 1], measurement, noise.root_of_inverse(covariance),
@@ -214,6 +217,7 @@ class LoopFactors:
         self._stamps.extend(stamps)
 
     def _refuse(self, cause: str, loop: LoopClosure, why: str) -> None:
+        self.lost += not (loop.struck or loop.is_absolute or cause == 'repeated')
         kind = 'a strike' if loop.struck else 'a loop'
         what = 'an absolute pose at' if loop.is_absolute else f'{kind} from {loop.stamps[0]} ns to'
         self._notes.refuse(cause, f'{what} {loop.stamp} ns {why}')
@@ -241,7 +245,7 @@ class LoopFactors:
 
 
 def _carried(manifold: Manifold, used: list[WaitingLoop], to_reference: Array,
-            to_keyframe: Array) -> tuple[Array, Array, Mask]:
+             to_keyframe: Array, unseen: Array) -> tuple[Array, Array, Mask]:
     """
     Return what loops say between keyframes near their times.
 
@@ -250,6 +254,7 @@ def _carried(manifold: Manifold, used: list[WaitingLoop], to_reference: Array,
     to_reference : (m, p) the robot at the reference, seen from the first keyframe; an absolute
         pose has none
     to_keyframe : (m, p) the second keyframe, seen from the robot at the end
+    unseen : (2, m, 2) the sigmas [m], [rad] of where the robot was at the reference and at the end
 
     Returns
     -------
@@ -264,6 +269,9 @@ def _carried(manifold: Manifold, used: list[WaitingLoop], to_reference: Array,
     covariance = np.concatenate([one.covariance for one in used])
     absolute = np.array([one.loop.is_absolute for one in used])
     silent = np.diagonal(covariance, axis1=1, axis2=2) == 0
+    if unseen.any():
+        covariance = covariance + noise.silenced(
+            _of_silences(manifold, stated, absolute, unseen), silent)
     unturned = silent[:, manifold.ROTATION].any(axis=1)
     measurement = np.where(absolute[:, None], stated, manifold.compose(to_reference, stated))
     measurement = np.where(unturned[:, None], measurement,
@@ -279,6 +287,17 @@ def _carried(manifold: Manifold, used: list[WaitingLoop], to_reference: Array,
     kept = covariance + (lost * (unturned[:, None] & ~silent))[:, :, None] * np.eye(lost.shape[1])
     covariance = np.where(silent.any(axis=1)[:, None, None], kept, turned)
     return measurement, covariance, noise.usable(noise.filled(covariance, silent))
+
+
+def _of_silences(manifold: Manifold, stated: Array, absolute: Mask, unseen: Array) -> Array:
+    """Return the covariances, (m, d, d), of loops whose ends nobody saw; see `_carried`."""
+    own = np.zeros((*unseen.shape[:2], manifold.TANGENT_SIZE))
+    own[:, :, manifold.TRANSLATION] = unseen[:, :, :1] ** 2
+    own[:, :, manifold.ROTATION] = unseen[:, :, 1:] ** 2
+    own[0, absolute] = 0.0  # the map has no time
+    first, second = own[..., None] * np.eye(manifold.TANGENT_SIZE)
+    Ad = manifold.adjoint(manifold.inverse(stated))
+    return Ad @ first @ Ad.transpose(0, 2, 1) + second
 
 
 def _loop_covariance(stated: Array, model: Array | None,

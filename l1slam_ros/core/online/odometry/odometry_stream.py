@@ -3,56 +3,46 @@
 Which samples of the odometry are the robot's motion.
 
 In: samples as they come. Out: those to be used, in order. A sample that its predecessor does not
-explain is held until the next one speaks for it (goes on from it) or against it (goes on from
-before); nothing that is held is used, nothing is dropped without being counted:
+explain (`plausibility`) is held until the next one speaks for it (goes on from it) or against it
+(goes on from before); nothing that is held is used, nothing is dropped without being counted:
 
     child_frame   of another frame than the robot's
     stamp_ahead   a gap in time, and the next sample is back at the time before
-    jump          a motion no robot makes, and the next sample is back where the robot was
+    jump          a motion that is not the robot's, and the next sample is back where it was
     old_stamp     not after the sample before; also a first sample whose stamp was the stray
 
-Where the next sample speaks for a motion no robot makes, the odometry has moved its frame: it
-began at the identity again, or its source was exchanged. Where it speaks for an old stamp, the
-clock was set back, or a bag is played again. The sample says so (`gap`).
+Where the next sample speaks for a motion that is not the robot's, the odometry has moved its
+frame: it began again, or its source was exchanged. Where it speaks for an old stamp, the clock was
+set back, or a bag is played again. The sample says so (`gap`). Where after a silence nobody can
+tell, the next sample is waited for, too, and it says that (`unsure`). A sample that is a little
+late is no clock that was set back: see `GraphBuilder`.
 
-Not told from motion: a frame moved by less than robots move (34 m within .1 s), unless it is to
-the identity exactly and that is far; a restart at the identity nearer than half a metre.
+Not told from motion: a frame moved by less than the robot moves, or by less than half a metre
+where nothing else says that the odometry began again.
 """
 
-import math
-from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from l1slam_ros.core.errors import MessageError
-from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.graph.measurements import (
-    FASTEST,
-    LONGEST_PAUSE,
-    SHORTEST_STEP,
-    Notes,
-    OdometrySample,
+from l1slam_ros.core.geometry.manifold import Manifold
+from l1slam_ros.core.graph.measurements import LONGEST_PAUSE, Notes, OdometrySample
+from l1slam_ros.core.online.odometry.plausibility import (
+    UNSEEN,
+    UNSEEN_TURN,
+    Point,
+    RecentMotion,
+    Step,
 )
 
-# A restart at the identity is a step so many times the longest of the last few ...
-_FAR, _RECENT = 5.0, 16
-# ... and at least so far [m]: nearer, it bends the map by less than a keyframe.
-_NEAR = 0.5
 # [s] A clock that is set back is set back so far; messages that overtook each other are nearer.
 _BACK = 0.5
 # [s] After a longer gap a sample is held, which costs the robot nothing but a message's delay; it
 # is confirmed by one within `LONGEST_PAUSE`, so that odometry of any rate passes.
 _GAP = 2.0
-# [m/s], [rad/s] A robot that nobody saw may have gone, and turned, so fast.
-UNSEEN, UNSEEN_TURN = 1.0, 1.0
-# [m], [rad] The identity, after its way through a quaternion.
-_EXACT = 1e-9
+# [rad] A smaller turn is not told of.
+_TOLD = 0.1
 # So much of a frame's name is quoted.
 _QUOTED = 40
-
-
-def is_identity(manifold: Manifold, pose: Array) -> bool:
-    """Tell whether a pose (1, p) is where odometry begins."""
-    return bool(abs(manifold.local(manifold.identity(1), pose)).max() < _EXACT)
 
 
 class BaseFrame:
@@ -128,26 +118,6 @@ def _frame(sample: OdometrySample) -> str:
     return sample.frame.removeprefix('/')
 
 
-class Point:
-    """
-    A sample, its pose (1, p) in the frame of its message, and its position [m].
-
-    seconds : since the sample before; doubt : the cause it was held for, else empty; gap : why no
-    motion is known from the sample before, else empty; unseen : how far the robot may have gone
-    [m] meanwhile; anew : the only sample before it was a stray.
-    """
-
-    __slots__ = ('anew', 'doubt', 'gap', 'pose', 'position', 'sample', 'seconds', 'stamp',
-                 'unseen')
-
-    def __init__(self, manifold: Manifold, sample: OdometrySample):
-        self.sample, self.stamp = sample, sample.stamp
-        self.pose: Array = manifold.from_pose3(sample.pose3[None])
-        self.position: list[float] = manifold.positions(self.pose)[0].tolist()
-        self.doubt = self.gap = ''
-        self.unseen, self.anew, self.seconds = 0.0, False, 0.0
-
-
 class OdometryStream:
     """
     Passes samples on, holding one at most.
@@ -171,16 +141,17 @@ class OdometryStream:
         self._manifold, self._notes, self._resumed = manifold, notes, resumed
         self._base_frame = base_frame
         self.last: Point | None = None
-        self._recent: deque[float] = deque(maxlen=_RECENT)
+        self._recent = RecentMotion(manifold)
         self._alone = False
         self.held: Point | None = None
 
-    def take(self, sample: OdometrySample, verbatim: bool, back: bool = False
-             ) -> Iterator[Point]:
+    def take(self, sample: OdometrySample, verbatim: bool, back: bool = False,
+             put_in_place: Callable[[Point], bool] = lambda _: False) -> Iterator[Point]:
         """
         Yield the samples that may be used now: this one, none, or a held one and this.
 
-        verbatim : none is to be doubted; back : time may go back
+        verbatim : none is to be doubted; back : time may go back; put_in_place : takes a sample
+        that is late, or returns False: it is none
 
         Raises
         ------
@@ -192,15 +163,16 @@ class OdometryStream:
         stray = len(ours) > 1
         if stray:  # what was used before
             self.last = self.held = None
-            self._recent.clear()
+            self._recent.forget()
         for one in ours:
             point = Point(self._manifold, one)
             point.anew, stray = stray, False
-            yield from self._taken(point, verbatim, back)
+            yield from self._taken(point, verbatim, back, put_in_place)
 
-    def _taken(self, point: Point, verbatim: bool, back: bool) -> list[Point]:
+    def _taken(self, point: Point, verbatim: bool, back: bool,
+               put_in_place: Callable[[Point], bool]) -> list[Point]:
         """Return what may be used now that the robot's next sample is here; see `take`."""
-        last, held = self.last, self.held
+        last, held, how = self.last, self.held, (verbatim, back, put_in_place)
         if last is None:
             used = self._used(point)
             self._alone = not self._resumed
@@ -208,13 +180,17 @@ class OdometryStream:
         if held is not None and self._goes_on(last, held, point):
             self.held = None
             held.anew = held.doubt == 'old_stamp' and self._alone
-            if held.doubt != 'stamp_ahead' and not held.anew:
-                held.gap = self._why(last, held)
-                held.unseen = max((UNSEEN * (held.stamp - last.stamp) * 1e-9, *self._recent))
+            if not held.anew:
+                self._explain(last, held, Step(self._manifold, held, point))
             return self._used(held) + self._used(point)
+        if held is not None and held.doubt == 'unsure' and last.stamp < point.stamp < held.stamp:
+            self.held = None  # it came before, out of turn
+            return [*self._taken(point, *how), *self._taken(held, *how)]
         point.doubt = self._doubt(last, point)
         if verbatim and point.doubt != 'old_stamp':
             return self._used(point)
+        if point.doubt == 'old_stamp' and put_in_place(point):
+            return []
         again = held is not None and point.stamp == held.stamp
         known_back = (back and not verbatim) or self._may_begin_anew(last, point)
         if again or (point.doubt == 'old_stamp' and not (
@@ -222,6 +198,10 @@ class OdometryStream:
             known = held.stamp if again and held is not None else last.stamp
             raise MessageError('old_stamp', f'odometry stamp {point.stamp} ns is not after the '
                                f'last one, {known} ns')
+        self.held = None
+        if held is not None and held.doubt == 'unsure':  # nothing says that it is a stray
+            self._explain(last, held, None)
+            return self._used(held) + self._taken(point, *how)
         if held is not None:
             self._notes.refuse(held.doubt, self._why(last, held))
         self.held = point if point.doubt else None
@@ -231,10 +211,11 @@ class OdometryStream:
         """Return, as no more will come, what is held if it came after no more than a pause."""
         self._base_frame.refuse_rest(self._notes)
         last, held = self.last, self.held
-        if last is None or held is None or held.doubt != 'stamp_ahead' or (
+        if last is None or held is None or held.doubt not in ('stamp_ahead', 'unsure') or (
                 (held.stamp - last.stamp) * 1e-9 > LONGEST_PAUSE):
             return []
         self.held = None
+        self._explain(last, held, None)
         return self._used(held)
 
     def reason(self) -> str:
@@ -249,46 +230,70 @@ class OdometryStream:
             self._notes.refuse('stamp_ahead', f'first odometry stamp {last.stamp} ns; expected '
                                f'one before that of the next, {point.stamp} ns')
         elif last is not None:
-            point.seconds = (point.stamp - last.stamp) * 1e-9
-            if not point.gap:
-                self._recent.append(math.dist(last.position, point.position))
+            step = Step(self._manifold, last, point)
+            point.seconds = step.seconds
+            point.reach = self._recent.reach(step, bool(point.gap))
+            if point.unsure:  # it is not known where between the two either
+                point.reach = point.unseen, UNSEEN_TURN * step.seconds
+            elif not point.gap:
+                self._recent.add(step)
         return [point]
+
+    def _explain(self, last: Point, held: Point, after: Step | None) -> None:
+        """Say of a held sample that is used what is not known of the motion to it."""
+        step, recent = Step(self._manifold, last, held), self._recent
+        if held.doubt == 'old_stamp' or (
+                held.doubt == 'jump' and recent.jumps(last, held, step, after)):
+            held.gap = self._why(last, held)
+            held.unseen = max(UNSEEN * step.seconds, recent.longest)
+        elif unseen := recent.unsure(last, held, step, after):
+            held.unsure, held.unseen = self._why(last, held, 'unsure'), unseen
 
     def _doubt(self, last: Point, point: Point) -> str:
         """Return the cause for which a sample after `last` is to be doubted; empty: none."""
-        seconds = (point.stamp - last.stamp) * 1e-9
-        if seconds <= 0:
+        if point.stamp <= last.stamp:
             return 'old_stamp'
-        length = math.dist(last.position, point.position)
-        if length > FASTEST * max(seconds, SHORTEST_STEP):
+        step = Step(self._manifold, last, point)
+        if self._recent.jumps(last, point, step):
             return 'jump'
-        if length > _NEAR and length > _FAR * max(self._recent, default=0.0) and (
-                is_identity(self._manifold, point.pose)):
-            return 'jump'
-        return 'stamp_ahead' if seconds > _GAP else ''
+        if step.seconds > _GAP:
+            return 'stamp_ahead'
+        return 'unsure' if self._recent.unsure(last, point, step) else ''
 
     def _goes_on(self, last: Point, held: Point, point: Point) -> bool:
         """Tell whether a sample speaks for the one that is held."""
-        if held.doubt == 'old_stamp' and point.stamp > last.stamp:
+        if point.stamp <= held.stamp or (held.doubt == 'old_stamp' and point.stamp > last.stamp):
             return False
+        after = Step(self._manifold, held, point)
+        if held.doubt == 'old_stamp':  # maybe another recording
+            return after.is_possible and after.seconds <= LONGEST_PAUSE
+        if held.doubt == 'jump':
+            back = Step(self._manifold, last, point)
+            if after.metres + after.radians > back.metres + back.radians:
+                return False
+            if after.is_possible and not self._recent.jumps(
+                    last, held, Step(self._manifold, last, held), after):
+                return True  # a robot that is faster now
         doubt = self._doubt(held, point)
-        slow = doubt == 'stamp_ahead' and (point.stamp - held.stamp) * 1e-9 <= LONGEST_PAUSE
-        if doubt and not slow:
-            return False
-        return held.doubt != 'jump' or (math.dist(held.position, point.position)
-                                        <= math.dist(last.position, point.position))
+        slow = doubt == 'stamp_ahead' and after.seconds <= LONGEST_PAUSE
+        return slow or doubt in ('', 'unsure')
 
     def _may_begin_anew(self, last: Point, point: Point) -> bool:
         """Tell whether the only sample so far may be a stray, its stamp far ahead of all."""
         return self._alone and (last.stamp - point.stamp) * 1e-9 > LONGEST_PAUSE
 
-    def _why(self, last: Point, held: Point) -> str:
-        seconds = (held.stamp - last.stamp) * 1e-9
-        if held.doubt == 'jump':
-            length = math.dist(last.position, held.position)
-            return (f'odometry {length:.6g} m from one message to the next, {seconds:.6g} s '
-                    f'later, at stamp {held.stamp} ns; expected a motion that robots make')
-        if held.doubt == 'old_stamp':
+    def _why(self, last: Point, held: Point, doubt: str = '') -> str:
+        step, doubt = Step(self._manifold, last, held), doubt or held.doubt
+        if doubt in ('jump', 'unsure'):
+            expected = 'a motion that robots make' if doubt == 'jump' else (
+                'a robot that moves on as before and after')
+            turned = ''
+            if step.is_possible and step.radians > _TOLD:
+                turned = f' and {step.radians:.2g} rad'
+            return (f'odometry {step.metres:.6g} m{turned} from one message to the next, '
+                    f'{step.seconds:.6g} s later, at stamp {held.stamp} ns; expected {expected}')
+        seconds = step.seconds
+        if doubt == 'old_stamp':
             return (f'odometry stamp {held.stamp} ns is not after the last one, {last.stamp} ns')
         return (f'odometry stamp {held.stamp} ns is {seconds:.6g} s after the one before; '
                 'expected the next one to go on from there')

@@ -16,7 +16,8 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import LEAST_VARIANCE, Mask
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.measurements import LONGEST_PAUSE
-from l1slam_ros.core.online.odometry.odometry_stream import UNSEEN, is_identity
+from l1slam_ros.core.online.odometry.plausibility import UNSEEN, is_identity
+from l1slam_ros.core.online.odometry.silences import Silences
 
 # So many keyframes tell how fast the robot goes.
 _RECENT = 16
@@ -30,6 +31,9 @@ _WORTH = 1 / 8
 
 # [ns] Between the last sample before stamps went back, and the first after.
 _BETWEEN = 1_000_000_000
+
+# Who went by a place makes no more of a detour over it, times and [m].
+_DETOUR, _BESIDE = 2.0, 0.1
 
 
 class OdometryTrack:
@@ -55,6 +59,7 @@ class OdometryTrack:
         self._parts = GrowingArray((3,), np.int64)
         self._shifts: list[tuple[int, int]] = []
         self._thinned = 0  # samples
+        self._silences = Silences()
 
     def __len__(self) -> int:
         return len(self._times)
@@ -105,9 +110,15 @@ class OdometryTrack:
                 return stamp + shift
         return stamp + (self._shifts[0][1] if self._shifts else 0)
 
-    def begin_part(self, stamp: int) -> bool:
-        """Let a part begin with the sample to come; return whether its stamp goes back in time."""
+    def begin_part(self, stamp: int, reach: tuple[float, float] = (0.0, 0.0)) -> bool:
+        """
+        Let a part begin with the sample to come; return whether its stamp goes back in time.
+
+        reach : how far [m] and by what angle [rad] the robot may have gone by then
+        """
         back = not self._shifts or stamp <= self.last_stamp
+        if any(reach) and not back:
+            self._silences.add(self.last, stamp + self._shifts[-1][1], reach, False)
         if back:
             begin = self.last + _BETWEEN if self._shifts else stamp
             self._shifts.append((begin, begin - stamp))
@@ -115,15 +126,51 @@ class OdometryTrack:
             (len(self), stamp + self._shifts[-1][1], len(self._keyframes))]))
         return back
 
-    def append(self, stamp: int, pose: Array, is_keyframe: bool) -> None:
-        """Append a sample after the last one, pose (1, p)."""
+    def append(self, stamp: int, pose: Array, is_keyframe: bool,
+               reach: tuple[float, float] = (0.0, 0.0)) -> None:
+        """
+        Append a sample after the last one, pose (1, p).
+
+        reach : how far [m] and by what angle [rad] the robot may have been off the middle of the
+        way from there
+        """
         if not len(self):
             self.begin_part(stamp)
+        elif any(reach) and self._parts.view()[-1, 0] < len(self):
+            self._silences.add(self.last, stamp + self._shifts[-1][1], reach, True)
         self._times.extend(np.array([stamp + self._shifts[-1][1]]))
         self._poses.extend(pose)
         if is_keyframe:
             self._keyframes.extend(np.array([len(self) - 1]))
             self._keyframe_stamps.extend(np.array([stamp]))
+
+    def went_by(self, stamp: int, pose: Array) -> Array | None:
+        """
+        Return the poses before and after a stamp, (2, p), if the robot went by a pose (1, p) then.
+
+        None: it did not, or there is a sample of that time.
+        """
+        times = self._times.view()[self._parts.view()[-1, 0]:]
+        after = int(np.searchsorted(times, time := stamp + self._shifts[-1][1]))
+        if not 0 < after < len(times) or times[after] == time:
+            return None
+        beside = self._poses.view()[self._parts.view()[-1, 0]:][after - 1:after + 1]
+        a, b, way = self._manifold.motion(self._manifold.local(
+            np.concatenate((pose, pose, beside[:1])), np.concatenate((beside, beside[1:]))))[0]
+        return beside.copy() if a + b <= _DETOUR * way + _BESIDE else None
+
+    def insert(self, stamp: int, pose: Array) -> None:
+        """Put a sample in its place, after the last keyframe; see `went_by`."""
+        time = stamp + self._shifts[-1][1]
+        place = int(np.searchsorted(self._times.view(), time))
+        self._times.replace(place, np.append(time, self._times.view()[place:]))
+        self._poses.replace(place, np.concatenate((pose, self._poses.view()[place:])))
+        self._thinned += place <= self._thinned
+        self._silences.split(time)
+
+    def unseen(self, times: Indices) -> Array:
+        """Return the sigmas, (m, 2) [m] and [rad], of what `at` returns of times in silences."""
+        return self._silences.sigmas(times)
 
     @property
     def may_be_thinned(self) -> bool:

@@ -116,7 +116,7 @@ class Updates:
     def settle(self, stopped: Stopped) -> Improvement | None:
         """See `Backend.settle`."""
         while True:
-            with self.alone():
+            with self.alone(check=until(stopped)):
                 began = self._keeper.state.began
                 try:
                     improvement = self._settled(began, stopped)
@@ -148,10 +148,16 @@ class Updates:
         return improvement
 
     @contextmanager
-    def alone(self, urgent: bool = False) -> Iterator[None]:
-        """Let nothing be at work; urgent : a settle that is under way waits, too."""
+    def alone(self, urgent: bool = False, check: Check = lambda: None) -> Iterator[None]:
+        """
+        Let nothing be at work.
+
+        urgent : a settle that is under way makes way, too; check : called now and then while
+        another thread has the map for itself, may raise
+        """
         with (self._urgent if urgent else self._claims).one():
-            self._update_lock.acquire()
+            while not self._update_lock.acquire(timeout=LOOK):
+                check()
             self._workers.join()
         try:
             yield

@@ -70,10 +70,11 @@ def judge_all(keeper: Keeper, anew: bool, idle: bool, check: Check) -> None:
     whole = now.problem()
     problem = as_one(whole)
     alone = until(lambda: keeper.revisions.grown != grown, check) if idle else check
-    judgement, poses = robust_solve(problem.graph, check=alone) if anew else judge(
-        problem.graph, problem.poses, problem.judgement, np.inf, check)
+    graph, known, poses = problem.graph, problem.judgement, problem.poses
+    judgement, l2_poses = (robust_solve(graph, check=alone, known=(known, poses)) if anew
+                           else judge(graph, poses, known, np.inf, check))
     check()
-    take_judgement(keeper, now, judgement.of_all(whole.graph), poses, anew)
+    take_judgement(keeper, now, judgement.of_all(whole.graph), l2_poses, anew)
 
 
 def ask_norm(keeper: Keeper, check: Check) -> None:

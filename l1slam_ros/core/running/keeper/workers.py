@@ -30,6 +30,17 @@ def until(over: Stopped, check: Check = lambda: None) -> Check:
     return checked
 
 
+@contextmanager
+def held(lock: threading.Lock, check: Callable[[], None]) -> Iterator[None]:
+    """Hold a lock; check : called now and then while another thread has it, may raise."""
+    while not lock.acquire(timeout=LOOK):
+        check()
+    try:
+        yield
+    finally:
+        lock.release()
+
+
 class Calm:
     """
     While it lasts, work that nobody waits for makes way for what somebody does.

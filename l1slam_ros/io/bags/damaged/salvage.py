@@ -16,13 +16,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import yaml
 import zstandard  # comes with the bag libraries
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from l1slam_ros.io.bags.bounds import MOST_AT_ONCE, BombError, unpacked
 from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError
 from l1slam_ros.io.bags.damaged.walk_mcap import walk_mcap
 from l1slam_ros.io.bags.damaged.walk_sqlite import walk_sqlite
+from l1slam_ros.io.bounded import read_yaml
 
 METADATA = 'metadata.yaml'
 # How rosbag2 names the files of a bag; `.zstd` where it compresses them as a whole.
@@ -31,6 +32,7 @@ _STORAGE_NAME = re.compile(r'(?P<bag>.+?)(_[0-9]+)?(\.mcap|\.db3)(\.zstd)?')
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 _WALKS = {'.mcap': walk_mcap, '.db3': walk_sqlite}
 _PIECE = 4096  # [bytes] of a compressed file that are decompressed at a time
+_MOST_PACKED = 200  # a compressed file is at most so many times larger: images of one colour are
 _COMPLAINT = 200  # the longest piece of a library's complaint that is passed on
 
 
@@ -118,7 +120,7 @@ class Salvage:
                 raise DamageError(file, ': the file is missing')
             try:
                 yield from self._messages_of(file)
-            except DamageError:
+            except (DamageError, BombError):
                 raise
             except Exception as error:  # damaged files make the libraries raise anything
                 raise DamageError(file, f': {complaint(error)}') from error
@@ -145,7 +147,7 @@ def complaint(error: Exception) -> str:
 def directory_metadata(bag: Path) -> dict[str, Any]:
     """Return what the metadata.yaml of a bag says, nothing where it cannot be read."""
     with suppress(Exception):  # it may be missing, no text, no YAML or other YAML
-        document = yaml.safe_load((bag / METADATA).read_text(encoding='utf-8'))
+        document = read_yaml((bag / METADATA).read_text(encoding='utf-8'))
         return dict(document['rosbag2_bagfile_information'])
     return {}
 
@@ -186,9 +188,14 @@ def _decompressed(file: Path) -> Iterator[Path]:
         return
     with TemporaryDirectory() as folder:
         readable, decoder = Path(folder, file.stem), zstandard.ZstdDecompressor().decompressobj()
-        with file.open('rb') as source, readable.open('wb') as target, suppress(Exception):
+        most = max(MOST_AT_ONCE, _MOST_PACKED * file.stat().st_size)
+        with (file.open('rb') as source, readable.open('wb') as target,
+              suppress(zstandard.ZstdError)):
             while piece := source.read(_PIECE):
                 target.write(decoder.decompress(piece))
+                if target.tell() > most:
+                    raise BombError(f'{file.name} unpacks to more than {most:,} bytes, '
+                                    f'{_MOST_PACKED} times its size; expected a recording')
         yield readable
 
 
@@ -196,5 +203,4 @@ def _unpacked(message: BagMessage) -> BagMessage:
     """Return a message, decompressed where it was compressed by itself."""
     if not message.data.startswith(_ZSTD_MAGIC):
         return message
-    decoder = zstandard.ZstdDecompressor().decompressobj()
-    return message._replace(data=decoder.decompress(message.data))
+    return message._replace(data=unpacked('zstd', message.data))

@@ -9,17 +9,16 @@ comes before is decompressed and used.
 
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import lz4.frame  # type: ignore[import-untyped]  # comes with the bag libraries, as does zstandard
-import zstandard
 from mcap import data_stream, records
 from mcap.reader import make_reader
 
+from l1slam_ros.io.bags.bounds import BombError, require_small, unpacked
 from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -30,10 +29,6 @@ _HEAD = struct.Struct('<BQ')
 _MESSAGE_HEAD = struct.Struct('<HIQQ')
 _FOOTER = struct.Struct('<BQQQI')
 _CHECKSUM = 4  # [bytes] at the end of the footer
-# By the name of a chunk's compression, each for one use. Of what is cut they give the first part.
-_DECODERS: dict[str, Callable[[], Any]] = {
-    'zstd': lambda: zstandard.ZstdDecompressor().decompressobj(),
-    'lz4': lz4.frame.LZ4FrameDecompressor}
 
 
 def walk_mcap(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
@@ -59,12 +54,15 @@ def walk_mcap(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
                 break
             if opcode not in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK):
                 continue
+            require_small(length, 'a record')
             content = file.read(length)
             # The last record of a whole file is none of these: this one is cut.
             position = size if file.tell() == size else start
             read = channels.chunk if opcode == _CHUNK else partial(channels.record, opcode)
             try:
                 yield from read(content)
+            except BombError:
+                raise
             except Exception as error:  # damaged content makes readers of records raise anything
                 raise BrokenRecordError(position) from error
         file.seek(-min(size, len(MAGIC)), 2)
@@ -95,6 +93,8 @@ def is_indexed(path: Path) -> bool:
     if checksum and zlib.crc32(covered) != checksum:
         return False
     chunks = summary.chunk_indexes
+    for chunk in chunks:
+        require_small(chunk.uncompressed_size, 'a chunk')
     return (all(chunk.message_index_offsets for chunk in chunks)
             and bool(chunks or not summary.statistics.message_count))
 
@@ -153,8 +153,9 @@ class _Channels:
         """Yield the messages of a chunk, in part where it is damaged."""
         chunk = _parsed('Chunk', content)
         rows = chunk.data
+        require_small(chunk.uncompressed_size, 'a chunk')
         if chunk.compression:
-            rows = _DECODERS[chunk.compression]().decompress(rows)
+            rows = unpacked(chunk.compression, rows)
         whole = len(rows) == chunk.uncompressed_size
         messages = self._rows(rows)
         if whole and chunk.uncompressed_crc and zlib.crc32(rows) != chunk.uncompressed_crc:

@@ -8,6 +8,7 @@ from pathlib import Path
 from shutil import copyfile
 from tempfile import TemporaryDirectory
 
+from l1slam_ros.io.bags.bounds import require_tables
 from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError
 
 _FILE_HEADER = 100  # [bytes] "Database File Format", sqlite.org/fileformat2.html
@@ -19,7 +20,8 @@ Row = tuple[int, int, bytes]
 
 def walk_sqlite(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
     """Yield the messages of a .db3 in the order of writing; put its definitions in."""
-    with _opened(path) as database:
+    with opened(path) as database:
+        require_tables(database)
         with suppress(sqlite3.Error):  # older versions have no definitions
             definitions.update(database.execute(
                 'SELECT topic_type, encoded_message_definition FROM message_definitions '
@@ -96,7 +98,7 @@ def _journal(path: Path) -> Path:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+def opened(path: Path) -> Iterator[sqlite3.Connection]:
     """Yield a database; one with a journal is put together in a copy."""
     with TemporaryDirectory() as folder:
         options = 'immutable=1'
@@ -113,7 +115,8 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
 
 def sqlite_metadata(path: Path) -> str:
     """Return the copy of metadata.yaml in a .db3, empty where there is none."""
-    with _opened(path) as database:
+    with opened(path) as database:
+        require_tables(database)
         for (text,) in database.execute('SELECT metadata FROM metadata ORDER BY id DESC LIMIT 1'):
             return str(text)
     return ''

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a bag may ask for before it is refused: memory by what is packed in it, time by its queries.
+
+A few kilobytes can unpack to gigabytes, a table of a database can be a query without an end, and
+nested YAML costs a parser the square of its length. So each is bounded before it is read.
+"""
+
+import bz2
+import sqlite3
+from collections.abc import Callable
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import lz4.frame  # type: ignore[import-untyped]  # comes with the bag libraries, as does zstandard
+import yaml
+import zstandard
+from rosbags.rosbag1 import reader as rosbag1
+from rosbags.rosbag2 import storage_mcap
+
+from l1slam_ros.core.errors import L1SlamError
+from l1slam_ros.io.bounded import read_yaml
+
+_MIB = 2**20
+# [bytes] A chunk or a message: recorders make chunks of some megabytes, cameras messages of tens.
+MOST_AT_ONCE = 256 * _MIB
+# The tables of rosbag2 that are read.
+_TABLES = ('topics', 'messages', 'message_definitions', 'metadata')
+
+
+class BombError(L1SlamError):
+    """A file asks for more memory or time than any recording needs."""
+
+
+def require_small(size: int, what: str) -> None:
+    """Refuse a piece of a bag, of so many bytes, that is larger than any recorder makes one."""
+    if size > MOST_AT_ONCE:
+        raise BombError(f'{what} of {size / _MIB:,.0f} MiB; expected at most '
+                        f'{MOST_AT_ONCE // _MIB} MiB')
+
+
+def unpacked(compression: str, data: bytes) -> bytes:
+    """
+    Return what is packed, as far as it goes where it is cut; compression : zstd, lz4 or bz2.
+
+    Raises
+    ------
+    BombError : it is more than any recorder packs into one piece.
+
+    """
+    content: bytes = _UNPACK[compression](data, MOST_AT_ONCE + 1)
+    if len(content) > MOST_AT_ONCE:
+        raise BombError(f'{len(data):,} bytes of {compression} that unpack to more than '
+                        f'{MOST_AT_ONCE // _MIB} MiB; expected a chunk or a message')
+    return content
+
+
+def _zstd(data: bytes, most: int) -> bytes:
+    with zstandard.ZstdDecompressor().stream_reader(BytesIO(data), read_across_frames=True) as (
+            stream):
+        return stream.read(most)
+
+
+def _lz4(data: bytes, most: int) -> bytes:
+    content = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most)
+    return bytes(content)
+
+
+def _bz2(data: bytes, most: int) -> bytes:
+    return bz2.BZ2Decompressor().decompress(data, max_length=most)
+
+
+_UNPACK: dict[str, Callable[[bytes, int], Any]] = {'zstd': _zstd, 'lz4': _lz4, 'bz2': _bz2}
+
+
+def require_shallow(metadata: Path) -> None:
+    """Refuse a metadata.yaml that would cost its reader minutes; one that is missing is none."""
+    if not metadata.is_file():
+        return
+    require_small(metadata.stat().st_size, metadata.name)
+    try:
+        with suppress(yaml.YAMLError, UnicodeDecodeError):
+            read_yaml(metadata.read_text(encoding='utf-8'))
+    except ValueError as error:
+        raise BombError(f'{metadata.name}: {error}') from error
+
+
+def require_tables(database: sqlite3.Connection) -> None:
+    """
+    Refuse a database whose tables are something else, or hold what no recorder writes.
+
+    Raises
+    ------
+    BombError : a view, a virtual table or a computed column in the place of a table of rosbag2, or
+        a message that is larger than any.
+
+    """
+    for name, kind, statement in database.execute(
+            'SELECT name, type, sql FROM sqlite_master WHERE lower(name) IN (?, ?, ?, ?)',
+            _TABLES):
+        words = str(statement).upper()
+        plain = kind == 'table' and words.startswith('CREATE TABLE') and 'GENERATED' not in words
+        if not plain or ' AS (' in ' '.join(words.split()):
+            raise BombError(f'{name} is {"a view" if kind == "view" else "computed"}; expected a '
+                            'table of rosbag2')
+    pages, size = (database.execute(f'PRAGMA {name}').fetchone()[0]
+                   for name in ('page_count', 'page_size'))
+    if pages * size > MOST_AT_ONCE:
+        with suppress(sqlite3.DatabaseError):  # one that is cut is read page by page
+            # Of a blob only the length is read.
+            largest, = database.execute('SELECT max(length(data)) FROM messages').fetchone()
+            require_small(int(largest or 0), 'a message')
+
+
+def _bound_library() -> None:
+    """Let the bag library unpack with the bounds from here; it has none of its own."""
+    for name in ('zstd', 'lz4'):
+        storage_mcap.DECOMPRESSORS[name] = lambda data, _, name=name: unpacked(name, data)
+    for name in ('bz2', 'lz4'):
+        rosbag1.decompressors[name] = lambda data, name=name: unpacked(name, data)
+
+
+_bound_library()

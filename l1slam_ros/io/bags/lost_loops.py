@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Loops of a bag that did not get into its graph: most were refused, or nobody read their topic.
+
+A map without its loops is no success, and whoever left them out has to hear where they are.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+from l1slam_ros.io.bags.reader import TopicSummary, bag_summary, read_messages
+from l1slam_ros.io.bags.topics import ABSOLUTE_TOPIC, FALSE_LOOP_TOPIC, ODOMETRY_TYPE, POSE_TYPE
+from l1slam_ros.io.files import counted
+from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH
+
+# The frame of a loop, near enough: what of it is wrong is told by who reads the topic.
+_LOOP_FRAME = re.compile(r'.+@[0-9]+\.[0-9]+')
+# So many messages of a topic are looked at to tell what it is for.
+_FIRST = 100
+
+
+class LoopCount:
+    """
+    Counts the loops of a bag.
+
+    Attributes
+    ----------
+    came, refused : how many came on each topic, and how many of these cannot be used
+
+    """
+
+    def __init__(self) -> None:
+        self.came, self.refused = Counter[str](), Counter[str]()
+        self._first = ''
+
+    def refuse(self, topic: str, reason: str) -> None:
+        """Count one that cannot be used."""
+        self.refused[topic] += 1
+        self._first = self._first or reason
+
+    def only(self, topic: str) -> None:
+        """Forget what came on other topics."""
+        for count in self.came, self.refused:
+            for other in count.keys() - {topic}:
+                del count[other]
+
+    def sentences(self, lost: int, path: Path, read: Collection[str],
+                  odometry: str) -> Iterator[str]:
+        """
+        Yield a sentence where most loops were lost, and one where some are there that nobody read.
+
+        Parameters
+        ----------
+        lost : how many are not in the graph for other reasons than those that were counted
+        path : the bag
+        read : the topics that were read
+        odometry : that of the odometry
+
+        """
+        came, lost = self.came.total(), self.refused.total() + lost
+        if 2 * lost > came:
+            reason = f', the first: {self._first}' if self._first else ''
+            yield (f'{lost:,} of {counted(came, "loop")} on {" and ".join(sorted(self.came))} '
+                   f'did not get into the map{reason}')
+        if lost >= came and (found := _unread(path, read, odometry)):
+            there = ' and '.join(f'{counted(topic.count, "message")} on {topic.name}'
+                                 for topic, _ in found)
+            yield (f'no loop is in the map, but there are loops in {there}; expected '
+                   f'{" or ".join(option for _, option in found)}')
+
+
+def _unread(path: Path, read: Collection[str],
+            odometry: str) -> list[tuple[TopicSummary, str]]:
+    """Return the topics of loops that were not read, and by which options they would be."""
+    topics = bag_summary(path).topics
+    others = [topic for topic in topics if topic.name not in read and topic.count]
+    shaped = _with_loop_frames(path, {
+        topic.name: min(topic.count, _FIRST) for topic in others if topic.msgtype == POSE_TYPE
+        and topic.name not in (FALSE_LOOP_TOPIC, ABSOLUTE_TOPIC)})
+    sources = [topic.name for topic in topics if topic.msgtype == ODOMETRY_TYPE]
+    found = []
+    for topic in others:
+        if topic.name in shaped or topic.msgtype in (MAP_GRAPH, POSE_GRAPH):
+            nearest = max([odometry, *sources], key=lambda name: _shared(name, topic.name))
+            beside = f' --odom-topic {nearest}' if nearest != odometry else ''
+            found.append((topic, f'--loop-topic {topic.name}{beside}'))
+    # Those of the robot whose odometry was read come first.
+    return sorted(found, key=lambda one: -_shared(odometry, one[0].name))
+
+
+def _shared(name: str, other: str) -> int:
+    """Return how many leading parts two topics share: of one robot they have its name."""
+    parts = list(zip(name.split('/')[:-1], other.split('/')[:-1], strict=False))
+    return next((k for k, (a, b) in enumerate(parts) if a != b), len(parts))
+
+
+def _with_loop_frames(path: Path, left: dict[str, int]) -> set[str]:
+    """Return which topics have a loop among the first messages; left : so many of each."""
+    seen, shaped = Counter[str](), set[str]()
+    for message in read_messages(path, left.keys(), lambda _: None) if left else ():
+        # The bag may define the type otherwise.
+        header = getattr(message.data, 'header', None)
+        if _LOOP_FRAME.fullmatch(str(getattr(header, 'frame_id', ''))):
+            shaped.add(message.topic)
+        seen[message.topic] += 1
+        if all(topic in shaped or seen[topic] >= count for topic, count in left.items()):
+            break
+    return shaped

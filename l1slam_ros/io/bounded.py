@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text and YAML of strangers, looked at before all of it is read: in memory, and in time."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from l1slam_ros.core.errors import FileError
+
+# [bytes] A text file as a whole (a graph of a million poses has .4e9), one line of it, and a
+# document of YAML.
+_LARGEST, _LONGEST_LINE, _LONGEST_YAML = 2**31, 2**16, 2**22
+# Brackets and lists within each other: PyYAML takes the square of it.
+_DEEPEST = 64
+_BLOCK = 2**20
+_BRACKET, _LISTS = re.compile(r'[][{}]'), re.compile(r'^ *(?:[-?] )+', re.MULTILINE)
+
+
+def read_text(path: Path) -> bytes:
+    """
+    Return the bytes of a text file.
+
+    Raises
+    ------
+    FileError : it is larger, or one of its lines is longer, than that of any graph.
+    OSError : it cannot be read.
+
+    """
+    size = path.stat().st_size
+    if size > _LARGEST:
+        raise FileError(path, f'{size:,} bytes; expected a text file of at most {_LARGEST:,}')
+    blocks, begun, number = list[bytes](), 0, 1
+    with path.open('rb') as file:
+        while block := file.read(_BLOCK):
+            lengths = [len(line) for line in block.split(b'\n')]
+            lengths[0] += begun  # a line may begin in one block and end in another
+            if max(lengths) > _LONGEST_LINE:
+                number += next(k for k, length in enumerate(lengths) if length > _LONGEST_LINE)
+                raise FileError(path, f'a line of more than {_LONGEST_LINE:,} bytes; expected a '
+                                'text file', number)
+            begun, number = lengths[-1], number + len(lengths) - 1
+            blocks.append(block)
+    return b''.join(blocks)
+
+
+def read_yaml(text: str) -> Any:
+    """
+    Return what a document of YAML says.
+
+    Raises
+    ------
+    ValueError : it is too long, or nested too deeply, to be what anybody writes.
+    yaml.YAMLError : it is no YAML.
+
+    """
+    depth = deepest = 0
+    for found in _BRACKET.finditer(text) if len(text) <= _LONGEST_YAML else ():
+        depth += 1 if found[0] in '[{' else -1
+        deepest = max(deepest, depth)
+    lists = max((len(found[0].split()) for found in _LISTS.finditer(text)), default=0)
+    if len(text) > _LONGEST_YAML or max(deepest, lists) > _DEEPEST:
+        raise ValueError(f'YAML of {len(text):,} characters, {max(deepest, lists)} deep; expected '
+                         f'at most {_LONGEST_YAML:,}, and {_DEEPEST} deep')
+    return yaml.safe_load(text)

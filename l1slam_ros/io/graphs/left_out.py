@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Factors that a map was made without: comments for other programs, factors again for this one.
+
+    # rejected EDGE_SE2 ...   a loop or an absolute pose that was not believed
+    # suspect EDGE_SE2 ...    one that fits, but could as well be chance
+    # slip EDGE_SE2 ...       odometry that was left out
+    # struck EDGE_SE2 ...     a loop that a person struck out
+
+So whoever optimises the graph in the file gets the map in it. They stand behind all edges, each
+with its number among the factors: GTSAM reads no edge behind a comment. Of a file that this
+program did not write comments are comments.
+"""
+
+import re
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import BetweenFactors
+from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.io.files import TextLines
+from l1slam_ros.io.ours import MARK
+from l1slam_ros.io.remarks import KEYWORD
+
+REJECTED, SUSPECT, SLIP, STRUCK = 'rejected', 'suspect', 'slip', 'struck'
+_COMMENT = re.compile(f'# ({REJECTED}|{SUSPECT}|{SLIP}|{STRUCK}) '
+                      '([A-Z].*?) # factor ([0-9]{1,9})')
+
+
+def nothing_left_out(count: int) -> np.ndarray:
+    """Return for each of some factors that a map is made with it: an empty word, (count,)."""
+    return np.full(count, '', object)
+
+
+def left_out_by(judgement: Judgement | None, factors: BetweenFactors) -> np.ndarray:
+    """Return for each factor why a map was made without it, (m,) of the words above, or empty."""
+    words = nothing_left_out(len(factors))
+    if judgement is not None:
+        judged = words[:len(judgement.accepted)]  # a view: later factors are not judged yet
+        judged[~judgement.accepted] = REJECTED
+        judged[judgement.suspect] = SUSPECT
+        judged[judgement.slips] = SLIP
+    words[factors.struck] = STRUCK
+    return words
+
+
+def left_out_of(inliers: Mask, factors: BetweenFactors) -> np.ndarray:
+    """Return the same where all that is known is which factors (m,) bool were believed."""
+    words = np.where(inliers, '', np.where(factors.is_odometry, SLIP, REJECTED)).astype(object)
+    words[factors.struck] = STRUCK
+    return words
+
+
+def commented(lines: list[str], words: np.ndarray) -> list[str]:
+    """Return the lines of factors that were left out as comments."""
+    return [f'# {words[k]} {lines[k]} # factor {k}' for k in np.flatnonzero(words != '').tolist()]
+
+
+def restored(lines: TextLines) -> tuple[TextLines, dict[int, tuple[str, int]]]:
+    """
+    Return the lines of a file with those that were left out, and their words and places.
+
+    Those by the numbers of their lines; a place is the number among the factors.
+
+    What remains of the comments is what others wrote.
+    """
+    is_ours = lines.remarks is not None or bool(lines.comments and lines.comments[-1][1] == MARK)
+    if not is_ours:
+        return lines, {}
+    rows, words, comments = list(zip(lines.numbers, lines.texts, strict=True)), {}, []
+    for number, text in lines.comments:
+        if found := _COMMENT.fullmatch(text):
+            words[number] = found[1], int(found[3])
+            rows.append((number, found[2]))
+        elif text != MARK and not text.startswith(KEYWORD):
+            comments.append((number, text))
+    rows.sort(key=lambda row: row[0])
+    return TextLines([number for number, _ in rows], [text for _, text in rows], lines.remarks,
+                     tuple(comments)), words
+
+
+def in_place(numbers: Indices, words: dict[int, tuple[str, int]]) -> tuple[Indices, np.ndarray]:
+    """Return the order (m,) in which factors stood, by their lines, and their words in it."""
+    found = [words.get(number, ('', -1)) for number in numbers.tolist()]
+    said = np.array([word for word, _ in found], object)
+    places = np.array([place for _, place in found], np.int64)
+    out = np.flatnonzero(places >= 0)
+    order = np.arange(len(said))
+    # A person may have taken lines away: then they stay where they are.
+    if len(np.unique(places[out])) == len(out) and places.max(initial=-1) < len(said):
+        others = np.delete(order, places[out])
+        order[places[out]], order[others] = out, np.flatnonzero(places < 0)
+    return order, said[order]

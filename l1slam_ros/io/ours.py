@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What this program may replace: what it wrote, told by a mark in it, and nothing else.
+
+    text              a comment, `MARK`, the first line, of a graph the last: GTSAM reads no edge
+                      behind a comment; of a saved map the lines of `remarks`
+    report            the first line, `REPORT_MARK`
+    .png, .svg, .pdf  the field for the program that drew the picture
+    bag directory     in each .mcap the field for the library that wrote it
+
+The shape of a file tells nothing: a recording or a graph of another program looks just the same.
+"""
+
+import os
+from collections.abc import Iterable, Iterator
+from itertools import chain
+from pathlib import Path
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.io.files import reported
+
+PROGRAM = 'l1slam_ros'
+MARK = f'# {PROGRAM} wrote this file and may replace it'
+REPORT_MARK = f'<!-- {PROGRAM} wrote this file and may replace it -->'
+_FIRST_LINES = f'{MARK}\n'.encode(), f'{REPORT_MARK}\n'.encode(), b'#L1SLAM '
+# The begin of a file -> what tells ours from others: PNG, PDF, SVG.
+_PICTURES = {
+    b'\x89PNG': f'tEXtSoftware\0{PROGRAM}'.encode(),
+    b'%PDF': f'/Creator ({PROGRAM})'.encode(),
+    b'<?xml': f'<dc:title>{PROGRAM}</dc:title>'.encode()}
+# Magic, and a header record of 22 bytes: the profile and the library, each with its length.
+_BAG = (b'\x89MCAP0\r\n\x01' + (22).to_bytes(8, 'little') + b'\x04\0\0\0ros2\x0a\0\0\0'
+        + PROGRAM.encode())
+_METADATA = 'metadata.yaml'
+# [bytes] Of a file so much is looked at, at its begin and at its end.
+_ENOUGH = 2**16
+
+
+def marked(lines: Iterable[str]) -> Iterator[str]:
+    """Yield the lines of a text file with the mark before them."""
+    return chain([MARK], lines)
+
+
+def is_ours(path: str | os.PathLike[str]) -> bool:
+    """
+    Tell whether this program wrote a file or a bag directory, or there is nothing in it.
+
+    Raises
+    ------
+    FileError : it cannot be read.
+
+    """
+    with reported(path, 'read'):
+        if os.path.isdir(path):
+            files = sorted(Path(path).iterdir())
+            return bool(files) and all(
+                file.is_file() and (file.name == _METADATA or _ends(file)[0].startswith(_BAG))
+                for file in files) and any(file.name != _METADATA for file in files)
+        first, last = _ends(path)
+    return (not first or first.startswith(_FIRST_LINES) or last.endswith(f'\n{MARK}\n'.encode())
+            or any(first.startswith(begin) and (mark in first or mark in last)
+                   for begin, mark in _PICTURES.items()))
+
+
+def _ends(path: str | os.PathLike[str]) -> tuple[bytes, bytes]:
+    with open(path, 'rb') as file:
+        first = file.read(_ENOUGH)
+        file.seek(max(file.seek(0, os.SEEK_END) - _ENOUGH, 0))
+        return first, file.read(_ENOUGH)
+
+
+def refuse_others(outputs: Iterable[str | os.PathLike[str]],
+                  inputs: Iterable[str | os.PathLike[str]] = (), force: bool = False) -> None:
+    """
+    Refuse outputs in the place of what somebody else wrote, or of an input.
+
+    Parameters
+    ----------
+    outputs : all that will be written, or removed because it is not written
+    inputs : all that may be read; none of them is an output, even by another name of the file
+    force : whether to replace what others wrote
+
+    Raises
+    ------
+    FileError : naming the first such output.
+
+    """
+    read = [path for path in inputs if os.path.exists(path)]
+    for output in outputs:
+        if not os.path.lexists(output):
+            continue
+        for path in read:
+            if _is_part(output, path):
+                raise FileError(output, f'is read, as {path}, so it is not written; expected '
+                                'another name')
+        if not force and os.path.exists(output) and not is_ours(output):
+            raise FileError(output, f'was not written by {PROGRAM}, so it is not overwritten; '
+                            'expected another name, or --force')
+
+
+def _is_part(output: str | os.PathLike[str], path: str | os.PathLike[str]) -> bool:
+    """Tell whether an input is an output, lies in it, or has it as a file of its own."""
+    if not os.path.exists(output):
+        return False
+    if os.path.isdir(output) and Path(os.path.realpath(output)) in Path(
+            os.path.realpath(path)).parents:
+        return True
+    parts = [path, *(os.scandir(path) if os.path.isdir(path) else ())]
+    return any(os.path.exists(part) and os.path.samefile(output, part) for part in parts)

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command lines of the executables: what is ROS's of them, and what `backend --help` says."""
+
+from textwrap import wrap
+
+from l1slam_ros.core.options import Meaning, Options, Scalar, flatten
+
+_WIDTH = 98
+_HEAD = """\
+usage: backend [-h] [--ros-args ...]
+
+Pose-graph SLAM back end: odometry and loop closures in, the optimised map out.
+
+  backend --ros-args --params-file config/backend.yaml -r odom:=/robot/odometry
+"""
+# (name, type, meaning)
+_INPUTS = (
+    ('odom', 'nav_msgs/Odometry', "the robot's pose in the odometry frame"),
+    ('loop_closures', 'geometry_msgs/PoseWithCovarianceStamped',
+     'the robot at header.stamp, in its frame at the time that header.frame_id = '
+     'BASE_FRAME@SEC.NANOSEC names'),
+    ('trusted_loop_closures', 'the same', 'never rejected'),
+    ('false_loop_closures', 'the same', 'the loop of these two stamps is never used again'),
+    ('absolute_poses', 'geometry_msgs/PoseWithCovarianceStamped',
+     'the robot in the map frame: GPS, markers, a person'),
+    ('map_graph', 'rtabmap_msgs/MapGraph', 'where that package is installed'),
+    ('pose_graph', 'pose_graph_tools_msgs/PoseGraph', 'where that package is installed'),
+)
+_OUTPUTS = (
+    ('path', 'nav_msgs/Path', 'the optimised keyframes'),
+    ('pose', 'geometry_msgs/PoseStamped', 'the robot now, with its odometry'),
+    ('pose_with_covariance', 'geometry_msgs/PoseWithCovarianceStamped',
+     'the newest keyframe after each update'),
+    ('map_to_odom', 'geometry_msgs/TransformStamped', 'map -> odom'),
+    ('/tf', 'tf2_msgs/TFMessage', 'the same, where that package is installed'),
+    ('graph', 'visualization_msgs/MarkerArray', 'keyframes and factors, for RViz and Foxglove'),
+    ('loop_status', 'diagnostic_msgs/DiagnosticArray', 'what has become of each loop'),
+    ('/diagnostics', 'diagnostic_msgs/DiagnosticArray', 'how the node is, each second'),
+)
+_SERVICES = (
+    ('~/optimize', 'std_srvs/Trigger', 'solve to the end'),
+    ('~/reset', 'std_srvs/Trigger', 'empty the map'),
+    ('~/save', 'std_srvs/Trigger', 'write the map to save_path'),
+    ('~/load', 'std_srvs/Trigger', 'read it from there'),
+    ('~/pause', 'std_srvs/SetBool', 'let no update begin, or go on'),
+)
+
+
+def split(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """
+    Split a command line in what is not ROS's, and what is.
+
+    ROS's begins at each `--ros-args` and ends at `--`. rclpy's own splitting, too, takes the
+    old:=new of `replay --remap` for its.
+    """
+    own: list[str] = []
+    ros: list[str] = []
+    within = False
+    for argument in arguments:
+        begins = argument == '--ros-args'
+        (ros if within or begins else own).append(argument)
+        within = (within or begins) and argument != '--'
+    return own, ros
+
+
+def backend_help(options: Options) -> str:
+    """Return what `backend --help` prints; options : of the node, with their defaults."""
+    parts = [_HEAD]
+    for title, rows in (('subscribes to', _INPUTS), ('publishes', _OUTPUTS),
+                        ('services', _SERVICES)):
+        parts.append(f'{title}:\n' + ''.join(
+            _entry(f'{name} ({kind})', meaning) for name, kind, meaning in rows))
+    parts.append('parameters, with their defaults:\n' + ''.join(
+        _entry(f'{name}: {_shown(value)}', _said(meaning))
+        for name, (value, meaning) in flatten(options).items()))
+    parts.append('ended by SIGINT or SIGTERM with exit code 0; by an unknown argument with 2')
+    return '\n'.join(parts)
+
+
+def _entry(name: str, meaning: str) -> str:
+    lines = wrap(meaning, _WIDTH - 6)
+    return f'  {name}\n' + ''.join(f'      {line}\n' for line in lines)
+
+
+def _shown(value: Scalar) -> str:
+    """Return a value as it is written after `-p name:=`."""
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _said(meaning: Meaning) -> str:
+    unit = f' [{meaning.unit}]' if meaning.unit else ''
+    limits = f'; {meaning.expected()}' if meaning.choices or meaning.low is not None else ''
+    return f'{meaning.doc}{unit}{limits}{"; at start only" if meaning.fixed else ""}'

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is never replaced, and what another program makes of what was written."""
+
+import os
+import shutil
+
+import numpy as np
+import pytest
+from command import run, solve_json
+from rosbags.rosbag2 import StoragePlugin
+
+import l1slam_ros as l1
+from bags import recording_of, rosbag2_directory
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.io.formats import read_input
+from l1slam_ros.io.graphs.graph_file import read_graph_file
+from l1slam_ros.io.ours import MARK, is_ours
+
+GRAPH = """# a survey of 2011
+VERTEX_SE2 10 0 0 0
+VERTEX_SE2 13 1 0 0
+VERTEX_SE2 16 2 0 0
+EDGE_SE2 10 13 1 0 0 1 0 0 1 0 1
+# the lift
+EDGE_SE2 13 16 1 0 0 1 0 0 1 0 1
+EDGE_SE2 10 16 2.1 0 0 1 0 0 1 0 1
+# the end
+"""
+REFUSED = 'was not written by l1slam_ros, so it is not overwritten'
+
+
+def contents(path):
+    files = [path] if path.is_file() else sorted(path.iterdir())
+    return {file.name: file.read_bytes() for file in files}
+
+
+@pytest.fixture(scope='module')
+def lies(tmp_path_factory):
+    """A world with 20 lies."""
+    path = tmp_path_factory.mktemp('lies') / 'world.g2o'
+    from l1slam_ros.cli.main import main
+
+    assert main(['simulate', str(path), '--poses', '600', '--edges', '2400', '--seed', '3',
+                 '--false-loops', '20']) == 0
+    return path
+
+
+@pytest.fixture(scope='module')
+def solved(lies):
+    from l1slam_ros.cli.main import main
+
+    path = lies.with_name('solved.g2o')
+    assert main(['solve', str(lies), '--output', str(path), '--quiet']) == 0
+    return path
+
+
+@pytest.fixture(params=[StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def recording(capsys, tmp_path, request):
+    """Return a recording written by rosbags."""
+    run(capsys, 'simulate', tmp_path / 'ours', '--poses', 20, '--edges', 25)
+    rosbag2_directory(tmp_path / 'run', recording_of(tmp_path / 'ours'), request.param)
+    return tmp_path / 'run'
+
+
+@pytest.fixture
+def users(tmp_path):
+    path = tmp_path / 'users.g2o'
+    path.write_text(GRAPH)
+    return path
+
+
+def test_a_recording_stays_as_it_is(capsys, recording, users):
+    before, link = contents(recording), recording.with_name('link')
+    link.symlink_to(recording)
+    for output in recording, link:
+        for command in (('convert', users, output), ('solve', users, '--output', output),
+                        ('simulate', output, '--poses', 9, '--edges', 9),
+                        ('corrupt', users, output, '--false-loops', 1)):
+            out, err = run(capsys, *command, code=2)
+            assert out == '' and err.count('\n') == 1 and REFUSED in err
+        for force in (), ('--force',):
+            for command in (('convert', recording), ('solve', recording, '--output')):
+                _, err = run(capsys, *command, output, *force, code=2)
+                assert err.count('\n') == 1 and 'is read' in err
+    file = next(p for p in recording.iterdir() if p.suffix != '.yaml')
+    assert 'is read' in run(capsys, 'convert', file, recording, '--force', code=2)[1]
+    assert contents(recording) == before
+    run(capsys, 'convert', users, recording, '--force')
+    assert is_ours(recording) and contents(recording) != before
+    run(capsys, 'convert', users, recording)
+
+
+def test_a_graph_of_a_user_stays_as_it_is(capsys, users, tmp_path, lies):
+    copy, hard, before = tmp_path / 'copy.g2o', tmp_path / 'hard.g2o', users.read_bytes()
+    os.link(users, hard)
+    for force in (), ('--force',):
+        for output in users, hard:
+            assert 'is read' in run(capsys, 'convert', users, output, *force, code=2)[1]
+            assert 'is read' in run(capsys, 'solve', users, '--output', output, *force,
+                                    code=2)[1]
+    assert REFUSED in run(capsys, 'convert', lies, users, code=2)[1]
+    assert REFUSED in run(capsys, 'solve', lies, '--output', users, code=2)[1]
+    assert users.read_bytes() == before
+    run(capsys, 'convert', users, copy)
+    run(capsys, 'convert', users, copy)
+    run(capsys, 'convert', lies, users, '--force')
+    assert users.read_bytes() != before
+
+
+@pytest.mark.parametrize('what', ['stamps', 'trusted', 'struck', 'truth', 'false'])
+def test_what_lies_beside_a_graph_is_a_users_too(capsys, tmp_path, what):
+    output = tmp_path / 'a.g2o'
+    world = ('simulate', output, '--poses', 9, '--edges', 9)
+    run(capsys, *world)
+    run(capsys, *world)
+    side, before = tmp_path / f'a.g2o.{what}.txt', output.read_bytes()
+    side.write_text('0 1\n')
+    assert REFUSED in run(capsys, *world, '--seed', 1, code=2)[1]
+    assert (side.read_text(), output.read_bytes()) == ('0 1\n', before)
+    run(capsys, *world, '--seed', 1, '--force')
+    assert not side.exists() or is_ours(side)
+
+
+@pytest.mark.parametrize('suffix', ['.png', '.svg', '.pdf'])
+def test_a_picture_is_replaced_only_where_it_is_ours(capsys, users, tmp_path, suffix):
+    from matplotlib.figure import Figure
+
+    picture = tmp_path / f'map{suffix}'
+    draw = ('plot', users, '--output', picture)
+    run(capsys, *draw)
+    run(capsys, *draw)
+    Figure().savefig(picture)
+    before = picture.read_bytes()
+    assert REFUSED in run(capsys, *draw, code=2)[1]
+    assert REFUSED in run(capsys, 'solve', users, '--plot', picture, code=2)[1]
+    assert picture.read_bytes() == before
+    run(capsys, *draw, '--force')
+    assert is_ours(picture)
+
+
+def test_a_trajectory_that_others_wrote_stays(capsys, users, tmp_path):
+    output = tmp_path / 'a.tum'
+    run(capsys, 'convert', users, output)
+    run(capsys, 'convert', users, output)
+    output.write_text(output.read_text().split('\n', 1)[1])
+    assert REFUSED in run(capsys, 'convert', users, output, code=2)[1]
+    assert 'is read' in run(capsys, 'solve', users, '--reference', output, '--output', output,
+                            '--force', code=2)[1]
+
+
+def lines_of(path, tag):
+    """Read as other programs do: lines by their first word; what is none of theirs is nothing."""
+    rows = [line.split() for line in path.read_text().splitlines()]
+    return [row[1:] for row in rows if row and row[0] == tag]
+
+
+def test_what_is_written_is_what_was_believed(capsys, lies, solved, tmp_path):
+    report = solve_json(capsys, lies)
+    left = report['rejected'] + report['suspect'] + report['slips']
+    assert len(report['rejected']) >= 18
+    pairs = [[int(i), int(j)] for i, j, *_ in lines_of(lies, 'EDGE_SE2')]
+    assert [[int(i), int(j)] for i, j, *_ in lines_of(solved, 'EDGE_SE2')] == [
+        pair for pair in pairs if pair not in left]
+    # Read again it is the graph that it was, to be doubted again; converted, still the same map.
+    before, after = (read_graph_file(path) for path in (lies, solved))
+    for name in 'i', 'j', 'measurement', 'sqrt_information':
+        np.testing.assert_array_equal(getattr(before.graph.between, name),
+                                      getattr(after.graph.between, name))
+    assert solve_json(capsys, solved)['rejected'] == report['rejected']
+    run(capsys, 'convert', solved, tmp_path / 'again.g2o')
+    assert (tmp_path / 'again.g2o').read_text() == solved.read_text()
+    # All are believed where that is asked for.
+    run(capsys, 'solve', solved, '--no-robust', '--output', tmp_path / 'all.g2o')
+    assert len(lines_of(tmp_path / 'all.g2o', 'EDGE_SE2')) == len(pairs)
+
+
+def test_in_a_bag_refused_loops_have_a_topic_of_their_own(capsys, lies, solved, tmp_path):
+    left = (read_graph_file(solved).left_out != '').sum()
+    run(capsys, 'convert', solved, tmp_path / 'bag')
+    out, _ = run(capsys, 'info', tmp_path / 'bag')
+    assert f'/rejected_loop_closures: {left:,} of' in out
+    back = read_input(tmp_path / 'bag')
+    assert (back.left_out != '').sum() == left
+    assert len(back.graph.between) == len(read_graph_file(lies).graph.between)
+    run(capsys, 'convert', tmp_path / 'bag', tmp_path / 'back.g2o')
+    assert sorted(row[:2] for row in lines_of(tmp_path / 'back.g2o', 'EDGE_SE2')) == sorted(
+        row[:2] for row in lines_of(solved, 'EDGE_SE2'))
+
+
+def test_gtsam_leaves_the_map_as_it_is(lies, solved):
+    """Levenberg-Marquardt of another program, on the file as it stands."""
+    gtsam = pytest.importorskip('gtsam')
+
+    def moved(path):
+        graph, start = gtsam.readG2o(str(path), False)
+        graph.add(gtsam.PriorFactorPose2(
+            0, start.atPose2(0), gtsam.noiseModel.Diagonal.Sigmas(np.full(3, 1e-6))))
+        found = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
+        a, b = (np.array([[values.atPose2(k).x(), values.atPose2(k).y()] for k in range(600)])
+                for values in (start, found))
+        return np.linalg.norm(a - b, axis=1).mean()
+
+    assert moved(solved) < 0.05
+    every = solved.with_name('every.g2o')
+    every.write_text(solved.read_text().replace('# rejected ', '').replace('# suspect ', ''))
+    assert gtsam.readG2o(str(solved), False)[0].size() == len(lines_of(solved, 'EDGE_SE2'))
+    assert moved(every) > 1.0, 'the lies would have moved it'
+
+
+def test_python_keeps_ids_stamps_and_comments(users, tmp_path):
+    output = tmp_path / 'out.g2o'
+    (tmp_path / 'users.g2o.stamps.txt').write_text('10 1.5\n13 2.5\n16 3.5\n')
+    graph, poses = l1.read_graph(users)
+    l1.write_graph(output, graph, poses)
+    *lines, mark = output.read_text().splitlines()
+    assert mark == MARK
+    assert [line.split()[:3] for line in lines] == [
+        line.split()[:3] if line.startswith(('#', 'EDGE')) else [*line.split()[:2],
+                                                               f'{float(line.split()[2])}']
+        for line in GRAPH.splitlines()]
+    assert read_graph_file(output).stamps.tolist() == [1500000000, 2500000000, 3500000000]
+    l1.write_graph(output, graph, poses, inliers=np.array([True, True, False]))
+    assert '# rejected EDGE_SE2 10 16 ' in output.read_text()
+    assert len(l1.read_graph(output)[0].between) == 3
+    with pytest.raises(FileError, match=REFUSED):
+        l1.write_graph(users, graph, poses)
+    assert users.read_text() == GRAPH
+    shutil.copy(users, tmp_path / 'copy.g2o')
+    l1.write_graph(tmp_path / 'copy.g2o', graph, poses, force=True)
+    assert is_ours(tmp_path / 'copy.g2o')
+
+
+def test_comments_of_others_are_comments(capsys, tmp_path):
+    path = tmp_path / 'a.g2o'
+    path.write_text(GRAPH.replace('EDGE_SE2 10 16', '# rejected EDGE_SE2 10 16'))
+    assert len(read_graph_file(path).graph.between) == 2

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise that is stated 1e-4 to 1e4 times what it is, of odometry or of loops: judged the same."""
+
+import numpy as np
+import pytest
+from lies import is_false, laps, position_error, spoilt
+from numpy.testing import assert_allclose
+from problems import graph_of, retold, straight
+
+from l1slam_ros.core.robust.batch import robust_solve
+from l1slam_ros.core.robust.innovation import LEAST_RATIO, stated_variance, within_ratio
+from l1slam_ros.core.worlds.simulate import WorldOptions
+
+# Odometry far better than the loops: the weights of the one are lost in those of the other.
+SHARP = WorldOptions(odometry_sigma_translation=1e-3, odometry_sigma_rotation=1e-4)
+USUAL = WorldOptions(odometry_sigma_translation=0.02, odometry_sigma_rotation=0.003)
+
+
+@pytest.fixture(scope='module', params=[SHARP, USUAL], ids=['sharp odometry', 'usual odometry'])
+def bad(request):
+    """Five laps of a city block with 400 true loops, and 170 false ones."""
+    return spoilt(laps(2000, 5, 400, request.param, np.random.default_rng(1)), 'random', 170)
+
+
+@pytest.mark.parametrize('times', [1e-4, 1e-2, 1e2, 1e4])
+@pytest.mark.parametrize('odometry', [True, False], ids=['odometry', 'loops'])
+def test_no_lie_is_believed_and_at_most_one_true_loop_in_fifty_is_refused(bad, odometry, times):
+    factors = bad.graph.between
+    graph = retold(bad.graph, times=np.where(factors.is_odometry == odometry, times, 1.0))
+    found, poses = robust_solve(graph)
+    lies = is_false(bad, factors)
+    assert not found.doubts and not (found.accepted & lies).any()
+    assert np.count_nonzero(~found.accepted & ~lies) <= 400 / 50
+    assert position_error(poses, bad.truth) < 0.5
+    stated = stated_variance(graph.between)
+    effective = found.variance * stated
+    assert effective.min() >= LEAST_RATIO * effective.max() * (1 - 1e-12)
+
+
+def test_what_is_stated_is_the_median_by_determinant():
+    graph = graph_of(straight(5), [(0, 1), (1, 2), (2, 3), (3, 4), (0, 2), (1, 4)])
+    variance = np.array([[1.0, 4.0, 16.0]] * 5 + [[1e4, 1e4, 1e4]])
+    roots = np.eye(3) / np.sqrt(variance)[:, :, None]
+    graph = graph.subset(np.arange(6))
+    graph.between.sqrt_information[:] = roots
+    assert_allclose(stated_variance(graph.between), [4.0, (4.0 + 1e4) / 2])
+    assert_allclose(stated_variance(graph.subset(np.arange(4)).between), [4.0, 4.0])
+
+
+def test_only_the_smaller_variance_is_raised_and_only_beyond_the_ratio():
+    assert_allclose(within_ratio(np.array([1e-9, 1.0]), np.ones(2)), [LEAST_RATIO, 1.0])
+    assert_allclose(within_ratio(np.array([1e-9, 1.0]), np.array([1e5, 1.0])), [1e-9, 1.0])
+    assert_allclose(within_ratio(np.array([1.0, 1e-3]), np.array([1.0, 1e-4])), [1.0, 1e-1])

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small files that ask for gigabytes, or hours: refused in one line, in moments."""
+
+import resource
+import sqlite3
+import struct
+import subprocess
+import sys
+import time
+from contextlib import closing
+
+import lz4.frame
+import pytest
+import zstandard
+from mcap.writer import CompressionType, Writer
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.io.bags.bounds import MOST_AT_ONCE
+from l1slam_ros.io.bags.reader import bag_summary, read_messages, read_note
+from l1slam_ros.io.formats import read_input
+from l1slam_ros.io.node_options import read_params_file
+
+_MAGIC = b'\x89MCAP0\r\n'
+_ZEROS = bytes(2**24)
+_ODOM = ('/odom', 'nav_msgs/msg/Odometry')
+
+
+def _packed(size, name):
+    """Return so many zeros, packed."""
+    stream = (zstandard.ZstdCompressor().compressobj() if name == 'zstd'
+              else lz4.frame.LZ4FrameCompressor())
+    parts = [stream.begin()] if name == 'lz4' else []
+    parts += [stream.compress(_ZEROS) for _ in range(size // len(_ZEROS))]
+    return b''.join((*parts, stream.flush()))
+
+
+def _record(opcode, content):
+    return struct.pack('<BQ', opcode, len(content)) + content
+
+
+def _text(words):
+    return struct.pack('<I', len(words)) + words.encode()
+
+
+def _unindexed(path, name, stated, packed):
+    """Write an MCAP file of one chunk that states a size, without an index."""
+    chunk = struct.pack('<QQQI', 1, 2, stated, 0) + _text(name) + struct.pack(
+        '<Q', len(packed)) + packed
+    path.write_bytes(_MAGIC + _record(1, _text('') + _text('')) + _record(6, chunk)
+                     + _record(15, bytes(4)) + _record(2, bytes(20)) + _MAGIC)
+
+
+@pytest.mark.parametrize('name', ['zstd', 'lz4'])
+@pytest.mark.parametrize('stated', [3 * MOST_AT_ONCE // 2, 1000], ids=['true', 'lying'])
+def test_a_chunk_that_unpacks_to_gigabytes_is_refused(tmp_path, name, stated):
+    bag = tmp_path / 'bomb.mcap'
+    _unindexed(bag, name, stated, _packed(3 * MOST_AT_ONCE // 2, name))
+    for read in (read_input, bag_summary, lambda path: list(read_messages(path))):
+        with pytest.raises(FileError, match=r'bomb\.mcap: .* MiB; expected'):
+            read(bag)
+    assert read_note(bag) == {}
+
+
+def test_an_indexed_chunk_that_unpacks_to_gigabytes_is_refused(tmp_path):
+    bag = tmp_path / 'bomb.mcap'
+    with bag.open('wb') as stream:
+        writer = Writer(stream, chunk_size=2 * MOST_AT_ONCE, compression=CompressionType.ZSTD)
+        writer.start()
+        schema = writer.register_schema(_ODOM[1], 'ros2msg', b'')
+        channel = writer.register_channel(_ODOM[0], 'cdr', schema)
+        for k in range(MOST_AT_ONCE // len(_ZEROS) + 1):
+            writer.add_message(channel, k, _ZEROS, k)
+        writer.finish()
+    assert bag.stat().st_size < 2**18
+    for read in (read_input, lambda path: list(read_messages(path))):
+        with pytest.raises(FileError, match='a chunk of 272 MiB; expected at most 256 MiB'):
+            read(bag)
+
+
+def _database(path, *statements):
+    with closing(sqlite3.connect(path)) as database:
+        for statement in (
+                'CREATE TABLE topics (id INTEGER PRIMARY KEY, name, type, serialization_format, '
+                'offered_qos_profiles)',
+                f"INSERT INTO topics VALUES (1, '{_ODOM[0]}', '{_ODOM[1]}', 'cdr', '')",
+                *statements):
+            database.execute(statement)
+        database.commit()
+
+
+@pytest.mark.parametrize('query', [
+    'WITH RECURSIVE more(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM more) SELECT id, 1 AS '
+    "topic_id, id AS timestamp, x'00' AS data FROM more",
+    'SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, zeroblob(900000000) AS data'])
+def test_a_view_in_the_place_of_messages_is_refused(tmp_path, query):
+    bag = tmp_path / 'bomb.db3'
+    _database(bag, f'CREATE VIEW messages AS {query}')
+    for read in (read_input, bag_summary, lambda path: list(read_messages(path))):
+        with pytest.raises(FileError, match=r'messages is a view; expected a table of rosbag2'):
+            read(bag)
+
+
+def test_a_column_that_is_computed_is_refused(tmp_path):
+    bag = tmp_path / 'bomb.db3'
+    _database(bag, 'CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, '
+              'data AS (zeroblob(900000000)))', 'INSERT INTO messages VALUES (1, 1, 1)')
+    with pytest.raises(FileError, match='messages is computed'):
+        list(read_messages(bag))
+
+
+def test_a_blob_of_gigabytes_is_refused(tmp_path):
+    bag = tmp_path / 'bomb.db3'
+    _database(bag, 'CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data)',
+              f'INSERT INTO messages VALUES (1, 1, 1, zeroblob({MOST_AT_ONCE + 1}))')
+    with pytest.raises(FileError, match='a message of 256 MiB'):
+        list(read_messages(bag))
+
+
+def _nested():
+    return {'brackets': '[' * 10000, 'lists': '- ' * 10000 + 'x', 'keys': '? ' * 5000 + 'x'}
+
+
+@pytest.mark.parametrize('text', _nested().values(), ids=_nested())
+def test_nested_yaml_is_refused_at_once(tmp_path, text):
+    bag, params = tmp_path / 'bag', tmp_path / 'params.yaml'
+    bag.mkdir()
+    (bag / 'metadata.yaml').write_text(text)
+    (bag / 'bag_0.mcap').write_bytes(_MAGIC)
+    params.write_text(text)
+    began = time.process_time()
+    for refused in (lambda: read_input(bag), lambda: bag_summary(bag),
+                    lambda: read_params_file(params)):
+        with pytest.raises(FileError, match=r'YAML of .* deep; expected'):
+            refused()
+    assert read_note(bag) == {}
+    assert time.process_time() - began < 2
+
+
+def test_a_compressed_file_that_unpacks_to_gigabytes_is_refused(tmp_path):
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    (bag / 'bag_0.mcap.zstd').write_bytes(_packed(3 * MOST_AT_ONCE // 2, 'zstd'))
+    (bag / 'metadata.yaml').write_text(
+        'rosbag2_bagfile_information: {version: 5, compression_mode: FILE, compression_format: '
+        'zstd, relative_file_paths: [bag_0.mcap.zstd]}')
+    with pytest.raises(FileError, match=r'bag_0\.mcap\.zstd unpacks to more than'):
+        list(read_messages(bag))
+
+
+def test_a_line_of_gigabytes_is_refused_before_it_is_read(tmp_path):
+    graph = tmp_path / 'bomb.g2o'
+    with graph.open('wb') as file:
+        file.write(b'VERTEX_SE2 0 0 0 0\n# ')
+        file.truncate(2**30)  # zeros that take no room on the disk
+    began = time.process_time()
+    with pytest.raises(FileError, match=r'bomb\.g2o:2: a line of more than 65,536 bytes'):
+        read_input(graph)
+    with graph.open('r+b') as file:
+        file.truncate(2**33)
+    with pytest.raises(FileError, match='expected a text file of at most'):
+        read_input(graph)
+    assert time.process_time() - began < 2
+
+
+def test_lines_across_blocks_are_read_whole(tmp_path):
+    graph = tmp_path / 'long.g2o'
+    comment = '# ' + 'x' * 60000
+    lines = [comment if k % 3 else f'VERTEX_SE2 {k} 0 0 0' for k in range(90)]
+    lines += [f'EDGE_SE2 {k} {k + 3} 1 0 0 1 0 0 1 0 1' for k in range(0, 87, 3)]
+    graph.write_text('\n'.join(lines))
+    assert read_input(graph).graph.n_poses == 30
+
+
+def test_a_bomb_costs_the_command_no_memory(tmp_path):
+    bag = tmp_path / 'bomb.mcap'
+    _unindexed(bag, 'zstd', 1000, _packed(2**31, 'zstd'))
+    before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    code = ('import resource, sys; from l1slam_ros.cli.main import main; code = main(sys.argv[1:])'
+            '; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss); sys.exit(code)')
+    done = subprocess.run([sys.executable, '-c', code, 'info', str(bag)], capture_output=True,
+                          text=True, timeout=60)
+    assert done.returncode == 2, before
+    assert len(done.stderr.splitlines()) == 1
+    assert int(done.stdout.split()[-1]) < 900 * 1024

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag whose loops did not get into the map is no success: exit 3, and where they are."""
+
+from collections import Counter
+
+import pytest
+from command import run
+from rosbags.rosbag2 import StoragePlugin
+
+from bags import TYPES, mcap_file, recording_of, rosbag2_directory, write_world
+from l1slam_ros.io.bags.topics import Topics
+from l1slam_ros.io.formats import read_graph, read_input
+
+
+@pytest.fixture(scope='module')
+def recording(tmp_path_factory):
+    """Ten seconds of a world with 100 poses and 82 loops."""
+    folder = tmp_path_factory.mktemp('world')
+    write_world(folder / 'bag', 100, 181)
+    return recording_of(folder / 'bag')
+
+
+def changed(recording, topic, change):
+    """Return the recording; change : of message and number, in place, of one topic."""
+    count, found = Counter(), []
+    for name, msgtype, time, data in recording:
+        if name == topic:
+            message = TYPES.deserialize_cdr(data, msgtype)
+            change(message, count[name])
+            count[name] += 1
+            data = bytes(TYPES.serialize_cdr(message, msgtype))
+        found.append((name, msgtype, time, data))
+    return found
+
+
+def renamed(recording, **names):
+    names = {f'/{old}': new for old, new in names.items()}
+    return [(names.get(topic, topic), *rest) for topic, *rest in recording]
+
+
+def in_frame(frame, numbers=range(10**6)):
+    def change(message, k):
+        if k in numbers:
+            message.header.frame_id = frame
+
+    return change
+
+
+def written(tmp_path, recording):
+    return mcap_file(tmp_path / 'a.mcap', recording)
+
+
+def damage_of(path, **topics):
+    return read_input(path, topics=Topics(**topics)).damage
+
+
+def test_loops_on_another_topic_are_named_with_what_reads_them(capsys, tmp_path, recording):
+    names = {'odom': '/robot1/odometry/filtered', 'loop_closures': '/robot1/loops'}
+    path = rosbag2_directory(tmp_path / 'bag', renamed(recording, **names), StoragePlugin.SQLITE3)
+    said = ('no loop is in the map, but there are loops in 82 messages on /robot1/loops; expected '
+            '--loop-topic /robot1/loops')
+    asked = (path, '--odom-topic', '/robot1/odometry/filtered')
+    for command in ('solve', 'info'):
+        out, err = run(capsys, command, *asked, code=3)
+        assert err == f'l1slam: {said}\n' and 'nothing looks wrong' not in out
+        run(capsys, command, *asked, '--loop-topic', '/robot1/loops')
+    with pytest.warns(UserWarning, match='--loop-topic /loops'):
+        read_graph(written(tmp_path, renamed(recording, loop_closures='/loops')))
+
+
+def test_of_several_robots_each_is_named_with_its_odometry_and_one_that_is_read_will_do(
+        tmp_path, recording):
+    robots = [renamed(recording, odom=f'/r{k}/odom', loop_closures=f'/r{k}/loops')
+              for k in (2, 1)]
+    path = written(tmp_path, [*robots[0], *robots[1]])
+    assert damage_of(path, odometry='/r1/odom') == (
+        'no loop is in the map, but there are loops in 82 messages on /r1/loops and 82 messages '
+        'on /r2/loops; expected --loop-topic /r1/loops or --loop-topic /r2/loops --odom-topic '
+        '/r2/odom')
+    assert damage_of(path, odometry='/r1/odom', loops='/r1/loops') == ''
+
+
+@pytest.mark.parametrize('count, lost', [(82, True), (42, True), (41, False), (1, False)])
+def test_more_than_half_of_the_loops_refused_is_too_many(
+        capsys, tmp_path, recording, count, lost):
+    path = written(tmp_path, changed(recording, '/loop_closures', in_frame('map', range(count))))
+    said = (f"l1slam: {count} of 82 loops on /loop_closures did not get into the map, the first: "
+            f"frame 'map' of a loop; expected ")
+    for command in ('solve', 'info'):
+        err = run(capsys, command, path, code=3 if lost else 0)[1]
+        assert (said in err) == lost
+
+
+def test_loops_that_are_lost_in_the_odometry_count_too(tmp_path, recording):
+    """By a clock of their own they begin before the odometry, or never come."""
+    def earlier(message, k):
+        message.header.stamp.sec -= 900
+        message.header.frame_id = 'base_link@1.000000000'
+
+    def later(message, k):
+        message.header.stamp.sec += 900
+
+    for change in (earlier, later):
+        path = written(tmp_path, changed(recording, '/loop_closures', change))
+        assert damage_of(path) == '82 of 82 loops on /loop_closures did not get into the map'
+
+
+def test_what_was_sent_again_is_in_the_map(tmp_path, recording):
+    twice = [one for one in recording for _ in range(1 + 2 * (one[0] == '/loop_closures'))]
+    assert damage_of(written(tmp_path, twice)) == ''
+
+
+@pytest.mark.parametrize('frame', ['map', 'odom', '', 'user@home', 'a@1'])
+def test_poses_that_are_no_loops_are_none(capsys, tmp_path, recording, frame):
+    others = renamed(changed(recording, '/loop_closures', in_frame(frame)),
+                     loop_closures='/amcl_pose')
+    assert damage_of(written(tmp_path, others)) == ''
+
+
+@pytest.mark.parametrize('topic', ['/absolute_poses', '/false_loop_closures'])
+def test_absolute_poses_and_strikes_are_no_loops_that_were_lost(tmp_path, recording, topic):
+    others = changed(recording, '/loop_closures', in_frame('map')) if 'abs' in topic else recording
+    assert damage_of(written(tmp_path, renamed(others, loop_closures=topic))) == ''
+
+
+def test_absolute_poses_that_are_refused_are_no_lost_loops(tmp_path, recording):
+    poses = renamed([one for one in recording if one[0] == '/loop_closures'],
+                    loop_closures='/absolute_poses')
+    assert damage_of(written(tmp_path, [*recording, *poses, *poses])) == ''
+
+
+def test_a_bag_without_loops_is_one(capsys, tmp_path, recording):
+    path = written(tmp_path, [one for one in recording if one[0] != '/loop_closures'])
+    run(capsys, 'solve', path)
+    run(capsys, 'info', path)

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a driver did to its odometry is told from a recording as it is while driving."""
+
+import numpy as np
+import pytest
+from laps import LAP, Laps, late
+from numpy.testing import assert_array_equal
+from problems import hear
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from bags import TYPES
+from l1slam_ros.core.errors import MessageError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
+from l1slam_ros.io.bags.to_graph import DEFAULT_TOPICS, graph_from_bag
+from l1slam_ros.io.messages.conversion import reference_frame_id
+
+_KINDS = {'/odom': 'nav_msgs/msg/Odometry',
+          '/loop_closures': 'geometry_msgs/msg/PoseWithCovarianceStamped'}
+
+
+def write(path, found):
+    """Write samples and loops in the order they come, by a writer that is not ours."""
+    T = TYPES.types
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = {name: writer.add_connection(name, kind, typestore=TYPES)
+                  for name, kind in _KINDS.items()}
+        for k, one in enumerate(found):
+            frame, topic = 'odom', '/odom'
+            if isinstance(one, LoopClosure):
+                frame, topic = reference_frame_id('b', one.reference_stamp), '/loop_closures'
+            x, y, z, qx, qy, qz, qw = one.pose3.tolist()
+            pose = T['geometry_msgs/msg/PoseWithCovariance'](
+                T['geometry_msgs/msg/Pose'](T['geometry_msgs/msg/Point'](x, y, z),
+                                            T['geometry_msgs/msg/Quaternion'](qx, qy, qz, qw)),
+                one.covariance.ravel())
+            header = T['std_msgs/msg/Header'](
+                T['builtin_interfaces/msg/Time'](*divmod(one.stamp, 10**9)), frame)
+            message = T[_KINDS[topic]](header, pose) if topic != '/odom' else T[_KINDS[topic]](
+                header, 'b', pose, _twist(T))
+            writer.write(topics[topic], 10**18 + k, TYPES.serialize_cdr(message, _KINDS[topic]))
+
+
+def _twist(T):
+    none = T['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
+    return T['geometry_msgs/msg/TwistWithCovariance'](
+        T['geometry_msgs/msg/Twist'](none, none), np.zeros(36))
+
+
+@pytest.mark.parametrize('fault', ['restart', 'silence', 'disorder'])
+def test_a_recording_makes_the_graph_that_the_node_makes(tmp_path, fault):
+    laps = Laps(laps=2.0)
+    samples = {'restart': lambda: laps.restarted(LAP + 14.4, 2.0, (0.02, 0.0, 0.0)),
+               'silence': lambda: laps.silent(LAP + 7.0, LAP + 11.0),
+               'disorder': lambda: late(laps.samples(), 0.2, 1.0, np.random.default_rng(0)),
+               }[fault]()
+    found, live = laps.heard(samples), GraphBuilder(se2, GraphBuilderOptions())
+    for one in found:
+        try:
+            hear(live, [one])
+        except MessageError as error:
+            live.notes.refuse(error.cause, str(error))
+    live.add_due_loops()
+    write(tmp_path / 'bag', found)
+    record = graph_from_bag(tmp_path / 'bag', None, DEFAULT_TOPICS)
+    assert_array_equal(record.stamps, live.track.keyframe_stamps)
+    ours, theirs = live.graph.between, record.graph.between
+    order = [np.lexsort(factors.pairs.T) for factors in (ours, theirs)]
+    assert_array_equal(theirs.pairs[order[1]], ours.pairs[order[0]])
+    np.testing.assert_allclose(theirs.sqrt_information[order[1]],
+                               ours.sqrt_information[order[0]], rtol=1e-6)
+    assert (len(live.track.gaps), len(record.skipped)) == {
+        'restart': (1, 1), 'silence': (0, 0), 'disorder': (0, 1)}[fault]

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot on square laps, the loops it sees one lap back, and what drivers do to its odometry."""
+
+
+import numpy as np
+from lies import position_error
+from problems import covariance6, seconds
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+
+# At 1 m/s round four corners of 1 m radius.
+LAP, RATE, START = 40.0, 20.0, 100.0  # [s], [1/s], [s]
+_SIDE, _CORNER = LAP / 4, np.pi / 2
+LOOP_SIGMA = np.array([0.05, 0.05, 0.02])
+
+
+def at(time):
+    """Return where the robot is, some seconds after its start (n,), (n, 3)."""
+    side, rest = np.divmod(time, _SIDE)
+    straight = _SIDE - _CORNER
+    angle = np.maximum(rest - straight, 0.0)
+    on = np.column_stack((np.minimum(rest, straight) + np.sin(angle), 1 - np.cos(angle), angle))
+    corners, step = [se2.identity(1)], np.array([[straight + 1.0, 1.0, np.pi / 2]])
+    for _ in range(3):
+        corners.append(se2.compose(corners[-1], step))
+    return se2.compose(np.concatenate(corners)[side.astype(int) % 4], on)
+
+
+class Laps:
+    """
+    What is heard of a drive, without a fault.
+
+    Attributes
+    ----------
+    samples : of odometry that errs by about 1.5% of each metre and radian; loops : twice a second
+
+    """
+
+    def __init__(self, seed=0, laps=3.0, twist=False, rate=RATE, speed=1.0):
+        rng = np.random.default_rng(seed)
+        self.period, self.speed, self.lap = 1 / rate, speed, LAP / speed
+        self.times = np.arange(round(laps * self.lap * rate)) / rate
+        truth = at(self.times * speed)
+        steps = se2.between(truth[:-1], truth[1:])
+        # Half of it is the same all the way: a wheel's radius, a gyro's scale.
+        error = 1 + rng.normal(0, 0.01, 3) + rng.normal(0, 0.01 * np.sqrt(rate), steps.shape)
+        odometry = [se2.identity(1)]
+        for step in steps * error:
+            odometry.append(se2.compose(odometry[-1], step[None]))
+        self.odometry = np.concatenate(odometry)
+        length, angle = se2.motion(np.vstack((steps, steps[-1:])) * rate * twist)
+        self.speeds = [*zip(length.tolist(), angle.tolist(), strict=True)]
+        ends = np.arange(self.lap, self.times[-1], 0.5 / speed)
+        begins = ends - self.lap
+        measured = se2.retract(se2.between(at(begins * speed), at(ends * speed)),
+                               LOOP_SIGMA * rng.standard_normal((len(ends), 3)))
+        self.loops = [LoopClosure(stamp(begin), stamp(end), se2.to_pose3(Z[None])[0],
+                                  covariance6(np.diag(LOOP_SIGMA**2)))
+                      for begin, end, Z in zip(begins, ends, measured, strict=True)]
+
+
+    def sample(self, k, pose=None, covariance=None):
+        """Return the message of number k; pose (1, 3) : what it says."""
+        pose3 = se2.to_pose3(self.odometry[k:k + 1] if pose is None else pose)[0]
+        none = np.zeros((6, 6))
+        return OdometrySample(stamp(self.times[k]), pose3,
+                              none if covariance is None else covariance, none, '',
+                              self.speeds[k])
+
+    def samples(self):
+        """Return all messages of the odometry."""
+        return [self.sample(k) for k in range(len(self.times))]
+
+    def silent(self, begin, end):
+        """Return the messages but those of some time."""
+        return [self.sample(k) for k, time in enumerate(self.times) if not begin < time < end]
+
+    def restarted(self, begin, silence, where):
+        """Return the messages of odometry that begins again at `where` (3,) after a silence."""
+        last = int(np.searchsorted(self.times, begin, side='right')) - 1
+        first = last + max(round(silence / self.period), 1)
+        start = self.odometry[last:last + 1] if where is SAME else np.array([where], float)
+        frame = se2.compose(start, se2.inverse(self.odometry[first:first + 1]))
+        return [self.sample(k) for k in range(last + 1)] + [
+            self.sample(k, se2.compose(frame, self.odometry[k:k + 1]))
+            for k in range(first, len(self.times))]
+
+    def heard(self, samples):
+        """Return samples, in the order they come, and each loop as soon as its end is over."""
+        loops, newest, found = list(self.loops), 0, []
+        for sample in samples:
+            found.append(sample)
+            newest = max(newest, sample.stamp)
+            while loops and loops[0].stamp <= newest:
+                found.append(loops.pop(0))
+        return found
+
+    def error(self, snapshot):
+        """Return the RMSE of the positions of the keyframes [m]."""
+        return position_error(
+            snapshot.poses, at((snapshot.stamps - stamp(0.0)) * 1e-9 * self.speed))
+
+
+# In the place of a pose: that of the last message before.
+SAME = object()
+
+
+def stamp(time):
+    """Return the stamp some seconds after the start [ns]."""
+    return seconds(START + time)
+
+
+def late(samples, share, delay, rng):
+    """Return samples in the order they come if a share of them is so many seconds late."""
+    arrival = np.array([one.stamp for one in samples]) * 1e-9
+    arrival += delay * (rng.random(len(samples)) < share)
+    return [samples[k] for k in np.argsort(arrival, kind='stable')]

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The odometry's driver restarts while the real node listens: another publisher, another frame."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from laps import LAP, Laps, at, stamp
+from lies import position_error
+from nav_msgs.msg import Odometry
+from node_bench import call, odometry, poses_of
+from problems import seconds
+from rclpy.qos import QoSProfile
+
+from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.io.messages.conversion import reference_frame_id
+from l1slam_ros.ros.publishing import header
+
+
+def message_of(found):
+    """Return the message of a sample or a loop."""
+    if isinstance(found, LoopClosure):
+        message = PoseWithCovarianceStamped(header=header(
+            reference_frame_id('base_link', found.reference_stamp), found.stamp))
+    else:
+        message = Odometry(header=header('odom', found.stamp), child_frame_id='base_link')
+    pose = message.pose.pose
+    (pose.position.x, pose.position.y, _, _, _, pose.orientation.z,
+     pose.orientation.w) = found.pose3.tolist()
+    message.pose.covariance = found.covariance.ravel()
+    return message
+
+
+def restart_driver(b):
+    """Let another publisher speak on odom from now on."""
+    b.peer.destroy_publisher(b.publishers['/odom'])
+    b.publishers['/odom'] = b.peer.create_publisher(Odometry, '/odom', QoSProfile(depth=1000))
+    b.until(lambda: b.publishers['/odom'].get_subscription_count()
+            and b.backend.count_publishers('/odom') == 1, 'the node hears of it')
+
+
+def said(capfd):
+    return [line for line in capfd.readouterr().err.splitlines() if 'WARN' in line]
+
+
+def test_a_map_over_a_restart_is_whole_and_the_restart_is_told_of(bench, capfd):
+    laps, b, sent = Laps(seed=4, laps=2.5), bench(), 0
+    begin, silence = LAP + 14.4, 2.0
+    for found in laps.heard(laps.restarted(begin, silence, (0.02, 0.0, 0.0))):
+        is_loop = isinstance(found, LoopClosure)
+        if not is_loop and found.stamp == stamp(begin + silence):
+            restart_driver(b)
+        b.send('/loop_closures' if is_loop else '/odom', message_of(found))
+        sent += not is_loop
+        if sent % 20 == 0:
+            b.until(lambda n=sent: b.backend._inputs.traffic['odom'].received >= n, 'it is used')
+    b.until(lambda: sum(b.backend._backend.counts()[0][f'{state}_loops'] for state in (
+        'accepted', 'suspect', 'rejected')) == len(laps.loops), 'all loops are used')
+    # All that joins both parts is one lap driven twice: the map is taken, and that is said.
+    answer = call(b, 'optimize')
+    assert not answer.success and answer.message.startswith('doubtful: of how two parts lie ')
+    counts, refused = b.backend._backend.counts()
+    assert counts['accepted_loops'] == len(laps.loops) and not refused
+    b.until(lambda: len(b.path().poses) == counts['keyframes'], 'the whole map')
+    stamps = np.array([p.header.stamp.sec * 10**9 + p.header.stamp.nanosec
+                       for p in b.path().poses])
+    assert position_error(poses_of(b.path()), at((stamps - stamp(0.0)) * 1e-9)) < 0.2
+    told = []
+    b.until(lambda: told.extend(said(capfd)) or told, 'it is told of')
+    assert len(told) == 1 and f'at stamp {stamp(begin + silence)} ns' in told[0]
+
+
+@pytest.mark.parametrize('restarts', [True, False])
+def test_another_publisher_makes_a_small_jump_a_restart(bench, capfd, restarts):
+    """Without it, the odometry may as well have been corrected."""
+    b = bench()
+    for k in range(60):
+        if k == 30 and restarts:
+            restart_driver(b)
+        b.send('/odom', odometry(seconds(10 + 0.05 * k), 5 + 0.05 * k + 0.4 * (k >= 30)))
+    b.until(lambda: b.backend._backend.robot().stamp == seconds(12.95), 'all is used')
+    assert b.backend._backend.snapshot().gaps.size == restarts
+    told = []
+    if restarts:
+        b.until(lambda: told.extend(said(capfd)) or told, 'it is told of')
+        assert 'a new part of the map begins' in told[0]
+        b.until(lambda: b.status()[2].get('odometry.new_part') == '1', 'diagnostics say so')
+        level, sentence, _ = b.status()
+        assert level == DiagnosticStatus.WARN and sentence.endswith('last minute: 1 new_part')

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shells that say other things than most: the executables, the demo and the tests work in them."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from test_introspection import INPUTS, OUTPUTS, PARAMETERS, SERVICES
+
+rclpy = pytest.importorskip('rclpy')
+
+from l1slam_ros.core.errors import L1SlamError
+from l1slam_ros.ros.demo import executable
+from l1slam_ros.ros.shell import domain
+from l1slam_ros.ros.shell.arguments import split
+
+ROOT = Path(__file__).parents[2]
+DEADLINE = 300.0  # [s] the solver can have to be compiled first
+NOBODYS = 'rmw_of_nobody_cpp'
+# What each of these says would stop a demo, or tests, that take it as it is.
+ODD = {
+    'RMW_IMPLEMENTATION': NOBODYS, 'ROS_LOCALHOST_ONLY': '1', 'ROS_STATIC_PEERS': '192.0.2.1',
+    'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF', 'ROS_DISCOVERY_SERVER': '127.0.0.1:11811',
+    'ROS_NAMESPACE': '/robot', 'FASTRTPS_DEFAULT_PROFILES_FILE': '/no/such.xml',
+    'RCUTILS_LOGGING_USE_STDOUT': '1', 'RCUTILS_CONSOLE_OUTPUT_FORMAT': '{message}',
+}
+CHOOSE = ('from l1slam_ros.ros.shell.domain import go_where_nobody_is as go; '
+          'print(go(), flush=True); input()')
+STAND_IN = ('import os, rclpy; rclpy.init(); node = rclpy.create_node("other"); '
+            'print("here", flush=True); input()')
+
+
+def run(*command, cwd=ROOT, **variables):
+    return subprocess.run([str(part) for part in command], cwd=cwd, capture_output=True,
+                          text=True, timeout=DEADLINE, env={**os.environ, **variables})
+
+
+@pytest.fixture
+def python():
+    """Return what starts some lines of Python and returns the first line they print."""
+    processes = []
+
+    def begin(code, **variables):
+        processes.append(subprocess.Popen(
+            [sys.executable, '-c', code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            text=True, env={**os.environ, **variables}))
+        return processes[-1], processes[-1].stdout.readline().strip()
+
+    yield begin
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def is_free(number):
+    mark = domain._take(number)
+    if mark is not None:
+        mark.close()
+    return mark is not None
+
+
+def test_who_choose_at_once_are_in_different_domains_until_they_end(python):
+    begun = [python(CHOOSE) for _ in range(4)]
+    chosen = {int(said) for _, said in begun}
+    assert len(chosen) == 4 and int(os.environ['ROS_DOMAIN_ID']) not in chosen
+    assert not any(is_free(number) for number in chosen)
+    for process, _ in begun:
+        process.kill()
+        process.wait()
+    assert all(is_free(number) for number in chosen)
+
+
+@pytest.mark.parametrize('told', [
+    {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'},
+    {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}, {'ROS_LOCALHOST_ONLY': '1'}])
+def test_a_domain_with_a_node_in_it_is_not_free(python, told):
+    process, said = python(CHOOSE)
+    process.kill()
+    process.wait()
+    number = int(said)
+    assert is_free(number)
+    python(STAND_IN, ROS_DOMAIN_ID=said, **told)
+    assert not is_free(number)
+
+
+def test_where_no_domain_is_free_it_is_said(monkeypatch):
+    before = os.environ['ROS_DOMAIN_ID']
+    monkeypatch.setattr(domain, '_DOMAINS', range(int(before), int(before) + 1))
+    with pytest.raises(L1SlamError, match='expected a free one'):
+        domain.go_where_nobody_is()
+    assert os.environ['ROS_DOMAIN_ID'] == before
+
+
+def test_a_middleware_that_is_not_there_is_said_and_another_used(start, tmp_path):
+    process = start(RMW_IMPLEMENTATION=NOBODYS)
+    sentence = rf'RMW_IMPLEMENTATION is {NOBODYS}, which cannot be loaded here; rmw_\w+ is used '
+    assert re.match(f'backend: {sentence}', process.stderr.readline())
+    assert 'ready' in process.stderr.readline()
+    played = run(executable('replay'), tmp_path / 'no', RMW_IMPLEMENTATION=NOBODYS)
+    assert played.returncode == 2 and 'no such file' in played.stderr.splitlines()[1]
+    assert re.match(f'replay: {sentence}', played.stderr)
+
+
+def test_a_middleware_that_is_there_is_used_without_a_word(start):
+    named = rclpy.get_rmw_implementation_identifier()
+    assert 'ready' in start(RMW_IMPLEMENTATION=named).stderr.readline()
+
+
+def test_the_demo_works_in_an_odd_shell_beside_another_node(python, tmp_path):
+    """That of another domain would be heard, and counted."""
+    (tmp_path / 'bags').symlink_to(ROOT / 'bags')
+    other = {'ROS_DOMAIN_ID': os.environ['ROS_DOMAIN_ID']}
+    python(STAND_IN.replace('other', 'backend'), **other)
+    shown = run(sys.executable, '-m', 'l1slam_ros.ros.executables', cwd=tmp_path, **ODD)
+    assert shown.returncode == 0, shown.stderr
+    (line,) = (line for line in shown.stderr.splitlines() if NOBODYS in line)
+    assert line.startswith('demo: ') and line.endswith('is used instead')
+    (number,) = re.findall(r'^demo: in ROS domain (\d+), ', shown.stdout, re.MULTILINE)
+    assert number != other['ROS_DOMAIN_ID'] and '10 false loops, 0 true ones' in shown.stdout
+    assert (tmp_path / 'demo' / 'map.png').exists()
+
+
+def test_the_tests_work_in_an_odd_shell():
+    """Two that read what processes say, and talk to them."""
+    tests = ROOT / 'test' / 'ros' / 'test_processes.py'
+    ran = run(sys.executable, '-m', 'pytest', '-p', 'no:cacheprovider', tests, '-k',
+              'a_map_comes_out or loses_neither', **ODD, ROS_DOMAIN_ID='7')
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert '2 passed' in ran.stdout and f'{NOBODYS}, which cannot be loaded here' in ran.stdout
+
+
+@pytest.mark.parametrize('ask', ['--help', '-h'])
+def test_the_help_of_backend_lists_all_and_starts_nothing(ask):
+    began = time.monotonic()
+    helped = run(executable('backend'), ask, '--ros-args', '-p', 'dimension:=7')
+    assert helped.returncode == 0 and not helped.stderr and time.monotonic() - began < 30
+    text = helped.stdout
+    of_type = dict(re.findall(r'^  ([~/\w]+) \((.+)\)$', text, re.MULTILINE))
+    of_type = {name.replace('~', '/backend') if name[0] in '~/' else f'/{name}': kind
+               for name, kind in of_type.items()}
+    before = ''
+    for name, kind in of_type.items():
+        of_type[name] = before = before if kind == 'the same' else kind
+    for name, kind in {**INPUTS, **OUTPUTS, **SERVICES}.items():
+        assert of_type.pop(name) == kind.replace('/msg/', '/').replace('/srv/', '/')
+    assert of_type.keys() == {'/map_graph', '/pose_graph', '/tf'}
+    for name, (default, unit, _) in PARAMETERS.items():
+        shown = str(default).lower() if isinstance(default, bool) else repr(default)
+        assert f'\n  {name}: {shown}\n' in text and (f'[{unit}]' in text or not unit)
+    assert max(map(len, text.splitlines())) <= 99
+
+
+def test_half_of_the_help_is_enough_for_who_wants_no_more():
+    shown = subprocess.run(['sh', '-c', '"$0" --help | head -n 1', executable('backend')],
+                           capture_output=True, text=True, timeout=DEADLINE)
+    assert shown.stdout.startswith('usage: backend') and not shown.stderr
+
+
+@pytest.mark.parametrize('arguments, named', [
+    (['--frobnicate'], '--frobnicate'), (['map.g2o'], 'map.g2o'), (['__node:=x'], '__node:=x'),
+    (['--ros-args', '-r', 'odom:=o', '--', '--verbose'], '--verbose'),
+    (['--ros-args', '--frobnicate'], '--frobnicate')])
+def test_an_argument_that_backend_does_not_know_ends_it(arguments, named):
+    run_once = run(executable('backend'), *arguments)
+    assert run_once.returncode == 2 and not run_once.stdout
+    (line,) = run_once.stderr.splitlines()
+    assert line.startswith('backend: ') and named in line
+
+
+def test_replay_helps_and_refuses_what_it_does_not_know():
+    helped = run(executable('replay'), '--help')
+    assert helped.returncode == 0 and '--ros-args' in helped.stdout and '--rate' in helped.stdout
+    assert run(executable('replay'), 'bag', '--frobnicate').returncode == 2
+
+
+@pytest.mark.parametrize('line, own', [
+    ('', ''), ('bag --remap a:=b', 'bag --remap a:=b'), ('--ros-args -r a:=b', ''),
+    ('--ros-args -r a:=b -- bag', 'bag'), ('bag --ros-args -r a:=b -- --clock --ros-args -p x:=1',
+                                           'bag --clock')])
+def test_a_command_line_is_split(line, own):
+    mine, of_ros = split(line.split())
+    assert mine == own.split()
+    assert sorted(mine + of_ros) == sorted(line.split())
