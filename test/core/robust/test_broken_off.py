@@ -133,4 +133,4 @@ def test_a_running_back_end_goes_on_with_what_it_believed(bad, failing):
     assert np.count_nonzero(judgement.accepted) > 200
     assert judgement.doubt.kind == FAILED and judgement.settled
     while backend.update(1.0):
-        assert backend.snapshot().optimised.judgement.doubt.kind == FAILED
+        assert backend.snapshot().judgement.doubt.kind == FAILED
