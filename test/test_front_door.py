@@ -23,7 +23,7 @@ from l1slam_ros.io.bags.writer import new_bag
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / 'README.md').read_text()
-EXAMPLE = re.search(r'## From Python.*?```python\n(.*?)```', README, re.S)[1]
+EXAMPLE = re.search(r'## In Python.*?```python\n(.*?)```', README, re.S)[1]
 
 
 @pytest.fixture(scope='module')

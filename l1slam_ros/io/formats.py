@@ -7,7 +7,7 @@ In the end `l1slam_ros.read_graph` and `write_graph`.
 
 import os
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +34,12 @@ from l1slam_ros.io.trajectory import write_tum
 if TYPE_CHECKING:
     from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
 
-GRAPH_SUFFIXES = ('.g2o', '.graph')
+# By the suffix of a file. A reader takes the path and what the rotation block of the information
+# is of, and raises FileError.
+GRAPH_READERS: dict[str, Callable[[Path, str], GraphRecord]] = {
+    '.g2o': read_graph_file,
+    '.graph': read_graph_file,
+}
 
 
 class _Origin(NamedTuple):
@@ -78,9 +83,11 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
         record = graph_from_bag(path, options, topics, dimension)
         return replace(record, rotation_information=rotation_information)
     # The map before the one of that name, too.
-    if path.name.lower().removesuffix('.1').endswith(GRAPH_SUFFIXES):
-        return read_graph_file(path, rotation_information)
-    raise FileError(path, f'unknown kind of file; expected {", ".join(GRAPH_SUFFIXES)}, '
+    name = path.name.lower().removesuffix('.1')
+    for suffix, read in GRAPH_READERS.items():
+        if name.endswith(suffix):
+            return read(path, rotation_information)
+    raise FileError(path, f'unknown kind of file; expected {", ".join(GRAPH_READERS)}, '
                     f'{", ".join(BAG_SUFFIXES)} or a rosbag2 directory')
 
 
@@ -226,7 +233,8 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
     path : .g2o, .tum (the poses alone), or a name without a suffix for a bag directory
     rotation_information : see `read_graph`
     inliers : (m,) bool of the factors, as of a `Solution`: the others are written as what was left
-        out, which other programs do not use; None: those that were left out in the file read
+        out, which other programs do not use; None: those of the solution whose poses these are, or
+        else those that were left out in the file read
     force : whether to replace what was there, though this program did not write it
 
     Raises
@@ -239,6 +247,10 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
     """
     _check_reading(path, rotation_information)
     require(FactorGraph, 'graph', graph, 'a FactorGraph, as read_graph returns first')
+    if inliers is None:
+        from l1slam_ros.core.robust.door import believed
+
+        inliers = believed(graph, poses)
     poses = as_poses(graph, poses, 'poses have')
     if not np.isfinite(poses).all():
         row = int(np.argmin(np.isfinite(poses).all(axis=1)))

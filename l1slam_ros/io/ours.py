@@ -18,11 +18,12 @@ from pathlib import Path
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.files import reported
+from l1slam_ros.io.remarks import KEYWORD
 
 PROGRAM = 'l1slam_ros'
 MARK = f'# {PROGRAM} wrote this file and may replace it'
 REPORT_MARK = f'<!-- {PROGRAM} wrote this file and may replace it -->'
-_FIRST_LINES = f'{MARK}\n'.encode(), f'{REPORT_MARK}\n'.encode(), b'#L1SLAM '
+_FIRST_LINES = f'{MARK}\n'.encode(), f'{REPORT_MARK}\n'.encode()
 # The begin of a file -> what tells ours from others: PNG, PDF, SVG.
 _PICTURES = {
     b'\x89PNG': f'tEXtSoftware\0{PROGRAM}'.encode(),
@@ -57,7 +58,9 @@ def is_ours(path: str | os.PathLike[str]) -> bool:
                 file.is_file() and (file.name == _METADATA or _ends(file)[0].startswith(_BAG))
                 for file in files) and any(file.name != _METADATA for file in files)
         first, last = _ends(path)
-    return (not first or first.startswith(_FIRST_LINES) or last.endswith(f'\n{MARK}\n'.encode())
+    return (not first or first.startswith(_FIRST_LINES)
+            or KEYWORD.encode() in first.partition(b'\n')[0]
+            or last.endswith(f'\n{MARK}\n'.encode())
             or any(first.startswith(begin) and (mark in first or mark in last)
                    for begin, mark in _PICTURES.items()))
 

@@ -2,7 +2,8 @@
 """
 What a saved map says that no graph format has a tag for, in lines that others take for comments.
 
-    #L1SLAM map 2               the first line: the version of what follows
+    ... #L1SLAM map 3           ends the first line: the version. It has no line of its own, for
+                                GTSAM reads no edge behind a comment; version 2 had
     #L1SLAM <name> <JSON>       a value; of one with many rows the first, and more in lines to come
     #L1SLAM <name> <f8 <Base64> the numbers of an array, of NumPy's type `<f8`; more to come, too
     #L1SLAM sha256 <digest>     the last line: of all bytes before, the proof that they are whole
@@ -25,7 +26,7 @@ from l1slam_ros.core.errors import FileError
 Remarks = Mapping[str, Any] | None
 
 KEYWORD = '#L1SLAM '
-_FIRST = f'{KEYWORD}map 2'
+_FIRST, _FIRST_OF_2 = f' {KEYWORD}map 3', f'{KEYWORD}map 2'
 _PROOF = f'{KEYWORD}sha256 '
 _LAST = len(_PROOF) + 2 * sha256().digest_size + 1  # bytes of the last line
 # Rows to a line: readers whose lines have an end get through, and other threads their turn.
@@ -58,8 +59,10 @@ def _together(lines: Iterable[str]) -> Iterator[str]:
 
 def _unproven(lines: Iterable[str], values: Mapping[str, Any]) -> Iterator[str]:
     """Yield lines and values: arrays, or what JSON knows."""
-    yield _FIRST
-    yield from lines
+    graph = iter(lines)
+    first, newline, rest = next(graph).partition('\n')
+    yield f'{first}{_FIRST}{newline}{rest}'
+    yield from graph
     for name, value in values.items():
         parts = [value]
         if isinstance(value, np.ndarray | list):
@@ -79,14 +82,15 @@ def is_proven(path: object, content: bytes) -> bool:
     FileError : it was one, and is not as it was written.
 
     """
-    last = content[-_LAST:]
-    if not content.startswith(KEYWORD.encode()) and not last.startswith(_PROOF.encode()):
+    first, last = content[: content.find(b'\n')], content[-_LAST:]
+    if KEYWORD.encode() not in first and not last.startswith(_PROOF.encode()):
         return False
     if last != f'{_PROOF}{sha256(memoryview(content)[:-_LAST]).hexdigest()}\n'.encode():
         raise FileError(path, 'is damaged: its last line is not the checksum of those before; '
                         'expected a saved map as it was written')
-    if not content.startswith(f'{_FIRST}\n'.encode()):
-        raise FileError(path, f'is a saved map of another version; expected {_FIRST!r}', 1)
+    if not first.endswith(_FIRST.encode()) and first != _FIRST_OF_2.encode():
+        raise FileError(path, 'is a saved map of another version; expected one that says '
+                        f'{_FIRST.strip()!r}', 1)
     return True
 
 
@@ -102,8 +106,8 @@ def read_remarks(path: object, content: bytes) -> Remarks:
     if not is_proven(path, content):
         return None
     parts: dict[str, list[Any]] = {}
-    _, *lines, _ = (line.split(' ', 2)[1:] for line in content.decode().split('\n')
-                    if line.startswith(KEYWORD))
+    *lines, _ = (line.split(' ', 2)[1:] for line in content.decode().split('\n')
+                 if line.startswith(KEYWORD) and line != _FIRST_OF_2)
     for name, text in lines:
         parts.setdefault(name, []).append(_value(text))
     return {name: _joined(of_name) for name, of_name in parts.items()}

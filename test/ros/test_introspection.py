@@ -88,8 +88,9 @@ def test_topics_and_services_are_those_of_the_interface(bench):
 
 
 @pytest.mark.parametrize('way, topics', [('in', INPUTS), ('out', OUTPUTS)])
-def test_the_readme_names_each_topic_and_its_type(way, topics):
-    table = (ROOT / 'README.md').read_text().split(f'| {way} | type | meaning |')[1]
+def test_the_page_names_each_topic_and_its_type(way, topics):
+    page = (ROOT / 'doc' / 'topics_and_parameters.md').read_text()
+    table = page.split(f'| {way} | type | meaning |')[1]
     said, types = {}, ''
     for row in table.split('\n\n')[0].splitlines()[2:]:
         names, kinds, _ = row.strip('| ').split(' | ', 2)

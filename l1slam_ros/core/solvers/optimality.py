@@ -5,6 +5,7 @@ How good an answer is, recomputed from the problem itself: objectives, duality g
 Nothing here trusts what a solver says of its own result.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple, Protocol
@@ -290,12 +291,18 @@ class Largest:
 
 L1 = Lengths()
 
+# What makes each of `names.NORMS` of the rows of a factor, Huber's delta [sigmas] and a scale.
+NORM_OF: dict[str, Callable[[int, float, float], SmoothNorm]] = {
+    'l1': lambda size, delta, scale: L1,
+    'group-l1': lambda size, delta, scale: Lengths(size),
+    'l2': lambda size, delta, scale: Huber(scale=scale),
+    'huber': Huber,
+}
+
 
 def norm_of(name: str, size: int, delta: float = np.inf, scale: float = 1.0) -> SmoothNorm:
     """Return one of `names.NORMS` for factors of so many rows; delta, scale : of Huber."""
-    norms: dict[str, SmoothNorm] = {'l1': L1, 'group-l1': Lengths(size), 'l2': Huber(scale=scale),
-                                    'huber': Huber(size, delta, scale)}
-    return norms[name]
+    return NORM_OF[name](size, delta, scale)
 
 
 def _lengths(rows: Array, size: int) -> Array:

@@ -6,6 +6,7 @@ In: a graph and poses. Out: the solution, the name of the solver that found it, 
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry.manifold import Array
@@ -18,7 +19,7 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
 from l1slam_ros.core.solvers.optimality import Mixed, SmoothNorm, Status, norm_of
 from l1slam_ros.core.solvers.primal_dual_newton import minimise_norm
 
-AUTO, PRIMAL_DUAL, INTERIOR_POINT = SOLVERS
+AUTO, PRIMAL_DUAL, INTERIOR_POINT, *_ = SOLVERS
 L1_NORM, GROUP_L1_NORM, *_ = NORMS
 # What other norms are minimised by.
 GAUSS_NEWTON, PRIMAL_DUAL_NEWTON = 'gauss-newton', 'primal-dual-newton'
@@ -30,6 +31,21 @@ _WORK_PER_FACTOR = 700.0
 _SPARSE = 'the graph is sparse'
 _DENSE = 'the graph is dense'
 _TOO_DENSE = 'the graph is too dense to be factorised'
+
+
+class L1Solver(Protocol):
+    """A method for the L1 norm; arguments and result as those of `nonlinear.minimise`."""
+
+    def __call__(self, graph: FactorGraph, poses: Array, options: OptimiserOptions,
+                 cholesky: BlockCholesky, *, report: Report) -> Solution:
+        """Return poses of lower cost; cholesky : of the graph."""
+
+
+# Each of `names.SOLVERS` but `auto`.
+L1_SOLVERS: dict[str, L1Solver] = {
+    PRIMAL_DUAL: minimise,
+    INTERIOR_POINT: minimise_interior_point,
+}
 
 
 @dataclass(frozen=True)
@@ -85,7 +101,7 @@ def choose(solver: str, graph: FactorGraph, norm: str = L1_NORM, loop_norm: str 
     try:
         cholesky = cholesky_of(graph, before)
     except FillError:
-        if solver == INTERIOR_POINT:
+        if solver not in (AUTO, PRIMAL_DUAL):
             raise
         return Method(None, PRIMAL_DUAL, _TOO_DENSE)
     if solver != AUTO:
@@ -116,8 +132,8 @@ def minimise_by(
         return gauss_newton(graph, poses, norm, least_squares, cholesky, report), method.solver
     if method.solver == PRIMAL_DUAL or cholesky is None:
         return minimise(graph, poses, options, cholesky, report=report), PRIMAL_DUAL
-    solution = minimise_interior_point(graph, poses, options, cholesky, report)
+    solution = L1_SOLVERS[method.solver](graph, poses, options, cholesky, report=report)
     content = solution.status is Status.CONVERGED or not options.outer_iterations
     if content or not method.falls_back:
-        return solution, INTERIOR_POINT
+        return solution, method.solver
     return minimise(graph, solution.poses, options, cholesky, report=report), PRIMAL_DUAL

@@ -2,6 +2,7 @@
 """Where a running back end keeps its map: when it is saved, and never over that of another."""
 
 import filecmp
+import math
 import os
 import threading
 import time
@@ -44,7 +45,9 @@ class MapFile:
                  warn: Callable[[str], object]):
         self._backend, self._options, self._warn = backend, options, warn
         self.is_saving, self._one = False, threading.Lock()
-        self._began = time.monotonic()
+        # The first save is due as soon as there is a map: who restarts a node again and again must
+        # not lose all of it again and again.
+        self._began = -math.inf
         # Where the map was saved or loaded last, and its revision then.
         self._known = _absolute(options().save_path), backend.revisions.now
         # The file that we wrote or loaded, its end, and what names the graph whose map it holds;
@@ -71,6 +74,7 @@ class MapFile:
             saved = self._backend.saved() if self._is_to_be_saved() else None
             taken()
             if saved is None:
+                self._began = -math.inf
                 return
             path = self._path()
             for sentence in self._keep_others(path, saved):

@@ -68,6 +68,16 @@ def test_a_map_is_saved_when_it_has_changed(tmp_path):
     assert keyframes(path) == 4
 
 
+def test_the_first_save_waits_for_nothing(tmp_path):
+    robot, path = Robot(tmp_path / 'map.g2o', HOUR), tmp_path / 'map.g2o'
+    robot.drive(1)
+    robot.autosave()
+    robot.drive(1)
+    assert robot.autosave() and keyframes(path) == 2
+    robot.drive(1)
+    assert not robot.autosave() and keyframes(path) == 2
+
+
 @pytest.mark.parametrize('changes', [{'autosave_period': HOUR}, {'save_path': ''},
                                      {'autosave_period': 0.0}])
 def test_it_is_saved_no_sooner_and_nowhere_that_nobody_said(tmp_path, changes):

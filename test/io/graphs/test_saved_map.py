@@ -4,6 +4,7 @@
 import os
 import re
 from dataclasses import fields, is_dataclass, replace
+from hashlib import sha256
 
 import numpy as np
 import pytest
@@ -233,8 +234,31 @@ def test_the_commands_read_both_and_notice_damage_too(two, capsys):
     assert capsys.readouterr().err.strip().endswith(
         f'{two}: is damaged: its last line is not the checksum of those before; expected a saved '
         'map as it was written')
-    two.write_bytes(content.replace(b'map 2', b'map 3'))
+    two.write_bytes(content.replace(b'map 3', b'map 4'))
     assert not is_map(two)
+
+
+def test_a_map_of_the_version_before_is_read(two, tmp_path):
+    first, _, rest = two.read_text().partition('\n')
+    assert first.endswith(' #L1SLAM map 3')
+    lines = ['#L1SLAM map 2', first.removesuffix(' #L1SLAM map 3'), *rest.split('\n')[:-2]]
+    content = ''.join(f'{line}\n' for line in lines)
+    old = tmp_path / 'old.g2o'
+    old.write_text(f'{content}#L1SLAM sha256 {sha256(content.encode()).hexdigest()}\n')
+    assert is_map(old)
+    saved, known = load_map(old)[0], load_map(two)[0]
+    np.testing.assert_array_equal(saved.optimised.poses, known.optimised.poses)
+    np.testing.assert_array_equal(saved.optimised.judgement.accepted,
+                                  known.optimised.judgement.accepted)
+
+
+def test_others_find_every_believed_edge_before_the_first_comment_line(two, halfway):
+    lines = two.read_text().split('\n')
+    graph = lines[: next(k for k, line in enumerate(lines) if line.startswith('#'))]
+    tags = [line.split()[0] for line in graph]
+    believed = halfway.snapshot().judgement.accepted & ~(
+        halfway.snapshot().graph.between.is_absolute)
+    assert tags.count('EDGE_SE2') == np.count_nonzero(believed)
 
 
 # The disk

@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""README and doc/: links lead somewhere, commands and Python run, recipes are true."""
+
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from l1slam_ros.cli.main import main
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / 'README.md'
+PAGES = [README, *sorted((ROOT / 'doc').glob('*.md'))]
+RECIPES = ROOT / 'doc' / 'how_to_change_it.md'
+MOST_WORDS, MOST_TERMS = 1200, 30
+
+MINUTES = 'takes minutes; its options are held to its --help'
+PEERS = 'takes minutes, and other solvers from PyPI; its options are held to its --help'
+# Commands of the pages that no test runs as they stand, by how they begin, and why.
+NOT_RUN = {
+    'make ': 'makes an environment from PyPI; test_make.py and ros/test_demo.py hold its parts',
+    'rosdep ': 'no ROS installation here',
+    'colcon ': 'no ROS installation here; test_package.py and test_builds.py build the package',
+    'ros2 ': 'no ros2cli here; the same executable is run as .venv/bin/...',
+    'rviz2 ': 'no RViz here; its layout is held to the topics by test/ros',
+    'pip install': 'fetches from PyPI; test_builds.py installs what is built',
+    'python -m build': 'test_builds.py builds both',
+    'python benchmarks/false_loops.py': PEERS,
+    'python benchmarks/gps.py': MINUTES,
+    'python benchmarks/norms.py': MINUTES,
+    'python benchmarks/solvers ': PEERS,
+    'python benchmarks/incremental.py': PEERS,
+    'python benchmarks/cli/startup.py': MINUTES,
+    'python benchmarks/ros/clocks.py': MINUTES,
+    'l1slam reproduce': 'takes minutes; test/paper runs its parts',
+    'l1slam simulate w.g2o': 'takes minutes and 1.5 GB',
+    'l1slam solve w.g2o': 'takes minutes and 1.5 GB',
+}
+
+
+class Block(NamedTuple):
+    """A fenced block: its language, its text, and the heading it stands under."""
+
+    language: str
+    text: str
+    heading: str
+
+
+def blocks(page):
+    """Return the fenced blocks of a page."""
+    found, heading, language, lines = [], '', None, []
+    for line in page.read_text().splitlines():
+        if language is None and line.startswith('#'):
+            heading = line.lstrip('# ')
+        elif language is not None and line == '```':
+            found.append(Block(language, '\n'.join(lines) + '\n', heading))
+            language = None
+        elif language is None and line.startswith('```'):
+            language, lines = line[3:], []
+        else:
+            lines.append(line)
+    assert language is None, f'{page.name}: a block has no end'
+    return found
+
+
+def prose(page):
+    """Return a page without its fenced blocks."""
+    return re.sub(r'^```.*?^```$', '', page.read_text(), flags=re.M | re.S)
+
+
+def commands(text):
+    """Return the command lines of a block, without comments."""
+    lines = (re.sub(r'(^|\s)#.*', '', line).strip() for line in text.splitlines())
+    return [line for line in lines if line]
+
+
+def reason_not_to_run(command):
+    return next((reason for begin, reason in NOT_RUN.items() if command.startswith(begin)), '')
+
+
+NEED_ROS = '.venv/bin/backend', '.venv/bin/replay', 'python benchmarks/ros/walk.py'
+
+
+def all_commands():
+    return [command for page in PAGES for block in blocks(page) if block.language == 'sh'
+            for command in commands(block.text)]
+
+
+def of_page(page):
+    return page.name
+
+
+def test_the_readme_is_short():
+    assert len(README.read_text().split()) <= MOST_WORDS
+
+
+def test_the_readme_leads_to_every_page():
+    assert set(re.findall(r'\]\(doc/(\w+\.md)\)', README.read_text())) == {
+        page.name for page in PAGES[1:]}
+
+
+@pytest.mark.parametrize('page', PAGES, ids=of_page)
+def test_every_link_leads_somewhere(page):
+    for target in re.findall(r'\]\(([^)]+)\)', prose(page)):
+        if not target.startswith(('http://', 'https://')):
+            name, _, anchor = target.partition('#')
+            there = page.parent / name if name else page
+            assert there.exists(), target
+            headings = re.findall(r'^#+ (.*)$', there.read_text(), re.M) if anchor else ()
+            assert not anchor or anchor in {
+                re.sub(r'[^\w -]', '', heading).lower().replace(' ', '-')
+                for heading in headings}, target
+
+
+@pytest.mark.parametrize('page', PAGES, ids=of_page)
+def test_every_file_that_is_named_is_there(page):
+    for path in re.findall(r'`((?:test|config|bags|benchmarks|l1slam_ros)/[\w./]+)`', prose(page)):
+        assert (ROOT / path).exists(), path
+
+
+@pytest.mark.parametrize('page', PAGES, ids=of_page)
+def test_every_block_says_what_it_is(page):
+    assert {block.language for block in blocks(page)} <= {'sh', 'python', 'diff'}
+    # What is only indented, no test would find.
+    assert not re.search(r'^    \S', prose(page), re.M)
+
+
+def test_the_glossary_is_short_and_says_each_word_once():
+    rows = re.findall(r'^\| ([^|]+) \| ', (ROOT / 'doc' / 'glossary.md').read_text(), re.M)
+    assert rows[0] == 'word'
+    assert len(rows) - 1 <= MOST_TERMS
+    assert rows[1:] == sorted(set(rows[1:]), key=str.casefold)
+
+
+def test_what_is_not_run_is_in_a_page_and_has_a_reason(capsys):
+    left = {command: reason for command in all_commands()
+            if (reason := reason_not_to_run(command))}
+    for begin, reason in NOT_RUN.items():
+        assert reason and any(command.startswith(begin) for command in left), begin
+    with capsys.disabled():
+        print('\ncommands of README and doc/ that are not run:')
+        for command, reason in left.items():
+            print(f'  {command}\n    {reason}')
+
+
+BENCHMARKS = sorted({
+    command for page in PAGES
+    for command in (*re.findall(r'`(python benchmarks/[^`]+)`', prose(page)), *all_commands())
+    if command.startswith('python benchmarks/')})
+
+
+@pytest.mark.parametrize('command', BENCHMARKS)
+def test_a_benchmark_knows_the_options_that_a_page_gives_it(command):
+    _, script, *arguments = shlex.split(command)
+    helped = subprocess.run([sys.executable, script, '--help'], cwd=ROOT, capture_output=True,
+                            text=True, timeout=120)
+    assert helped.returncode == 0, helped.stderr
+    assert {word for word in arguments if word.startswith('--')} <= set(
+        re.findall(r'--[\w-]+', helped.stdout))
+    places = len(re.findall(r'^  [a-zA-Z]\w*', helped.stdout, re.M))
+    assert not arguments or arguments[0].startswith('--') or places
+
+
+# What is `l1slam WORD ...` in a sentence or a table.
+INLINE = sorted({found for page in PAGES
+                 for found in re.findall(r'`(l1slam \w[^`]*)`', prose(page))})
+
+
+@pytest.mark.parametrize('command', INLINE)
+def test_a_command_in_a_sentence_has_options_that_there_are(command, capsys):
+    _, word, *arguments = shlex.split(command)
+    with pytest.raises(SystemExit) as ended:
+        main([word, '--help'])
+    assert ended.value.code == 0
+    said = capsys.readouterr().out
+    for option in (word for word in arguments if word.startswith('--')):
+        assert option.replace('--no-', '--') in said, option
+
+
+def room(folder, package=ROOT):
+    """Return a folder like a fresh checkout, beside its own outputs, and what it is run with."""
+    for entry in ROOT.iterdir():
+        if entry.name not in ('.git', '.venv', 'demo', 'build', 'l1slam_ros'):
+            (folder / entry.name).symlink_to(entry)
+    if package == ROOT:
+        (folder / 'l1slam_ros').symlink_to(ROOT / 'l1slam_ros')
+    (folder / '.venv').symlink_to(sys.prefix)
+    return {**os.environ, 'PATH': f'{folder / ".venv" / "bin"}:{os.environ["PATH"]}',
+            'DATASETS': str(ROOT.parent / 'shared' / 'datasets')}
+
+
+def run(command, folder, environment, codes=(0,)):
+    ran = subprocess.run(['sh', '-c', command], cwd=folder, env=environment, capture_output=True,
+                         text=True, timeout=300)
+    assert ran.returncode in codes, f'{command}\n{ran.returncode}\n{ran.stdout}{ran.stderr}'
+    return ran
+
+
+@contextmanager
+def backend(command, folder, environment):
+    """Run the node until the block ends; it has to end by SIGINT with 0."""
+    errors = folder / 'backend.txt'
+    with errors.open('w') as stream:
+        process = subprocess.Popen(shlex.split(command.rstrip('& ')), cwd=folder,
+                                   env=environment, stderr=stream, start_new_session=True)
+        try:
+            for _ in range(600):
+                if 'ready' in errors.read_text():
+                    break
+                assert process.poll() is None, errors.read_text()
+                with pytest.raises(subprocess.TimeoutExpired):
+                    process.wait(0.1)
+            yield
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 0, errors.read_text()
+        finally:
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.parametrize('page', [page for page in PAGES if page != RECIPES], ids=of_page)
+def test_the_commands_of_a_page_run_in_their_order(page, tmp_path):
+    environment, nodes = room(tmp_path), []
+    for block in blocks(page):
+        if block.language == 'python':
+            run(f'{shlex.quote(sys.executable)} -c {shlex.quote(block.text)}', tmp_path,
+                environment)
+        for command in commands(block.text) if block.language == 'sh' else ():
+            needs_ros = command.startswith(NEED_ROS)
+            if reason_not_to_run(command) or (needs_ros and not has_ros()) or (
+                    '$DATASETS' in command and not Path(environment['DATASETS']).exists()):
+                continue
+            if command.startswith('.venv/bin/backend'):
+                nodes.append(backend(command, tmp_path, environment))
+                nodes[-1].__enter__()
+            else:
+                # The best map of a graph with lies that nobody vouches for may be doubtful.
+                run(command, tmp_path, environment, (0, 4) if 'lies' in command else (0,))
+    for node in nodes:
+        node.__exit__(None, None, None)
+
+
+def has_ros():
+    try:
+        import rclpy  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def copied_package(folder):
+    """Copy the package, compiled loops and all, and put an `l1slam` of it into the path."""
+    shutil.copytree(ROOT / 'l1slam_ros', folder / 'l1slam_ros')
+    (folder / 'bin').mkdir()
+    command = folder / 'bin' / 'l1slam'
+    command.write_text(
+        f'#!/bin/sh\nPYTHONPATH={shlex.quote(str(folder))} exec {shlex.quote(sys.executable)} -c '
+        '"import sys; from l1slam_ros.cli.main import main; sys.exit(main(sys.argv[1:]))" "$@"\n')
+    command.chmod(0o755)
+
+
+def carry_out(block, folder):
+    """Change the copy as a block says; return the path that it names."""
+    first, _, rest = block.text.partition('\n')
+    path = first.split()[1]
+    if block.language == 'python':
+        assert not (folder / path).exists(), path
+        (folder / path).write_text(rest)
+        return path
+    lines = rest.splitlines()
+    before, after = (''.join(f'{line[1:]}\n' for line in lines if line[0] in marks)
+                     for marks in (' -', ' +'))
+    text = (folder / path).read_text()
+    assert text.count(before) == 1, f'{path}: {text.count(before)} times\n{before}'
+    (folder / path).write_text(text.replace(before, after))
+    return path
+
+
+def assert_the_map_is_good(trials, folder, environment):
+    """Hold the map of the first solve to one of a norm and a solver that are tested elsewhere."""
+    truth = folder / 'world.g2o.truth.txt'
+    asked = next(command for command in trials if command.startswith('l1slam solve'))
+    asked = re.sub(' --(reference|output) \\S+', '', asked)
+    ours, theirs = (
+        json.loads(run(f'{command} --no-robust --json --quiet --reference {truth}', folder,
+                       environment).stdout) for command in (asked, 'l1slam solve world.g2o'))
+    assert ours['status'] == 'converged'
+    assert ours['poses'] == ours['ate_poses'] == 200
+    assert ours['ate'] < 1.5 * theirs['ate']
+    if '--solver' in asked:
+        assert ours['solver'] == 'newton'
+        assert ours['final_cost'] == pytest.approx(theirs['final_cost'], rel=1e-4)
+
+
+@pytest.mark.parametrize('heading, said', [
+    ('Add a norm', 'pseudo-huber'), ('Add a solver', 'newton'), ('Add an input', '.edges')])
+def test_a_recipe_carried_out_as_written_does_what_it_says(heading, said, tmp_path):
+    environment = room(tmp_path, package=None)
+    copied_package(tmp_path)
+    environment['PATH'] = f'{tmp_path / "bin"}:{environment["PATH"]}'
+    ours = [block for block in blocks(RECIPES) if block.heading == heading]
+    trials = [command for block in ours if block.language == 'sh'
+              for command in commands(block.text)]
+    (first,) = commands(blocks(RECIPES)[0].text)
+    run(first, tmp_path, environment)
+    # Without the recipe nobody knows the name.
+    assert said in run(trials[-1], tmp_path, environment, (2,)).stderr
+    changed = {carry_out(block, tmp_path) for block in ours if block.language != 'sh'}
+    for command in trials:
+        run(command, tmp_path, environment)
+    assert_the_map_is_good(trials, tmp_path, environment)
+    style = [sys.executable, '-m', 'ruff', 'check', '--no-cache', *changed]
+    assert subprocess.run(style, cwd=tmp_path, capture_output=True).returncode == 0
+
