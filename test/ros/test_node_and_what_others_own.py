@@ -26,6 +26,12 @@ def kept_in(folder):
     return kept
 
 
+def drive(b, first, last):
+    """Drive, until there is a map."""
+    b.drive(first, last)
+    b.until(lambda: b.backend._backend.counts()[0]['keyframes'] == last - first, 'a map')
+
+
 def files_of(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.rglob('*')) if path.is_file()}
 
@@ -53,13 +59,13 @@ def test_a_graph_at_save_path_outlives_every_save_and_reset(bench, tmp_path, per
     path.write_text(GRAPH)
     b = bench(save_path=str(path), autosave_period=period)
     for begin in (0, 5):
-        b.drive(begin, begin + 4)
+        drive(b, begin, begin + 4)
         for _ in range(2):
             answer = call(b, 'save')
             assert answer.success
         assert call(b, 'reset').success
         assert kept_in(tmp_path)
-    b.drive(10, 13)
+    drive(b, 10, 13)
     assert call(b, 'save').success
     assert kept_in(tmp_path)
 
@@ -68,6 +74,6 @@ def test_the_answer_says_what_was_kept(bench, tmp_path):
     path = tmp_path / 'map.g2o'
     path.write_text(GRAPH)
     b = bench(save_path=str(path), autosave_period=0.0)
-    b.drive(0, 3)
+    drive(b, 0, 3)
     message = call(b, 'save').message
     assert str(kept_in(tmp_path)) in message
