@@ -73,7 +73,7 @@ class Judged:
     loops : of so many there is a judgement; anew : of so many there is one from the graph alone;
     doubted : so many there were when a judgement last doubted those that it refused; poses :
     (n, p) the L2 map of the last one, None: there is none; wanted : the front has left a loop that
-    fits; norm_of : the map of which was asked whether it hangs on its norm; began, ended, took :
+    fits; compared : the map that was last compared with that of another norm; began, ended, took :
     of the last one that went on from the one before; anew_ended, anew_took : of the last one anew
     """
 
@@ -82,7 +82,7 @@ class Judged:
     doubted: int
     poses: Array | None = None
     wanted: bool = False
-    norm_of: Optimised | None = None
+    compared: Optimised | None = None
     began: float = 0.0
     ended: float = 0.0
     took: float = 0.0
@@ -93,7 +93,7 @@ class Judged:
               now: float) -> 'Judged':
         """Return it after a judgement of so many loops; anew : from the graph alone."""
         doubted = loops if judgement.is_refusal_doubted else self.doubted
-        after = replace(self, loops=loops, poses=poses, norm_of=None, doubted=doubted, ended=now)
+        after = replace(self, loops=loops, poses=poses, compared=None, doubted=doubted, ended=now)
         if anew:
             return replace(after, anew=loops, anew_ended=now, anew_took=now - self.began)
         return replace(after, took=now - self.began)
@@ -248,11 +248,11 @@ class MapState:
             made=now, bound=bound[0], bound_at=bound[1])
 
     def doubted(self, earlier: 'MapState', doubts: tuple[Doubt, ...]) -> 'MapState':
-        """Return the state with the doubts of an earlier one's norm, if its map is the same."""
+        """Return the state with what was found of an earlier one, if its map is the same."""
         if self.optimised is not earlier.optimised or self.of_all is not earlier.of_all:
             return self
         of_all = replace(self.of_all, doubts=tuple(dict.fromkeys(self.of_all.doubts + doubts)))
-        return replace(self, of_all=of_all, judged=replace(self.judged, norm_of=self.optimised))
+        return replace(self, of_all=of_all, judged=replace(self.judged, compared=self.optimised))
 
     def account(self, loops: int, seconds: float) -> Improvement:
         """Return what the last map says of itself, after an update that took so long."""

@@ -28,7 +28,7 @@ EMPTY = MapState.beginning(0, True, Optimised.nothing(se2.identity(0)), Judgemen
 RESTED = replace(
     MapState.beginning(7, True, MAP, JUDGEMENT, 2),
     carried=Carried(rows=5, taken=0, closed=False, keyframes=4, border=0, variance=np.ones(2)))
-RESTED = replace(RESTED, judged=replace(RESTED.judged, norm_of=MAP, took=1.0, ended=NOW - 1.5))
+RESTED = replace(RESTED, judged=replace(RESTED.judged, compared=MAP, took=1.0, ended=NOW - 1.5))
 
 
 def with_front(**changes):
@@ -78,12 +78,12 @@ TABLE = {
     'it was asked just now': (
         with_judge(DOUBTED, anew_ended=NOW - 1.0), SIZE, BUSY, None, None),
     'there are twice as many loops by now': (DOUBTED, Size(4, 21, 4), BUSY, None, None),
-    'the norm was not asked yet': (with_judge(norm_of=None), SIZE, IDLE, None, Work.NORM),
-    'the same while it drives': (with_judge(norm_of=None), SIZE, BUSY, None, None),
+    'no other norm was asked yet': (with_judge(compared=None), SIZE, IDLE, None, Work.NORM),
+    'the same while it drives': (with_judge(compared=None), SIZE, BUSY, None, None),
     'no norm is asked of a map that is to be made anew': (
-        with_judge(PENDING, norm_of=None), SIZE, IDLE, Work.ROUND, None),
+        with_judge(PENDING, compared=None), SIZE, IDLE, Work.ROUND, None),
     'where nothing is doubted, nothing is judged': (
-        replace(with_judge(norm_of=None), robust=False), ONE_MORE_LOOP, BUSY, None, None),
+        replace(with_judge(compared=None), robust=False), ONE_MORE_LOOP, BUSY, None, None),
 }
 
 

@@ -27,7 +27,7 @@ class Work(Enum):
     EXACT = 'solve for the map to the end, and factor it'
     JUDGE = 'judge all loops, from what is believed on'
     JUDGE_ANEW = 'judge all loops, from the graph alone'
-    NORM = 'ask whether the map hangs on its norm'
+    NORM = 'compare the map with that of another norm'
 
 
 @dataclass(frozen=True)
@@ -71,10 +71,11 @@ def _map(state: MapState, idle: bool) -> Work:
 def _judgement(state: MapState, size: Size, moment: Moment, make: bool) -> Work | None:
     anew = is_anew_due(state, size, moment)
     if is_judge_due(state, size, moment):
-        # At rest first what is the sooner over, and all there is to find out mostly.
+        # At rest first from what is believed on: that takes less time, and mostly finds as much.
         return Work.JUDGE_ANEW if anew else Work.JUDGE
-    asked = state.judged.norm_of is state.optimised
-    if state.robust and moment.idle and not (make or asked) and state.all_judged_anew(size.loops):
+    compared = state.judged.compared is state.optimised
+    final = moment.idle and not make and state.all_judged_anew(size.loops)
+    if state.robust and final and not compared:
         return Work.NORM
     return None
 

@@ -18,14 +18,13 @@ from dataclasses import replace
 from functools import partial
 
 from l1slam_ros.core.errors import Interrupted
-from l1slam_ros.core.running.improve import Improvement, front_of, optimise
+from l1slam_ros.core.running.improve import Check, Improvement, front_of, optimise
 from l1slam_ros.core.running.keeper.keeper import Keeper
 from l1slam_ros.core.running.keeper.schedule import Moment, Size, due
 from l1slam_ros.core.running.keeper.work import carry_out, take_judgement
 from l1slam_ros.core.running.keeper.workers import (
     LOOK,
     Calm,
-    Check,
     Requests,
     Stopped,
     Workers,

@@ -14,10 +14,10 @@ from l1slam_ros.core.bordered.front import Look
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.robust.batch import doubts_of_norm, judge, robust_solve
 from l1slam_ros.core.robust.judgement import Judgement
-from l1slam_ros.core.running.improve import front_of, improve, one_round
+from l1slam_ros.core.running.improve import Check, front_of, improve, one_round
 from l1slam_ros.core.running.keeper.keeper import Keeper
 from l1slam_ros.core.running.keeper.schedule import Moment, Work, is_late
-from l1slam_ros.core.running.keeper.workers import Check, until
+from l1slam_ros.core.running.keeper.workers import until
 from l1slam_ros.core.running.problem import as_one
 from l1slam_ros.core.running.snapshot import Snapshot
 
@@ -33,7 +33,7 @@ def carry_out(keeper: Keeper, piece: Work, moment: Moment, check: Check) -> None
     if piece in (Work.ROUND, Work.EXACT):
         make_map(keeper, piece is Work.EXACT, moment.budget, check)
     elif piece is Work.NORM:
-        ask_norm(keeper, check)
+        compare_norms(keeper, check)
     else:
         judge_all(keeper, piece is Work.JUDGE_ANEW, moment.idle, check)
 
@@ -77,8 +77,8 @@ def judge_all(keeper: Keeper, anew: bool, idle: bool, check: Check) -> None:
     take_judgement(keeper, now, judgement.of_all(whole.graph), l2_poses, anew)
 
 
-def ask_norm(keeper: Keeper, check: Check) -> None:
-    """Doubt the map where it hangs on its norm."""
+def compare_norms(keeper: Keeper, check: Check) -> None:
+    """Doubt the map where another norm has another one."""
     now = keeper.snapshot()
     problem = as_one(now.problem())
     doubts = doubts_of_norm(problem.graph, problem.judgement, problem.poses, check)

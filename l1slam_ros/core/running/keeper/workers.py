@@ -10,12 +10,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from l1slam_ros.core.errors import Interrupted
+from l1slam_ros.core.running.improve import Check
 
 # [s] How often who waits looks whether to stop.
 LOOK = 0.05
 
-# Called on the way, often; raises `Interrupted` where the work shall stop.
-Check = Callable[[], None]
 # Asked on the way, often: whether to stop.
 Stopped = Callable[[], bool]
 
