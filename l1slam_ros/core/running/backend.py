@@ -266,9 +266,8 @@ class Backend:
 
     def behind(self) -> Behind:
         """Return what goes on behind updates."""
-        with self._keeper.reading() as builder:
-            state, loops = self._keeper.state, len(builder.loops.rows)
-        return Behind.of(state, loops, time.monotonic())
+        state, _, size = self._keeper.look()
+        return Behind.of(state, size.loops, time.monotonic())
 
     def news(self) -> list[str]:
         """Return what is new in the notes on messages; see `GraphBuilder.notes`."""

@@ -205,9 +205,5 @@ def _rows(judgement: Judgement, said_by: int) -> Any:
 
 def _rows_of_looks(looks: Sequence[Look]) -> Any:
     """Return the rows of factors that a front took: its map is of what it accepted."""
-    rows = np.zeros(len(looks), ROW)
-    rows['accepted'] = rows['in_map'] = [look.accepted for look in looks]
-    rows['suspect'] = [look.suspect for look in looks]
-    rows['sigmas'] = [look.sigmas for look in looks]
-    rows['noise'], rows['said_by'] = np.nan, FRONT
-    return rows
+    return np.array([(look.accepted, look.suspect, look.accepted, False, FRONT, look.sigmas,
+                      np.nan) for look in looks], ROW)

@@ -256,9 +256,9 @@ class MapState:
 
     def account(self, loops: int, seconds: float) -> Improvement:
         """Return what the last map says of itself, after an update that took so long."""
-        optimised = self.optimised
-        judgement = replace(self.table.judgement(self.of_all), settled=self.all_judged(loops))
-        if self.last is None:
-            return Improvement(self.began, optimised.poses, optimised.dual, judgement, 0.0, 0.0,
-                               Status.OUT_OF_TIME, 0, 0, 0, np.inf, seconds)
-        return replace(self.last, judgement=judgement, seconds=seconds)
+        settled, last = self.all_judged(loops), self.last
+        if last is None:
+            judgement = replace(self.table.judgement(self.of_all), settled=settled)
+            return Improvement(self.began, self.optimised.poses, self.optimised.dual, judgement,
+                               0.0, 0.0, Status.OUT_OF_TIME, 0, 0, 0, np.inf, seconds)
+        return replace(last, judgement=replace(last.judgement, settled=settled), seconds=seconds)

@@ -22,13 +22,13 @@ from dataclasses import dataclass
 
 from l1slam_ros.core.bordered.front import Front, Look
 from l1slam_ros.core.errors import Interrupted
-from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import BetweenFactors
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.improve import Improvement
+from l1slam_ros.core.running.keeper.schedule import Size
 from l1slam_ros.core.running.map_state import Carried, MapState, Newest
 from l1slam_ros.core.running.map_to_odom import MapToOdom
 from l1slam_ros.core.running.optimised import Optimised
@@ -192,6 +192,11 @@ class Keeper:
             builder, graph = self._builder.grown(), self._revisions.graph
         return SavedMap(builder, now.optimised(), now.judgement, now.state.robust, graph)
 
+    def look(self) -> tuple[MapState, BetweenFactors, Size]:
+        """Return the state, the factors, and how large the graph is."""
+        with self._graph_lock:
+            return self._state, self._builder.graph.between, Size.of(self._builder)
+
     def robot(self) -> Robot | None:
         """See `Backend.robot`."""
         with self._graph_lock:
@@ -262,17 +267,6 @@ class Keeper:
         self._revisions = self._revisions.after(map=True)
 
     # What the workers make.
-
-    def for_new_front(self, part: Mask,
-                      pending: Judgement | None) -> tuple[BetweenFactors, Indices]:
-        """
-        Return all factors, and what a new front is to do with them, as far as anybody looked.
-
-        part : the factors that its map is of; pending : the judgement that it is made for
-        """
-        with self._front_lock, self._graph_lock:
-            state, factors = self._state, self._builder.graph.between
-        return factors, state.table.for_new_front(factors, part, pending is not None)
 
     def adopt(self, improvement: Improvement, front: Front | None = None,
               pending: Judgement | None = None, looks: Sequence[Look] = ()) -> None:

@@ -20,7 +20,7 @@ from functools import partial
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.running.improve import Check, Improvement, front_of, optimise
 from l1slam_ros.core.running.keeper.keeper import Keeper
-from l1slam_ros.core.running.keeper.schedule import Moment, Size, due
+from l1slam_ros.core.running.keeper.schedule import Moment, due
 from l1slam_ros.core.running.keeper.work import carry_out, take_judgement
 from l1slam_ros.core.running.keeper.workers import (
     LOOK,
@@ -91,16 +91,14 @@ class Updates:
         return None
 
     def _account(self, start: float) -> Improvement:
-        with self._keeper.reading() as builder:
-            loops = len(builder.loops.rows)
-        return self._keeper.state.account(loops, time.monotonic() - start)
+        state, _, size = self._keeper.look()
+        return state.account(size.loops, time.monotonic() - start)
 
     def _begin_due(self, idle: bool, budget: float, check: Check) -> bool:
         """Let the workers begin what is due; return whether any is at work."""
         moment = Moment(time.monotonic(), idle, budget)
-        with self._keeper.reading() as builder:
-            size = Size.of(builder)
-        make, judge = due(self._keeper.state, size, moment)
+        state, _, size = self._keeper.look()
+        make, judge = due(state, size, moment)
         for worker, piece in ((self._workers.mapper, make), (self._workers.judge, judge)):
             if piece is not None:
                 worker.start(partial(

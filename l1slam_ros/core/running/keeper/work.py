@@ -56,7 +56,9 @@ def make_map(keeper: Keeper, exact: bool, budget: float, check: Check) -> None:
     front = front_of(problem, improvement.poses, looked, check)
     looks = list[Look]()
     for _ in range(_PASSES):
-        factors, what = keeper.for_new_front(whole.judgement.accepted, pending)
+        state, factors, _ = keeper.look()
+        what = state.table.for_new_front(
+            factors, whole.judgement.accepted, pending is not None)
         while front is not None and not front.closed and front.rows < len(what):
             check()
             looks += front.take(factors, what[front.rows:front.rows + _AT_ONCE])
