@@ -210,9 +210,9 @@ class FactorGraph:
         before = np.arange(first - 1, first + count - 1)
         before[:1] = NO_PREDECESSOR if begins_part else self._last.get(robot, NO_PREDECESSOR)
         self._predecessor.extend(before)
-        self._robot.extend(np.full(count, robot))
-        if count:
-            self._last[robot] = self.n_poses - 1
+        before[:] = robot
+        self._robot.extend(before)
+        self._last[robot] = self.n_poses - 1
         self._factors = None
 
     def append_step(self, measurement: Array, sqrt_information: Array, robot: int = 0) -> None:

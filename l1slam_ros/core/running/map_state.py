@@ -13,6 +13,7 @@ and the transitions pure: who holds one need not hold a lock.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,8 +30,7 @@ from l1slam_ros.core.solvers.optimality import Status
 _TOLD_SINCE = -1
 
 
-@dataclass(frozen=True)
-class Carried:
+class Carried(NamedTuple):
     """
     What a front carries beside the map that it was made of.
 
@@ -49,20 +49,6 @@ class Carried:
         """Return what a front carries now."""
         return Carried(front.rows, front.taken, front.closed, front.keyframes, front.border,
                        front.variance)
-
-
-@dataclass(frozen=True)
-class Newest:
-    """The last keyframe of the map, which keyframes to come follow, -1: none; its pose (1, p)."""
-
-    keyframe: int
-    pose: Array
-
-    @staticmethod
-    def of(poses: Array, front: Front | None) -> 'Newest':
-        """Return that of a map, poses (n, p), or of its front where there is one."""
-        return (Newest(front.keyframes - 1, front.newest) if front
-                else Newest(len(poses) - 1, poses[-1:]))
 
 
 @dataclass(frozen=True)
@@ -109,7 +95,6 @@ class MapState:
     began : the revision at which this map began: it names it, see `Improvement`
     robust : loops may be doubted
     optimised : the last map that was solved for
-    newest : where the map ends
     table : what is said of each factor
     of_all : what the last judgement says of all factors together; it has no columns
     judged : what the judge has done
@@ -126,7 +111,6 @@ class MapState:
     began: int
     robust: bool
     optimised: Optimised
-    newest: Newest
     table: FactorTable
     of_all: Judgement
     judged: Judged
@@ -145,8 +129,7 @@ class MapState:
         of_all = replace(judgement, accepted=none.accepted, suspect=none.suspect,
                          sigmas=none.sigmas, noise=none.noise)
         return MapState(
-            began, robust, optimised, Newest.of(optimised.poses, None),
-            FactorTable.of_judgement(judgement), of_all,
+            began, robust, optimised, FactorTable.of_judgement(judgement), of_all,
             Judged(judged_loops, judged_loops, judged_loops * judgement.is_refusal_doubted))
 
     @property
@@ -187,10 +170,6 @@ class MapState:
         if wanted and not judged.wanted:
             judged = replace(judged, wanted=True)
         return replace(self, table=self.table.with_looks(new), carried=carried, judged=judged)
-
-    def ending(self, newest: Newest) -> 'MapState':
-        """Return the state whose map ends elsewhere by now."""
-        return replace(self, newest=newest)
 
     def being_judged(self, now: float) -> 'MapState':
         """Return the state while the judge looks at all loops that there are."""

@@ -117,6 +117,28 @@ def test_nobody_sees_the_front_of_a_map_that_was_replaced(monkeypatch):
     assert len(now.poses) == now.graph.n_poses == 0
 
 
+def test_nobody_follows_the_end_of_a_map_that_was_replaced(monkeypatch):
+    backend, newest = Backend(EVERY), Front.newest.fget
+    drive(backend, 0, 5)
+    while backend.update(DEADLINE) is not None:
+        pass
+
+    def slowly(front):
+        seen = newest(front)
+        backend.reset()
+        drive(backend, 100, 102)
+        return seen
+
+    drive(backend, 5, 6)
+    with monkeypatch.context() as patched:
+        patched.setattr(Front, 'newest', property(slowly))
+        with pytest.raises(Interrupted):
+            backend.update(DEADLINE)
+    now = backend.snapshot()
+    np.testing.assert_allclose(now.poses[:, 0], [100, 101])
+    np.testing.assert_allclose(now.map_to_odom, np.zeros((1, 3)))
+
+
 def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):
     backend, meeting = Backend(EVERY), Meeting()
     drive(backend, 0, 5)

@@ -32,7 +32,7 @@ RESTED = replace(RESTED, judged=replace(RESTED.judged, compared=MAP, took=1.0, e
 
 
 def with_front(**changes):
-    return replace(RESTED, carried=replace(RESTED.carried, **changes))
+    return replace(RESTED, carried=RESTED.carried._replace(**changes))
 
 
 def with_judge(state=RESTED, **changes):

@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from l1slam_ros.core.bordered.front import Front, Look
 from l1slam_ros.core.errors import Interrupted
@@ -29,8 +29,8 @@ from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptio
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.improve import Improvement
 from l1slam_ros.core.running.keeper.schedule import Size
-from l1slam_ros.core.running.map_state import Carried, MapState, Newest
-from l1slam_ros.core.running.map_to_odom import MapToOdom
+from l1slam_ros.core.running.map_state import Carried, MapState
+from l1slam_ros.core.running.map_to_odom import MapToOdom, Newest
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.running.snapshot import Robot, SavedMap, Snapshot
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
@@ -40,8 +40,7 @@ from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 _AT_ONCE = 4
 
 
-@dataclass(frozen=True)
-class Revisions:
+class Revisions(NamedTuple):
     """
     The one number that counts the changes of a back end, and where it stood at some of them.
 
@@ -77,8 +76,8 @@ class Keeper:
         self._front_lock, self._graph_lock = threading.Lock(), threading.Lock()
         self._builder, self._solver, self._robust = builder, solver, robust
         self._front: Front | None = None
-        self._odom, self._revisions = MapToOdom(), Revisions()
         nothing = Optimised.nothing(builder.graph.manifold.identity(0))
+        self._odom, self._revisions = MapToOdom(Newest.of(nothing.poses, None)), Revisions()
         self._state = MapState.beginning(0, robust, nothing, Judgement.nothing(), 0)
 
     @property
@@ -148,12 +147,12 @@ class Keeper:
         """Begin a map, see `begin`; the graph is locked."""
         builder, self._front = self._builder, None
         self._revisions = self._revisions.after(map=not same_graph, graph=not same_graph)
+        optimised = optimised or Optimised.nothing(builder.graph.manifold.identity(0))
         judgement = judgement or Judgement.nothing()
         judged_loops = int((builder.loops.rows < len(judgement.accepted)).sum())
+        self._odom.begin(Newest.of(optimised.poses, None))
         self._state = MapState.beginning(
-            self._revisions.now, self._robust,
-            optimised or Optimised.nothing(builder.graph.manifold.identity(0)), judgement,
-            judged_loops)
+            self._revisions.now, self._robust, optimised, judgement, judged_loops)
 
     # What is there.
 
@@ -181,8 +180,8 @@ class Keeper:
                 views = views if front is self._front else ()
                 yield Snapshot(
                     self._state, self._builder.graph.copy(), track.keyframe_stamps,
-                    track.keyframe_poses, self._map_to_odom, loops.rows, loops.stamps, views,
-                    front.pattern if front and views else None)
+                    track.keyframe_poses, self._odom.now(self._builder), loops.rows,
+                    loops.stamps, views, front.pattern if front and views else None)
 
     def saved(self) -> SavedMap | None:
         """See `Backend.saved`."""
@@ -201,12 +200,13 @@ class Keeper:
         """See `Backend.robot`."""
         with self._graph_lock:
             last = self._builder.stream.last
-            return Robot(last.stamp, last.pose, self._map_to_odom) if last else None
+            now = self._odom.now(self._builder)
+            return Robot(last.stamp, last.pose, now) if last else None
 
     def moved(self) -> tuple[Array, Array]:
         """See `Backend.moved`."""
         with self._graph_lock:
-            return self._odom.moved(self._map_to_odom)
+            return self._odom.moved(self._builder)
 
     def covariance(self, keyframe: int) -> Array | None:
         """See `Backend.marginal_covariance`."""
@@ -215,17 +215,13 @@ class Keeper:
             known = front is not None and 0 <= keyframe < front.keyframes
             return front.covariance(keyframe) if front and known else None
 
-    @property
-    def _map_to_odom(self) -> Array:
-        return self._odom.now(self._builder, self._state.newest)
-
     # What the front takes.
 
     def take_what_has_come(self, deadline: float) -> None:
         """Make factors of the due loops; let the front take what is new to it until a time [s]."""
         with self._front_lock, self._graph_lock:
             self._add_due_loops()
-            before, taken = self._map_to_odom, False
+        taken = False
         while time.monotonic() < deadline:
             with self._front_lock:
                 if not self._take_some():
@@ -234,9 +230,11 @@ class Keeper:
             time.sleep(0)  # who waits for the lock would else wait for the deadline
         if taken:
             with self._front_lock:
-                newest = Newest.of(self._state.optimised.poses, self._front)
+                state = self._state
+                newest = Newest.of(state.optimised.poses, self._front)
                 with self._graph_lock:
-                    self._end_map(newest, before)
+                    if self._state.began == state.began:
+                        self._move(newest)
 
     def _add_due_loops(self) -> None:
         """Make factors of the loops whose times odometry has reached; the graph is locked."""
@@ -260,10 +258,9 @@ class Keeper:
                 self._state = state.taken(looks, Carried.by(front))
         return bool(looks)
 
-    def _end_map(self, newest: Newest, before: Array) -> None:
-        """Let the map end elsewhere; before : map -> odom until now; the graph is locked."""
-        self._state = self._state.ending(newest)
-        self._odom.note(before, self._map_to_odom)
+    def _move(self, newest: Newest) -> None:
+        """Note that the map is another, which ends here; the graph is locked."""
+        self._odom.move(self._builder, newest)
         self._revisions = self._revisions.after(map=True)
 
     # What the workers make.
@@ -288,12 +285,11 @@ class Keeper:
             state = self._state
             if state.began != improvement.map:
                 raise Interrupted
-            before = self._map_to_odom
             self._state = state.adopted(
                 improvement, carried, looks, pending, self._builder.graph.between,
                 self._solver.outer_tolerance, time.monotonic())
             self._front = front
-            self._end_map(newest, before)
+            self._move(newest)
         # To give its memory back takes long: it shall not be an update that does so last.
         with self._front_lock:
             pass

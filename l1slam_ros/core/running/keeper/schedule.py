@@ -6,8 +6,8 @@ In: the state of the map, how large the graph is by now, and the moment. Out: pi
 for each worker at most. Pure: who carries them out is no concern of it.
 """
 
-from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.running.map_state import MapState
@@ -30,8 +30,7 @@ class Work(Enum):
     NORM = 'compare the map with that of another norm'
 
 
-@dataclass(frozen=True)
-class Size:
+class Size(NamedTuple):
     """How large a graph is: keyframes, rows of its residual, and loops among its factors."""
 
     keyframes: int
@@ -46,8 +45,7 @@ class Size:
         return Size(graph.n_poses, rows, len(builder.loops.rows))
 
 
-@dataclass(frozen=True)
-class Moment:
+class Moment(NamedTuple):
     """The time [s] of any clock; nothing has come for a while; there is so much time now [s]."""
 
     now: float
