@@ -2,7 +2,6 @@
 """Where a running back end keeps its map: when it is saved, and never over that of another."""
 
 import filecmp
-import math
 import os
 import threading
 import time
@@ -45,9 +44,8 @@ class MapFile:
                  warn: Callable[[str], object]):
         self._backend, self._options, self._warn = backend, options, warn
         self.is_saving, self._one = False, threading.Lock()
-        # The first save is due as soon as there is a map: who restarts a node again and again must
-        # not lose all of it again and again.
-        self._began = -math.inf
+        # When the last save began, or the node; and whether there was one.
+        self._began, self._tried = time.monotonic(), False
         # Where the map was saved or loaded last, and its revision then.
         self._known = _absolute(options().save_path), backend.revisions.now
         # The file that we wrote or loaded, its end, and what names the graph whose map it holds;
@@ -74,7 +72,6 @@ class MapFile:
             saved = self._backend.saved() if self._is_to_be_saved() else None
             taken()
             if saved is None:
-                self._began = -math.inf
                 return
             path = self._path()
             for sentence in self._keep_others(path, saved):
@@ -103,6 +100,7 @@ class MapFile:
                 self.is_saving = False
 
     def _write(self, path: Path, saved: SavedMap | None, revision: int) -> str:
+        self._tried = True
         sentence = save_map(path, saved)
         self._known = path, revision
         self._ours = path, _end_of(path), saved.graph_began if saved else 0
@@ -140,9 +138,16 @@ class MapFile:
         (tell if well else self._warn)(sentence)
 
     def is_due(self) -> bool:
-        """Return whether to autosave now."""
+        """
+        Return whether to autosave now.
+
+        The first save is due as soon as there is a map: who restarts a node again and again must
+        not lose all of it again and again. But what stands in its place and was not loaded has
+        time to be.
+        """
         due = self._began + _PART * self._options().autosave_period
-        return time.monotonic() >= due and self._is_to_be_saved()
+        return self._is_to_be_saved() and (time.monotonic() >= due or (
+            not self._tried and (bool(self._ours) or not _end_of(self._path()))))
 
     def _is_to_be_saved(self) -> bool:
         options = self._options()

@@ -202,7 +202,9 @@ def test_what_is_damaged_is_noticed_and_the_map_before_taken(two, rng):
         assert not is_map(two)
         saved, said, whole = load_map(two)
         assert len(saved.optimised.poses) == 5 and not whole
-        assert said.startswith(f'5 keyframes loaded from {two}.1, the map before: {two}: ')
+        # Of a file that is cut within its first line only that line can be complained of.
+        assert re.match(re.escape(f'5 keyframes loaded from {two}.1, the map before: {two}')
+                        + '(:1)?: ', said)
     two.write_bytes(content)
     assert load_map(two)[1] == f'6 keyframes loaded from {two}'
 
@@ -248,16 +250,17 @@ def test_a_map_of_the_version_before_is_read(two, tmp_path):
     assert is_map(old)
     saved, known = load_map(old)[0], load_map(two)[0]
     np.testing.assert_array_equal(saved.optimised.poses, known.optimised.poses)
-    np.testing.assert_array_equal(saved.optimised.judgement.accepted,
-                                  known.optimised.judgement.accepted)
+    np.testing.assert_array_equal(saved.judgement.accepted,
+                                  known.judgement.accepted)
 
 
-def test_others_find_every_believed_edge_before_the_first_comment_line(two, halfway):
+def test_others_find_every_believed_edge_before_the_first_comment_line(two):
     lines = two.read_text().split('\n')
     graph = lines[: next(k for k, line in enumerate(lines) if line.startswith('#'))]
     tags = [line.split()[0] for line in graph]
-    believed = halfway.snapshot().judgement.accepted & ~(
-        halfway.snapshot().graph.between.is_absolute)
+    saved = load_map(two)[0]
+    factors = saved.builder.graph.between
+    believed = saved.judgement.accepted & ~factors.is_absolute
     assert tags.count('EDGE_SE2') == np.count_nonzero(believed)
 
 
@@ -335,11 +338,12 @@ def test_what_killed_writers_left_is_removed(two, halfway):
 def test_to_others_it_is_a_graph_with_comments(halfway, tmp_path):
     saved, path, plain = halfway.saved(), tmp_path / 'map.g2o', tmp_path / 'plain.g2o'
     save_map(path, saved)
-    graph, judgement = saved.builder.graph, saved.optimised.judgement
+    graph, judgement = saved.builder.graph, saved.judgement
     write_graph_file(plain, GraphRecord(graph, saved.optimised.poses, np.arange(50)))
     lines = path.read_text().splitlines()
     def all_of(lines):
-        return sorted(re.sub('^# [a-z]+ (EDGE.*) # factor [0-9]+$', r'\1', line)
+        return sorted(re.sub('^# [a-z]+ (EDGE.*) # factor [0-9]+$', r'\1', line).removesuffix(
+            ' #L1SLAM map 3')
                       for line in lines if not line.startswith('#L') and line != MARK)
 
     assert all_of(lines) == all_of(plain.read_text().splitlines())
