@@ -66,6 +66,10 @@ _PROJECTIONS, _CLOSE = 10, 1e-4
 _LEAST_WEIGHT = 1e-2
 
 
+# What the complementarity products u s and v t shall become, (rows,) each.
+_Products = tuple[Array, Array]
+
+
 @dataclass
 class _Iterate:
     """
@@ -111,7 +115,8 @@ class _Iterate:
         self.s = np.maximum(self.s - dual * direction.y, _SMALLEST_SLACK)
         self.t = np.maximum(self.t + dual * direction.y, _SMALLEST_SLACK)
 
-    def is_solved(self, cost: float, tolerance: float) -> bool:
+    def check_termination(self, cost: float, tolerance: float) -> bool:
+        """Tell whether |e - u + v|_1 and u's + v't are below a part of the cost."""
         split = l1_cost(self.residual - self.u + self.v)
         return split <= tolerance * cost and self.gap <= tolerance * cost
 
@@ -195,7 +200,7 @@ def interior_point(
     status, worst = Status.ITERATION_LIMIT, 1 + tolerance
     for iteration in range(iterations + 1):
         cost = l1_cost(at.residual)
-        if at.is_solved(cost, tolerance) or fits_exactly(cost, len(at.y)):
+        if at.check_termination(cost, tolerance) or fits_exactly(cost, len(at.y)):
             status = Status.CONVERGED if cost <= worst * costs[-1] else Status.STALLED
         if cost <= costs[-1]:
             best = replace(at)
@@ -268,53 +273,73 @@ def _start(problem: L1Problem, poses: Array) -> _Iterate:
 
 
 def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: Curvature) -> bool:
-    """Move `at` by one predictor and corrector step; False: there was no direction."""
-    n, Q, gap = len(at.y), at.weights, at.gap
+    """
+    Move `at` by one affine and one combined step; False: there was no direction.
+
+    They have the names that Clarabel and others give them: the affine step aims at mu = 0, and how
+    far it comes says how far the combined step aims.
+    """
+    Q, gap = at.weights, at.gap
     if not curvature.factorise(at.system, Q, problem.curvature(at.poses, at.y), cholesky):
         return False
-    predictor = _direction(at, cholesky, Q, np.zeros(n), np.zeros(n))
-    mu = gap / (2 * n) * (predictor.gap / gap) ** 3
-    c1, c2 = mu + predictor.u * predictor.y, mu - predictor.v * predictor.y
-    direction = _direction(at, cholesky, Q, c1, c2)
+    affine = _solve_kkt(at, cholesky, Q, _affine_step_rhs(at))
+    mu = gap / (2 * len(at.y)) * (affine.gap / gap) ** 3
+    rhs = _combined_step_rhs(affine, mu)
+    combined = _solve_kkt(at, cholesky, Q, rhs)
     if not at.is_torn:  # else bends hold a step back rather than bounds
-        aligned = _direction(at, cholesky, Q, *_aligned(direction, c1, c2, mu))
-        direction = max(direction, aligned, key=lambda direction: direction.reach)
-    if direction.reach < _SHORT:
+        corrected = _solve_kkt(at, cholesky, Q, _centrality_corrector_rhs(combined, rhs, mu))
+        combined = max(combined, corrected, key=lambda step: step.reach)
+    if combined.reach < _SHORT:
         # Some products u s and v t are far smaller than others: first make them equal.
-        mean = np.full(n, gap / (2 * n))
-        centred = _direction(at, cholesky, Q, mean, mean)
-        direction = max(direction, centred, key=lambda direction: direction.reach)
-    if not np.isfinite(direction.x).all():
+        centring = _solve_kkt(at, cholesky, Q, _centring_step_rhs(at))
+        combined = max(combined, centring, key=lambda step: step.reach)
+    if not np.isfinite(combined.x).all():
         return False
-    primal, at.poses, residual = _trusted(problem, at, direction)
+    primal, at.poses, residual = _line_search(problem, at, combined)
     at.system = problem.linearise(at.poses, residual)
-    at.advance(direction, primal)
+    at.advance(combined, primal)
     return True
 
 
-def _aligned(direction: _Direction, c1: Array, c2: Array, mu: float) -> list[Array]:
+def _affine_step_rhs(at: _Iterate) -> _Products:
+    """Return the products that the affine step aims at: all of them zero."""
+    return np.zeros(len(at.y)), np.zeros(len(at.y))
+
+
+def _combined_step_rhs(affine: _Direction, mu: float) -> _Products:
+    """Return mu, corrected by what the affine step leaves to second order (Mehrotra)."""
+    return mu + affine.u * affine.y, mu - affine.v * affine.y
+
+
+def _centring_step_rhs(at: _Iterate) -> _Products:
+    """Return the mean of the products for each of them."""
+    mean = np.full(len(at.y), at.gap / (2 * len(at.y)))
+    return mean, mean
+
+
+def _centrality_corrector_rhs(direction: _Direction, rhs: _Products, mu: float) -> _Products:
     """
-    Return c1, c2 that bring the products at the end of a direction into line with mu.
+    Return what brings the products at the end of a direction into line with mu (Gondzio).
 
     Meant to become c1 and c2, they end as c1 - du dy and c2 + dv dy. Of those far too large no
     more is taken than the most they may be, or they would rule the step.
     """
     least, most = _ALIKE * mu, mu / _ALIKE
-    ends = c1 - direction.u * direction.y, c2 + direction.v * direction.y
+    ends = rhs[0] - direction.u * direction.y, rhs[1] + direction.v * direction.y
     wanted = []
-    for c, end in zip((c1, c2), ends, strict=True):
+    for c, end in zip(rhs, ends, strict=True):
         # In place: memory that is new each time takes longer than the sums.
         shift = np.clip(end, least, most)
         shift -= end
         np.maximum(shift, -most, out=shift)
         shift += c
         wanted.append(shift)
-    return wanted
+    return wanted[0], wanted[1]
 
 
-def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, c1: Array,
-               c2: Array) -> _Direction:
-    """Solve for the step whose complementarity products become c1, c2 to first order."""
+def _solve_kkt(at: _Iterate, cholesky: BlockCholesky, Q: Array, rhs: _Products) -> _Direction:
+    """Solve for the step whose complementarity products become `rhs` to first order."""
+    c1, c2 = rhs
     # e - (u - v) - (c1/s - u) + (c2/t - v)
     g = at.residual - c1 / at.s + c2 / at.t
     x = cholesky.solve(-at.system.transposed_times(at.y + Q * g))
@@ -324,8 +349,8 @@ def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, c1: Array,
     return _Direction(x, moved, y, u, v, primal, dual, gap)
 
 
-def _trusted(problem: L1Problem, at: _Iterate,
-             direction: _Direction) -> tuple[float, Array, Array]:
+def _line_search(problem: L1Problem, at: _Iterate,
+                 direction: _Direction) -> tuple[float, Array, Array]:
     """
     Halve the primal step while the residual departs too far from its linearisation.
 
