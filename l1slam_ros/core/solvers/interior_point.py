@@ -35,13 +35,10 @@ from l1slam_ros.core.graph.l1_problem import L1Problem
 from l1slam_ros.core.graph.linear_system import LinearSystem
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.nonlinear import Report
-from l1slam_ros.core.solvers.optimality import L1, Norm, Status, fits_exactly, l1_cost, smoothing
+from l1slam_ros.core.solvers.optimality import Status, fits_exactly, l1_cost, smoothing
 
 # How far to go towards the nearest bound.
 _FRACTION = 0.9995
-# Converged must also mean that no step of the last linear problem would lower the cost by more
-# than this part: with many false loops it can come to rest where one would.
-_PROVEN = 1e-2
 # A step cut to less by the bounds has run into them: the next does no more than to leave them.
 _SHORT = 0.1
 # Slacks are kept above this and never recomputed as 1 -+ y, which would cancel.
@@ -58,14 +55,6 @@ _CURVATURE, _REFUSED, _NEXT, _RECOVERY = 0.7, 0.25, 0.5, 1.3
 # Part of its diagonal that J'QJ gets where rounding leaves it indefinite: ten times what is taken
 # for rounding there, and so many times more each time that it is so again.
 _ROUNDING, _MORE = 1e-12, 100.0
-# Of the dual at the end: most projections to make it feasible (each costs a solution, none a
-# factorisation), and the part of the cost that is a gap small enough.
-_PROJECTIONS, _CLOSE = 10, 1e-4
-# A row at its bound still gives way a little, or there might be no feasible dual nearby. With a
-# tenth of it the proof misses by percents on the torus in space; in the plane it costs nothing.
-_LEAST_WEIGHT = 1e-2
-
-
 # What the complementarity products u s and v t shall become, (rows,) each.
 _Products = tuple[Array, Array]
 
@@ -213,51 +202,6 @@ def interior_point(
             status = Status.STALLED
             break
     return Optimum(best.poses, costs, status, replace(at, system=best.system))
-
-
-def prove(optimum: Optimum, cholesky: BlockCholesky) -> tuple[Array, float, Status]:
-    """
-    Return a dual y (rows,) with A'y = 0, |y| <= 1, what it proves, and the status in its light.
-
-    No step of the linear problem at the poses can lower their cost by more than the gap,
-    |b|_1 + b'y. A run that came to rest where one might lower it has not converged.
-    """
-    end = optimum.end
-    y, gap = feasible_dual(end.system, end.y, np.minimum(end.s, end.t), L1, cholesky)
-    return y, gap, proven(optimum.status, gap, optimum.costs[-1], len(y))
-
-
-def proven(status: Status, gap: float, cost: float, rows: int) -> Status:
-    """Return the status of a run in the light of what its dual proves."""
-    if fits_exactly(cost, rows) or gap <= _CLOSE * cost:
-        return Status.CONVERGED
-    return Status.STALLED if gap > _PROVEN * cost and status is Status.CONVERGED else status
-
-
-def feasible_dual(system: LinearSystem, y: Array, slack: Array, norm: Norm,
-                  cholesky: BlockCholesky) -> tuple[Array, float]:
-    """
-    Return a dual near y with A'y = 0, |y| <= 1, and by how much the cost exceeds its value.
-
-    By turns projected on the one, along the slack (rows,) that it has left, and to the other; at
-    the end shrunk by what is missing.
-
-    norm : L1 or group L1
-    """
-    residual, slack = -system.b, np.maximum(slack, _LEAST_WEIGHT)
-    cost = norm.cost(residual)
-    if not cholesky.factorise(system, slack):
-        return np.zeros_like(y), cost
-    for _ in range(_PROJECTIONS):
-        y = norm.resolvent(y, 0.0)
-        y = y - slack * system.times(cholesky.solve(system.transposed_times(y)))
-        longest = float((np.abs(y) / np.maximum(np.abs(norm.resolvent(y, 0.0)), 1e-300)).max(
-            initial=1.0))
-        feasible = y / longest
-        gap = max(norm.gap(residual, feasible), 0.0)
-        if gap <= _CLOSE * cost:
-            break
-    return feasible, gap
 
 
 def _start(problem: L1Problem, poses: Array) -> _Iterate:
