@@ -84,14 +84,16 @@ class Updates:
                 self._workers.check()
                 check()
                 if time.monotonic() >= end:
-                    return self._account(start)
+                    return self._account(before.began, start)
             if came or not idle or keeper.state.last is not before.last:
-                return self._account(start)
+                return self._account(before.began, start)
             self._rested = seen.now
         return None
 
-    def _account(self, start: float) -> Improvement:
+    def _account(self, began: int, start: float) -> Improvement:
         state, _, size = self._keeper.look()
+        if state.began != began:
+            raise Interrupted
         return state.account(size.loops, time.monotonic() - start)
 
     def _begin_due(self, idle: bool, budget: float, check: Check) -> bool:
