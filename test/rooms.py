@@ -1,55 +1,120 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A few rooms, what a laser sees in them, and a robot that drives through them with bad wheels."""
+"""A robot with a laser that drives round a block in a room, and what it records."""
 
 import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.scans.points import Scan
 
-RAYS = 360
-# x0, y0, x1, y1 of walls [m]: a ring of corridors with doors, niches and pillars, none like another.
+# Walls, from x y to x y [m]: the room, a block in it, and what tells one corner from another.
 WALLS = np.array([
-    (0, 0, 14, 0), (14, 0, 14, 9), (14, 9, 0, 9), (0, 9, 0, 0),
-    (3, 3, 6, 3), (7, 3, 11, 3), (11, 3, 11, 6), (11, 6, 4.5, 6), (3, 6, 3, 3),
-    (5, 0, 5, .8), (5, .8, 5.4, .8), (5.4, .8, 5.4, 0), (9, 9, 8.5, 8.2), (8.5, 8.2, 8, 9),
-    (14, 5, 13.2, 5), (13.2, 5, 13.2, 5.5), (13.2, 5.5, 14, 5.5), (0, 6.5, .9, 7.2),
-    (.9, 7.2, 0, 7.6), (2, 9, 2, 8.3), (12.5, 0, 13.4, 0.6), (13.4, .6, 14, .6),
-    (6, 3, 6, 4), (7, 3, 7, 4), (6, 4, 7, 4), (10, 0, 10.3, .5), (10.3, .5, 10.6, 0)])
+    (0, 0, 12, 0), (12, 0, 12, 8), (12, 8, 0, 8), (0, 8, 0, 0),
+    (3, 3, 9, 3), (9, 3, 9, 5), (9, 5, 3, 5), (3, 5, 3, 3),
+    (5, 0, 5, 0.7), (5, 0.7, 5.5, 0), (12, 6, 11.2, 6), (11.2, 6, 12, 6.8),
+    (0, 2.2, 0.6, 2.6), (0.6, 2.6, 0, 3), (7, 8, 7.4, 7.3), (7.4, 7.3, 8, 8)], float)
+_CORNERS = np.array([(1.5, 1.5), (10.5, 1.5), (10.5, 6.5), (1.5, 6.5)])
+_STEP, _PERIOD, _RAYS = 0.15, 0.2, 240
 
 
-def ranges_from(pose, rays=RAYS, walls=WALLS):
-    """Return how far a laser sees at a pose (3,), rays from -pi on, (rays,) [m]."""
-    angles = pose[2] - np.pi + 2 * np.pi / rays * np.arange(rays)
-    d = np.stack((np.cos(angles), np.sin(angles)), axis=1)[:, None]
-    a, b = walls[:, :2] - pose[:2], walls[:, 2:] - walls[:, :2]
-    cross = d[..., 0] * b[:, 1] - d[..., 1] * b[:, 0]
-    with np.errstate(divide='ignore', invalid='ignore'):
-        along = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / cross
-        at = (a[:, 0] * d[..., 1] - a[:, 1] * d[..., 0]) / cross
-    hit = (along > 0) & (at >= 0) & (at <= 1)
-    return np.where(hit, along, np.inf).min(axis=1)
+def ranges_at(pose, rng):
+    """Return what a laser that looks all round measures at a pose, to a centimetre, (r,) [m]."""
+    angles = pose[2] + 2 * np.pi * np.arange(_RAYS) / _RAYS
+    u = np.stack((np.cos(angles), np.sin(angles)), axis=1)[:, None]
+    a, d = WALLS[:, :2] - pose[:2], WALLS[:, 2:] - WALLS[:, :2]
+    cross = u[..., 0] * d[:, 1] - u[..., 1] * d[:, 0]
+    with np.errstate(all='ignore'):
+        t = (a[:, 0] * d[:, 1] - a[:, 1] * d[:, 0]) / cross
+        s = (a[:, 0] * u[..., 1] - a[:, 1] * u[..., 0]) / cross
+    hit = np.where((t > 0) & (s >= 0) & (s <= 1), t, np.inf).min(axis=1)
+    return hit + 0.01 * rng.standard_normal(_RAYS)
 
 
-def laps(count, step=0.1):
-    """Return poses (n, 3) of a robot that goes around, and turns about the corners."""
-    corners = np.array([(1.6, 1.6), (12.4, 1.6), (12.4, 7.4), (1.6, 7.4)])
-    poses, turn = [], np.pi / 2 / 12
+def laps(count=2, seed=0):
+    """Return scans, the wheels' poses and the true ones (n, 3) of some laps round the block."""
+    rng = np.random.default_rng(seed)
+    true = []
     for k in range(4 * count):
-        a, b = corners[k % 4], corners[(k + 1) % 4]
-        heading, length = k * np.pi / 2, np.hypot(*(b - a))
-        way = np.arange(0, length, step)[:, None] / length
-        poses += [(*p, heading) for p in a + way * (b - a)]
-        poses += [(*b, heading + j * turn) for j in range(12)]
-    return np.array(poses)
+        a, b = _CORNERS[k % 4], _CORNERS[(k + 1) % 4]
+        heading = k * np.pi / 2
+        for part in np.arange(0, np.linalg.norm(b - a), _STEP):
+            true.append((*(a + part * (b - a) / np.linalg.norm(b - a)), heading))
+        true += [(*b, heading + turn) for turn in np.linspace(0, np.pi / 2, 6)[1:-1]]
+    true = np.array(true)
+    steps = se2.between(true[:-1], true[1:])
+    steps[:, 2] += 0.02 * np.hypot(steps[:, 0], steps[:, 1]) + 0.002 * rng.standard_normal(
+        len(steps))  # wheels that drift
+    wheels = se2.identity(len(true))
+    for k, step in enumerate(steps):
+        wheels[k + 1] = se2.compose(wheels[k][None], step[None])[0]
+    stamps = (1000 * 10**9 + np.arange(len(true)) * int(_PERIOD * 1e9)).tolist()
+    scans = [Scan(stamp, ranges_at(pose, rng), 0.0, 2 * np.pi / _RAYS, 0.05, 30.0)
+             for stamp, pose in zip(stamps, true, strict=True)]
+    return scans, wheels, true
 
 
-def by_wheels(poses, rng, way=0.03, turn=0.02):
-    """Return the poses as wheels have them: they stretch ways, and turn a little all the time."""
-    motion = se2.between(poses[:-1], poses[1:])
-    length = np.hypot(motion[:, 0], motion[:, 1])
-    motion[:, 0] *= 1 + way
-    motion[:, 2] = motion[:, 2] * (1 + turn) + turn * length
-    motion += rng.normal(0, 1, motion.shape) * (0.003, 0.001, 0.002)
-    found = [np.zeros((1, 3))]
-    for one in motion:
-        found.append(se2.compose(found[-1], one[None]))
-    return np.concatenate(found)
+def write_log(path, scans, wheels):
+    """Write what a laser that looks ahead has seen as a CARMEN log."""
+    front = np.r_[-_RAYS // 4 : _RAYS // 4 + 1]
+    lines = ['# CARMEN Logfile', 'PARAM robot_length 0.5 0 nohost 0']
+    for scan, pose in zip(scans, wheels, strict=True):
+        ranges = ' '.join(f'{r:.3f}' for r in scan.ranges[front])
+        robot = ' '.join(f'{x:.6f}' for x in pose)
+        lines.append(f'FLASER {len(front)} {ranges} {robot} {robot} {scan.stamp / 1e9:.6f} host '
+                     f'{scan.stamp / 1e9 - 1000:.6f}')
+    path.write_text('\n'.join(lines) + '\n')
+
+
+def write_scan_bag(path, scans, wheels, mount=None):
+    """Write scans, odometry twice as often and where the laser is, by an independent writer."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = store.types
+    time, head = types['builtin_interfaces/msg/Time'], types['std_msgs/msg/Header']
+    point, vector = types['geometry_msgs/msg/Point'], types['geometry_msgs/msg/Vector3']
+    quaternion = types['geometry_msgs/msg/Quaternion']
+
+    def header(stamp, frame):
+        return head(time(*divmod(stamp, 10**9)), frame)
+
+    def odometry(stamp, pose):
+        x, y, theta = pose.tolist()
+        zero = vector(0.0, 0.0, 0.0)
+        return types['nav_msgs/msg/Odometry'](
+            header(stamp, 'odom'), 'base_link', types['geometry_msgs/msg/PoseWithCovariance'](
+                types['geometry_msgs/msg/Pose'](point(x, y, 0.0), quaternion(
+                    0.0, 0.0, np.sin(theta / 2), np.cos(theta / 2))), np.zeros(36)),
+            types['geometry_msgs/msg/TwistWithCovariance'](
+                types['geometry_msgs/msg/Twist'](zero, zero), np.zeros(36)))
+
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        names = {'/wheels': 'nav_msgs/msg/Odometry', '/scan': 'sensor_msgs/msg/LaserScan',
+                 '/tf_static': 'tf2_msgs/msg/TFMessage'}
+        topics = {name: writer.add_connection(name, kind, typestore=store)
+                  for name, kind in names.items()}
+
+        def put(name, stamp, message):
+            writer.write(topics[name], stamp, store.serialize_cdr(message, names[name]))
+
+        if mount is not None:
+            (x, y, z), q = mount
+            put('/tf_static', scans[0].stamp, types['tf2_msgs/msg/TFMessage']([
+                types['geometry_msgs/msg/TransformStamped'](
+                    header(scans[0].stamp, 'base_link'), 'laser',
+                    types['geometry_msgs/msg/Transform'](vector(x, y, z), quaternion(*q)))]))
+        for k, (scan, pose) in enumerate(zip(scans, wheels, strict=True)):
+            put('/wheels', scan.stamp, odometry(scan.stamp, pose))
+            put('/scan', scan.stamp, types['sensor_msgs/msg/LaserScan'](
+                header(scan.stamp, 'laser'), scan.angle_min, 6.28, scan.angle_increment, 0.0, 0.2,
+                scan.range_min, scan.range_max, scan.ranges.astype(np.float32),
+                np.zeros(0, np.float32)))
+            if k + 1 < len(scans):
+                between = se2.interpolate(wheels[k][None], wheels[k + 1][None], np.array([0.5]))[0]
+                put('/wheels', scan.stamp + 10**8, odometry(scan.stamp + 10**8, between))
+
+
+def write_truth(path, scans, true):
+    """Write the true poses as CSV."""
+    path.write_text('stamp,x,y,theta\n' + ''.join(
+        f'{scan.stamp / 1e9:.6f},{x},{y},{theta}\n'
+        for scan, (x, y, theta) in zip(scans, true.tolist(), strict=True)))

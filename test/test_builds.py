@@ -193,7 +193,7 @@ def test_a_type_checker_finds_the_types_in_every_kind_of_install(
         fresh.install('--no-deps', '--no-build-isolation', '--editable', copy)
     else:
         fresh.install('--no-deps', '--no-index', distributions['wheel'])
-    example = re.search(r'## From Python.*?```python\n(.*?)```', (ROOT / 'README.md').read_text(),
+    example = re.search(r'## .*Python.*?```python\n(.*?)```', (ROOT / 'README.md').read_text(),
                         re.S)[1]
     (tmp_path / 'right.py').write_text(example)
     (tmp_path / 'wrong.py').write_text(f'{example}\nl1.solve(3)\n')

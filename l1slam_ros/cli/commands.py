@@ -4,13 +4,19 @@
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from l1slam_ros.cli import summary
 from l1slam_ros.io import formats
 from l1slam_ros.io.bags.topics import Topics
+from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, compile_now
+from l1slam_ros.io.files import counted
+from l1slam_ros.io.formats import is_log
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.progress import say
+from l1slam_ros.io.progress import Progress, say
+
+if TYPE_CHECKING:
+    from l1slam_ros.io.scans.to_graph import ScanMap
 
 
 class Ending(NamedTuple):
@@ -67,11 +73,29 @@ def read(arguments: argparse.Namespace, path: Path, quiet: bool = False) -> Grap
         from l1slam_ros.io.node_options import read_params_file
 
         options = read_params_file(arguments.params_file)
+    if is_log(path):
+        record = read_scan_map(arguments, path, quiet).record
+        warn(record.skipped, quiet)
+        return record
     topics = Topics(arguments.odom_topic, arguments.loop_topic)
     record = formats.read_input(path, options, topics, arguments.rotation_information,
                                 options.dimension if options else 2)
     warn(record.skipped, quiet)
     return record
+
+
+def read_scan_map(arguments: argparse.Namespace, path: Path, quiet: bool = False,
+                  topic: str | None = None) -> 'ScanMap':
+    """Return what the scans of a log, or of a bag's topic, make."""
+    from l1slam_ros.io.scans.reading import read_scans
+
+    compile_now((*SPARSE, *JUDGEMENT), quiet)
+    with Progress(None, 'scan', quiet, 'matching scans') as progress:
+        def report(scans: int, of_all: int, loops: int) -> None:
+            progress.reach(scans, of_all)
+            progress.advance(0, counted(loops, 'loop'))
+
+        return read_scans(path, arguments.odom_topic, topic, report)
 
 
 def warn(sentences: Sequence[str], quiet: bool = False) -> None:

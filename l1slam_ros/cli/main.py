@@ -19,7 +19,8 @@ from l1slam_ros.io.progress import say
 from l1slam_ros.paper import printed as paper
 
 BAD_INPUT, READ_IN_PART, DOUBTFUL, INTERRUPTED, BROKEN_PIPE = 2, 3, 4, 130, 141
-_INPUT = '.g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1'
+_INPUT = ('.g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, .bag of ROS 1, or a CARMEN log '
+          'with scans: .clf, .log, .bz2, .gz')
 _WORD = ('beside a graph INPUT.trusted.txt and INPUT.struck.txt, lines `i j` of vertex ids, may '
          'vouch for loops and strike loops out')
 _OUTPUT = '.g2o, .tum, or a name without a suffix for a bag directory'
@@ -168,6 +169,12 @@ def _add_solve(parser: argparse.ArgumentParser) -> None:
         "theta`, or a bag's topic, BAG:/TOPIC, where `bag` is INPUT; interpolated at the "
         'stamps of the poses')
     add('--plot', type=Path, metavar='PNG', help='draw the map and its cost; .svg and .pdf too')
+    add('--scans', metavar='TOPIC',
+        help='of a bag: make the graph of the laser scans on this topic and of --odom-topic; a '
+        'CARMEN log needs none')
+    add('--grid', type=Path, metavar='PGM',
+        help='write the occupancy grid of the scans, with its .yaml, as the map server of nav2 '
+        'reads them')
     _add_force(parser)
     add('--json', action='store_true', help='one object on standard output')
     add('--quiet', action='store_true', help='no progress, no summary, no warning')

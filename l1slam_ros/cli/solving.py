@@ -4,13 +4,16 @@
 import argparse
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from l1slam_ros.cli.commands import Ending, inputs, read, warn
+from l1slam_ros.cli.commands import Ending, inputs, read, read_scan_map, warn
 from l1slam_ros.cli.reference import Truth, known_false, position_error, read_truth
+from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
@@ -34,12 +37,15 @@ from l1slam_ros.io.sentences import (
     offset_sentence,
 )
 
+if TYPE_CHECKING:
+    from l1slam_ros.core.scans.points import Points
+
 
 def solve(arguments: argparse.Namespace) -> Ending:
     """Optimise a graph; print, write and draw what came out."""
     _check_outputs(arguments)
     asked = _asked(arguments)
-    record = read(arguments, arguments.input, quiet=True)
+    record, points = _read(arguments)
     truth = read_truth(arguments.reference, record, arguments.input) if (
         arguments.reference) else None
     warnings = [*record.skipped, *(truth.skipped if truth else ())]
@@ -59,6 +65,8 @@ def solve(arguments: argparse.Namespace) -> Ending:
         report['ate'] = position_error(record, outcome.solution.poses, truth)
         report['ate_poses'] = len(truth.rows)
     _write(arguments, record, outcome, truth, _cost_name(asked))
+    if arguments.grid:
+        _write_grid(arguments.grid, points, outcome)
     if arguments.json:
         # What is not finite has no place in JSON.
         print(json.dumps({name: None if isinstance(value, float) and not math.isfinite(value)
@@ -68,6 +76,14 @@ def solve(arguments: argparse.Namespace) -> Ending:
         for sentence in judgement_sentences(record, judgement) if judgement else ():
             print(sentence)
     return ending
+
+
+def _read(arguments: argparse.Namespace) -> tuple[GraphRecord, 'Sequence[Points] | None']:
+    """Return the graph, and what its keyframes saw where it is made of scans."""
+    if not (arguments.scans or formats.is_log(arguments.input)):
+        return read(arguments, arguments.input, quiet=True), None
+    made = read_scan_map(arguments, arguments.input, arguments.quiet, arguments.scans)
+    return made.record, made.points
 
 
 def _remarks(outcome: Outcome) -> Iterator[str]:
@@ -90,6 +106,13 @@ def _write(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
         formats.write_output(arguments.output, replace(
             record, poses=outcome.solution.poses,
             left_out=left_out_by(outcome.judgement, record.graph.between)), force=arguments.force)
+
+
+def _write_grid(path: Path, points: 'Sequence[Points] | None', outcome: Outcome) -> None:
+    from l1slam_ros.core.scans.grid import draw
+    from l1slam_ros.io.scans.grid_file import write_grid
+
+    write_grid(path, draw(points or (), outcome.solution.poses))
 
 
 def _solved(arguments: argparse.Namespace, record: GraphRecord, asked: SolveOptions) -> Outcome:
@@ -122,6 +145,12 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
 
         check_picture(arguments.plot)
         refuse_others([arguments.plot], read, arguments.force)
+    if arguments.grid:
+        from l1slam_ros.io.scans.grid_file import check_grid
+
+        if not (arguments.scans or formats.is_log(arguments.input)):
+            raise OptionError('--grid is of scans; expected --scans TOPIC, or a CARMEN log')
+        check_grid(arguments.grid, read, arguments.force)
 
 
 def _asked(arguments: argparse.Namespace) -> SolveOptions:

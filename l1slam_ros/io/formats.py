@@ -19,7 +19,8 @@ import numpy as np
 from l1slam_ros.core.errors import FileError, GraphError, OptionError, require
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph, as_poses
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.measurements import as_poses
 from l1slam_ros.core.names import QUATERNION, ROTATION_INFORMATION
 from l1slam_ros.core.robust.inspection import initial_poses
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES, DEFAULT_TOPICS, Topics
@@ -39,6 +40,10 @@ GRAPH_READERS: dict[str, Callable[[Path, str], GraphRecord]] = {
     '.g2o': read_graph_file,
     '.graph': read_graph_file,
 }
+
+
+# Of CARMEN logs with scans, packed or not.
+LOG_SUFFIXES = ('.clf', '.log', '.bz2', '.gz')
 
 
 class _Origin(NamedTuple):
@@ -93,6 +98,11 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
 def is_bag(path: Path) -> bool:
     """Tell whether an input is taken for a bag."""
     return path.is_dir() or path.suffix.lower() in BAG_SUFFIXES
+
+
+def is_log(path: Path) -> bool:
+    """Tell whether an input is taken for a log of scans, see `io.scans`."""
+    return path.is_file() and path.suffix.lower() in LOG_SUFFIXES
 
 
 def stored_poses(record: GraphRecord) -> Array:

@@ -5,7 +5,7 @@ What this program may replace: what it wrote, told by a mark in it, and nothing 
     text              a comment, `MARK`, the first line, of a graph the last: GTSAM reads no edge
                       behind a comment; of a saved map the lines of `remarks`
     report            the first line, `REPORT_MARK`
-    .png, .svg, .pdf  the field for the program that drew the picture
+    .png, .svg, .pdf  the field for the program that drew the picture; of a .pgm a comment
     bag directory     in each .mcap the field for the library that wrote it
 
 The shape of a file tells nothing: a recording or a graph of another program looks just the same.
@@ -27,6 +27,7 @@ _FIRST_LINES = f'{MARK}\n'.encode(), f'{REPORT_MARK}\n'.encode()
 # The begin of a file -> what tells ours from others: PNG, PDF, SVG.
 _PICTURES = {
     b'\x89PNG': f'tEXtSoftware\0{PROGRAM}'.encode(),
+    b'P5\n': f'\n{MARK}\n'.encode(),
     b'%PDF': f'/Creator ({PROGRAM})'.encode(),
     b'<?xml': f'<dc:title>{PROGRAM}</dc:title>'.encode()}
 # Magic, and a header record of 22 bytes: the profile and the library, each with its length.

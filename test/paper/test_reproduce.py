@@ -24,6 +24,7 @@ from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.solvers.seed import rotation_system, seed_poses, translation_system
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
+from l1slam_ros.io.ours import REPORT_MARK
 from l1slam_ros.paper import experiments as reproduction
 from l1slam_ros.paper import printed as paper
 from l1slam_ros.paper import reproduce
@@ -212,7 +213,7 @@ def test_the_largest_residual_is_that_of_a_linear_program(world, seed):
 
 
 def test_a_report_replaces_its_former_self_and_nothing_else(tmp_path):
-    (tmp_path / 'report.md').write_text('former')
+    (tmp_path / 'report.md').write_text(f'{REPORT_MARK}\nformer')
     (tmp_path / 'notes.txt').write_text('mine')
     reproduce.reproduce(None, [TINY_50K], tmp_path, LITTLE)
     assert (tmp_path / 'notes.txt').read_text() == 'mine'

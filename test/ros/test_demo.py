@@ -53,7 +53,7 @@ def test_the_bag_is_made_by_the_command_its_readme_gives(tmp_path):
     assert main(['simulate', str(tmp_path / 'demo'), *command[3:]]) == 0
     np.testing.assert_allclose(numbers(tmp_path / 'demo'), numbers(DEMO), rtol=1e-9, atol=1e-12)
     made, kept = (Path(f'{bag}.false.txt').read_text() for bag in (tmp_path / 'demo', DEMO))
-    assert made == kept and len(kept.splitlines()) == 10
+    assert made == kept and len(kept.splitlines()) == 11  # the mark, and ten
 
 
 def test_the_summary_of_a_perfect_map_is_an_error_of_zero(tmp_path):

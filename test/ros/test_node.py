@@ -19,8 +19,8 @@ from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.online.snapshot import ACCEPTED
 from l1slam_ros.core.robust.batch import robust_solve
+from l1slam_ros.core.running.snapshot import ACCEPTED
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
@@ -134,7 +134,7 @@ def test_a_saved_map_is_loaded_and_odometry_goes_on_from_its_end(bench, tmp_path
 def test_optimize_answers_with_the_cost_and_a_broken_file_leaves_the_map(bench, tmp_path):
     write_world(tmp_path / 'bag', 60, 90)
     (tmp_path / 'broken.g2o').write_text('no graph')
-    b = bench(save_path=str(tmp_path / 'broken.g2o'), **EVERY_MESSAGE)
+    b = bench(save_path=str(tmp_path / 'broken.g2o'), autosave_period=0.0, **EVERY_MESSAGE)
     assert call(b, 'optimize').message == 'there are no factors yet'
     b.play(tmp_path / 'bag')
     b.until(lambda: len(b.path().poses) == 60, 'all keyframes')

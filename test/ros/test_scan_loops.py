@@ -137,7 +137,7 @@ def robot(ros):
 def test_two_laps_make_a_map(robot, tmp_path, rng):
     truth = laps(2)
     wheels = by_wheels(truth, rng)
-    r = robot(map_path=str(tmp_path / 'rooms.pgm'), **{'map_period': 0.5})
+    r = robot(map_path=str(tmp_path / 'corridors.pgm'), **{'map_period': 0.5})
     r.drive(truth, wheels)
     r.until(lambda: r.received['path'] and len(r.received['path'][-1].poses)
             == r.front_end._front_end.counts['keyframes'], 'the path has every keyframe')

@@ -9,7 +9,8 @@ import numpy as np
 from l1slam_ros.core.errors import GraphError, OptionError, require
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph, as_poses
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.measurements import as_poses
 from l1slam_ros.core.names import NORMS, SAME
 from l1slam_ros.core.robust import batch_map
 
@@ -86,6 +87,7 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
 
 def believed(graph: FactorGraph, poses: Array) -> Mask | None:
     """Return the inliers of the last solution of a graph, if these are its poses; else None."""
-    made_of, inliers = _LAST.get(graph, (None, None))
-    same = made_of is not None and made_of() is poses
-    return inliers if same and len(graph.between) == len(inliers) else None
+    if graph not in _LAST:
+        return None
+    made_of, inliers = _LAST[graph]
+    return inliers if made_of() is poses and len(graph.between) == len(inliers) else None

@@ -35,13 +35,10 @@ from l1slam_ros.core.graph.l1_problem import L1Problem
 from l1slam_ros.core.graph.linear_system import LinearSystem
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.nonlinear import Report
-from l1slam_ros.core.solvers.optimality import L1, Norm, Status, fits_exactly, l1_cost, smoothing
+from l1slam_ros.core.solvers.optimality import Status, fits_exactly, l1_cost, smoothing
 
 # How far to go towards the nearest bound.
 _FRACTION = 0.9995
-# Converged must also mean that no step of the last linear problem would lower the cost by more
-# than this part: with many false loops it can come to rest where one would.
-_PROVEN = 1e-2
 # A step cut to less by the bounds has run into them: the next does no more than to leave them.
 _SHORT = 0.1
 # Slacks are kept above this and never recomputed as 1 -+ y, which would cancel.
@@ -58,12 +55,8 @@ _CURVATURE, _REFUSED, _NEXT, _RECOVERY = 0.7, 0.25, 0.5, 1.3
 # Part of its diagonal that J'QJ gets where rounding leaves it indefinite: ten times what is taken
 # for rounding there, and so many times more each time that it is so again.
 _ROUNDING, _MORE = 1e-12, 100.0
-# Of the dual at the end: most projections to make it feasible (each costs a solution, none a
-# factorisation), and the part of the cost that is a gap small enough.
-_PROJECTIONS, _CLOSE = 10, 1e-4
-# A row at its bound still gives way a little, or there might be no feasible dual nearby. With a
-# tenth of it the proof misses by percents on the torus in space; in the plane it costs nothing.
-_LEAST_WEIGHT = 1e-2
+# What the complementarity products u s and v t shall become, (rows,) each.
+_Products = tuple[Array, Array]
 
 
 @dataclass
@@ -111,7 +104,8 @@ class _Iterate:
         self.s = np.maximum(self.s - dual * direction.y, _SMALLEST_SLACK)
         self.t = np.maximum(self.t + dual * direction.y, _SMALLEST_SLACK)
 
-    def is_solved(self, cost: float, tolerance: float) -> bool:
+    def check_termination(self, cost: float, tolerance: float) -> bool:
+        """Tell whether |e - u + v|_1 and u's + v't are below a part of the cost."""
         split = l1_cost(self.residual - self.u + self.v)
         return split <= tolerance * cost and self.gap <= tolerance * cost
 
@@ -195,7 +189,7 @@ def interior_point(
     status, worst = Status.ITERATION_LIMIT, 1 + tolerance
     for iteration in range(iterations + 1):
         cost = l1_cost(at.residual)
-        if at.is_solved(cost, tolerance) or fits_exactly(cost, len(at.y)):
+        if at.check_termination(cost, tolerance) or fits_exactly(cost, len(at.y)):
             status = Status.CONVERGED if cost <= worst * costs[-1] else Status.STALLED
         if cost <= costs[-1]:
             best = replace(at)
@@ -208,51 +202,6 @@ def interior_point(
             status = Status.STALLED
             break
     return Optimum(best.poses, costs, status, replace(at, system=best.system))
-
-
-def prove(optimum: Optimum, cholesky: BlockCholesky) -> tuple[Array, float, Status]:
-    """
-    Return a dual y (rows,) with A'y = 0, |y| <= 1, what it proves, and the status in its light.
-
-    No step of the linear problem at the poses can lower their cost by more than the gap,
-    |b|_1 + b'y. A run that came to rest where one might lower it has not converged.
-    """
-    end = optimum.end
-    y, gap = feasible_dual(end.system, end.y, np.minimum(end.s, end.t), L1, cholesky)
-    return y, gap, proven(optimum.status, gap, optimum.costs[-1], len(y))
-
-
-def proven(status: Status, gap: float, cost: float, rows: int) -> Status:
-    """Return the status of a run in the light of what its dual proves."""
-    if fits_exactly(cost, rows) or gap <= _CLOSE * cost:
-        return Status.CONVERGED
-    return Status.STALLED if gap > _PROVEN * cost and status is Status.CONVERGED else status
-
-
-def feasible_dual(system: LinearSystem, y: Array, slack: Array, norm: Norm,
-                  cholesky: BlockCholesky) -> tuple[Array, float]:
-    """
-    Return a dual near y with A'y = 0, |y| <= 1, and by how much the cost exceeds its value.
-
-    By turns projected on the one, along the slack (rows,) that it has left, and to the other; at
-    the end shrunk by what is missing.
-
-    norm : L1 or group L1
-    """
-    residual, slack = -system.b, np.maximum(slack, _LEAST_WEIGHT)
-    cost = norm.cost(residual)
-    if not cholesky.factorise(system, slack):
-        return np.zeros_like(y), cost
-    for _ in range(_PROJECTIONS):
-        y = norm.resolvent(y, 0.0)
-        y = y - slack * system.times(cholesky.solve(system.transposed_times(y)))
-        longest = float((np.abs(y) / np.maximum(np.abs(norm.resolvent(y, 0.0)), 1e-300)).max(
-            initial=1.0))
-        feasible = y / longest
-        gap = max(norm.gap(residual, feasible), 0.0)
-        if gap <= _CLOSE * cost:
-            break
-    return feasible, gap
 
 
 def _start(problem: L1Problem, poses: Array) -> _Iterate:
@@ -268,53 +217,73 @@ def _start(problem: L1Problem, poses: Array) -> _Iterate:
 
 
 def _step(problem: L1Problem, at: _Iterate, cholesky: BlockCholesky, curvature: Curvature) -> bool:
-    """Move `at` by one predictor and corrector step; False: there was no direction."""
-    n, Q, gap = len(at.y), at.weights, at.gap
+    """
+    Move `at` by one affine and one combined step; False: there was no direction.
+
+    They have the names that Clarabel and others give them: the affine step aims at mu = 0, and how
+    far it comes says how far the combined step aims.
+    """
+    Q, gap = at.weights, at.gap
     if not curvature.factorise(at.system, Q, problem.curvature(at.poses, at.y), cholesky):
         return False
-    predictor = _direction(at, cholesky, Q, np.zeros(n), np.zeros(n))
-    mu = gap / (2 * n) * (predictor.gap / gap) ** 3
-    c1, c2 = mu + predictor.u * predictor.y, mu - predictor.v * predictor.y
-    direction = _direction(at, cholesky, Q, c1, c2)
+    affine = _solve_kkt(at, cholesky, Q, _affine_step_rhs(at))
+    mu = gap / (2 * len(at.y)) * (affine.gap / gap) ** 3
+    rhs = _combined_step_rhs(affine, mu)
+    combined = _solve_kkt(at, cholesky, Q, rhs)
     if not at.is_torn:  # else bends hold a step back rather than bounds
-        aligned = _direction(at, cholesky, Q, *_aligned(direction, c1, c2, mu))
-        direction = max(direction, aligned, key=lambda direction: direction.reach)
-    if direction.reach < _SHORT:
+        corrected = _solve_kkt(at, cholesky, Q, _centrality_corrector_rhs(combined, rhs, mu))
+        combined = max(combined, corrected, key=lambda step: step.reach)
+    if combined.reach < _SHORT:
         # Some products u s and v t are far smaller than others: first make them equal.
-        mean = np.full(n, gap / (2 * n))
-        centred = _direction(at, cholesky, Q, mean, mean)
-        direction = max(direction, centred, key=lambda direction: direction.reach)
-    if not np.isfinite(direction.x).all():
+        centring = _solve_kkt(at, cholesky, Q, _centring_step_rhs(at))
+        combined = max(combined, centring, key=lambda step: step.reach)
+    if not np.isfinite(combined.x).all():
         return False
-    primal, at.poses, residual = _trusted(problem, at, direction)
+    primal, at.poses, residual = _line_search(problem, at, combined)
     at.system = problem.linearise(at.poses, residual)
-    at.advance(direction, primal)
+    at.advance(combined, primal)
     return True
 
 
-def _aligned(direction: _Direction, c1: Array, c2: Array, mu: float) -> list[Array]:
+def _affine_step_rhs(at: _Iterate) -> _Products:
+    """Return the products that the affine step aims at: all of them zero."""
+    return np.zeros(len(at.y)), np.zeros(len(at.y))
+
+
+def _combined_step_rhs(affine: _Direction, mu: float) -> _Products:
+    """Return mu, corrected by what the affine step leaves to second order (Mehrotra)."""
+    return mu + affine.u * affine.y, mu - affine.v * affine.y
+
+
+def _centring_step_rhs(at: _Iterate) -> _Products:
+    """Return the mean of the products for each of them."""
+    mean = np.full(len(at.y), at.gap / (2 * len(at.y)))
+    return mean, mean
+
+
+def _centrality_corrector_rhs(direction: _Direction, rhs: _Products, mu: float) -> _Products:
     """
-    Return c1, c2 that bring the products at the end of a direction into line with mu.
+    Return what brings the products at the end of a direction into line with mu (Gondzio).
 
     Meant to become c1 and c2, they end as c1 - du dy and c2 + dv dy. Of those far too large no
     more is taken than the most they may be, or they would rule the step.
     """
     least, most = _ALIKE * mu, mu / _ALIKE
-    ends = c1 - direction.u * direction.y, c2 + direction.v * direction.y
+    ends = rhs[0] - direction.u * direction.y, rhs[1] + direction.v * direction.y
     wanted = []
-    for c, end in zip((c1, c2), ends, strict=True):
+    for c, end in zip(rhs, ends, strict=True):
         # In place: memory that is new each time takes longer than the sums.
         shift = np.clip(end, least, most)
         shift -= end
         np.maximum(shift, -most, out=shift)
         shift += c
         wanted.append(shift)
-    return wanted
+    return wanted[0], wanted[1]
 
 
-def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, c1: Array,
-               c2: Array) -> _Direction:
-    """Solve for the step whose complementarity products become c1, c2 to first order."""
+def _solve_kkt(at: _Iterate, cholesky: BlockCholesky, Q: Array, rhs: _Products) -> _Direction:
+    """Solve for the step whose complementarity products become `rhs` to first order."""
+    c1, c2 = rhs
     # e - (u - v) - (c1/s - u) + (c2/t - v)
     g = at.residual - c1 / at.s + c2 / at.t
     x = cholesky.solve(-at.system.transposed_times(at.y + Q * g))
@@ -324,8 +293,8 @@ def _direction(at: _Iterate, cholesky: BlockCholesky, Q: Array, c1: Array,
     return _Direction(x, moved, y, u, v, primal, dual, gap)
 
 
-def _trusted(problem: L1Problem, at: _Iterate,
-             direction: _Direction) -> tuple[float, Array, Array]:
+def _line_search(problem: L1Problem, at: _Iterate,
+                 direction: _Direction) -> tuple[float, Array, Array]:
     """
     Halve the primal step while the residual departs too far from its linearisation.
 

@@ -28,8 +28,9 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.l1_problem import GraphProblem
 from l1slam_ros.core.graph.linear_system import LinearSystem, whitened_residual
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
+from l1slam_ros.core.solvers.exact import feasible_dual, proven
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
-from l1slam_ros.core.solvers.interior_point import Curvature, feasible_dual, proven
+from l1slam_ros.core.solvers.interior_point import Curvature
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
 from l1slam_ros.core.solvers.optimality import SmoothNorm, Status, fits_exactly, smoothing
 

@@ -13,43 +13,22 @@ import bz2
 import gzip
 import math
 from bisect import bisect_left
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans.points import Mount, Scan
+from l1slam_ros.io.scans.laser_log import LaserLog
 
-_OPEN = {'.bz2': bz2.open, '.gz': gzip.open}
-SUFFIXES = ('.clf', '.log', '.bz2', '.gz')
+_OPEN: dict[str, Callable[[Path, str], Any]] = {'.bz2': bz2.open, '.gz': gzip.open}
 # [m] CARMEN's laser says so, or more, where nothing is in range.
 _FAR = 80.0
 # A longer line is no message of a laser.
 _LONGEST = 1 << 18
 _SCAN = b'FLASER'
-
-
-@dataclass(frozen=True)
-class LaserLog:
-    """
-    What a log has of one laser.
-
-    scans : in the order of the file; wheels : (n, 3) the robot's pose by the wheels at each;
-    mount : where the laser is on the robot; skipped : what was left out, in words
-    """
-
-    scans: list[Scan]
-    wheels: Array
-    mount: Mount
-    skipped: list[str]
-
-
-def is_carmen(path: Path) -> bool:
-    """Tell whether a name is that of a CARMEN log."""
-    return path.suffix.lower() in SUFFIXES
 
 
 def read_carmen(path: Path) -> LaserLog:
@@ -74,10 +53,9 @@ def read_carmen(path: Path) -> LaserLog:
         raise FileError(path, 'holds no FLASER line; expected a CARMEN log with laser scans')
     kept = _in_order([scan.stamp for scan in scans])
     out = len(scans) - len(kept)
-    skipped = [f'{out:,} scans left out: their stamps are not in the order of the file'] if (
-        out) else []
+    skipped = (f'{out:,} scans left out: their stamps are not in the order of the file',)
     return LaserLog([scans[k] for k in kept], np.array(wheels)[kept],
-                    Mount(x=float(np.median(offsets))), skipped)
+                    Mount(x=float(np.median(offsets))), skipped if out else ())
 
 
 def _in_order(stamps: list[int]) -> list[int]:
@@ -96,7 +74,7 @@ def _in_order(stamps: list[int]) -> list[int]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
-    opened = _OPEN.get(path.suffix.lower(), open)
+    opened = _OPEN.get(path.suffix.lower(), Path.open)
     try:
         with opened(path, 'rb') as file:
             number = 0

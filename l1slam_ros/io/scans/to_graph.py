@@ -7,6 +7,7 @@ solved as any other. The same scans make the same graph: nothing here goes by th
 """
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.innovation import sample_posterior
 from l1slam_ros.core.scans.front_end import FrontEndOptions, ScanFrontEnd
 from l1slam_ros.core.scans.odometry import Step
-from l1slam_ros.core.scans.points import Mount, Scan
+from l1slam_ros.core.scans.points import Mount, Points, Scan
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import GraphRecord
@@ -28,11 +29,19 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord
 _MORE_LOOPS = 0.1
 
 
-def graph_from_scans(scans: Iterable[tuple[Scan, Array]], mount: Mount,
-                     report: Callable[[int, int], None] = lambda scans, loops: None,
-                     options: FrontEndOptions = FrontEndOptions()) -> GraphRecord:  # noqa: B008
+@dataclass(frozen=True)
+class ScanMap:
+    """The graph that scans make, and what each of its keyframes saw."""
+
+    record: GraphRecord
+    points: list[Points]
+
+
+def map_scans(scans: Iterable[tuple[Scan, Array]], mount: Mount,
+              report: Callable[[int, int], None] = lambda scans, loops: None,
+              options: FrontEndOptions = FrontEndOptions()) -> ScanMap:  # noqa: B008
     """
-    Return the graph that scans make.
+    Return the graph that scans make, and the points of its keyframes.
 
     Parameters
     ----------
@@ -63,7 +72,8 @@ def graph_from_scans(scans: Iterable[tuple[Scan, Array]], mount: Mount,
     stamps = np.array([keyframe.stamp for keyframe in front_end.keyframes], np.int64)
     sentences = [f'{sentence} ({counted(said.count(sentence), "time")})'
                  for sentence in dict.fromkeys(said)]
-    return GraphRecord(graph, None, np.arange(graph.n_poses), stamps, tuple(sentences))
+    return ScanMap(GraphRecord(graph, None, np.arange(graph.n_poses), stamps, tuple(sentences)),
+                   [keyframe.points for keyframe in front_end.keyframes])
 
 
 def _append(graph: FactorGraph, front_end: ScanFrontEnd, step: Step) -> None:

@@ -13,7 +13,8 @@ from l1slam_ros.core.graph.l1_problem import GraphProblem, LinearProblem
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.kernels import interior_point as kernels
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
-from l1slam_ros.core.solvers.interior_point import _Direction, _Iterate, interior_point, prove
+from l1slam_ros.core.solvers.exact import prove
+from l1slam_ros.core.solvers.interior_point import _Direction, _Iterate, interior_point
 from l1slam_ros.core.solvers.optimality import Status, l1_cost
 
 TOLERANCE = 1e-8

@@ -10,7 +10,7 @@ import pytest
 from problems import odometry
 
 from l1slam_ros.core.errors import FileError, OptionError
-from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.io.graphs.map_file import MapFile, unusable_path
 from l1slam_ros.io.graphs.saved_map import is_map, load_map
 from l1slam_ros.io.graphs.side_files import beside
@@ -76,12 +76,25 @@ def test_the_first_save_waits_for_nothing(tmp_path):
     assert robot.autosave() and keyframes(path) == 2
     robot.drive(1)
     assert not robot.autosave() and keyframes(path) == 2
+    # What stands there and was not loaded may yet be; what was loaded is saved at once.
+    another = Robot(path, HOUR)
+    another.drive(3)
+    assert not another.autosave() and keyframes(path) == 2
+    going_on = Robot(path, HOUR)
+    going_on.load_at_start()
+    going_on.seconds = 10
+    going_on.drive(1)
+    assert going_on.autosave() and keyframes(path) == 3
 
 
 @pytest.mark.parametrize('changes', [{'autosave_period': HOUR}, {'save_path': ''},
                                      {'autosave_period': 0.0}])
 def test_it_is_saved_no_sooner_and_nowhere_that_nobody_said(tmp_path, changes):
     robot = Robot(tmp_path / 'map.g2o')
+    robot.drive(2)
+    if 'save_path' not in changes:
+        robot.map_file.save()
+        (tmp_path / 'map.g2o').unlink()
     robot.options = replace(robot.options, **changes)
     robot.drive(3)
     assert not robot.autosave()

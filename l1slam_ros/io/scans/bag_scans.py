@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The laser scans of a bag, with the wheels at their stamps, and where the laser is on the robot.
+
+Where that is stands in /tf_static, from the robot's frame (the `child_frame_id` of the odometry)
+to that of the scans; without, the laser is taken to be where the robot is, and that is said.
+"""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from l1slam_ros.core.errors import FileError, MessageError
+from l1slam_ros.core.geometry import se2, se3
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.scans.points import Mount, Scan
+from l1slam_ros.io.bags.reader import bag_summary, read_messages
+from l1slam_ros.io.files import counted
+from l1slam_ros.io.messages.conversion import odometry_sample, stamp_of
+from l1slam_ros.io.scans.laser_log import LaserLog, wheels_at
+
+SCAN = 'sensor_msgs/msg/LaserScan'
+_STATIC = '/tf_static'
+
+
+def read_bag_scans(path: Path, odom_topic: str, scan_topic: str) -> LaserLog:
+    """
+    Read the scans of a bag.
+
+    Raises
+    ------
+    FileError : the bag cannot be read, or has no scans, or no odometry around any.
+
+    """
+    taken = _Taken()
+    damage: list[str] = []
+    for message in read_messages(path, (odom_topic, scan_topic, _STATIC), damage.append):
+        taken.take(message.topic == scan_topic, message)
+    if not taken.scans:
+        others = [topic.name for topic in bag_summary(path).topics if topic.msgtype == SCAN]
+        raise FileError(path, f'no scans on {scan_topic}; expected {SCAN}' + (
+            f', which is on {", ".join(others)}' if others else ''))
+    if len(taken.stamps) < 2:
+        raise FileError(path, f'{counted(len(taken.stamps), "message")} of odometry on '
+                        f'{odom_topic}; expected those of a drive')
+    order = np.argsort([scan.stamp for scan in taken.scans], kind='stable')
+    scans = [taken.scans[k] for k in order]
+    rising = np.flatnonzero(np.diff(taken.stamps, prepend=taken.stamps[0] - 1) > 0)
+    stamps, poses = np.array(taken.stamps)[rising], np.array(taken.poses)[rising]
+    wheels, rows = wheels_at(stamps, poses, np.array([scan.stamp for scan in scans]))
+    if not len(rows):
+        raise FileError(path, f'no scan on {scan_topic} lies between two messages on '
+                        f'{odom_topic}; expected stamps of one clock')
+    out = len(scans) - len(rows)
+    skipped = [f'{counted(out, "scan")} left out: no odometry surrounds them'] if out else []
+    mount, said = taken.mount()
+    return LaserLog([scans[row] for row in rows], wheels, mount,
+                    (*skipped, *said, *taken.refused), '; '.join(damage))
+
+
+class _Taken:
+    """What was taken of a bag so far."""
+
+    def __init__(self) -> None:
+        self.scans: list[Scan] = []
+        self.stamps: list[int] = []
+        self.poses: list[Array] = []
+        self.refused: list[str] = []
+        self._frame = self._base = ''
+        self._transforms: dict[str, tuple[str, Array]] = {}
+
+    def take(self, is_scan: bool, message: Any) -> None:
+        """Take a message; one that is none is told of once."""
+        try:
+            if message.topic == _STATIC:
+                for found in message.data.transforms:
+                    self._transforms[found.child_frame_id] = (
+                        found.header.frame_id, _pose3(found.transform))
+            elif is_scan:
+                self._frame = message.data.header.frame_id.removeprefix('/')
+                self.scans.append(scan_of(message.data))
+            else:
+                sample = odometry_sample(message.data)
+                self._base = sample.frame.removeprefix('/')
+                self.stamps.append(sample.stamp)
+                self.poses.append(se2.from_pose3(sample.pose3[None])[0])
+        except (MessageError, AttributeError, TypeError, ValueError) as error:
+            sentence = f'a message on {message.topic} is refused: {error}'
+            if sentence not in self.refused:
+                self.refused.append(sentence)
+
+    def mount(self) -> tuple[Mount, tuple[str, ...]]:
+        """Return where the laser is on the robot, and what is to be said of it."""
+        pose, frame = se3.identity(1), self._frame
+        for _ in self._transforms:
+            if frame in (self._base, '') or frame not in self._transforms:
+                break
+            frame, transform = self._transforms[frame]
+            pose = se3.compose(transform[None], pose)
+        if frame != self._base and self._frame:
+            return Mount(), (
+                f'{_STATIC} does not lead from {self._base!r} to {self._frame!r}; the laser is '
+                'taken to be where the robot is',)
+        R = se3.rotation(pose)[0]
+        return Mount(float(pose[0, 0]), float(pose[0, 1]), math.atan2(R[1, 0], R[0, 0]),
+                     bool(R[2, 2] < 0)), ()
+
+
+def scan_of(message: Any) -> Scan:
+    """
+    Return what a sensor_msgs/LaserScan says.
+
+    Raises
+    ------
+    ValueError : it is no scan.
+
+    """
+    ranges = np.asarray(message.ranges, float)
+    values = [float(value) for value in (
+        message.angle_min, message.angle_increment, message.range_min, message.range_max,
+        message.time_increment)]
+    if len(ranges) < 2 or not all(map(math.isfinite, values[:2])) or not values[1]:
+        raise ValueError(f'a scan of {counted(len(ranges), "ray")}, every {values[1]} rad')
+    return Scan(stamp_of(message.header), ranges, *values)
+
+
+def _pose3(transform: Any) -> Array:
+    t, q = transform.translation, transform.rotation
+    return np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whatever holds scans -> the graph that they make, and the points of its keyframes."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.io.formats import LOG_SUFFIXES, is_bag, is_log
+from l1slam_ros.io.scans.carmen import read_carmen
+from l1slam_ros.io.scans.to_graph import ScanMap, map_scans
+
+
+def read_scans(path: Path, odom_topic: str, scan_topic: str | None,
+               report: Callable[[int, int, int], None]) -> ScanMap:
+    """
+    Return what the scans of a log or a bag make.
+
+    Parameters
+    ----------
+    odom_topic, scan_topic : of a bag
+    report : told of how many scans of how many were used, and how many loops were found
+
+    Raises
+    ------
+    FileError : it cannot be read, or holds no scans.
+
+    """
+    if is_log(path):
+        log = read_carmen(path)
+    elif is_bag(path) and scan_topic:
+        from l1slam_ros.io.bags.reader import bag_summary
+        from l1slam_ros.io.scans.bag_scans import read_bag_scans
+
+        bag_summary(path)  # what is no bag is said as such
+        log = read_bag_scans(path, odom_topic, scan_topic)
+    else:
+        raise FileError(path, 'holds no scans; expected a bag, or a CARMEN log: '
+                        f'{", ".join(LOG_SUFFIXES)}')
+    made = map_scans(zip(log.scans, log.wheels, strict=True), log.mount,
+                     lambda scans, loops: report(scans, len(log.scans), loops))
+    if made.record.graph.n_poses < 2:
+        raise FileError(path, f'{len(log.scans):,} scans of a robot that did not move; expected '
+                        '2 keyframes or more')
+    record = made.record
+    return replace(made, record=replace(
+        record, skipped=(*log.skipped, *record.skipped), damage=log.damage))

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From scans to a map, a grid and a picture, with one command."""
+
+import bz2
+import json
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+from rooms import WALLS, laps, write_log, write_scan_bag, write_truth
+
+from l1slam_ros.cli.main import main
+
+
+@pytest.fixture(scope='module')
+def drive():
+    return laps()
+
+
+@pytest.fixture
+def truth(drive, tmp_path):
+    path = tmp_path / 'truth.csv'
+    write_truth(path, drive[0], drive[2])
+    return path
+
+
+def solved(capsys, *arguments):
+    """Return the exit code and what `solve --json` says."""
+    code = main(['solve', *map(str, arguments), '--json'])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_a_log_becomes_a_map_and_a_grid_that_others_read(drive, truth, tmp_path, capsys):
+    log, grid = tmp_path / 'room.clf.bz2', tmp_path / 'map.pgm'
+    plain = tmp_path / 'plain.clf'
+    write_log(plain, drive[0], drive[1])
+    log.write_bytes(bz2.compress(plain.read_bytes()))
+    code, said = solved(capsys, log, '--reference', truth, '--grid', grid)
+    assert code == 0 and said['status'] == 'converged'
+    assert said['loops'] - len(said['rejected']) >= 3
+    assert said['ate'] < 0.1 and said['ate_poses'] == said['poses']
+    picture, document = np.array(Image.open(grid)), yaml.safe_load(
+        grid.with_suffix('.yaml').read_text())
+    assert document['image'] == 'map.pgm' and document['negate'] == 0
+    assert document['resolution'] == 0.05 and len(document['origin']) == 3
+    assert set(np.unique(picture)) == {0, 205, 254}
+    # The room, from wall to wall; the robot began at (1.5, 1.5) of it.
+    rows, columns = np.nonzero(picture == 0)
+    x = document['origin'][0] + 0.05 * columns + 1.5
+    y = document['origin'][1] + 0.05 * (len(picture) - 1 - rows) + 1.5
+    assert (x.min(), x.max()) == pytest.approx((0, WALLS[:, ::2].max()), abs=0.2)
+    assert (y.min(), y.max()) == pytest.approx((0, WALLS[:, 1::2].max()), abs=0.2)
+
+
+def test_the_scans_of_a_bag_make_the_same_map(drive, truth, tmp_path, capsys):
+    bag = tmp_path / 'bag'
+    write_scan_bag(bag, *drive[:2], mount=((0.0, 0.0, 0.3), (0.0, 0.0, 0.0, 1.0)))
+    code, said = solved(capsys, bag, '--scans', '/scan', '--odom-topic', '/wheels',
+                        '--reference', truth)
+    assert code == 0 and said['ate'] < 0.05 and said['loops'] >= 3
+    assert said['warnings'] == []
+    again = solved(capsys, bag, '--scans', '/scan', '--odom-topic', '/wheels',
+                   '--reference', truth)[1]
+    assert {**again, 'seconds': 0} == {**said, 'seconds': 0}, 'nothing goes by the clock'
+
+
+def test_a_laser_that_is_turned_upside_down_and_ahead_is_read_off_the_transforms(
+        drive, truth, tmp_path, capsys):
+    scans, wheels, _ = drive
+    bag, turned = tmp_path / 'bag', []
+    for scan in scans:  # a half turn about x: rays go clockwise, from the same first one
+        ranges = np.roll(scan.ranges[::-1], 1)
+        turned.append(type(scan)(scan.stamp, ranges, scan.angle_min, scan.angle_increment,
+                                 scan.range_min, scan.range_max))
+    write_scan_bag(bag, turned, wheels, mount=((0.0, 0.0, 0.3), (1.0, 0.0, 0.0, 0.0)))
+    code, said = solved(capsys, bag, '--scans', '/scan', '--odom-topic', '/wheels',
+                        '--reference', truth)
+    assert code == 0 and said['ate'] < 0.05
+
+
+def test_without_transforms_it_says_where_it_takes_the_laser_to_be(drive, tmp_path, capsys):
+    bag = tmp_path / 'bag'
+    write_scan_bag(bag, *(part[:60] for part in drive[:2]))
+    said = solved(capsys, bag, '--scans', '/scan', '--odom-topic', '/wheels')[1]
+    assert any("/tf_static does not lead from 'base_link' to 'laser'" in sentence
+               for sentence in said['warnings'])
+
+
+@pytest.mark.parametrize(('arguments', 'expected'), [
+    (['--scans', '/laser', '--odom-topic', '/wheels'],
+     'no scans on /laser; expected sensor_msgs/msg/LaserScan, which is on /scan'),
+    (['--scans', '/scan'], '0 messages of odometry on /odom; expected those of a drive'),
+    (['--grid', 'map.pgm'], '--grid is of scans; expected --scans TOPIC, or a CARMEN log'),
+    (['--scans', '/scan', '--odom-topic', '/wheels', '--grid', 'map.png'],
+     'map.png: unknown suffix; expected .pgm')])
+def test_what_cannot_be_is_said_in_one_line(drive, tmp_path, capsys, arguments, expected):
+    bag = tmp_path / 'bag'
+    write_scan_bag(bag, *(part[:20] for part in drive[:2]))
+    assert main(['solve', str(bag), *arguments]) == 2
+    error, = capsys.readouterr().err.splitlines()
+    assert error.endswith(expected)
+
+
+def test_a_graph_holds_no_scans(tmp_path, capsys):
+    graph = tmp_path / 'graph.g2o'
+    graph.write_text('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n')
+    assert main(['solve', str(graph), '--scans', '/scan']) == 2
+    assert 'holds no scans; expected a bag, or a CARMEN log' in capsys.readouterr().err
+
+
+def test_a_grid_of_others_is_not_replaced(drive, tmp_path, capsys):
+    log, grid = tmp_path / 'room.clf', tmp_path / 'map.pgm'
+    write_log(log, *(part[:60] for part in drive[:2]))
+    grid.write_bytes(b'P5\n1 1\n255\n\0')
+    assert main(['solve', str(log), '--grid', str(grid)]) == 2
+    assert grid.read_bytes() == b'P5\n1 1\n255\n\0'
+    assert main(['solve', str(log), '--grid', str(grid), '--force']) == 0
+    assert main(['solve', str(log), '--grid', str(grid)]) == 0, 'this one is ours'
+
+
+def test_the_log_of_a_building_is_mapped_from_its_scans_alone(datasets, capsys, tmp_path):
+    folder = datasets / 'lidar'
+    code, said = solved(capsys, folder / 'fr079.clf.bz2', '--reference',
+                        folder / 'fr079.truth.csv')
+    assert code == 0 and said['ate'] < 0.2, 'by the wheels it is 14 m off'
