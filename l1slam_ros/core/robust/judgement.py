@@ -16,6 +16,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, lowest_of_components
+from l1slam_ros.core.robust.drift import straightened
 from l1slam_ros.core.robust.pairwise_consistency import (
     ASKED,
     Group,
@@ -71,7 +72,8 @@ class Judgement:
     (2,) of odometry and of loops as it was found, in units of what they state; noise : (m,) that
     of each in a map, in the same units; slips : (k,) the odometry factors that slipped, not
     accepted; doubts : reasons not to rely on the map; settled : no more is to be found out from
-    the factors that are there.
+    the factors that are there; drift : by how much more each metre of the odometry turns than it
+    says [rad/m].
     """
 
     accepted: Mask
@@ -82,6 +84,7 @@ class Judgement:
     slips: Indices
     doubts: tuple[Doubt, ...] = ()
     settled: bool = True
+    drift: float = 0.0
 
     @property
     def doubt(self) -> Doubt | None:
@@ -132,7 +135,8 @@ class Judgement:
 
     def believed(self, graph: FactorGraph) -> FactorGraph:
         """Return the accepted factors of a graph, as noisy as they are."""
-        return graph.subset(self.accepted, self.noise[self.accepted])
+        straight = straightened(graph, self.drift)
+        return straight.subset(self.accepted, self.noise[self.accepted])
 
     def found_variance(self, graph: FactorGraph) -> Array:
         """Return the variance that was found of these, in units of what they then state, (k,)."""
