@@ -26,9 +26,12 @@ from updates.cells import prefix
 from updates.tables import LARGE_MEMORY
 
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.online.backend import Backend, BackendOptions
+from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.online.snapshot import BuilderState, Optimised, SavedMap
+from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.running.backend import Backend, BackendOptions
+from l1slam_ros.core.running.optimised import Optimised
+from l1slam_ros.core.running.snapshot import SavedMap
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.compilation import load
 from l1slam_ros.io.files import invented_stamps
@@ -70,7 +73,7 @@ def _save(keyframes: int, edges: int, path: Path) -> None:
     part, chain = prefix(graph, count), odometry_poses(graph)[:count]
     with Backend(_OPTIONS) as backend:
         backend.restore(SavedMap(BuilderState.of_graph(part, chain, invented_stamps(count)),
-                                 Optimised.nothing(chain), True))
+                                 Optimised.nothing(chain), Judgement.nothing(), True))
         backend.settle()
         print(save_map(path, backend.saved()), flush=True)
     rest = list(islice(Drive.of(graph).messages, count, None))

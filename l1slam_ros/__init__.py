@@ -19,10 +19,10 @@ if TYPE_CHECKING:  # for editors and type checkers, which run nothing
     from l1slam_ros.core.graph.factor_graph import FactorGraph as FactorGraph
     from l1slam_ros.core.graph.measurements import LoopClosure as LoopClosure
     from l1slam_ros.core.graph.measurements import OdometrySample as OdometrySample
-    from l1slam_ros.core.online.backend import Backend as Backend
-    from l1slam_ros.core.online.backend import BackendOptions as BackendOptions
     from l1slam_ros.core.robust.door import Solution as Solution
     from l1slam_ros.core.robust.door import solve as solve
+    from l1slam_ros.core.running.backend import Backend as Backend
+    from l1slam_ros.core.running.backend import BackendOptions as BackendOptions
     from l1slam_ros.io.formats import read_graph as read_graph
     from l1slam_ros.io.formats import write_graph as write_graph
 
@@ -34,8 +34,8 @@ _HOMES = {
     'FactorGraph': 'core.graph.factor_graph',
     'OdometrySample': 'core.graph.measurements',
     'LoopClosure': 'core.graph.measurements',
-    'Backend': 'core.online.backend',
-    'BackendOptions': 'core.online.backend',
+    'Backend': 'core.running.backend',
+    'BackendOptions': 'core.running.backend',
     'L1SlamError': 'core.errors',
 }
 

@@ -12,9 +12,9 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.graph.recording import recorded
-from l1slam_ros.core.online.backend import BackendOptions
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.running.backend import BackendOptions
 
 # Every message a keyframe, with the covariance it states: the graph is that of the messages.
 EVERY = BackendOptions(KeyframeOptions(0.0, 0.0, 0.0), OdometryOptions('increment'))

@@ -2,6 +2,8 @@
 """The walls of the package, read off its source: who may import whom, and how long things are."""
 
 import ast
+import io
+import tokenize
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -19,7 +21,8 @@ ROS = {
 # stand beside the building: all may use them, and they use nothing.
 FLOORS = (
     ('core.kernels',), ('core.geometry',), ('core.graph',), ('core.solvers',), ('core.robust',),
-    ('core.incremental', 'core.worlds'), ('core.online',), ('io',), ('paper',), ('cli', 'ros'),
+    ('core.bordered', 'core.worlds'), ('core.online',), ('core.running',), ('io',), ('paper',),
+    ('cli', 'ros'),
 )
 # Only the algorithms that join them may know both a linear system and poses.
 BLIND = {f'{PACKAGE}.core.{name}': {f'{PACKAGE}.core.{other}' for other in others}
@@ -62,6 +65,21 @@ def imports(module):
             inside = {f'{node.module}.{alias.name}' for alias in node.names} & FILES.keys()
             found.update(inside or {node.module})
     return found
+
+
+def code_lines(path):
+    """Return the numbers of the lines of a file without docstrings, comments and blanks."""
+    text = path.read_text()
+    documented = [node for node in ast.walk(ast.parse(text))
+                  if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+                  and ast.get_docstring(node)]
+    docstrings = {line for node in documented
+                  for line in range(node.body[0].lineno, node.body[0].end_lineno + 1)}
+    layout = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT,
+              tokenize.ENDMARKER}
+    lines = {line for token in tokenize.generate_tokens(io.StringIO(text).readline)
+             if token.type not in layout for line in range(token.start[0], token.end[0] + 1)}
+    return lines - docstrings
 
 
 def ours(module):
@@ -156,3 +174,36 @@ def test_modules_and_functions_are_short(module):
 def test_modules_say_their_licence_and_what_they_are(module):
     assert FILES[module].read_text().startswith('# SPDX-License-Identifier: Apache-2.0\n')
     assert ast.get_docstring(tree(module))
+
+
+# What runs while a robot drives: a reader holds each class and function at once.
+RUNNING = [name for name in FILES if name.startswith(tuple(
+    f'{PACKAGE}.core.{part}' for part in ('bordered', 'graph', 'running')))]
+MOST_ATTRIBUTES, MOST_METHODS, MOST_CODE, MOST_OF_A_FUNCTION = 15, 25, 260, 40
+
+
+def stored(node):
+    """Return the attributes that are assigned anywhere in a node: of what, which."""
+    return [(getattr(one.value, 'id', ''), one.attr) for one in ast.walk(node)
+            if isinstance(one, ast.Attribute) and isinstance(one.ctx, ast.Store)]
+
+
+@pytest.mark.parametrize('module', RUNNING)
+def test_classes_that_run_are_small(module):
+    lines = code_lines(FILES[module])
+    assert len(lines) <= MOST_CODE
+    for node in ast.walk(tree(module)):
+        if isinstance(node, ast.FunctionDef):
+            assert len(lines & set(range(node.lineno, node.end_lineno + 1))) <= MOST_OF_A_FUNCTION
+        elif isinstance(node, ast.ClassDef):
+            methods = [one for one in node.body if isinstance(one, ast.FunctionDef)]
+            fields = {one.target.id for one in node.body if isinstance(one, ast.AnnAssign)}
+            fields |= {name for method in methods for of, name in stored(method) if of == 'self'}
+            assert len(methods) <= MOST_METHODS, f'{node.name} has {len(methods)} methods'
+            assert len(fields) <= MOST_ATTRIBUTES, f'{node.name} has {len(fields)} attributes'
+
+
+@pytest.mark.parametrize('module', RUNNING)
+def test_no_attribute_is_set_from_outside_its_class(module):
+    """A clone is of the class that makes it."""
+    assert {of for of, _ in stored(tree(module))} <= {'self', 'clone'}

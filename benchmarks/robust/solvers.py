@@ -12,10 +12,10 @@ from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
-from l1slam_ros.core.online.backend import Backend, BackendOptions
-from l1slam_ros.core.online.snapshot import ACCEPTED
 from l1slam_ros.core.robust import batch_map
 from l1slam_ros.core.robust.judgement import Doubt
+from l1slam_ros.core.running.backend import Backend, BackendOptions
+from l1slam_ros.core.running.snapshot import ACCEPTED
 from l1slam_ros.paper.updates import Drive
 
 # Online: an update after so many keyframes, for so long [s].
@@ -134,8 +134,8 @@ def _online(rate: float) -> Callable[[FactorGraph, Array], Found]:
 def _come_to_rest(backend: Backend) -> None:
     """Wait, as a robot that stands still, until no map follows another."""
     began, maps = time.monotonic(), -1
-    while backend.maps != maps and time.monotonic() - began < _LONGEST_REST:
-        maps = backend.maps
+    while backend.revisions.map != maps and time.monotonic() - began < _LONGEST_REST:
+        maps = backend.revisions.map
         time.sleep(_REST)
 
 
@@ -143,7 +143,7 @@ def _found(backend: Backend, graph: FactorGraph, seconds: float,
            maps: tuple[Array, ...]) -> Found:
     """Return what the back end believes, by the rows of the graph it was fed."""
     now, factors = backend.snapshot(), graph.between
-    judgement = now.optimised.judgement
+    judgement = now.judgement
     steps = np.where(factors.is_odometry, np.minimum(factors.i, factors.j), -1)
     slips = np.flatnonzero(np.isin(steps, now.graph.between.i[judgement.slips]))
     return Found(backend.poses, seconds, _accepted(backend, graph), tuple(slips.tolist()),

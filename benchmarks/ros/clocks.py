@@ -99,7 +99,7 @@ class Robot(Peer):
     def saved(self) -> tuple[FactorGraph, Indices]:
         """Return the graph of what is accepted in the saved map, and the stamps (n,) [ns]."""
         saved = load_map(self.path)[0]
-        accepted = saved.optimised.judgement.accepted
+        accepted = saved.judgement.accepted
         return saved.builder.graph.subset(accepted), saved.builder.stamps
 
 

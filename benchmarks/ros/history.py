@@ -20,7 +20,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import OdometrySample
-from l1slam_ros.core.online.backend import Backend, BackendOptions
+from l1slam_ros.core.running.backend import Backend, BackendOptions
 
 MESSAGES, RATE = 1_000_000, 1_000
 _SECOND = 10**9  # [ns]
@@ -58,7 +58,7 @@ def _run(kind: str, source: str, count: int) -> None:
         pose[0] = position(kind, k / RATE, rng)
         backend.add_odometry(OdometrySample(k * _SECOND // RATE, pose, _COVARIANCE, _COVARIANCE))
         if k % (count // _REPORTS) == 0:
-            kept = len(backend._builder.track)
+            kept = len(backend._keeper._builder.track)
             print(f'  {k:9,} messages: {_resident() - before:6.1f} MB more, {kept:9,} samples '
                   f'kept, {len(backend.snapshot().stamps)} keyframes, '
                   f'{(time.process_time() - began) / k * 1e6:.0f} us each', flush=True)

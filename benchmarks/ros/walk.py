@@ -2,11 +2,13 @@
 """
 Which files one odometry message and one loop enter, from the callback to the published Path.
 
-    python benchmarks/ros/walk.py
+    python benchmarks/ros/walk.py [--files]
 
 The real node runs in this process, a hook in each of its threads; a peer sends it a little map,
-and, once that is at rest, a message that makes a keyframe and a loop that ends there. Said are the
-files of the package in the order in which each thread enters them, and what it calls there.
+and, once that is at rest, a message that makes a keyframe and a loop that ends there. Said is of
+each step of doc/how_a_message_becomes_a_map.md whether its thread came there, after the step
+before; with --files also all files of the package that each thread enters. It ends with 1 where
+the walk leaves the page.
 """
 
 import argparse
@@ -24,6 +26,7 @@ import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
+from page import Part, parts
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -35,28 +38,45 @@ from l1slam_ros.ros.node import BackendNode
 from l1slam_ros.ros.publishing import header
 from l1slam_ros.ros.shell.domain import go_where_nobody_is
 
-PACKAGE = Path(l1slam_ros.__file__).parent
+PACKAGE = f'{Path(l1slam_ros.__file__).parent}{os.sep}'
 KEYFRAMES, SECOND = 10, 10**9
 _CALM = 3.0  # [s] without a Path: the map is at rest
-# What judges and factors the map behind the update is another walk.
-THREADS = 'intake', 'solver'
 
 
 class Walk:
-    """The files that each thread enters while it is on, and the functions there."""
+    """What each thread calls in the package while it is on, in order."""
 
     def __init__(self) -> None:
         self.on = False
-        self.entered: dict[str, dict[Path, dict[str, None]]] = defaultdict(dict)
+        self.calls: dict[str, list[tuple[str, str]]] = defaultdict(list)
         threading.setprofile(self._note)
 
     def _note(self, frame: FrameType, event: str, _: Any) -> None:
         code = frame.f_code
-        if self.on and event == 'call' and code.co_filename.startswith(f'{PACKAGE}{os.sep}'):
-            files = self.entered[threading.current_thread().name]
-            file = Path(code.co_filename).relative_to(PACKAGE)
-            if not code.co_name.startswith('<'):
-                files.setdefault(file, {})[code.co_name] = None
+        ours = code.co_filename.startswith(PACKAGE) and not code.co_name.startswith('<')
+        if self.on and event == 'call' and ours:
+            file = code.co_filename.removeprefix(PACKAGE)
+            self.calls[threading.current_thread().name].append((file, code.co_name))
+
+    def met(self, part: Part) -> list[bool]:
+        """Return of each step whether its thread came there after the one before."""
+        calls, begin, met = self.calls[part.thread], 0, []
+        for step in part.steps:
+            wanted = step.file, step.call.split('.')[-1]
+            found = wanted in calls[begin:]
+            met.append(found)
+            begin = calls.index(wanted, begin) if found else begin
+        return met
+
+    def print_files(self) -> None:
+        """Print the files that each thread entered, and what it called there."""
+        for thread, calls in self.calls.items():
+            files: dict[str, dict[str, None]] = {}
+            for file, name in calls:
+                files.setdefault(file, {})[name] = None
+            print(f'{thread}: {len(files)} files')
+            for file, names in files.items():
+                print(f'  {file:42}{", ".join(names)}')
 
 
 class Peer:
@@ -104,10 +124,8 @@ class Peer:
                 count, end = len(self.paths), time.monotonic() + _CALM
 
 
-def main() -> int:
-    """Walk and print."""
-    argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+def walked() -> Walk:
+    """Return the walk of a message and a loop through the node."""
     compile_now(STEPS)
     go_where_nobody_is()  # nobody else's odometry is counted
     rclpy.init()
@@ -122,16 +140,29 @@ def main() -> int:
     walk.on = True
     peer.drive()
     peer.close()
+    peer.rest()
     walk.on = False
-    files = {thread: walk.entered[thread] for thread in THREADS}
-    for thread, entered in files.items():
-        print(f'{thread}: {len(entered)} files')
-        for file, functions in entered.items():
-            print(f'  {str(file):42}{", ".join(functions)}')
-    print(f'{len(set().union(*files.values()))} files in all')
     node.close()
     rclpy.try_shutdown()
-    return 0
+    return walk
+
+
+def main() -> int:
+    """Walk and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--files', action='store_true', help='print all files, too')
+    arguments = parser.parse_args()
+    walk, left = walked(), 0
+    for part in parts():
+        print(f'{part.title} ({part.thread})')
+        for step, met in zip(part.steps, walk.met(part), strict=True):
+            left += not met
+            print(f'  {step.number:2} {step.file:44}{step.call:34}{"" if met else "NOT MET"}')
+    if arguments.files:
+        walk.print_files()
+    print(f'{left} steps of the page were not met' if left else 'the walk is that of the page')
+    return min(left, 1)
 
 
 if __name__ == '__main__':

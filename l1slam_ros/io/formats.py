@@ -19,7 +19,8 @@ import numpy as np
 from l1slam_ros.core.errors import FileError, GraphError, OptionError, require
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph, as_poses
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.measurements import as_poses
 from l1slam_ros.core.names import QUATERNION, ROTATION_INFORMATION
 from l1slam_ros.core.robust.inspection import initial_poses
 from l1slam_ros.io.bags.topics import BAG_SUFFIXES, DEFAULT_TOPICS, Topics

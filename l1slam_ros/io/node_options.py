@@ -10,8 +10,8 @@ import yaml
 
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.names import OF_ROS
-from l1slam_ros.core.online.backend import BackendOptions
 from l1slam_ros.core.options import Options, Scalar, dotted, option
+from l1slam_ros.core.running.backend import BackendOptions
 from l1slam_ros.io.bounded import read_yaml
 
 # The name of the node, unless it was given another.

@@ -24,8 +24,8 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.graph.recording import recorded
-from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.running.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world

@@ -9,8 +9,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.online.snapshot import Behind
-from l1slam_ros.core.online.update import Improvement
+from l1slam_ros.core.running.improve import Improvement
+from l1slam_ros.core.running.snapshot import Behind
 from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.inputs import Traffic
 from l1slam_ros.ros.threads.solver_thread import SolverThread

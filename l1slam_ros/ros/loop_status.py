@@ -9,7 +9,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from l1slam_ros.core.geometry.manifold import Indices
-from l1slam_ros.core.online.snapshot import ACCEPTED, EXPIRED, LOOP_STATES, WAITING, LoopStates
+from l1slam_ros.core.running.snapshot import ACCEPTED, EXPIRED, LOOP_STATES, WAITING, LoopStates
 from l1slam_ros.io.files import stamp_text
 from l1slam_ros.io.messages.serialisation import cdr, header_bytes, string_bytes
 

@@ -19,7 +19,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import WORLD
-from l1slam_ros.core.online.snapshot import ACCEPTED, REJECTED, SUSPECT, Snapshot
+from l1slam_ros.core.running.snapshot import ACCEPTED, REJECTED, SUSPECT, Snapshot
 from l1slam_ros.io.messages.serialisation import cdr, header_bytes, string_bytes
 
 # As in the pictures: Okabe and Ito's, and a redder red.

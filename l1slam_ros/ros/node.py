@@ -3,7 +3,7 @@
 `backend`: the node. Odometry and loop closures in, the optimised Path out; no arithmetic.
 
 One thread takes messages in and answers with poses, one improves the map and publishes it, one
-carries out what services ask for, and saves. See `core.online.backend` for why none waits for the
+carries out what services ask for, and saves. See `core.running.backend` for why none waits for the
 other.
 """
 
@@ -19,7 +19,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
-from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.io.graphs.map_file import MapFile, unusable_path
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.diagnostics import Diagnostics
@@ -39,7 +39,7 @@ _SAVING = 4.0
 
 class BackendNode(LifecycleNode):
     """
-    The ROS face of `core.online.backend.Backend`.
+    The ROS face of `core.running.backend.Backend`.
 
     A managed node: messages are used, and map -> odom is published, while it is active, which it
     is at once unless `autostart` is off. To clean it up empties the map.
@@ -172,10 +172,11 @@ class BackendNode(LifecycleNode):
         self._inputs.look_at_events()
         for sentence in self._backend.news():
             self.get_logger().warning(sentence)
-        counts, refused = self._backend.counts()
+        counts = self._backend.counts()
         self._diagnostics.publish(
-            counts, self._backend.behind(), self._inputs.refused.copy() + Counter(refused),
-            Counter(self._backend.told()), self._twins())
+            counts.sizes, self._backend.behind(),
+            self._inputs.refused.copy() + Counter(counts.refused), Counter(counts.told),
+            self._twins())
 
     def _twins(self) -> str:
         """Return what is wrong where another node has this one's name; else nothing."""

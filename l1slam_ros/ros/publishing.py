@@ -10,8 +10,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
 from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.core.online.update import Improvement
+from l1slam_ros.core.running.backend import Backend
+from l1slam_ros.core.running.improve import Improvement
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.messages.serialisation import path_bytes, pose_bytes
 from l1slam_ros.ros.diagnostics import Diagnostics
@@ -42,22 +42,22 @@ class MapPublisher:
         self.covariance = node.create_publisher(
             PoseWithCovarianceStamped, 'pose_with_covariance', 10)
         self._markers, self._loop_status = GraphMarkers(node), LoopStatus(node)
-        self._maps, self._version = 0, backend.version
+        # The revision that was published last.
+        self._published = 0
 
     def tell(self, improvement: Improvement | None = None) -> None:
         """Publish what is new; improvement : what the last update did, None: nothing."""
         if improvement is not None:
             self._diagnostics.note(improvement)
-        maps, version = self._backend.maps, self._backend.version
-        if maps != self._maps:
+        revisions = self._backend.revisions
+        if revisions.map > self._published:
             self._publish_map()
-            self._maps = maps
-        elif version != self._version:
+        elif revisions.now > self._published:
             # Nothing new in the map, but a loop can have come for later, or expired.
             self._loop_status.publish(self._backend.loop_states())
         elif self._markers.behind:
             self._markers.publish(self._frame, self._newest(), self._backend.snapshot())
-        self._version = version
+        self._published = revisions.now
 
     def _publish_map(self) -> None:
         now, manifold = self._backend.snapshot(), self._backend.manifold

@@ -12,8 +12,8 @@ from collections import deque
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.node import Node
 
-from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.core.online.snapshot import Robot
+from l1slam_ros.core.running.backend import Backend
+from l1slam_ros.core.running.snapshot import Robot
 from l1slam_ros.io.files import LAST_STAMP, NANOSECONDS
 from l1slam_ros.io.messages.serialisation import pose_bytes, transform_bytes
 from l1slam_ros.ros.parameters import NodeParameters

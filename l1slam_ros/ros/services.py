@@ -16,10 +16,10 @@ from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.core.errors import DoubtfulError, Interrupted
-from l1slam_ros.core.online.backend import Backend, Stopped
-from l1slam_ros.core.online.snapshot import Snapshot
-from l1slam_ros.core.online.update import Improvement
 from l1slam_ros.core.robust.batch_map import shared_offset
+from l1slam_ros.core.running.backend import Backend, Stopped
+from l1slam_ros.core.running.improve import Improvement
+from l1slam_ros.core.running.snapshot import Snapshot
 from l1slam_ros.io.graphs.map_file import MapFile
 from l1slam_ros.io.sentences import doubt_sentence, offset_sentence
 from l1slam_ros.ros.threads.failures import Failures

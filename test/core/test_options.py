@@ -12,9 +12,9 @@ import yaml
 
 import l1slam_ros.core
 from l1slam_ros.core.errors import L1SlamError, OptionError
-from l1slam_ros.core.online.backend import BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.options import Options, dotted, flatten, option, with_values
+from l1slam_ros.core.running.backend import BackendOptions
 from l1slam_ros.io.node_options import NodeOptions, read_params_file
 
 SHIPPED = Path(__file__).parents[2] / 'config' / 'backend.yaml'

@@ -31,7 +31,7 @@ from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.graph.linear_system import linearise
 from l1slam_ros.core.names import NORMS
-from l1slam_ros.core.online.backend import Backend, RobustOptions
+from l1slam_ros.core.running.backend import Backend, RobustOptions
 from l1slam_ros.core.robust import batch_map
 from l1slam_ros.core.robust.inspection import connected_parts
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of

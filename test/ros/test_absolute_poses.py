@@ -11,7 +11,7 @@ from gps import seen
 from node_bench import EVERY_MESSAGE, call, odometry, poses_of
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.online.snapshot import ACCEPTED
+from l1slam_ros.core.running.snapshot import ACCEPTED
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bags.from_graph import write_graph_bag
 from l1slam_ros.io.graphs.graph_file import GraphRecord

@@ -19,8 +19,8 @@ from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.online.snapshot import ACCEPTED
 from l1slam_ros.core.robust.batch import robust_solve
+from l1slam_ros.core.running.snapshot import ACCEPTED
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file

@@ -14,7 +14,7 @@ pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticStatus
 from node_bench import call
 
-from l1slam_ros.core.online.upkeep import upkeep
+from l1slam_ros.core.running.keeper import updates, work
 from l1slam_ros.io.graphs import saved_map
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.ros import publishing
@@ -70,7 +70,7 @@ def assert_all_finite(b):
 
 @pytest.mark.parametrize('kind', FAULTS)
 def test_an_update_that_fails(bench, monkeypatch, tmp_path, kind):
-    fault = Fault(monkeypatch, upkeep, 'improve', kind)
+    fault = Fault(monkeypatch, work, 'improve', kind)
     b = bench(save_path=str(tmp_path / 'map.g2o'))
     b.drive(0, 3)
     b.until(lambda: len(b.path().poses) == 3 and is_ok(b), 'a map')
@@ -87,7 +87,7 @@ def test_an_update_that_fails(bench, monkeypatch, tmp_path, kind):
 
 
 def test_an_update_that_always_fails_is_not_tried_all_the_time(bench, monkeypatch):
-    fault = Fault(monkeypatch, upkeep, 'improve', 'ValueError')
+    fault = Fault(monkeypatch, work, 'improve', 'ValueError')
     fault.on = True
     b = bench(**{'update.period': 0.001})
     b.drive(0, 3)
@@ -105,8 +105,8 @@ def test_an_update_that_always_fails_is_not_tried_all_the_time(bench, monkeypatc
 @pytest.mark.parametrize('kind, service, module, function', [
     ('ValueError', 'save', saved_map, 'graph_lines'),
     ('MemoryError', 'load', saved_map, 'read_graph_file'),
-    ('MemoryError', 'optimize', upkeep, 'optimise'),
-    ('nan', 'optimize', upkeep, 'optimise')])
+    ('MemoryError', 'optimize', updates, 'optimise'),
+    ('nan', 'optimize', updates, 'optimise')])
 def test_a_service_that_fails(bench, monkeypatch, tmp_path, kind, service, module, function):
     fault = Fault(monkeypatch, module, function, kind)
     b = bench(save_path=str(tmp_path / 'map.g2o'))
@@ -164,7 +164,7 @@ def test_a_publisher_that_fails(bench, monkeypatch):
 
 
 def test_each_kind_of_failure_is_logged_once_in_full(bench, monkeypatch, capfd):
-    fault = Fault(monkeypatch, upkeep, 'improve', 'ValueError')
+    fault = Fault(monkeypatch, work, 'improve', 'ValueError')
     fault.on = True
     b = bench()
     b.drive(0, 3)

@@ -18,7 +18,7 @@ from node_bench import begin, call, odometry, poses_of
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from l1slam_ros.core.online.upkeep import upkeep
+from l1slam_ros.core.running.keeper import updates, work
 from l1slam_ros.io.graphs.saved_map import is_map, load_map
 
 DEADLINE = 60.0
@@ -48,7 +48,7 @@ def test_the_map_is_saved_while_it_grows_and_at_the_end(bench, tmp_path, monkeyp
 
 
 def test_the_map_is_saved_whatever_a_service_works_at(bench, tmp_path, monkeypatch):
-    path, optimise = tmp_path / 'map.g2o', upkeep.optimise
+    path, optimise = tmp_path / 'map.g2o', updates.optimise
     begun, finish = threading.Event(), threading.Event()
 
     def slow(*arguments):
@@ -56,7 +56,7 @@ def test_the_map_is_saved_whatever_a_service_works_at(bench, tmp_path, monkeypat
         finish.wait(DEADLINE)
         return optimise(*arguments)
 
-    monkeypatch.setattr(upkeep, 'optimise', slow)
+    monkeypatch.setattr(updates, 'optimise', slow)
     b = bench(save_path=str(path), autosave_period=0.2)
     b.drive(0, 3)
     b.until(lambda: keyframes(path) == 3, 'the map is saved')
@@ -76,7 +76,7 @@ def test_a_settled_map_is_loaded_at_start_and_published_at_once(bench, tmp_path,
     first.until(lambda: first.backend._backend.snapshot().problem().settled, 'it settles')
     assert call(first, 'save').success
     improved = []
-    monkeypatch.setattr(upkeep, 'improve', lambda *_: improved.append(1))
+    monkeypatch.setattr(work, 'improve', lambda *_: improved.append(1))
     second = bench(save_path=str(path), load_on_start=True)
     second.until(lambda: len(second.path().poses) == 4, 'the map is there without odometry')
     np.testing.assert_array_equal(poses_of(second.path()), poses_of(first.path()))

@@ -62,7 +62,7 @@ def test_a_map_over_a_restart_is_whole_and_the_restart_is_told_of(bench, capfd):
     # All that joins both parts is one lap driven twice: the map is taken, and that is said.
     answer = call(b, 'optimize')
     assert not answer.success and answer.message.startswith('doubtful: of how two parts lie ')
-    counts, refused = b.backend._backend.counts()
+    counts, refused, _ = b.backend._backend.counts()
     assert counts['accepted_loops'] == len(laps.loops) and not refused
     b.until(lambda: len(b.path().poses) == counts['keyframes'], 'the whole map')
     stamps = np.array([p.header.stamp.sec * 10**9 + p.header.stamp.nanosec
@@ -82,7 +82,7 @@ def test_another_publisher_makes_a_small_jump_a_restart(bench, capfd, restarts):
             restart_driver(b)
         b.send('/odom', odometry(seconds(10 + 0.05 * k), 5 + 0.05 * k + 0.4 * (k >= 30)))
     b.until(lambda: b.backend._backend.robot().stamp == seconds(12.95), 'all is used')
-    assert b.backend._backend.snapshot().gaps.size == restarts
+    assert b.backend._backend.snapshot().graph.firsts.size == restarts
     told = []
     if restarts:
         b.until(lambda: told.extend(said(capfd)) or told, 'it is told of')

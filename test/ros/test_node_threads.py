@@ -16,8 +16,8 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 
-from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.core.online.upkeep import upkeep
+from l1slam_ros.core.running.backend import Backend
+from l1slam_ros.core.running.keeper import updates, work
 from l1slam_ros.io.graphs.saved_map import load_map
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.ros.threads import solver_thread
@@ -71,7 +71,7 @@ from pathlib import Path
 from problems import loop, odometry
 from l1slam_ros.ros import node
 from l1slam_ros.io.node_options import NodeOptions
-from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.io.graphs.saved_map import load_map, save_map
 backend = Backend(NodeOptions())
 for k in range(20):
@@ -109,8 +109,8 @@ def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
     b = bench(save_path=str(tmp_path / 'map.g2o'))
     b.drive(0, 3)
     b.until(lambda: len(b.path().poses) == 3, 'a map')
-    began, improve = threading.Event(), upkeep.improve
-    monkeypatch.setattr(upkeep, 'improve', lambda *a: began.set() or patient(*a))
+    began, improve = threading.Event(), work.improve
+    monkeypatch.setattr(work, 'improve', lambda *a: began.set() or patient(*a))
     b.drive(3, 5)
     b.until(began.is_set, 'an update that takes for ever')
     assert call(b, 'save').message.startswith('5 keyframes')
@@ -121,8 +121,8 @@ def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
     assert call(b, 'load').success
     b.until(lambda: len(b.path().poses) == 5, 'the map is back')
     assert call(b, 'pause', SetBool.Request(data=True)).success
-    b.until(lambda: not b.backend._backend._updating.locked(), 'the update stops')
-    monkeypatch.setattr(upkeep, 'improve', improve)
+    b.until(lambda: not b.backend._backend._updates._update_lock.locked(), 'the update stops')
+    monkeypatch.setattr(work, 'improve', improve)
     assert call(b, 'pause', SetBool.Request(data=False)).success
     b.drive(5, 8)
     b.until(lambda: len(b.path().poses) == 8, 'updates go on')
@@ -181,7 +181,7 @@ def test_optimize_is_done_though_the_map_is_replaced_meanwhile(bench, monkeypatc
     b = bench()
     b.drive(0, 3)
     b.until(lambda: len(b.path().poses) == 3, 'a map')
-    began, optimise = threading.Event(), upkeep.optimise
+    began, optimise = threading.Event(), updates.optimise
 
     def interrupted(problem, options, check):
         while not began.is_set():
@@ -190,7 +190,7 @@ def test_optimize_is_done_though_the_map_is_replaced_meanwhile(bench, monkeypatc
                 check()
         return optimise(problem, options, check)
 
-    monkeypatch.setattr(upkeep, 'optimise', interrupted)
+    monkeypatch.setattr(updates, 'optimise', interrupted)
     answer = begin(b, 'optimize')
     b.until(began.is_set, 'it is at work')
     assert b.backend.set_parameters([Parameter('robust.enabled', value=False)])[0].successful

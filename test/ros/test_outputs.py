@@ -15,13 +15,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from bags import write_world
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.online.snapshot import (
-    ACCEPTED,
-    EXPIRED,
-    REJECTED,
-    WAITING,
-    LoopStates,
-)
+from l1slam_ros.core.running.snapshot import ACCEPTED, EXPIRED, REJECTED, WAITING, LoopStates
 from l1slam_ros.io.messages.serialisation import header_bytes
 from l1slam_ros.ros.loop_status import LoopStatus, states_bytes
 from l1slam_ros.ros.markers import _array_bytes

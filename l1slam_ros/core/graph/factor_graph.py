@@ -22,6 +22,8 @@ from l1slam_ros.core.graph.growable_array import GrowingArray
 # The first end of an absolute factor: the map frame, a keyframe that never moves. As an index into
 # poses with the identity behind them it picks that; see `linear_system.with_world`.
 WORLD = -1
+# In the place of a predecessor: the keyframe is the first of a part.
+NO_PREDECESSOR = -1
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class BetweenFactors:
     i, j : (m,) keyframe indices, i may be `WORLD`: an absolute factor; measurement : (m, p)
     relative poses; sqrt_information : (m, d, d) upper triangular roots, see `noise`, a zero row
     says nothing; trusted, struck : (m,) bool, a person or a marker vouches for it, or a person has
-    struck it out.
+    struck it out; predecessor : (n,) of the keyframes, see `FactorGraph`.
     """
 
     i: Indices
@@ -41,6 +43,7 @@ class BetweenFactors:
     sqrt_information: Array
     trusted: Mask
     struck: Mask
+    predecessor: Indices
 
     def __len__(self) -> int:
         return len(self.i)
@@ -56,12 +59,21 @@ class BetweenFactors:
         return np.asarray(self.i == WORLD)
 
     @cached_property
+    def step_to(self) -> Indices:
+        """(n,) the first factor between each keyframe and its predecessor, -1: there is none."""
+        before = np.append(self.predecessor, NO_PREDECESSOR)  # the last one is the world's
+        forward, backward = before[self.j] == self.i, before[self.i] == self.j
+        steps = np.flatnonzero((forward | backward) & ~self.is_absolute)
+        keyframe, first = np.unique(np.where(forward, self.j, self.i)[steps], return_index=True)
+        row = np.full(len(self.predecessor), -1)
+        row[keyframe] = steps[first]
+        return row
+
+    @cached_property
     def is_odometry(self) -> Mask:
-        """(m,) bool: the first factor between each two consecutive keyframes, either way round."""
-        consecutive = np.flatnonzero((np.abs(self.i - self.j) == 1) & ~self.is_absolute)
-        _, first = np.unique(np.minimum(self.i, self.j)[consecutive], return_index=True)
+        """(m,) bool: the first factor between each keyframe and its predecessor, see `step_to`."""
         mask = np.zeros(len(self), bool)
-        mask[consecutive[first]] = True
+        mask[self.step_to[self.step_to >= 0]] = True
         return mask
 
     @cached_property
@@ -79,25 +91,29 @@ class FactorGraph:
     """
     An append-only pose graph on one manifold.
 
+    A keyframe has a robot, and a predecessor: the keyframe from which the odometry of that robot
+    leads to it, which was there before it; or none. Nothing else is said by its index: keyframes
+    of several robots come in any order.
+
     Parameters
     ----------
     manifold : the module the poses live on, e.g. `se2`
-    n_poses : how many keyframes exist already
-
-    Attributes
-    ----------
-    n_poses : how many keyframes exist
-    said : how often a person changed what counts, see `say`
+    n_poses : how many keyframes exist already, each the predecessor of the next
 
     """
 
     def __init__(self, manifold: Manifold, n_poses: int = 0):
-        self.manifold, self.n_poses, self.said = manifold, n_poses, 0
+        self.manifold = manifold
         p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
+        self._predecessor, self._robot = GrowingArray((), np.int64), GrowingArray((), np.int64)
+        # By robot.
+        self._last: dict[int, int] = {}
         self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
                          GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_),
                          GrowingArray((), np.bool_)]
         self._factors: BetweenFactors | None = None
+        if n_poses:
+            self.add_poses(n_poses)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all, the manifold by its name: modules are not pickled, nor deeply copied."""
@@ -106,11 +122,44 @@ class FactorGraph:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, manifold=import_module(state['manifold']))
 
+    @property
+    def n_poses(self) -> int:
+        """How many keyframes exist."""
+        return len(self._predecessor)
+
+    @property
+    def predecessor(self) -> Indices:
+        """The keyframe before each one, (n,), `NO_PREDECESSOR`: there is none."""
+        return self._predecessor.view()
+
+    @property
+    def firsts(self) -> Indices:
+        """The keyframes that have no predecessor, but for the first one of all, (g,)."""
+        return np.flatnonzero(self.predecessor[1:] == NO_PREDECESSOR) + 1
+
+    @property
+    def parent(self) -> Indices:
+        """The predecessor of each keyframe, (n,); where there is none, the keyframe itself."""
+        before = self.predecessor
+        return np.where(before == NO_PREDECESSOR, np.arange(len(before)), before)
+
+    @property
+    def robot(self) -> Indices:
+        """The number of the robot of each keyframe, (n,)."""
+        return self._robot.view()
+
     def copy(self) -> 'FactorGraph':
         """Return a graph that shares all factors so far; either may grow without the other."""
-        clone = FactorGraph(self.manifold, self.n_poses)
+        clone = self.without_factors()
         clone._between = [column.copy() for column in self._between]
         clone._factors = self._factors
+        return clone
+
+    def without_factors(self) -> 'FactorGraph':
+        """Return a graph of the same keyframes, of which nothing is measured."""
+        clone = FactorGraph(self.manifold)
+        clone._predecessor, clone._robot = self._predecessor.copy(), self._robot.copy()
+        clone._last = self._last.copy()
         return clone
 
     @property
@@ -132,7 +181,7 @@ class FactorGraph:
         variance : (k,) by which to multiply the covariance of each, none: as they are
 
         """
-        part = FactorGraph(self.manifold, self.n_poses)
+        part = self.without_factors()
         i, j, measurement, root, trusted, struck = (
             column.view()[chosen] for column in self._between)
         if variance is not None:
@@ -144,18 +193,41 @@ class FactorGraph:
     def between(self) -> BetweenFactors:
         """All factors so far: a snapshot that later appends do not change."""
         if self._factors is None:
-            self._factors = BetweenFactors(*(column.view() for column in self._between))
+            i, j, measurement, root, trusted, struck = (
+                column.view() for column in self._between)
+            self._factors = BetweenFactors(
+                i, j, measurement, root, trusted, struck, self.predecessor)
         return self._factors
 
-    def add_poses(self, count: int = 1) -> None:
-        """Let `count` more keyframes exist; the next index is `n_poses` before the call."""
-        self.n_poses += count
+    def add_poses(self, count: int = 1, robot: int = 0, begins_part: bool = False) -> None:
+        """
+        Let `count` more keyframes of a robot exist; the next index is `n_poses` before the call.
 
-    def append_step(self, measurement: Array, sqrt_information: Array) -> None:
-        """Append a keyframe and the factor to it from the one before: (1, p), (1, d, d)."""
-        self.add_poses(1)
-        k = np.array([self.n_poses - 1])
-        self.append_between(k - 1, k, measurement, sqrt_information)
+        Each follows the one before it; the first of them the robot's last one, unless it begins a
+        part: then it has no predecessor.
+        """
+        first = self.n_poses
+        before = np.arange(first - 1, first + count - 1)
+        before[:1] = NO_PREDECESSOR if begins_part else self._last.get(robot, NO_PREDECESSOR)
+        self._predecessor.extend(before)
+        before[:] = robot
+        self._robot.extend(before)
+        self._last[robot] = self.n_poses - 1
+        self._factors = None
+
+    def append_step(self, measurement: Array, sqrt_information: Array, robot: int = 0) -> None:
+        """Append a keyframe and the factor to it from the robot's last: (1, p), (1, d, d)."""
+        self.add_poses(1, robot)
+        i = self.predecessor[-1:]
+        self.append_between(i, np.array([self.n_poses - 1]), measurement, sqrt_information)
+
+    def follow(self, keyframes: Indices, predecessors: Indices | int) -> None:
+        """Let some keyframes (k,) have other predecessors; what was seen before stays."""
+        before = self.predecessor.copy()
+        before[keyframes] = predecessors
+        self._predecessor = GrowingArray((), np.int64)
+        self._predecessor.extend(before)
+        self._factors = None
 
     def add_between(self, i: Indices, j: Indices, measurement: Array, information: Array,
                     trusted: Mask | bool = False) -> None:
@@ -210,29 +282,7 @@ class FactorGraph:
             # What was seen of the column before stays as it was.
             self._between[column] = GrowingArray((), np.bool_)
             self._between[column].extend(said)
-        self._factors, self.said = None, self.said + 1
-
-
-def as_poses(graph: FactorGraph, values: object, what: str) -> Array:
-    """
-    Return what a caller calls poses as an array (n, p) of numbers, finite or not.
-
-    what : begins the sentence on what is wrong with them, e.g. `poses have`
-
-    Raises
-    ------
-    GraphError : of another shape, or none of numbers.
-
-    """
-    expected = (graph.n_poses, graph.manifold.POSE_SIZE)
-    try:
-        poses = np.asarray(values, float)
-    except (TypeError, ValueError) as error:
-        raise GraphError(f'{what} entries that are no numbers ({error}), expected the shape '
-                         f'{expected}') from error
-    if poses.shape != expected:
-        raise GraphError(f'{what} the shape {poses.shape}, expected {expected}')
-    return poses
+        self._factors = None
 
 
 def component_labels(graph: FactorGraph) -> Indices:
@@ -294,6 +344,6 @@ def turned(graph: FactorGraph, rows: Indices | Mask) -> FactorGraph:
     upper = np.linalg.qr(roots[rows] @ manifold.adjoint(Z[rows]), mode='r')
     signs = np.where(np.diagonal(upper, axis1=1, axis2=2) < 0, -1.0, 1.0)
     roots[rows] = signs[:, :, None] * upper
-    other = FactorGraph(manifold, graph.n_poses)
+    other = graph.without_factors()
     other.append_between(i, j, Z, roots, factors.trusted, factors.struck)
     return other

@@ -4,6 +4,7 @@
 import mmap
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 # Memory of this process alone; elsewhere it is so anyway.
 _PRIVATE = ({'flags': mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, 'MAP_PRIVATE')
@@ -24,7 +25,8 @@ class GrowingArray:
 
     """
 
-    def __init__(self, shape: tuple[int, ...] = (), dtype: type = np.float64, room: int = 0):
+    def __init__(self, shape: tuple[int, ...] = (), dtype: DTypeLike = np.float64,
+                 room: int = 0):
         self._data = _reserved((room, *shape), dtype) if room else np.empty((0, *shape), dtype)
         self._length = 0
 
@@ -53,13 +55,13 @@ class GrowingArray:
 
     def copy(self) -> 'GrowingArray':
         """Return an equal array that shares these rows; without spare room, it moves to grow."""
-        clone = GrowingArray(self._data.shape[1:], self._data.dtype.type)
+        clone = GrowingArray(self._data.shape[1:], self._data.dtype)
         clone._data = self.view()
         clone._length = self._length
         return clone
 
 
-def _reserved(shape: tuple[int, ...], dtype: type) -> np.ndarray:
+def _reserved(shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
     """
     Return an array of zeros whose small pages come as they are written to.
 

@@ -43,18 +43,21 @@ class GraphProblem:
 
     def step_along(self, poses: Array, x: Array) -> Array:
         """
-        Return the poses moved by x (columns,), each as seen from the one before.
+        Return the poses moved by x (columns,), each as seen from its predecessor.
 
         The same to first order; but where a long way turns as a whole, none of it is torn.
         """
         manifold, fixed = self.graph.manifold, anchor(self.graph)
         step = np.zeros((len(poses), manifold.TANGENT_SIZE))
         step[fixed:] = x.reshape(-1, manifold.TANGENT_SIZE)
-        relative = manifold.between(poses[:-1], poses[1:])
-        carried = manifold.adjoint(manifold.inverse(relative)) @ step[:-1, :, None]
-        chain = np.concatenate((manifold.retract(poses[:1], step[:1]),
-                                manifold.retract(relative, step[1:] - carried[..., 0])))
-        return compose_tree(manifold, np.maximum(np.arange(len(poses)) - 1, 0), chain)
+        parent = self.graph.parent
+        child = np.flatnonzero(parent != np.arange(len(parent)))
+        before = parent[child]
+        relative = manifold.between(poses[before], poses[child])
+        carried = manifold.adjoint(manifold.inverse(relative)) @ step[before, :, None]
+        chain = manifold.retract(poses, step)
+        chain[child] = manifold.retract(relative, step[child] - carried[..., 0])
+        return compose_tree(manifold, parent, chain)
 
     def curvature(self, poses: Array, dual: Array) -> Array:
         """Return the Hessian of dual'e for each factor, (m, 2 k, 2 k)."""

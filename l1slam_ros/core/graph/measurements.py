@@ -12,10 +12,11 @@ from numbers import Integral
 
 import numpy as np
 
-from l1slam_ros.core.errors import MessageError, require
+from l1slam_ros.core.errors import GraphError, MessageError, require
 from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import LEAST_VARIANCE
+from l1slam_ros.core.graph.factor_graph import FactorGraph
 
 # [m/s] The speed of sound: no vehicle on the ground has been faster (Thrust SSC, 341 m/s). Stamps
 # nearer to each other than this [s] may be jitter, and say nothing about speed.
@@ -106,6 +107,28 @@ def in_order(loop: LoopClosure) -> LoopClosure:
     Ad = se3.adjoint(pose)[0]
     return replace(loop, reference_stamp=loop.stamp, stamp=reference, pose3=se3.inverse(pose)[0],
                    covariance=Ad @ loop.covariance @ Ad.T)
+
+
+def as_poses(graph: FactorGraph, values: object, what: str) -> Array:
+    """
+    Return what a caller calls poses as an array (n, p) of numbers, finite or not.
+
+    what : begins the sentence on what is wrong with them, e.g. `poses have`
+
+    Raises
+    ------
+    GraphError : of another shape, or none of numbers.
+
+    """
+    expected = (graph.n_poses, graph.manifold.POSE_SIZE)
+    try:
+        poses = np.asarray(values, float)
+    except (TypeError, ValueError) as error:
+        raise GraphError(f'{what} entries that are no numbers ({error}), expected the shape '
+                         f'{expected}') from error
+    if poses.shape != expected:
+        raise GraphError(f'{what} the shape {poses.shape}, expected {expected}')
+    return poses
 
 
 def require_sound(what: OdometrySample | LoopClosure, kind: type) -> None:

@@ -17,10 +17,8 @@ _VAGUE, _TINY = 21.5, 1e-300
 
 
 def odometry_gaps(graph: FactorGraph) -> Indices:
-    """Return the keyframes k without a factor between k and k + 1, (g,)."""
-    factors = graph.between
-    first = np.minimum(factors.i, factors.j)[factors.is_odometry]
-    return np.setdiff1d(np.arange(graph.n_poses - 1), first)
+    """Return the keyframes k where no odometry leads from any keyframe to k + 1, (g,)."""
+    return np.flatnonzero(graph.between.step_to[1:] < 0)
 
 
 def vague_odometry(graph: FactorGraph) -> Mask:
@@ -64,6 +62,7 @@ def _with_steps(graph: FactorGraph, at: Indices, Z: Array) -> FactorGraph:
     if not len(at):
         return graph
     whole, usual = graph.copy(), _usual(graph)
+    whole.follow(at + 1, at)
     whole.append_between(at, at + 1, Z, np.broadcast_to(usual, (len(at), *usual.shape)))
     return whole
 

@@ -18,10 +18,9 @@ from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 
 
 def steps_of(graph: FactorGraph) -> Indices:
-    """Return which factor leads from each keyframe to the next, (n - 1,)."""
-    factors = graph.between
-    rows = np.flatnonzero(factors.is_odometry)
-    return rows[np.argsort(np.minimum(factors.i, factors.j)[rows])]
+    """Return which factor leads to each keyframe that has odometry, in their order, (s,)."""
+    step_to = graph.between.step_to
+    return step_to[step_to >= 0]
 
 
 def loops_of(graph: FactorGraph) -> Indices:
@@ -44,13 +43,14 @@ def recorded(graph: FactorGraph,
     factors; what is left unsaid has an infinite variance.
     """
     factors, to_pose3 = graph.between, graph.manifold.to_pose3
-    steps, loops = steps_of(graph), loops_of(graph)
-    poses, measured, covariances = to_pose3(_chain(graph, steps)), to_pose3(
+    steps, loops = factors.step_to, loops_of(graph)
+    poses, measured, covariances = to_pose3(_chain(graph)), to_pose3(
         factors.measurement), _covariances(graph)
     ends = np.searchsorted(factors.j[loops], np.arange(graph.n_poses + 1))
     still = np.zeros((6, 6))
     for k, stamp in enumerate(stamps):
-        sample = OdometrySample(stamp, poses[k], covariances[steps[k - 1]] if k else still, still)
+        covariance = covariances[steps[k]] if steps[k] >= 0 else still
+        sample = OdometrySample(stamp, poses[k], covariance, still)
         rows = loops[ends[k]:ends[k + 1]]
         said = [LoopClosure(None if factors.i[row] == WORLD else stamps[factors.i[row]], stamp,
                             measured[row], covariances[row], bool(factors.trusted[row]))
@@ -60,15 +60,17 @@ def recorded(graph: FactorGraph,
                        *said[count:]]
 
 
-def _chain(graph: FactorGraph, steps: Indices) -> Array:
+def _chain(graph: FactorGraph) -> Array:
     """
     Return the poses (n, p) that the odometry alone gives, from the identity.
 
     One after the other: so each is exact to rounding *relative to the one before*.
     """
-    poses = graph.manifold.identity(graph.n_poses)
-    for k, step in enumerate(graph.between.measurement[steps]):
-        poses[k + 1] = graph.manifold.compose(poses[k], step)
+    poses, parent = graph.manifold.identity(graph.n_poses), graph.parent
+    steps = graph.between.step_to
+    for k in np.flatnonzero(steps >= 0).tolist():
+        step = graph.between.measurement[steps[k]]
+        poses[k] = graph.manifold.compose(poses[parent[k]], step)
     return poses
 
 

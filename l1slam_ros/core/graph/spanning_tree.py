@@ -18,10 +18,13 @@ def odometry_poses(graph: FactorGraph) -> Array:
 
     Raises
     ------
-    GraphError : two consecutive keyframes without a factor between them.
+    GraphError : a keyframe, but the first, without odometry from a predecessor.
 
     """
-    parent = np.maximum(np.arange(graph.n_poses) - 1, 0)
+    parent = graph.parent
+    if len(graph.firsts):
+        raise GraphError(f'keyframe {graph.firsts[0]} has no predecessor; expected odometry that '
+                         'joins all keyframes')
     odometry = np.flatnonzero(graph.between.is_odometry)
     return _compose_along(graph, parent, odometry)
 

@@ -15,9 +15,9 @@ import numpy as np
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.geometry.noise import MOST_OF_ODOMETRY, root_of_inverse
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import NO_PREDECESSOR, FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, Notes, OdometrySample
-from l1slam_ros.core.graph.parts import odometry_gaps
+from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.online.keyframes import (
     KeyframeMotion,
     KeyframeOptions,
@@ -28,7 +28,6 @@ from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
 from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame, OdometryStream
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
 from l1slam_ros.core.online.odometry.plausibility import UNSEEN_TURN, Point
-from l1slam_ros.core.online.snapshot import BuilderState
 from l1slam_ros.core.options import Options, option
 
 # What a gap in the odometry is to the map: the cause it is counted by, and what is said of it.
@@ -60,7 +59,7 @@ class GraphBuilder:
     Parameters
     ----------
     manifold : what the poses live on
-    options : see `GraphBuilderOptions`; may be replaced at any time
+    options : see `GraphBuilderOptions`
     verbatim : the messages are those of a graph: each is a measurement as it is stated, none a
         loop sent again or odometry that jumps
     base_frame : tells whose odometry it is; None: by the options alone
@@ -97,6 +96,10 @@ class GraphBuilder:
         self.track = OdometryTrack(graph.manifold)
         self.offset, self._level = graph.manifold.identity(1), Level(graph.manifold)
         self._moved, self._glued = False, True
+
+    def set_options(self, options: GraphBuilderOptions) -> None:
+        """Go on by other options; what is in the graph stays."""
+        self.options = options
 
     def add_odometry(self, sample: OdometrySample) -> bool:
         """
@@ -225,7 +228,7 @@ class GraphBuilder:
     def _begin_part(self, stamp: int, pose: Array) -> None:
         """Begin a part of the map with a keyframe."""
         self.track.append(stamp, pose, is_keyframe=True)
-        self.graph.add_poses(1)
+        self.graph.add_poses(1, begins_part=True)
         self._motion = KeyframeMotion(self.graph.manifold, stamp, pose)
 
     def _forget(self) -> None:
@@ -248,8 +251,12 @@ class GraphBuilder:
     def restore(self, state: BuilderState) -> None:
         """Go on where a run ended; odometry that begins elsewhere begins a part there."""
         self._begin(state.graph)
+        # In a file a loop across a gap looks like odometry.
+        steps = self.graph.between.step_to
+        firsts = np.flatnonzero((steps[1:] < 0) | np.isin(steps[1:], state.loop_rows)) + 1
+        self.graph.follow(firsts, NO_PREDECESSOR)
         track, stamps = self.track, state.stamps
-        for part in np.split(np.arange(len(stamps)), odometry_gaps(self.graph) + 1):
+        for part in np.split(np.arange(len(stamps)), firsts):
             track.extend_by_part(stamps[part], state.odometry[part])
         self.offset = state.offset
         self._motion = KeyframeMotion(self.graph.manifold, track.last_stamp, track.last_pose)

@@ -9,7 +9,8 @@ import numpy as np
 from l1slam_ros.core.errors import GraphError, OptionError, require
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph, as_poses
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.measurements import as_poses
 from l1slam_ros.core.names import NORMS, SAME
 from l1slam_ros.core.robust import batch_map
 

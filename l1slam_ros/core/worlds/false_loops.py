@@ -56,7 +56,7 @@ def insert_loops(graph: FactorGraph, loops: Loops) -> FactorGraph:
     factors = graph.between
     ends = np.maximum.accumulate(np.maximum(factors.i, factors.j))
     place = np.searchsorted(ends, loops.j, side='right')
-    longer = FactorGraph(graph.manifold, graph.n_poses)
+    longer = graph.without_factors()
     longer.add_between(
         np.insert(factors.i, place, loops.i), np.insert(factors.j, place, loops.j),
         np.insert(factors.measurement, place, loops.measurement, axis=0),

@@ -182,7 +182,7 @@ def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, e
     i, j = _index(path, ids, edges).T
     i, none = np.where(edges.alone, WORLD, i), np.zeros(len(edges), bool)
     roots = _roots(path, edges)
-    doubted = BetweenFactors(i, j, edges.pose, roots, none, none)
+    doubted = BetweenFactors(i, j, edges.pose, roots, none, none, graph.predecessor)
     trusted, struck = (remarks['trusted'], remarks['struck']) if remarks else (
         named_loops(path, name, ids, doubted) for name in ('trusted', 'struck'))
     graph.append_between(i, j, edges.pose, roots, trusted & ~struck & ~struck_here,

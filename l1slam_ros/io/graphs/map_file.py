@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from l1slam_ros.core.errors import FileError, OptionError
-from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.core.online.snapshot import SavedMap
+from l1slam_ros.core.running.backend import Backend
+from l1slam_ros.core.running.snapshot import SavedMap
 from l1slam_ros.io.files import other_kind
 from l1slam_ros.io.formats import named
 from l1slam_ros.io.graphs.saved_map import before_of, is_map, keep_as, load_map, save_map
@@ -46,19 +46,20 @@ class MapFile:
         self.is_saving, self._one = False, threading.Lock()
         # When the last save began, or the node; and whether there was one.
         self._began, self._tried = time.monotonic(), False
-        # Where the map was saved or loaded last, and its version then.
-        self._known = _absolute(options().save_path), backend.version
-        # The file that we wrote or loaded, its end, and the graph whose map it holds; and of the
-        # one before it the name and the end.
+        # Where the map was saved or loaded last, and its revision then.
+        self._known = _absolute(options().save_path), backend.revisions.now
+        # The file that we wrote or loaded, its end, and what names the graph whose map it holds;
+        # and of the one before it the name and the end.
         self._ours: tuple[object, ...] = ()
         self._ours_before: tuple[object, ...] = ()
 
     def save(self) -> str:
         """Save the map; return a sentence that says where, and what of others was kept."""
         with self._at_work(), self._backend.calm:
-            version, path, saved = self._backend.version, self._path(), self._backend.saved()
+            revision, path = self._backend.revisions.now, self._path()
+            saved = self._backend.saved()
             kept = self._keep_others(path, saved)
-            return '; '.join([self._write(path, saved, version), *kept])
+            return '; '.join([self._write(path, saved, revision), *kept])
 
     def autosave(self, taken: Callable[[], None] = lambda: None) -> None:
         """
@@ -67,7 +68,7 @@ class MapFile:
         taken : called before it is written: what becomes of the map from then on does not matter
         """
         with self._at_work():
-            version = self._backend.version
+            revision = self._backend.revisions.now
             saved = self._backend.saved() if self._is_to_be_saved() else None
             taken()
             if saved is None:
@@ -75,7 +76,7 @@ class MapFile:
             path = self._path()
             for sentence in self._keep_others(path, saved):
                 self._warn(sentence)
-            self._write(path, saved, version)
+            self._write(path, saved, revision)
 
     def _keep_others(self, path: Path, saved: SavedMap | None) -> list[str]:
         """Keep what stands in the places of a map and is none of it; return what to say of it."""
@@ -85,7 +86,7 @@ class MapFile:
         end_before = _end_of(before)
         if end_before and self._ours_before != (before, end_before):
             sentences += _kept(before, path)
-        if end and self._ours != (path, end, saved.number):
+        if end and self._ours != (path, end, saved.graph_began):
             sentences += _kept(path, path)
         return sentences
 
@@ -98,12 +99,11 @@ class MapFile:
             finally:
                 self.is_saving = False
 
-    def _write(self, path: Path, saved: SavedMap | None,
-               version: tuple[int, int, int]) -> str:
+    def _write(self, path: Path, saved: SavedMap | None, revision: int) -> str:
         self._tried = True
         sentence = save_map(path, saved)
-        self._known = path, version
-        self._ours = path, _end_of(path), saved.number if saved else 0
+        self._known = path, revision
+        self._ours = path, _end_of(path), saved.graph_began if saved else 0
         self._ours_before = before_of(path), _end_of(before_of(path))
         return sentence
 
@@ -120,11 +120,11 @@ class MapFile:
         end = _end_of(path)
         saved, sentence, whole = load_map(path)
         with named(path):
-            number = self._backend.restore(saved)
-        self._known = path, self._backend.version
+            graph = self._backend.restore(saved)
+        self._known = path, self._backend.revisions.now
         # What could not be read may be of use to somebody yet, and a graph that is no saved map is
         # somebody's own.
-        self._ours = (path, end, number) if whole and is_map(path) else ()
+        self._ours = (path, end, graph) if whole and is_map(path) else ()
         before = before_of(path)
         self._ours_before = (before, _end_of(before)) if is_map(before) else ()
         return sentence, whole
@@ -152,7 +152,7 @@ class MapFile:
     def _is_to_be_saved(self) -> bool:
         options = self._options()
         return (options.save_path != '' and options.autosave_period > 0
-                and self._known != (_absolute(options.save_path), self._backend.version))
+                and self._known != (_absolute(options.save_path), self._backend.revisions.now))
 
     def _path(self) -> Path:
         path = self._options().save_path

@@ -16,8 +16,10 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.graph.measurements import LoopClosure
-from l1slam_ros.core.online.snapshot import BuilderState, Optimised, SavedMap
+from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.robust.judgement import Doubt, Judgement
+from l1slam_ros.core.running.optimised import Optimised
+from l1slam_ros.core.running.snapshot import SavedMap
 from l1slam_ros.io.files import other_kind, put_lines, replacing
 from l1slam_ros.io.graphs.graph_file import GraphRecord, graph_lines, read_graph_file
 from l1slam_ros.io.graphs.left_out import SUSPECT, left_out_by
@@ -119,7 +121,7 @@ def _remove_leftovers(path: Path) -> None:
 
 def _left_out(saved: SavedMap) -> np.ndarray:
     """Return why each factor is left out; loops that came after the judgement wait for it."""
-    factors, judgement = saved.builder.graph.between, saved.optimised.judgement
+    factors, judgement = saved.builder.graph.between, saved.judgement
     if not saved.robust or not len(judgement.accepted):
         return left_out_by(None, factors)
     words = left_out_by(judgement, factors)
@@ -130,13 +132,13 @@ def _left_out(saved: SavedMap) -> np.ndarray:
 
 def _remarks(saved: SavedMap) -> dict[str, Any]:
     """Return by name what g2o has no tag for."""
-    state, optimised = saved.builder, saved.optimised
+    state, judgement = saved.builder, saved.judgement
     values = {f.name: getattr(record, f.name)
-              for record in (state, optimised, optimised.judgement) for f in fields(record)}
-    for name in 'graph', 'poses', 'judgement':
+              for record in (state, saved.optimised, judgement) for f in fields(record)}
+    for name in 'graph', 'poses':
         del values[name]
     return values | {
-        'doubts': [asdict(doubt) for doubt in optimised.judgement.doubts], 'robust': saved.robust,
+        'doubts': [asdict(doubt) for doubt in judgement.doubts], 'robust': saved.robust,
         'trusted': state.graph.between.trusted, 'struck': state.graph.between.struck,
         'seen': [[key.hex(), state.seen[key]] for key in sorted(state.seen)],
         'waiting': [[loop.reference_stamp, loop.stamp, loop.trusted, loop.struck, age,
@@ -153,17 +155,16 @@ def _read(path: Path) -> SavedMap:
     state = BuilderState.of_graph(record.graph, record.poses, record.stamps)
     optimised, values = Optimised.nothing(record.poses), dict(record.remarks or {})
     if not values:
-        return SavedMap(state, optimised, True)
+        return SavedMap(state, optimised, Judgement.nothing(), True)
     waiting = tuple(
         (LoopClosure(reference, stamp, np.array(pose3), np.array(covariance), trusted, struck),
          age)
         for reference, stamp, trusted, struck, age, pose3, covariance in values.pop('waiting'))
     seen = {bytes.fromhex(key): row for key, row in values.pop('seen')}
     doubts = tuple(Doubt(**doubt) for doubt in values.pop('doubts'))
-    judgement = replace(_restored(optimised.judgement, values), doubts=doubts)
+    judgement = replace(_restored(Judgement.nothing(), values), doubts=doubts)
     return SavedMap(replace(_restored(state, values), waiting=waiting, seen=seen),
-                    replace(_restored(optimised, values), judgement=judgement),
-                    values['robust'])
+                    _restored(optimised, values), judgement, values['robust'])
 
 
 def _restored(record: _Record, values: dict[str, Any]) -> _Record:

@@ -34,7 +34,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from l1slam_ros.core.errors import L1SlamError, MessageError, OptionError
 from l1slam_ros.core.graph.measurements import LoopClosure
-from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.io.files import quoted
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs

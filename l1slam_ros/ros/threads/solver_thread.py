@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 from l1slam_ros.core.errors import Interrupted
-from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.core.online.update import Improvement
+from l1slam_ros.core.running.backend import Backend
+from l1slam_ros.core.running.improve import Improvement
 from l1slam_ros.io.compilation import STEPS, fill_cache, load, with_space
 from l1slam_ros.ros.parameters import NodeParameters
 from l1slam_ros.ros.threads.background import background
@@ -125,7 +125,9 @@ class SolverThread:
 
         try:
             steps = with_space(STEPS, self._backend.manifold)
-            if self._backend.alone(lambda: fill_cache(report, self.is_closing, steps)):
+            with self._backend.alone():
+                whole = fill_cache(report, self.is_closing, steps)
+            if whole:
                 load(steps)
             else:
                 self._logger.debug('not all is compiled yet: the rest is when it is first called')

@@ -9,20 +9,25 @@ from problems import add_absolute, random_information, random_poses
 from l1slam_ros.core.errors import GraphError, L1SlamError, NoiseError
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.graph.factor_graph import (
+    NO_PREDECESSOR,
     WORLD,
     BetweenFactors,
     FactorGraph,
     component_labels,
     turned,
 )
+from l1slam_ros.core.graph.l1_problem import GraphProblem
 from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.graph.parts import bridged, odometry_gaps
+from l1slam_ros.core.graph.recording import recorded
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
 
 
 def between(i, j):
     """Return factors between the given keyframes that measure nothing in particular."""
     m = len(i)
     return BetweenFactors(np.array(i), np.array(j), np.zeros((m, 3)), np.zeros((m, 3, 3)),
-                          *np.zeros((2, m), bool))
+                          *np.zeros((2, m), bool), np.arange(-1, 8))
 
 
 def graph_with(n, pairs):
@@ -160,8 +165,8 @@ def test_arrays_that_do_not_fit_together_are_refused(shape):
     with pytest.raises((GraphError, ValueError)):
         graph.add_between(np.array([0, 1]), np.array([1, 2]), np.zeros(shape),
                           np.array([GOOD, GOOD]))
-    columns = vars(graph.between).values()
-    assert {len(column) for column in columns} == {0}
+    columns = vars(graph.between) | {'predecessor': ()}  # that is of the keyframes
+    assert {len(column) for column in columns.values()} == {0}
 
 
 @pytest.mark.parametrize('manifold', [se2, se3])
@@ -177,3 +182,62 @@ def test_a_factor_that_is_turned_says_the_same_to_first_order(rng, manifold):
     squares = [(whitened_residual(g, poses).reshape(-1, d)**2).sum(axis=1)
                for g in (graph, turned(graph, np.arange(5)))]
     assert_allclose(squares[1], squares[0], rtol=1e-4)
+
+
+def two_robots(rng):
+    """Return a graph of two robots whose keyframes come in turns, and poses it measures."""
+    graph, truth, root = FactorGraph(se2), random_poses(6, rng), 2 * np.eye(3)[None]
+    for robot in 0, 1:
+        graph.add_poses(1, robot, begins_part=True)
+    for k, robot in (2, 0), (3, 1), (4, 1), (5, 0):
+        before = np.flatnonzero(graph.robot == robot)[-1]
+        graph.append_step(se2.between(truth[before:before + 1], truth[k:k + 1]), root, robot)
+    i, j = np.array([1, 3]), np.array([2, 5])
+    graph.append_between(i, j, se2.between(truth[i], truth[j]), np.tile(root, (2, 1, 1)))
+    return graph, truth
+
+
+def test_keyframes_of_several_robots_come_in_any_order(rng):
+    graph, truth = two_robots(rng)
+    assert graph.robot.tolist() == [0, 1, 0, 1, 1, 0]
+    assert graph.predecessor.tolist() == [NO_PREDECESSOR, NO_PREDECESSOR, 0, 1, 3, 2]
+    factors = graph.between
+    # One loop joins neighbours in the order of their indices.
+    assert factors.is_odometry.tolist() == 4 * [True] + 2 * [False]
+    assert factors.step_to.tolist() == [-1, -1, 0, 1, 2, 3]
+    assert odometry_gaps(graph).tolist() == [0]
+    assert graph.subset(np.array([3, 4])).between.is_odometry.tolist() == [True, False]
+    turned_round = turned(graph, np.arange(6)).between
+    assert_array_equal(turned_round.is_odometry, factors.is_odometry)
+    stamps = list(range(1, 7))
+    poses = se2.from_pose3(np.stack([sample.pose3 for sample, _ in recorded(graph, stamps)]))
+    for own in [0, 2, 5], [1, 3, 4]:
+        way = se2.between(truth[own[:1] * 3], truth[own])
+        assert_allclose(se2.local(poses[own], way), 0, atol=1e-12)
+    with pytest.raises(GraphError, match='keyframe 1 has no predecessor'):
+        odometry_poses(graph)
+    # For a judge of chains one is made of them; the graph stays as it is.
+    assert odometry_poses(bridged(graph)).shape == (6, 3)
+    assert graph.predecessor[1] == NO_PREDECESSOR
+
+
+def test_a_step_along_is_one_along_predecessors(rng):
+    graph, truth = two_robots(rng)
+    x, problem = 1e-5 * rng.standard_normal(15), GraphProblem(graph)
+    apart = se2.local(problem.step(truth, x), problem.step_along(truth, x))
+    assert np.abs(apart).max() < 1e-8
+    # What leads to a keyframe is changed by its own step and that of its predecessor alone.
+    x[:12] = 0.0
+    moved = problem.step_along(truth, x)
+    assert_allclose(moved[:5], truth[:5], atol=1e-12)
+
+
+def test_what_was_seen_of_predecessors_stays():
+    graph = graph_with(4, [(0, 1), (1, 2), (2, 3)])
+    before, copy = graph.predecessor, graph.copy()
+    graph.follow(np.array([2]), NO_PREDECESSOR)
+    graph.add_poses()
+    assert before.tolist() == copy.predecessor.tolist() == [-1, 0, 1, 2]
+    assert graph.predecessor.tolist() == [-1, 0, -1, 2, 3]
+    assert graph.between.is_odometry.tolist() == [True, False, True]
+    assert copy.between.is_odometry.all()

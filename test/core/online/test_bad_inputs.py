@@ -21,10 +21,10 @@ from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.online.snapshot import ACCEPTED
 from l1slam_ros.core.robust.batch import robust_solve
+from l1slam_ros.core.running.backend import Backend, BackendOptions, RobustOptions
+from l1slam_ros.core.running.snapshot import ACCEPTED
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import read_graph_file
@@ -60,7 +60,7 @@ def test_intel_with_absurd_variances_and_every_loop_five_times(datasets, robust)
     assert (spoiled.loop_states().state == ACCEPTED).sum() == 893
     # 895 loops, two of which stand in the file twice.
     assert spoiled.counts()[1]['repeated'] == 5 * 895 - 893
-    assert spoiled._builder.notes.warned['odometry_variance'] == 80 * 3
+    assert spoiled._keeper._builder.notes.warned['odometry_variance'] == 80 * 3
 
 
 VARIANCES = [1e-300, 1e-30, 1e-20, 1e-12, 1e-8, 1e-4, 1.0, 1e4, 1e12, 1e30, 1e300]
@@ -93,7 +93,7 @@ def test_no_variance_makes_an_update_fail(source, component, period, rng):
                 backend.add_loop(loop(factors.i[loops[n]] * PERIOD, k * PERIOD,
                                       factors.measurement[loops[n]],
                                       stated(n, source == 'loop')))
-        backend._builder.add_due_loops()
+        backend._keeper._builder.add_due_loops()
     for _ in range(3):
         backend.update(0.1)
     backend.settle()
@@ -101,7 +101,7 @@ def test_no_variance_makes_an_update_fail(source, component, period, rng):
     assert len(backend.poses) == backend.snapshot().graph.n_poses
     off = np.hypot(*(se2.between(backend.poses[:1], backend.poses))[:, :2].T)
     assert off.max() < 2 * np.hypot(*chain[:, :2].T).max() + 10
-    assert backend._builder.notes.warned
+    assert backend._keeper._builder.notes.warned
 
 
 def exact_world(n, edges, rng, false_loops):

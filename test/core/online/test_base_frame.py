@@ -8,8 +8,8 @@ from problems import EVERY, odometry
 
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.graph_builder import GraphBuilder
+from l1slam_ros.core.running.backend import Backend
 
 
 def fed(frames, name=''):

@@ -26,10 +26,10 @@ from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.graph.parts import odometry_gaps
-from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.keyframes import KeyframeOptions
-from l1slam_ros.core.online.snapshot import ACCEPTED, REJECTED
+from l1slam_ros.core.running.backend import Backend
+from l1slam_ros.core.running.snapshot import ACCEPTED, REJECTED
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 N, HALF = 200, 100
@@ -82,7 +82,7 @@ def undisturbed(recording):
 def test_the_map_is_that_of_an_undisturbed_drive(world, recording, undisturbed, frame, back):
     backend = fed(Backend(EVERY), moved(recording, frame, back))
     now = backend.snapshot()
-    assert now.gaps.tolist() == [HALF] and odometry_gaps(now.graph).tolist() == [HALF - 1]
+    assert now.graph.firsts.tolist() == [HALF] and odometry_gaps(now.graph).tolist() == [HALF - 1]
     assert len(now.poses) == N and (np.diff(now.stamps) < 0).sum() == (back > 0)
     assert np.bincount(backend.loop_states().state)[ACCEPTED] > 100
     # What the odometry knew of that step is lost.
@@ -94,7 +94,7 @@ def test_played_twice_it_is_one_map_with_twice_the_odometry(world, recording, un
     """The loops are known, and what they say is in the first part; the second is odometry."""
     backend = fed(Backend(EVERY), recording + recording)
     now, loops = backend.snapshot(), len(world.graph.between) - N + 1
-    assert now.gaps.tolist() == [N] and len(now.graph.between) == 2 * (N - 1) + loops
+    assert now.graph.firsts.tolist() == [N] and len(now.graph.between) == 2 * (N - 1) + loops
     assert backend.counts()[1] == {'repeated': loops}
     assert_allclose(now.poses[:N], undisturbed, atol=0.05)
     assert_allclose(now.poses[N], now.poses[N - 1], atol=0.05)
@@ -192,17 +192,17 @@ def test_a_saved_map_keeps_its_parts(recording):
     one, second = fed(Backend(EVERY), moved(recording, (0.0, 0.0, 0.0), 5.0)), Backend(EVERY)
     first = one.snapshot()
     second.restore(one.saved())
-    assert second.snapshot().gaps.tolist() == [HALF]
+    assert second.snapshot().graph.firsts.tolist() == [HALF]
     assert_array_equal(second.snapshot().stamps, first.stamps)
     # The odometry of the second part goes on, in its frame.
     last = one.robot()
     there = se2.compose(last.odometry, np.array([[0.1, 0.0, 0.0]]))
     second.add_odometry(odometry(last.stamp / 1e9 + PERIOD, there[0]))
     assert_allclose(second.poses[N], se2.compose(last.map_to_odom, there)[0], atol=1e-9)
-    assert second.snapshot().gaps.tolist() == [HALF]
+    assert second.snapshot().graph.firsts.tolist() == [HALF]
     # Another recording, made earlier, is a part of its own.
     drive_on(second, straight(5), start=0.5)
-    assert second.snapshot().gaps.tolist() == [HALF, N + 1]
+    assert second.snapshot().graph.firsts.tolist() == [HALF, N + 1]
     assert_allclose(second.poses[N + 1], second.poses[N], atol=1e-9)
 
 
@@ -223,7 +223,7 @@ def test_a_robot_carried_off_while_its_map_was_saved_is_where_loops_say(
     second.restore(one.saved())
     fed(second, (message for message in found if message.stamp >= last and seen(message)))
     now = second.snapshot()
-    assert now.gaps.tolist() == gaps and len(now.poses) == N - unseen
+    assert now.graph.firsts.tolist() == gaps and len(now.poses) == N - unseen
     if gaps:
         truth = np.delete(world.truth, np.s_[HALF:HALF + unseen], axis=0)
         assert position_error(now.poses, truth) < 0.2

@@ -14,10 +14,10 @@ from problems import EVERY, hear, odometry, straight
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.noise import covariance_of
-from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import OdometryOptions
-from l1slam_ros.core.online.snapshot import ACCEPTED, REJECTED
+from l1slam_ros.core.running.backend import Backend, BackendOptions
+from l1slam_ros.core.running.snapshot import ACCEPTED, REJECTED
 
 NEAR, ZERO = (0.02, 0.0, 0.0), (0.0, 0.0, 0.0)
 # [s] Into the second lap, 11.4 m from the origin, before a corner, near the end and at the end.
@@ -125,7 +125,7 @@ def test_messages_that_come_late_make_no_parts(delay, share):
     found = late(laps.samples(), share, delay, np.random.default_rng(1))
     backend, refused = told(Backend(), laps, found)
     assert_whole(laps, backend, least, 0)
-    assert not backend.snapshot().gaps.size
+    assert not backend.snapshot().graph.firsts.size
     assert 0 < refused < share * len(found)
     # The pose of the robot waits for none of them.
     newest, backend = 0, Backend()
@@ -242,5 +242,5 @@ def test_a_restart_is_the_users_to_ignore():
     laps, _ = drive(False)
     backend = Backend(BackendOptions(on_time_jump='ignore'))
     told(backend, laps, laps.restarted(TIMES['far'], 0.05, NEAR))
-    assert not backend.snapshot().gaps.size
+    assert not backend.snapshot().graph.firsts.size
     assert 'the robot is taken to be where it was' in backend.news()[0]

@@ -19,10 +19,10 @@ from problems import (
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.first_fixes import first_fixes
 from l1slam_ros.core.graph.measurements import LoopClosure
-from l1slam_ros.core.online.backend import Backend, BackendOptions
-from l1slam_ros.core.online.snapshot import ACCEPTED
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
+from l1slam_ros.core.running.backend import Backend, BackendOptions
+from l1slam_ros.core.running.snapshot import ACCEPTED
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import read_graph_file
 

@@ -9,11 +9,11 @@ from problems import EVERY, play
 
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.graph.linear_system import whitened_residual
-from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.robust import batch, rounds
 from l1slam_ros.core.robust.batch import doubts_of_norm, judge, minimise_robustly, robust_solve
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
 from l1slam_ros.core.robust.judgement import FAILED, UNSOLVED
+from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
 from l1slam_ros.core.solvers.optimality import Status, l1_cost, l2_cost
@@ -133,4 +133,4 @@ def test_a_running_back_end_goes_on_with_what_it_believed(bad, failing):
     assert np.count_nonzero(judgement.accepted) > 200
     assert judgement.doubt.kind == FAILED and judgement.settled
     while backend.update(1.0):
-        assert backend.snapshot().optimised.judgement.doubt.kind == FAILED
+        assert backend.snapshot().judgement.doubt.kind == FAILED

@@ -19,9 +19,9 @@ from problems import EVERY, chain_of, retold, straight
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.robust.batch import judge
 from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.running.backend import Backend
 
 LOOPS = [(0, 2), (1, 4), (0, 1)]
 

@@ -10,8 +10,8 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.names import WORLDS
-from l1slam_ros.core.online.backend import Backend
 from l1slam_ros.core.robust.door import solve
+from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS
 from l1slam_ros.core.worlds.in_space import DRIVES
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
@@ -73,7 +73,7 @@ def test_a_back_end_in_space_ends_at_the_map_of_the_batch(world):
         backend.settle()
         batch = solve(made.graph)
         # A valley is flat: .01 m along it change the cost by less than a millionth.
-        assert backend.snapshot().optimised.cost == pytest.approx(batch.cost, rel=1e-5)
+        assert backend.snapshot().state.optimised.cost == pytest.approx(batch.cost, rel=1e-5)
         assert absolute_trajectory_error(backend.poses[:, :3], batch.poses[:, :3]) < 0.03
         saved = backend.saved()
     with Backend(EVERY, dimension=2) as flat, pytest.raises(

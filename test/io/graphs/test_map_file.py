@@ -10,7 +10,7 @@ import pytest
 from problems import odometry
 
 from l1slam_ros.core.errors import FileError, OptionError
-from l1slam_ros.core.online.backend import Backend
+from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.io.graphs.map_file import MapFile, unusable_path
 from l1slam_ros.io.graphs.saved_map import is_map, load_map
 from l1slam_ros.io.graphs.side_files import beside

@@ -14,11 +14,11 @@ from problems import EVERY, covariance6, loop, odometry, play
 from l1slam_ros.cli.main import main
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.online.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
-from l1slam_ros.core.online.snapshot import ACCEPTED, REJECTED, WAITING
-from l1slam_ros.core.online.upkeep import upkeep
 from l1slam_ros.core.robust.judgement import Doubt
+from l1slam_ros.core.running.backend import Backend, BackendOptions, RobustOptions
+from l1slam_ros.core.running.keeper import work
+from l1slam_ros.core.running.snapshot import ACCEPTED, REJECTED, WAITING
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 from l1slam_ros.io.graphs.saved_map import is_map, load_map, save_map
@@ -89,14 +89,14 @@ def test_all_comes_back(halfway, tmp_path):
     saved, path = halfway.saved(), tmp_path / 'map.g2o'
     assert {WAITING, ACCEPTED, REJECTED} <= set(halfway.loop_states().state)
     assert saved.builder.graph.between.struck.sum() == 1
-    doubtful = replace(saved.optimised.judgement, doubts=(Doubt('another map', 3, 4, 5),),
+    doubtful = replace(saved.judgement, doubts=(Doubt('another map', 3, 4, 5),),
                        variance=np.array([0.1, 2 / 3]), slips=np.array([7, 9]))
-    saved = replace(saved, optimised=replace(saved.optimised, judgement=doubtful))
+    saved = replace(saved, judgement=doubtful)
     assert save_map(path, saved) == f'50 keyframes saved to {path}'
     back, said, whole = load_map(path)
     assert whole and said == f'50 keyframes loaded from {path}'
-    # It has another number wherever it is loaded.
-    assert_equal(replace(saved, number=back.number), back)
+    # Its graph has another name wherever it is loaded.
+    assert_equal(replace(saved, graph_began=back.graph_began), back)
     assert [p.name for p in tmp_path.iterdir()] == ['map.g2o']
     assert len(saved.builder.waiting) == 3 and len(saved.builder.seen) == 20
 
@@ -110,7 +110,7 @@ def test_what_is_loaded_goes_on_as_if_nothing_had_been(world, halfway, tmp_path,
     np.testing.assert_array_equal(backend.snapshot().map_to_odom, halfway.snapshot().map_to_odom)
     # Nothing is judged anew, nor improved: there is nothing new.
     with monkeypatch.context() as patch:
-        patch.setattr(upkeep, 'improve', None)
+        patch.setattr(work, 'improve', None)
         assert backend.update(PLENTY) is None
     for one in backend, undisturbed:
         one.add_loop(TO_COME)
@@ -250,8 +250,8 @@ def test_a_map_of_the_version_before_is_read(two, tmp_path):
     assert is_map(old)
     saved, known = load_map(old)[0], load_map(two)[0]
     np.testing.assert_array_equal(saved.optimised.poses, known.optimised.poses)
-    np.testing.assert_array_equal(saved.optimised.judgement.accepted,
-                                  known.optimised.judgement.accepted)
+    np.testing.assert_array_equal(saved.judgement.accepted,
+                                  known.judgement.accepted)
 
 
 def test_others_find_every_believed_edge_before_the_first_comment_line(two):
@@ -260,7 +260,7 @@ def test_others_find_every_believed_edge_before_the_first_comment_line(two):
     tags = [line.split()[0] for line in graph]
     saved = load_map(two)[0]
     factors = saved.builder.graph.between
-    believed = saved.optimised.judgement.accepted & ~factors.is_absolute
+    believed = saved.judgement.accepted & ~factors.is_absolute
     assert tags.count('EDGE_SE2') == np.count_nonzero(believed)
 
 
@@ -338,7 +338,7 @@ def test_what_killed_writers_left_is_removed(two, halfway):
 def test_to_others_it_is_a_graph_with_comments(halfway, tmp_path):
     saved, path, plain = halfway.saved(), tmp_path / 'map.g2o', tmp_path / 'plain.g2o'
     save_map(path, saved)
-    graph, judgement = saved.builder.graph, saved.optimised.judgement
+    graph, judgement = saved.builder.graph, saved.judgement
     write_graph_file(plain, GraphRecord(graph, saved.optimised.poses, np.arange(50)))
     lines = path.read_text().splitlines()
     def all_of(lines):

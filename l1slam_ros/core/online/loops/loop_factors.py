@@ -20,10 +20,10 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.measurements import LoopClosure, Notes
+from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.online.keyframes import diagonal_covariance, reduced_covariance
 from l1slam_ros.core.online.loops.waiting_loops import WaitingLoop, WaitingLoops
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
-from l1slam_ros.core.online.snapshot import BuilderState
 from l1slam_ros.core.options import Options, option
 
 

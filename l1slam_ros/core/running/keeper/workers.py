@@ -1,18 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Threads of the back end: one piece of work behind an update, and updates without a timer."""
+"""
+Threads that only carry out: what to do, and when, others say.
+
+In: pieces of work, as functions. Out: their end, or what they raised.
+"""
 
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from l1slam_ros.core.errors import Interrupted
+from l1slam_ros.core.running.improve import Check
 
 # [s] How often who waits looks whether to stop.
 LOOK = 0.05
 
+# Asked on the way, often: whether to stop.
+Stopped = Callable[[], bool]
 
-def until(over: Callable[[], bool],
-          check: Callable[[], None] = lambda: None) -> Callable[[], None]:
+
+def until(over: Stopped, check: Check = lambda: None) -> Check:
     """Return a check that raises `Interrupted` where another does, or something is over."""
     def checked() -> None:
         check()
@@ -51,7 +58,7 @@ class Calm:
     def __exit__(self, *_: object) -> None:
         self._over.set()
 
-    def kept(self, check: Callable[[], None]) -> Callable[[], None]:
+    def kept(self, check: Check) -> Check:
         """Return a check that waits for its end, too, unless the other raises."""
         def checked() -> None:
             check()
@@ -59,6 +66,33 @@ class Calm:
                 check()
 
         return checked
+
+
+class Requests:
+    """How many threads ask for something at the moment; true while any does."""
+
+    def __init__(self) -> None:
+        self._count, self._none = 0, threading.Condition()
+
+    def __bool__(self) -> bool:
+        return self._count > 0
+
+    @contextmanager
+    def one(self) -> Iterator[None]:
+        """Ask for it."""
+        with self._none:
+            self._count += 1
+        try:
+            yield
+        finally:
+            with self._none:
+                self._count -= 1
+                self._none.notify_all()
+
+    def wait(self) -> None:
+        """Wait until nobody asks."""
+        with self._none:
+            self._none.wait_for(lambda: not self._count)
 
 
 class Worker:
@@ -101,13 +135,53 @@ class Worker:
     def _run(self, work: Callable[[], None]) -> None:
         try:
             work()
-        except Interrupted:
-            # By what wants no more of it.
+        except Interrupted:  # its result is not wanted any more
             pass
         except Exception as error:
             self._error = error
         self.busy = False
         self._done()
+
+
+class Workers:
+    """
+    The two that go on behind updates: one makes maps, one judges.
+
+    Parameters
+    ----------
+    done : called when one of them has ended some work
+
+    """
+
+    def __init__(self, done: Callable[[], None]):
+        self._done = done
+        self._ended = threading.Event()
+        self.mapper, self.judge = Worker('map', self.tell), Worker('judge', self.tell)
+
+    @property
+    def busy(self) -> bool:
+        """Whether any is at work."""
+        return self.mapper.busy or self.judge.busy
+
+    def tell(self) -> None:
+        """Wake who waits for the end of some work."""
+        self._ended.set()
+        self._done()
+
+    def wait(self, seconds: float) -> None:
+        """Wait so long for the end of some work."""
+        self._ended.wait(seconds)
+        self._ended.clear()
+
+    def join(self) -> None:
+        """Wait for the end of all work."""
+        self.mapper.join()
+        self.judge.join()
+
+    def check(self) -> None:
+        """Raise what the last work of one of them raised, once."""
+        self.mapper.check()
+        self.judge.check()
 
 
 class Background:
@@ -116,18 +190,24 @@ class Background:
 
     Parameters
     ----------
-    update : called with whether nothing has come for a while, and a function that tells it to stop
+    update : called with whether nothing has come for a while, and a function that tells it to
+        stop; returns whether more may be to do later
     pause : [s] that is a while
 
     """
 
-    def __init__(self, update: Callable[[bool, Callable[[], bool]], object], pause: float):
+    def __init__(self, update: Callable[[bool, Stopped], bool], pause: float):
         self._update, self._pause = update, pause
         self._woken = threading.Event()
         self._closing = False
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._work, name='updates', daemon=True)
         self._thread.start()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether there is the thread; a process that was forked has none."""
+        return self._thread.is_alive()
 
     def wake(self) -> None:
         """Look whether there is something to do."""
@@ -157,8 +237,6 @@ class Background:
     def _updated(self, idle: bool) -> bool:
         """Tell whether more may be to do later."""
         try:
-            # What found nothing to do may only have had to wait until nothing comes.
-            return self._update(idle, lambda: self._closing) is not None or not idle
-        except Interrupted:
-            # By what wakes this thread when it is done.
+            return self._update(idle, lambda: self._closing)
+        except Interrupted:  # by what wakes this thread when it is done
             return False

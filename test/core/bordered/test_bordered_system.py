@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The border of a factored map against the same least squares problem solved as a whole."""
+"""A bordered system against the same least squares problem solved as a whole."""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from systems import SHAPES, random_system
 
-from l1slam_ros.core.incremental.border import FIXED, Border
+from l1slam_ros.core.bordered.bordered_system import BorderedSystem
+from l1slam_ros.core.bordered.points import FIXED
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, find_pattern
 
 OLD, NEW = 14, 6
@@ -79,7 +80,7 @@ def test_a_climb_is_the_inverse_factor_where_that_is_not_zero(k, shape, rng):
 def test_a_border_is_the_whole_problem(k, shape, rng):
     """Old, new and fixed keyframes in all mixtures: steps, and what is predicted, are exact."""
     system, weights, cholesky = factored(k, shape, rng)
-    whole, border = Whole(system, weights, k), Border(cholesky, OLD, k)
+    whole, border = Whole(system, weights, k), BorderedSystem(cholesky, OLD, k)
     assert_allclose(border.steps().all(), 0)
 
     def compare(ends, blocks, residual, count):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What is computed behind an update: a better map, of a snapshot of the back end.
+The numerical step behind an update: a better map of a snapshot, and a front that goes on from it.
 
-In: a `Problem`. Out: an `Improvement`, to be adopted. Nothing here knows of threads or locks; who
-may have to stop the work hands in a check.
+In: a `Problem`. Out: an `Improvement`, to be adopted, and its `Front`. Nothing here knows of
+threads or locks; who may have to stop the work hands in a check.
 """
 
 import time
@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from l1slam_ros.core.bordered.front import Front
 from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -22,10 +23,10 @@ from l1slam_ros.core.graph.linear_system import (
     whitened_residual,
 )
 from l1slam_ros.core.graph.world_frame import placed
-from l1slam_ros.core.incremental.front import Front
-from l1slam_ros.core.online.snapshot import Optimised, Problem
 from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.running.optimised import Optimised
+from l1slam_ros.core.running.problem import Problem
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.nonlinear import (
     OptimiserOptions,
@@ -58,7 +59,7 @@ _OUTER, _INNER = 2, 120
 # Steps of Gauss-Newton that the gate's map gets each time it is made.
 _L2_STEPS = 4
 
-# Called on the way, often; raises where the work shall stop.
+# Called on the way, often; raises `Interrupted` where the work shall stop.
 Check = Callable[[], None]
 
 
@@ -99,8 +100,16 @@ class Improvement:
                 raise ArithmeticError(f'the {name} of a new map is not finite; the map stays')
         same = len(self.dual) == len(before.dual)
         quiet = same and self.cost_before - self.cost <= tolerance * self.cost
-        return Optimised(self.poses, self.dual, before.judgement, self.cost, self.status,
+        return Optimised(self.poses, self.dual, self.cost, self.status,
                          before.quiet_updates + 1 if quiet else 0)
+
+    def of_all(self, problem: Problem) -> 'Improvement':
+        """Return what was made of `as_one(problem)`, for the factors of the problem."""
+        graph = problem.graph
+        rows, d = graph.not_struck, graph.manifold.TANGENT_SIZE
+        dual = np.zeros((len(graph.between), d))
+        dual[rows] = self.dual.reshape(-1, d)[:len(rows)]
+        return replace(self, dual=dual.ravel(), judgement=self.judgement.of_all(graph))
 
     @property
     def falls(self) -> bool:
@@ -112,16 +121,16 @@ class Improvement:
 def improve(problem: Problem, options: OptimiserOptions, budget: float,
             check: Check = lambda: None, exact: bool = False) -> Improvement:
     """
-    Lower the L1 cost of what is believed of a snapshot, for about `budget` seconds.
+    Lower the L1 cost of the accepted factors of a snapshot, for about `budget` seconds.
 
-    exact : to the end instead, where that is done by factorisations
+    exact : solve to the optimum instead, where a factorisation does that
 
-    Without: reweighted least squares steps, warm from the kept dual, carry the long-range part:
-    one factorisation bends the whole chain, where a first-order method moves it a few keyframes
-    per iteration. One is always taken, more where the cost is far above what the last map left (a
-    loop has closed) and still falls. Where that loop carries all it closes a long way by, no such
-    step leaves the corner: the path from least squares does. Then, always, Algorithm 4 from the
-    kept dual.
+    A round has two parts. First, iteratively reweighted least squares, warm from the kept dual:
+    one factorisation bends the whole chain, where a first-order method moves a few keyframes an
+    iteration. One step is always taken; more while the cost is far above what the last map left,
+    as after a long loop has closed, and falls. If such a step does not lower the cost, the loop's
+    residual is all in one factor, a corner of the L1 norm: the path from least squares to L1 leads
+    out of it. Second, Algorithm 4 from the kept dual.
     """
     start = time.monotonic()
     graph, method, deadline = problem.part, problem.method, start + budget
@@ -190,9 +199,10 @@ def _dual_of(problem: Problem, e: Array) -> Array:
 def front_of(problem: Problem, poses: Array, rows: int,
              check: Check = lambda: None) -> Front | None:
     """
-    Return the map of a snapshot, poses (n, p), for the factors from `rows` on to move.
+    Return the front of a map, poses (n, p), which takes the factors from `rows` on.
 
-    None: its factor would take longer than what it is for, or some keyframe is not tied to others.
+    None: the graph is too dense to be factored in the time of an update, or some keyframe is not
+    tied to the others.
     """
     judgement, method, part = problem.judgement, problem.method, problem.part
     if not problem.is_sparse or method.cholesky is None:
@@ -211,7 +221,7 @@ def front_of(problem: Problem, poses: Array, rows: int,
             check()
             system = linearise(found, l2_poses, residual)
             step = weighted_least_squares(system, cholesky, np.ones_like(system.b))
-            # Far from the minimum of chi2 the gate would see ghosts; one above it is none.
+            # The NIS holds at the minimum of chi2; a chi2 that is higher by one is near enough.
             if step @ system.transposed_times(system.b) <= 1:
                 break
             l2_poses, residual = backtrack(found, l2_poses, residual, step, l2_cost)

@@ -9,12 +9,18 @@ from numpy.testing import assert_allclose
 from problems import EVERY, covariance6, drive_on, play, straight
 from systems import dense_covariance
 
+from l1slam_ros.core.bordered import front
 from l1slam_ros.core.graph.linear_system import whitened_residual
+from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.incremental import front
-from l1slam_ros.core.online.backend import Backend
-from l1slam_ros.core.online.snapshot import ACCEPTED, BuilderState, Optimised, SavedMap
-from l1slam_ros.core.online.update import improve
+from l1slam_ros.core.online.builder_state import BuilderState
+from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.running.backend import Backend
+from l1slam_ros.core.running.factor_table import FRONT
+from l1slam_ros.core.running.improve import improve
+from l1slam_ros.core.running.keeper.work import make_map
+from l1slam_ros.core.running.optimised import Optimised
+from l1slam_ros.core.running.snapshot import ACCEPTED, SavedMap
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
@@ -32,7 +38,7 @@ def alone(world):
     backend = Backend(EVERY)
     play(backend, world, 0, KNOWN)
     backend.settle()
-    backend._begin_due = lambda *_: False
+    backend._updates._begin_due = lambda *_: False
     return backend
 
 
@@ -41,8 +47,7 @@ def test_without_a_worker_the_map_stays_near_the_optimum_and_knows_how_sure_it_i
     for k in range(KNOWN, LAST):
         play(backend, world, k, k + 1)
         backend.update(10.0)
-        assert len(backend._live.looks) == len(backend.snapshot().graph.between) - len(
-            backend._live.optimised.judgement.accepted)
+        assert backend._keeper.state.table.looked == len(backend.snapshot().graph.between)
     now = backend.snapshot()
     assert (now.loop_states().state == ACCEPTED).mean() > 0.98
     problem = now.problem()
@@ -72,7 +77,7 @@ def test_how_sure_it_is_in_space_and_in_the_world(graph_of, fixed):
     poses = odometry_poses(graph)
     state = BuilderState.of_graph(graph, poses, np.arange(60) * 10**9)
     backend = Backend(EVERY, len(graph.manifold.positions(poses)[0]))
-    backend.restore(SavedMap(state, Optimised.nothing(poses), True))
+    backend.restore(SavedMap(state, Optimised.nothing(poses), Judgement.nothing(), True))
     assert backend.marginal_covariance(59) is None
     backend.settle()
     whole = dense_covariance(backend.snapshot())
@@ -115,7 +120,7 @@ def test_the_gate_lets_no_lie_in(world, kind):
         backend.update(10.0)
     now = backend.snapshot()
     false, accepted = is_false(lies, now.graph.between), now.judgement.accepted
-    new = np.arange(len(accepted)) >= len(backend._live.optimised.judgement.accepted)
+    new = backend._keeper.state.table.rows['said_by'] == FRONT
     loops = new & ~now.graph.between.is_odometry
     assert np.count_nonzero(false & new) > 5 and not (false & accepted).any()
     # The others wait for the judgement.
@@ -125,13 +130,13 @@ def test_the_gate_lets_no_lie_in(world, kind):
 def test_what_it_is_not_to_take_costs_a_front_nothing(world):
     backend = alone(world)
     play(backend, world, KNOWN, LAST)
-    front, factors = backend._live.front, backend.snapshot().graph.between
+    front, factors = backend._keeper._front, backend.snapshot().graph.between
     new = slice(front.rows, front.rows + 20)
     odometry = factors.is_odometry[new]
     looks = front.take(factors, odometry.astype(int))
     assert [look.accepted for look in looks] == odometry.tolist() and not odometry.all()
     # What is touched: the last keyframe it knew and the new ones, not the far ends of loops.
-    assert [border.points for border in front._borders] == 2 * [1 + odometry.sum()]
+    assert [system.points for system in front._systems] == 2 * [1 + odometry.sum()]
     assert front.rows == new.stop and front.taken == odometry.sum()
 
 
@@ -140,10 +145,10 @@ def test_loops_that_come_before_a_map_is_made_are_looked_at_by_its_front(world):
     begun = len(backend.snapshot().graph.between)
     play(backend, world, KNOWN, LAST)
     # No update lets the last front look at them.
-    assert len(backend._live.looks) == 0
-    backend._map_anew(False, 10.0, lambda: None)
+    assert not (backend._keeper.state.table.rows['said_by'] == FRONT).any()
+    make_map(backend._keeper, False, 10.0, lambda: None)
     now = backend.snapshot()
-    assert backend._live.front.rows == len(now.graph.between) > begun + 2 * (LAST - KNOWN) / 3
+    assert backend._keeper._front.rows == len(now.graph.between) > begun + 2 * (LAST - KNOWN) / 3
     assert now.judgement.accepted[begun:].mean() > 0.9
 
 
@@ -153,25 +158,25 @@ def test_a_front_that_is_full_leaves_loops_to_the_next_one(world, monkeypatch):
     play(backend, world, KNOWN, LAST)
     with monkeypatch.context() as patched:
         patched.setattr(front, '_MOST_POINTS', -1)
-        backend._map_anew(False, 10.0, lambda: None)
-    assert backend._live.front.closed and backend.behind().bound > 0
+        make_map(backend._keeper, False, 10.0, lambda: None)
+    assert backend._keeper._front.closed and backend.behind().bound > 0
     now = backend.snapshot()
     new = now.graph.between.is_odometry[begun:]
     assert now.judgement.accepted[begun:].tolist() == new.tolist()
     assert now.judgement.suspect[begun:].tolist() == (~new).tolist()
-    backend._map_anew(False, 10.0, lambda: None)
+    make_map(backend._keeper, False, 10.0, lambda: None)
     assert backend.snapshot().judgement.accepted[begun:].mean() > 0.9
 
 
 def test_a_front_that_fails_is_closed_and_moves_nothing(world, monkeypatch):
     backend = alone(world)
-    front = backend._live.front
+    front = backend._keeper._front
 
     def fail(*_):
         raise np.linalg.LinAlgError
 
     before = backend.poses
-    monkeypatch.setattr(front._borders[1], 'add', fail)
+    monkeypatch.setattr(front._systems[1], 'add', fail)
     play(backend, world, KNOWN, KNOWN + 5)
     backend.update(10.0)
     assert front.closed
@@ -184,10 +189,10 @@ def test_what_no_odometry_ties_to_the_map_is_for_the_next_one():
     backend = Backend(EVERY)
     drive_on(backend, straight(5), 0, SURE, 1.0, 1.0)
     backend.settle()
-    backend._begin_due = lambda *_: False
+    backend._updates._begin_due = lambda *_: False
     # The clock is set back: a part of its own begins.
     drive_on(backend, straight(4), 0, SURE, 1.0, 1.0)
-    assert backend.update(10.0) is not None and backend._live.front.closed
+    assert backend.update(10.0) is not None and backend._keeper._front.closed
     assert len(backend.poses) == 9 and np.isfinite(backend.poses).all()
 
 
@@ -197,7 +202,7 @@ def test_how_far_the_optimum_is_at_most_is_known_at_any_time(world):
     play(backend, world, 0, KNOWN)
     backend.settle()
     proved = backend.behind()
-    backend._begin_due = lambda *_: False
+    backend._updates._begin_due = lambda *_: False
     play(backend, world, KNOWN, LAST)
     backend.update(10.0)
     now, behind = backend.snapshot(), backend.behind()
@@ -207,7 +212,8 @@ def test_how_far_the_optimum_is_at_most_is_known_at_any_time(world):
     assert 0.8 * best < behind.bound <= best
     assert behind.rows > 0 == proved.rows and behind.loops > 0 == proved.loops
     # Of fewer factors nothing was proved.
-    loops = backend._builder.loops.rows
-    backend._builder.graph.say(loops[backend._live.accepted[loops]][:1], trusted=False)
+    states = backend.loop_states()
+    reference, stamp = states.stamps[np.argmax(states.state == ACCEPTED)].tolist()
+    backend.add_loop(LoopClosure(reference, stamp, np.eye(7)[6], np.eye(6), struck=True))
     backend.update(10.0)
     assert np.isnan(backend.behind().bound)

@@ -4,25 +4,25 @@
 import os
 import threading
 import time
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
 from problems import EVERY, covariance6, drive_on, loop, odometry, straight
 
+from l1slam_ros.core.bordered.front import Front
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
-from l1slam_ros.core.incremental.front import Front
-from l1slam_ros.core.online.backend import Backend, BackendOptions
 from l1slam_ros.core.online.keyframes import KeyframeOptions
-from l1slam_ros.core.online.snapshot import ACCEPTED
-from l1slam_ros.core.online.update import Improvement, improve
-from l1slam_ros.core.online.upkeep import upkeep
-from l1slam_ros.core.online.upkeep.threads import Background
 from l1slam_ros.core.robust import batch
 from l1slam_ros.core.robust.judgement import MOSTLY_REFUSED
+from l1slam_ros.core.running.backend import Backend, BackendOptions
+from l1slam_ros.core.running.improve import Improvement, improve
+from l1slam_ros.core.running.keeper import updates, work
+from l1slam_ros.core.running.keeper.workers import Background
+from l1slam_ros.core.running.snapshot import ACCEPTED
 from l1slam_ros.core.solvers.optimality import l1_cost
 
 DEADLINE = 30.0
@@ -62,8 +62,8 @@ def test_nobody_sees_a_keyframe_without_its_odometry(monkeypatch):
     backend, meeting, add_poses = Backend(EVERY), Meeting(), FactorGraph.add_poses
     drive(backend, 0, 1)
 
-    def slowly(graph, count=1):
-        add_poses(graph, count)
+    def slowly(graph, *given, **how):
+        add_poses(graph, *given, **how)
         meeting()
 
     monkeypatch.setattr(FactorGraph, 'add_poses', slowly)
@@ -90,15 +90,15 @@ def test_nobody_sees_the_front_of_one_map_with_the_poses_of_another(monkeypatch)
         made = improve(*arguments)
         return Slow(**{field.name: getattr(made, field.name) for field in fields(made)})
 
-    monkeypatch.setattr(upkeep, 'improve', slowly)
+    monkeypatch.setattr(work, 'improve', slowly)
     # The first one leaves the loop to the front.
     updating = meanwhile(lambda: [backend.update(DEADLINE) for _ in range(2)])
     seen = meeting.look(backend.snapshot)
     updating.join()
     after = backend.snapshot()
     assert after.loop_states().state.tolist() == [ACCEPTED]
-    assert (seen.poses == seen.optimised.poses).all() or (
-        seen.optimised.poses != after.optimised.poses).any()
+    assert (seen.poses == seen.state.optimised.poses).all() or (
+        seen.state.optimised.poses != after.state.optimised.poses).any()
 
 
 def test_nobody_sees_the_front_of_a_map_that_was_replaced(monkeypatch):
@@ -117,6 +117,28 @@ def test_nobody_sees_the_front_of_a_map_that_was_replaced(monkeypatch):
     assert len(now.poses) == now.graph.n_poses == 0
 
 
+def test_nobody_follows_the_end_of_a_map_that_was_replaced(monkeypatch):
+    backend, newest = Backend(EVERY), Front.newest.fget
+    drive(backend, 0, 5)
+    while backend.update(DEADLINE) is not None:
+        pass
+
+    def slowly(front):
+        seen = newest(front)
+        backend.reset()
+        drive(backend, 100, 102)
+        return seen
+
+    drive(backend, 5, 6)
+    with monkeypatch.context() as patched:
+        patched.setattr(Front, 'newest', property(slowly))
+        with pytest.raises(Interrupted):
+            backend.update(DEADLINE)
+    now = backend.snapshot()
+    np.testing.assert_allclose(now.poses[:, 0], [100, 101])
+    np.testing.assert_allclose(now.map_to_odom, np.zeros((1, 3)))
+
+
 def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):
     backend, meeting = Backend(EVERY), Meeting()
     drive(backend, 0, 5)
@@ -133,7 +155,7 @@ def test_what_was_made_of_a_map_that_was_replaced_is_not_adopted(monkeypatch):
         except Interrupted as interrupted:
             ended.append(interrupted)
 
-    monkeypatch.setattr(upkeep, 'improve', slowly)
+    monkeypatch.setattr(work, 'improve', slowly)
     updating = meanwhile(update)
     meeting.look(backend.reset)
     updating.join()
@@ -158,7 +180,7 @@ def test_an_update_is_interrupted_at_once(monkeypatch, interrupt):
         with pytest.raises(Interrupted):
             backend.update(DEADLINE, lambda: begun.set() or stopped.is_set())
 
-    monkeypatch.setattr(upkeep, 'improve', patient)
+    monkeypatch.setattr(work, 'improve', patient)
     updating = meanwhile(update)
     assert begun.wait(DEADLINE)
     # What needs no solver does not interrupt it, and is not held up.
@@ -189,16 +211,16 @@ def test_at_rest_nothing_is_looked_at_until_something_comes(monkeypatch):
 
     assert settle() > 0
     looked = []
-    standing = backend._standing
-    monkeypatch.setattr(backend, '_standing', lambda: looked.append(1) or standing())
-    version = backend.version
+    standing = backend._keeper.standing
+    monkeypatch.setattr(backend._keeper, 'standing', lambda: looked.append(1) or standing())
+    revisions = backend.revisions
     backend.counts()
     looked.clear()
     assert backend.update(DEADLINE) is None
     backend.counts()
-    assert not looked and backend.version == version
+    assert not looked and backend.revisions is revisions
     backend.add_loop(loop(1.0, 30.0, (28.9, 0.0, 0.0), 1e-4 * np.eye(6)))
-    assert backend.version != version
+    assert backend.revisions.now > revisions.now
     assert settle() > 0 and backend.loop_states().state.tolist() == [ACCEPTED]
     drive(backend, 30, 31)
     assert settle() > 0 and len(backend.snapshot().poses) == 31
@@ -224,6 +246,27 @@ def test_a_map_of_nothing_is_not_asked_whether_it_hangs_on_its_norm(monkeypatch)
     assert asked == [5]
 
 
+def test_a_settle_lets_a_fork_through_and_comes_to_its_end(monkeypatch):
+    backend, begun, solve, calls = Backend(EVERY), threading.Event(), updates.optimise, []
+    drive(backend, 0, 5)
+
+    def slowly(problem, options, check):
+        calls.append(1)
+        begun.set()
+        while len(calls) == 1:
+            check()
+        return solve(problem, options, check)
+
+    monkeypatch.setattr(updates, 'optimise', slowly)
+    found = []
+    settling = meanwhile(lambda: found.append(backend.settle()))
+    assert begun.wait(DEADLINE)
+    with backend.alone(urgent=True):
+        assert not found
+    settling.join(DEADLINE)
+    assert len(calls) == 2 and found[0].cost == pytest.approx(0.0, abs=1e-6)
+
+
 # In the background
 
 
@@ -247,7 +290,7 @@ def test_in_the_background_what_comes_is_judged_and_the_thread_ends():
         now = backend.saved()
         # A map that takes the place of another is woken for too.
         backend.restore(now)
-        wait_until(lambda: backend.snapshot().optimised.at_rest)
+        wait_until(lambda: backend.snapshot().state.optimised.at_rest)
         assert len(of_threads()) == 1
     assert not of_threads()
     drive(backend, 30, 31)
@@ -258,26 +301,26 @@ def test_what_goes_on_behind_keeps_its_order_while_the_map_grows():
     """Five keyframes with a loop each are enough for the next map, and it is not ordered anew."""
     with Backend(EVERY) as backend:
         drive(backend, 0, 60)
-        settled, found = backend.settle(), backend._live.front.pattern.found
+        settled, found = backend.settle(), backend._keeper._front.pattern.found
         drive(backend, 60, 64)
         backend.update(MOMENT)
-        assert backend._live.last is settled
+        assert backend._keeper.state.last is settled
         for k in range(60, 65):
             backend.add_loop(loop(float(k - 20), float(k), (20.0, 0.0, 0.0), 1e-4 * np.eye(6)))
         drive(backend, 64, 65)
         deadline = time.monotonic() + DEADLINE
-        while backend._live.last is settled and time.monotonic() < deadline:
-            backend._update(MOMENT, lambda: False, idle=False)
-        assert backend._live.last is not settled
-        front = backend._live.front
+        while backend._keeper.state.last is settled and time.monotonic() < deadline:
+            backend._updates.update(MOMENT, lambda: False, idle=False)
+        assert backend._keeper.state.last is not settled
+        front = backend._keeper._front
         assert (front.keyframes, front.pattern.found) == (65, found)
 
 
 def test_a_judgement_that_doubts_itself_is_followed_by_one_from_the_graph_alone(monkeypatch):
     """Not only at rest: what was believed early may keep out what came after it."""
-    anew, solve = [], upkeep.robust_solve
+    anew, solve = [], work.robust_solve
     monkeypatch.setattr(
-        upkeep, 'robust_solve', lambda *given, **how: anew.append(1) or solve(*given, **how))
+        work, 'robust_solve', lambda *given, **how: anew.append(1) or solve(*given, **how))
     covariance = 1e-4 * np.eye(6)
     with Backend(EVERY) as backend:
         for k, aside in enumerate([0.0] * 20 + [6.0] * 60):
@@ -286,22 +329,34 @@ def test_a_judgement_that_doubts_itself_is_followed_by_one_from_the_graph_alone(
                 backend.add_loop(loop(float(k - 10), float(k), (10.0, aside * k, 0.0), covariance))
         deadline = time.monotonic() + DEADLINE
         while not anew and time.monotonic() < deadline:
-            backend._update(MOMENT, lambda: False, idle=False)
+            backend._updates.update(MOMENT, lambda: False, idle=False)
         assert anew and backend.snapshot().judgement.doubt.kind == MOSTLY_REFUSED
-        with backend._alone():  # what lays the doubt is asked, too, until there are twice as many
-            live, laid = backend._live, replace(backend.snapshot().judgement, doubts=())
-            loops = len(live._builder.loops.rows)
-            for doubted, anew in (loops, False), (loops, True), (loops // 2, False):
-                live._doubted_loops = doubted
-                live.take_judgement(laid, live.judged, loops - 1, True)
-                live.take_judgement(laid, live.judged, loops, anew)
-                live._anew_at = -np.inf
-                assert live.is_anew_due(False) == (doubted == loops and not anew)
+
+
+def test_in_the_background_an_update_never_waits_for_the_workers(monkeypatch):
+    begun = threading.Event()
+    monkeypatch.setattr(work, 'improve', lambda *a: begun.set() or patient(*a))
+    with Backend(EVERY, background=True) as backend:
+        drive(backend, 0, 5)
+        assert begun.wait(DEADLINE)
+        start = time.monotonic()
+        assert backend.update(DEADLINE) is not None
+        assert time.monotonic() - start < 1.0
+        # Nor for its own thread, which leaves the updates to who calls them.
+        updates_of = backend._updates.update
+        helped = []
+        monkeypatch.setattr(backend._updates, 'update', lambda budget, stopped, idle=None, **how: (
+            helped.append(idle) or updates_of(budget, stopped, idle, **how)))
+        for k in range(5, 15):
+            drive(backend, k, k + 1)
+            backend.update(0.0)
+        assert helped == 10 * [None]
+        wait_until(lambda: True in helped)
 
 
 def test_the_background_looks_again_when_nothing_comes_any_more():
     calls = []
-    background = Background(lambda idle, _: calls.append(idle), 0.01)
+    background = Background(lambda idle, _: calls.append(idle) or not idle, 0.01)
     background.wake()
     wait_until(lambda: calls == [False, True])
     background.close()
@@ -339,7 +394,7 @@ def test_a_square_that_closes_after_3000_keyframes_is_right_soon(rng):
 @pytest.mark.parametrize('end', ['close', 'settle', 'reset'])
 def test_the_background_makes_way(monkeypatch, end):
     begun = threading.Event()
-    monkeypatch.setattr(upkeep, 'improve', lambda *a: begun.set() or patient(*a))
+    monkeypatch.setattr(work, 'improve', lambda *a: begun.set() or patient(*a))
     with Backend(EVERY, background=True) as backend:
         drive(backend, 0, 5)
         assert begun.wait(DEADLINE)
@@ -374,7 +429,7 @@ def test_a_process_that_is_forked_has_a_back_end_at_rest(monkeypatch):
             begun.set()
             patient(*arguments)
 
-    monkeypatch.setattr(upkeep, 'improve', improve)
+    monkeypatch.setattr(work, 'improve', improve)
     with Backend(EVERY, background=True) as backend:
         drive(backend, 0, 5)
         assert begun.wait(DEADLINE)
@@ -399,7 +454,7 @@ def test_what_fails_in_the_background_is_raised_at_the_end(monkeypatch):
         failed.set()
         raise MemoryError('no more')
 
-    monkeypatch.setattr(upkeep, 'improve', fail)
+    monkeypatch.setattr(work, 'improve', fail)
     with pytest.raises(MemoryError, match='no more'), Backend(EVERY, background=True) as backend:
         drive(backend, 0, 5)
         assert failed.wait(DEADLINE)
@@ -431,8 +486,8 @@ def test_several_threads_may_settle_at_once():
 def test_who_waits_to_settle_can_be_told_to_stop(monkeypatch):
     backend, meeting = Backend(EVERY), Meeting()
     drive(backend, 0, 20)
-    optimise = upkeep.optimise
-    monkeypatch.setattr(upkeep, 'optimise', lambda *given: (meeting(), optimise(*given))[1])
+    optimise = updates.optimise
+    monkeypatch.setattr(updates, 'optimise', lambda *given: (meeting(), optimise(*given))[1])
     first = meanwhile(backend.settle)
 
     def stopped():

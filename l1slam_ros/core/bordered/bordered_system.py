@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A factored normal matrix, bordered by what has come since: Woodbury's identity, row by row.
+
+In: H = L L' of the keyframes there were, then factors and keyframes one by one. Out: steps of all
+keyframes, and the exact covariance of any linear function of them.
+
+A new keyframe is where the factor says that sees it first, see `points`; that gives the means m
+and the covariance C of all keyframes. With A the blocks of all other factors, W^-1 their noise and
+r their residuals, the least squares solution is
+
+    x = m + C A' lambda,    S lambda = -(r + A m),    S = W^-1 + A C A',
+
+where S, the covariance of the innovations, is kept as F F', F lower triangular. A factor that is
+appended costs one substitution, and its pivot before the noise is added is the covariance of its
+innovation given all others: who predicts a factor before appending it has the gate for free.
+
+Hager, "Updating the inverse of a matrix", SIAM Review 31, 1989.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core import kernels
+from l1slam_ros.core.bordered.points import FIXED, Points, PointsNow, triangle
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.growable_array import GrowingArray
+from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """
+    What the map says of r + J x before the factor tells: the innovation.
+
+    residual : (k,) to expect; covariance : (k, k) of it, without the factor's own noise; rows :
+    (k, rows) of F, to be; points (2,), blocks (2, k, k) : of the factor
+    """
+
+    residual: Array
+    covariance: Array
+    rows: Array
+    points: Indices
+    blocks: Array
+
+
+@dataclass(frozen=True)
+class Rows:
+    """
+    The factors of the border at one moment.
+
+    ends : (b, 2) points; blocks : (b, 2, k, k), A; factor : the triangle F, row after row; right :
+    (b k,) F^-1 times the right hand side
+    """
+
+    ends: Indices
+    blocks: Array
+    factor: Array
+    right: Array
+
+    def gradient(self, points: int) -> Array:
+        """Return A' lambda at so many points, (t, k)."""
+        gradient = np.zeros((points, self.blocks.shape[-1]))
+        kernels.border.pull(self.factor, self.right, self.ends, self.blocks, gradient)
+        return gradient
+
+
+@dataclass(frozen=True)
+class Steps:
+    """The steps of all keyframes at one moment, worked out when they are asked for."""
+
+    points: PointsNow
+    rows: Rows
+
+    def all(self) -> Array:
+        """Return the steps of all keyframes, (n + b, k)."""
+        return self.points.steps(self.rows.gradient(len(self.points.mean)))
+
+
+class BorderedSystem:
+    """
+    The system of one weighting; keyframes are those of the factored system, new ones follow.
+
+    Parameters
+    ----------
+    cholesky : holds the factor of H, which must stay
+    size, k : keyframes that H has, numbers of the step of each
+    points, rows : so many may come, and none of what is there is moved for it: that takes longer
+        than to append
+
+    """
+
+    def __init__(self, cholesky: BlockCholesky, size: int, k: int, points: int = 0,
+                 rows: int = 0):
+        self._points, self._k = Points(cholesky, size, k, points), k
+        self._ends, self._blocks = GrowingArray((2,), np.int64), GrowingArray((2, k, k))
+        self._factor, self._right = GrowingArray(room=triangle(rows)), GrowingArray()
+        # A' lambda at the first points; nothing pulls at those that came since. Empty: not known.
+        self._pulled = np.zeros((0, k))
+
+    @property
+    def rows(self) -> int:
+        """How many rows S has."""
+        return len(self._right)
+
+    @property
+    def keyframes(self) -> int:
+        """How many keyframes there are, old and new."""
+        return self._points.keyframes
+
+    @property
+    def points(self) -> int:
+        """How many of them factors name, or are new."""
+        return len(self._points)
+
+    def begin(self, ends: tuple[int, int], blocks: Array, residual: Array, noise: Array) -> None:
+        """
+        Append a keyframe by the factor that sees it first; see `predict`, `add`.
+
+        Raises
+        ------
+        LinAlgError : that does not say where it is; nothing is appended.
+
+        """
+        own = ends.index(self.keyframes)
+        parent, inverse = self._points.of(ends[1 - own]), np.linalg.inv(blocks[own])
+        self._points.hang(parent, -inverse @ blocks[1 - own], -inverse @ residual,
+                          inverse * noise @ inverse.T)
+
+    def predict(self, ends: tuple[int, int], blocks: Array, residual: Array) -> Prediction:
+        """
+        Return what is known of r + J_i x_i + J_j x_j.
+
+        ends : the keyframes i and j, `FIXED` for none; blocks : (2, k, k); residual : r, (k,)
+        """
+        points = np.array([self._points.of(end) for end in ends])
+        rows, expected = np.empty((self._k, self.rows)), residual.copy()
+        covariance, now = np.empty((self._k, self._k)), self._now
+        kernels.border.predict(
+            self._points.covariance, self._points.mean, now.ends, now.blocks, now.factor,
+            now.right, points, blocks, rows, covariance, expected)
+        return Prediction(expected, covariance, rows, points, blocks)
+
+    def add(self, predicted: Prediction, noise: Array) -> None:
+        """
+        Append a factor just predicted; noise : (k,) variances.
+
+        Raises
+        ------
+        LinAlgError : beyond double precision; nothing is appended.
+
+        """
+        pivot = np.linalg.cholesky(predicted.covariance + np.diag(noise))
+        lines = np.concatenate((predicted.rows, pivot), axis=1)
+        # Row r ends at its diagonal.
+        k, columns = lines.shape
+        self._factor.extend(lines[np.tri(k, columns, columns - k, dtype=bool)])
+        self._right.extend(-np.linalg.solve(pivot, predicted.residual))
+        self._ends.extend(predicted.points[None])
+        self._blocks.extend(predicted.blocks[None])
+        self._pulled = self._pulled[:0]
+
+    def covariance(self, keyframe: int) -> Array:
+        """Return the covariance of the step of a keyframe, `FIXED` for none, (k, k)."""
+        before = self.points
+        blocks = np.stack((np.eye(self._k), np.zeros((self._k, self._k))))
+        covariance = self.predict((keyframe, FIXED), blocks, np.zeros(self._k)).covariance
+        if self.points > before:
+            self._points.forget_last(keyframe)
+        return covariance
+
+    def step(self, keyframes: list[int]) -> Array:
+        """Return the steps of some keyframes, (m, k); zero of those that are not here yet."""
+        points = np.array([self._points.of(keyframe) if keyframe < self.keyframes else FIXED
+                           for keyframe in keyframes])
+        return kernels.border.move(
+            self._points.covariance, self._points.mean, self._gradient(), points)
+
+    def steps(self) -> Steps:
+        """Return the steps of all keyframes as they are now."""
+        return Steps(self._points.now(), self._now)
+
+    @property
+    def _now(self) -> Rows:
+        return Rows(self._ends.view(), self._blocks.view(), self._factor.view(),
+                    self._right.view())
+
+    def _gradient(self) -> Array:
+        """Return A' lambda at all points, (t, k)."""
+        known = self._pulled
+        if not len(known):
+            self._pulled = self._now.gradient(self.points)
+        elif len(known) < self.points:
+            self._pulled = np.zeros((self.points, self._k))
+            self._pulled[:len(known)] = known
+        return self._pulled

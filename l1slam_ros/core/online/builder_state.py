@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a graph builder has made of messages, as it is saved."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.measurements import LoopClosure
+
+
+@dataclass(frozen=True)
+class BuilderState:
+    """
+    What a graph builder has made of messages, for another to go on from.
+
+    graph : the factors; stamps (n,) [ns] and odometry (n, p) of the keyframes; offset : see
+    `GraphBuilder`; end : stamp [ns] of the last sample, end_pose (1, p) and end_covariance (d, d)
+    of the motion to it from the last keyframe; loop_rows (k,), loop_stamps (k, 2) and expired
+    (l, 2) [ns] : see `GraphBuilder`; waiting : loops, and how long each has waited [ns]; seen : of
+    each loop that came, by its identity, its factor, -1 for none; struck_pairs (s, 2) : the
+    keyframes between which loops are struck out, those to come too.
+    """
+
+    graph: FactorGraph
+    stamps: Indices
+    odometry: Array
+    offset: Array
+    end: int
+    end_pose: Array
+    end_covariance: Array
+    loop_rows: Indices
+    loop_stamps: Indices
+    expired: Indices
+    waiting: tuple[tuple[LoopClosure, int], ...]
+    seen: Mapping[bytes, int]
+    struck_pairs: Indices
+
+    @staticmethod
+    def of_graph(graph: FactorGraph, poses: Array, stamps: Indices) -> 'BuilderState':
+        """Return that of a graph alone, whose odometry went from pose to pose (n, p)."""
+        d, none = graph.manifold.TANGENT_SIZE, np.zeros((0, 2), np.int64)
+        loops = np.flatnonzero(~graph.between.is_odometry)
+        ends = np.sort(stamps[graph.between.pairs[loops]], axis=1)
+        struck = np.sort(graph.between.pairs[graph.between.struck], axis=1)
+        return BuilderState(graph, stamps, poses, graph.manifold.identity(1), int(stamps[-1]),
+                      poses[-1:], np.zeros((d, d)), loops, ends, none, (), {}, struck)

@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The running back end: samples and loops in, optimised poses out, from many threads.
+
+It has a keeper, which owns the graph and its map, and updates of that; see `keeper`.
+"""
+
+import os
+import time
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass
+from weakref import WeakSet
+
+from l1slam_ros.core.errors import GraphError, OptionError, require
+from l1slam_ros.core.geometry import se2, se3
+from l1slam_ros.core.geometry.manifold import Array, Manifold
+from l1slam_ros.core.graph.measurements import (
+    LoopClosure,
+    OdometrySample,
+    in_order,
+    require_sound,
+)
+from l1slam_ros.core.names import OF_THE_NODE
+from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
+from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame
+from l1slam_ros.core.options import Options, option
+from l1slam_ros.core.running.improve import Improvement
+from l1slam_ros.core.running.keeper.keeper import Keeper, Revisions
+from l1slam_ros.core.running.keeper.updates import Updates
+from l1slam_ros.core.running.keeper.workers import Background
+from l1slam_ros.core.running.keeper.workers import Stopped as Stopped
+from l1slam_ros.core.running.snapshot import (
+    Behind,
+    Counts,
+    LoopStates,
+    Robot,
+    SavedMap,
+    Snapshot,
+)
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
+
+# What poses live on, by the dimension of the world.
+_MANIFOLDS: dict[int, Manifold] = {2: se2, 3: se3}
+# [s] In the background nothing has come for a while when it has not for so long.
+_PAUSE = 0.2
+
+
+@dataclass(frozen=True)
+class RobustOptions(Options):
+    """Whether loops are doubted."""
+
+    enabled: bool = option(
+        True, 'believe a loop only once others, or the odometry, vouch for it; without, every '
+        'loop is used at once')
+
+
+@dataclass(frozen=True)
+class BackendOptions(GraphBuilderOptions):
+    """Everything the back end can be told; a mapping may say what its node is told besides."""
+
+    PASSED_OVER = OF_THE_NODE
+
+    solver: OptimiserOptions = OptimiserOptions()
+    robust: RobustOptions = RobustOptions()
+
+
+class Backend:
+    """
+    Keeps a map while it grows.
+
+    Parameters
+    ----------
+    options : see `BackendOptions`
+    dimension : of the world, 2 or 3
+    background : update in a thread of its own whenever there is something new, until `close` or
+        the end of the `with` block; not in a process that is forked from this one
+
+    Attributes
+    ----------
+    manifold : what the poses live on
+    options : as they are now
+    base_frame : of the robot, as far as is known; no reset forgets it
+    calm : what goes on behind waits for its end, `with backend.calm:`
+
+    Raises
+    ------
+    OptionError : there is no such dimension, or an argument is of another kind.
+
+    """
+
+    def __init__(self, options: BackendOptions = BackendOptions(),  # noqa: B008
+                 dimension: int = 2, background: bool = False):
+        _require_options(options)
+        require(bool, 'background', background, 'True or False')
+        require(int, 'dimension', dimension, '2 or 3')
+        if dimension not in _MANIFOLDS:
+            raise OptionError(f'dimension is {dimension!r}, expected 2 or 3')
+        self.manifold, self.options = _MANIFOLDS[dimension], options
+        self.base_frame = BaseFrame(options.base_frame)
+        self._keeper = Keeper(_builder(self), options.solver, options.robust.enabled)
+        self._updates = Updates(self._keeper, self._wake)
+        self.calm = self._updates.calm
+        # Sizes of the graph, and at which revision.
+        self._counted: tuple[int, dict[str, int]] = (-1, {})
+        self._called = -_PAUSE
+        self._background = Background(self._help, _PAUSE) if background else None
+        _ALL.add(self)
+
+    def __enter__(self) -> 'Backend':
+        """Return the back end; the end of the block closes it."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """See `close`."""
+        self.close()
+
+    def close(self) -> None:
+        """End what is at work behind; raise what went wrong there, if anything did."""
+        try:
+            if self._background is not None:
+                self._background.close()
+        finally:
+            with self.alone(urgent=True):
+                pass
+        self._updates.check()
+
+    # What comes in.
+
+    def add_odometry(self, sample: OdometrySample) -> bool:
+        """Add one sample; return whether it is used, see `GraphBuilder.add_odometry`."""
+        require_sound(sample, OdometrySample)
+        used = self._keeper.add_odometry(sample)
+        self._wake()
+        return used
+
+    def add_loop(self, loop: LoopClosure) -> None:
+        """Add one loop closure, turned round if it leads back; see `GraphBuilder.add_loop`."""
+        require_sound(loop, LoopClosure)
+        self._keeper.add_loop(in_order(loop))
+        self._wake()
+
+    def set_options(self, options: BackendOptions) -> None:
+        """
+        Work by other options from now on; what is in the graph stays.
+
+        Where loops are to be doubted that were not before, or the other way round, all are judged
+        anew.
+        """
+        _require_options(options)
+        self.options = options
+        self._keeper.set_options(options, options.solver, options.robust.enabled)
+        self._wake()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._keeper.begin(_builder(self))
+        self._wake()
+
+    def saved(self) -> SavedMap | None:
+        """Return all that another back end goes on from; None: there are no factors yet."""
+        return self._keeper.saved()
+
+    def restore(self, saved: SavedMap) -> int:
+        """
+        Go on from what another back end has `saved`, in the place of the map there is.
+
+        Return what names its graph in this one, see `SavedMap`.
+        """
+        found, robust = saved.builder.graph.manifold, self.options.robust.enabled
+        if found is not self.manifold:
+            raise GraphError(f'a map of {found.NAME}, expected one of {self.manifold.NAME}')
+        builder = _builder(self)
+        builder.restore(saved.builder)
+        builder.set_options(self.options)  # they may have changed since it was made
+        graph = (self._keeper.begin(builder, saved.optimised, saved.judgement)
+                 if saved.robust == robust else
+                 self._keeper.begin(builder, saved.optimised.unfinished()))
+        self._wake()
+        return graph
+
+    # What is done.
+
+    def update(self, budget: float = 0.1,
+               stopped: Stopped = lambda: False) -> Improvement | None:
+        """
+        Take what has come into the map, and let it be improved; None: there was nothing to do.
+
+        What has come, up to some twenty milliseconds of work, is in the map when this returns. It
+        waits up to `budget` seconds for what goes on behind, and leaves the rest there; where the
+        map is updated in the background, it does not wait.
+
+        Raises
+        ------
+        Interrupted : told to stop, or to make way for `settle`, or the map was replaced.
+
+        """
+        self._called = time.monotonic()
+        behind = self._background is not None and self._background.is_alive
+        return self._updates.update(budget, stopped, waits=not behind)
+
+    def settle(self, stopped: Stopped = lambda: False) -> Improvement | None:
+        """
+        Judge all loops and solve to the end; None: there are no factors yet.
+
+        What is under way makes way, but for other calls of this: one follows the other.
+
+        Raises
+        ------
+        Interrupted : told to stop, or the map was replaced.
+
+        """
+        return self._updates.settle(stopped)
+
+    def alone(self, urgent: bool = False) -> AbstractContextManager[None]:
+        """Let nothing be solved, nor begin to be; urgent : a `settle` under way waits, too."""
+        return self._updates.alone(urgent)
+
+    def _help(self, idle: bool, stopped: Stopped) -> bool:
+        """Update in the background; return whether more may be to do later."""
+        if not idle and time.monotonic() < self._called + _PAUSE:
+            return True  # who updates by himself would have to wait for it
+        # What found nothing to do may only have had to wait until nothing comes.
+        return self._updates.update(0.0, stopped, idle) is not None or not idle
+
+    def _wake(self) -> None:
+        """Tell the background that there may be something to do."""
+        if self._background is not None:
+            self._background.wake()
+
+    # What is there.
+
+    @property
+    def revisions(self) -> Revisions:
+        """The number that counts changes: by it is known whether what is kept is stale."""
+        return self._keeper.revisions
+
+    @property
+    def poses(self) -> Array:
+        """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
+        return self.snapshot().poses
+
+    def snapshot(self) -> Snapshot:
+        """Return the back end as it is now, the due loops in its graph, to be read at leisure."""
+        return self._keeper.snapshot()
+
+    def loop_states(self) -> LoopStates:
+        """Return what has become of each loop, those of the graph first, in its order."""
+        return self.snapshot().loop_states()
+
+    def robot(self) -> Robot | None:
+        """Return where the robot is; None: no odometry has said yet where it is in this map."""
+        return self._keeper.robot()
+
+    def moved(self) -> tuple[Array, Array]:
+        """Return map -> odom as it was when this was asked before, and as it is, (1, p) each."""
+        return self._keeper.moved()
+
+    def counts(self) -> Counts:
+        """Return how large the graph is, and what was noted of messages."""
+        with self._keeper.reading() as builder:
+            revision, notes = self.revisions.now, builder.notes
+            refused, told = dict(notes.refused), dict(notes.told)
+        if self._counted[0] != revision:
+            self._counted = revision, self.snapshot().sizes()
+        return Counts(self._counted[1], refused, told)
+
+    def behind(self) -> Behind:
+        """Return what goes on behind updates."""
+        state, _, size = self._keeper.look()
+        return Behind.of(state, size.loops, time.monotonic())
+
+    def news(self) -> list[str]:
+        """Return what is new in the notes on messages; see `GraphBuilder.notes`."""
+        with self._keeper.reading() as builder:
+            return builder.notes.news()
+
+    def marginal_covariance(self, keyframe: int) -> Array | None:
+        """
+        Return the covariance of a keyframe in its own axes, (d, d).
+
+        Of the least squares map of the accepted factors, with the noise that was found in them:
+        relative to the first keyframe, or to the world where absolute poses are accepted. None:
+        the map does not have the keyframe, or its graph is too dense to be factored.
+        """
+        return self._keeper.covariance(keyframe)
+
+
+def _require_options(options: object) -> None:
+    require(BackendOptions, 'options', options,
+            'BackendOptions; BackendOptions.from_mapping makes them of a mapping')
+
+
+def _builder(backend: Backend) -> GraphBuilder:
+    return GraphBuilder(backend.manifold, backend.options, base_frame=backend.base_frame)
+
+
+_ALL: WeakSet[Backend] = WeakSet()
+_at_rest = ExitStack()
+
+
+def _before_fork() -> None:
+    for backend in tuple(_ALL):
+        _at_rest.enter_context(backend.alone(urgent=True))
+
+
+# Threads do not come along into a process that is forked, but what they have locked does, of ours,
+# numba's and Python's: so nothing is at work meanwhile.
+os.register_at_fork(before=_before_fork, after_in_parent=_at_rest.close,
+                    after_in_child=_at_rest.close)

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What is said of the factors of a growing graph: one table, one row per factor.
+
+In: what the gate of the front says of new factors, what the judge says of all of them, and the
+factors that a map was made of. Out: which factors are accepted, and who says so.
+
+A person's word, `trusted` and `struck`, is a column of the factors themselves, and overrules
+whatever stands here; factors behind the last row were not looked at yet.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from l1slam_ros.core.bordered.front import BELIEVE, GATE, SKIP, Look
+from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import BetweenFactors
+from l1slam_ros.core.graph.growable_array import GrowingArray
+from l1slam_ros.core.robust.judgement import Judgement
+
+# Who said last what stands in a row. Nobody: the factor stood in a graph that was solved without
+# a look at it.
+NOBODY, FRONT, JUDGE, PERSON = range(4)
+
+# accepted, suspect, sigmas, noise : see `Judgement`, noise is NaN until a judgement; said_by : one
+# of the above; in_map : the map that is published is of it; proved : so is the one of which a
+# lower bound was proved.
+ROW = np.dtype([('accepted', bool), ('suspect', bool), ('in_map', bool), ('proved', bool),
+                ('said_by', np.int32), ('sigmas', float), ('noise', float)])
+
+# So many more rows at least come before all are moved.
+_ROOM = 64
+
+
+@dataclass(frozen=True)
+class FactorTable:
+    """
+    The table at one moment; what comes later is written elsewhere.
+
+    rows : (m,) of `ROW`, in the order of the factors; looked : at so many of the first ones
+    somebody has looked; is_map_of_accepted : whether the map is of those of them that are accepted
+    """
+
+    rows: Any
+    looked: int
+    is_map_of_accepted: bool
+    _store: GrowingArray
+
+    @staticmethod
+    def of(rows: Any) -> 'FactorTable':
+        """Return the table of some rows, which nobody else writes to, and room for more."""
+        store = GrowingArray((), ROW, len(rows) + len(rows) // 8 + _ROOM)
+        store.extend(rows)
+        looked = rows[rows['said_by'] != NOBODY]
+        same = bool((looked['accepted'] == looked['in_map']).all())
+        return FactorTable(store.view(), len(looked), same, store)
+
+    @staticmethod
+    def of_judgement(judgement: Judgement) -> 'FactorTable':
+        """Return the table of what was judged; the map is of what is accepted."""
+        return FactorTable.of(_rows(judgement, JUDGE))
+
+    @property
+    def accepted(self) -> Mask:
+        """Which of the factors that somebody looked at are accepted, (looked,) bool."""
+        accepted: Mask = self.rows['accepted'][:self.looked]
+        return accepted
+
+    @property
+    def is_proof_of_accepted(self) -> bool:
+        """Whether all factors of which a bound was proved are accepted still."""
+        return not (self.rows['proved'][:self.looked] & ~self.accepted).any()
+
+    def judgement(self, of_all: Judgement) -> Judgement:
+        """Return what the judge said, with what `of_all` says of the first factors as a whole."""
+        rows = self.rows[~np.isnan(self.rows['noise'])]
+        return replace(of_all, accepted=rows['accepted'], suspect=rows['suspect'],
+                       sigmas=rows['sigmas'], noise=rows['noise'])
+
+    def behind(self, judgement: Judgement) -> Judgement:
+        """Return a judgement of the first factors, with what stands here of those behind them."""
+        rest = self.rows[len(judgement.accepted):self.looked]
+        return replace(judgement, accepted=np.append(judgement.accepted, rest['accepted']),
+                       suspect=np.append(judgement.suspect, rest['suspect']),
+                       sigmas=np.append(judgement.sigmas, rest['sigmas']))
+
+    def with_looks(self, looks: Sequence[Look]) -> 'FactorTable':
+        """Return the table with rows for the next factors, which the front took."""
+        if not looks:
+            return self
+        # Behind rows that somebody else has appended by now, there is no room.
+        store = self._store if len(self._store) == self.looked else FactorTable.of(
+            self.rows[:self.looked])._store
+        store.extend(_rows_of_looks(looks))
+        return FactorTable(store.view(), len(store), self.is_map_of_accepted, store)
+
+    def told(self, factors: BetweenFactors) -> 'FactorTable':
+        """Return the table in which a person has the last word; itself where nothing changes."""
+        if not (factors.trusted.any() or factors.struck.any()):
+            return self
+        before = self.accepted
+        after = _by_person(before, factors)
+        changed = np.flatnonzero(after != before)
+        if not len(changed):
+            return self
+        rows = self.rows.copy()
+        rows['accepted'][changed] = after[changed]
+        rows['suspect'][changed] &= ~after[changed]
+        rows['said_by'][changed] = PERSON
+        return FactorTable.of(rows)
+
+    def judged(self, judgement: Judgement, factors: BetweenFactors) -> 'FactorTable':
+        """Return the table with what was judged of the first factors, unless a person says."""
+        rows = _rows(judgement, JUDGE)
+        rows['accepted'] = _by_person(judgement.accepted, factors)
+        rows['said_by'][rows['accepted'] != judgement.accepted] = PERSON
+        rows['suspect'] &= ~rows['accepted']
+        known = min(len(self.rows), len(rows))
+        rows['in_map'][:known] = self.rows['in_map'][:known]
+        rows['proved'][:known] = self.rows['proved'][:known]
+        return FactorTable.of(np.concatenate((rows, self.rows[len(rows):])))
+
+    def adopted(self, made: Judgement, looks: Sequence[Look], end: int, again: bool,
+                proved: bool) -> 'FactorTable':
+        """
+        Return the table once a map is published; what stands in it is kept.
+
+        Parameters
+        ----------
+        made : of the first factors, as the map was made of those that are accepted there
+        looks, end : what the front of that map says of the last factors up to row `end`, which
+            may be among the first ones; without a front that is the end of these
+        again : the front has looked again at factors that were not accepted
+        proved : a bound was proved of the map
+
+        """
+        size, begun = len(made.accepted), end - len(looks)
+        said, seen = _rows(made, FRONT), _rows_of_looks(looks)
+        said['noise'] = np.nan
+        said['said_by'][end:] = NOBODY
+        among = slice(begun, min(size, end))
+        in_map = made.accepted.copy()
+        in_map[among] |= seen['accepted'][:size - begun]
+        # What the map is made of was not for its front to take.
+        part = made.accepted[among]
+        seen[:size - begun][part] = said[among][part]
+        rows = np.concatenate((said[:begun], seen, said[end:]))
+        rows = np.concatenate((rows, self.rows[len(rows):self.looked]))
+        before = self.rows[:self.looked]
+        stays = (before['said_by'] != FRONT) | before['accepted'] | (not again)
+        stays[end:] = True
+        rows[:self.looked][stays] = before[stays]
+        rows['in_map'] = rows['accepted']
+        rows['in_map'][:size] = in_map
+        known = min(len(self.rows), len(rows))
+        rows['proved'][:known] = self.rows['proved'][:known]
+        if proved:
+            rows['proved'] = False
+            rows['proved'][:size] = made.accepted
+        return FactorTable.of(rows)
+
+    def for_front(self, factors: BetweenFactors, first: int, last: int,
+                  robust: bool) -> Indices:
+        """Return what a front does with the factors from `first` to `last`, see `Front.take`."""
+        next_ones = slice(first, min(last, len(factors)))
+        what = np.where(factors.trusted[next_ones] | (not robust), BELIEVE, GATE)
+        known = self.accepted[next_ones]
+        what[:len(known)] = np.where(known, BELIEVE, SKIP)
+        what[factors.struck[next_ones]] = SKIP
+        return what
+
+    def for_new_front(self, factors: BetweenFactors, part: Mask, again: bool) -> Indices:
+        """
+        Return what a new front does with the factors, as far as anybody looked at them.
+
+        part : (k,) bool, those of the first factors that its map is of; again : at what was not
+        accepted it looks again: beside what is accepted now more may fit
+        """
+        known = self.accepted
+        what = np.full(max(len(part), len(known)), GATE)
+        what[:len(known)] = np.where(known, BELIEVE, GATE if again else SKIP)
+        what[factors.struck[:len(what)]] = SKIP
+        what[:len(part)][part] = SKIP
+        return what
+
+
+def _by_person(accepted: Mask, factors: BetweenFactors) -> Mask:
+    """Return which of the first factors are accepted once a person has the last word."""
+    size = len(accepted)
+    return (accepted | factors.trusted[:size]) & ~factors.struck[:size]
+
+
+def _rows(judgement: Judgement, said_by: int) -> Any:
+    """Return rows of a map of what is accepted."""
+    rows = np.zeros(len(judgement.accepted), ROW)
+    rows['accepted'] = rows['in_map'] = judgement.accepted
+    rows['suspect'], rows['sigmas'] = judgement.suspect, judgement.sigmas
+    rows['noise'], rows['said_by'] = judgement.noise, said_by
+    return rows
+
+
+def _rows_of_looks(looks: Sequence[Look]) -> Any:
+    """Return the rows of factors that a front took: its map is of what it accepted."""
+    return np.array([(look.accepted, look.suspect, look.accepted, False, FRONT, look.sigmas,
+                      np.nan) for look in looks], ROW)

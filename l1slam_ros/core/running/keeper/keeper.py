@@ -1,0 +1,318 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The keeper of a map: it owns the growing graph, the state of its map, and two locks.
+
+In: messages, and what was made of snapshots. Out: snapshots, and the one number by which all who
+keep something know whether it is stale.
+
+    _front_lock     the front and its bordered systems, while factors are appended or steps asked
+    _graph_lock     graph, odometry, loops, state and revision: held for moments, so that messages
+                    never wait
+
+Who needs both takes them in this order; neither is held while solving, or reading or writing a
+file. The state changes under both, but for a map that begins anew: that needs the second alone,
+and whoever works with what was there before finds out when he comes to hand in what he made.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import NamedTuple
+
+from l1slam_ros.core.bordered.front import Front, Look
+from l1slam_ros.core.errors import Interrupted
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.factor_graph import BetweenFactors
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
+from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.running.improve import Improvement
+from l1slam_ros.core.running.keeper.schedule import Size
+from l1slam_ros.core.running.map_state import Carried, MapState
+from l1slam_ros.core.running.map_to_odom import MapToOdom, Newest
+from l1slam_ros.core.running.optimised import Optimised
+from l1slam_ros.core.running.snapshot import Robot, SavedMap, Snapshot
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
+
+# Factors that a front takes while its lock is held, and between two looks at the clock: on a large
+# map a loop takes milliseconds.
+_AT_ONCE = 4
+
+
+class Revisions(NamedTuple):
+    """
+    The one number that counts the changes of a back end, and where it stood at some of them.
+
+    now : there may be something new to do or to tell since any lower one; map : since then the
+    poses of the map are what they are; grown : since then the graph has its size; graph : the
+    graph began then, which names it
+    """
+
+    now: int = 0
+    map: int = 0
+    grown: int = 0
+    graph: int = 0
+
+    def after(self, map: bool = False, grown: bool = False, graph: bool = False) -> 'Revisions':
+        """Return them after one more change, of these."""
+        now = self.now + 1
+        return Revisions(now, now if map else self.map, now if grown else self.grown,
+                         now if graph else self.graph)
+
+
+class Keeper:
+    """
+    Keeps a graph and the state of its map.
+
+    Parameters
+    ----------
+    builder : of the graph
+    solver, robust : the options of these names
+
+    """
+
+    def __init__(self, builder: GraphBuilder, solver: OptimiserOptions, robust: bool):
+        self._front_lock, self._graph_lock = threading.Lock(), threading.Lock()
+        self._builder, self._solver, self._robust = builder, solver, robust
+        self._front: Front | None = None
+        nothing = Optimised.nothing(builder.graph.manifold.identity(0))
+        self._odom, self._revisions = MapToOdom(Newest.of(nothing.poses, None)), Revisions()
+        self._state = MapState.beginning(0, robust, nothing, Judgement.nothing(), 0)
+
+    @property
+    def state(self) -> MapState:
+        """The state of the map as it is now."""
+        return self._state
+
+    @property
+    def revisions(self) -> Revisions:
+        """The revisions as they are now."""
+        return self._revisions
+
+    @property
+    def solver(self) -> OptimiserOptions:
+        """The options of the solver as they are now."""
+        return self._solver
+
+    # What comes in.
+
+    def add_odometry(self, sample: OdometrySample) -> bool:
+        """See `Backend.add_odometry`."""
+        with self._graph_lock:
+            builder, graph = self._builder, self._builder.graph
+            keyframes = graph.n_poses
+            try:
+                return builder.add_odometry(sample)
+            finally:  # of two samples the second may be refused
+                if builder.graph is not graph:
+                    self._begin()
+                elif graph.n_poses != keyframes:
+                    self._revisions = self._revisions.after(grown=True)
+                elif len(builder.loops.waiting):
+                    # Any sample may be the one that they wait for, or one too many.
+                    self._revisions = self._revisions.after()
+
+    def add_loop(self, loop: LoopClosure) -> None:
+        """See `Backend.add_loop`."""
+        with self._graph_lock:
+            self._revisions = self._revisions.after()
+            self._builder.add_loop(loop)
+
+    def begin(self, builder: GraphBuilder, optimised: Optimised | None = None,
+              judgement: Judgement | None = None) -> int:
+        """
+        Begin a map with the graph of a builder; what is made for the one before is left.
+
+        optimised, judgement : of the graph, as far as they are known; None: nothing is. Return
+        what names the graph, see `Revisions`.
+        """
+        with self._graph_lock:
+            self._builder = builder
+            self._begin(optimised, judgement)
+            return self._revisions.graph
+
+    def set_options(self, options: GraphBuilderOptions, solver: OptimiserOptions,
+                    robust: bool) -> None:
+        """See `Backend.set_options`."""
+        with self.standing() as now:
+            self._builder.set_options(options)
+            self._solver, doubted, self._robust = solver, self._robust, robust
+            self._revisions = self._revisions.after()
+            if doubted != robust:
+                self._begin(now.optimised().unfinished(), same_graph=True)
+
+    def _begin(self, optimised: Optimised | None = None, judgement: Judgement | None = None,
+               same_graph: bool = False) -> None:
+        """Begin a map, see `begin`; the graph is locked."""
+        builder, self._front = self._builder, None
+        self._revisions = self._revisions.after(map=not same_graph, graph=not same_graph)
+        optimised = optimised or Optimised.nothing(builder.graph.manifold.identity(0))
+        judgement = judgement or Judgement.nothing()
+        judged_loops = int((builder.loops.rows < len(judgement.accepted)).sum())
+        self._odom.begin(Newest.of(optimised.poses, None))
+        self._state = MapState.beginning(
+            self._revisions.now, self._robust, optimised, judgement, judged_loops)
+
+    # What is there.
+
+    @contextmanager
+    def reading(self) -> Iterator[GraphBuilder]:
+        """Give the builder to be read, while nothing changes."""
+        with self._graph_lock:
+            yield self._builder
+
+    def snapshot(self) -> Snapshot:
+        """Return all as it is now, the due loops in its graph, to be read at leisure."""
+        with self.standing() as now:
+            return now
+
+    @contextmanager
+    def standing(self) -> Iterator[Snapshot]:
+        """Let nothing change; give a snapshot, see `snapshot`."""
+        with self._front_lock:
+            front = self._front
+            views = front.views if front else ()
+            with self._graph_lock:
+                self._add_due_loops()
+                track, loops = self._builder.track, self._builder.loops
+                # A map that began meanwhile has no front.
+                views = views if front is self._front else ()
+                yield Snapshot(
+                    self._state, self._builder.graph.copy(), track.keyframe_stamps,
+                    track.keyframe_poses, self._odom.now(self._builder), loops.rows,
+                    loops.stamps, views, front.pattern if front and views else None)
+
+    def saved(self) -> SavedMap | None:
+        """See `Backend.saved`."""
+        with self.standing() as now:
+            if now.graph.between.is_absolute.all():
+                return None
+            builder, graph = self._builder.grown(), self._revisions.graph
+        return SavedMap(builder, now.optimised(), now.judgement, now.state.robust, graph)
+
+    def look(self) -> tuple[MapState, BetweenFactors, Size]:
+        """Return the state, the factors, and how large the graph is."""
+        with self._graph_lock:
+            return self._state, self._builder.graph.between, Size.of(self._builder)
+
+    def robot(self) -> Robot | None:
+        """See `Backend.robot`."""
+        with self._graph_lock:
+            last = self._builder.stream.last
+            now = self._odom.now(self._builder)
+            return Robot(last.stamp, last.pose, now) if last else None
+
+    def moved(self) -> tuple[Array, Array]:
+        """See `Backend.moved`."""
+        with self._graph_lock:
+            return self._odom.moved(self._builder)
+
+    def covariance(self, keyframe: int) -> Array | None:
+        """See `Backend.marginal_covariance`."""
+        with self._front_lock:
+            front = self._front
+            known = front is not None and 0 <= keyframe < front.keyframes
+            return front.covariance(keyframe) if front and known else None
+
+    # What the front takes.
+
+    def take_what_has_come(self, deadline: float) -> None:
+        """Make factors of the due loops; let the front take what is new to it until a time [s]."""
+        with self._front_lock, self._graph_lock:
+            self._add_due_loops()
+        taken = False
+        while time.monotonic() < deadline:
+            with self._front_lock:
+                if not self._take_some():
+                    break
+            taken = True
+            time.sleep(0)  # who waits for the lock would else wait for the deadline
+        if taken:
+            with self._front_lock:
+                state = self._state
+                newest = Newest.of(state.optimised.poses, self._front)
+                with self._graph_lock:
+                    if self._state.began == state.began:
+                        self._move(newest)
+
+    def _add_due_loops(self) -> None:
+        """Make factors of the loops whose times odometry has reached; the graph is locked."""
+        graph, loops = self._builder.graph, self._builder.loops
+        waiting = len(loops.waiting)
+        new = self._builder.add_due_loops()
+        if len(loops.waiting) != waiting:
+            self._state = self._state.told(graph.between)
+            self._revisions = self._revisions.after(grown=new > 0)
+
+    def _take_some(self) -> bool:
+        """Let the front take a few factors; return whether it did; the front is locked."""
+        with self._graph_lock:
+            front, state, factors = self._front, self._state, self._builder.graph.between
+        if front is None or front.closed or front.rows >= len(factors):
+            return False
+        what = state.table.for_front(factors, front.rows, front.rows + _AT_ONCE, state.robust)
+        looks = front.take(factors, what)
+        with self._graph_lock:
+            if self._state is state:  # else another map has begun
+                self._state = state.taken(looks, Carried.by(front))
+        return bool(looks)
+
+    def _move(self, newest: Newest) -> None:
+        """Note that the map is another, which ends here; the graph is locked."""
+        self._odom.move(self._builder, newest)
+        self._revisions = self._revisions.after(map=True)
+
+    # What the workers make.
+
+    def adopt(self, improvement: Improvement, front: Front | None = None,
+              pending: Judgement | None = None, looks: Sequence[Look] = ()) -> None:
+        """
+        Take over a map that was made of a snapshot; keyframes since then follow along.
+
+        front : made of it, None: it cannot be factored; pending, looks : see `MapState.adopted`
+
+        Raises
+        ------
+        Interrupted : it was made for a map that is there no more.
+        ArithmeticError : it is not finite; nothing is taken over.
+
+        """
+        newest = Newest.of(improvement.poses, front)
+        carried = Carried.by(front) if front else None
+        former = self._front
+        with self._front_lock, self._graph_lock:
+            state = self._state
+            if state.began != improvement.map:
+                raise Interrupted
+            self._state = state.adopted(
+                improvement, carried, looks, pending, self._builder.graph.between,
+                self._solver.outer_tolerance, time.monotonic())
+            self._front = front
+            self._move(newest)
+        # To give its memory back takes long: it shall not be an update that does so last.
+        with self._front_lock:
+            pass
+        del former
+
+    def begin_judgement(self) -> tuple[Snapshot, int]:
+        """Return all as it is now, to be judged, and since when the graph has its size."""
+        with self.standing() as now:
+            self._state = self._state.being_judged(time.monotonic())
+            return now, self._revisions.grown
+
+    def change(self, made_for: Snapshot,
+               transition: Callable[[MapState, BetweenFactors], MapState]) -> None:
+        """
+        Let another state follow, by what was found of a snapshot.
+
+        Raises
+        ------
+        Interrupted : the map is there no more.
+
+        """
+        with self._front_lock, self._graph_lock:
+            if self._state.began != made_for.map:
+                raise Interrupted
+            self._state = transition(self._state, self._builder.graph.between)
+            self._revisions = self._revisions.after()

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What is due: which map to make, and what to judge.
+
+In: the state of the map, how large the graph is by now, and the moment. Out: pieces of work, one
+for each worker at most. Pure: who carries them out is no concern of it.
+"""
+
+from enum import Enum
+from typing import NamedTuple
+
+from l1slam_ros.core.online.graph_builder import GraphBuilder
+from l1slam_ros.core.running.map_state import MapState
+
+# A map is factored anew from so many factors on that came since, those of five keyframes; on a
+# large one, from one for so many keyframes on: what goes on behind costs each keyframe the same,
+# however large the map is.
+_FEWEST, _KEYFRAMES_EACH = 10, 200
+# [s] While loops come none of which fits, they are judged so often.
+_JUDGE_EVERY = 2.0
+
+
+class Work(Enum):
+    """A piece of work."""
+
+    ROUND = 'lower the cost of the map, and factor it'
+    EXACT = 'solve for the map to the end, and factor it'
+    JUDGE = 'judge all loops, from what is believed on'
+    JUDGE_ANEW = 'judge all loops, from the graph alone'
+    NORM = 'compare the map with that of another norm'
+
+
+class Size(NamedTuple):
+    """How large a graph is: keyframes, rows of its residual, and loops among its factors."""
+
+    keyframes: int
+    rows: int
+    loops: int
+
+    @staticmethod
+    def of(builder: GraphBuilder) -> 'Size':
+        """Return that of the graph of a builder."""
+        graph = builder.graph
+        rows = len(graph.between) * graph.manifold.TANGENT_SIZE
+        return Size(graph.n_poses, rows, len(builder.loops.rows))
+
+
+class Moment(NamedTuple):
+    """The time [s] of any clock; nothing has come for a while; there is so much time now [s]."""
+
+    now: float
+    idle: bool
+    budget: float = 0.0
+
+
+def due(state: MapState, size: Size, moment: Moment) -> tuple[Work | None, Work | None]:
+    """Return what is due of the worker that makes maps, and of the one that judges."""
+    make = is_map_due(state, size, moment.idle)
+    return (_map(state, moment.idle) if make else None,
+            _judgement(state, size, moment, make))
+
+
+def _map(state: MapState, idle: bool) -> Work:
+    of_all_there_is = state.carried is not None and not state.carried.taken
+    exact = idle and of_all_there_is and not state.is_stale and not state.falls
+    return Work.EXACT if exact else Work.ROUND
+
+
+def _judgement(state: MapState, size: Size, moment: Moment, make: bool) -> Work | None:
+    anew = is_anew_due(state, size, moment)
+    if is_judge_due(state, size, moment):
+        # At rest first from what is believed on: that takes less time, and mostly finds as much.
+        return Work.JUDGE_ANEW if anew else Work.JUDGE
+    compared = state.judged.compared is state.optimised
+    final = moment.idle and not make and state.all_judged_anew(size.loops)
+    if state.robust and final and not compared:
+        return Work.NORM
+    return None
+
+
+def is_map_due(state: MapState, size: Size, idle: bool) -> bool:
+    """Return whether to make the map anew; idle : nothing has come for a while."""
+    optimised, carried = state.optimised, state.carried
+    behind = (len(optimised.poses) < size.keyframes or len(optimised.dual) < size.rows
+              or not optimised.at_rest)
+    # The front goes by the noise that was known when it was made.
+    other_noise = idle and carried is not None and bool(
+        (carried.variance != state.of_all.variance).any())
+    return bool(size.keyframes) and (state.is_stale or state.falls or other_noise
+                                     or (behind and (idle or is_late(state))))
+
+
+def is_late(state: MapState) -> bool:
+    """Return whether the front has more to carry than it should."""
+    carried = state.carried
+    return carried is None or carried.closed or carried.taken >= max(
+        _FEWEST, carried.keyframes // _KEYFRAMES_EACH)
+
+
+def is_judge_due(state: MapState, size: Size, moment: Moment) -> bool:
+    """
+    Return whether to judge all loops.
+
+    At rest until all are judged from the graph alone; else where there is as much time as it
+    takes, or the last judgement is long over. That is sooner where the front left a loop that
+    fits, or there is no front that gates them.
+    """
+    if moment.idle:
+        return not state.all_judged_anew(size.loops)
+    judged = state.judged
+    soon = judged.wanted or state.carried is None
+    pause = judged.took if soon else max(_JUDGE_EVERY, 2 * judged.took)
+    has_time = moment.budget > judged.took or moment.now > judged.ended + pause
+    return (is_anew_due(state, size, moment)
+            or (has_time and not state.all_judged(size.loops)))
+
+
+def is_anew_due(state: MapState, size: Size, moment: Moment) -> bool:
+    """
+    Return whether the next judgement is to be from the graph alone.
+
+    At rest what the last one went on from is asked, too; and before, where loops that it refused
+    make it doubtful: a lie that came first may keep out true ones. What lays the doubt may be lies
+    that agree: it is asked until there are twice as many loops.
+    """
+    if moment.idle:
+        return state.all_judged(size.loops)
+    judged = state.judged
+    return (size.loops < 2 * judged.doubted and judged.anew != judged.loops
+            and moment.now > judged.anew_ended + max(_JUDGE_EVERY, 2 * judged.anew_took))

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Updates of a map: what has come is taken in at once, and workers are let begin what is due.
+
+In: a keeper, and calls of any threads. Out: the account of what an update did. The order of all
+that happens to a message is told in doc/how_a_message_becomes_a_map.md, step by step.
+
+One lock lets one thread at a time update the map, or solve it to the end. Who waits to have the
+map for itself is counted, and work that is under way makes way; a settle is work that somebody
+waits for, and makes way for what cannot wait alone: a process that is about to fork, or to end.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+
+from l1slam_ros.core.errors import Interrupted
+from l1slam_ros.core.running.improve import Check, Improvement, front_of, optimise
+from l1slam_ros.core.running.keeper.keeper import Keeper
+from l1slam_ros.core.running.keeper.schedule import Moment, due
+from l1slam_ros.core.running.keeper.work import carry_out, take_judgement
+from l1slam_ros.core.running.keeper.workers import (
+    LOOK,
+    Calm,
+    Requests,
+    Stopped,
+    Workers,
+    until,
+)
+from l1slam_ros.core.running.problem import as_one
+
+# [s] So long an update may take what has come, whatever the budget.
+_LEAST_TIME = 0.02
+
+
+class Updates:
+    """
+    Updates the map of a keeper.
+
+    Parameters
+    ----------
+    keeper : of the map
+    done : called when some work behind has ended
+
+    Attributes
+    ----------
+    calm : what goes on behind waits for its end
+
+    """
+
+    def __init__(self, keeper: Keeper, done: Callable[[], None]):
+        self._keeper, self._workers, self.calm = keeper, Workers(done), Calm()
+        self._update_lock = threading.Lock()
+        self._claims, self._urgent = Requests(), Requests()
+        # The revisions to which the map was updated last, and at which nothing was left to do.
+        self._updated, self._rested = 0, -1
+
+    def update(self, budget: float, stopped: Stopped, idle: bool | None = None,
+               waits: bool = True) -> Improvement | None:
+        """
+        See `Backend.update`.
+
+        idle : nothing has come for a while, None: find out; waits : up to `budget` for the workers
+        """
+        start, keeper = time.monotonic(), self._keeper
+        with self._update_lock:
+            self._workers.check()
+            if self._rested == keeper.revisions.now:
+                return None
+            before = keeper.state
+            keeper.take_what_has_come(start + max(budget, _LEAST_TIME))
+            seen = keeper.revisions
+            # What a map begins with is not news.
+            came = seen.grown > max(self._updated, keeper.state.began)
+            self._updated = seen.now
+            idle = not came if idle is None else idle
+            check = self._check(before.began, stopped)
+            end = start + budget if waits else start
+            while self._begin_due(idle, budget, check):
+                self._workers.wait(max(min(LOOK, end - time.monotonic()), 0.0))
+                self._workers.check()
+                check()
+                if time.monotonic() >= end:
+                    return self._account(before.began, start)
+            if came or not idle or keeper.state.last is not before.last:
+                return self._account(before.began, start)
+            self._rested = seen.now
+        return None
+
+    def _account(self, began: int, start: float) -> Improvement:
+        state, _, size = self._keeper.look()
+        if state.began != began:
+            raise Interrupted
+        return state.account(size.loops, time.monotonic() - start)
+
+    def _begin_due(self, idle: bool, budget: float, check: Check) -> bool:
+        """Let the workers begin what is due; return whether any is at work."""
+        moment = Moment(time.monotonic(), idle, budget)
+        state, _, size = self._keeper.look()
+        make, judge = due(state, size, moment)
+        for worker, piece in ((self._workers.mapper, make), (self._workers.judge, judge)):
+            if piece is not None:
+                worker.start(partial(
+                    carry_out, self._keeper, piece, moment, self.calm.kept(check)))
+        return self._workers.busy
+
+    def _check(self, began: int, stopped: Stopped) -> Check:
+        """Return what raises `Interrupted` where work for a map is not wanted any more."""
+        return until(lambda: bool(self._claims or self._urgent) or stopped()
+                     or self._keeper.state.began != began)
+
+    def settle(self, stopped: Stopped) -> Improvement | None:
+        """See `Backend.settle`."""
+        while True:
+            with self.alone(check=until(stopped)):
+                began = self._keeper.state.began
+                try:
+                    improvement = self._settled(began, stopped)
+                    break
+                except Interrupted:
+                    if stopped() or self._keeper.state.began != began:
+                        raise
+            # What could not wait is let through.
+            self._urgent.wait()
+        self._workers.tell()
+        return improvement
+
+    def _settled(self, began: int, stopped: Stopped) -> Improvement | None:
+        keeper = self._keeper
+        now, _ = keeper.begin_judgement()
+        self._updated = keeper.revisions.now
+        whole = now.problem()
+        if not len(whole.graph.between):
+            return None
+        problem, check = as_one(whole), self.calm.kept(until(
+            lambda: bool(self._urgent) or stopped() or keeper.state.began != began))
+        improvement = optimise(problem, keeper.solver, check)
+        check()
+        front = front_of(replace(problem, judgement=improvement.judgement), improvement.poses,
+                         len(whole.graph.between), check)
+        improvement = improvement.of_all(whole)
+        take_judgement(keeper, now, improvement.judgement, improvement.poses, True)
+        keeper.adopt(improvement, front, improvement.judgement)
+        return improvement
+
+    @contextmanager
+    def alone(self, urgent: bool = False, check: Check = lambda: None) -> Iterator[None]:
+        """
+        Let nothing be at work.
+
+        urgent : a settle that is under way makes way, too; check : called now and then while
+        another thread has the map for itself, may raise
+        """
+        with (self._urgent if urgent else self._claims).one():
+            while not self._update_lock.acquire(timeout=LOOK):
+                check()
+            self._workers.join()
+        try:
+            yield
+        finally:
+            self._update_lock.release()
+
+    def check(self) -> None:
+        """Raise what some work behind has raised, once."""
+        self._workers.check()

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the workers carry out behind updates: each piece of work from a snapshot to its adoption.
+
+In: the keeper of a map. Out: a better map, or a judgement, handed back to it. Nothing is locked
+while it is computed.
+"""
+
+import time
+
+import numpy as np
+
+from l1slam_ros.core.bordered.front import Look
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.robust.batch import doubts_of_norm, judge, robust_solve
+from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.running.improve import Check, front_of, improve, one_round
+from l1slam_ros.core.running.keeper.keeper import Keeper
+from l1slam_ros.core.running.keeper.schedule import Moment, Work, is_late
+from l1slam_ros.core.running.keeper.workers import until
+from l1slam_ros.core.running.problem import as_one
+from l1slam_ros.core.running.snapshot import Snapshot
+
+# [s] So long a map is improved, whatever the budget; of the clock a round may take some times as
+# long.
+_LEAST_ROUND, _PATIENCE = 0.1, 4
+# So often a new front takes what came meanwhile, before it is one; so many factors at once.
+_PASSES, _AT_ONCE = 3, 16
+
+
+def carry_out(keeper: Keeper, piece: Work, moment: Moment, check: Check) -> None:
+    """Do a piece of work that was due at a moment; check : raises where it shall stop."""
+    if piece in (Work.ROUND, Work.EXACT):
+        make_map(keeper, piece is Work.EXACT, moment.budget, check)
+    elif piece is Work.NORM:
+        compare_norms(keeper, check)
+    else:
+        judge_all(keeper, piece is Work.JUDGE_ANEW, moment.idle, check)
+
+
+def make_map(keeper: Keeper, exact: bool, budget: float, check: Check) -> None:
+    """Lower the cost of the map, exact : to the end; factor it, and let a front carry the rest."""
+    now, solver = keeper.snapshot(), keeper.solver
+    whole, pending, looked = now.problem(), now.state.pending, now.looked
+    del now  # holds the factors of a front that may be replaced meanwhile
+    problem = as_one(whole)
+    if pending is None:
+        # What is made of less than is believed by then, would be late.
+        check = until(lambda: keeper.state.pending is not None, check)
+    if exact:
+        check = until(lambda: is_late(keeper.state), check)
+    else:
+        solver = one_round(solver, problem.is_sparse)
+    improvement = improve(problem, solver, _PATIENCE * max(budget, _LEAST_ROUND), check, exact)
+    check()
+    front = front_of(problem, improvement.poses, looked, check)
+    looks = list[Look]()
+    for _ in range(_PASSES):
+        state, factors, _ = keeper.look()
+        what = state.table.for_new_front(
+            factors, whole.judgement.accepted, pending is not None)
+        while front is not None and not front.closed and front.rows < len(what):
+            check()
+            looks += front.take(factors, what[front.rows:front.rows + _AT_ONCE])
+    check()
+    keeper.adopt(improvement.of_all(whole), front, pending, looks)
+
+
+def judge_all(keeper: Keeper, anew: bool, idle: bool, check: Check) -> None:
+    """Judge all loops; anew : from the graph alone; idle : only as long as nothing comes."""
+    now, grown = keeper.begin_judgement()
+    whole = now.problem()
+    problem = as_one(whole)
+    alone = until(lambda: keeper.revisions.grown != grown, check) if idle else check
+    graph, known, poses = problem.graph, problem.judgement, problem.poses
+    judgement, l2_poses = (robust_solve(graph, check=alone, known=(known, poses)) if anew
+                           else judge(graph, poses, known, np.inf, check))
+    check()
+    take_judgement(keeper, now, judgement.of_all(whole.graph), l2_poses, anew)
+
+
+def compare_norms(keeper: Keeper, check: Check) -> None:
+    """Doubt the map where another norm has another one."""
+    now = keeper.snapshot()
+    problem = as_one(now.problem())
+    doubts = doubts_of_norm(problem.graph, problem.judgement, problem.poses, check)
+    keeper.change(now, lambda state, _: state.doubted(now.state, doubts))
+
+
+def take_judgement(keeper: Keeper, of: Snapshot, judgement: Judgement, poses: Array,
+                   anew: bool) -> None:
+    """Hand in what was found of a snapshot, and its L2 map (n, p); anew : from it alone."""
+    keeper.change(of, lambda state, factors: state.judged_by(
+        judgement, poses, len(of.loop_rows), anew, factors, time.monotonic()))

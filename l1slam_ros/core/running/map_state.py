@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The state of the map of a running back end, at one moment, and how one state follows from another.
+
+In: a state, and what was made of a snapshot of it. Out: the state after that. States are frozen
+and the transitions pure: who holds one need not hold a lock.
+
+    adopted     a new map, and a front that carries what comes next
+    taken       new factors, by that front
+    judged      what the judge says of all factors
+    told        what a person says of some
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from l1slam_ros.core.bordered.front import Front, Look
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.factor_graph import BetweenFactors
+from l1slam_ros.core.robust.judgement import Doubt, Judgement
+from l1slam_ros.core.running.factor_table import FactorTable
+from l1slam_ros.core.running.improve import Improvement
+from l1slam_ros.core.running.optimised import Optimised
+from l1slam_ros.core.solvers.optimality import Status
+
+# In the place of how many loops were judged: a person has spoken since.
+_TOLD_SINCE = -1
+
+
+class Carried(NamedTuple):
+    """
+    What a front carries beside the map that it was made of.
+
+    rows, taken, closed, keyframes, border, variance : see `Front`
+    """
+
+    rows: int
+    taken: int
+    closed: bool
+    keyframes: int
+    border: int
+    variance: Array
+
+    @staticmethod
+    def by(front: Front) -> 'Carried':
+        """Return what a front carries now."""
+        return Carried(front.rows, front.taken, front.closed, front.keyframes, front.border,
+                       front.variance)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """
+    What the judge has done, and when [s].
+
+    loops : of so many there is a judgement; anew : of so many there is one from the graph alone;
+    doubted : so many there were when a judgement last doubted those that it refused; poses :
+    (n, p) the L2 map of the last one, None: there is none; wanted : the front has left a loop that
+    fits; compared : the map that was last compared with that of another norm; began, ended, took :
+    of the last one that went on from the one before; anew_ended, anew_took : of the last one anew
+    """
+
+    loops: int
+    anew: int
+    doubted: int
+    poses: Array | None = None
+    wanted: bool = False
+    compared: Optimised | None = None
+    began: float = 0.0
+    ended: float = 0.0
+    took: float = 0.0
+    anew_ended: float = 0.0
+    anew_took: float = 0.0
+
+    def after(self, judgement: Judgement, poses: Array, loops: int, anew: bool,
+              now: float) -> 'Judged':
+        """Return it after a judgement of so many loops; anew : from the graph alone."""
+        doubted = loops if judgement.is_refusal_doubted else self.doubted
+        after = replace(self, loops=loops, poses=poses, compared=None, doubted=doubted, ended=now)
+        if anew:
+            return replace(after, anew=loops, anew_ended=now, anew_took=now - self.began)
+        return replace(after, took=now - self.began)
+
+
+@dataclass(frozen=True)
+class MapState:
+    """
+    What is known of the map of one graph.
+
+    Parameters
+    ----------
+    began : the revision at which this map began: it names it, see `Improvement`
+    robust : loops may be doubted
+    optimised : the last map that was solved for
+    table : what is said of each factor
+    of_all : what the last judgement says of all factors together; it has no columns
+    judged : what the judge has done
+    pending : the last judgement, where no map is made of it yet: until there is one, map and table
+        are those before; None: there is none
+    carried : by the front since the last map, None: there is no front
+    last : the account of the last map, None: there was none
+    made : [s] when it was adopted
+    bound, bound_at : no map of the factors that are `proved`, and near this one, has less cost;
+        [s] when that was found
+
+    """
+
+    began: int
+    robust: bool
+    optimised: Optimised
+    table: FactorTable
+    of_all: Judgement
+    judged: Judged
+    pending: Judgement | None = None
+    carried: Carried | None = None
+    last: Improvement | None = None
+    made: float = 0.0
+    bound: float = np.nan
+    bound_at: float = 0.0
+
+    @staticmethod
+    def beginning(began: int, robust: bool, optimised: Optimised, judgement: Judgement,
+                  judged_loops: int) -> 'MapState':
+        """Return the state in which a map begins, that of a saved one; judged_loops : of these."""
+        none = Judgement.nothing()
+        of_all = replace(judgement, accepted=none.accepted, suspect=none.suspect,
+                         sigmas=none.sigmas, noise=none.noise)
+        return MapState(
+            began, robust, optimised, FactorTable.of_judgement(judgement), of_all,
+            Judged(judged_loops, judged_loops, judged_loops * judgement.is_refusal_doubted))
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether the map is not of the factors that are accepted, or are to be."""
+        return self.pending is not None or not self.table.is_map_of_accepted
+
+    @property
+    def falls(self) -> bool:
+        """Whether the last round of the map ended on the way down."""
+        return self.last is not None and self.last.falls
+
+    def all_judged(self, loops: int) -> bool:
+        """Return whether none of so many loops waits to be judged."""
+        return not self.robust or (self.of_all.settled and self.judged.loops == loops)
+
+    def all_judged_anew(self, loops: int) -> bool:
+        """
+        Return whether all of so many loops were judged from the graph alone.
+
+        What was believed when little was known stays as long as it fits: at rest there is time to
+        ask whether it would be believed now.
+        """
+        return self.all_judged(loops) and (not self.robust or self.judged.anew == loops)
+
+    def told(self, factors: BetweenFactors) -> 'MapState':
+        """Return the state once a person's word on some factors counts."""
+        table = self.table.told(factors)
+        if table is self.table:
+            return self
+        return replace(self, table=table, judged=replace(self.judged, loops=_TOLD_SINCE))
+
+    def taken(self, looks: Sequence[Look], carried: Carried) -> 'MapState':
+        """Return the state once the front has taken some factors, which it looked at."""
+        # At what it takes again nobody else looks.
+        new = looks[max(self.table.looked - (carried.rows - len(looks)), 0):]
+        judged, wanted = self.judged, any(look.suspect for look in new)
+        if wanted and not judged.wanted:
+            judged = replace(judged, wanted=True)
+        return replace(self, table=self.table.with_looks(new), carried=carried, judged=judged)
+
+    def being_judged(self, now: float) -> 'MapState':
+        """Return the state while the judge looks at all loops that there are."""
+        return replace(self, judged=replace(self.judged, wanted=False, began=now))
+
+    def judged_by(self, judgement: Judgement, poses: Array, loops: int, anew: bool,
+                  factors: BetweenFactors, now: float) -> 'MapState':
+        """
+        Return the state after a judgement of so many loops, of which poses (n, p) is the L2 map.
+
+        Where it accepts other factors than the map is of, it waits for a map; anew : from the
+        graph alone
+        """
+        after = replace(self, judged=self.judged.after(judgement, poses, loops, anew, now))
+        accepted = self.table.accepted[:len(judgement.accepted)]
+        if self.pending is not None or not np.array_equal(judgement.accepted, accepted):
+            return replace(after, pending=judgement)
+        return after._committed(judgement, factors)
+
+    def _committed(self, judgement: Judgement, factors: BetweenFactors) -> 'MapState':
+        """Return the state whose table says what was judged."""
+        none = self.of_all
+        return replace(
+            self, table=self.table.judged(judgement, factors),
+            of_all=replace(judgement, accepted=none.accepted, suspect=none.suspect,
+                           sigmas=none.sigmas, noise=none.noise))
+
+    def adopted(self, improvement: Improvement, carried: Carried | None, looks: Sequence[Look],
+                pending: Judgement | None, factors: BetweenFactors, tolerance: float,
+                now: float) -> 'MapState':
+        """
+        Return the state once a map is published.
+
+        Parameters
+        ----------
+        improvement : the map
+        carried, looks : by its front, None: there is none; at the last factors it has looked
+        pending : the judgement that it was made for
+        tolerance : see `OptimiserOptions.outer_tolerance`
+
+        """
+        after, made = self, improvement.judgement
+        if pending is not None:
+            after = self._committed(pending, factors)
+            after = replace(after, pending=None if self.pending is pending else self.pending)
+        proved = improvement.gap < np.inf
+        bound = (improvement.cost - improvement.gap, now) if proved else (
+            self.bound, self.bound_at)
+        end = carried.rows if carried else len(made.accepted)
+        wanted = self.judged.wanted or any(look.suspect for look in looks)
+        return replace(
+            after, optimised=improvement.taken_over(self.optimised, tolerance),
+            table=after.table.adopted(made, looks, end, pending is not None, proved),
+            judged=replace(self.judged, wanted=wanted), carried=carried, last=improvement,
+            made=now, bound=bound[0], bound_at=bound[1])
+
+    def doubted(self, earlier: 'MapState', doubts: tuple[Doubt, ...]) -> 'MapState':
+        """Return the state with what was found of an earlier one, if its map is the same."""
+        if self.optimised is not earlier.optimised or self.of_all is not earlier.of_all:
+            return self
+        of_all = replace(self.of_all, doubts=tuple(dict.fromkeys(self.of_all.doubts + doubts)))
+        return replace(self, of_all=of_all, judged=replace(self.judged, compared=self.optimised))
+
+    def account(self, loops: int, seconds: float) -> Improvement:
+        """Return what the last map says of itself, after an update that took so long."""
+        settled, last = self.all_judged(loops), self.last
+        if last is None:
+            judgement = replace(self.table.judgement(self.of_all), settled=settled)
+            return Improvement(self.began, self.optimised.poses, self.optimised.dual, judgement,
+                               0.0, 0.0, Status.OUT_OF_TIME, 0, 0, 0, np.inf, seconds)
+        return replace(last, judgement=replace(last.judgement, settled=settled), seconds=seconds)

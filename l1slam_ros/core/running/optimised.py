@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The last map that a running back end has solved for."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.solvers.optimality import Status
+
+# A large map gets but one linearisation into an update, and never meets a test that takes two of
+# them. It is at rest when so many updates in a row lowered the cost by less than is looked for.
+_QUIET_UPDATES = 5
+
+
+@dataclass(frozen=True)
+class Optimised:
+    """
+    What has been made so far, of the first keyframes and factors.
+
+    poses : (k, p); dual : (rows,); cost, status : as the last map left them; quiet_updates : how
+    many in a row hardly lowered the cost.
+    """
+
+    poses: Array
+    dual: Array
+    cost: float
+    status: Status
+    quiet_updates: int
+
+    @staticmethod
+    def nothing(poses: Array) -> 'Optimised':
+        """Return what stands before the first update: poses at most."""
+        return Optimised(poses, np.zeros(0), 0.0, Status.OUT_OF_TIME, 0)
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether more updates of the same factors would hardly change the map."""
+        return (self.status in (Status.CONVERGED, Status.STALLED)
+                or self.quiet_updates >= _QUIET_UPDATES)
+
+    def unfinished(self) -> 'Optimised':
+        """Return the same where more is to be done."""
+        return replace(self, status=Status.OUT_OF_TIME)

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What there is to minimise: a graph, what is believed of it, and a warm start.
+
+In: what a back end has at one moment. Out: the same as judge and solvers want it, see `as_one`: of
+one piece, without what a person struck out. What was made of that, `Improvement.of_all` gives back
+for the factors of the back end's graph.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.geometry.noise import sigmas
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.solvers.block_cholesky import Pattern
+from l1slam_ros.core.solvers.solve import AUTO, PRIMAL_DUAL, Method, choose
+
+# [rad] Of the heading of a part: that it is not known. Its place is, to the extent of the map.
+_HEADING = 1.0
+
+
+@dataclass(frozen=True)
+class Problem:
+    """
+    What there is to minimise.
+
+    map : names the map that it is of, another after `Backend.reset` and `Backend.restore`; graph :
+    all factors; starts : poses (n, p) to start from, `poses` the first; dual : (rows,) to start
+    from; judgement : of all factors; robust : loops may be doubted; last_cost : the cost that the
+    last update left, for as many factors as there are now; settled : nothing has come since an
+    update that converged; pattern : of the last factorisation, None: there was none.
+    """
+
+    map: int
+    graph: FactorGraph
+    starts: list[Array]
+    dual: Array
+    judgement: Judgement
+    robust: bool
+    last_cost: float
+    settled: bool
+    pattern: Pattern | None = None
+
+    @property
+    def poses(self) -> Array:
+        """Where the keyframes are, (n, p)."""
+        return self.starts[0]
+
+    @cached_property
+    def part(self) -> FactorGraph:
+        """The factors that are believed."""
+        return self.judgement.believed(self.graph)
+
+    @cached_property
+    def method(self) -> Method:
+        """What to solve them by."""
+        return choose(AUTO, self.part, before=self.pattern)
+
+    @property
+    def is_sparse(self) -> bool:
+        """Whether they are solved by factorisations."""
+        return self.method.solver != PRIMAL_DUAL
+
+
+def as_one(problem: Problem) -> Problem:
+    """
+    Return the problem whose graph is of one piece, without what a person struck out.
+
+    Each part of the map is tied to the keyframe before its first one, where both stand: so weakly
+    that whatever else joins them decides.
+    """
+    graph, judgement = problem.graph, problem.judgement
+    rows, d = graph.not_struck, graph.manifold.TANGENT_SIZE
+    firsts = graph.firsts
+    g = len(firsts)
+    if not g and len(rows) == len(graph.between):
+        return problem
+    return replace(
+        problem, graph=_tied(graph.subset(rows), problem.poses, firsts),
+        dual=np.append(problem.dual.reshape(-1, d)[rows].ravel(), np.zeros(g * d)),
+        judgement=replace(
+            judgement, accepted=np.append(judgement.accepted[rows], np.ones(g, bool)),
+            suspect=np.append(judgement.suspect[rows], np.zeros(g, bool)),
+            sigmas=np.append(judgement.sigmas[rows], np.zeros(g)),
+            noise=np.append(judgement.noise[rows], np.ones(g))))
+
+
+def _tied(graph: FactorGraph, poses: Array, firsts: Indices) -> FactorGraph:
+    """Return the graph with the first keyframes of parts tied to others; poses : (n, p)."""
+    manifold, d = graph.manifold, graph.manifold.TANGENT_SIZE
+    extent = float(np.ptp(manifold.positions(poses), axis=0).max()) if len(poses) else 0.0
+    sigma = sigmas(manifold, 1.0 + extent, _HEADING)
+    # Any keyframe of a part that came earlier will do.
+    others = firsts - 1
+    graph.follow(firsts, others)
+    graph.append_between(
+        others, firsts, manifold.between(poses[others], poses[firsts]),
+        np.broadcast_to(np.diag(1 / sigma), (len(firsts), d, d)))
+    return graph

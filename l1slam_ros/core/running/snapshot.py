@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The back end at one moment: taken in a moment, and read at leisure while the back end goes on.
+
+In: references to arrays that are never written to again. Out: what is worked out of them, the
+problem of the next update first of all.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from l1slam_ros.core.bordered.front import View
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.online.builder_state import BuilderState
+from l1slam_ros.core.robust.judgement import Judgement
+from l1slam_ros.core.running.map_state import MapState
+from l1slam_ros.core.running.optimised import Optimised
+from l1slam_ros.core.running.problem import Problem
+from l1slam_ros.core.solvers.block_cholesky import Pattern
+
+# What can become of a loop; `LoopStates.state` counts in this order.
+LOOP_STATES = ('waiting', 'suspect', 'accepted', 'rejected', 'expired')
+WAITING, SUSPECT, ACCEPTED, REJECTED, EXPIRED = range(len(LOOP_STATES))
+
+
+@dataclass(frozen=True)
+class LoopStates:
+    """
+    What has become of the loops.
+
+    rows : (k,) the between factors of the first k of them; stamps : (l, 2) [ns] reference and end;
+    state : (l,) of `LOOP_STATES`; sigmas : (l,), NaN where a loop was not looked at.
+    """
+
+    rows: Indices
+    stamps: Indices
+    state: Indices
+    sigmas: Array
+
+
+@dataclass(frozen=True)
+class SavedMap:
+    """
+    All that another back end goes on from.
+
+    judgement : of all factors; robust : loops were doubted; graph_began : names the graph in its
+    back end, see `Revisions`
+    """
+
+    builder: BuilderState
+    optimised: Optimised
+    judgement: Judgement
+    robust: bool
+    graph_began: int = 0
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Where the robot is: stamp [ns] and pose (1, p) of its odometry, and map -> odom (1, p)."""
+
+    stamp: int
+    odometry: Array
+    map_to_odom: Array
+
+
+class Counts(NamedTuple):
+    """
+    How large a graph is, and what was noted of messages.
+
+    sizes : keyframes, factors and loops of each state, by name; refused : cause -> how many loops
+    were; told : how often the odometry did not go on as robots move, see `Notes.told`
+    """
+
+    sizes: dict[str, int]
+    refused: dict[str, int]
+    told: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Behind:
+    """
+    What goes on behind updates.
+
+    age : [s] of the map that was factored, NaN: there is none; rows : of loops that came since;
+    loops : not judged yet; bound : what no map of the accepted factors that is near this one has
+    less L1 cost than, and its age [s], NaN: nothing was proved of them.
+    """
+
+    age: float
+    rows: int
+    loops: int
+    bound: float
+    bound_age: float
+
+    @staticmethod
+    def of(state: MapState, loops: int, now: float) -> 'Behind':
+        """Return what goes on behind a state, with so many loops in the graph."""
+        carried, holds = state.carried, state.table.is_proof_of_accepted
+        waiting = 0 if state.all_judged(loops) else loops - max(state.judged.loops, 0)
+        return Behind(
+            now - state.made if carried else np.nan, carried.border if carried else 0, waiting,
+            state.bound if holds else np.nan, now - state.bound_at if holds else np.nan)
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """
+    What a back end knows.
+
+    state : of its map; graph : the factors so far; stamps (n,) [ns] and odometry (n, p) of the
+    keyframes; map_to_odom : (1, p); loop_rows, loop_stamps : see `LoopFactors`; views : the L1 and
+    L2 map of the front, where there is one; pattern : see `Problem`.
+    """
+
+    state: MapState
+    graph: FactorGraph
+    stamps: Indices
+    odometry: Array
+    map_to_odom: Array
+    loop_rows: Indices
+    loop_stamps: tuple[Indices, Indices, Indices]
+    views: tuple[View, ...]
+    pattern: Pattern | None
+
+    @property
+    def map(self) -> int:
+        """What names the map, see `Improvement`."""
+        return self.state.began
+
+    @cached_property
+    def poses(self) -> Array:
+        """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
+        return self._followed(
+            self.views[0].poses if self.views else self.state.optimised.poses, self.odometry)
+
+    def _followed(self, poses: Array, others: Array) -> Array:
+        """
+        Return poses (k, p), and behind them the other keyframes as they follow in others (n, p).
+
+        Each follows the last of its predecessors that is known, the first of a part the last
+        keyframe that is.
+        """
+        manifold, known = self.graph.manifold, len(poses)
+        if not known or known == len(others):
+            return np.concatenate((poses, others[known:]))
+        before = np.where(self.graph.parent < np.arange(len(others)), self.graph.parent, known - 1)
+        while (before[known:] >= known).any():
+            before = np.where(before >= known, before[before], before)
+        before = before[known:]
+        way = manifold.between(others[before], others[known:])
+        return np.concatenate((poses, manifold.compose(poses[before], way)))
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """What is believed of all factors, as the map has it."""
+        return self._of_all(self.state.table.judgement(self.state.of_all))
+
+    def _of_all(self, judged: Judgement) -> Judgement:
+        """Return a judgement of the first factors, with what the front says of the others."""
+        state = self.state
+        known = state.table.behind(judged)
+        all_judged = state.all_judged(len(self.loop_rows)) and state.pending is None
+        settled = not state.robust or (judged.settled and all_judged)
+        return replace(known, settled=settled).extended(self.graph, state.robust)
+
+    @property
+    def looked(self) -> int:
+        """From which factor on the next front gates them; with no front the judge does."""
+        state = self.state
+        if state.pending is not None:
+            return len(state.pending.accepted)
+        return state.table.looked if self.views else len(self.graph.between)
+
+    def problem(self) -> Problem:
+        """Return what an update begins with: the graph, and the warm start for all of it."""
+        state, last = self.state, self.state.optimised
+        rows = len(self.graph.between) * self.graph.manifold.TANGENT_SIZE
+        # Rows are only ever appended, so the dual of the old ones stays; new ones start at zero.
+        dual = np.concatenate((last.dual, np.zeros(rows - len(last.dual))))
+        starts = [self.poses]
+        starts += [self._followed(view.poses, self.poses) for view in self.views[1:]]
+        if state.judged.poses is not None and state.is_stale:
+            # After a loop has closed, the L2 map of the judgement is nearer.
+            starts.append(self._followed(state.judged.poses, self.poses))
+        grown = len(last.poses) < self.graph.n_poses or len(last.dual) < rows
+        judgement = self.judgement if state.pending is None else self._of_all(state.pending)
+        settled = not (grown or state.is_stale) and judgement.settled and last.at_rest
+        return Problem(state.began, self.graph, starts, dual, judgement, state.robust,
+                       last.cost * rows / max(len(last.dual), 1), settled, self.pattern)
+
+    def optimised(self) -> Optimised:
+        """Return the map that was solved for, grown to all keyframes and factors there are."""
+        problem, last = self.problem(), self.state.optimised
+        same = len(last.poses) == len(problem.poses) and len(last.dual) == len(problem.dual)
+        grown = replace(last, poses=problem.poses, dual=problem.dual)
+        return grown if same else replace(grown.unfinished(), quiet_updates=0)
+
+    def loop_states(self) -> LoopStates:
+        """Return what has become of each loop, those of the graph first, in its order."""
+        in_graph, waiting, expired = self.loop_stamps
+        judgement, rows = self.judgement, self.loop_rows
+        state = np.where(judgement.accepted[rows], ACCEPTED,
+                         np.where(judgement.suspect[rows], SUSPECT, REJECTED))
+        others = np.repeat([WAITING, EXPIRED], [len(waiting), len(expired)])
+        sigmas = np.concatenate((judgement.sigmas[rows], np.full(len(others), np.nan)))
+        return LoopStates(rows, np.concatenate((in_graph, waiting, expired)),
+                          np.concatenate((state, others)), sigmas)
+
+    def sizes(self) -> dict[str, int]:
+        """Return how many keyframes, factors and loops of each state there are, by name."""
+        loops = np.bincount(self.loop_states().state, minlength=len(LOOP_STATES))
+        return {'keyframes': self.graph.n_poses, 'factors': len(self.graph.between)} | {
+            f'{name}_loops': int(count) for name, count in zip(LOOP_STATES, loops, strict=True)}
