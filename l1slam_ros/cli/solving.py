@@ -89,7 +89,8 @@ def _write(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
     if arguments.output:
         formats.write_output(arguments.output, replace(
             record, poses=outcome.solution.poses,
-            left_out=left_out_by(outcome.judgement, record.graph.between)), force=arguments.force)
+            left_out=left_out_by(outcome.judgement, record.graph.between),
+            drift=outcome.judgement.drift if outcome.judgement else 0.0), force=arguments.force)
 
 
 def _solved(arguments: argparse.Namespace, record: GraphRecord, asked: SolveOptions) -> Outcome:
@@ -169,6 +170,7 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
         'suspect': record.ids[factors.pairs[suspect]].tolist(),
         'slips': record.ids[factors.pairs[slips]].tolist(),
         'parts': outcome.parts,
+        'drift': judgement.drift if judgement else 0.0,
     }
 
 

@@ -32,6 +32,9 @@ _NAMED = 20
 # A gross slip of the odometry: said apart, because nothing that was driven after it can be trusted
 # without the loops across it.
 _SLIP = 'odometry {pair} lies: {sigmas:.1f} sigmas off what the loops say; left out'
+# The odometry of the map is not that which was measured: who takes the file of it has to know.
+_DRIFT = ('the odometry drifts by {drift:+.3g} rad on each metre, as the loops agree: the map is '
+          'made of odometry that is corrected by that')
 # Sigmas so many times the stated ones are worth a word; less is what people are wrong by.
 _NOISY = 2.0
 # Of odometry and of loops, as `Judgement.variance` has them.
@@ -72,6 +75,8 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
     factors, accepted = record.graph.between, judgement.accepted
     is_loop = ~factors.is_odometry
     pairs = record.ids[factors.pairs]
+    if judgement.drift:
+        yield _DRIFT.format(drift=judgement.drift)
     for row in judgement.slips.tolist():
         yield _SLIP.format(pair=_named(pairs[row]), sigmas=judgement.sigmas[row])
     refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect & ~factors.struck)

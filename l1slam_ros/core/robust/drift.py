@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A heading that drifts: how much each metre of the odometry turns too far, by a vote of the loops.
+A heading that drifts: how far each metre of the odometry turns, by a vote of the loops.
 
-In: a graph in the plane, of whose loops nothing is believed yet. Out: the drift d [rad/m] that they
-agree on, and how sure that is. A true loop from keyframe i to j, with s metres of way between them,
-says by how much the odometry has turned too little:
+In: a graph in the plane, of whose loops nothing is believed yet. Out: the drift d [rad/m] that
+they agree on, and how sure that is. A true loop from keyframe i to j, with s metres of way
+between them, says by how much the odometry has turned too little:
 
     phi = wrap(z_theta - (theta_j - theta_i)) = d s + noise,
 

@@ -10,9 +10,7 @@ cut, the loops across are asked anew, and the rounds go on from there. To the od
 gate for each place that is won and that nothing else explains, less one for each that is lost. A
 slip is believed if that makes it likelier than not. Loops do not make a robot jump: the slip
 repaired, it has to move as at some other step, or rather so than as measured. What fits the loops
-that came in without it did not slip: a lie had bent the map. And odometry that errs alike on each
-metre did not slip either: where a slip would be believed, or most loops are left out, a drift is
-compared by the same odds.
+that came in without it did not slip: a lie had bent the map.
 """
 
 from collections.abc import Iterator
@@ -27,7 +25,6 @@ from l1slam_ros.core.robust.motion import (
     Motion,
     log_odds_of_slips,
     steps_of,
-    straightened,
     unwhitening,
     usual_motion,
 )
@@ -94,8 +91,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     """
     Return a state in which an odometry factor is cut that slipped; None: there is none.
 
-    Or one that a lie does not bend any more, because an odometry factor was out for a while; or
-    one whose odometry does not drift any more.
+    Or one that a lie does not bend any more, because an odometry factor was out for a while.
 
     as_stated : the state where all may be as noisy as they say; what that explains needs no slip
     """
@@ -115,14 +111,6 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         if state and evidence > most and (usual or (odds > 0 and len(steps) == 1)):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
-    half = np.count_nonzero(growth.is_loop) / 2
-    if found or len(as_stated.undecided()) > half:
-        # A drift errs at all steps, and many places show it: no slip need be, nor most loops lie.
-        state, odds = straightened(growth)
-        state.solve()
-        _accept_more(state)
-        if odds + _gain(growth, as_stated, state) > most and len(state.undecided()) < half:
-            found = state
     if not found and growth.cut.any():
         # In the end more is known than when it was cut.
         now = log_odds_of_slips(growth, motion)

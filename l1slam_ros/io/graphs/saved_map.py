@@ -40,7 +40,7 @@ def save_map(path: Path, saved: SavedMap | None) -> str:
     if saved is None:
         raise FileError(path, 'there is no graph yet to be saved')
     record = GraphRecord(saved.builder.graph, saved.optimised.poses, np.arange(_count(saved)),
-                         left_out=_left_out(saved))
+                         left_out=_left_out(saved), drift=saved.judgement.drift)
     with replacing(path) as temporary:
         put_lines(temporary, with_remarks(graph_lines(path, record), _remarks(saved)))
         _keep(path)
