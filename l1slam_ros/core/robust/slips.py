@@ -42,6 +42,8 @@ JOINING, SPANNING = 2, 3
 _TRIED = 2
 # What is nearly sure: ln of the odds.
 SURE = float(np.log(1 / DOUBT - 1))
+# By so much more the odometry may vary than its good steps say.
+_NOISIER = (10.0, 100.0)
 # Of fewer steps there is no habit.
 _FEWEST_STEPS = 20
 
@@ -99,7 +101,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     if np.count_nonzero(~growth.is_loop & ~growth.cut) < _FEWEST_STEPS:
         return None
     motion = usual_motion(growth)
-    found, most = None, 0.0
+    found, most = _noisier(growth, as_stated)
     for steps, odds, state, usual in _tried(growth, as_stated, motion):
         back = _put_back(state, steps, motion) if state else None
         state, odds = back or (state, odds)
@@ -117,6 +119,34 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         growth.slip_odds |= {step: max(odds, float(now[step]))
                              for step, odds in growth.slip_odds.items() if growth.cut[step]}
     return found
+
+
+def _noisier(growth: Growth, as_stated: Growth) -> tuple[Growth | None, float]:
+    """
+    Return a state whose odometry is noisier than its good steps say, None: it is not; its odds.
+
+    Asked only where most loops are left out, and believed only where most come in by it. The odds
+    are those of f residuals, as many as others check, of K times the variance: what was learnt
+    then over what was learnt of them alone, f / 2 (1 - 1 / K - ln K).
+    """
+    half = np.count_nonzero(growth.is_loop) / 2
+    if len(as_stated.undecided()) <= half:
+        return None, 0.0
+    odometry = ~growth.is_loop[growth.accepted] & ~growth.cut[growth.accepted]
+    freedom = np.trace(growth.posterior.moment[odometry], axis1=1, axis2=2).sum()
+    found, most = None, 0.0
+    for times in _NOISIER:
+        state = growth.copy()
+        state.variance = growth.variance * (times, 1.0)
+        state.drops[:] = 0
+        state.solve()
+        _accept_more(state)
+        ratio = state.variance[0] / growth.variance[0]
+        evidence = _gain(growth, as_stated, state) + freedom / 2 * (
+            1 - 1 / ratio - np.log(ratio))
+        if len(state.undecided()) < half and evidence > most:
+            found, most = state, evidence
+    return found, most
 
 
 def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
