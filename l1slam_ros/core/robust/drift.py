@@ -18,9 +18,9 @@ Source: ours, by the recorded logs that `test_drift.py` names where they are.
 import numpy as np
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import covariance_of
-from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time
+from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph, ends_in_time
 from l1slam_ros.core.graph.parts import bridged
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.places import places
@@ -41,12 +41,17 @@ def straightened(graph: FactorGraph, drift: float) -> FactorGraph:
         return graph
     other = graph.subset(np.arange(len(graph.between)))
     factors, rows = other.between, np.flatnonzero(other.between.is_odometry)
+    factors.measurement[rows] = corrected(factors, rows, drift)
+    return other
+
+
+def corrected(factors: BetweenFactors, rows: Indices, drift: float) -> Array:
+    """Return what some odometry factors in the plane measured, without its drift, (k, 3)."""
     measured = factors.measurement[rows]
     along = np.where(factors.i[rows] < factors.j[rows], 1.0, -1.0)
     step = np.zeros((len(rows), 3))
     step[:, 2] = drift * along * np.hypot(measured[:, 0], measured[:, 1])
-    factors.measurement[rows] = se2.retract(measured, step)
-    return other
+    return se2.retract(measured, step)
 
 
 def vote(graph: FactorGraph) -> tuple[float, float]:
