@@ -80,7 +80,7 @@ def test_a_chosen_solver_is_the_one_that_solves(capsys, world, solver):
 
 REPORTED = ['poses', 'factors', 'loops', 'initial_cost', 'seed_cost', 'final_cost', 'status',
             'seconds', 'solver', 'outer_iterations', 'inner_iterations', 'rejected', 'suspect',
-            'slips', 'parts', 'warnings']
+            'slips', 'parts', 'drift', 'warnings']
 
 
 @pytest.mark.parametrize('more', [(), ('--no-robust',), ('--robust', '--norm', 'l2')])

@@ -28,8 +28,8 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.linear_system import anchor, linearise
-from l1slam_ros.core.robust.drift import corrected
 from l1slam_ros.core.robust.innovation import chi2_quantile, claimed_volume
+from l1slam_ros.core.robust.odometry.drift import corrected
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.optimality import smoothing
 

@@ -57,7 +57,6 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import bridged, tied
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.robust.drift import straightened, vote
 from l1slam_ros.core.robust.innovation import chi2_quantile, covariances
 from l1slam_ros.core.robust.judgement import (
     NORM,
@@ -68,9 +67,10 @@ from l1slam_ros.core.robust.judgement import (
     doubts,
     judgement_of,
 )
+from l1slam_ros.core.robust.odometry.drift import straightened, vote
+from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.places import places
 from l1slam_ros.core.robust.rounds import REFUSED, Growth
-from l1slam_ros.core.robust.slips import join, without_slip
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 from l1slam_ros.core.solvers.nonlinear import Solution

@@ -20,7 +20,6 @@ from l1slam_ros.core.graph.parts import bridged, odometry_gaps
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch import OnRound, RobustMap, minimise_robustly
-from l1slam_ros.core.robust.drift import straightened
 from l1slam_ros.core.robust.inspection import (
     FEWEST_SPARE,
     densest_part,
@@ -29,6 +28,7 @@ from l1slam_ros.core.robust.inspection import (
     require_connected,
 )
 from l1slam_ros.core.robust.judgement import UNSOLVED, Judgement
+from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution

@@ -16,7 +16,8 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, lowest_of_components
-from l1slam_ros.core.robust.drift import straightened
+from l1slam_ros.core.robust.odometry.drift import straightened
+from l1slam_ros.core.robust.odometry.slips import JOINING, SPANNING, SURE, common_steps, spanning
 from l1slam_ros.core.robust.pairwise_consistency import (
     ASKED,
     Group,
@@ -27,7 +28,6 @@ from l1slam_ros.core.robust.pairwise_consistency import (
 )
 from l1slam_ros.core.robust.places import err_together
 from l1slam_ros.core.robust.rounds import Growth
-from l1slam_ros.core.robust.slips import JOINING, SPANNING, SURE, common_steps, spanning
 
 # Most loops are refused; all that are accepted are of one place; loops of one place alone say how
 # two parts lie to each other; refused loops of several places agree on another map; an odometry

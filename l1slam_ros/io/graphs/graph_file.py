@@ -17,7 +17,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask, square_root_information
 from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
 from l1slam_ros.core.names import QUATERNION
-from l1slam_ros.core.robust.drift import straightened
+from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.io.files import (
     LARGEST,
     TextLines,
@@ -30,13 +30,7 @@ from l1slam_ros.io.files import (
     replacing,
     rounded,
 )
-from l1slam_ros.io.graphs.left_out import (
-    MEASURED,
-    STRUCK,
-    commented,
-    in_place,
-    nothing_left_out,
-)
+from l1slam_ros.io.graphs.left_out import MEASURED, STRUCK, commented, in_place, nothing_left_out
 from l1slam_ros.io.graphs.rows import (
     Rows,
     expected_tags,
@@ -130,9 +124,9 @@ def read_graph_file(path: str | os.PathLike[str],
     ends = np.concatenate(([0], used + 1))
     before = ends[np.searchsorted(
         stand[used], [number for number, _ in lines.comments])].tolist()
-    skipped = (*circles, *indefinite, *_skipped(groups, ids, anchors))
     return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
-                       _stamps(path, ids, remarks), skipped,
+                       _stamps(path, ids, remarks),
+                       (*circles, *indefinite, *_skipped(groups, ids, anchors)),
                        rotation_information=rotation_information, remarks=remarks,
                        left_out=left_out,
                        comments=tuple(zip(before, (text for _, text in lines.comments),

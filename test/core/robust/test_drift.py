@@ -7,7 +7,7 @@ from lies import careful_world, is_false, position_error, spoilt
 
 from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS
 from l1slam_ros.core.robust import batch_map
-from l1slam_ros.core.robust.drift import straightened, vote
+from l1slam_ros.core.robust.odometry.drift import straightened, vote
 
 DRIFT = 0.05
 WORLD = careful_world(400, 800)

@@ -8,7 +8,7 @@ from problems import EVERY
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.robust.drift import straightened
+from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.paper.updates import Drive
 

@@ -21,7 +21,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.gating import DOUBT
-from l1slam_ros.core.robust.motion import (
+from l1slam_ros.core.robust.odometry.motion import (
     Motion,
     log_odds_of_slips,
     steps_of,
