@@ -28,8 +28,10 @@ from l1slam_ros.io.ours import refuse_others
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.sentences import (
     DOUBTFUL,
+    doubt_reasons,
     doubt_sentence,
     doubted,
+    doubted_rows,
     judgement_sentences,
     offset_sentence,
 )
@@ -152,7 +154,7 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
     suspect = judgement.suspect if judgement else np.zeros(len(factors), bool)
     refused = ~judgement.accepted & ~suspect if judgement else suspect
     slips = judgement.slips if judgement else np.zeros(0, np.int64)
-    doubtful = judgement is not None and judgement.doubts
+    doubts = judgement.doubts if judgement else ()
     return {
         'poses': record.graph.n_poses,
         'factors': len(factors),
@@ -160,7 +162,7 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
         'initial_cost': outcome.initial_cost,
         'seed_cost': outcome.seed_cost,
         'final_cost': solution.cost,
-        'status': DOUBTFUL if doubtful else solution.status.value,
+        'status': DOUBTFUL if doubts else solution.status.value,
         'seconds': outcome.seconds,
         'solver': outcome.solver,
         'outer_iterations': solution.outer_iterations,
@@ -169,6 +171,11 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
         'suspect': record.ids[factors.pairs[suspect]].tolist(),
         'slips': record.ids[factors.pairs[slips]].tolist(),
         'parts': outcome.parts,
+        'doubts': [
+            {'kind': doubt.kind, 'text': text,
+             'loops': record.ids[factors.pairs[doubted_rows(doubt, factors)]].tolist()}
+            for doubt, text in zip(doubts, doubt_reasons(doubts, record.ids, record.stamps),
+                                   strict=True)],
     }
 
 
