@@ -61,6 +61,11 @@ def solve(arguments: argparse.Namespace) -> Ending:
         report['ate'] = position_error(record, outcome.solution.poses, truth)
         report['ate_poses'] = len(truth.rows)
     _write(arguments, record, outcome, truth, _cost_name(asked))
+    if arguments.report:
+        from l1slam_ros.cli.report.page import write_report
+
+        write_report(arguments, record, outcome, asked, [*warnings, *remarks, *filter(
+            None, [record.damage])])
     if arguments.json:
         # What is not finite has no place in JSON.
         print(json.dumps({name: None if isinstance(value, float) and not math.isfinite(value)
@@ -124,6 +129,10 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
 
         check_picture(arguments.plot)
         refuse_others([arguments.plot], read, arguments.force)
+    if arguments.report:
+        from l1slam_ros.cli.report.page import check_report
+
+        check_report(arguments.report, read, arguments.force)
 
 
 def _asked(arguments: argparse.Namespace) -> SolveOptions:
