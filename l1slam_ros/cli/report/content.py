@@ -63,6 +63,8 @@ _ADVICE = {
     NORM: 'No single loop settles this. Switch to the least squares map: if that is the place as '
           'you know it, solve with `--norm l2`.',
     FAILED: 'Please report the sentence.', UNSOLVED: 'Please report the sentence.'}
+# By no word about loops.
+_UNSETTLED = NORM, FAILED, UNSOLVED
 
 
 def content(path: Path, norm: str | None, record: GraphRecord, outcome: Outcome,
@@ -90,18 +92,21 @@ def content(path: Path, norm: str | None, record: GraphRecord, outcome: Outcome,
         'doubtful': bool(doubts),
         'verdict': _verdict(record, outcome),
         'doubts': [
-            {'kind': doubt.kind, 'text': text, 'advice': _ADVICE[doubt.kind],
+            {'text': text, 'advice': _ADVICE[doubt.kind],
+             'settled': doubt.kind not in _UNSETTLED,
              'loops': number_of[doubted_rows(doubt, factors)].tolist()}
             for doubt, text in zip(doubts, doubt_reasons(doubts, record.ids, record.stamps),
                                    strict=True)],
         'remarks': list(remarks),
         # Of 64 bits, which JavaScript's numbers have not.
         'ids': [str(name) for name in record.ids.tolist()],
+        'path': _path(record.graph),
         'i': factors.pairs[rows, 0].tolist(), 'j': factors.pairs[rows, 1].tolist(),
         'said': said[rows].tolist(), 'loops': len(rows) - len(slips),
         'fates': [dict(zip(('word', 'reason', 'unknown'), fate, strict=True)) for fate in _FATES],
         'maps': _maps(record, outcome, rivals, rows),
-        'files': _files(path, name, norm, record),
+        'files': _files(path, name, norm, record,
+                        any(doubt.kind == NORM for doubt in doubts)),
     }
 
 
@@ -127,7 +132,7 @@ def _maps(record: GraphRecord, outcome: Outcome, rivals: Sequence[Rival],
     positions = record.graph.manifold.positions
     first = positions(outcome.solution.poses)
     fate, sigmas = _fates(record.graph, outcome.judgement)
-    maps = [('the map', '', -1, first, fate, sigmas)]
+    maps = [('the map', _used(outcome, fate), -1, first, fate, sigmas)]
     for rival in rivals:
         other, judgement = positions(rival.outcome.solution.poses), rival.outcome.judgement
         if judgement is not None:
@@ -140,7 +145,7 @@ def _maps(record: GraphRecord, outcome: Outcome, rivals: Sequence[Rival],
                      other, fate_there, sigmas_there))
     digits = _digits(first)
     return [{'name': name, 'note': note, 'doubt': doubt,
-             'at': [axis.round(digits).tolist() for axis in np.nan_to_num(place).T],
+             'at': [axis.round(digits).tolist() for axis in place.T],
              'fate': fate[rows].tolist(),
              'sigmas': [None if not np.isfinite(one) else round(one, 2)
                         for one in sigmas[rows].tolist()]}
@@ -148,12 +153,15 @@ def _maps(record: GraphRecord, outcome: Outcome, rivals: Sequence[Rival],
 
 
 def _note(rival: Rival, first: Array, other: Array, fate: Indices) -> str:
-    used = int(np.isin(fate, (_ACCEPTED, _TRUSTED)).sum())
-    judgement = rival.outcome.judgement
-    status = DOUBTFUL if judgement and judgement.doubts else rival.outcome.solution.status.value
-    return (f'{counted(used, "loop")} used, {status.replace("_", " ")}; '
-            f'{absolute_trajectory_error(other, first):.2f} m from the map that was solved (RMSE '
+    error = absolute_trajectory_error(other, first)
+    return (f'{_used(rival.outcome, fate)}; {error:.2f} m from the map that was solved (RMSE '
             'after rigid alignment)')
+
+
+def _used(outcome: Outcome, fate: Indices) -> str:
+    used, judgement = int(np.isin(fate, (_ACCEPTED, _TRUSTED)).sum()), outcome.judgement
+    status = DOUBTFUL if judgement and judgement.doubts else outcome.solution.status.value
+    return f'{counted(used, "loop")} used, {status.replace("_", " ")}'
 
 
 def _fates(graph: FactorGraph, judgement: Judgement | None) -> tuple[Indices, Array]:
@@ -171,14 +179,28 @@ def _fates(graph: FactorGraph, judgement: Judgement | None) -> tuple[Indices, Ar
     return fate, sigmas
 
 
+def _path(graph: FactorGraph) -> list[int]:
+    """Return the keyframes robot by robot, -1 before each that no odometry leads to."""
+    robot, path = graph.robot, list[int]()
+    for number in np.unique(robot).tolist():
+        for keyframe in np.flatnonzero(robot == number).tolist():
+            path += [keyframe] if graph.between.step_to[keyframe] >= 0 else [-1, keyframe]
+    return path[1:]
+
+
 def _digits(positions: Array) -> int:
     """Return how many decimals a drawing of positions (n, k) needs."""
     extent = float(np.ptp(positions, axis=0).max(initial=1e-6))
     return int(np.clip(5 - np.floor(np.log10(max(extent, 1e-6))), 0, 12))
 
 
-def _files(path: Path, name: str, norm: str | None, record: GraphRecord) -> dict[str, str]:
-    """Return where the lines go, by what comes after, and the command that obeys them."""
+def _files(path: Path, name: str, norm: str | None, record: GraphRecord,
+           by_norm: bool) -> dict[str, str]:
+    """
+    Return where the lines go, the command that obeys them, and what comes before.
+
+    by_norm : whether another norm may settle it
+    """
     first = ''
     if formats.is_bag(path) or record.remarks is not None:
         # Only beside graphs there are such files.
@@ -186,6 +208,7 @@ def _files(path: Path, name: str, norm: str | None, record: GraphRecord) -> dict
         first = shlex.join(['l1slam', 'convert', name, str(graph)])
         name = str(graph)
     more = ['--norm', norm] if norm else []
+    least_squares = shlex.join(['l1slam', 'solve', name, '--norm', 'l2'])
     return {'trusted': beside(name, 'trusted').name, 'struck': beside(name, 'struck').name,
             'first': first, 'command': shlex.join(['l1slam', 'solve', name, *more]),
-            'least_squares': shlex.join(['l1slam', 'solve', name, '--norm', 'l2'])}
+            'settled': least_squares if by_norm else ''}

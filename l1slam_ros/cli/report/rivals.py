@@ -16,7 +16,7 @@ from itertools import islice
 import numpy as np
 
 from l1slam_ros.core.errors import GraphError
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions, solve
@@ -94,7 +94,7 @@ def _plans(record: GraphRecord, judgement: Judgement, asked: SolveOptions) -> It
             yield _Plan('least squares', number, graph, replace(asked, norm='l2', loop_norm=SAME))
 
 
-def _told(graph: FactorGraph, rows: Array, trusted: bool) -> FactorGraph:
+def _told(graph: FactorGraph, rows: Indices, trusted: bool) -> FactorGraph:
     told = graph.copy()
     told.say(rows, trusted)
     return told
