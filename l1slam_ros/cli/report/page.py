@@ -61,8 +61,8 @@ def page(shown: dict[str, Any]) -> str:
     from plotly.offline import get_plotlyjs
 
     template = files(__package__).joinpath('page.html').read_text(encoding='utf-8')
-    begin, between = template.split(_LIBRARY)
-    between, end = between.split(_CONTENTS)
+    begin, between = template.split(_CONTENTS)
+    between, end = between.split(_LIBRARY)
     # Whatever a file is called ends no script.
     data = json.dumps(shown, separators=(',', ':')).replace('<', '\\u003c')
-    return ''.join((REPORT_MARK, '\n', begin, get_plotlyjs(), between, data, end))
+    return ''.join((REPORT_MARK, '\n', begin, data, between, get_plotlyjs(), end))
