@@ -150,6 +150,14 @@ def test_the_table_is_cut_searched_and_sorted_and_the_map_switched(capsys, tmp_p
           Math.max(...before.map((x, k) => Math.abs(x - moved[k]))) > 1,
           document.getElementById('map').data.some(one => one.name.startsWith('chosen')),
           document.getElementById('note').textContent];""")
+    at, complaints_at = opened(page, f"""{HEAD}
+        const map = document.getElementById('map');
+        const keyframes = map.data.find(one => one.name === 'keyframes');
+        map.emit('plotly_click', {{points: [{{data: keyframes, pointNumber: {i - 100}}}]}});
+        return [document.getElementById('search').value, [...document.querySelectorAll('#rows tr')
+          ].map(row => [row.cells[0].textContent, row.cells[1].textContent])];""")
+    assert complaints_at == [] and at[0] == str(i)
+    assert [str(i), str(j)] in at[1] and all(str(i) in ends for ends in at[1])
     loops = len(report['doubts'][0]['loops'])
     assert complaints == []
     assert found[:7] == [50, True, [f'{i} {j}'], 50, f'{loops} listed', True, True]
