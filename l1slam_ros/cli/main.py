@@ -168,6 +168,9 @@ def _add_solve(parser: argparse.ArgumentParser) -> None:
         "theta`, or a bag's topic, BAG:/TOPIC, where `bag` is INPUT; interpolated at the "
         'stamps of the poses')
     add('--plot', type=Path, metavar='PNG', help='draw the map and its cost; .svg and .pdf too')
+    add('--report', type=Path, metavar='HTML',
+        help='write a page that shows each loop, its fate and why, and lets one settle a doubt; '
+        'needs plotly')
     _add_force(parser)
     add('--json', action='store_true', help='one object on standard output')
     add('--quiet', action='store_true', help='no progress, no summary, no warning')

@@ -28,8 +28,10 @@ from l1slam_ros.io.ours import refuse_others
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.sentences import (
     DOUBTFUL,
+    doubt_reasons,
     doubt_sentence,
     doubted,
+    doubted_rows,
     judgement_sentences,
     offset_sentence,
 )
@@ -59,6 +61,11 @@ def solve(arguments: argparse.Namespace) -> Ending:
         report['ate'] = position_error(record, outcome.solution.poses, truth)
         report['ate_poses'] = len(truth.rows)
     _write(arguments, record, outcome, truth, _cost_name(asked))
+    if arguments.report:
+        from l1slam_ros.cli.report.page import write_report
+
+        write_report(arguments, record, outcome, asked, [*warnings, *remarks, *filter(
+            None, [record.damage])])
     if arguments.json:
         # What is not finite has no place in JSON.
         print(json.dumps({name: None if isinstance(value, float) and not math.isfinite(value)
@@ -123,6 +130,10 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
 
         check_picture(arguments.plot)
         refuse_others([arguments.plot], read, arguments.force)
+    if arguments.report:
+        from l1slam_ros.cli.report.page import check_report
+
+        check_report(arguments.report, read, arguments.force)
 
 
 def _asked(arguments: argparse.Namespace) -> SolveOptions:
@@ -153,7 +164,7 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
     suspect = judgement.suspect if judgement else np.zeros(len(factors), bool)
     refused = ~judgement.accepted & ~suspect if judgement else suspect
     slips = judgement.slips if judgement else np.zeros(0, np.int64)
-    doubtful = judgement is not None and judgement.doubts
+    doubts = judgement.doubts if judgement else ()
     return {
         'poses': record.graph.n_poses,
         'factors': len(factors),
@@ -161,7 +172,7 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
         'initial_cost': outcome.initial_cost,
         'seed_cost': outcome.seed_cost,
         'final_cost': solution.cost,
-        'status': DOUBTFUL if doubtful else solution.status.value,
+        'status': DOUBTFUL if doubts else solution.status.value,
         'seconds': outcome.seconds,
         'solver': outcome.solver,
         'outer_iterations': solution.outer_iterations,
@@ -171,6 +182,11 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
         'slips': record.ids[factors.pairs[slips]].tolist(),
         'parts': outcome.parts,
         'drift': judgement.drift if judgement else 0.0,
+        'doubts': [
+            {'kind': doubt.kind, 'text': text,
+             'loops': record.ids[factors.pairs[doubted_rows(doubt, factors)]].tolist()}
+            for doubt, text in zip(doubts, doubt_reasons(doubts, record.ids, record.stamps),
+                                   strict=True)],
     }
 
 

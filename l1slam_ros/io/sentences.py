@@ -121,6 +121,12 @@ def doubt_sentence(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None
 
     ids, stamps : (n,) of the keyframes
     """
+    reasons = '; '.join(doubt_reasons(doubts, ids, stamps))
+    return f'{DOUBTFUL}: {reasons}. {_REMEDY}' if reasons else ''
+
+
+def doubt_reasons(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None) -> list[str]:
+    """Return why and where a map is not to be relied on, a clause on each doubt; see above."""
     reasons = []
     for doubt in doubts:
         where = f'between {ids[doubt.first]} and {ids[doubt.last]}'
@@ -129,7 +135,17 @@ def doubt_sentence(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None
             where += f' ({first} s to {last} s)'
         reasons.append(_REASONS[doubt.kind].format(loops=f'{doubt.loops:,}', where=where,
                                                    detail=doubt.detail))
-    return f'{DOUBTFUL}: {"; ".join(reasons)}. {_REMEDY}' if reasons else ''
+    return reasons
+
+
+def doubted_rows(doubt: Doubt, factors: BetweenFactors) -> Indices:
+    """Return the rows of the loops that a doubt is about, (k,), in the order of the file."""
+    if not doubt.pairs:
+        return np.zeros(0, np.int64)
+    n = len(factors.predecessor)
+    (of, pairs) = (np.sort(pairs, axis=1) for pairs in (factors.pairs, np.array(doubt.pairs)))
+    named = np.isin(of @ [n, 1], pairs @ [n, 1])
+    return np.flatnonzero(named & ~factors.is_odometry & ~factors.struck)
 
 
 def _named(pair: np.ndarray) -> str:

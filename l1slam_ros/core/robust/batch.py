@@ -66,6 +66,7 @@ from l1slam_ros.core.robust.judgement import (
     doubt_of,
     doubts,
     judgement_of,
+    listed,
 )
 from l1slam_ros.core.robust.odometry.drift import straightened, vote
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
@@ -239,8 +240,8 @@ class _LeastSquares:
         explained = (np.pi / 2 - 1) * chi2_quantile(1 - REFUSED, np.array([manifold.TANGENT_SIZE]))
         if np.count_nonzero(np.isfinite(square) & (square > explained)) <= len(square) / 2:
             return ()
-        loops = np.count_nonzero(judgement.accepted & ~graph.between.is_odometry)
-        return (Doubt(NORM, int(loops), 0, graph.n_poses - 1),)
+        loops = graph.between.pairs[judgement.accepted & ~graph.between.is_odometry]
+        return (Doubt(NORM, len(loops), 0, graph.n_poses - 1, pairs=listed(loops)),)
 
 
 def _least_squares(graph: FactorGraph, judgement: Judgement, poses: Array,

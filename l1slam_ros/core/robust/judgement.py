@@ -8,7 +8,7 @@ for a loop, strike one out, or state the noise as it is.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -50,7 +50,8 @@ class Doubt:
     One reason why a map is not to be relied on.
 
     kind : one of the above; loops : how many it is about; first, last : the keyframes between
-    which they lie; detail : what failed, where something did.
+    which they lie; detail : what failed, where something did; pairs : the keyframes of each of
+    the loops, either way round.
     """
 
     kind: str
@@ -58,6 +59,7 @@ class Doubt:
     first: int
     last: int
     detail: str = ''
+    pairs: tuple[tuple[int, int], ...] = field(default=(), compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -170,7 +172,12 @@ class Judgement:
 def doubt_of(pairs: Indices, n_poses: int, kind: str, detail: str) -> Doubt:
     """Return a doubt about the loops between pairs of keyframes (k, 2), none: about them all."""
     first, last = (int(pairs.min()), int(pairs.max())) if len(pairs) else (0, n_poses - 1)
-    return Doubt(kind, len(pairs), first, last, detail)
+    return Doubt(kind, len(pairs), first, last, detail, listed(pairs))
+
+
+def listed(pairs: Indices) -> tuple[tuple[int, int], ...]:
+    """Return pairs of keyframes (k, 2) as a doubt has them."""
+    return tuple((i, j) for i, j in pairs.tolist())
 
 
 def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
@@ -236,8 +243,7 @@ def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
         reasons += [_doubt(growth, ONE_JOINS, rows) for rows in _joining_alone(growth)]
     reasons += _other_map(growth)
     reasons += [
-        Doubt(SLIP, int(np.count_nonzero(growth.accepted & spanning(growth, step))),
-              int(growth.low[step]), int(growth.high[step]))
+        _slip_doubt(growth, step)
         for step, odds in growth.slip_odds.items()
         if (odds < SURE if growth.cut[step] else odds > -SURE)]
     return tuple(dict.fromkeys(reasons))
@@ -318,4 +324,11 @@ def _against(growth: Growth, group: Group, rows: Mask) -> int:
 
 def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
     low, high = np.maximum(growth.low[rows], 0), growth.high[rows]
-    return Doubt(kind, len(rows), int(low.min()), int(high.max()))
+    return Doubt(kind, len(rows), int(low.min()), int(high.max()),
+                 pairs=listed(growth.factors.pairs[rows]))
+
+
+def _slip_doubt(growth: Growth, step: int) -> Doubt:
+    across = growth.factors.pairs[growth.accepted & spanning(growth, step)]
+    return Doubt(SLIP, len(across), int(growth.low[step]), int(growth.high[step]),
+                 pairs=listed(across))

@@ -161,7 +161,9 @@ def _read(path: Path) -> SavedMap:
          age)
         for reference, stamp, trusted, struck, age, pose3, covariance in values.pop('waiting'))
     seen = {bytes.fromhex(key): row for key, row in values.pop('seen')}
-    doubts = tuple(Doubt(**doubt) for doubt in values.pop('doubts'))
+    doubts = tuple(
+        Doubt(**doubt | {'pairs': tuple((i, j) for i, j in doubt.get('pairs', ()))})
+        for doubt in values.pop('doubts'))
     judgement = replace(_restored(Judgement.nothing(), values), doubts=doubts)
     return SavedMap(replace(_restored(state, values), waiting=waiting, seen=seen),
                     _restored(optimised, values), judgement, values['robust'])
