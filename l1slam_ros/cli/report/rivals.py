@@ -30,6 +30,7 @@ from l1slam_ros.core.robust.judgement import (
     Doubt,
     Judgement,
 )
+from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.sentences import doubted_rows
@@ -87,7 +88,8 @@ def _plans(record: GraphRecord, judgement: Judgement, asked: SolveOptions) -> It
             yield _Plan(f'{loops} vouched for', number, _told(graph, rows, True), asked)
         elif doubt.kind == MOSTLY_REFUSED and len(rows) <= graph.n_poses:
             # Of many more a graph fills in, and nobody would take them all for true.
-            yield _Plan('every loop believed', number, graph, believing)
+            yield _Plan('every loop believed', number, straightened(graph, judgement.drift),
+                        believing)
         elif doubt.kind == SLIP:
             yield from _of_step(record, judgement, doubt, number, believing)
         elif doubt.kind == NORM:
@@ -111,4 +113,5 @@ def _of_step(record: GraphRecord, judgement: Judgement, doubt: Doubt, number: in
         step = f'{record.ids[doubt.first]} - {record.ids[doubt.last]}'
         word = 'with' if believed[rows[0]] else 'without'
         yield _Plan(f'{word} the step {step}', number,
-                    record.graph.subset(believed, judgement.noise[believed]), believing)
+                    straightened(record.graph, judgement.drift).subset(
+                        believed, judgement.noise[believed]), believing)
