@@ -35,7 +35,10 @@ setup(
     # Said though it is so anyway: then an editable install is a path, which type checkers follow,
     # and not a hook of the import, which they do not.
     package_dir={'': '.'},
-    package_data={package_name: ['py.typed']},  # its annotations are there to be used
+    package_data={
+        package_name: ['py.typed'],  # its annotations are there to be used
+        f'{package_name}.cli.report': ['page.html'],
+    },
     data_files=data_files,
     zip_safe=True,
     python_requires='>=3.10',
@@ -56,6 +59,8 @@ setup(
         'ros': ['ros-jazzy-rclpy[fastrtps]', 'ros-jazzy-common-interfaces'],
         # The TAB key: commands and options of l1slam; see `l1slam --help`.
         'completion': ['argcomplete>=3.1'],
+        # `l1slam solve --report`; the library that Ubuntu 24.04 ships, or newer.
+        'report': ['plotly>=5.15'],
         # Newer style tools find other things, and a test asserts that they find none.
         # setuptools: a test builds the wheel, and from 70.1 on it can do so by itself.
         # pip: tests install into other environments, which from 22.3 on it can do.
@@ -67,6 +72,7 @@ setup(
             'mypy~=2.4.1',
             'packaging',
             'argcomplete>=3.1',
+            'plotly>=5.15',
             'pip>=22.3',
             'setuptools>=70.1',
         ],

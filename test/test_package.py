@@ -105,6 +105,7 @@ def test_every_module_is_in_the_wheel_and_no_test(wheel):
     in_wheel = {name for name in wheel.namelist()
                 if name.endswith(('.py', 'py.typed')) and '.data/' not in name}
     assert in_wheel == modules | {'l1slam_ros/py.typed'}
+    assert 'l1slam_ros/cli/report/page.html' in wheel.namelist()
 
 
 def test_every_folder_with_modules_is_a_package():

@@ -175,6 +175,9 @@ def _add_solve(parser: argparse.ArgumentParser) -> None:
     add('--grid', type=Path, metavar='PGM',
         help='write the occupancy grid of the scans, with its .yaml, as the map server of nav2 '
         'reads them')
+    add('--report', type=Path, metavar='HTML',
+        help='write a page that shows each loop, its fate and why, and lets one settle a doubt; '
+        'needs plotly')
     _add_force(parser)
     add('--json', action='store_true', help='one object on standard output')
     add('--quiet', action='store_true', help='no progress, no summary, no warning')

@@ -31,8 +31,10 @@ from l1slam_ros.io.ours import refuse_others
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.sentences import (
     DOUBTFUL,
+    doubt_reasons,
     doubt_sentence,
     doubted,
+    doubted_rows,
     judgement_sentences,
     offset_sentence,
 )
@@ -67,6 +69,11 @@ def solve(arguments: argparse.Namespace) -> Ending:
     _write(arguments, record, outcome, truth, _cost_name(asked))
     if arguments.grid:
         _write_grid(arguments.grid, points, outcome)
+    if arguments.report:
+        from l1slam_ros.cli.report.page import write_report
+
+        write_report(arguments, record, outcome, asked, [*warnings, *remarks, *filter(
+            None, [record.damage])])
     if arguments.json:
         # What is not finite has no place in JSON.
         print(json.dumps({name: None if isinstance(value, float) and not math.isfinite(value)
@@ -105,7 +112,8 @@ def _write(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
     if arguments.output:
         formats.write_output(arguments.output, replace(
             record, poses=outcome.solution.poses,
-            left_out=left_out_by(outcome.judgement, record.graph.between)), force=arguments.force)
+            left_out=left_out_by(outcome.judgement, record.graph.between),
+            drift=outcome.judgement.drift if outcome.judgement else 0.0), force=arguments.force)
 
 
 def _write_grid(path: Path, points: 'Sequence[Points] | None', outcome: Outcome) -> None:
@@ -151,6 +159,10 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
         if not (arguments.scans or formats.is_log(arguments.input)):
             raise OptionError('--grid is of scans; expected --scans TOPIC, or a CARMEN log')
         check_grid(arguments.grid, read, arguments.force)
+    if arguments.report:
+        from l1slam_ros.cli.report.page import check_report
+
+        check_report(arguments.report, read, arguments.force)
 
 
 def _asked(arguments: argparse.Namespace) -> SolveOptions:
@@ -181,7 +193,7 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
     suspect = judgement.suspect if judgement else np.zeros(len(factors), bool)
     refused = ~judgement.accepted & ~suspect if judgement else suspect
     slips = judgement.slips if judgement else np.zeros(0, np.int64)
-    doubtful = judgement is not None and judgement.doubts
+    doubts = judgement.doubts if judgement else ()
     return {
         'poses': record.graph.n_poses,
         'factors': len(factors),
@@ -189,7 +201,7 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
         'initial_cost': outcome.initial_cost,
         'seed_cost': outcome.seed_cost,
         'final_cost': solution.cost,
-        'status': DOUBTFUL if doubtful else solution.status.value,
+        'status': DOUBTFUL if doubts else solution.status.value,
         'seconds': outcome.seconds,
         'solver': outcome.solver,
         'outer_iterations': solution.outer_iterations,
@@ -198,6 +210,12 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
         'suspect': record.ids[factors.pairs[suspect]].tolist(),
         'slips': record.ids[factors.pairs[slips]].tolist(),
         'parts': outcome.parts,
+        'drift': judgement.drift if judgement else 0.0,
+        'doubts': [
+            {'kind': doubt.kind, 'text': text,
+             'loops': record.ids[factors.pairs[doubted_rows(doubt, factors)]].tolist()}
+            for doubt, text in zip(doubts, doubt_reasons(doubts, record.ids, record.stamps),
+                                   strict=True)],
     }
 
 

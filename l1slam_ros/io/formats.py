@@ -256,10 +256,10 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
     """
     _check_reading(path, rotation_information)
     require(FactorGraph, 'graph', graph, 'a FactorGraph, as read_graph returns first')
-    if inliers is None:
-        from l1slam_ros.core.robust.door import believed
+    from l1slam_ros.core.robust.door import believed
 
-        inliers = believed(graph, poses)
+    known, drift = believed(graph, poses)
+    inliers = known if inliers is None else inliers
     poses = as_poses(graph, poses, 'poses have')
     if not np.isfinite(poses).all():
         row = int(np.argmin(np.isfinite(poses).all(axis=1)))
@@ -277,7 +277,8 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
         left_out = np.concatenate((left_out, nothing_left_out(len(factors) - len(left_out))))
     write_output(Path(path), GraphRecord(
         graph, poses, origin.ids, origin.stamps, left_out=left_out,
-        rotation_information=rotation_information, comments=origin.comments), force=force)
+        rotation_information=rotation_information, comments=origin.comments, drift=drift),
+        force=force)
 
 
 def _check_reading(path: object, rotation_information: str) -> None:

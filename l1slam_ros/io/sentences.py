@@ -32,6 +32,9 @@ _NAMED = 20
 # A gross slip of the odometry: said apart, because nothing that was driven after it can be trusted
 # without the loops across it.
 _SLIP = 'odometry {pair} lies: {sigmas:.1f} sigmas off what the loops say; left out'
+# The odometry of the map is not that which was measured: who takes the file of it has to know.
+_DRIFT = ('the odometry drifts by {drift:+.3g} rad on each metre, as the loops agree: the map is '
+          'made of odometry that is corrected by that')
 # Sigmas so many times the stated ones are worth a word; less is what people are wrong by.
 _NOISY = 2.0
 # Of odometry and of loops, as `Judgement.variance` has them.
@@ -72,6 +75,8 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
     factors, accepted = record.graph.between, judgement.accepted
     is_loop = ~factors.is_odometry
     pairs = record.ids[factors.pairs]
+    if judgement.drift:
+        yield _DRIFT.format(drift=judgement.drift)
     for row in judgement.slips.tolist():
         yield _SLIP.format(pair=_named(pairs[row]), sigmas=judgement.sigmas[row])
     refused = np.flatnonzero(is_loop & ~accepted & ~judgement.suspect & ~factors.struck)
@@ -116,6 +121,12 @@ def doubt_sentence(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None
 
     ids, stamps : (n,) of the keyframes
     """
+    reasons = '; '.join(doubt_reasons(doubts, ids, stamps))
+    return f'{DOUBTFUL}: {reasons}. {_REMEDY}' if reasons else ''
+
+
+def doubt_reasons(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None) -> list[str]:
+    """Return why and where a map is not to be relied on, a clause on each doubt; see above."""
     reasons = []
     for doubt in doubts:
         where = f'between {ids[doubt.first]} and {ids[doubt.last]}'
@@ -124,7 +135,17 @@ def doubt_sentence(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None
             where += f' ({first} s to {last} s)'
         reasons.append(_REASONS[doubt.kind].format(loops=f'{doubt.loops:,}', where=where,
                                                    detail=doubt.detail))
-    return f'{DOUBTFUL}: {"; ".join(reasons)}. {_REMEDY}' if reasons else ''
+    return reasons
+
+
+def doubted_rows(doubt: Doubt, factors: BetweenFactors) -> Indices:
+    """Return the rows of the loops that a doubt is about, (k,), in the order of the file."""
+    if not doubt.pairs:
+        return np.zeros(0, np.int64)
+    n = len(factors.predecessor)
+    (of, pairs) = (np.sort(pairs, axis=1) for pairs in (factors.pairs, np.array(doubt.pairs)))
+    named = np.isin(of @ [n, 1], pairs @ [n, 1])
+    return np.flatnonzero(named & ~factors.is_odometry & ~factors.struck)
 
 
 def _named(pair: np.ndarray) -> str:

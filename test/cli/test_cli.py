@@ -80,7 +80,7 @@ def test_a_chosen_solver_is_the_one_that_solves(capsys, world, solver):
 
 REPORTED = ['poses', 'factors', 'loops', 'initial_cost', 'seed_cost', 'final_cost', 'status',
             'seconds', 'solver', 'outer_iterations', 'inner_iterations', 'rejected', 'suspect',
-            'slips', 'parts', 'warnings']
+            'slips', 'parts', 'drift', 'doubts', 'warnings']
 
 
 @pytest.mark.parametrize('more', [(), ('--no-robust',), ('--robust', '--norm', 'l2')])
@@ -242,6 +242,12 @@ def test_a_map_that_loops_agree_is_wrong_is_given_as_doubtful(capsys, torn, tmp_
     assert ends[0] <= first < last <= ends[1] and 10 < loops <= len(report['rejected'])
     assert report['status'] == 'doubtful' and report['warnings'] == [said[0]]
     left = report['rejected'] + report['suspect']
+    doubt, = report['doubts']
+    assert doubt['kind'] == 'another map' and doubt['text'] in said[0]
+    # All of them stand in the file like this, and all are among what was refused.
+    named = {tuple(pair) for pair in doubt['loops']}
+    assert len(named) == loops and named <= {tuple(pair) for pair in report['rejected']}
+    assert {min(map(min, named)), max(map(max, named))} == {first, last}
     assert edges_of(output) == [pair for pair in edges_of(path) if pair not in left]
     record = read_graph_file(output)
     kept = [pair not in left for pair in edges_of(path)]
@@ -274,6 +280,8 @@ def test_most_loops_refused_is_a_doubt(capsys, world, tmp_path):
     report = json.loads(out)
     left_out = len(report['rejected'] + report['suspect'])
     assert report['status'] == 'doubtful' and left_out >= 150
+    assert [doubt['kind'] for doubt in report['doubts']] == ['mostly refused']
+    assert sorted(report['doubts'][0]['loops']) == sorted(report['rejected'] + report['suspect'])
     assert err.startswith(f'l1slam: doubtful: {left_out} loops, most of all, are refused or ')
     assert len(err.splitlines()) == 1
 

@@ -29,6 +29,7 @@ from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGrap
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.linear_system import anchor, linearise
 from l1slam_ros.core.robust.innovation import chi2_quantile, claimed_volume
+from l1slam_ros.core.robust.odometry.drift import corrected
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.optimality import smoothing
 
@@ -112,6 +113,7 @@ class Front:
     variance : (2,) of odometry and loops, in units of what they state
     log_odds : of a false loop to a true one
     rows : factors of the graph that grows, when `part` was taken from it
+    drift : of the odometry that is to come, see `Judgement`
 
     Attributes
     ----------
@@ -128,7 +130,8 @@ class Front:
 
     def __init__(self, part: FactorGraph, poses: tuple[Array, Array],
                  choleskys: tuple[BlockCholesky, BlockCholesky], variance: Array,
-                 log_odds: float, rows: int):
+                 log_odds: float, rows: int, drift: float = 0.0):
+        self._drift = drift
         self.rows, self.taken, self.closed = rows, 0, False
         self.pattern, self.variance = choleskys[L1].pattern, variance
         self._manifold, self._fixed = part.manifold, anchor(part)
@@ -282,12 +285,16 @@ class Front:
         newest = np.maximum.accumulate(np.append(len(self._first) - 1, pairs.max(axis=1)))
         skips = np.flatnonzero(np.diff(newest) > 1)
         pairs = pairs[:skips[0] if len(skips) else None]
-        Z, root = factors.measurement[rows][:len(pairs)], factors.sqrt_information[rows]
+        rows = rows[:len(pairs)]
+        Z, root = factors.measurement[rows], factors.sqrt_information[rows]
+        if self._drift:
+            odometry = factors.is_odometry[rows]
+            Z[odometry] = corrected(factors, rows[odometry], self._drift)
         self._put_new(pairs, Z)
         first, steps, poses = self._moved(pairs.T.ravel())
         p, k = first.shape[2], steps.shape[2]
         # Of each factor in both maps: Jacobians at the first poses, residuals at those of now.
-        Z, root = np.repeat(Z, 2, axis=0), root[:len(pairs), None]
+        Z, root = np.repeat(Z, 2, axis=0), root[:, None]
         J = manifold.residual_jacobians(Z, *first.reshape(2, -1, p)).reshape(-1, 2, 2, k, k)
         e = manifold.residual(Z, *poses.reshape(2, -1, p)).reshape(-1, 2, k)
         blocks = root[:, None] @ J

@@ -55,7 +55,8 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
-from l1slam_ros.core.graph.parts import tied
+from l1slam_ros.core.graph.parts import bridged, tied
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.innovation import chi2_quantile, covariances
 from l1slam_ros.core.robust.judgement import (
     NORM,
@@ -65,9 +66,12 @@ from l1slam_ros.core.robust.judgement import (
     doubt_of,
     doubts,
     judgement_of,
+    listed,
 )
+from l1slam_ros.core.robust.odometry.drift import straightened, vote
+from l1slam_ros.core.robust.odometry.slips import join, without_slip
+from l1slam_ros.core.robust.places import places
 from l1slam_ros.core.robust.rounds import REFUSED, Growth
-from l1slam_ros.core.robust.slips import join, without_slip
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
 from l1slam_ros.core.solvers.nonlinear import Solution
@@ -102,6 +106,36 @@ def robust_solve(
     known : what was believed before and stays if this fails; None: what was in the last round
 
     """
+    believed = _grown(graph, report, check, known)
+    drift = _suspected_drift(graph, believed[0])
+    if not drift:
+        return believed
+    straight = straightened(graph, drift)
+    judgement, poses = _grown(straight, report, check, known)
+    if _won(straight, judgement) > _won(straight, believed[0]):
+        return replace(judgement, drift=drift), poses
+    return believed
+
+
+def _suspected_drift(graph: FactorGraph, judgement: Judgement) -> float:
+    """Return the drift of the odometry that may be why loops do not fit; 0: there is none."""
+    left_out = ~graph.between.is_odometry & ~judgement.accepted & ~graph.between.struck
+    if not (left_out.any() or len(judgement.slips)):
+        return 0.0
+    drift, odds = vote(graph)
+    return drift if odds > 0 else 0.0
+
+
+def _won(graph: FactorGraph, judgement: Judgement) -> tuple[int, int]:
+    """Return how many places loops that are accepted are of, and how few steps slipped for it."""
+    place, _ = places(graph, odometry_poses(bridged(graph)))
+    loops = judgement.accepted & ~graph.between.is_odometry
+    return len(np.unique(place[: len(loops)][loops])), -len(judgement.slips)
+
+
+def _grown(graph: FactorGraph, report: OnRound, check: Callable[[], None],
+           known: Believed | None) -> Believed:
+    """Return what is believed of a graph whose odometry errs at random; see `robust_solve`."""
     first = growth = Growth(graph, check)
     so_far, number = _so_far(first), 0
     try:
@@ -206,8 +240,8 @@ class _LeastSquares:
         explained = (np.pi / 2 - 1) * chi2_quantile(1 - REFUSED, np.array([manifold.TANGENT_SIZE]))
         if np.count_nonzero(np.isfinite(square) & (square > explained)) <= len(square) / 2:
             return ()
-        loops = np.count_nonzero(judgement.accepted & ~graph.between.is_odometry)
-        return (Doubt(NORM, int(loops), 0, graph.n_poses - 1),)
+        loops = graph.between.pairs[judgement.accepted & ~graph.between.is_odometry]
+        return (Doubt(NORM, len(loops), 0, graph.n_poses - 1, pairs=listed(loops)),)
 
 
 def _least_squares(graph: FactorGraph, judgement: Judgement, poses: Array,
@@ -267,7 +301,7 @@ def judge(
     check : called before long steps, raises where the work shall stop
 
     """
-    first, settled = Growth(graph, check), True
+    first, settled = Growth(straightened(graph, known.drift), check), True
     growth = first
     try:
         first.resume(poses, known.accepted, known.variance)
@@ -277,6 +311,6 @@ def judge(
                 settled = False
                 break
         reasons = doubts(growth) if settled else ()
-        return judgement_of(growth, reasons, settled), growth.poses
+        return replace(judgement_of(growth, reasons, settled), drift=known.drift), growth.poses
     except _FAILURES as error:
         return known.broken_off(graph, error), poses

@@ -28,6 +28,7 @@ from l1slam_ros.core.robust.inspection import (
     require_connected,
 )
 from l1slam_ros.core.robust.judgement import UNSOLVED, Judgement
+from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
@@ -119,7 +120,7 @@ def solve(
     robust, unjudged = _robust_map(graph, asked, minimiser, on_round, ids)
     if robust:
         solution, seed = robust.solution, robust.seed
-        graph = graph.subset(robust.judgement.accepted)
+        graph = straightened(graph, robust.judgement.drift).subset(robust.judgement.accepted)
     else:
         method = minimiser.choose(graph)
         seed = seed_poses(graph, method.cholesky) if asked.start == 'seed' else None
@@ -188,7 +189,8 @@ def shared_offset(graph: FactorGraph, poses: Array, judgement: Judgement) -> Arr
     """Return the step (k,) that accepted loops lack in a map (n, p); see `lacked_step`."""
     rows = judgement.accepted
     part, keyframes, is_loop = densest_part(
-        graph.subset(rows, judgement.noise[rows] * judgement.found_variance(graph)))
+        straightened(graph, judgement.drift).subset(
+            rows, judgement.noise[rows] * judgement.found_variance(graph)))
     if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < FEWEST_SPARE:
         return None
     cholesky, system = cholesky_of(part), linearise(part, poses[keyframes])

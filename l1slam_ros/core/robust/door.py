@@ -16,7 +16,8 @@ from l1slam_ros.core.robust import batch_map
 
 # Of each graph the poses of its last solution, and what these were made of: who writes them writes
 # what was believed.
-_LAST: WeakKeyDictionary[FactorGraph, tuple[ReferenceType[Array], Mask]] = WeakKeyDictionary()
+_LAST: WeakKeyDictionary[FactorGraph, tuple[ReferenceType[Array], Mask, float]] = (
+    WeakKeyDictionary())
 
 
 @dataclass(frozen=True)
@@ -77,17 +78,22 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
     outcome = batch_map.solve(graph, start, asked)
     judgement, status = outcome.judgement, outcome.solution.status.value
     if judgement is None:
-        inliers = ~graph.between.struck
+        inliers, drift = ~graph.between.struck, 0.0
     else:
-        inliers = judgement.accepted
+        inliers, drift = judgement.accepted, judgement.drift
         status = 'doubtful' if judgement.doubt else status
-    _LAST[graph] = ref(outcome.solution.poses), inliers
+    _LAST[graph] = ref(outcome.solution.poses), inliers, drift
     return Solution(outcome.solution.poses, outcome.solution.cost, status, inliers)
 
 
-def believed(graph: FactorGraph, poses: Array) -> Mask | None:
-    """Return the inliers of the last solution of a graph, if these are its poses; else None."""
-    if graph not in _LAST:
-        return None
-    made_of, inliers = _LAST[graph]
-    return inliers if made_of() is poses and len(graph.between) == len(inliers) else None
+def believed(graph: FactorGraph, poses: Array) -> tuple[Mask | None, float]:
+    """
+    Return the inliers (m,) of the last solution of a graph and the drift [rad/m] of its odometry.
+
+    Of another map than these poses are, nothing is known: None, 0.
+    """
+    if graph in _LAST:
+        made_of, inliers, drift = _LAST[graph]
+        if made_of() is poses and len(graph.between) == len(inliers):
+            return inliers, drift
+    return None, 0.0

@@ -8,7 +8,7 @@ for a loop, strike one out, or state the noise as it is.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,8 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, lowest_of_components
+from l1slam_ros.core.robust.odometry.drift import straightened
+from l1slam_ros.core.robust.odometry.slips import JOINING, SPANNING, SURE, common_steps, spanning
 from l1slam_ros.core.robust.pairwise_consistency import (
     ASKED,
     Group,
@@ -26,7 +28,6 @@ from l1slam_ros.core.robust.pairwise_consistency import (
 )
 from l1slam_ros.core.robust.places import err_together
 from l1slam_ros.core.robust.rounds import Growth
-from l1slam_ros.core.robust.slips import JOINING, SPANNING, SURE, common_steps, spanning
 
 # Most loops are refused; all that are accepted are of one place; loops of one place alone say how
 # two parts lie to each other; refused loops of several places agree on another map; an odometry
@@ -49,7 +50,8 @@ class Doubt:
     One reason why a map is not to be relied on.
 
     kind : one of the above; loops : how many it is about; first, last : the keyframes between
-    which they lie; detail : what failed, where something did.
+    which they lie; detail : what failed, where something did; pairs : the keyframes of each of
+    the loops, either way round.
     """
 
     kind: str
@@ -57,6 +59,7 @@ class Doubt:
     first: int
     last: int
     detail: str = ''
+    pairs: tuple[tuple[int, int], ...] = field(default=(), compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,8 @@ class Judgement:
     (2,) of odometry and of loops as it was found, in units of what they state; noise : (m,) that
     of each in a map, in the same units; slips : (k,) the odometry factors that slipped, not
     accepted; doubts : reasons not to rely on the map; settled : no more is to be found out from
-    the factors that are there.
+    the factors that are there; drift : by how much more each metre of the odometry turns than it
+    says [rad/m].
     """
 
     accepted: Mask
@@ -82,6 +86,7 @@ class Judgement:
     slips: Indices
     doubts: tuple[Doubt, ...] = ()
     settled: bool = True
+    drift: float = 0.0
 
     @property
     def doubt(self) -> Doubt | None:
@@ -132,7 +137,8 @@ class Judgement:
 
     def believed(self, graph: FactorGraph) -> FactorGraph:
         """Return the accepted factors of a graph, as noisy as they are."""
-        return graph.subset(self.accepted, self.noise[self.accepted])
+        straight = straightened(graph, self.drift)
+        return straight.subset(self.accepted, self.noise[self.accepted])
 
     def found_variance(self, graph: FactorGraph) -> Array:
         """Return the variance that was found of these, in units of what they then state, (k,)."""
@@ -166,7 +172,12 @@ class Judgement:
 def doubt_of(pairs: Indices, n_poses: int, kind: str, detail: str) -> Doubt:
     """Return a doubt about the loops between pairs of keyframes (k, 2), none: about them all."""
     first, last = (int(pairs.min()), int(pairs.max())) if len(pairs) else (0, n_poses - 1)
-    return Doubt(kind, len(pairs), first, last, detail)
+    return Doubt(kind, len(pairs), first, last, detail, listed(pairs))
+
+
+def listed(pairs: Indices) -> tuple[tuple[int, int], ...]:
+    """Return pairs of keyframes (k, 2) as a doubt has them."""
+    return tuple((i, j) for i, j in pairs.tolist())
 
 
 def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
@@ -232,8 +243,7 @@ def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
         reasons += [_doubt(growth, ONE_JOINS, rows) for rows in _joining_alone(growth)]
     reasons += _other_map(growth)
     reasons += [
-        Doubt(SLIP, int(np.count_nonzero(growth.accepted & spanning(growth, step))),
-              int(growth.low[step]), int(growth.high[step]))
+        _slip_doubt(growth, step)
         for step, odds in growth.slip_odds.items()
         if (odds < SURE if growth.cut[step] else odds > -SURE)]
     return tuple(dict.fromkeys(reasons))
@@ -314,4 +324,11 @@ def _against(growth: Growth, group: Group, rows: Mask) -> int:
 
 def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
     low, high = np.maximum(growth.low[rows], 0), growth.high[rows]
-    return Doubt(kind, len(rows), int(low.min()), int(high.max()))
+    return Doubt(kind, len(rows), int(low.min()), int(high.max()),
+                 pairs=listed(growth.factors.pairs[rows]))
+
+
+def _slip_doubt(growth: Growth, step: int) -> Doubt:
+    across = growth.factors.pairs[growth.accepted & spanning(growth, step)]
+    return Doubt(SLIP, len(across), int(growth.low[step]), int(growth.high[step]),
+                 pairs=listed(across))

@@ -267,7 +267,7 @@ class Backend:
     def behind(self) -> Behind:
         """Return what goes on behind updates."""
         state, _, size = self._keeper.look()
-        return Behind.of(state, size.loops, time.monotonic())
+        return Behind.of(state, size.loops, time.monotonic(), self._updates.failing)
 
     def news(self) -> list[str]:
         """Return what is new in the notes on messages; see `GraphBuilder.notes`."""

@@ -227,7 +227,7 @@ def front_of(problem: Problem, poses: Array, rows: int,
             l2_poses, residual = backtrack(found, l2_poses, residual, step, l2_cost)
         check()
         return Front(part, (poses, l2_poses), (method.cholesky, cholesky), judgement.variance,
-                     log_odds, rows)
+                     log_odds, rows, judgement.drift)
     except GraphError:
         return None
 

@@ -180,12 +180,15 @@ class MapState:
         """
         Return the state after a judgement of so many loops, of which poses (n, p) is the L2 map.
 
-        Where it accepts other factors than the map is of, it waits for a map; anew : from the
+        Where it accepts other factors than the map is of, or corrects them otherwise, it waits for
+        a map; anew : from the
         graph alone
         """
         after = replace(self, judged=self.judged.after(judgement, poses, loops, anew, now))
         accepted = self.table.accepted[:len(judgement.accepted)]
-        if self.pending is not None or not np.array_equal(judgement.accepted, accepted):
+        same = judgement.drift == self.of_all.drift and np.array_equal(
+            judgement.accepted, accepted)
+        if self.pending is not None or not same:
             return replace(after, pending=judgement)
         return after._committed(judgement, factors)
 

@@ -87,7 +87,8 @@ class Behind:
 
     age : [s] of the map that was factored, NaN: there is none; rows : of loops that came since;
     loops : not judged yet; bound : what no map of the accepted factors that is near this one has
-    less L1 cost than, and its age [s], NaN: nothing was proved of them.
+    less L1 cost than, and its age [s], NaN: nothing was proved of them; failing : the last work
+    failed, told or not.
     """
 
     age: float
@@ -95,15 +96,16 @@ class Behind:
     loops: int
     bound: float
     bound_age: float
+    failing: bool
 
     @staticmethod
-    def of(state: MapState, loops: int, now: float) -> 'Behind':
+    def of(state: MapState, loops: int, now: float, failing: bool) -> 'Behind':
         """Return what goes on behind a state, with so many loops in the graph."""
         carried, holds = state.carried, state.table.is_proof_of_accepted
         waiting = 0 if state.all_judged(loops) else loops - max(state.judged.loops, 0)
         return Behind(
             now - state.made if carried else np.nan, carried.border if carried else 0, waiting,
-            state.bound if holds else np.nan, now - state.bound_at if holds else np.nan)
+            state.bound if holds else np.nan, now - state.bound_at if holds else np.nan, failing)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask, square_root_information
 from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
 from l1slam_ros.core.names import QUATERNION
+from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.io.files import (
     LARGEST,
     TextLines,
@@ -29,7 +30,7 @@ from l1slam_ros.io.files import (
     replacing,
     rounded,
 )
-from l1slam_ros.io.graphs.left_out import STRUCK, commented, in_place, nothing_left_out
+from l1slam_ros.io.graphs.left_out import MEASURED, STRUCK, commented, in_place, nothing_left_out
 from l1slam_ros.io.graphs.rows import (
     Rows,
     expected_tags,
@@ -65,7 +66,8 @@ class GraphRecord:
     damage : a sentence where only a part of the input could be read, else empty;
     rotation_information : what the rotation block in a g2o file of it is of, of `names`;
     remarks : of a saved map; left_out : (m,) why a map was made without each factor, of
-    `left_out`, or empty; comments : lines of others, each with how many factors stand before it.
+    `left_out`, or empty; comments : lines of others, each with how many factors stand before it;
+    drift : see `Judgement`, of the map: its odometry is to be written corrected.
     """
 
     graph: FactorGraph
@@ -78,6 +80,7 @@ class GraphRecord:
     remarks: Remarks = None
     left_out: np.ndarray | None = None
     comments: tuple[tuple[int, str], ...] = ()
+    drift: float = 0.0
 
     @property
     def times(self) -> Indices:
@@ -114,16 +117,16 @@ def read_graph_file(path: str | os.PathLike[str],
         ids, vertices = ids[kept], vertices.chosen(kept) if len(vertices) else vertices
         edges = edges.chosen(np.flatnonzero(np.isin(edges.ids, anchors).sum(axis=1) == 0))
     graph = FactorGraph(manifold, len(ids))
-    order, left_out = in_place(edges.lines, lines.left_out)
-    edges = edges.chosen(order)
+    order, left_out, as_measured = in_place(edges.lines, lines.left_out)
+    stand, edges = edges.lines[order], edges.chosen(as_measured)
     _add_edges(path, graph, ids, edges, remarks, left_out == STRUCK)
     used = np.flatnonzero(left_out == '')
     ends = np.concatenate(([0], used + 1))
     before = ends[np.searchsorted(
-        edges.lines[used], [number for number, _ in lines.comments])].tolist()
-    skipped = (*circles, *indefinite, *_skipped(groups, ids, anchors))
+        stand[used], [number for number, _ in lines.comments])].tolist()
     return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
-                       _stamps(path, ids, remarks), skipped,
+                       _stamps(path, ids, remarks),
+                       (*circles, *indefinite, *_skipped(groups, ids, anchors)),
                        rotation_information=rotation_information, remarks=remarks,
                        left_out=left_out,
                        comments=tuple(zip(before, (text for _, text in lines.comments),
@@ -264,22 +267,29 @@ def graph_lines(path: Path, record: GraphRecord) -> list[str]:
     d = graph.manifold.TANGENT_SIZE
     lines = [] if record.poses is None else _lines(
         path, record, 'vertex', ids[:, None], record.poses, np.empty((0, d, d)))
-    factors, pairs, kinds = graph.between, ids[graph.between.pairs], _kinds(graph)
     left_out = left_out_words(record)
-    if factors.is_absolute.any() and graph.manifold is se3:
+    if graph.between.is_absolute.any() and graph.manifold is se3:
         lines.append(NO_OFFSET)
+    texts = used_texts = _factor_lines(path, record, graph)
+    used, beside = left_out == '', left_out
+    if record.drift:
+        used_texts = _factor_lines(path, record, straightened(graph, record.drift))
+        beside = np.where(used & graph.between.is_odometry, MEASURED, left_out)
+    comments = tuple((int(used[:before].sum()), text) for before, text in record.comments)
+    return [*_among(comments, lines, used_texts[used].tolist()),
+            *commented(texts.tolist(), beside)]
+
+
+def _factor_lines(path: Path, record: GraphRecord, graph: FactorGraph) -> np.ndarray:
+    """Return the line of each factor of a graph, (m,)."""
+    factors, pairs, kinds = graph.between, record.ids[graph.between.pairs], _kinds(graph)
     texts = np.empty(len(factors), object)
     for kind in np.unique(kinds):
         rows = np.flatnonzero(kinds == kind)
-        written = _lines(path, record, str(kind), pairs[rows], factors.measurement[rows],
-                         factors.sqrt_information[rows])
-        if len(rows) == len(factors) and not left_out.any() and not record.comments:
-            return lines + written
-        texts[rows] = '\n'.join(written).split('\n')
-    used = left_out == ''
-    comments = tuple((int(used[:before].sum()), text) for before, text in record.comments)
-    return [*_among(comments, lines, texts[used].tolist()),
-            *commented(texts.tolist(), left_out)]
+        texts[rows] = '\n'.join(_lines(
+            path, record, str(kind), pairs[rows], factors.measurement[rows],
+            factors.sqrt_information[rows])).split('\n')
+    return texts
 
 
 def left_out_words(record: GraphRecord) -> np.ndarray:

@@ -6,6 +6,7 @@ Factors that a map was made without: comments for other programs, factors again 
     # suspect EDGE_SE2 ...    one that fits, but could as well be chance
     # slip EDGE_SE2 ...       odometry that was left out
     # struck EDGE_SE2 ...     a loop that a person struck out
+    # measured EDGE_SE2 ...   odometry as it was measured, where the map is made of corrected one
 
 So whoever optimises the graph in the file gets the map in it. They stand behind all edges, each
 with its number among the factors: GTSAM reads no edge behind a comment. Of a file that this
@@ -24,8 +25,8 @@ from l1slam_ros.io.files import TextLines
 from l1slam_ros.io.ours import MARK
 from l1slam_ros.io.remarks import KEYWORD
 
-REJECTED, SUSPECT, SLIP, STRUCK = 'rejected', 'suspect', 'slip', 'struck'
-_COMMENT = re.compile(f'# ({REJECTED}|{SUSPECT}|{SLIP}|{STRUCK}) '
+REJECTED, SUSPECT, SLIP, STRUCK, MEASURED = 'rejected', 'suspect', 'slip', 'struck', 'measured'
+_COMMENT = re.compile(f'# ({REJECTED}|{SUSPECT}|{SLIP}|{STRUCK}|{MEASURED}) '
                       '([A-Z].*?) # factor ([0-9]{1,9})')
 
 
@@ -81,11 +82,27 @@ def restored(lines: TextLines) -> tuple[TextLines, dict[int, tuple[str, int]]]:
                      tuple(comments)), words
 
 
-def in_place(numbers: Indices, words: dict[int, tuple[str, int]]) -> tuple[Indices, np.ndarray]:
-    """Return the order (m,) in which factors stood, by their lines, and their words in it."""
+def in_place(numbers: Indices, words: dict[int, tuple[str, int]]
+             ) -> tuple[Indices, np.ndarray, Indices]:
+    """
+    Return the order (m,) in which factors stood, by their lines, and their words in it.
+
+    And the order (m,) of their measurements: of what was corrected, as it was measured.
+    """
     found = [words.get(number, ('', -1)) for number in numbers.tolist()]
     said = np.array([word for word, _ in found], object)
     places = np.array([place for _, place in found], np.int64)
+    measured = np.flatnonzero(said == MEASURED)
+    rest = np.flatnonzero(said != MEASURED)
+    order, said = _in_order(said[rest], places[rest])
+    order = rest[order]
+    as_measured, there = order.copy(), places[measured] < len(order)
+    as_measured[places[measured[there]]] = measured[there]
+    return order, said, as_measured
+
+
+def _in_order(said: np.ndarray, places: Indices) -> tuple[Indices, np.ndarray]:
+    """Return the order of factors with these words, at these places or -1, and the words."""
     out = np.flatnonzero(places >= 0)
     order = np.arange(len(said))
     # A person may have taken lines away: then they stay where they are.

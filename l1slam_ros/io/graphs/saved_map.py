@@ -40,7 +40,7 @@ def save_map(path: Path, saved: SavedMap | None) -> str:
     if saved is None:
         raise FileError(path, 'there is no graph yet to be saved')
     record = GraphRecord(saved.builder.graph, saved.optimised.poses, np.arange(_count(saved)),
-                         left_out=_left_out(saved))
+                         left_out=_left_out(saved), drift=saved.judgement.drift)
     with replacing(path) as temporary:
         put_lines(temporary, with_remarks(graph_lines(path, record), _remarks(saved)))
         _keep(path)
@@ -161,7 +161,9 @@ def _read(path: Path) -> SavedMap:
          age)
         for reference, stamp, trusted, struck, age, pose3, covariance in values.pop('waiting'))
     seen = {bytes.fromhex(key): row for key, row in values.pop('seen')}
-    doubts = tuple(Doubt(**doubt) for doubt in values.pop('doubts'))
+    doubts = tuple(
+        Doubt(**doubt | {'pairs': tuple((i, j) for i, j in doubt.get('pairs', ()))})
+        for doubt in values.pop('doubts'))
     judgement = replace(_restored(Judgement.nothing(), values), doubts=doubts)
     return SavedMap(replace(_restored(state, values), waiting=waiting, seen=seen),
                     _restored(optimised, values), judgement, values['robust'])

@@ -94,7 +94,8 @@ class SolverThread:
             try:
                 # First what services have made of the map: an update may take long.
                 tell(None)
-                tell(self._update())
+                improvement = self._update()
+                tell(improvement)
             except Interrupted:
                 continue
             except Exception as error:
@@ -103,8 +104,10 @@ class SolverThread:
                 self._not_before = time.monotonic() + self._pause
                 self._pause = min(2 * self._pause, _LONGEST_PAUSE)
             else:
-                self._failures.over('update')
-                self._pause = _FIRST_PAUSE
+                # What failed behind is tried again, and may fail after the update has returned.
+                if improvement is None or not self._backend.behind().failing:
+                    self._failures.over('update')
+                    self._pause = _FIRST_PAUSE
 
     def _update(self) -> Improvement | None:
         if self._paused:

@@ -11,8 +11,8 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.judgement import OTHER_MAP
-from l1slam_ros.core.robust.motion import log_odds_of_slips, usual_motion
-from l1slam_ros.core.robust.slips import SURE, spanning, without_slip
+from l1slam_ros.core.robust.odometry.motion import log_odds_of_slips, usual_motion
+from l1slam_ros.core.robust.odometry.slips import SURE, spanning, without_slip
 
 
 @pytest.fixture(scope='module')

@@ -21,7 +21,7 @@ from l1slam_ros.core.robust.judgement import MOSTLY_REFUSED
 from l1slam_ros.core.running.backend import Backend, BackendOptions
 from l1slam_ros.core.running.improve import Improvement, improve
 from l1slam_ros.core.running.keeper import updates, work
-from l1slam_ros.core.running.keeper.workers import Background
+from l1slam_ros.core.running.keeper.workers import Background, Worker
 from l1slam_ros.core.running.snapshot import ACCEPTED
 from l1slam_ros.core.solvers.optimality import l1_cost
 
@@ -460,6 +460,31 @@ def test_what_fails_in_the_background_is_raised_at_the_end(monkeypatch):
         assert failed.wait(DEADLINE)
     assert not of_threads()
     backend.close()
+
+
+def test_what_fails_before_an_update_looks_whether_it_is_at_work_is_not_forgotten(monkeypatch):
+    begin = Worker.start
+
+    def start(worker, work):
+        begin(worker, work)
+        worker.join()
+
+    def fail(*_):
+        raise ValueError('injected')
+
+    monkeypatch.setattr(Worker, 'start', start)
+    backend = Backend(EVERY)
+    with monkeypatch.context() as context:
+        context.setattr(work, 'improve', fail)
+        drive(backend, 0, 3)
+        assert backend.update()  # took what had come
+        for _ in range(3):
+            with pytest.raises(ValueError, match='injected'):
+                backend.update()
+            assert backend.behind().failing
+    while backend.update():
+        pass
+    assert not backend.behind().failing and len(backend.poses) == 3
 
 
 def test_several_threads_may_settle_at_once():

@@ -89,7 +89,8 @@ def test_all_comes_back(halfway, tmp_path):
     saved, path = halfway.saved(), tmp_path / 'map.g2o'
     assert {WAITING, ACCEPTED, REJECTED} <= set(halfway.loop_states().state)
     assert saved.builder.graph.between.struck.sum() == 1
-    doubtful = replace(saved.judgement, doubts=(Doubt('another map', 3, 4, 5),),
+    doubtful = replace(saved.judgement, doubts=(
+        Doubt('another map', 3, 4, 5, pairs=((4, 5), (5, 4))),),
                        variance=np.array([0.1, 2 / 3]), slips=np.array([7, 9]))
     saved = replace(saved, judgement=doubtful)
     assert save_map(path, saved) == f'50 keyframes saved to {path}'
@@ -97,6 +98,7 @@ def test_all_comes_back(halfway, tmp_path):
     assert whole and said == f'50 keyframes loaded from {path}'
     # Its graph has another name wherever it is loaded.
     assert_equal(replace(saved, graph_began=back.graph_began), back)
+    assert back.judgement.doubts[0].pairs == ((4, 5), (5, 4))  # no part of their equality
     assert [p.name for p in tmp_path.iterdir()] == ['map.g2o']
     assert len(saved.builder.waiting) == 3 and len(saved.builder.seen) == 20
 

@@ -58,6 +58,11 @@ class Updates:
         # The revisions to which the map was updated last, and at which nothing was left to do.
         self._updated, self._rested = 0, -1
 
+    @property
+    def failing(self) -> bool:
+        """Whether what went on behind failed the last time that it came to an end."""
+        return self._workers.failing
+
     def update(self, budget: float, stopped: Stopped, idle: bool | None = None,
                waits: bool = True) -> Improvement | None:
         """
@@ -87,6 +92,8 @@ class Updates:
                     return self._account(before.began, start)
             if came or not idle or keeper.state.last is not before.last:
                 return self._account(before.began, start)
+            # What failed since it was asked is still to do.
+            self._workers.check()
             self._rested = seen.now
         return None
 

@@ -104,13 +104,18 @@ class Worker:
     name : of its threads
     done : called when some work has ended, however it did
 
+    Attributes
+    ----------
+    busy : whether it is at work
+    failed : whether the last work that came to an end of its own raised an error
+
     """
 
     def __init__(self, name: str, done: Callable[[], None]):
         self._name, self._done = name, done
         self._thread: threading.Thread | None = None
         self._error: Exception | None = None
-        self.busy = False
+        self.busy = self.failed = False
 
     def start(self, work: Callable[[], None]) -> None:
         """Begin some work, unless some is under way, or what the last one raised is not told."""
@@ -135,10 +140,11 @@ class Worker:
     def _run(self, work: Callable[[], None]) -> None:
         try:
             work()
+            self.failed = False
         except Interrupted:  # its result is not wanted any more
             pass
         except Exception as error:
-            self._error = error
+            self._error, self.failed = error, True
         self.busy = False
         self._done()
 
@@ -162,6 +168,11 @@ class Workers:
     def busy(self) -> bool:
         """Whether any is at work."""
         return self.mapper.busy or self.judge.busy
+
+    @property
+    def failing(self) -> bool:
+        """Whether the last work of any of them failed, told or not."""
+        return self.mapper.failed or self.judge.failed
 
     def tell(self) -> None:
         """Wake who waits for the end of some work."""

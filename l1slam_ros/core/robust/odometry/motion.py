@@ -15,18 +15,14 @@ from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.robust.innovation import (
     claimed_volume,
-    factorised,
     log_likelihood_ratio,
 )
 from l1slam_ros.core.robust.rounds import Growth
-from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 
 # Motions are told apart to this part of what they are.
 _GRAIN, _TINY = 1e-3, 1e-12
 # The part of its noise that is left of a component that no other factor checks.
 _ALONE = 1e-9
-# [m, rad] What the odometry may err by alike on each metre: wheels and gyros, by some per cent.
-_DRIFT = 0.03
 
 
 @dataclass(frozen=True)
@@ -142,33 +138,6 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     odds[rows] = motions - motion.log_density(steps_of(growth, rows)) - fit - (
         claims + np.log(len(rows)))
     return odds
-
-
-def straightened(growth: Growth) -> tuple[Growth, float]:
-    """
-    Return the state whose odometry is rid of its drift, and the log odds of that.
-
-    A drift is what all steps err by alike, normal, of `_DRIFT`. It is what the residuals say of
-    it, the map left free; the odds, how much likelier these are than of odometry without.
-    """
-    rows, manifold = np.flatnonzero(growth.accepted), growth.graph.manifold
-    graph, k = growth.subgraph(rows), manifold.TANGENT_SIZE
-    cholesky = cholesky_of(graph)
-    system = factorised(graph, growth.poses, cholesky)
-    way = manifold.motion(steps_of(growth, rows))[0] * (~growth.is_loop & ~growth.cut)[rows]
-    drifts = _DRIFT * (way[:, None, None] * graph.between.sqrt_information).transpose(2, 0, 1)
-    residual, *alike = (e - system.times(cholesky.solve(system.transposed_times(e)))
-                        for e in (-system.b, *drifts.reshape(k, -1)))
-    expected = np.trace(growth.posterior.moment, axis1=1, axis2=2).sum()
-    variance = max(residual @ residual / expected, 1.0)
-    information, said = np.eye(k) + np.inner(alike, alike) / variance, alike @ residual / variance
-    drift = np.linalg.solve(information, said)
-    state = growth.copy()
-    state.graph = growth.graph.subset(np.arange(len(growth.factors)))
-    state.factors = state.graph.between
-    state.factors.measurement[rows] = manifold.retract(
-        state.factors.measurement[rows], _DRIFT * way[:, None] * drift)
-    return state, float(said @ drift - np.linalg.slogdet(information)[1]) / 2
 
 
 def unwhitening(growth: Growth, rows: Indices) -> Array:

@@ -10,9 +10,7 @@ cut, the loops across are asked anew, and the rounds go on from there. To the od
 gate for each place that is won and that nothing else explains, less one for each that is lost. A
 slip is believed if that makes it likelier than not. Loops do not make a robot jump: the slip
 repaired, it has to move as at some other step, or rather so than as measured. What fits the loops
-that came in without it did not slip: a lie had bent the map. And odometry that errs alike on each
-metre did not slip either: where a slip would be believed, or most loops are left out, a drift is
-compared by the same odds.
+that came in without it did not slip: a lie had bent the map.
 """
 
 from collections.abc import Iterator
@@ -23,11 +21,10 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.gating import DOUBT
-from l1slam_ros.core.robust.motion import (
+from l1slam_ros.core.robust.odometry.motion import (
     Motion,
     log_odds_of_slips,
     steps_of,
-    straightened,
     unwhitening,
     usual_motion,
 )
@@ -45,6 +42,8 @@ JOINING, SPANNING = 2, 3
 _TRIED = 2
 # What is nearly sure: ln of the odds.
 SURE = float(np.log(1 / DOUBT - 1))
+# By so much more the odometry may vary than its good steps say.
+_NOISIER = (10.0, 100.0)
 # Of fewer steps there is no habit.
 _FEWEST_STEPS = 20
 
@@ -94,8 +93,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     """
     Return a state in which an odometry factor is cut that slipped; None: there is none.
 
-    Or one that a lie does not bend any more, because an odometry factor was out for a while; or
-    one whose odometry does not drift any more.
+    Or one that a lie does not bend any more, because an odometry factor was out for a while.
 
     as_stated : the state where all may be as noisy as they say; what that explains needs no slip
     """
@@ -103,7 +101,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     if np.count_nonzero(~growth.is_loop & ~growth.cut) < _FEWEST_STEPS:
         return None
     motion = usual_motion(growth)
-    found, most = None, 0.0
+    found, most = _noisier(growth, as_stated)
     for steps, odds, state, usual in _tried(growth, as_stated, motion):
         back = _put_back(state, steps, motion) if state else None
         state, odds = back or (state, odds)
@@ -115,20 +113,40 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         if state and evidence > most and (usual or (odds > 0 and len(steps) == 1)):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
-    half = np.count_nonzero(growth.is_loop) / 2
-    if found or len(as_stated.undecided()) > half:
-        # A drift errs at all steps, and many places show it: no slip need be, nor most loops lie.
-        state, odds = straightened(growth)
-        state.solve()
-        _accept_more(state)
-        if odds + _gain(growth, as_stated, state) > most and len(state.undecided()) < half:
-            found = state
     if not found and growth.cut.any():
         # In the end more is known than when it was cut.
         now = log_odds_of_slips(growth, motion)
         growth.slip_odds |= {step: max(odds, float(now[step]))
                              for step, odds in growth.slip_odds.items() if growth.cut[step]}
     return found
+
+
+def _noisier(growth: Growth, as_stated: Growth) -> tuple[Growth | None, float]:
+    """
+    Return a state whose odometry is noisier than its good steps say, None: it is not; its odds.
+
+    Asked only where most loops are left out, and believed only where most come in by it. The odds
+    are those of f residuals, as many as others check, of K times the variance: what was learnt
+    then over what was learnt of them alone, f / 2 (1 - 1 / K - ln K).
+    """
+    half = np.count_nonzero(growth.is_loop) / 2
+    if len(as_stated.undecided()) <= half:
+        return None, 0.0
+    odometry = ~growth.is_loop[growth.accepted] & ~growth.cut[growth.accepted]
+    freedom = np.trace(growth.posterior.moment[odometry], axis1=1, axis2=2).sum()
+    found, most = None, 0.0
+    for times in _NOISIER:
+        state = growth.copy()
+        state.variance = growth.variance * (times, 1.0)
+        state.drops[:] = 0
+        state.solve()
+        _accept_more(state)
+        ratio = state.variance[0] / growth.variance[0]
+        evidence = _gain(growth, as_stated, state) + freedom / 2 * (
+            1 - 1 / ratio - np.log(ratio))
+        if len(state.undecided()) < half and evidence > most:
+            found, most = state, evidence
+    return found, most
 
 
 def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True

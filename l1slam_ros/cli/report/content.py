@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the page of a doubt shows: a map and its rivals, each loop, its fate and the reason."""
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from l1slam_ros.cli.report.rivals import Rival
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.robust.batch_map import Outcome
+from l1slam_ros.core.robust.judgement import (
+    FAILED,
+    MOSTLY_REFUSED,
+    NORM,
+    ONE_JOINS,
+    ONE_PLACE,
+    OTHER_MAP,
+    SLIP,
+    UNFINISHED,
+    UNSOLVED,
+    Judgement,
+)
+from l1slam_ros.io import formats
+from l1slam_ros.io.files import counted
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.graphs.side_files import beside
+from l1slam_ros.io.sentences import DOUBTFUL, doubt_reasons, doubted, doubted_rows
+
+# What became of a loop, or a step of the odometry: the word; where it is so many sigmas off; where
+# nobody knows how many.
+_FATES = (
+    ('accepted', 'agrees with the map, {} sigmas off it', 'is in the map, and was not judged'),
+    ('rejected', 'contradicts what is accepted: {} sigmas off the map without it',
+     'was refused before its place was known'),
+    ('suspect', 'fits, {} sigmas off, but nothing else confirms it: it could be chance',
+     'could not be tested: nothing accepted leads from one end of it to the other'),
+    ('slip', 'is odometry that the loops contradict, {} sigmas off: left out',
+     'is odometry that the loops contradict: left out'),
+    ('trusted', 'is vouched for, so never refused; {} sigmas off the map',
+     'is vouched for, so never refused'),
+    ('struck', 'was struck out, so not used', 'was struck out, so not used'))
+_ACCEPTED, _REJECTED, _SUSPECT, _SLIP, _TRUSTED, _STRUCK = range(len(_FATES))
+
+_LOOK = 'Look at the images or scans of a few of them'
+# What a person can do about a doubt, by its kind.
+_ADVICE = {
+    MOSTLY_REFUSED: f'{_LOOK}. If they are false, as most loops of a careless front end are, tick '
+                    'them all as false. Tick as true those of places that you know.',
+    ONE_PLACE: f'{_LOOK}. One of them ticked as true settles it; ticked as false, they all go.',
+    ONE_JOINS: f'{_LOOK}. Ticked as true, they join the two parts for good; ticked as false, '
+               'nothing does.',
+    OTHER_MAP: 'Switch to the rival map: which of the two is the place as you know it? If it is '
+               'the one solved, tick these loops as false. If it is the rival, tick them as true, '
+               'and the loops that contradict them as false.',
+    SLIP: 'Did the robot slip, hit something or get carried there? Loops across the step that are '
+          'surely true, ticked as true, say where the robot went.',
+    UNFINISHED: 'A few loops ticked as true or as false shorten the judgement.',
+    NORM: 'No single loop settles this. Switch to the least squares map: if that is the place as '
+          'you know it, solve with `--norm l2`.',
+    FAILED: 'Please report the sentence.', UNSOLVED: 'Please report the sentence.'}
+# By no word about loops.
+_UNSETTLED = NORM, FAILED, UNSOLVED
+
+
+def content(path: Path, norm: str | None, record: GraphRecord, outcome: Outcome,
+            rivals: Sequence[Rival], remarks: Sequence[str]) -> dict[str, Any]:
+    """
+    Return what the page shows, as JSON has it; loops and keyframes by their numbers, from 0.
+
+    Parameters
+    ----------
+    path : of the input
+    norm : as it was asked for; None: the default
+    remarks : sentences that were said besides
+
+    """
+    factors, judgement = record.graph.between, outcome.judgement
+    slips = judgement.slips if judgement else np.zeros(0, np.int64)
+    rows = np.concatenate((np.flatnonzero(~factors.is_odometry), slips))
+    doubts = judgement.doubts if judgement else ()
+    number_of = np.full(len(factors), -1)
+    number_of[rows] = np.arange(len(rows))
+    said = np.where(factors.trusted & ~factors.is_odometry, 1, np.where(factors.struck, 2, 0))
+    name = path.name.encode(errors='replace').decode()
+    return {
+        'name': name,
+        'doubtful': bool(doubts),
+        'verdict': _verdict(record, outcome),
+        'doubts': [
+            {'text': text, 'advice': _ADVICE[doubt.kind],
+             'settled': doubt.kind not in _UNSETTLED,
+             'loops': number_of[doubted_rows(doubt, factors)].tolist()}
+            for doubt, text in zip(doubts, doubt_reasons(doubts, record.ids, record.stamps),
+                                   strict=True)],
+        'remarks': list(remarks),
+        # Of 64 bits, which JavaScript's numbers have not.
+        'ids': [str(name) for name in record.ids.tolist()],
+        'path': _path(record.graph),
+        'i': factors.pairs[rows, 0].tolist(), 'j': factors.pairs[rows, 1].tolist(),
+        'said': said[rows].tolist(), 'loops': len(rows) - len(slips),
+        'fates': [dict(zip(('word', 'reason', 'unknown'), fate, strict=True)) for fate in _FATES],
+        'maps': _maps(record, outcome, rivals, rows),
+        'files': _files(path, name, norm, record,
+                        any(doubt.kind == NORM for doubt in doubts)),
+    }
+
+
+def _verdict(record: GraphRecord, outcome: Outcome) -> str:
+    factors, judgement = record.graph.between, outcome.judgement
+    if judgement is None:
+        return f'All of {doubted(factors)} were believed; none was judged.'
+    used = int((judgement.accepted & ~factors.is_odometry).sum())
+    said = f'{used:,} of {doubted(factors)} are in this map'
+    if judgement.doubts:
+        return f'{said}, but it is not to be relied on: {_counted_doubts(judgement)}.'
+    return f'{said}, and nothing that was found speaks against it.'
+
+
+def _counted_doubts(judgement: Judgement) -> str:
+    count = len(judgement.doubts)
+    return f'there {"is one doubt" if count == 1 else f"are {count} doubts"}'
+
+
+def _maps(record: GraphRecord, outcome: Outcome, rivals: Sequence[Rival],
+          rows: Indices) -> list[dict[str, Any]]:
+    """Return the map that was solved and its rivals: name, note, positions, fates, sigmas."""
+    positions = record.graph.manifold.positions
+    first = positions(outcome.solution.poses)
+    fate, sigmas = _fates(record.graph, outcome.judgement)
+    maps = [('the map', _used(outcome, fate), -1, first, fate, sigmas)]
+    for rival in rivals:
+        other, judgement = positions(rival.outcome.solution.poses), rival.outcome.judgement
+        if judgement is not None:
+            fate_there, sigmas_there = _fates(rival.graph, judgement)
+        elif len(rival.graph.between) == len(record.graph.between):
+            fate_there, sigmas_there = _fates(rival.graph, None)
+        else:  # of the same loops, but for one step
+            fate_there, sigmas_there = fate, sigmas
+        maps.append((f'rival: {rival.name}', _note(rival, first, other, fate_there), rival.doubt,
+                     other, fate_there, sigmas_there))
+    digits = _digits(first)
+    return [{'name': name, 'note': note, 'doubt': doubt,
+             'at': [axis.round(digits).tolist() for axis in place.T],
+             'fate': fate[rows].tolist(),
+             'sigmas': [None if not np.isfinite(one) else round(one, 2)
+                        for one in sigmas[rows].tolist()]}
+            for name, note, doubt, place, fate, sigmas in maps]
+
+
+def _note(rival: Rival, first: Array, other: Array, fate: Indices) -> str:
+    error = absolute_trajectory_error(other, first)
+    return (f'{_used(rival.outcome, fate)}; {error:.2f} m from the map that was solved (RMSE '
+            'after rigid alignment)')
+
+
+def _used(outcome: Outcome, fate: Indices) -> str:
+    used, judgement = int(np.isin(fate, (_ACCEPTED, _TRUSTED)).sum()), outcome.judgement
+    status = DOUBTFUL if judgement and judgement.doubts else outcome.solution.status.value
+    return f'{counted(used, "loop")} used, {status.replace("_", " ")}'
+
+
+def _fates(graph: FactorGraph, judgement: Judgement | None) -> tuple[Indices, Array]:
+    """Return the fate of each factor, (m,), -1 of odometry in its place; and its sigmas, (m,)."""
+    factors = graph.between
+    fate = np.where(factors.is_odometry, -1, _ACCEPTED)
+    sigmas = np.full(len(factors), np.nan)
+    if judgement is not None:
+        sigmas = judgement.sigmas
+        fate[~factors.is_odometry & ~judgement.accepted] = _REJECTED
+        fate[judgement.suspect] = _SUSPECT
+        fate[judgement.slips] = _SLIP
+    fate[factors.trusted & ~factors.is_odometry] = _TRUSTED
+    fate[factors.struck] = _STRUCK
+    return fate, sigmas
+
+
+def _path(graph: FactorGraph) -> list[int]:
+    """Return the keyframes robot by robot, -1 before each that no odometry leads to."""
+    robot, path = graph.robot, list[int]()
+    for number in np.unique(robot).tolist():
+        for keyframe in np.flatnonzero(robot == number).tolist():
+            path += [keyframe] if graph.between.step_to[keyframe] >= 0 else [-1, keyframe]
+    return path[1:]
+
+
+def _digits(positions: Array) -> int:
+    """Return how many decimals a drawing of positions (n, k) needs."""
+    extent = float(np.ptp(positions, axis=0).max(initial=1e-6))
+    return int(np.clip(5 - np.floor(np.log10(max(extent, 1e-6))), 0, 12))
+
+
+def _files(path: Path, name: str, norm: str | None, record: GraphRecord,
+           by_norm: bool) -> dict[str, str]:
+    """
+    Return where the lines go, the command that obeys them, and what comes before.
+
+    by_norm : whether another norm may settle it
+    """
+    first = ''
+    if formats.is_bag(path) or record.remarks is not None:
+        # Only beside graphs there are such files.
+        graph = Path(f'{name}.g2o')
+        first = shlex.join(['l1slam', 'convert', name, str(graph)])
+        name = str(graph)
+    more = ['--norm', norm] if norm else []
+    least_squares = shlex.join(['l1slam', 'solve', name, '--norm', 'l2'])
+    return {'trusted': beside(name, 'trusted').name, 'struck': beside(name, 'struck').name,
+            'first': first, 'command': shlex.join(['l1slam', 'solve', name, *more]),
+            'settled': least_squares if by_norm else ''}

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A headless browser of the system, without a network: opens a page, acts on it, reads it."""
+
+import html
+import json
+import re
+import shutil
+import subprocess
+import tempfile
+
+import pytest
+
+_NAMES = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable')
+_DEADLINE = 120.0  # [s] on a machine that is busy
+# No name is looked up, so nothing can be fetched; WebGL without a graphics card.
+_OPTIONS = ('--headless', '--no-sandbox', '--disable-gpu', '--enable-unsafe-swiftshader',
+            '--host-resolver-rules=MAP * ~NOTFOUND', '--window-size=1400,1200',
+            '--enable-logging=stderr', '--no-first-run', '--disable-background-networking')
+# Runs before everything of the page: whatever goes wrong in it is kept.
+_WATCH = """<script>
+window.complaints = [];
+window.addEventListener('error', event => window.complaints.push(String(event.message)));
+window.addEventListener('unhandledrejection', event => window.complaints.push(
+  String(event.reason)));
+document.addEventListener('securitypolicyviolation', event => window.complaints.push(
+  'would fetch ' + event.blockedURI));
+for (const name of ['error', 'warn']) console[name] = (...words) => window.complaints.push(
+  words.join(' '));
+</script>"""
+# Waits until the page is open, acts, and leaves what that returns in the page.
+_ACT = """<script>
+(async () => {{
+  const wait = milliseconds => new Promise(done => setTimeout(done, milliseconds));
+  while (!document.body.dataset.opened) await wait(20);
+  let found;
+  try {{ found = await (async () => {{ {script} }})(); }}
+  catch (error) {{ window.complaints.push(String(error)); }}
+  await wait(100);
+  const made = document.createElement('pre');
+  made.id = 'found-by-the-test';
+  made.textContent = JSON.stringify([window.complaints, found === undefined ? null : found]);
+  document.body.append(made);
+}})();
+</script>"""
+
+
+def browser():
+    """Return the browser's path; skip the test where none is installed."""
+    path = next(filter(None, map(shutil.which, _NAMES)), None)
+    if path is None:
+        pytest.skip(f'no browser is installed here; expected one of {", ".join(_NAMES)}')
+    return path
+
+
+def opened(page, script):
+    """Open a copy of a page, run a script in it, return what that returns and complaints."""
+    text = page.read_text(encoding='utf-8')
+    assert text.count('<head>') == text.count('</body>\n</html>') == 1
+    text = text.replace('<head>', f'<head>{_WATCH}', 1).replace(
+        '</body>\n</html>', f'{_ACT.format(script=script)}</body>\n</html>', 1)
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        copy = f'{folder}/page.html'
+        with open(copy, 'w', encoding='utf-8') as file:
+            file.write(text)
+        ran = subprocess.run(
+            [browser(), *_OPTIONS, f'--user-data-dir={folder}/profile',
+             '--virtual-time-budget=30000', '--dump-dom', f'file://{copy}'],
+            capture_output=True, text=True, timeout=_DEADLINE)
+    found = re.search(r'<pre id="found-by-the-test">(.*?)</pre>', ran.stdout, re.DOTALL)
+    assert found, f'{ran.stdout[-500:]}\n{ran.stderr[-2000:]}'
+    complaints, value = json.loads(html.unescape(found[1]))
+    return value, complaints

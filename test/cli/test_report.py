@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`l1slam solve --report`: what the page shows, in a browser, and that it settles a doubt."""
+
+import importlib.util
+import json
+
+import numpy as np
+import pytest
+from browser import browser, opened
+from command import run, solve_json
+from problems import chain_of, graph_of
+from torn import torn_graph
+
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.io import files
+from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
+from l1slam_ros.io.ours import REPORT_MARK, is_ours
+
+pytest.importorskip('plotly')
+# What a person reads and does.
+HEAD = 'const words = id => document.getElementById(id).textContent.trim();'
+PRESS = """const press = text => [...document.querySelectorAll('button')].find(
+  one => one.textContent === text).click();"""
+LINES = "[document.getElementById('trusted').value, document.getElementById('struck').value]"
+
+
+def ring(path, loops=20, n=600):
+    """Write a drive round a ring whose loops are all of one place."""
+    angle = 2 * np.pi * np.arange(n + loops) / n
+    truth = np.column_stack((95 * np.cos(angle), 95 * np.sin(angle), angle))
+    chain, back = chain_of(n + loops), np.arange(loops)
+    pairs = np.concatenate((chain, np.column_stack((back + n, back))))
+    noise = np.random.default_rng(0).standard_normal((len(pairs), 3)) * [0.05, 0.05, 0.005]
+    graph = graph_of(truth, pairs, noise, np.diag([400.0, 400.0, 4e4]))
+    write_graph_file(path, GraphRecord(graph, odometry_poses(graph), 7 + np.arange(n + loops)))
+    return path
+
+
+def torn(path):
+    graph, _ = torn_graph()
+    write_graph_file(path, GraphRecord(graph, odometry_poses(graph), 100 + np.arange(400)))
+    return path
+
+
+DOUBTFUL = {'ring': ring, 'torn': torn}
+
+
+def shown(page):
+    """Return what a page was given to show."""
+    text = page.read_text(encoding='utf-8')
+    return json.loads(text.split('type="application/json">')[1].split('</script>')[0])
+
+
+def reported(capsys, path, *more, code=4):
+    page = path.with_name('map.html')
+    report = json.loads(run(capsys, 'solve', path, '--report', page, '--json', '--quiet', *more,
+                            code=code)[0])
+    return page, report
+
+
+def pairs_of(page):
+    names = shown(page)['ids']
+    return [[int(names[i]), int(names[j])]
+            for i, j in zip(shown(page)['i'], shown(page)['j'], strict=True)]
+
+
+def test_a_page_shows_each_loop_once_with_its_fate_and_the_doubted(capsys, tmp_path):
+    page, report = reported(capsys, torn(tmp_path / 'torn.g2o'))
+    data, pairs = shown(page), pairs_of(page)
+    words, here = [fate['word'] for fate in data['fates']], data['maps'][0]
+    assert len(pairs) == data['loops'] == report['loops'] == len(here['fate'])
+    assert [pair for pair, fate in zip(pairs, here['fate'], strict=True)
+            if words[fate] == 'rejected'] == report['rejected']
+    doubt, = data['doubts']
+    assert doubt['text'] == report['doubts'][0]['text']
+    assert [pairs[k] for k in doubt['loops']] == report['doubts'][0]['loops']
+    assert all(sigmas is not None for sigmas in here['sigmas'])
+    # In the rival the doubted loops are in the map, and the map is another.
+    rival, = data['maps'][1:]
+    assert {words[rival['fate'][k]] for k in doubt['loops']} == {'trusted'}
+    assert rival['doubt'] == 0 and 'm from the map that was solved' in rival['note']
+    assert np.abs(np.array(rival['at']) - here['at']).max() > 1
+
+
+@pytest.mark.parametrize('kind', DOUBTFUL)
+@pytest.mark.parametrize('button, place', [('Tick all as true', 0), ('Tick all as false', 1)])
+def test_a_doubt_is_settled_through_the_page(capsys, tmp_path, kind, button, place):
+    path = DOUBTFUL[kind](tmp_path / 'graph.g2o')
+    page, report = reported(capsys, path)
+    (lines, names, verdict), complaints = opened(page, f"""{HEAD} {PRESS} press('{button}');
+        return [{LINES}, [words('trusted-name'), words('struck-name')], words('status')];""")
+    assert complaints == [] and verdict == 'doubtful' and lines[1 - place] == ''
+    assert [list(map(int, line.split())) for line in lines[place].splitlines()] == (
+        report['doubts'][0]['loops'])
+    (tmp_path / names[place]).write_text(lines[place])
+    if (kind, place) == ('torn', 0):  # vouched for against what is right
+        assert run(capsys, 'solve', path, code=4)
+        return
+    assert solve_json(capsys, path)['status'] == 'converged'
+    # What was said by then is ticked in the next page.
+    page, report = reported(capsys, path, code=0)
+    (again, verdict), complaints = opened(page, f"""{HEAD}
+        return [{LINES}, words('status')];""")
+    assert complaints == [] and again == lines and verdict == 'not doubted'
+
+
+def test_ticks_make_lines_one_by_one_and_are_taken_back(capsys, tmp_path):
+    path = ring(tmp_path / 'ring.g2o')
+    text = path.read_text().splitlines()
+    # Once more, with another measurement, and the other way round: a line of the files is of both.
+    edge = next(line for line in text if line.startswith('EDGE_SE2 607 7 ')).split()
+    path.write_text('\n'.join([*text, ' '.join([edge[0], '7', '607', '0', '-.2', '0',
+                                                *edge[6:]])]) + '\n')
+    page, _ = reported(capsys, path)
+    found, complaints = opened(page, f"""
+        const box = (i, j, word) => [...document.querySelectorAll('#rows tr')].find(row =>
+          row.cells[0].textContent === i && row.cells[1].textContent === j
+        ).querySelector(`[data-word="${{word}}"]`);
+        const steps = [{LINES}];
+        for (const [i, j, word] of [['607', '7', 'true'], ['608', '8', 'false'],
+                                    ['607', '7', 'false'], ['608', '8', 'false']]) {{
+          box(i, j, word).click();
+          steps.push({LINES});
+        }}
+        return [steps, box('7', '607', 'false').checked, box('7', '607', 'true').checked];""")
+    assert complaints == []
+    assert found == [[['', ''], ['607 7\n', ''], ['607 7\n', '608 8\n'],
+                      ['', '607 7\n608 8\n'], ['', '607 7\n']], True, False]
+
+
+def test_the_table_is_cut_searched_and_sorted_and_the_map_switched(capsys, tmp_path):
+    page, report = reported(capsys, torn(tmp_path / 'torn.g2o'))
+    i, j = report['doubts'][0]['loops'][0]
+    found, complaints = opened(page, f"""
+        const rows = () => [...document.querySelectorAll('#rows tr')];
+        const keyframes = () => document.getElementById('map').data.find(
+          one => one.name === 'keyframes').x.slice();
+        const first = rows().length, all = rows().every(one => one.classList.contains('doubted'));
+        const box = document.getElementById('search'), before = keyframes();
+        box.value = '{i} {j}'; box.dispatchEvent(new Event('input')); await wait(400);
+        const one = rows().map(row => row.cells[0].textContent + ' ' + row.cells[1].textContent);
+        box.value = ''; box.dispatchEvent(new Event('input')); await wait(400);
+        const which = document.getElementById('which');
+        which.value = '1'; which.dispatchEvent(new Event('change')); await wait(500);
+        const fate = document.getElementById('fate');
+        fate.value = '4'; fate.dispatchEvent(new Event('change'));
+        const moved = keyframes();
+        rows()[0].click(); await wait(300);
+        return [first, all, one, rows().length, document.getElementById('found').textContent,
+          Math.max(...before.map((x, k) => Math.abs(x - moved[k]))) > 1,
+          document.getElementById('map').data.some(one => one.name.startsWith('chosen')),
+          document.getElementById('note').textContent];""")
+    at, complaints_at = opened(page, f"""{HEAD}
+        const map = document.getElementById('map');
+        const keyframes = map.data.find(one => one.name === 'keyframes');
+        map.emit('plotly_click', {{points: [{{data: keyframes, pointNumber: {i - 100}}}]}});
+        return [document.getElementById('search').value, [...document.querySelectorAll('#rows tr')
+          ].map(row => [row.cells[0].textContent, row.cells[1].textContent])];""")
+    assert complaints_at == [] and at[0] == str(i)
+    assert [str(i), str(j)] in at[1] and all(str(i) in ends for ends in at[1])
+    loops = len(report['doubts'][0]['loops'])
+    assert complaints == []
+    assert found[:7] == [50, True, [f'{i} {j}'], 50, f'{loops} listed', True, True]
+    assert found[7] == shown(page)['maps'][1]['note']
+
+
+def test_a_world_in_space_is_drawn_in_space(capsys, tmp_path):
+    path = tmp_path / 'building.g2o'
+    run(capsys, 'simulate', path, '--world', 'building', '--poses', 150, '--edges', 330)
+    page, _ = reported(capsys, path, code=0)
+    found, complaints = opened(page, """
+        return [...new Set(document.getElementById('map').data.map(one => one.type))];""")
+    assert complaints == [] and found == ['scatter3d']
+    assert len(shown(page)['maps'][0]['at']) == 3
+
+
+def test_a_slip_and_most_loops_refused_have_rivals(capsys, tmp_path):
+    world, bad = tmp_path / 'world.g2o', tmp_path / 'bad.g2o'
+    run(capsys, 'simulate', world, '--poses', 150, '--edges', 250, '--seed', 7)
+    run(capsys, 'corrupt', world, bad, '--false-loops', 150)
+    page, report = reported(capsys, bad)
+    rival, = shown(page)['maps'][1:]
+    assert rival['name'] == 'rival: every loop believed'
+    assert rival['note'].startswith(f'{report["loops"]} loops used')
+    path = torn(tmp_path / 'torn.g2o')
+    _, report = reported(capsys, path)
+    (tmp_path / 'torn.g2o.trusted.txt').write_text(''.join(
+        f'{i} {j}\n' for i, j in report['doubts'][0]['loops']))
+    page, report = reported(capsys, path)
+    kinds = [doubt['kind'] for doubt in report['doubts']]
+    assert kinds == ['a slip suspected', 'a slip suspected', 'another norm']
+    names = [rival['name'] for rival in shown(page)['maps'][1:]]
+    steps = [doubt['text'].split(' between ')[1].split(',')[0].split(' and ')
+             for doubt in report['doubts'][:2]]
+    assert [name.split(' the step ')[1] for name in names[:2]] == [' - '.join(s) for s in steps]
+    assert names[2] == 'rival: least squares'
+    assert shown(page)['files']['settled'] == 'l1slam solve torn.g2o --norm l2'
+
+
+def test_a_page_of_what_nobody_judged(capsys, tmp_path):
+    page, _ = reported(capsys, torn(tmp_path / 'torn.g2o'), '--no-robust', code=0)
+    data = shown(page)
+    assert data['verdict'] == 'All of 282 loops were believed; none was judged.'
+    assert set(data['maps'][0]['fate']) == {0} and set(data['maps'][0]['sigmas']) == {None}
+    assert not opened(page, 'return 0;')[1]
+
+
+def test_a_slip_is_listed_and_cannot_be_ticked(capsys, tmp_path):
+    """Only a loop can be vouched for or struck out: the reader of the files says so."""
+    path = tmp_path / 'world.g2o'
+    run(capsys, 'simulate', path, '--poses', 400, '--edges', 900, '--seed', 3)
+    lines = path.read_text().splitlines()
+    k = next(k for k, line in enumerate(lines) if line.startswith('EDGE_SE2 200 201 '))
+    words = lines[k].split()
+    lines[k] = ' '.join([*words[:3], str(float(words[3]) + 3), *words[4:]])
+    path.write_text('\n'.join(lines) + '\n')
+    page, report = reported(capsys, path, code=0)
+    assert report['slips'] == [[200, 201]]
+    found, complaints = opened(page, """
+        const row = document.querySelector('#rows tr');
+        document.getElementById('all-true').click();
+        return [row.cells[2].textContent, row.querySelectorAll('input').length,
+          document.getElementById('trusted').value.includes('200 201')];""")
+    assert complaints == [] and found == ['slip', 0, False]
+
+
+def test_of_a_bag_the_page_says_to_make_a_graph_first(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    graph = ring(tmp_path / 'ring.g2o')
+    run(capsys, 'convert', graph, 'bag')
+    page, report = reported(capsys, tmp_path / 'bag')
+    steps = shown(page)['files']
+    assert steps['first'] == 'l1slam convert bag bag.g2o'
+    run(capsys, *steps['first'].split()[1:])
+    i, j = report['doubts'][0]['loops'][0]
+    (tmp_path / steps['trusted']).write_text(f'{i} {j}\n')
+    run(capsys, *steps['command'].split()[1:])
+
+
+def test_least_squares_settles_what_no_loop_does(capsys, datasets, tmp_path):
+    recorded = datasets / 'real' / 'bovisa06.g2o'
+    if not recorded.exists():
+        pytest.skip('the recorded graphs are not on this machine')
+    (tmp_path / 'bovisa06.g2o').write_bytes(recorded.read_bytes())
+    page, report = reported(capsys, tmp_path / 'bovisa06.g2o')
+    assert [doubt['kind'] for doubt in report['doubts']] == ['another norm']
+    assert not shown(page)['doubts'][0]['settled']
+    command = shown(page)['files']['settled'].split()
+    assert command == ['l1slam', 'solve', 'bovisa06.g2o', '--norm', 'l2']
+    again = solve_json(capsys, tmp_path / 'bovisa06.g2o', *command[3:])
+    assert again['status'] == 'converged' and again['doubts'] == []
+
+
+# Outputs
+
+
+def test_a_page_replaces_a_page_and_nothing_of_others(capsys, tmp_path):
+    path, page = ring(tmp_path / 'ring.g2o'), tmp_path / 'map.html'
+    page.write_text('<html>mine</html>\n')
+    err = run(capsys, 'solve', path, '--report', page, code=2)[1]
+    assert 'was not written by l1slam_ros, so it is not overwritten' in err
+    assert err.count('\n') == 1 and page.read_text() == '<html>mine</html>\n'
+    reported(capsys, path, '--force')
+    assert is_ours(page) and page.read_text().startswith(f'{REPORT_MARK}\n<!DOCTYPE html>')
+    reported(capsys, path)
+    for name in 'map.png', 'map':
+        err = run(capsys, 'solve', path, '--report', tmp_path / name, code=2)[1]
+        assert err.endswith('is no name of a page; expected one that ends in .html or .htm\n')
+    link = tmp_path / 'graph.g2o'
+    link.symlink_to(page)
+    assert 'is read' in run(capsys, 'solve', link, '--report', page, '--force', code=2)[1]
+
+
+def test_without_the_library_one_line_says_so_before_the_work(capsys, tmp_path, monkeypatch):
+    found = importlib.util.find_spec
+    monkeypatch.setattr('l1slam_ros.cli.report.page.find_spec',
+                        lambda name: None if name == 'plotly' else found(name))
+    out, err = run(capsys, 'solve', tmp_path / 'absent.g2o', '--report', tmp_path / 'map.html',
+                   code=2)
+    assert (out, err) == ('', "l1slam: --report draws with plotly, which is not installed; "
+                          "expected it: `pip install 'l1slam_ros[report]'`, or the package "
+                          "python3-plotly\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_page_is_written_whole_or_not_at_all(capsys, tmp_path, monkeypatch):
+    path = ring(tmp_path / 'ring.g2o')
+    page, _ = reported(capsys, path)
+    before = page.read_bytes()
+
+    def full(*_):
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(files.os, 'replace', full)
+    err = run(capsys, 'solve', path, '--report', page, '--quiet', code=2)[1]
+    assert 'No space left' in err and page.read_bytes() == before
+    assert sorted(one.name for one in tmp_path.iterdir()) == ['map.html', 'ring.g2o']
+
+
+@pytest.mark.parametrize('name', ['</script><b>.g2o', "a'b c.g2o"])
+def test_a_name_ends_no_script_and_its_command_runs(capsys, tmp_path, name):
+    if '/' in name:
+        name = name.replace('/', '\u2044')
+    browser()
+    path = ring(tmp_path / name)
+    page, _ = reported(capsys, path)
+    found, complaints = opened(page, "return document.getElementById('name').textContent;")
+    assert complaints == [] and found == name
+    assert shown(page)['files']['command'].startswith("l1slam solve '")

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A heading that drifts is found by vote, the map is made without it; where none is, none is."""
+
+import numpy as np
+import pytest
+from lies import careful_world, is_false, position_error, spoilt
+
+from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS
+from l1slam_ros.core.robust import batch_map
+from l1slam_ros.core.robust.odometry.drift import straightened, vote
+
+DRIFT = 0.05
+WORLD = careful_world(400, 800)
+
+
+@pytest.mark.parametrize('drift', [DRIFT, -0.02])
+def test_loops_vote_for_the_drift_that_there_is(drift):
+    found, odds = vote(straightened(WORLD.graph, -drift))
+    assert odds > 0
+    assert found == pytest.approx(drift, abs=2e-3)
+
+
+@pytest.mark.parametrize('kind', KINDS_OF_FALSE_LOOPS)
+def test_lies_do_not_hide_it(kind):
+    found, odds = vote(straightened(spoilt(WORLD, kind, 300).graph, -DRIFT))
+    assert odds > 0
+    assert found == pytest.approx(DRIFT, abs=2e-3)
+
+
+def test_odometry_that_does_not_drift_is_left_as_it_is():
+    assert abs(vote(WORLD.graph)[0]) < 2e-3
+    bad = spoilt(WORLD, 'random', 400)
+    assert batch_map.solve(bad.graph, None, batch_map.SolveOptions()).judgement.drift == 0
+
+
+@pytest.mark.parametrize('norm', ['l1', 'l2'])
+def test_the_map_is_made_without_it(norm):
+    bad = spoilt(WORLD, 'random', 300)
+    graph = straightened(bad.graph, -DRIFT)
+    before = graph.between.measurement.copy()
+    outcome = batch_map.solve(graph, None, batch_map.SolveOptions(norm=norm))
+    assert outcome.judgement.drift == pytest.approx(DRIFT, abs=2e-3)
+    assert position_error(outcome.solution.poses, bad.truth) < 0.5
+    assert not (outcome.judgement.accepted & is_false(bad, graph.between)).any()
+    np.testing.assert_array_equal(graph.between.measurement, before)
+
+
+def test_odometry_that_is_corrected_and_corrected_back_is_as_it_was():
+    back = straightened(straightened(WORLD.graph, DRIFT), -DRIFT).between
+    np.testing.assert_allclose(back.measurement, WORLD.graph.between.measurement, atol=1e-12)
+    assert straightened(WORLD.graph, 0.0) is WORLD.graph
