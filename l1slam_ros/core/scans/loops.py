@@ -125,7 +125,7 @@ class LoopFinder:
     def _sigma(self, j: int, spread: Array) -> Array:
         """Return how far keyframe j may lie from where the map has it, seen from each, (j, 2)."""
         way = np.array([self._keyframes[j].travelled - k.travelled for k in self._keyframes[:j]])
-        known = spread.any(axis=1)
+        known = spread[:, 0] > 0
         placed = int(np.flatnonzero(known)[-1]) if known.any() else -1
         since = self._keyframes[j].travelled - (
             self._keyframes[placed].travelled if 0 <= placed < j else np.inf)

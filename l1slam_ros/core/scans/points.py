@@ -93,7 +93,7 @@ def points_of(scan: Scan, mount: Mount = Mount(),  # noqa: B008
     xy = np.stack((mount.x + reach * np.cos(angles), mount.y + reach * np.sin(angles)), axis=1)
     centre = np.array([mount.x, mount.y])
     if velocity is not None and scan.time_increment:
-        xy = _at_stamp(xy, velocity, scan.time_increment * np.arange(len(ranges)))
+        xy = _at_stamp(xy, velocity, scan.time_increment * np.arange(0.0, len(ranges)))
     view = _view(np.where(hit, ranges, np.inf)[looked], angles[looked])
     seen = np.ascontiguousarray(xy[hit])
     if len(seen):
