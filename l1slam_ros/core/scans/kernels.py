@@ -10,6 +10,9 @@ import numpy as np
 
 from l1slam_ros.core.kernels.compiled import compiled, loop
 
+# Neighbourhoods of a point that are tried for a line, each half as wide as the one before.
+_WINDOWS = 3
+
 
 @loop('(f8[:, ::1], f8[::1], i8[::1], f8, f8)')
 def nearest_points(points, origin, shape, resolution, reach):
@@ -97,44 +100,58 @@ def normals_along(points, least_reach, widening, off):
     Return the normals of points that follow each other along a scan, (n, 2), turned to (0, 0).
 
     A line is fitted to the neighbours on both sides that hang together within `least_reach` [m],
-    or within `widening` of the range; zero where one side has none, or where the points are
-    further than `off` [m] from the line (RMS).
+    or within `widening` of the range; where they are further than `off` [m] from the line (RMS),
+    as at a corner, to those within half as much, and half of that. Zero where one side has none,
+    or there is no line.
     """
     n = len(points)
     normals = np.zeros((n, 2))
     for k in range(n):
-        first = last = k
-        range_ = np.sqrt(points[k, 0] ** 2 + points[k, 1] ** 2)
-        reach = max(least_reach, widening * range_)
-        while first > 0 and _near(points, first - 1, k, reach) and (
-                _near(points, first - 1, first, 0.5 * reach)):
-            first -= 1
-        while last < n - 1 and _near(points, last + 1, k, reach) and (
-                _near(points, last + 1, last, 0.5 * reach)):
-            last += 1
-        if first == k or last == k:
-            continue
-        count = last - first + 1
-        mx = my = 0.0
-        for j in range(first, last + 1):
-            mx += points[j, 0] / count
-            my += points[j, 1] / count
-        xx = xy = yy = 0.0
-        for j in range(first, last + 1):
-            dx, dy = points[j, 0] - mx, points[j, 1] - my
-            xx += dx * dx / count
-            xy += dx * dy / count
-            yy += dy * dy / count
-        half = 0.5 * (xx - yy)
-        least = 0.5 * (xx + yy) - np.sqrt(half * half + xy * xy)
-        if least > off * off:
-            continue
-        angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the line
-        nx, ny = -np.sin(angle), np.cos(angle)
-        if nx * points[k, 0] + ny * points[k, 1] > 0:
-            nx, ny = -nx, -ny
-        normals[k, 0], normals[k, 1] = nx, ny
+        reach = max(least_reach, widening * np.sqrt(points[k, 0] ** 2 + points[k, 1] ** 2))
+        linked = 0.5 * reach
+        for _ in range(_WINDOWS):
+            first, last = _window(points, k, reach, linked)
+            if first == k or last == k:
+                break
+            angle, least = _line(points, first, last)
+            if least <= off * off:
+                nx, ny = -np.sin(angle), np.cos(angle)
+                away = nx * points[k, 0] + ny * points[k, 1] > 0
+                normals[k, 0], normals[k, 1] = (-nx, -ny) if away else (nx, ny)
+                break
+            reach *= 0.5
     return normals
+
+
+@compiled
+def _window(points, k, reach, linked):
+    """Return the first and the last point around k within reach, none further than `linked`."""
+    first = last = k
+    while first > 0 and _near(points, first - 1, k, reach) and (
+            _near(points, first - 1, first, linked)):
+        first -= 1
+    while last < len(points) - 1 and _near(points, last + 1, k, reach) and (
+            _near(points, last + 1, last, linked)):
+        last += 1
+    return first, last
+
+
+@compiled
+def _line(points, first, last):
+    """Return the angle of the line through points, and their mean squared distance from it."""
+    count = last - first + 1
+    mx = my = 0.0
+    for j in range(first, last + 1):
+        mx += points[j, 0] / count
+        my += points[j, 1] / count
+    xx = xy = yy = 0.0
+    for j in range(first, last + 1):
+        dx, dy = points[j, 0] - mx, points[j, 1] - my
+        xx += dx * dx / count
+        xy += dx * dy / count
+        yy += dy * dy / count
+    half = 0.5 * (xx - yy)
+    return 0.5 * np.arctan2(2 * xy, xx - yy), 0.5 * (xx + yy) - np.sqrt(half * half + xy * xy)
 
 
 @compiled

@@ -118,7 +118,7 @@ def _view(ranges: Array, angles: Array) -> Array:
     at = np.floor(angles / (2 * np.pi) * _BEARINGS).astype(np.int64) % _BEARINGS
     np.fmin.at(view, at, ranges)
     # A bearing between two rays is seen by both.
-    width = max(1, round(_BEARINGS * _spacing_of(angles) / (2 * np.pi)))
+    width = 1 + int(_BEARINGS * _spacing_of(angles) / (2 * np.pi) + 1e-6)
     for _ in range(width - 1):
         follower = np.roll(view, 1)
         view = np.where(np.isnan(view), follower, view)
