@@ -172,16 +172,45 @@ def apart(points, spacing):
     return kept
 
 
-@loop('(f4[:, :, ::1], i8[::1], i8[:, :, ::1], i8[::1], i8[::1], f8, f8[::1])')
-def branch_and_bound(levels, margin, cells, lowest, highest, least, excluded):
+@loop('(f4[:, :, ::1], i8[::1], i8[:, :, ::1], i8[::1], i8[::1])')
+def widest_nodes(levels, margin, cells, lowest, highest):
     """
-    Return the best shift of a scan over a likelihood grid for any of its turns.
+    Return where a search begins: the nodes of the highest level, and bounds of their scores.
 
     levels : (h + 1, a, b) the likelihood, pooled over 1, 2, 4, ... cells; margin : (2,) cells of
     the grid before cell (0, 0) of the shifts; cells : (t, n, 2) cells of the points for each turn,
-    unshifted; lowest, highest : (2,) of the shifts, inclusive; least : score to beat; excluded :
-    (6,) turn, shift (2), how many turns and cells around it do not count, and after how many
-    turns they begin anew; fewer than no turns: nothing is excluded
+    unshifted; lowest, highest : (2,) of the shifts, inclusive
+
+    Returns
+    -------
+    nodes (k, 3): turn, column, row of each, and bounds (k,), the best one first
+
+    """
+    height = len(levels) - 1
+    width = 1 << height
+    across = (highest[0] - lowest[0]) // width + 1
+    along = (highest[1] - lowest[1]) // width + 1
+    nodes = np.empty((len(cells) * across * along, 3), np.int64)
+    scores = np.empty(len(nodes))
+    count = 0
+    for t in range(len(cells)):
+        for x in range(lowest[0], highest[0] + 1, width):
+            for y in range(lowest[1], highest[1] + 1, width):
+                nodes[count, 0], nodes[count, 1], nodes[count, 2] = t, x, y
+                scores[count] = _score(levels[height], margin, cells[t], x, y)
+                count += 1
+    order = np.argsort(-scores)
+    return nodes[order], scores[order]
+
+
+@loop('(f4[:, :, ::1], i8[::1], i8[:, :, ::1], i8[:, ::1], f8[::1], i8[::1], f8, f8[::1])')
+def branch_and_bound(levels, margin, cells, nodes, scores, highest, least, excluded):
+    """
+    Return the best shift of a scan over a likelihood grid for any of its turns.
+
+    levels, margin, cells, highest, nodes, scores : see `widest_nodes`; least : score to beat;
+    excluded : (6,) turn, shift (2), how many turns and cells around it do not count, and after how
+    many turns they begin anew; fewer than no turns: nothing is excluded
 
     Returns
     -------
@@ -193,10 +222,9 @@ def branch_and_bound(levels, margin, cells, lowest, highest, least, excluded):
     """
     height = len(levels) - 1
     best, found = least, np.array([-1, 0, 0])
-    nodes, scores = _widest(levels, margin, cells, lowest, highest)
     stack = np.empty((4 * height + 4, 4), np.int64)
     bounds = np.empty(4 * height + 4)
-    for at in np.argsort(-scores):
+    for at in range(len(nodes)):
         if scores[at] <= best:
             break
         stack[0, :3] = nodes[at]
@@ -212,25 +240,6 @@ def branch_and_bound(levels, margin, cells, lowest, highest, least, excluded):
                 best = bounds[depth]
                 found[:] = stack[depth, :3]
     return best, found[0], found[1], found[2]
-
-
-@compiled
-def _widest(levels, margin, cells, lowest, highest):
-    """Return the nodes (turn, column, row) of the highest level, and bounds of their scores."""
-    height = len(levels) - 1
-    width = 1 << height
-    across = (highest[0] - lowest[0]) // width + 1
-    along = (highest[1] - lowest[1]) // width + 1
-    nodes = np.empty((len(cells) * across * along, 3), np.int64)
-    scores = np.empty(len(nodes))
-    count = 0
-    for t in range(len(cells)):
-        for x in range(lowest[0], highest[0] + 1, width):
-            for y in range(lowest[1], highest[1] + 1, width):
-                nodes[count, 0], nodes[count, 1], nodes[count, 2] = t, x, y
-                scores[count] = _score(levels[height], margin, cells[t], x, y)
-                count += 1
-    return nodes, scores
 
 
 @compiled
