@@ -43,7 +43,7 @@ _SIGMAS = 3.0
 # [m/m], [rad/m] How the odometry's error grows with the way, beyond where the map is known.
 _DRIFT = np.array((0.05, 0.01))
 # What a loop must show; see above.
-_SCORE, _RIVAL, _OVERLAP, _AGREE, _HELD = 0.42, 0.85, 0.3, 0.85, 0.1
+_SCORE, _RIVAL, _OVERLAP, _AGREE, _HELD = 0.42, 0.85, 0.3, 0.93, 0.05
 # [m] A match that goes so far from the peak of the search slides.
 _WANDER = 0.4
 # [m] A ray that passes a point by so much contradicts it.
