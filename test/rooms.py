@@ -18,17 +18,101 @@ _CORNERS = np.array([(1.5, 1.5), (10.5, 1.5), (10.5, 6.5), (1.5, 6.5)])
 _STEP, _PERIOD, _RAYS = 0.15, 0.2, 240
 
 
-def ranges_at(pose, rng):
+def box(x, y, u, v):
+    """Return the four walls of a box, from corner (x, y) to corner (u, v)."""
+    return np.array([(x, y, u, y), (u, y, u, v), (u, v, x, v), (x, v, x, y)], float)
+
+
+def mirrored(walls):
+    """Return what walls look like in a mirror on the x axis."""
+    return walls * (1, -1, 1, -1)
+
+
+def ranges_at(pose, rng, walls=WALLS, noise=0.01, rays=_RAYS):
     """Return what a laser that looks all round measures at a pose, to a centimetre, (r,) [m]."""
-    angles = pose[2] + 2 * np.pi * np.arange(_RAYS) / _RAYS
+    angles = pose[2] + 2 * np.pi * np.arange(rays) / rays
+    return _cast(np.broadcast_to(pose[:2], (rays, 2)), angles, walls) + (
+        noise * rng.standard_normal(rays))
+
+
+def ranges_on_the_way(pose, velocity, period, rng, walls=WALLS, noise=0.01):
+    """Return what it measures while it turns once from a pose on, at a steady velocity, (r,)."""
+    seconds = period * np.arange(_RAYS) / _RAYS
+    steps = seconds[:, None] * velocity
+    poses = se2.compose(np.broadcast_to(pose, steps.shape), steps)
+    angles = poses[:, 2] + 2 * np.pi * np.arange(_RAYS) / _RAYS
+    return _cast(poses[:, :2], angles, walls) + noise * rng.standard_normal(_RAYS)
+
+
+def _cast(starts, angles, walls):
+    """Return the way from each start (r, 2) at each angle to the nearest wall, (r,) [m]."""
     u = np.stack((np.cos(angles), np.sin(angles)), axis=1)[:, None]
-    a, d = WALLS[:, :2] - pose[:2], WALLS[:, 2:] - WALLS[:, :2]
+    a, d = walls[:, :2] - starts[:, None], walls[:, 2:] - walls[:, :2]
     cross = u[..., 0] * d[:, 1] - u[..., 1] * d[:, 0]
     with np.errstate(all='ignore'):
-        t = (a[:, 0] * d[:, 1] - a[:, 1] * d[:, 0]) / cross
-        s = (a[:, 0] * u[..., 1] - a[:, 1] * u[..., 0]) / cross
-    hit = np.where((t > 0) & (s >= 0) & (s <= 1), t, np.inf).min(axis=1)
-    return hit + 0.01 * rng.standard_normal(_RAYS)
+        t = (a[..., 0] * d[:, 1] - a[..., 1] * d[:, 0]) / cross
+        s = (a[..., 0] * u[..., 1] - a[..., 1] * u[..., 0]) / cross
+    return np.where((t > 0) & (s >= 0) & (s <= 1), t, np.inf).min(axis=1)
+
+
+def scan_at(pose, rng, walls=WALLS, noise=0.01, farthest=30.0):
+    """Return a scan of a laser that looks all round at a pose."""
+    return Scan(0, ranges_at(pose, rng, walls, noise), 0.0, 2 * np.pi / _RAYS, 0.05, farthest)
+
+
+def along(corners, step=_STEP):
+    """Return poses on a way through corners (k, 2), that turns on the spot at each, (n, 3)."""
+    poses, last = [], None
+    for a, b in zip(corners[:-1], corners[1:], strict=True):
+        d = np.subtract(b, a)
+        heading = np.arctan2(d[1], d[0])
+        if last is not None:
+            turn = se2.wrap(heading - last)
+            count = int(np.ceil(abs(turn) / 0.3))
+            poses += [(*a, last + turn * k / count) for k in range(1, count)]
+        length = np.hypot(*d)
+        poses += [(*(a + part * d / length), heading) for part in np.arange(0, length, step)]
+        last = heading
+    return np.array(poses)
+
+
+def drifting(true, rng):
+    """Return the wheels of a robot that was at poses (n, 3): they drift to the left."""
+    steps = se2.between(true[:-1], true[1:])
+    steps[:, 2] += 0.02 * np.hypot(steps[:, 0], steps[:, 1]) + 0.002 * rng.standard_normal(
+        len(steps))
+    wheels = se2.identity(len(true))
+    for k, step in enumerate(steps):
+        wheels[k + 1] = se2.compose(wheels[k][None], step[None])[0]
+    return wheels
+
+
+def drive(true, seed=0, walls=WALLS, spoil=None):
+    """
+    Return scans and the wheels' poses of a robot that is at poses (n, 3).
+
+    spoil : takes ranges, the number of the scan and the generator, returns other ranges
+    """
+    rng = np.random.default_rng(seed)
+    wheels = drifting(true, rng)
+    scans = []
+    for k, pose in enumerate(true):
+        ranges = ranges_at(pose, rng, walls)
+        scans.append(Scan(1000 * 10**9 + k * int(_PERIOD * 1e9),
+                          ranges if spoil is None else spoil(ranges, k, rng), 0.0,
+                          2 * np.pi / _RAYS, 0.05, 30.0))
+    return scans, wheels
+
+
+def random_rays(ranges, _, rng, part=0.1):
+    """Let so many rays end anywhere before the wall."""
+    return np.where(rng.random(len(ranges)) < part, rng.random(len(ranges)) * ranges, ranges)
+
+
+def glass(ranges, _, rng, part=0.2):
+    """Let so many rays go on behind the wall, up to 6 m."""
+    far = ranges + 6 * rng.random(len(ranges))
+    return np.where(rng.random(len(ranges)) < part, far, ranges)
 
 
 def laps(count=2, seed=0):
@@ -42,12 +126,7 @@ def laps(count=2, seed=0):
             true.append((*(a + part * (b - a) / np.linalg.norm(b - a)), heading))
         true += [(*b, heading + turn) for turn in np.linspace(0, np.pi / 2, 6)[1:-1]]
     true = np.array(true)
-    steps = se2.between(true[:-1], true[1:])
-    steps[:, 2] += 0.02 * np.hypot(steps[:, 0], steps[:, 1]) + 0.002 * rng.standard_normal(
-        len(steps))  # wheels that drift
-    wheels = se2.identity(len(true))
-    for k, step in enumerate(steps):
-        wheels[k + 1] = se2.compose(wheels[k][None], step[None])[0]
+    wheels = drifting(true, rng)
     stamps = (1000 * 10**9 + np.arange(len(true)) * int(_PERIOD * 1e9)).tolist()
     scans = [Scan(stamp, ranges_at(pose, rng), 0.0, 2 * np.pi / _RAYS, 0.05, 30.0)
              for stamp, pose in zip(stamps, true, strict=True)]

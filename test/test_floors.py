@@ -20,9 +20,9 @@ ROS = {
 # From the ground up; what shares a floor does not know of each other. Errors, options and names
 # stand beside the building: all may use them, and they use nothing.
 FLOORS = (
-    ('core.kernels',), ('core.geometry',), ('core.graph',), ('core.solvers',), ('core.robust',),
-    ('core.bordered', 'core.worlds'), ('core.online',), ('core.running',), ('io',), ('paper',),
-    ('cli', 'ros'),
+    ('core.kernels',), ('core.geometry',), ('core.graph', 'core.scans'), ('core.solvers',),
+    ('core.robust',), ('core.bordered', 'core.worlds'), ('core.online',), ('core.running',),
+    ('io',), ('paper',), ('cli', 'ros'),
 )
 # Only the algorithms that join them may know both a linear system and poses.
 BLIND = {f'{PACKAGE}.core.{name}': {f'{PACKAGE}.core.{other}' for other in others}

@@ -14,6 +14,7 @@ from l1slam_ros.io.files import NANOSECONDS, counted
 from l1slam_ros.io.formats import is_bag
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import named_loops
+from l1slam_ros.io.scans.scan_path import ScanPath
 from l1slam_ros.io.trajectory import Reference, read_reference
 
 # [ns] As far as that a pose may lie before the first or after the last true one: files round.
@@ -28,16 +29,24 @@ class Truth:
     Where some keyframes should be.
 
     rows : (k,) these keyframes; poses : (k, p) theirs; path : (l, p) the true poses from the first
-    of them to the last, a row of NaN in each gap; skipped : sentences on what was not used.
+    of them to the last, a row of NaN in each gap; skipped : sentences on what was not used;
+    steps : (k, 3) or None, from each keyframe to where `poses` has the robot a little later
     """
 
     rows: Indices
     poses: Array
     path: Array
     skipped: tuple[str, ...] = ()
+    steps: Array | None = None
+
+    def estimate(self, record: GraphRecord, poses: Array) -> Array:
+        """Return where a map (n, p) has what `poses` tells of, (k, p)."""
+        own: Array = poses[self.rows]
+        return own if self.steps is None else record.graph.manifold.compose(own, self.steps)
 
 
-def read_truth(source: str, record: GraphRecord, input_path: Path) -> Truth:
+def read_truth(source: str, record: GraphRecord, input_path: Path,
+               scans: ScanPath | None = None) -> Truth:
     """
     Return the truth about a graph.
 
@@ -46,6 +55,8 @@ def read_truth(source: str, record: GraphRecord, input_path: Path) -> Truth:
     source : a TUM or CSV file, a graph file, `id x y theta` text; or `BAG:/TOPIC`, where `bag`
         stands for an input that is one
     record, input_path : the graph, and where it is from
+    scans : the odometry between its keyframes, where it is known: where there are fewer true poses
+        than keyframes, these are compared where they are, not with what lies between them
 
     Raises
     ------
@@ -54,7 +65,12 @@ def read_truth(source: str, record: GraphRecord, input_path: Path) -> Truth:
     """
     reference = _read(source, record, input_path)
     keys = record.times if reference.stamped else record.ids
-    if reference.stamped:
+    steps = None
+    if reference.stamped and scans is not None and _sparser(reference.keys, keys):
+        theirs, rows, steps = scans.steps_at(
+            reference.keys, _longest(scans.stamps), _SAME_STAMP)
+        poses, gaps = reference.poses[theirs], _gaps(reference.keys)
+    elif reference.stamped:
         rows, poses, gaps = _at_stamps(record, reference, keys)
     else:
         _, rows, theirs = np.intersect1d(keys, reference.keys, return_indices=True)
@@ -68,7 +84,7 @@ def read_truth(source: str, record: GraphRecord, input_path: Path) -> Truth:
     first, last = np.searchsorted(reference.keys, [scored.min(), scored.max()])
     inside = gaps[(gaps > first) & (gaps <= last)] - first
     path = np.insert(reference.poses[first:last + 1], inside, np.nan, axis=0)
-    return Truth(rows, poses, path, reference.skipped)
+    return Truth(rows, poses, path, reference.skipped, steps)
 
 
 def _read(source: str, record: GraphRecord, input_path: Path) -> Reference:
@@ -86,23 +102,41 @@ def _at_stamps(record: GraphRecord, reference: Reference,
     """Return the keyframes that have truth, it, and before which true poses there is a gap."""
     if len(reference.keys) < 2:
         return np.zeros(0, np.int64), reference.poses[:0], np.zeros(0, np.int64)
-    steps = np.diff(reference.keys)
-    longest = max(_USUAL_STEPS * int(np.median(steps)), _SHORT)
     rows, poses = poses_at(record.graph.manifold, reference.keys, reference.poses, stamps,
-                           longest, _SAME_STAMP)
-    return rows, poses, np.flatnonzero(steps > longest) + 1
+                           _longest(reference.keys), _SAME_STAMP)
+    return rows, poses, _gaps(reference.keys)
+
+
+def _longest(stamps: Indices) -> int:
+    """Return how long a gap between some stamps is bridged [ns]."""
+    return max(_USUAL_STEPS * int(np.median(np.diff(stamps))), _SHORT)
+
+
+def _gaps(stamps: Indices) -> Indices:
+    """Return before which of some stamps there is a gap that is not bridged."""
+    return np.flatnonzero(np.diff(stamps) > _longest(stamps)) + 1
+
+
+def _sparser(true: Indices, own: Indices) -> bool:
+    """Tell whether there are fewer true stamps than own ones, of the time that has both."""
+    def between(stamps: Indices) -> int:
+        first, last = max(true[0], own[0]), min(true[-1], own[-1])
+        return int(((stamps >= first) & (stamps <= last)).sum())
+
+    return between(true) < between(own)
 
 
 def position_error(record: GraphRecord, poses: Array, truth: Truth) -> float:
     """Return the RMSE of the positions [m] of poses (n, p) after rigid alignment."""
     positions = record.graph.manifold.positions
-    return absolute_trajectory_error(positions(poses)[truth.rows], positions(truth.poses))
+    return absolute_trajectory_error(
+        positions(truth.estimate(record, poses)), positions(truth.poses))
 
 
 def true_path(record: GraphRecord, poses: Array, truth: Truth) -> Array:
     """Return the positions (l, k) of the true path, moved onto poses (n, p) as for the error."""
     positions = record.graph.manifold.positions
-    R, t = align(positions(truth.poses), positions(poses)[truth.rows])
+    R, t = align(positions(truth.poses), positions(truth.estimate(record, poses)))
     return positions(truth.path) @ R.T + t
 
 

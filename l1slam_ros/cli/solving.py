@@ -4,7 +4,7 @@
 import argparse
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,15 +40,16 @@ from l1slam_ros.io.sentences import (
 )
 
 if TYPE_CHECKING:
-    from l1slam_ros.core.scans.points import Points
+    from l1slam_ros.io.scans.to_graph import ScanMap
 
 
 def solve(arguments: argparse.Namespace) -> Ending:
     """Optimise a graph; print, write and draw what came out."""
     _check_outputs(arguments)
     asked = _asked(arguments)
-    record, points = _read(arguments)
-    truth = read_truth(arguments.reference, record, arguments.input) if (
+    record, made = _read(arguments)
+    truth = read_truth(
+        arguments.reference, record, arguments.input, made.path if made else None) if (
         arguments.reference) else None
     warnings = [*record.skipped, *(truth.skipped if truth else ())]
     warn(warnings, arguments.quiet)
@@ -67,8 +68,8 @@ def solve(arguments: argparse.Namespace) -> Ending:
         report['ate'] = position_error(record, outcome.solution.poses, truth)
         report['ate_poses'] = len(truth.rows)
     _write(arguments, record, outcome, truth, _cost_name(asked))
-    if arguments.grid:
-        _write_grid(arguments.grid, points, outcome)
+    if arguments.grid and made:
+        _write_grid(arguments.grid, made, outcome)
     if arguments.report:
         from l1slam_ros.cli.report.page import write_report
 
@@ -85,12 +86,12 @@ def solve(arguments: argparse.Namespace) -> Ending:
     return ending
 
 
-def _read(arguments: argparse.Namespace) -> tuple[GraphRecord, 'Sequence[Points] | None']:
-    """Return the graph, and what its keyframes saw where it is made of scans."""
+def _read(arguments: argparse.Namespace) -> tuple[GraphRecord, 'ScanMap | None']:
+    """Return the graph, and all that scans made where it is of scans."""
     if not (arguments.scans or formats.is_log(arguments.input)):
         return read(arguments, arguments.input, quiet=True), None
     made = read_scan_map(arguments, arguments.input, arguments.quiet, arguments.scans)
-    return made.record, made.points
+    return made.record, made
 
 
 def _remarks(outcome: Outcome) -> Iterator[str]:
@@ -116,11 +117,11 @@ def _write(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,
             drift=outcome.judgement.drift if outcome.judgement else 0.0), force=arguments.force)
 
 
-def _write_grid(path: Path, points: 'Sequence[Points] | None', outcome: Outcome) -> None:
+def _write_grid(path: Path, made: 'ScanMap', outcome: Outcome) -> None:
     from l1slam_ros.core.scans.grid import draw
     from l1slam_ros.io.scans.grid_file import write_grid
 
-    write_grid(path, draw(points or (), outcome.solution.poses))
+    write_grid(path, draw(made.points, outcome.solution.poses))
 
 
 def _solved(arguments: argparse.Namespace, record: GraphRecord, asked: SolveOptions) -> Outcome:

@@ -53,6 +53,17 @@ def test_a_log_becomes_a_map_and_a_grid_that_others_read(drive, truth, tmp_path,
     assert (y.min(), y.max()) == pytest.approx((0, WALLS[:, 1::2].max()), abs=0.2)
 
 
+def test_truth_that_is_sparser_than_the_map_is_compared_where_it_is(drive, tmp_path, capsys):
+    """Between two of its poses the robot turns a corner: what lies between them is no truth."""
+    log, truth = tmp_path / 'room.clf', tmp_path / 'truth.csv'
+    write_log(log, *drive[:2])
+    every = slice(3, -3, 16)
+    write_truth(truth, drive[0][every], drive[2][every])
+    code, said = solved(capsys, log, '--reference', truth)
+    assert code == 0 and said['ate'] < 0.1
+    assert said['ate_poses'] == len(drive[0][every])
+
+
 def test_the_scans_of_a_bag_make_the_same_map(drive, truth, tmp_path, capsys):
     bag = tmp_path / 'bag'
     write_scan_bag(bag, *drive[:2], mount=((0.0, 0.0, 0.3), (0.0, 0.0, 0.0, 1.0)))

@@ -21,6 +21,9 @@ from l1slam_ros.core.scans.odometry import ScanKeyframes, ScanOdometry, Step
 from l1slam_ros.core.scans.points import Mount, Scan, points_of
 from l1slam_ros.core.scans.submaps import Keyframe
 
+# Of so many comparisons that wait one more is made at a time.
+_MANY = 8
+
 
 @dataclass(frozen=True)
 class FrontEndOptions(Options):
@@ -74,12 +77,22 @@ class ScanFrontEnd:
         self._poses, self._spread = poses, spread
 
     def loops(self) -> list[ScanLoop]:
-        """Return what loops have been found since this was asked before."""
+        """
+        Look for loops for a while; return those found.
+
+        To be called after each scan: comparisons of keyframes take longer than anything else, so
+        that they wait for each other, and one is made at a call, more only where many wait.
+        """
         due = self._finder.due()
-        if not len(due):
-            return []
-        poses, spread = self._in_map()
-        return [loop for j in due for loop in self._finder.find(int(j), poses, spread)]
+        if len(due):
+            poses, spread = self._in_map()
+            for j in due:
+                self._finder.ask(int(j), poses, spread)
+        return self._finder.find(1 + self._finder.waiting // _MANY)
+
+    def last_loops(self) -> list[ScanLoop]:
+        """Make all comparisons that wait, for no scan will come; return the loops found."""
+        return self._finder.find(self._finder.waiting)
 
     def _in_map(self) -> tuple[Array, Array]:
         """Return all keyframes in the map (n, 3), those not placed by odometry, and `spread`."""

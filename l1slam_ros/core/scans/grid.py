@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans import kernels
@@ -35,12 +36,12 @@ class Grid:
     of cell (0, 0) [m]; resolution : [m]
     """
 
-    log_odds: Array
+    log_odds: NDArray[np.float32]
     origin: Array
     resolution: float
 
     @property
-    def occupancy(self) -> Array:
+    def occupancy(self) -> NDArray[np.int8]:
         """100 occupied, 0 free, -1 unknown, (a, b) int8, as nav_msgs/OccupancyGrid has it."""
         known = np.where(self.log_odds > OCCUPIED, 100, np.where(self.log_odds < FREE, 0, -1))
         return known.astype(np.int8)

@@ -10,6 +10,9 @@ import numpy as np
 
 from l1slam_ros.core.kernels.compiled import compiled, loop
 
+# Neighbourhoods of a point that are tried for a line, each half as wide as the one before.
+_WINDOWS = 3
+
 
 @loop('(f8[:, ::1], f8[::1], i8[::1], f8, f8)')
 def nearest_points(points, origin, shape, resolution, reach):
@@ -45,8 +48,8 @@ def normal_equations(points, normals, map_points, map_normals, nearest, origin, 
     The residual of a point p with the map's nearest point m and its normal n is n'(R p + t - m);
     its Jacobian is taken in the axes of the moving pose. Weights are Cauchy's, 1 / (1 + (e/s)^2).
 
-    gate : [m] farther points, and those whose normals differ by more than 45 degrees, do not match;
-    scale : s [m]
+    gate : [m] farther points, and those whose normals differ by more than 45 degrees, do not
+    match; scale : s [m]
 
     Returns
     -------
@@ -97,44 +100,58 @@ def normals_along(points, least_reach, widening, off):
     Return the normals of points that follow each other along a scan, (n, 2), turned to (0, 0).
 
     A line is fitted to the neighbours on both sides that hang together within `least_reach` [m],
-    or within `widening` of the range; zero where one side has none, or where the points are
-    further than `off` [m] from the line (RMS).
+    or within `widening` of the range; where they are further than `off` [m] from the line (RMS),
+    as at a corner, to those within half as much, and half of that. Zero where one side has none,
+    or there is no line.
     """
     n = len(points)
     normals = np.zeros((n, 2))
     for k in range(n):
-        first = last = k
-        range_ = np.sqrt(points[k, 0] ** 2 + points[k, 1] ** 2)
-        reach = max(least_reach, widening * range_)
-        while first > 0 and _near(points, first - 1, k, reach) and (
-                _near(points, first - 1, first, 0.5 * reach)):
-            first -= 1
-        while last < n - 1 and _near(points, last + 1, k, reach) and (
-                _near(points, last + 1, last, 0.5 * reach)):
-            last += 1
-        if first == k or last == k:
-            continue
-        count = last - first + 1
-        mx = my = 0.0
-        for j in range(first, last + 1):
-            mx += points[j, 0] / count
-            my += points[j, 1] / count
-        xx = xy = yy = 0.0
-        for j in range(first, last + 1):
-            dx, dy = points[j, 0] - mx, points[j, 1] - my
-            xx += dx * dx / count
-            xy += dx * dy / count
-            yy += dy * dy / count
-        half = 0.5 * (xx - yy)
-        least = 0.5 * (xx + yy) - np.sqrt(half * half + xy * xy)
-        if least > off * off:
-            continue
-        angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the line
-        nx, ny = -np.sin(angle), np.cos(angle)
-        if nx * points[k, 0] + ny * points[k, 1] > 0:
-            nx, ny = -nx, -ny
-        normals[k, 0], normals[k, 1] = nx, ny
+        reach = max(least_reach, widening * np.sqrt(points[k, 0] ** 2 + points[k, 1] ** 2))
+        linked = 0.5 * reach
+        for _ in range(_WINDOWS):
+            first, last = _window(points, k, reach, linked)
+            if first == k or last == k:
+                break
+            angle, least = _line(points, first, last)
+            if least <= off * off:
+                nx, ny = -np.sin(angle), np.cos(angle)
+                away = nx * points[k, 0] + ny * points[k, 1] > 0
+                normals[k, 0], normals[k, 1] = (-nx, -ny) if away else (nx, ny)
+                break
+            reach *= 0.5
     return normals
+
+
+@compiled
+def _window(points, k, reach, linked):
+    """Return the first and the last point around k within reach, none further than `linked`."""
+    first = last = k
+    while first > 0 and _near(points, first - 1, k, reach) and (
+            _near(points, first - 1, first, linked)):
+        first -= 1
+    while last < len(points) - 1 and _near(points, last + 1, k, reach) and (
+            _near(points, last + 1, last, linked)):
+        last += 1
+    return first, last
+
+
+@compiled
+def _line(points, first, last):
+    """Return the angle of the line through points, and their mean squared distance from it."""
+    count = last - first + 1
+    mx = my = 0.0
+    for j in range(first, last + 1):
+        mx += points[j, 0] / count
+        my += points[j, 1] / count
+    xx = xy = yy = 0.0
+    for j in range(first, last + 1):
+        dx, dy = points[j, 0] - mx, points[j, 1] - my
+        xx += dx * dx / count
+        xy += dx * dy / count
+        yy += dy * dy / count
+    half = 0.5 * (xx - yy)
+    return 0.5 * np.arctan2(2 * xy, xx - yy), 0.5 * (xx + yy) - np.sqrt(half * half + xy * xy)
 
 
 @compiled
@@ -155,90 +172,117 @@ def apart(points, spacing):
     return kept
 
 
-@loop('(f4[:, :, ::1], i8[::1], i8[:, :, ::1], i8[::1], i8[::1], f8, f8[::1])')
-def branch_and_bound(levels, margin, cells, lowest, highest, least, excluded):
+@loop('(f4[:, :, ::1], i8[::1], i8[:, :, ::1], i8[::1], i8[::1])')
+def widest_nodes(levels, margin, cells, lowest, highest):
     """
-    Return the best shift of a scan over a likelihood grid for any of its turns.
+    Return where a search begins: the nodes of the highest level, and bounds of their scores.
 
     levels : (h + 1, a, b) the likelihood, pooled over 1, 2, 4, ... cells; margin : (2,) cells of
     the grid before cell (0, 0) of the shifts; cells : (t, n, 2) cells of the points for each turn,
-    unshifted; lowest, highest : (2,) of the shifts, inclusive; least : score to beat; excluded :
-    (6,) turn, shift (2), how many turns and cells around it do not count, and after how many
-    turns they begin anew; fewer than no turns: nothing is excluded
+    unshifted; lowest, highest : (2,) of the shifts, inclusive
+
+    Returns
+    -------
+    nodes (k, 3): turn, column, row of each, and bounds (k,), the best one first
+
+    """
+    height = len(levels) - 1
+    width = 1 << height
+    across = (highest[0] - lowest[0]) // width + 1
+    along = (highest[1] - lowest[1]) // width + 1
+    nodes = np.empty((len(cells) * across * along, 3), np.int64)
+    scores = np.empty(len(nodes))
+    count = 0
+    for t in range(len(cells)):
+        for x in range(lowest[0], highest[0] + 1, width):
+            for y in range(lowest[1], highest[1] + 1, width):
+                nodes[count, 0], nodes[count, 1], nodes[count, 2] = t, x, y
+                scores[count] = _score(levels[height], margin, cells[t], x, y)
+                count += 1
+    order = np.argsort(-scores)
+    return nodes[order], scores[order]
+
+
+@loop('(f4[:, :, ::1], i8[::1], i8[:, :, ::1], i8[:, ::1], f8[::1], i8[::1], f8, f8[::1])')
+def branch_and_bound(levels, margin, cells, nodes, scores, highest, least, excluded):
+    """
+    Return the best shift of a scan over a likelihood grid for any of its turns.
+
+    levels, margin, cells, highest, nodes, scores : see `widest_nodes`; least : score to beat;
+    excluded : (6,) turn, shift (2), how many turns and cells around it do not count, and after how
+    many turns they begin anew; fewer than no turns: nothing is excluded
 
     Returns
     -------
     score, turn, column, row; turn -1: none beats `least`
 
-    Source: Hess, Kohler, Rapp, Andor, "Real-time loop closure in 2D LIDAR SLAM", 2016, Algorithm 3.
+    Source: Hess, Kohler, Rapp, Andor, "Real-time loop closure in 2D LIDAR SLAM", 2016,
+    Algorithm 3.
 
     """
     height = len(levels) - 1
-    width = 1 << height
     best, found = least, np.array([-1, 0, 0])
-    turns, n = cells.shape[0], cells.shape[1]
-    per_turn = ((highest[0] - lowest[0]) // width + 1) * ((highest[1] - lowest[1]) // width + 1)
-    scores = np.empty(turns * per_turn)
-    nodes = np.empty((turns * per_turn, 3), np.int64)
-    count = 0
-    for t in range(turns):
-        for x in range(lowest[0], highest[0] + 1, width):
-            for y in range(lowest[1], highest[1] + 1, width):
-                nodes[count, 0], nodes[count, 1], nodes[count, 2] = t, x, y
-                scores[count] = _score(levels[height], margin, cells[t], n, x, y)
-                count += 1
     stack = np.empty((4 * height + 4, 4), np.int64)
     bounds = np.empty(4 * height + 4)
-    for at in np.argsort(-scores[:count]):
+    for at in range(len(nodes)):
         if scores[at] <= best:
             break
-        stack[0, 0], stack[0, 1] = nodes[at, 0], nodes[at, 1]
-        stack[0, 2], stack[0, 3] = nodes[at, 2], height
-        bounds[0] = scores[at]
+        stack[0, :3] = nodes[at]
+        stack[0, 3], bounds[0] = height, scores[at]
         depth = 1
         while depth > 0:
             depth -= 1
             if bounds[depth] <= best:
                 continue
-            t, x, y, level = stack[depth, 0], stack[depth, 1], stack[depth, 2], stack[depth, 3]
-            if level == 0:
-                apart = abs(t - excluded[0])
-                far = (excluded[3] < 0 or min(apart, excluded[5] - apart) > excluded[3]
-                       or abs(x - excluded[1]) > excluded[4] or abs(y - excluded[2]) > excluded[4])
-                if far:
-                    best = bounds[depth]
-                    found[0], found[1], found[2] = t, x, y
-                continue
-            half = 1 << (level - 1)
-            first = depth
-            for dx in (0, half):
-                for dy in (0, half):
-                    if x + dx > highest[0] or y + dy > highest[1]:
-                        continue
-                    score = _score(levels[level - 1], margin, cells[t], n, x + dx, y + dy)
-                    if score <= best:
-                        continue
-                    place = depth
-                    while place > first and bounds[place - 1] > score:  # the best one on top
-                        bounds[place] = bounds[place - 1]
-                        for column in range(4):
-                            stack[place, column] = stack[place - 1, column]
-                        place -= 1
-                    bounds[place] = score
-                    stack[place, 0], stack[place, 1] = t, x + dx
-                    stack[place, 2], stack[place, 3] = y + dy, level - 1
-                    depth += 1
+            if stack[depth, 3] > 0:
+                depth = _branch(levels, margin, cells, highest, best, stack, bounds, depth)
+            elif _counts(stack[depth], excluded):
+                best = bounds[depth]
+                found[:] = stack[depth, :3]
     return best, found[0], found[1], found[2]
 
 
 @compiled
-def _score(likelihood, margin, cells, n, x, y):
+def _branch(levels, margin, cells, highest, best, stack, bounds, depth):
+    """Put the quarters of a node in its place on the stack, the best one on top; return depth."""
+    t, x, y, level = stack[depth, 0], stack[depth, 1], stack[depth, 2], stack[depth, 3] - 1
+    half, first = 1 << level, depth
+    for dx in (0, half):
+        for dy in (0, half):
+            if x + dx > highest[0] or y + dy > highest[1]:
+                continue
+            score = _score(levels[level], margin, cells[t], x + dx, y + dy)
+            if score <= best:
+                continue
+            place = depth
+            while place > first and bounds[place - 1] > score:
+                bounds[place] = bounds[place - 1]
+                stack[place] = stack[place - 1]
+                place -= 1
+            bounds[place] = score
+            stack[place, 0], stack[place, 1] = t, x + dx
+            stack[place, 2], stack[place, 3] = y + dy, level
+            depth += 1
+    return depth
+
+
+@compiled
+def _counts(node, excluded):
+    """Tell whether a node is outside what is excluded."""
+    turns = abs(node[0] - excluded[0])
+    return (excluded[3] < 0 or min(turns, excluded[5] - turns) > excluded[3]
+            or abs(node[1] - excluded[1]) > excluded[4]
+            or abs(node[2] - excluded[2]) > excluded[4])
+
+
+@compiled
+def _score(likelihood, margin, cells, x, y):
     total = 0.0
-    for k in range(n):
+    for k in range(len(cells)):
         column, row = cells[k, 0] + x + margin[0], cells[k, 1] + y + margin[1]
         if 0 <= column < likelihood.shape[0] and 0 <= row < likelihood.shape[1]:
             total += likelihood[column, row]
-    return total / n
+    return total / len(cells)
 
 
 @loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8)')

@@ -14,6 +14,7 @@ without a guess, matched, and believed only if
 What is sent is a proposal: the back end doubts it as any other loop.
 """
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -42,7 +43,7 @@ _SIGMAS = 3.0
 # [m/m], [rad/m] How the odometry's error grows with the way, beyond where the map is known.
 _DRIFT = np.array((0.05, 0.01))
 # What a loop must show; see above.
-_SCORE, _RIVAL, _OVERLAP, _AGREE, _HELD = 0.42, 0.85, 0.3, 0.85, 0.1
+_SCORE, _RIVAL, _OVERLAP, _AGREE, _HELD = 0.42, 0.85, 0.3, 0.93, 0.05
 # [m] A match that goes so far from the peak of the search slides.
 _WANDER = 0.4
 # [m] A ray that passes a point by so much contradicts it.
@@ -75,6 +76,17 @@ class ScanLoop:
     score: float
 
 
+@dataclass(frozen=True)
+class _Comparison:
+    """Keyframe j is to be looked for so far from a pose (3,), seen from i [m], [rad]."""
+
+    i: int
+    j: int
+    expected: Array
+    reach: float
+    turn: float
+
+
 class LoopFinder:
     """
     Finds loops among keyframes as they come.
@@ -91,6 +103,7 @@ class LoopFinder:
         self._submaps = Submaps(keyframes)
         self._asked = AROUND
         self._looks: list[Array] = []
+        self._waiting: deque[_Comparison] = deque()
 
     def due(self) -> Indices:
         """Return the keyframes that may ask now: their submaps are whole."""
@@ -101,9 +114,9 @@ class LoopFinder:
         asking = np.arange(first, end)
         return asking[asking % _EVERY == 0]
 
-    def find(self, j: int, poses: Array, spread: Array) -> list[ScanLoop]:
+    def ask(self, j: int, poses: Array, spread: Array) -> None:
         """
-        Return the loops from keyframe j to earlier ones.
+        Choose the earlier keyframes that keyframe j is to be compared with.
 
         poses : (n, 3) of the keyframes in the map, at least j + 1; spread : (n, 2) standard
         deviation of where each lies from the last one placed [m], [rad]; see `_sigma`
@@ -113,19 +126,29 @@ class LoopFinder:
         sigma = self._sigma(j, spread)
         reach = np.clip(_SIGMAS * sigma[:, 0], _LEAST_REACH, _MOST_REACH)
         turn = np.clip(_SIGMAS * sigma[:, 1], _LEAST_TURN, np.pi)
-        loops = []
         for i, alike in self._candidates(j, poses, reach):
             expected = se2.between(poses[i][None], poses[j][None])[0]
-            loop = (self._compare(i, j, np.array([0.0, 0.0, expected[2]]), _ALIKE_REACH, np.pi)
-                    if alike else self._compare(i, j, expected, float(reach[i]), float(turn[i])))
-            if loop is not None:
-                loops.append(loop)
-        return loops
+            if alike:
+                around = np.array([0.0, 0.0, expected[2]])
+                self._waiting.append(_Comparison(i, j, around, _ALIKE_REACH, np.pi))
+            else:
+                self._waiting.append(
+                    _Comparison(i, j, expected, float(reach[i]), float(turn[i])))
+
+    @property
+    def waiting(self) -> int:
+        """How many comparisons are still to be made."""
+        return len(self._waiting)
+
+    def find(self, most: int) -> list[ScanLoop]:
+        """Make so many of the comparisons that wait; return the loops that they found."""
+        made = [self._compare(self._waiting.popleft()) for _ in range(min(most, self.waiting))]
+        return [loop for loop in made if loop is not None]
 
     def _sigma(self, j: int, spread: Array) -> Array:
         """Return how far keyframe j may lie from where the map has it, seen from each, (j, 2)."""
         way = np.array([self._keyframes[j].travelled - k.travelled for k in self._keyframes[:j]])
-        known = spread.any(axis=1)
+        known = spread[:, 0] > 0
         placed = int(np.flatnonzero(known)[-1]) if known.any() else -1
         since = self._keyframes[j].travelled - (
             self._keyframes[placed].travelled if 0 <= placed < j else np.inf)
@@ -160,11 +183,12 @@ class LoopFinder:
                 chosen.append((int(i), alike))
                 taken += 1
 
-    def _compare(self, i: int, j: int, expected: Array, reach: float, turn: float
-                 ) -> ScanLoop | None:
+    def _compare(self, asked: '_Comparison') -> ScanLoop | None:
         """Return the loop from i to j, None: they are not seen to be one place."""
+        i, j = asked.i, asked.j
         reference, asking = self._submaps[i], self._submaps[j]
-        peak = search(reference.field, asking.xy, expected, reach, turn, _SCORE, _RIVAL)
+        peak = search(reference.field, asking.xy, asked.expected, asked.reach, asked.turn, _SCORE,
+                      _RIVAL)
         if peak is None or peak.second > _RIVAL * peak.score:
             return None
         found = match(reference.field, asking.xy, asking.normals, peak.pose, widest=0.3)

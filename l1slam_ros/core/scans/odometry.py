@@ -32,8 +32,8 @@ _MAP = 4
 _MATCHED, _GATE = 0.4, 16.27
 # So much of a scan must find the map where it was searched for, and no other place come so near.
 _FOUND, _RIVAL = 0.6, 0.85
-# [m], [rad] How far from half the wheels' motion is searched, at least and at most; between, as far
-# as wheels that turned the other way would be off.
+# [m], [rad] How far from half the wheels' motion is searched, at least and at most; between, as
+# far as wheels that turned the other way would be off.
 _SEARCH, _SEARCH_TURN, _MOST_SEARCH, _MOST_TURN = 0.3, 0.3, 1.5, 0.8
 # How far from the peak of a search the scan may be, where its surfaces do not say [m, m, rad].
 _NEAR_PEAK = np.diag(1 / np.array((0.2, 0.2, 0.1)) ** 2)
@@ -44,8 +44,8 @@ _SEARCHED = np.diag((0.1, 0.1, 0.05)) ** 2
 _FEWEST, _LOST_AFTER = 30, 6
 # Wheels: part of the way and of the turn, turn for each metre, and of each scan [m, rad].
 _WAY, _TURN, _TURN_OF_WAY, _STEP, _STEP_TURN = 0.3, 0.2, 0.3, 0.01, 0.01
-# After scans and wheels disagreed, for so many scans the wheels may be wrong by twice their motion:
-# where a driver loses the sign of wheels that turn backwards, it does for a while.
+# After scans and wheels disagreed, for so many scans the wheels may be wrong by twice their
+# motion: where a driver loses the sign of wheels that turn backwards, it does for a while.
 _DISTRUST, _WRONG = 25, 2.0
 # Errors of a match that no count of points lessens: of the map, of normals [m, m, rad].
 FLOOR = np.diag((0.005, 0.005, 0.002)) ** 2
@@ -125,7 +125,7 @@ class ScanOdometry:
         """Find the pose at a scan from what the wheels expect; return what is to be said."""
         xy, normals = points.surface
         assert self._field is not None
-        information = np.linalg.inv(predicted)
+        information: Array = np.linalg.inv(predicted).astype(float)
         found = match(self._field, xy, normals, expected, expected, information)
         off = se2.local(expected[None], found.pose[None])[0]
         said, floor = '', 0 * FLOOR

@@ -93,7 +93,7 @@ def points_of(scan: Scan, mount: Mount = Mount(),  # noqa: B008
     xy = np.stack((mount.x + reach * np.cos(angles), mount.y + reach * np.sin(angles)), axis=1)
     centre = np.array([mount.x, mount.y])
     if velocity is not None and scan.time_increment:
-        xy = _at_stamp(xy, velocity, scan.time_increment * np.arange(len(ranges)))
+        xy = _at_stamp(xy, velocity, scan.time_increment * np.arange(0.0, len(ranges)))
     view = _view(np.where(hit, ranges, np.inf)[looked], angles[looked])
     seen = np.ascontiguousarray(xy[hit])
     if len(seen):
@@ -118,7 +118,7 @@ def _view(ranges: Array, angles: Array) -> Array:
     at = np.floor(angles / (2 * np.pi) * _BEARINGS).astype(np.int64) % _BEARINGS
     np.fmin.at(view, at, ranges)
     # A bearing between two rays is seen by both.
-    width = max(1, round(_BEARINGS * _spacing_of(angles) / (2 * np.pi)))
+    width = 1 + int(_BEARINGS * _spacing_of(angles) / (2 * np.pi) + 1e-6)
     for _ in range(width - 1):
         follower = np.roll(view, 1)
         view = np.where(np.isnan(view), follower, view)

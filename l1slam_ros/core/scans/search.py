@@ -12,7 +12,6 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans import kernels
 from l1slam_ros.core.scans.field import RESOLUTION, Field
-from l1slam_ros.core.scans.points import rotated
 
 # [rad] Step of the turns: at 4 m a cell.
 TURN = 0.025
@@ -43,18 +42,20 @@ def search(field: Field, xy: Array, centre: Array, reach: float, turn: float, le
         return None
     xy = xy[np.linspace(0, len(xy) - 1, min(len(xy), _MOST_POINTS)).astype(np.int64)]
     turns = np.arange(-int(turn / TURN), int(turn / TURN) + 1) * TURN + centre[2]
-    cells = np.stack([np.floor((rotated(np.array([0, 0, a]), xy) + centre[:2] - field.origin)
-                               / RESOLUTION) for a in turns]).astype(np.int64)
+    c, s = np.cos(turns), np.sin(turns)
+    R = np.moveaxis(np.array([[c, s], [-s, c]]), 2, 0)
+    cells = np.floor((xy @ R + (centre[:2] - field.origin)) / RESOLUTION).astype(np.int64)
     levels, margin = field.levels
     most = np.full(2, int(reach / RESOLUTION))
     nothing = np.full(6, -1.0)
+    nodes, scores = kernels.widest_nodes(levels, margin, cells, -most, most)
     score, at, dx, dy = kernels.branch_and_bound(
-        levels, margin, cells, -most, most, least, nothing)
+        levels, margin, cells, nodes, scores, most, least, nothing)
     if at < 0:
         return None
     around = np.array([at, dx, dy, _SAME_TURN / TURN, _SAME / RESOLUTION,
                        2 * np.pi / TURN])
     second, other, *_ = kernels.branch_and_bound(
-        levels, margin, cells, -most, most, rival * score, around)
+        levels, margin, cells, nodes, scores, most, rival * score, around)
     pose = np.array([*(centre[:2] + RESOLUTION * np.array([dx, dy])), turns[at]])
     return Peak(pose, score, second if other >= 0 else 0.0)

@@ -66,7 +66,7 @@ class Submap:
         sector = np.floor((np.arctan2(y, x) / (2 * np.pi)) * _SECTORS).astype(np.int64) % _SECTORS
         seen = np.zeros((_RINGS, _SECTORS))
         np.add.at(seen, (ring, sector), 1.0)
-        spectrum = abs(np.fft.rfft(np.sqrt(seen), axis=1)).ravel()
+        spectrum: Array = np.abs(np.fft.rfft(np.sqrt(seen), axis=1)).astype(float).ravel()
         return spectrum / max(float(np.linalg.norm(spectrum)), 1e-12)
 
 

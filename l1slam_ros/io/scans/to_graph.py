@@ -19,11 +19,13 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.innovation import sample_posterior
 from l1slam_ros.core.scans.front_end import FrontEndOptions, ScanFrontEnd
+from l1slam_ros.core.scans.loops import ScanLoop
 from l1slam_ros.core.scans.odometry import Step
 from l1slam_ros.core.scans.points import Mount, Points, Scan
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.scans.scan_path import ScanPath
 
 # The map is made anew for each loop while there are few, later for so much more of them.
 _MORE_LOOPS = 0.1
@@ -31,10 +33,11 @@ _MORE_LOOPS = 0.1
 
 @dataclass(frozen=True)
 class ScanMap:
-    """The graph that scans make, and what each of its keyframes saw."""
+    """The graph that scans make, what each of its keyframes saw, and the way of all scans."""
 
     record: GraphRecord
     points: list[Points]
+    path: ScanPath
 
 
 def map_scans(scans: Iterable[tuple[Scan, Array]], mount: Mount,
@@ -51,39 +54,68 @@ def map_scans(scans: Iterable[tuple[Scan, Array]], mount: Mount,
     options : of the front end
 
     """
-    front_end = ScanFrontEnd(options, mount)
-    graph, mapped, loops, said = FactorGraph(se2), 0, 0, list[str]()
+    made = _Making(ScanFrontEnd(options, mount))
     for count, (scan, wheels) in enumerate(scans, 1):
-        step = front_end.add(scan, wheels)
+        if made.take(scan, wheels):
+            report(count, made.loops)
+    return made.finished()
+
+
+class _Making:
+    """A graph that grows with the scans."""
+
+    def __init__(self, front_end: ScanFrontEnd):
+        self.loops = 0
+        self._front_end, self._graph = front_end, FactorGraph(se2)
+        self._mapped = 0  # loops in the map that the front end knows
+        self._said: list[str] = []
+        self._stamps: list[int] = []
+        self._poses: list[Array] = []
+        self._last: list[int] = []
+
+    def take(self, scan: Scan, wheels: Array) -> bool:
+        """Take a scan; tell whether it is a keyframe."""
+        step = self._front_end.add(scan, wheels)
         if step.said:
-            said.append(step.said)
-        if step.keyframe is None:
-            continue
-        _append(graph, front_end, step)
-        for loop in front_end.loops():
-            loops += 1
-            graph.append_between(
+            self._said.append(step.said)
+        if step.keyframe is not None:
+            self._append(step)
+        self._stamps.append(scan.stamp)
+        self._poses.append(step.pose)
+        self._last.append(self._graph.n_poses - 1)
+        self._add(self._front_end.loops())
+        if self.loops > (1 + _MORE_LOOPS) * self._mapped:
+            self._mapped = self.loops
+            self._front_end.place(*_mapped(self._graph))
+        return step.keyframe is not None
+
+    def _append(self, step: Step) -> None:
+        """Append the newest keyframe, and its odometry where it goes on from the one before."""
+        keyframes = self._front_end.keyframes
+        if len(keyframes) < 2 or keyframes[-1].part != keyframes[-2].part:
+            self._graph.add_poses(1)
+            return
+        motion = se2.between(keyframes[-2].pose[None], keyframes[-1].pose[None])
+        self._graph.append_step(motion, root_of_inverse(step.covariance[None]))
+
+    def _add(self, loops: list[ScanLoop]) -> None:
+        self.loops += len(loops)
+        for loop in loops:
+            self._graph.append_between(
                 np.array([loop.i]), np.array([loop.j]), loop.measurement[None],
                 root_of_inverse(loop.covariance[None]))
-        if loops > (1 + _MORE_LOOPS) * mapped:
-            mapped = loops
-            front_end.place(*_mapped(graph))
-        report(count, loops)
-    stamps = np.array([keyframe.stamp for keyframe in front_end.keyframes], np.int64)
-    sentences = [f'{sentence} ({counted(said.count(sentence), "time")})'
-                 for sentence in dict.fromkeys(said)]
-    return ScanMap(GraphRecord(graph, None, np.arange(graph.n_poses), stamps, tuple(sentences)),
-                   [keyframe.points for keyframe in front_end.keyframes])
 
-
-def _append(graph: FactorGraph, front_end: ScanFrontEnd, step: Step) -> None:
-    """Append the newest keyframe, and its odometry where it goes on from the one before."""
-    keyframes = front_end.keyframes
-    if len(keyframes) < 2 or keyframes[-1].part != keyframes[-2].part:
-        graph.add_poses(1)
-        return
-    motion = se2.between(keyframes[-2].pose[None], keyframes[-1].pose[None])
-    graph.append_step(motion, root_of_inverse(step.covariance[None]))
+    def finished(self) -> ScanMap:
+        """Return what was made; no scan comes any more."""
+        self._add(self._front_end.last_loops())
+        keyframes = self._front_end.keyframes
+        stamps = np.array([keyframe.stamp for keyframe in keyframes], np.int64)
+        said = tuple(f'{sentence} ({counted(self._said.count(sentence), "time")})'
+                     for sentence in dict.fromkeys(self._said))
+        record = GraphRecord(self._graph, None, np.arange(self._graph.n_poses), stamps, said)
+        path = ScanPath(np.array(self._stamps, np.int64), np.array(self._poses).reshape(-1, 3),
+                        np.array(self._last, np.int64))
+        return ScanMap(record, [keyframe.points for keyframe in keyframes], path)
 
 
 def _mapped(graph: FactorGraph) -> tuple[Array, Array]:

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a robot was between keyframes: the odometry of all its scans."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.alignment import poses_at
+from l1slam_ros.core.geometry.manifold import Array, Indices
+
+
+@dataclass(frozen=True)
+class ScanPath:
+    """
+    The scan-matched odometry.
+
+    stamps : (n,) of the scans [ns], rising; poses : (n, 3) in the frame of the odometry;
+    keyframes : (n,) the last keyframe at each
+    """
+
+    stamps: Indices
+    poses: Array
+    keyframes: Indices
+
+    def steps_at(self, at: Indices, longest: int, tolerance: int
+                 ) -> tuple[Indices, Indices, Array]:
+        """
+        Return where the robot was at some times, seen from its keyframes.
+
+        Parameters
+        ----------
+        at : (m,) times [ns]
+        longest, tolerance : see `poses_at`
+
+        Returns
+        -------
+        rows (k,) of `at` that scans surround, the last keyframe (k,) at each, and the pose there
+        in the axes of that keyframe (k, 3)
+
+        """
+        if len(self.stamps) < 2:
+            return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3))
+        rows, poses = poses_at(se2, self.stamps, self.poses, at, longest, tolerance)
+        before = np.searchsorted(self.stamps, at[rows], side='right') - 1
+        keyframes = self.keyframes[np.clip(before, 0, len(self.stamps) - 1)]
+        first = np.unique(self.keyframes, return_index=True)[1]
+        return rows, keyframes, se2.between(self.poses[first[keyframes]], poses)

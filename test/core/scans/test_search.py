@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A search finds a scan from far, and is silent where two places look the same."""
+
+import numpy as np
+import pytest
+from rooms import WALLS, box, scan_at
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.scans.field import RESOLUTION, Field
+from l1slam_ros.core.scans.points import points_of
+from l1slam_ros.core.scans.search import TURN, search
+
+HERE = np.array([1.5, 1.5, 0.3])
+
+
+def surface(pose, walls=WALLS, seed=0):
+    return points_of(scan_at(pose, np.random.default_rng(seed), walls)).surface
+
+
+@pytest.mark.parametrize('there', [(2.2, 1.1, 2.0), (3.0, 1.2, -1.5), (1.0, 2.0, 0.3)])
+def test_a_scan_is_found_from_far(there):
+    field = Field.of(*surface(HERE))
+    expected = se2.between(HERE[None], np.array([there]))[0]
+    peak = search(field, surface(there, seed=1)[0], np.array([1.5, -1, 0]), 4.0, np.pi, 0.3, 0.85)
+    off = se2.between(expected[None], peak.pose[None])[0]
+    assert np.hypot(*off[:2]) < 1.5 * RESOLUTION and abs(off[2]) < 1.5 * TURN
+    assert peak.second < 0.85 * peak.score
+
+
+def test_it_is_the_best_of_all_shifts_and_turns():
+    """Branch and bound leaves out nothing: it agrees with trying each."""
+    field = Field.of(*surface(HERE))
+    xy = surface((2.0, 1.3, 0.8), seed=1)[0][::4]
+    peak = search(field, xy, np.zeros(3), 1.0, 0.7, 0.05, 0.85)
+    best = 0.0
+    for turn in np.arange(-28, 29) * TURN:
+        c, s = np.cos(turn), np.sin(turn)
+        turned = xy @ np.array([[c, s], [-s, c]])
+        cells = np.floor((turned - field.origin) / RESOLUTION).astype(int)
+        for dx in range(-10, 11):
+            for dy in range(-10, 11):
+                a, b = (cells + (dx, dy)).T
+                inside = (a >= 0) & (b >= 0) & (a < field.likelihood.shape[0]) & (
+                    b < field.likelihood.shape[1])
+                score = field.likelihood[a[inside], b[inside]].sum() / len(xy)
+                best = max(best, float(score))
+    assert peak.score == pytest.approx(best, abs=1e-6)
+
+
+def test_of_two_equal_rooms_it_cannot_tell_which():
+    rooms = np.concatenate((box(0, 0, 3, 2), box(4, 0, 7, 2)))
+    xy, normals = (np.concatenate(parts) for parts in zip(
+        *(surface((x, 1.0, 0.0), rooms) for x in (1.5, 5.5)), strict=True))
+    # The second scan in the frame of the first: it was 4 m ahead.
+    half = len(surface((1.5, 1.0, 0.0), rooms)[0])
+    xy[half:, 0] += 4.0
+    peak = search(Field.of(xy, normals), surface((1.7, 1.1, 0.0), rooms, 1)[0],
+                  np.array([2.0, 0, 0]), 3.0, 0.5, 0.3, 0.85)
+    assert peak.second > 0.85 * peak.score
+    alone = search(Field.of(xy[:half], normals[:half]), surface((1.7, 1.1, 0.0), rooms, 1)[0],
+                   np.array([2.0, 0, 0]), 3.0, 0.5, 0.3, 0.85)
+    assert alone.second < 0.85 * alone.score
+
+
+def test_what_fits_nowhere_is_not_found():
+    field = Field.of(*surface(HERE))
+    noise = np.random.default_rng(0).uniform(-3, 3, (100, 2))
+    assert search(field, noise, np.zeros(3), 2.0, 1.0, 0.6, 0.85) is None
+    nothing = np.zeros((0, 2))
+    assert search(field, nothing, np.zeros(3), 1.0, 1.0, 0.1, 0.85) is None
+    assert search(Field.of(nothing, nothing), noise, np.zeros(3), 1.0, 1.0, 0.1, 0.85) is None
