@@ -14,8 +14,8 @@ pytest.importorskip('rclpy')
 from l1slam_ros.core.errors import MessageError, OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import OdometrySample
-from l1slam_ros.core.running.backend import Backend, BackendOptions
 from l1slam_ros.core.options import dotted, flatten
+from l1slam_ros.core.running.backend import Backend, BackendOptions
 from l1slam_ros.core.scans.odometry import ScanKeyframes, Step
 from l1slam_ros.core.scans.points import Mount, Scan
 from l1slam_ros.core.scans.submaps import Keyframe

@@ -10,21 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-<<<<<<< HEAD
-from l1slam_ros.core.scans.grid import Grid
-from l1slam_ros.io.files import replacing, write_lines
-=======
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.scans.grid import Grid
 from l1slam_ros.io.files import replacing, require_file, write_lines
 from l1slam_ros.io.ours import MARK, marked, refuse_others
->>>>>>> scans
 
 _FREE, _UNKNOWN, _OCCUPIED = 254, 205, 0
+# A shade is read as (255 - shade) / 255 occupied: 205 is .19608, which .25 would call free.
+_FREE_BELOW = 0.196
 
 
-<<<<<<< HEAD
-=======
 def beside(path: Path) -> Path:
     """Return the name of the .yaml of a .pgm."""
     return path.with_suffix('.yaml')
@@ -39,7 +34,6 @@ def check_grid(path: Path, inputs: list[Path], force: bool = False) -> None:
     refuse_others((path, beside(path)), inputs, force)
 
 
->>>>>>> scans
 def write_grid(path: Path, grid: Grid) -> None:
     """
     Write a grid: `path` with the suffix .pgm, and the .yaml beside it, each whole or not at all.
@@ -54,18 +48,9 @@ def write_grid(path: Path, grid: Grid) -> None:
     picture = np.ascontiguousarray(shade.astype(np.uint8).T[::-1])
     height, width = picture.shape
     with replacing(path) as temporary:
-<<<<<<< HEAD
-        temporary.write_bytes(f'P5\n{width} {height}\n255\n'.encode() + picture.tobytes())
-    x, y = grid.origin.tolist()
-    write_lines(path.with_suffix('.yaml'), [
-        f'image: {path.name}', 'mode: trinary', f'resolution: {grid.resolution}',
-        f'origin: [{x:.6f}, {y:.6f}, 0.0]', 'negate: 0', 'occupied_thresh: 0.65',
-        'free_thresh: 0.25'])
-=======
         temporary.write_bytes(f'P5\n{MARK}\n{width} {height}\n255\n'.encode() + picture.tobytes())
     x, y = grid.origin.tolist()
     write_lines(beside(path), marked([
         f'image: {path.name}', 'mode: trinary', f'resolution: {grid.resolution}',
         f'origin: [{x:.6f}, {y:.6f}, 0.0]', 'negate: 0', 'occupied_thresh: 0.65',
-        'free_thresh: 0.25']))
->>>>>>> scans
+        f'free_thresh: {_FREE_BELOW}']))
