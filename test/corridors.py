@@ -6,7 +6,7 @@ import numpy as np
 from l1slam_ros.core.geometry import se2
 
 RAYS = 360
-# x0, y0, x1, y1 of walls [m]: a ring of corridors with doors, niches and pillars, none like another.
+# x0, y0, x1, y1 of walls [m]: a ring of corridors with doors and pillars, none like another.
 WALLS = np.array([
     (0, 0, 14, 0), (14, 0, 14, 9), (14, 9, 0, 9), (0, 9, 0, 0),
     (3, 3, 6, 3), (7, 3, 11, 3), (11, 3, 11, 6), (11, 6, 4.5, 6), (3, 6, 3, 3),

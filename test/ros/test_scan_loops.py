@@ -17,7 +17,7 @@ from node_bench import poses_of
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from rooms import RAYS, by_wheels, laps, ranges_from
+from corridors import RAYS, by_wheels, laps, ranges_from
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Trigger
 

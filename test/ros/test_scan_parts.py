@@ -123,7 +123,7 @@ def test_the_back_end_has_the_keyframes_of_the_scans_and_what_they_know(rng):
             keyframes.append(stamp)
             stated.append(step.covariance)
     now = backend.snapshot()
-    assert now.stamps.tolist() == keyframes and len(keyframes) > 7
+    assert now.stamps.tolist() == keyframes and len(keyframes) > 5
     factors = now.graph.between
     found = np.linalg.inv(np.einsum('mki,mkj->mij', factors.sqrt_information[:],
                                     factors.sqrt_information[:]))
@@ -160,7 +160,7 @@ def test_a_new_part_is_a_gap_to_the_back_end():
     now = backend.snapshot()
     assert now.stamps.tolist() == [(k + 1) * S // 10 for k in (0, 5, 10, 15, 20, 25)]
     assert len(now.graph.between) == 4
-    assert backend.told()['new_part'] == 1
+    assert backend.counts().told['new_part'] == 1
 
 
 def transform(parent, child, pose3):

@@ -67,10 +67,10 @@ class LiveGrid:
     def grid(self) -> Grid:
         """Return a copy of all that has ever been drawn on."""
         if not np.isfinite(self._low).all():
-            return Grid(np.zeros((1, 1)), np.zeros(2), self._resolution)
+            return Grid(np.zeros((1, 1), np.float32), np.zeros(2), self._resolution)
         first = np.floor((self._low - self._origin) / self._resolution).astype(int)
         end = np.floor((self._high - self._origin) / self._resolution).astype(int) + 1
-        part = self._log_odds[first[0] : end[0], first[1] : end[1]].astype(float)
+        part = self._log_odds[first[0] : end[0], first[1] : end[1]].astype(np.float32)
         return Grid(part, self._origin + first * self._resolution, self._resolution)
 
     def _cast(self, points: Points, pose: Array, sign: int) -> None:
