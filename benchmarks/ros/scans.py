@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A laser log over DDS, faster than it was driven: the map of `scan_loops` and `backend`.
+
+    python benchmarks/ros/scans.py LOG TRUTH [RATE]
+
+LOG is a CARMEN log, TRUTH a table of `stamp,x,y,theta`. Both nodes run as shipped, each a process
+of its own; the log is sent as LaserScan and Odometry, so many scans a second. Said is how many
+scans were used and left out, what each process took of a core for a scan, its memory, and the
+error of the Path to the truth at the truth's stamps.
+"""
+
+import csv
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
+from peer import arguments, cpu_seconds
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import LaserScan
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.io.messages.conversion import stamp_of
+from l1slam_ros.io.scans.carmen import read_carmen
+from l1slam_ros.ros.demo import executable
+from l1slam_ros.ros.publishing import header
+
+RATE = 40.0
+# Both nodes' parameters.
+_SHIPPED = Path(__file__).parents[2] / 'config' / 'scan_loops.yaml'
+_COMPILING, _END = 60.0, 30.0  # [s] nothing is sent before; the map may change after the last
+
+
+def main() -> None:
+    """Measure and print."""
+    given = arguments(__doc__, log=Path, truth=Path, rate=RATE)
+    log = read_carmen(given.log)
+    rclpy.init()
+    node = rclpy.create_node('laser')
+    maps: list[PathMessage] = []
+    node.create_subscription(PathMessage, 'path', maps.append, QoSProfile(
+        depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    scans = node.create_publisher(LaserScan, 'scan', qos_profile_sensor_data)
+    wheels = node.create_publisher(Odometry, 'odom', QoSProfile(depth=1000))
+    files = ['--ros-args', '--params-file', str(_SHIPPED), '--log-level', 'error']
+    mount = ','.join(f'{v:g}' for v in (log.mount.x, log.mount.y, log.mount.yaw))
+    nodes = [subprocess.Popen([executable(name), *files, *more]) for name, more in (
+        ('scan_loops', ['-p', f"laser_pose:='{mount}'"]), ('backend', ['-r', 'odom:=scan_odom']))]
+    try:
+        _listen(node, _COMPILING)
+        before = [cpu_seconds(process.pid) for process in nodes]
+        due = time.monotonic()
+        for scan, pose in zip(log.scans, log.wheels, strict=True):
+            scans.publish(_scan(scan))
+            wheels.publish(_wheels(scan.stamp, pose))
+            due += 1 / given.rate
+            _listen(node, due - time.monotonic())
+        _listen(node, _END)
+        spent = [cpu_seconds(process.pid) - first
+                 for process, first in zip(nodes, before, strict=True)]
+        for name, seconds, process in zip(('scan_loops', 'backend'), spent, nodes, strict=True):
+            print(f'{name}: {1e3 * seconds / len(log.scans):.2f} ms of a core for a scan, '
+                  f'{_memory(process.pid):.0f} MB')
+        print(f'{len(log.scans)} scans, {len(maps[-1].poses)} keyframes, '
+              f'{_error(maps[-1], given.truth):.3f} m from the truth')
+    finally:
+        for process in nodes:
+            process.terminate()
+            process.wait()
+
+
+def _listen(node: object, seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        rclpy.spin_once(node, timeout_sec=left)
+
+
+def _scan(scan: object) -> LaserScan:
+    return LaserScan(
+        header=header('laser', scan.stamp), angle_min=scan.angle_min,
+        angle_increment=scan.angle_increment, time_increment=scan.time_increment,
+        angle_max=scan.angle_min + scan.angle_increment * (len(scan.ranges) - 1),
+        range_min=scan.range_min, range_max=min(scan.range_max, 1e3), ranges=scan.ranges.tolist())
+
+
+def _wheels(stamp: int, pose: np.ndarray) -> Odometry:
+    message = Odometry(header=header('odom', stamp), child_frame_id='base_link')
+    x, y, z, *q = se2.to_pose3(pose[None])[0].tolist()
+    position, turn = message.pose.pose.position, message.pose.pose.orientation
+    position.x, position.y, position.z, (turn.x, turn.y, turn.z, turn.w) = x, y, z, q
+    return message
+
+
+def _memory(process: int) -> float:
+    with open(f'/proc/{process}/status') as file:
+        (line,) = (line for line in file if line.startswith('VmHWM'))
+    return int(line.split()[1]) / 1024
+
+
+def _error(path: PathMessage, truth: Path) -> float:
+    """Return the RMSE of positions [m] at the truth's stamps, between keyframes by the line."""
+    with truth.open() as file:
+        rows = [[float(value) for value in row.values()] for row in csv.DictReader(file)]
+    known = np.array(rows)
+    stamps = np.array([stamp_of(pose.header) for pose in path.poses]) / 1e9
+    places = np.array([(p.pose.position.x, p.pose.position.y) for p in path.poses])
+    known = known[(known[:, 0] >= stamps[0]) & (known[:, 0] <= stamps[-1])]
+    found = np.stack([np.interp(known[:, 0], stamps, values) for values in places.T], axis=1)
+    return absolute_trajectory_error(found, known[:, 1:3])
+
+
+if __name__ == '__main__':
+    sys.exit(main())
