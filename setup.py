@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The package's metadata; package.xml repeats what rosdep and colcon read, a test compares."""
+"""The package's metadata; the version is that of package.xml, a test compares the rest with it."""
 
 import sys
 from glob import glob
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -19,12 +20,12 @@ data_files = [
 if not {'install', 'develop'}.intersection(sys.argv):
     data_files.append((f'lib/{package_name}', sorted(glob('resource/run/*'))))
 
-# `colcon build --symlink-install` runs a link to this file, in a folder without the README.
-readme = Path(__file__).resolve().with_name('README.md')
+# `colcon build --symlink-install` runs a link to this file, in a folder without these.
+readme, manifest = (Path(__file__).resolve().with_name(n) for n in ('README.md', 'package.xml'))
 
 setup(
     name=package_name,
-    version='0.1.0',
+    version=ElementTree.parse(manifest).findtext('version'),
     description='Pose-graph SLAM back end for ROS 2: L1 norm, primal-dual, robust to false loops',
     long_description=readme.read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',

@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, TypeVar
 
@@ -45,10 +45,12 @@ class Peer:
 
     """
 
-    def __init__(self, parameters: Mapping[str, object]):
+    def __init__(self, parameters: Mapping[str, object], within: Sequence[str] = (),
+                 more: Sequence[str] = ()):
         self.process = subprocess.Popen([
-            executable('backend'), '--ros-args', '--log-level', 'error',
-            *(part for name, value in parameters.items() for part in ('-p', f'{name}:={value}'))])
+            *within, executable('backend'), '--ros-args', '--log-level', 'error',
+            *(part for name, value in parameters.items() for part in ('-p', f'{name}:={value}')),
+            *more])
         self.node = rclpy.create_node('peer')
         self.maps: list[PathMessage] = []
         self.said: dict[str, str] = {}

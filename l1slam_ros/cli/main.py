@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from l1slam_ros.core import names
-from l1slam_ros.core.errors import L1SlamError
+from l1slam_ros.core.errors import L1SlamError, optional_libraries
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS
 from l1slam_ros.io.progress import say
 from l1slam_ros.paper import printed as paper
@@ -81,9 +81,9 @@ def _answer(arguments: Sequence[str] | None) -> int:
         argcomplete.autocomplete(parser)
     options = parser.parse_args(arguments)
     if options.version:
-        from importlib.metadata import version
+        from l1slam_ros.cli.version import version_text
 
-        print(f'l1slam {version("l1slam_ros")}')
+        print(version_text())
         return 0
     if options.command is None:
         parser.print_help(sys.stderr)
@@ -99,11 +99,11 @@ def _answer(arguments: Sequence[str] | None) -> int:
 def _run(options: argparse.Namespace) -> Any:
     # That of a notebook, which its children get too, may not be installed here.
     os.environ.pop('MPLBACKEND', None)
-    module = import_module(f'l1slam_ros.cli.{_COMMANDS[options.command][0]}')
     import numpy as np
 
     # Numbers beyond all measure end in an error that says so, not in NumPy's warnings.
-    with np.errstate(all='ignore'):
+    with np.errstate(all='ignore'), optional_libraries():
+        module = import_module(f'l1slam_ros.cli.{_COMMANDS[options.command][0]}')
         return getattr(module, options.command)(options)
 
 

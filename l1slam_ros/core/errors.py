@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The errors that bad input raises: each says what, the value found and what was expected."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 # So much of a value that is none is shown.
 _SHOWN = 60
 
@@ -46,6 +49,38 @@ def require(kind: type | tuple[type, ...], name: str, value: object, expected: s
         text = ' '.join(repr(value).split())
         shown = text if len(text) <= _SHOWN else f'{text[:_SHOWN]}...'
         raise OptionError(f'{name} is {shown}, expected {expected}')
+
+
+class MissingError(L1SlamError):
+    """A library that only some inputs and outputs need, and that is not installed."""
+
+
+# By the first part of a module's name: who may do without, and what brings it.
+_OPTIONAL = {
+    **dict.fromkeys(('rosbags', 'mcap', 'lz4', 'zstandard'),
+                    'bags are read and written by it, expected `pip install rosbags mcap`'),
+    'matplotlib': 'pictures are drawn by it, expected `pip install matplotlib` or the package '
+                  'python3-matplotlib',
+}
+
+
+@contextmanager
+def optional_libraries() -> Iterator[None]:
+    """
+    Say what to install where a library that is not needed by all is not there.
+
+    Raises
+    ------
+    MissingError : in place of the error of the import.
+
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        library = (error.name or '').partition('.')[0]
+        if library not in _OPTIONAL:
+            raise
+        raise MissingError(f'{library} is not installed: {_OPTIONAL[library]}') from error
 
 
 class MessageError(L1SlamError):

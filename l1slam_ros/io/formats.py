@@ -16,7 +16,13 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from l1slam_ros.core.errors import FileError, GraphError, OptionError, require
+from l1slam_ros.core.errors import (
+    FileError,
+    GraphError,
+    OptionError,
+    optional_libraries,
+    require,
+)
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -78,7 +84,8 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
     if not path.exists():
         raise FileError(path, 'no such file or directory')
     if is_bag(path):
-        from l1slam_ros.io.bags.to_graph import graph_from_bag
+        with optional_libraries():
+            from l1slam_ros.io.bags.to_graph import graph_from_bag
 
         record = graph_from_bag(path, options, topics, dimension)
         return replace(record, rotation_information=rotation_information)
@@ -141,7 +148,8 @@ def check_output(path: Path, inputs: Iterable[Path] = (), force: bool = False,
     if path.suffix:
         require_file(path)
     else:
-        from l1slam_ros.io.bags.writer import refuse_other_than_bag
+        with optional_libraries():
+            from l1slam_ros.io.bags.writer import refuse_other_than_bag
 
         require_folder(path)
         refuse_other_than_bag(path)

@@ -64,7 +64,11 @@ class Progress:
 
     def _advance_bar(self, steps: float, note: str) -> None:
         if self._bar is None:
-            from tqdm import tqdm
+            try:
+                from tqdm import tqdm
+            except ImportError:  # lines, as in a log
+                self._on_terminal = False
+                return
 
             self._bar = tqdm(total=self._total, unit=self._unit, leave=False,
                              desc=self._label or None, delay=self._delay)

@@ -10,6 +10,7 @@ import sys
 from contextlib import suppress
 from importlib import import_module
 
+from l1slam_ros.core.errors import MissingError, optional_libraries
 from l1slam_ros.ros.run_backend import leave
 from l1slam_ros.ros.shell.arguments import backend_help, split
 from l1slam_ros.ros.shell.middleware import use_what_is_there
@@ -47,7 +48,11 @@ def _run(name: str, module: str) -> int:
     try:
         if sentence := use_what_is_there():
             print(f'{name}: {sentence}', file=sys.stderr, flush=True)
-        code: int = import_module(f'l1slam_ros.ros.{module}').main()
+        with optional_libraries():
+            code: int = import_module(f'l1slam_ros.ros.{module}').main()
+    except MissingError as error:
+        print(f'{name}: {error}', file=sys.stderr)
+        return _BAD_INPUT
     except ImportError as error:
         if (error.name or '').startswith('l1slam_ros'):
             raise

@@ -73,9 +73,13 @@ def test_a_command_imports_what_it_uses(graph, arguments, used):
     assert 'numpy' in found <= {*used, 'yaml'}
 
 
-def test_the_version_is_that_of_the_package(capsys):
+def test_the_version_says_commit_and_numba(capsys, monkeypatch):
+    monkeypatch.setenv('NUMBA_DISABLE_JIT', '1')
     assert main(['--version']) == 0
-    assert capsys.readouterr().out == f'l1slam {version("l1slam_ros")}\n'
+    said = re.fullmatch(r'l1slam (\S+)(?:, commit ([0-9a-f]{7,}(?:-dirty)?))?, numba (\S+) '
+                        r'switched off by NUMBA_DISABLE_JIT\n', capsys.readouterr().out)
+    assert said[1] == version('l1slam_ros') and said[3] == version('numba')
+    assert bool(said[2]) == (ROOT / '.git').exists()
 
 
 @pytest.mark.parametrize('arguments', [
