@@ -1,3 +1,10 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """What bloom asks of a released package, and that it is whole without what no package brings."""
 
@@ -12,6 +19,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from headers import HEADER, files_of_python
 
 from l1slam_ros.core.errors import MissingError, optional_libraries
 
@@ -108,6 +116,29 @@ def test_maintainer_and_licence():
     manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
     assert manifest.findtext('maintainer') == 'l1slam_ros maintainers'
     assert manifest.findtext('license') == 'Apache-2.0'
+
+
+def test_every_file_begins_with_copyright_and_licence():
+    """`python test/headers.py` puts them there."""
+    without = [path for path in files_of_python() if not path.read_text().startswith(HEADER)]
+    assert not without
+
+
+def test_the_header_is_what_ament_copyright_looks_for():
+    """A line with year and holder, and the notice of the licence, wherever its lines break."""
+    assert re.match(r'# Copyright \d{4} l1slam_ros maintainers\n', HEADER)
+    licence = ' '.join((ROOT / 'LICENSE').read_text().split())
+    notice = licence[licence.rindex('Licensed under the Apache License'):]
+    assert notice in ' '.join(HEADER.replace('#', ' ').split())
+
+
+@pytest.mark.parametrize('linter, paths', [
+    ('ament_copyright', ('l1slam_ros', 'test', 'config', 'benchmarks', 'setup.py')),
+    ('ament_xmllint', ('package.xml',))])
+def test_a_linter_of_ros_finds_nothing(linter, paths, monkeypatch):
+    run = pytest.importorskip(f'{linter}.main').main
+    monkeypatch.chdir(ROOT)
+    assert run(argv=list(paths)) == 0
 
 
 def test_a_graph_is_solved_where_nothing_optional_is(world):
