@@ -19,11 +19,13 @@ import subprocess
 import sys
 import termios
 import time
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from l1slam_ros.cli import version as which
 from l1slam_ros.cli.main import main
 from l1slam_ros.io.progress import Progress
 
@@ -87,6 +89,26 @@ def test_the_version_says_commit_and_numba(capsys, monkeypatch):
                         r'switched off by NUMBA_DISABLE_JIT\n', capsys.readouterr().out)
     assert said[1] == version('l1slam_ros') and said[3] == version('numba')
     assert bool(said[2]) == (ROOT / '.git').exists()
+
+
+@pytest.mark.parametrize('url, said', [
+    ({'vcs_info': {'commit_id': '0123456789abcdef'}}, 'l1slam 1.2.3, commit 0123456, '),
+    ({'dir_info': {}}, 'l1slam 1.2.3, numba'), (None, 'l1slam 1.2.3, numba')])
+def test_what_pip_installed_says_the_commit_that_pip_noted(monkeypatch, tmp_path, url, said):
+    installed = SimpleNamespace(
+        version='1.2.3', read_text=lambda name: url and json.dumps(url))
+    monkeypatch.setattr(which, 'distribution', lambda name: installed)
+    monkeypatch.setattr(which, '__file__', str(tmp_path / 'l1slam_ros' / 'cli' / 'version.py'))
+    assert which.version_text().startswith(said)
+
+
+def test_a_checkout_without_git_and_numba_has_a_version_all_the_same(monkeypatch):
+    def none(name):
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(which, 'version', none)
+    monkeypatch.setenv('PATH', '')
+    assert re.fullmatch(r'l1slam \S+, numba not installed', which.version_text())
 
 
 @pytest.mark.parametrize('arguments', [
