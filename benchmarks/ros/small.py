@@ -81,7 +81,7 @@ def main() -> int:
             peer.until(lambda: player.poll() is not None)
             seconds = time.monotonic() - began
             cpu = cpu_seconds(peer.process.pid) - cpu
-            peer.listen(3.0)
+            peer.until_calm('keyframes')
             _tell(peer, sent, poses, cpu / seconds)
             most = _most(peer.process.pid)
             code = peer.end()
