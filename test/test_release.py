@@ -32,8 +32,9 @@ OF_ROSDEP = {
     'python3-argcomplete': 'python3-argcomplete',
     'python3-hypothesis': 'python3-hypothesis',
     'python3-matplotlib': 'python3-matplotlib',
-    # That copy names Bionic and Focal alone; ros/rosdistro pull request 36477, merged since, is
-    # for all releases.
+    # That copy names Bionic and Focal alone. Pull request 36477 of ros/rosdistro, merged in March
+    # 2023, is for all releases by its description; its result, and that Noble has the package,
+    # were not seen.
     'python3-numba': 'python3-numba',
     'python3-numpy': 'python3-numpy',
     'python3-packaging': 'python3-packaging',
@@ -42,8 +43,8 @@ OF_ROSDEP = {
     'python3-tqdm': 'python3-tqdm',
     'python3-yaml': 'python3-yaml',
 }
-# Packages of ROS itself: ros/rosdistro, `jazzy/distribution.yaml`, by the repository that holds
-# them; each is released as ros-jazzy-<name>.
+# Packages of ROS itself: ros/rosdistro, `jazzy/distribution.yaml`, a stored copy (commit 0006cda),
+# by the repository that holds them; each is released as ros-jazzy-<name>.
 OF_JAZZY = {
     'builtin_interfaces': 'rcl_interfaces', 'diagnostic_msgs': 'common_interfaces',
     'geometry_msgs': 'common_interfaces', 'lifecycle_msgs': 'rcl_interfaces',
