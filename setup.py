@@ -1,9 +1,17 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""The package's metadata; package.xml repeats what rosdep and colcon read, a test compares."""
+"""The package's metadata; the version is that of package.xml, a test compares the rest with it."""
 
 import sys
 from glob import glob
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -19,12 +27,12 @@ data_files = [
 if not {'install', 'develop'}.intersection(sys.argv):
     data_files.append((f'lib/{package_name}', sorted(glob('resource/run/*'))))
 
-# `colcon build --symlink-install` runs a link to this file, in a folder without the README.
-readme = Path(__file__).resolve().with_name('README.md')
+# `colcon build --symlink-install` runs a link to this file, in a folder without these.
+readme, manifest = (Path(__file__).resolve().with_name(n) for n in ('README.md', 'package.xml'))
 
 setup(
     name=package_name,
-    version='0.1.0',
+    version=ElementTree.parse(manifest).findtext('version'),
     description='Pose-graph SLAM back end for ROS 2: L1 norm, primal-dual, robust to false loops',
     long_description=readme.read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',

@@ -1,3 +1,10 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """README and doc/: links lead somewhere, commands and Python run, recipes are true."""
 
@@ -12,9 +19,13 @@ import sys
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
+from xml.etree import ElementTree
 
 import pytest
+import yaml
+from environments import environment, own_variables
 
+import l1slam_ros
 from l1slam_ros.cli.main import main
 
 ROOT = Path(__file__).parents[1]
@@ -33,6 +44,7 @@ NOT_RUN = {
     'ros2 ': 'no ros2cli here; the same executable is run as .venv/bin/...',
     'rviz2 ': 'no RViz here; its layout is held to the topics by test/ros',
     'pip install': 'fetches from PyPI; test_builds.py installs what is built',
+    'ament_': 'linters of ROS that are not passed; the page says by how much',
     'python -m build': 'test_builds.py builds both',
     'python benchmarks/false_loops.py': PEERS,
     'python benchmarks/gps.py': MINUTES,
@@ -41,6 +53,9 @@ NOT_RUN = {
     'python benchmarks/incremental.py': PEERS,
     'python benchmarks/cli/startup.py': MINUTES,
     'python benchmarks/ros/clocks.py': MINUTES,
+    'python benchmarks/ros/small.py': MINUTES,
+    'mkdir /sys/fs/cgroup': 'needs the rights of root and control groups',
+    'echo 1G > /sys/fs/cgroup': 'needs the rights of root and control groups',
     'l1slam reproduce': 'takes minutes; test/paper runs its parts',
     'l1slam simulate w.g2o': 'takes minutes and 1.5 GB',
     'l1slam solve w.g2o': 'takes minutes and 1.5 GB',
@@ -129,7 +144,7 @@ def test_every_file_that_is_named_is_there(page):
 
 @pytest.mark.parametrize('page', PAGES, ids=of_page)
 def test_every_block_says_what_it_is(page):
-    assert {block.language for block in blocks(page)} <= {'sh', 'python', 'diff'}
+    assert {block.language for block in blocks(page)} <= {'sh', 'python', 'diff', 'xml', 'yaml'}
     # What is only indented, no test would find.
     assert not re.search(r'^    \S', prose(page), re.M)
 
@@ -321,3 +336,78 @@ def test_a_recipe_carried_out_as_written_does_what_it_says(heading, said, tmp_pa
     style = [sys.executable, '-m', 'ruff', 'check', '--no-cache', *changed]
     assert subprocess.run(style, cwd=tmp_path, capture_output=True).returncode == 0
 
+
+
+def test_the_index_for_rosdoc2_leads_to_every_page():
+    entries = re.findall(r'^   (\w+)$', (ROOT / 'doc' / 'index.rst').read_text(), re.M)
+    assert sorted(entries) == sorted(
+        path.stem for path in (ROOT / 'doc').iterdir()
+        if path.suffix in ('.md', '.rst') and path.stem != 'index')
+
+
+def test_the_page_of_the_python_names_has_all_of_them_and_no_other():
+    named = re.findall(r'auto\w+:: l1slam_ros\.(\w+)', (ROOT / 'doc' / 'api.rst').read_text())
+    assert sorted(named) == sorted(l1slam_ros.__all__)
+
+
+def test_sphinx_builds_the_pages_and_finds_every_name(tmp_path):
+    """As rosdoc2 does, with the same two tools, and what is only warned of is an error."""
+    tools = environment('sphinx', 'myst-parser', 'numpy', 'scipy', 'numba')
+    source = shutil.copytree(ROOT / 'doc', tmp_path / 'doc')
+    (tmp_path / 'bags').mkdir()
+    for picture in (ROOT / 'bags').glob('*.png'):
+        shutil.copy(picture, tmp_path / 'bags')
+    (source / 'conf.py').write_text(
+        "project = 'l1slam_ros'\n"
+        "extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon']\n"
+        # Links to files beside doc/ lead out of what Sphinx builds; a test above follows them.
+        "suppress_warnings = ['myst.xref_missing', 'docutils']\n")
+    built = subprocess.run([tools.prefix / 'bin' / 'sphinx-build', '-q', '-W', '--keep-going',
+                            source, tmp_path / 'html'], capture_output=True, text=True,
+                           env=own_variables(PYTHONPATH=str(ROOT)), timeout=300)
+    assert built.returncode == 0, built.stderr
+    api = (tmp_path / 'html' / 'api.html').read_text()
+    for name in l1slam_ros.__all__:
+        assert f'id="l1slam_ros.{name}"' in api or f'{name}</span>' in api, name
+
+
+OTHERS = ROOT / 'doc' / 'with_other_tools.md'
+
+
+@pytest.mark.parametrize('block', [block for block in blocks(OTHERS) if block.language == 'xml'],
+                         ids=lambda block: block.heading)
+def test_a_launch_file_starts_what_there_is(block):
+    launch = ElementTree.fromstring(block.text)
+    ours = [node for node in launch.iter('node') if node.get('pkg') == 'l1slam_ros']
+    assert launch.tag == 'launch' and ours
+    topics = (ROOT / 'doc' / 'topics_and_parameters.md').read_text()
+    for node in ours:
+        assert node.get('exec') in {'backend', 'replay'} and node.get('name')
+        for remap in node.iter('remap'):
+            assert f'`{remap.get("from")}`' in topics
+    beside = {block.heading for block in blocks(OTHERS) if block.language == 'yaml'}
+    assert block.heading in beside
+
+
+@pytest.mark.parametrize('block', [block for block in blocks(OTHERS) if block.language == 'yaml'],
+                         ids=lambda block: block.heading)
+def test_the_node_starts_with_a_parameter_file_of_the_page(block, start, tmp_path):
+    pytest.importorskip('rclpy')
+    told = yaml.safe_load(block.text)
+    ours = told.get('backend') or told['/**']
+    known = yaml.safe_load((ROOT / 'config' / 'backend.yaml').read_text())['/**']
+    for name in flat(ours['ros__parameters']):
+        assert name in flat(known['ros__parameters']), name
+    (tmp_path / 'of_the_page.yaml').write_text(block.text)
+    process = start('--ros-args', '--params-file', tmp_path / 'of_the_page.yaml')
+    said = process.stderr.readline()
+    assert 'ready' in said, said
+
+
+def flat(parameters, prefix=''):
+    """Return the names of parameters, joined by points."""
+    for name, value in parameters.items():
+        if isinstance(value, dict):
+            yield from flat(value, f'{prefix}{name}.')
+        else:
+            yield f'{prefix}{name}'

@@ -1,3 +1,10 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """`backend` as a process of its own, and a peer that plays to it, hears it and calls it."""
 
@@ -6,7 +13,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, TypeVar
 
@@ -45,10 +52,12 @@ class Peer:
 
     """
 
-    def __init__(self, parameters: Mapping[str, object]):
+    def __init__(self, parameters: Mapping[str, object], within: Sequence[str] = (),
+                 more: Sequence[str] = ()):
         self.process = subprocess.Popen([
-            executable('backend'), '--ros-args', '--log-level', 'error',
-            *(part for name, value in parameters.items() for part in ('-p', f'{name}:={value}'))])
+            *within, executable('backend'), '--ros-args', '--log-level', 'error',
+            *(part for name, value in parameters.items() for part in ('-p', f'{name}:={value}')),
+            *more])
         self.node = rclpy.create_node('peer')
         self.maps: list[PathMessage] = []
         self.said: dict[str, str] = {}

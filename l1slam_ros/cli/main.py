@@ -1,3 +1,10 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """`l1slam`: the core from the command line, without ROS. Parsing, and the exit code."""
 # PYTHON_ARGCOMPLETE_OK
@@ -13,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from l1slam_ros.core import names
-from l1slam_ros.core.errors import L1SlamError
+from l1slam_ros.core.errors import L1SlamError, optional_libraries
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS
 from l1slam_ros.io.progress import say
 from l1slam_ros.paper import printed as paper
@@ -82,9 +89,9 @@ def _answer(arguments: Sequence[str] | None) -> int:
         argcomplete.autocomplete(parser)
     options = parser.parse_args(arguments)
     if options.version:
-        from importlib.metadata import version
+        from l1slam_ros.cli.version import version_text
 
-        print(f'l1slam {version("l1slam_ros")}')
+        print(version_text())
         return 0
     if options.command is None:
         parser.print_help(sys.stderr)
@@ -100,11 +107,11 @@ def _answer(arguments: Sequence[str] | None) -> int:
 def _run(options: argparse.Namespace) -> Any:
     # That of a notebook, which its children get too, may not be installed here.
     os.environ.pop('MPLBACKEND', None)
-    module = import_module(f'l1slam_ros.cli.{_COMMANDS[options.command][0]}')
     import numpy as np
 
     # Numbers beyond all measure end in an error that says so, not in NumPy's warnings.
-    with np.errstate(all='ignore'):
+    with np.errstate(all='ignore'), optional_libraries():
+        module = import_module(f'l1slam_ros.cli.{_COMMANDS[options.command][0]}')
         return getattr(module, options.command)(options)
 
 

@@ -1,5 +1,15 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """The errors that bad input raises: each says what, the value found and what was expected."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 # So much of a value that is none is shown.
 _SHOWN = 60
@@ -46,6 +56,38 @@ def require(kind: type | tuple[type, ...], name: str, value: object, expected: s
         text = ' '.join(repr(value).split())
         shown = text if len(text) <= _SHOWN else f'{text[:_SHOWN]}...'
         raise OptionError(f'{name} is {shown}, expected {expected}')
+
+
+class MissingError(L1SlamError):
+    """A library that only some inputs and outputs need, and that is not installed."""
+
+
+# By the first part of a module's name: who may do without, and what brings it.
+_OPTIONAL = {
+    **dict.fromkeys(('rosbags', 'mcap', 'lz4', 'zstandard'),
+                    'bags are read and written by it, expected `pip install rosbags mcap`'),
+    'matplotlib': 'pictures are drawn by it, expected `pip install matplotlib` or the package '
+                  'python3-matplotlib',
+}
+
+
+@contextmanager
+def optional_libraries() -> Iterator[None]:
+    """
+    Say what to install where a library that is not needed by all is not there.
+
+    Raises
+    ------
+    MissingError : in place of the error of the import.
+
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        library = (error.name or '').partition('.')[0]
+        if library not in _OPTIONAL:
+            raise
+        raise MissingError(f'{library} is not installed: {_OPTIONAL[library]}') from error
 
 
 class MessageError(L1SlamError):

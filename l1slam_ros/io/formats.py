@@ -1,3 +1,10 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
 Any input file -> graph, and a graph -> any output file; nothing is solved here.
@@ -16,7 +23,13 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from l1slam_ros.core.errors import FileError, GraphError, OptionError, require
+from l1slam_ros.core.errors import (
+    FileError,
+    GraphError,
+    OptionError,
+    optional_libraries,
+    require,
+)
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -82,7 +95,8 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
     if not path.exists():
         raise FileError(path, 'no such file or directory')
     if is_bag(path):
-        from l1slam_ros.io.bags.to_graph import graph_from_bag
+        with optional_libraries():
+            from l1slam_ros.io.bags.to_graph import graph_from_bag
 
         record = graph_from_bag(path, options, topics, dimension)
         return replace(record, rotation_information=rotation_information)
@@ -150,7 +164,8 @@ def check_output(path: Path, inputs: Iterable[Path] = (), force: bool = False,
     if path.suffix:
         require_file(path)
     else:
-        from l1slam_ros.io.bags.writer import refuse_other_than_bag
+        with optional_libraries():
+            from l1slam_ros.io.bags.writer import refuse_other_than_bag
 
         require_folder(path)
         refuse_other_than_bag(path)

@@ -1,3 +1,10 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
 `backend`, `scan_loops`, `replay` and the demo: what comes before ROS is imported.
@@ -11,6 +18,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
 
+from l1slam_ros.core.errors import MissingError, optional_libraries
 from l1slam_ros.core.options import Options
 from l1slam_ros.ros.run_backend import leave
 from l1slam_ros.ros.shell.arguments import help_of, split
@@ -67,7 +75,11 @@ def _run(name: str, module: str) -> int:
     try:
         if sentence := use_what_is_there():
             print(f'{name}: {sentence}', file=sys.stderr, flush=True)
-        code: int = import_module(f'l1slam_ros.ros.{module}').main()
+        with optional_libraries():
+            code: int = import_module(f'l1slam_ros.ros.{module}').main()
+    except MissingError as error:
+        print(f'{name}: {error}', file=sys.stderr)
+        return _BAD_INPUT
     except ImportError as error:
         if (error.name or '').startswith('l1slam_ros'):
             raise

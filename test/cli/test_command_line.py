@@ -1,3 +1,10 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """`l1slam` as a process: what it imports; readers that have gone; TAB key, terminal and log."""
 
@@ -12,11 +19,13 @@ import subprocess
 import sys
 import termios
 import time
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from l1slam_ros.cli import version as which
 from l1slam_ros.cli.main import main
 from l1slam_ros.io.progress import Progress
 
@@ -73,9 +82,33 @@ def test_a_command_imports_what_it_uses(graph, arguments, used):
     assert 'numpy' in found <= {*used, 'yaml'}
 
 
-def test_the_version_is_that_of_the_package(capsys):
+def test_the_version_says_commit_and_numba(capsys, monkeypatch):
+    monkeypatch.setenv('NUMBA_DISABLE_JIT', '1')
     assert main(['--version']) == 0
-    assert capsys.readouterr().out == f'l1slam {version("l1slam_ros")}\n'
+    said = re.fullmatch(r'l1slam (\S+)(?:, commit ([0-9a-f]{7,}(?:-dirty)?))?, numba (\S+) '
+                        r'switched off by NUMBA_DISABLE_JIT\n', capsys.readouterr().out)
+    assert said[1] == version('l1slam_ros') and said[3] == version('numba')
+    assert bool(said[2]) == (ROOT / '.git').exists()
+
+
+@pytest.mark.parametrize('url, said', [
+    ({'vcs_info': {'commit_id': '0123456789abcdef'}}, 'l1slam 1.2.3, commit 0123456, '),
+    ({'dir_info': {}}, 'l1slam 1.2.3, numba'), (None, 'l1slam 1.2.3, numba')])
+def test_what_pip_installed_says_the_commit_that_pip_noted(monkeypatch, tmp_path, url, said):
+    installed = SimpleNamespace(
+        version='1.2.3', read_text=lambda name: url and json.dumps(url))
+    monkeypatch.setattr(which, 'distribution', lambda name: installed)
+    monkeypatch.setattr(which, '__file__', str(tmp_path / 'l1slam_ros' / 'cli' / 'version.py'))
+    assert which.version_text().startswith(said)
+
+
+def test_a_checkout_without_git_and_numba_has_a_version_all_the_same(monkeypatch):
+    def none(name):
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(which, 'version', none)
+    monkeypatch.setenv('PATH', '')
+    assert re.fullmatch(r'l1slam \S+, numba not installed', which.version_text())
 
 
 @pytest.mark.parametrize('arguments', [

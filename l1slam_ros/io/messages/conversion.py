@@ -1,3 +1,10 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
 ROS messages -> records, by their attributes: rclpy's and rosbags' messages alike, without ROS.
@@ -18,13 +25,12 @@ Covariances pass as they come: `graph_builder` decides what they are worth.
 
 import math
 import re
+import struct
 from collections.abc import Callable
-from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry.manifold import Array
@@ -37,6 +43,8 @@ from l1slam_ros.core.graph.measurements import (
 )
 from l1slam_ros.io.files import LAST_STAMP, NANOSECONDS, quoted, stamp_text
 
+# Of a nav_msgs/Odometry: pose and its covariance, twist and its covariance.
+_ODOMETRY_ENTRIES = 7 + 36 + 6 + 36
 _REFERENCE_FRAME = re.compile(
     r'/?(?P<base>.+)@(?P<seconds>[0-9]{1,10})\.(?P<nanoseconds>[0-9]{9})')
 
@@ -63,7 +71,7 @@ def odometry_in(data: bytes) -> tuple[str, OdometrySample]:
     """
     Return the frame of a serialised odometry message, and what it says.
 
-    By the bag library, in a third of the time that rclpy takes for it.
+    By its layout, in a quarter of the time that rclpy takes to make the objects of a message.
 
     Raises
     ------
@@ -71,16 +79,43 @@ def odometry_in(data: bytes) -> tuple[str, OdometrySample]:
 
     """
     try:
-        message = _types().deserialize_cdr(data, 'nav_msgs/msg/Odometry')
-    except Exception as error:  # bytes that are no message make the library raise anything
+        stamp, frame, child, entries = _odometry_parts(data)
+    except (struct.error, IndexError, ValueError) as error:
         raise MessageError('encoding', f'odometry of {len(data)} bytes that begin with '
                            f'{data[:4].hex()}; expected CDR') from error
-    return message.header.frame_id, odometry_sample(message)
+    # x y z, quaternion, covariance; velocity, turn rate, covariance.
+    pose, covariance, twist, twist_covariance = np.split(entries, (7, 43, 49))
+    return frame, OdometrySample(
+        _checked_stamp(*stamp), sound_pose3(tuple(pose[:3].tolist()), tuple(pose[3:].tolist())),
+        _covariance(covariance), _covariance(twist_covariance), child,
+        (_length(*twist[:3].tolist()), _length(*twist[3:].tolist())))
 
 
-@cache
-def _types() -> Any:
-    return get_typestore(Stores.ROS2_JAZZY)
+def _odometry_parts(data: bytes) -> tuple[tuple[int, int], str, str, Array]:
+    """
+    Return stamp, frame, child frame and the 85 numbers of a nav_msgs/Odometry in CDR.
+
+    The CDR begins with four bytes that say its byte order; each value lies at a multiple of its
+    own size from there. A string is its length with the closing zero, then its characters.
+    """
+    if data[0] or data[1] > 1:
+        raise ValueError('no plain CDR')
+    order = '<' if data[1] else '>'
+    seconds, nanoseconds, length = struct.unpack_from(f'{order}iII', data, 4)
+    frame, end = _text(data, 16, length)
+    place = 4 + -(-(end - 4) // 4) * 4
+    child, end = _text(data, place + 4, *struct.unpack_from(f'{order}I', data, place))
+    place = 4 + -(-(end - 4) // 8) * 8
+    entries = np.frombuffer(data, f'{order}f8', _ODOMETRY_ENTRIES, place).astype(float)
+    return (seconds, nanoseconds), frame, child, entries
+
+
+def _text(data: bytes, place: int, length: int) -> tuple[str, int]:
+    """Return a string of some length with its closing zero, and the place behind it."""
+    end = place + length
+    if not length or data[end - 1]:
+        raise ValueError('no string')
+    return bytes(data[place: end - 1]).decode(), end
 
 
 def loop_closure(message: Any, base_frame: str, trusted: bool) -> LoopClosure:
@@ -184,7 +219,10 @@ def stamp_of(header: Any) -> int:
     MessageError : it is zero, negative or no time.
 
     """
-    seconds, nanoseconds = int(header.stamp.sec), int(header.stamp.nanosec)
+    return _checked_stamp(int(header.stamp.sec), int(header.stamp.nanosec))
+
+
+def _checked_stamp(seconds: int, nanoseconds: int) -> int:
     stamp = seconds * NANOSECONDS + nanoseconds
     if seconds < 0 or not 0 <= nanoseconds < NANOSECONDS or stamp == 0:
         raise MessageError('stamp', f'stamp {seconds} s {nanoseconds} ns; '
@@ -234,7 +272,11 @@ def _pose3(pose: Any) -> Array:
 
 def _size(vector: Any) -> float:
     """Return the length of a geometry_msgs/Vector3, 0 where that is none of a twist."""
-    length = math.hypot(vector.x, vector.y, vector.z)
+    return _length(vector.x, vector.y, vector.z)
+
+
+def _length(*components: float) -> float:
+    length = math.hypot(*components)
     return length if length <= FASTEST else 0.0
 
 

@@ -1,3 +1,10 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """Odometry decoded from its bytes says what rclpy makes of them, and is refused when damaged."""
 
@@ -56,3 +63,25 @@ def test_nonsense_never_raises_anything_else(rng):
         except MessageError:
             continue
         assert sample.twist_covariance.shape == (6, 6)
+
+
+def test_bytes_in_the_other_order_say_the_same(rng):
+    """A writer on a machine whose bytes are the other way round."""
+    codec = pytest.importorskip('rosbags.typesys')
+    types = codec.get_typestore(codec.Stores.ROS2_JAZZY)
+    little = serialize_message(message(rng))
+    told = types.deserialize_cdr(little, 'nav_msgs/msg/Odometry')
+    big = bytes(types.serialize_cdr(told, 'nav_msgs/msg/Odometry', little_endian=False))
+    assert big[1] == 0 and little[1] == 1
+    (frame, ours), (other, theirs) = odometry_in(little), odometry_in(big)
+    assert (frame, ours.stamp, ours.frame) == (other, theirs.stamp, theirs.frame)
+    for name in ('pose3', 'covariance', 'twist_covariance'):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+
+
+@pytest.mark.parametrize('begin', ['0003', '0007', 'ff01', '0100'])
+def test_what_is_no_plain_cdr_is_refused(rng, begin):
+    data = bytearray(serialize_message(message(rng)))
+    data[:2] = bytes.fromhex(begin)
+    with pytest.raises(MessageError, match='expected CDR'):
+        odometry_in(bytes(data))
