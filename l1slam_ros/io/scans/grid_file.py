@@ -16,6 +16,8 @@ from l1slam_ros.io.files import replacing, require_file, write_lines
 from l1slam_ros.io.ours import MARK, marked, refuse_others
 
 _FREE, _UNKNOWN, _OCCUPIED = 254, 205, 0
+# A shade is read as (255 - shade) / 255 occupied: 205 is .19608, which .25 would call free.
+_FREE_BELOW = 0.196
 
 
 def beside(path: Path) -> Path:
@@ -51,4 +53,4 @@ def write_grid(path: Path, grid: Grid) -> None:
     write_lines(beside(path), marked([
         f'image: {path.name}', 'mode: trinary', f'resolution: {grid.resolution}',
         f'origin: [{x:.6f}, {y:.6f}, 0.0]', 'negate: 0', 'occupied_thresh: 0.65',
-        'free_thresh: 0.25']))
+        f'free_thresh: {_FREE_BELOW}']))
