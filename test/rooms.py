@@ -94,7 +94,7 @@ def drifting(true, rng):
     return wheels
 
 
-def drive(true, seed=0, walls=WALLS, spoil=None):
+def drive(true, seed=0, walls=WALLS, spoil=None, noise=0.01):
     """
     Return scans and the wheels' poses of a robot that is at poses (n, 3).
 
@@ -104,7 +104,7 @@ def drive(true, seed=0, walls=WALLS, spoil=None):
     wheels = drifting(true, rng)
     scans = []
     for k, pose in enumerate(true):
-        ranges = ranges_at(pose, rng, walls)
+        ranges = ranges_at(pose, rng, walls, noise)
         scans.append(Scan(1000 * 10**9 + k * int(_PERIOD * 1e9),
                           ranges if spoil is None else spoil(ranges, k, rng), 0.0,
                           2 * np.pi / _RAYS, 0.05, 30.0))

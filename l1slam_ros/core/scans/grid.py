@@ -22,16 +22,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.scans import kernels
 from l1slam_ros.core.scans.points import Points, transformed
 
 # Log odds that one ray adds, and the most that all do.
 _FREE, _OCCUPIED, _MOST = np.float32(0.4), np.float32(0.85), np.float32(100.0)
-# Cells above, and below, are occupied and free: probabilities .65 and .25, as nav2's map server
+# Cells above, and below, are occupied and free: probabilities .65 and .25, as nav2's map saver
 # has them.
 OCCUPIED, FREE = np.log(0.65 / 0.35), np.log(0.25 / 0.75)
 # [m] Rays into the open are free so far.
 _OPEN = 8.0
+# [m] Rays between points are free up to so much before the surface.
+_SHORT = 0.1
 
 
 @dataclass(frozen=True)
@@ -72,14 +75,17 @@ def draw(points: Sequence[Points], poses: Array, resolution: float = 0.05) -> Gr
     return Grid(log_odds, low, resolution)
 
 
-def rays_of(seen: Points, pose: Array) -> tuple[Array, Array, Array]:
+def rays_of(seen: Points, pose: Array) -> tuple[Array, Array, Mask]:
     """Return where the rays of a view begin and end (r, 2) [m], and whether there is a surface."""
     bins = len(seen.view)
     angles = (np.arange(bins) + 0.5) * (2 * np.pi / bins)
-    hit = np.isfinite(seen.view)
-    looked = hit | np.isposinf(seen.view)
-    reach = np.where(hit, seen.view, _OPEN)[looked]
-    ends = np.stack((np.cos(angles[looked]) * reach, np.sin(angles[looked]) * reach), axis=1)
-    ends = np.ascontiguousarray(transformed(pose, ends + seen.centre))
+    looked = ~np.isnan(seen.view)
+    # A bearing is as wide as it is: at its edge the surface may be nearer.
+    reach = np.maximum(seen.view[looked] - _SHORT, 0.0)
+    reach[np.isposinf(seen.view[looked])] = _OPEN
+    free = seen.centre + reach[:, None] * np.stack(
+        (np.cos(angles[looked]), np.sin(angles[looked])), axis=1)
+    ends = np.ascontiguousarray(transformed(pose, np.concatenate((free, seen.xy))))
     start = transformed(pose, seen.centre[None])
-    return np.ascontiguousarray(np.repeat(start, len(ends), axis=0)), ends, hit[looked]
+    hit = np.arange(len(ends)) >= len(free)
+    return np.ascontiguousarray(np.repeat(start, len(ends), axis=0)), ends, hit

@@ -32,8 +32,11 @@ from l1slam_ros.core.scans.field import REACH, RESOLUTION, Field
 # [m] Noise of a point off its line, in a map of several scans; where Cauchy's weight turns over.
 SIGMA = 0.03
 _SCALE = 3 * SIGMA
-# So many points along a surface count as one.
-KAPPA = 5.0
+# [m] No laser, and no map of it, is taken to be better than this.
+FINEST = 0.02
+# So many points along a surface count as one. From simulated drives, with `FINEST` and the floor
+# of the odometry: the squared error of a step, over its variance, is 1 in x, y and heading.
+KAPPA = 1.5
 # [m] Points farther than this do not match: by rounds, narrower each time.
 _WIDEST, _NARROWEST, _SHRINK = REACH, 0.15, 0.75
 _MOST_ITERATIONS = 20
@@ -47,10 +50,10 @@ class Match:
     """
     Where a scan lies in a map.
 
-    pose : (3,); information : (3, 3) of the matched points alone, in the axes of the pose, already
-    divided by `KAPPA` and by how much worse they fit than `SIGMA`; matched : part of the points
-    that found the map; curvature : the least eigenvalue of H over the number of matches, H of
-    unit weights with lengths measured in the scan's radius: 0 where a direction is not held
+    pose : (3,); information : (3, 3) of the matched points alone, in the axes of the pose: H over
+    `KAPPA` and over the mean square of their distances, at least `FINEST` squared; matched : part
+    of the points that found the map; curvature : the least eigenvalue of H over the number of
+    matches, lengths measured in the scan's radius: 0 where a direction is not held
     """
 
     pose: Array
@@ -89,8 +92,8 @@ def match(field: Field, xy: Array, normals: Array, start: Array, prior: Array | 
     radius = float(np.sqrt((xy**2).sum(axis=1).mean())) if len(xy) else 1.0
     units = np.array([1.0, 1.0, 1.0 / max(radius, 0.1)])
     curvature = float(np.linalg.eigvalsh(H * np.outer(units, units))[0] / max(count, 1.0))
-    worse = max(1.0, sums[10] / max(count, 1.0) / SIGMA**2)
-    return Match(pose, H / (KAPPA * SIGMA**2 * worse), count / max(len(xy), 1), curvature)
+    square = max(FINEST**2, sums[10] / max(count, 1.0))
+    return Match(pose, H / (KAPPA * square), count / max(len(xy), 1), curvature)
 
 
 def _sums(field: Field, xy: Array, normals: Array, pose: Array, gate: float

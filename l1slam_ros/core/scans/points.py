@@ -124,12 +124,13 @@ def _view(ranges: Array, angles: Array) -> Array:
     view = np.full(_BEARINGS, np.nan)
     at = np.floor(angles / (2 * np.pi) * _BEARINGS).astype(np.int64) % _BEARINGS
     np.fmin.at(view, at, ranges)
-    # A bearing between two rays is seen by both.
+    # A bearing between two rays is seen by both: so far as the nearer one.
     width = 1 + int(_BEARINGS * _spacing_of(angles) / (2 * np.pi) + 1e-6)
+    before, after = view, view
     for _ in range(width - 1):
-        follower = np.roll(view, 1)
-        view = np.where(np.isnan(view), follower, view)
-    return view
+        before = np.where(np.isnan(before), np.roll(before, 1), before)
+        after = np.where(np.isnan(after), np.roll(after, -1), after)
+    return np.where(np.isnan(view), np.minimum(before, after), view)
 
 
 def _spacing_of(angles: Array) -> float:

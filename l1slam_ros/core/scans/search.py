@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.scans import kernels
+from l1slam_ros.core.scans import search_kernels
 from l1slam_ros.core.scans.field import RESOLUTION, Field
 
 # [rad] Step of the turns: at 4 m a cell.
@@ -55,14 +55,14 @@ def search(field: Field, xy: Array, centre: Array, reach: float, turn: float, le
     levels, margin = field.levels
     most = np.full(2, int(reach / RESOLUTION))
     nothing = np.full(6, -1.0)
-    nodes, scores = kernels.widest_nodes(levels, margin, cells, -most, most)
-    score, at, dx, dy = kernels.branch_and_bound(
+    nodes, scores = search_kernels.widest_nodes(levels, margin, cells, -most, most)
+    score, at, dx, dy = search_kernels.branch_and_bound(
         levels, margin, cells, nodes, scores, most, least, nothing)
     if at < 0:
         return None
     around = np.array([at, dx, dy, _SAME_TURN / TURN, _SAME / RESOLUTION,
                        2 * np.pi / TURN])
-    second, other, *_ = kernels.branch_and_bound(
+    second, other, *_ = search_kernels.branch_and_bound(
         levels, margin, cells, nodes, scores, most, rival * score, around)
     pose = np.array([*(centre[:2] + RESOLUTION * np.array([dx, dy])), turns[at]])
     return Peak(pose, score, second if other >= 0 else 0.0)

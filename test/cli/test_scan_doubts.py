@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From scans that mislead to a map: it is right, or it is said that it may not be."""
+
+import json
+
+import numpy as np
+import pytest
+from rooms import (
+    along,
+    box,
+    drive,
+    glass,
+    mirrored,
+    random_rays,
+    write_scan_bag,
+    write_truth,
+)
+
+from l1slam_ros.cli.main import main
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.scans.points import Scan
+
+ROUND = along(np.array([(1.5, 1.5), (10.5, 1.5), (10.5, 6.5), (1.5, 6.5)] * 2 + [(1.5, 1.8)]))
+BACK = np.array([(1.5, 6.4), (1.5, 1.5), (10.5, 1.5), (10.5, 6)])
+
+
+def mirrored_corridor():
+    """Return a drive through a corridor, a hall, and a corridor that is the first in a mirror."""
+    first = np.array([(0, -1, 5, -1), (6, -1, 12, -1), (5, -1, 5, -2.5), (6, -1, 6, -2.5),
+                      (5, -2.5, 6, -2.5), (0, 1, 3, 1), (3, 1, 3, 2), (3, 2, 4, 2), (4, 2, 4, 1),
+                      (4, 1, 12, 1)], float)
+    hall = np.array([(12, -1, 12, -4), (12, -4, 18, -4), (18, -4, 18, -1), (12, 1, 12, 4),
+                     (12, 4, 18, 4), (18, 4, 18, 1), (0, -1, 0, 1), (30, -1, 30, 1)], float)
+    walls = np.concatenate((first, hall, mirrored(first) + (18, 0, 18, 0)))
+    way = along(np.array([(1, 0), (29, 0), (29, 0.2), (1, 0.2), (1, 0), (20, 0)], float))
+    return way, *drive(way, walls=walls)
+
+
+def equal_rooms():
+    """Return a drive into one of two equal rooms, into the other, and into the first again."""
+    room = np.array([(0, 0, 4, 0), (0, 0, 0, 4), (4, 0, 4, 4), (0, 4, 1.5, 4), (2.5, 4, 4, 4),
+                     (1, 1.2, 1.8, 1.2), (1, 1.2, 1, 2)], float)
+    between = np.array([(4, 4, 8, 4), (-2, 4, 0, 4), (12, 4, 14, 4), *box(-2, 4, 14, 6)[1:]])
+    walls = np.concatenate((room, room + (8, 0, 8, 0), between))
+    inside = np.array([(2, 5), (2, 3), (3.2, 3), (3.2, 0.6), (2.4, 0.6), (2.4, 3), (2, 3), (2, 5)])
+    way = along(np.concatenate((inside, inside + (8, 0), inside[:4])))
+    return way, *drive(way, walls=walls)
+
+
+def standing(true, scans, first, last):
+    """Return a drive whose wheels stand between two scans."""
+    wheels = drive(true)[1]
+    steps = se2.between(wheels[:-1], wheels[1:])
+    steps[first:last] = 0
+    for k, step in enumerate(steps):
+        wheels[k + 1] = se2.compose(wheels[k][None], step[None])[0]
+    return true, scans, wheels
+
+
+def carried():
+    """Return a drive in which the robot is carried on for 20 s, and goes on."""
+    at = len(ROUND) // 3
+    hands = ROUND[at] + np.linspace(0, 1, 100)[:, None] * (-3.5, 3.6, 1.4)
+    true = np.concatenate((ROUND[:at], hands, along(np.concatenate((hands[-1:, :2], BACK)))))
+    return standing(true, drive(true)[0], at - 1, at + 99)
+
+
+def carried_in_the_dark():
+    """Return one in which it is carried for 20 s and no scan is taken."""
+    at = len(ROUND) // 3
+    true = np.concatenate((ROUND[:at], along(np.concatenate(([(7, 6.2)], BACK)))))
+    scans = [Scan(scan.stamp + 20 * 10**9 * (k >= at), scan.ranges, scan.angle_min,
+                  scan.angle_increment, scan.range_min, scan.range_max)
+             for k, scan in enumerate(drive(true)[0])]
+    return standing(true, scans, at - 1, at)
+
+
+def upside_down():
+    """Return a drive with a laser that hangs, which nobody says."""
+    scans, wheels = drive(ROUND)
+    return ROUND, [Scan(scan.stamp, np.roll(scan.ranges[::-1], 1), scan.angle_min,
+                        scan.angle_increment, scan.range_min, scan.range_max)
+                   for scan in scans], wheels
+
+
+CASES = {
+    'a tenth of the rays is random': lambda: (ROUND, *drive(ROUND, spoil=random_rays)),
+    'a fifth goes through glass': lambda: (ROUND, *drive(ROUND, spoil=glass)),
+    'a mirrored corridor': mirrored_corridor, 'two equal rooms': equal_rooms,
+    'carried away': carried, 'carried away in the dark': carried_in_the_dark,
+    'upside down': upside_down}
+
+
+def solved(case, folder, capsys):
+    """Return the exit code of `solve`, and what it says."""
+    true, scans, wheels = CASES[case]()
+    write_scan_bag(folder / 'bag', scans, wheels, mount=((0.0, 0.0, 0.3), (0.0, 0.0, 0.0, 1.0)))
+    write_truth(folder / 'truth.csv', scans, true)
+    code = main(['solve', str(folder / 'bag'), '--scans', '/scan', '--odom-topic', '/wheels',
+                 '--reference', str(folder / 'truth.csv'), '--json'])
+    return code, json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize('case', CASES)
+def test_no_wrong_map_in_silence(case, tmp_path, capsys):
+    code, said = solved(case, tmp_path, capsys)
+    assert said['ate'] < 0.1 or (code == 4 and said['status'] == 'doubtful'), said
+
+
+@pytest.mark.parametrize('case', list(CASES)[:4])
+def test_what_is_hard_to_see_does_not_spoil_the_map(case, tmp_path, capsys):
+    code, said = solved(case, tmp_path, capsys)
+    assert code == 0 and said['ate'] < 0.1 and said['loops'] - len(said['rejected']) >= 3

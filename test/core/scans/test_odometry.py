@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scan-matched odometry: where the robot goes, how certain that is, and what it says when lost."""
+
+import numpy as np
+import pytest
+from rooms import WALLS, along, box, drive, random_rays, ranges_at, ranges_on_the_way
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.scans.odometry import ScanKeyframes, ScanOdometry
+from l1slam_ros.core.scans.points import Scan, points_of
+
+ROUND = along(np.array([(1.5, 1.5), (10.5, 1.5), (10.5, 6.5), (1.5, 6.5), (1.5, 1.8)]))
+# Another room: of other proportions, with a pillar.
+HALL = np.concatenate((box(-4, -3, 9, 5), box(2, 0.5, 2.6, 1.3), box(5.5, -1.5, 6.5, -1),
+                       np.array([(-4, 2, -2.5, 2), (9, -3, 7, -1.5)], float).reshape(2, 4)))
+ACROSS = along(np.array([(-2.0, -1.5), (4.0, -1.8), (4.4, 3.0), (-1.0, 3.2), (-2.0, 0.0)]))
+
+
+def steps_of(true, walls=WALLS, seed=0, spoil=None, odometry=None, noise=0.01):
+    """Return what odometry says of a drive, and how its steps between keyframes are wrong."""
+    scans, wheels = drive(true, seed, walls, spoil, noise)
+    odometry = ScanOdometry() if odometry is None else odometry
+    steps = [odometry.add(scan.stamp, points_of(scan), pose)
+             for scan, pose in zip(scans, wheels, strict=True)]
+    at = [k for k, step in enumerate(steps) if step.keyframe is not None]
+    poses = np.array([step.pose for step in steps])[at]
+    wrong = se2.local(se2.between(true[at][:-1], true[at][1:]),
+                      se2.between(poses[:-1], poses[1:]))
+    return steps, wrong, np.array([steps[k].covariance for k in at[1:]])
+
+
+def test_it_follows_the_robot_where_the_wheels_drift():
+    steps, _, _ = steps_of(ROUND)
+    poses = np.array([step.pose for step in steps])
+    true = se2.between(np.broadcast_to(ROUND[0], ROUND.shape), ROUND)
+    assert np.hypot(*(poses - true)[:, :2].T).max() < 0.1
+    assert abs(se2.wrap(poses[:, 2] - true[:, 2])).max() < 0.02
+    assert all(step.said == '' for step in steps)
+
+
+def nis(seeds):
+    """Return each component of the normalised innovation of steps squared, its mean, (3,)."""
+    squares = []
+    for seed in seeds:
+        for way, walls in ((ROUND, WALLS), (ACROSS, HALL)):
+            _, wrong, covariance = steps_of(way, walls, seed, noise=0.02)
+            squares.append(wrong**2 / np.diagonal(covariance, axis1=1, axis2=2))
+    return np.concatenate(squares).mean(axis=0)
+
+
+def test_a_step_is_as_certain_as_it_claims():
+    """In x, y and heading alike, to 20%; of a laser as good as the usual ones, 2 cm."""
+    assert nis(range(6)) == pytest.approx(np.ones(3), abs=0.2)
+
+
+def test_along_a_corridor_it_claims_no_more_than_the_wheels():
+    walls = np.array([(-60, -1, 60, -1), (60, 1, -60, 1)], float)
+    def short(ranges, *_):
+        return np.where(ranges > 8, np.inf, ranges)
+
+    way = along(np.array([(0.0, 0.1), (6.0, 0.1)]))
+    _, wrong, covariance = steps_of(way, walls, spoil=short)
+    along_, across = np.sqrt(covariance[:, 0, 0]), np.sqrt(covariance[:, 1, 1])
+    assert (along_ > 0.03).all() and (across < 0.02).all()
+    assert (abs(wrong[:, 0]) < 3 * along_).all()
+
+
+def test_motion_within_a_scan_is_taken_out():
+    """A robot that drives a curve, with a laser that turns once in a fifth of a second."""
+    rng = np.random.default_rng(0)
+    velocity, period = np.array([0.6, 0.0, 0.35]), 0.2
+    motion = velocity * period
+    true = [np.array([4.5, 1.2, 0.0])]
+    for _ in range(24):
+        true.append(se2.retract(true[-1][None], motion[None])[0])
+    ranges = [ranges_on_the_way(pose, velocity, period, rng, box(0, 0, 9, 6)) for pose in true]
+
+    def off(time_increment):
+        odometry = ScanOdometry(ScanKeyframes(0.2, 0.2))
+        for k, seen in enumerate(ranges):
+            scan = Scan(k, seen, 0.0, 2 * np.pi / len(seen), 0.05, 30.0, time_increment)
+            step = odometry.add(k, points_of(scan, velocity=velocity), true[k])
+        moved = se2.between(true[0][None], true[-1][None])[0]
+        return step.pose - moved
+
+    good, bad = off(period / 240), off(0.0)
+    assert np.hypot(*good[:2]) < 0.03 and abs(good[2]) < 0.01
+    assert np.hypot(*bad[:2]) > 2 * np.hypot(*good[:2])
+
+
+def test_wheels_that_lie_are_not_followed():
+    """They say the robot stands while it goes on, then turn the wrong way."""
+    scans, wheels = drive(ROUND)
+    steps = se2.between(wheels[:-1], wheels[1:])
+    steps[20:26] = 0.0
+    steps[45:48] *= (1, 1, -1)
+    odometry, pose = ScanOdometry(), wheels[0]
+    said = odometry.add(scans[0].stamp, points_of(scans[0]), pose).said
+    for scan, step in zip(scans[1:80], steps[:79], strict=True):
+        pose = se2.compose(pose[None], step[None])[0]
+        found = odometry.add(scan.stamp, points_of(scan), pose)
+        said += found.said
+    true = se2.between(ROUND[:1], ROUND[79:80])[0]
+    assert np.hypot(*(found.pose - true)[:2]) < 0.15
+    assert 'the scans disagree with the wheels, and are followed' in said
+
+
+def test_carried_away_it_says_so_and_begins_anew():
+    scans, wheels = drive(np.concatenate((ROUND[:40], ACROSS[:40])), spoil=lambda ranges, k, rng: (
+        ranges if k < 40 else ranges_at(ACROSS[k - 40], rng, HALL)))
+    wheels[40:] = se2.compose(np.broadcast_to(wheels[39], (40, 3)),
+                              se2.between(np.broadcast_to(ACROSS[0], (40, 3)), ACROSS[:40]))
+    odometry = ScanOdometry()
+    steps = [odometry.add(scan.stamp, points_of(scan), pose)
+             for scan, pose in zip(scans, wheels, strict=True)]
+    said = {step.said for step in steps}
+    assert 'the scans show nothing known any more; a new part of the map begins' in said
+    assert {keyframe.part for keyframe in odometry.keyframes} == {0, 1}
+
+
+def test_random_rays_do_not_disturb_it():
+    steps, _, _ = steps_of(ROUND[:80], spoil=random_rays)
+    true = se2.between(ROUND[:1], ROUND[79:80])[0]
+    assert np.hypot(*(steps[-1].pose - true)[:2]) < 0.1
+
+
+def test_where_nothing_is_seen_the_wheels_are_followed():
+    """Blind for a while; it is not lost for that."""
+    scans, wheels = drive(ROUND[:60], spoil=lambda ranges, k, _: (
+        np.full_like(ranges, np.inf) if 20 <= k < 32 else ranges))
+    odometry = ScanOdometry()
+    steps = [odometry.add(scan.stamp, points_of(scan), pose)
+             for scan, pose in zip(scans, wheels, strict=True)]
+    true = se2.between(ROUND[:1], ROUND[59:60])[0]
+    assert np.hypot(*(steps[-1].pose - true)[:2]) < 0.15
+    assert {keyframe.part for keyframe in odometry.keyframes} == {0}
