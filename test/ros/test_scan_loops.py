@@ -16,6 +16,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from corridors import RAYS, by_wheels, laps, ranges_from
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
@@ -24,7 +25,6 @@ from node_bench import poses_of
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from corridors import RAYS, by_wheels, laps, ranges_from
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Trigger
 
