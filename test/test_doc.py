@@ -54,6 +54,7 @@ NOT_RUN = {
     'python benchmarks/cli/startup.py': MINUTES,
     'python benchmarks/ros/clocks.py': MINUTES,
     'python benchmarks/ros/small.py': MINUTES,
+    'python benchmarks/ros/scans.py': MINUTES,
     'mkdir /sys/fs/cgroup': 'needs the rights of root and control groups',
     'echo 1G > /sys/fs/cgroup': 'needs the rights of root and control groups',
     'l1slam reproduce': 'takes minutes; test/paper runs its parts',

@@ -223,9 +223,10 @@ class FrontEndThread:
         self._say(step, begins)
         if step.keyframe is not None:
             self._place()
-            for loop in self._front_end.loops():
-                self._publisher.loop(self._base, self._front_end.keyframes, loop)
-                self.counts['loops'] += 1
+        # Comparisons of keyframes wait for each other: a few are made with each scan.
+        for loop in self._front_end.loops():
+            self._publisher.loop(self._base, self._front_end.keyframes, loop)
+            self.counts['loops'] += 1
         self.counts['scans'] += 1
         self.costs.append(time.thread_time() - began)
         self._count()
