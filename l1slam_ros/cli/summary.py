@@ -15,6 +15,7 @@ from l1slam_ros.core.names import ANGLE, QUATERNION
 from l1slam_ros.core.robust import inspection
 from l1slam_ros.io.files import NANOSECONDS, counted, stamp_text
 from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.graphs.robots import robot_names
 from l1slam_ros.io.sentences import offset_sentence
 
 # A reading of the rotations' information fits where their errors are as large as it says, to this
@@ -55,8 +56,11 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
         ('odometry', f'{int(factors.is_odometry.sum()):,}, {length:,.1f} m'),
         ('loops', f'{int(is_loop.sum()):,}{beside}{struck}'),
         ('components', f'{len(inspection.connected_parts(graph)):,}')]
+    names = robot_names(ids)
+    if len(names) > 1:
+        rows.insert(1, ('robots', f'{len(names)}: {", ".join(names)}'))
     if absolute:
-        rows.insert(3, ('absolute', f'{absolute:,}'))
+        rows.insert(-1, ('absolute', f'{absolute:,}'))
     if record.stamps is not None:
         rows.append(('time', f'{(record.stamps[-1] - record.stamps[0]) / NANOSECONDS:,.1f} s'))
     if record.poses is not None:

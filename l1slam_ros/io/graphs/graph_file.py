@@ -30,6 +30,7 @@ from l1slam_ros.io.files import (
     rounded,
 )
 from l1slam_ros.io.graphs.left_out import STRUCK, commented, in_place, nothing_left_out
+from l1slam_ros.io.graphs.robots import robots_of
 from l1slam_ros.io.graphs.rows import (
     Rows,
     expected_tags,
@@ -113,7 +114,9 @@ def read_graph_file(path: str | os.PathLike[str],
         kept = ~np.isin(ids, anchors)
         ids, vertices = ids[kept], vertices.chosen(kept) if len(vertices) else vertices
         edges = edges.chosen(np.flatnonzero(np.isin(edges.ids, anchors).sum(axis=1) == 0))
-    graph = FactorGraph(manifold, len(ids))
+    graph = FactorGraph(manifold)
+    for robot, count in enumerate(np.unique(robots_of(ids), return_counts=True)[1].tolist()):
+        graph.add_poses(count, robot)
     order, left_out = in_place(edges.lines, lines.left_out)
     edges = edges.chosen(order)
     _add_edges(path, graph, ids, edges, remarks, left_out == STRUCK)
