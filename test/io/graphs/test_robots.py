@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from l1slam_ros.cli.summary import numbers
+from l1slam_ros.cli.summary import complaints, numbers
 from l1slam_ros.io.graphs.graph_file import read_graph_file, write_graph_file
 
 A, B = ord('a') << 56, ord('b') << 56
@@ -21,6 +21,7 @@ def test_robots_of_one_file(tmp_path):
     np.testing.assert_array_equal(
         record.graph.between.is_odometry, [True, True, True, False])
     assert ('robots', '2: a, b') in numbers(record)
+    assert not [text for text in complaints(record) if 'jump' in text or 'gap' in text]
     out = tmp_path / 'out.g2o'
     write_graph_file(out, record)
     again = read_graph_file(out)
