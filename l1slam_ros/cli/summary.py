@@ -22,6 +22,7 @@ from l1slam_ros.core.names import ANGLE, QUATERNION
 from l1slam_ros.core.robust import inspection
 from l1slam_ros.io.files import NANOSECONDS, counted, stamp_text
 from l1slam_ros.io.graphs.graph_file import GraphRecord
+from l1slam_ros.io.graphs.robots import robot_names, robots_of
 from l1slam_ros.io.sentences import offset_sentence
 
 # A reading of the rotations' information fits where their errors are as large as it says, to this
@@ -62,8 +63,11 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
         ('odometry', f'{int(factors.is_odometry.sum()):,}, {length:,.1f} m'),
         ('loops', f'{int(is_loop.sum()):,}{beside}{struck}'),
         ('components', f'{len(inspection.connected_parts(graph)):,}')]
+    names = robot_names(ids)
+    if len(names) > 1:
+        rows.insert(1, ('robots', f'{len(names)}: {", ".join(names)}'))
     if absolute:
-        rows.insert(3, ('absolute', f'{absolute:,}'))
+        rows.insert(-1, ('absolute', f'{absolute:,}'))
     if record.stamps is not None:
         rows.append(('time', f'{(record.stamps[-1] - record.stamps[0]) / NANOSECONDS:,.1f} s'))
     if record.poses is not None:
@@ -82,7 +86,8 @@ def complaints(record: GraphRecord) -> list[str]:
 
 def _on_ids(record: GraphRecord) -> Iterator[str]:
     # A difference of two ids may be beyond 64 bits.
-    jumps = np.flatnonzero(record.ids[1:] != record.ids[:-1] + 1)
+    same_robot = np.diff(robots_of(record.ids)) == 0
+    jumps = np.flatnonzero((record.ids[1:] != record.ids[:-1] + 1) & same_robot)
     if len(jumps):
         pairs = [f'{record.ids[k]} to {record.ids[k + 1]}' for k in jumps[:_NAMED]]
         yield f'vertex ids are not consecutive: {_listed("jump", pairs, len(jumps))}'
@@ -108,6 +113,7 @@ def _on_parts(record: GraphRecord) -> Iterator[str]:
 
 def _on_gaps(record: GraphRecord) -> Iterator[str]:
     gaps = odometry_gaps(record.graph)
+    gaps = gaps[np.diff(robots_of(record.ids))[gaps] == 0]
     if len(gaps):
         pairs = [f'{record.ids[k]} and {record.ids[k + 1]}' for k in gaps[:_NAMED]]
         yield (f'the odometry has {_listed("gap", pairs, len(gaps))}, consecutive vertices '

@@ -38,6 +38,7 @@ from l1slam_ros.io.files import (
     rounded,
 )
 from l1slam_ros.io.graphs.left_out import MEASURED, STRUCK, commented, in_place, nothing_left_out
+from l1slam_ros.io.graphs.robots import robots_of
 from l1slam_ros.io.graphs.rows import (
     Rows,
     expected_tags,
@@ -123,7 +124,9 @@ def read_graph_file(path: str | os.PathLike[str],
         kept = ~np.isin(ids, anchors)
         ids, vertices = ids[kept], vertices.chosen(kept) if len(vertices) else vertices
         edges = edges.chosen(np.flatnonzero(np.isin(edges.ids, anchors).sum(axis=1) == 0))
-    graph = FactorGraph(manifold, len(ids))
+    graph = FactorGraph(manifold)
+    for robot, count in enumerate(np.unique(robots_of(ids), return_counts=True)[1].tolist()):
+        graph.add_poses(count, robot)
     order, left_out, as_measured = in_place(edges.lines, lines.left_out)
     stand, edges = edges.lines[order], edges.chosen(as_measured)
     _add_edges(path, graph, ids, edges, remarks, left_out == STRUCK)
