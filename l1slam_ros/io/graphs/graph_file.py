@@ -37,6 +37,7 @@ from l1slam_ros.io.files import (
     replacing,
     rounded,
 )
+from l1slam_ros.io.graphs.anchors import anchors_of, fixed_in
 from l1slam_ros.io.graphs.left_out import MEASURED, STRUCK, commented, in_place, nothing_left_out
 from l1slam_ros.io.graphs.robots import robots_of
 from l1slam_ros.io.graphs.rows import (
@@ -119,7 +120,7 @@ def read_graph_file(path: str | os.PathLike[str],
         raise FileError(path, f'no edges; expected {expected_tags("between")} lines')
     vertices = vertices_of(path, groups, manifold)
     ids = vertices.ids[:, 0] if len(vertices) else np.unique(edges.ids)
-    anchors = _anchors(groups, ids, edges)
+    anchors = anchors_of(groups, ids, edges)
     if len(anchors):
         kept = ~np.isin(ids, anchors)
         ids, vertices = ids[kept], vertices.chosen(kept) if len(vertices) else vertices
@@ -232,34 +233,12 @@ def _roots(path: object, rows: Rows) -> Array:
                         int(rows.lines[k])) from error
 
 
-def _fixed(groups: dict[str, TextLines]) -> list[str]:
-    return ' '.join(groups['FIX'].texts).split() if 'FIX' in groups else []
-
-
-def _anchors(groups: dict[str, TextLines], ids: Indices, edges: Rows) -> Indices:
-    """
-    Return the vertices that hold a graph in place and are none of the robot's, (k,).
-
-    As of hdl_graph_slam: fixed, on a single edge, and another leads from the vertex before to the
-    one behind. The map is the same without them; with them the odometry would have a gap.
-    """
-    fixed = _fixed(groups)
-    if not fixed:  # as in most files; else each vertex gets a name to compare
-        return ids[:0]
-    anchors, ends = [], np.sort(edges.ids, axis=1)
-    for k in np.flatnonzero(np.isin(ids.astype(str), fixed)):
-        passed = (ends == ids[[k - 1, (k + 1) % len(ids)]]).all(axis=1)
-        if (ends == ids[k]).any(axis=1).sum() == 1 and passed.any():
-            anchors.append(ids[k])
-    return np.array(anchors, np.int64)
-
-
 def _skipped(groups: dict[str, TextLines], ids: Indices,
              anchors: Indices) -> tuple[str, ...]:
     """Return a sentence on each tag that is known and not used, and on anchors."""
     sentences = [f'vertex {anchor} and its edge are not used: it is an anchor, and the first '
                  f'vertex, {ids[0]}, is the one held fixed' for anchor in anchors.tolist()]
-    fixed = [name for name in _fixed(groups) if name not in anchors.astype(str)]
+    fixed = [name for name in fixed_in(groups) if name not in anchors.astype(str)]
     if set(fixed) - {str(ids[0])}:
         sentences.append(f'FIX {quoted(" ".join(fixed))} is not used: the first vertex, {ids[0]}, '
                          'is the one held fixed')
