@@ -99,7 +99,7 @@ class Robot(Peer):
         self.call('optimize')
         self.until_calm('updates')
         assert self.end() == 0
-        poses = self.maps[-1].poses
+        poses = self.newest().poses
         pose3 = np.array([stamped_pose(pose)[1] for pose in poses])
         return np.array([stamp_of(pose.header) for pose in poses]), se2.from_pose3(pose3)
 

@@ -63,7 +63,7 @@ class Player:
             'odometry.covariance_source': 'increment'})
         if self.path.exists():
             self.peer.until(lambda: bool(self.peer.maps))
-            self.last = stamp_of(self.peer.maps[-1].poses[-1].header)
+            self.last = stamp_of(self.peer.newest().poses[-1].header)
 
     def play(self, seconds: float) -> bool:
         """Play on from the last keyframe for some time; return whether that was all."""
@@ -88,7 +88,7 @@ class Player:
             deadline = time.monotonic() + 2 * _PERIOD
             while not self._being_written() - before and time.monotonic() < deadline:
                 pass  # a small map is written in two milliseconds
-            size = len(self.peer.maps[-1].poses) if self.peer.maps else 0
+            size = len(self.peer.newest().poses) if self.peer.maps else 0
             time.sleep(self.rng.uniform(0, _SAVE * size))
         self.peer.end(signal.SIGKILL)
         killed = time.monotonic()
@@ -104,7 +104,7 @@ class Player:
     def finish(self) -> str:
         """Play to the end and optimise; return the sentence of the node."""
         self.play(PATIENCE)
-        self.peer.until(lambda: len(self.peer.maps[-1].poses) == POSES)
+        self.peer.until(lambda: len(self.peer.newest().poses) == POSES)
         _, sentence = self.peer.call('optimize')
         self.peer.end()
         return sentence
@@ -118,7 +118,7 @@ def _run(bag: Path, path: Path, kills: int) -> str:
             print(f'played to the end after {k} kills: make the world larger')
             break
         player.kill(inside=k % 2 == 1)
-        loaded = len(player.peer.maps[-1].poses) if player.peer.maps else 0
+        loaded = len(player.peer.newest().poses) if player.peer.maps else 0
         print(f'kill {k + 1}: {loaded} keyframes loaded, {player.lost[-1]:.2f} s lost', flush=True)
     if kills:
         print(f'{len(player.lost)} kills, {player.inside} of them inside of a save; at most '

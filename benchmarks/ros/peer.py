@@ -30,6 +30,7 @@ from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 
 from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC
@@ -47,7 +48,8 @@ class Peer:
 
     Attributes
     ----------
-    maps : all Paths that came; said : by name, what the last diagnostics say, their sentence is
+    maps : all Paths that came, as bytes: decoding one of 50,000 poses takes seconds, in which
+    nothing else would be heard; said : by name, what the last diagnostics say, their sentence is
     `message`; publishers : of `KINDS`, by topic
 
     """
@@ -59,10 +61,11 @@ class Peer:
             *(part for name, value in parameters.items() for part in ('-p', f'{name}:={value}')),
             *more])
         self.node = rclpy.create_node('peer')
-        self.maps: list[PathMessage] = []
+        self.maps: list[bytes] = []
         self.said: dict[str, str] = {}
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.node.create_subscription(PathMessage, 'path', self.maps.append, latched)
+        self.node.create_subscription(PathMessage, 'path', self.maps.append, latched,
+                                      raw=True)
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._hear, 10)
         self.publishers = {topic: self.node.create_publisher(kind, topic, QoSProfile(depth=1000))
                            for topic, kind in KINDS.items()}
@@ -80,6 +83,10 @@ class Peer:
         (status,) = message.status
         self.said = {value.key: value.value for value in status.values}
         self.said['message'] = status.message
+
+    def newest(self) -> PathMessage:
+        """Return the Path that came last."""
+        return deserialize_message(self.maps[-1], PathMessage)
 
     def until(self, condition: Callable[[], bool]) -> None:
         """Listen until something holds."""

@@ -77,9 +77,9 @@ def _play(peer: Peer, graph: FactorGraph, bag: Path, rate: float) -> None:
     subprocess.run([executable('replay'), str(bag), '--rate', str(rate / _BAG_RATE)], check=True)
     print(f'played in {time.monotonic() - began:.1f} s')
     peer.listen(_AFTER)
-    _tell_map(peer.maps[-1], graph, f'{_AFTER:.0f} s later')
+    _tell_map(peer.newest(), graph, f'{_AFTER:.0f} s later')
     peer.listen(_AT_REST)
-    _tell_map(peer.maps[-1], graph, 'at rest')
+    _tell_map(peer.newest(), graph, 'at rest')
     before = cpu_seconds(peer.process.pid)
     peer.listen(_IDLE)
     share = (cpu_seconds(peer.process.pid) - before) / _IDLE
