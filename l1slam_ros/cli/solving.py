@@ -219,12 +219,18 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
         'slips': record.ids[factors.pairs[slips]].tolist(),
         'parts': outcome.parts,
         'drift': judgement.drift if judgement else 0.0,
+        'confidence': _known(judgement.confidence) if judgement else None,
         'doubts': [
             {'kind': doubt.kind, 'text': text,
              'loops': record.ids[factors.pairs[doubted_rows(doubt, factors)]].tolist()}
             for doubt, text in zip(doubts, doubt_reasons(doubts, record.ids, record.stamps),
                                    strict=True)],
     }
+
+
+def _known(number: float) -> float | None:
+    """Return a number, None where it is none: JSON has no NaN."""
+    return None if math.isnan(number) else number
 
 
 def _print_report(report: dict[str, object], record: GraphRecord, cost_name: str,

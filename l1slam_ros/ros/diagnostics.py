@@ -86,7 +86,8 @@ class Diagnostics:
             values |= {'l1_cost': f'{self._last.cost:.6g}', 'gap': f'{self._last.gap:.3g}',
                        'update_seconds': f'{self._last.seconds:.4f}',
                        'update_status': self._last.status.value,
-                       'odometry.drift': f'{self._last.judgement.drift:.4g}'}
+                       'odometry.drift': f'{self._last.judgement.drift:.4g}',
+                       'judgement.confidence': f'{self._last.judgement.confidence:.3g}'}
         values |= {f'behind.{name}': f'{value:.6g}' for name, value in asdict(behind).items()}
         values |= self._jump
         for cause, count in sorted((+refused).items()):

@@ -87,7 +87,7 @@ def test_a_chosen_solver_is_the_one_that_solves(capsys, world, solver):
 
 REPORTED = ['poses', 'factors', 'loops', 'initial_cost', 'seed_cost', 'final_cost', 'status',
             'seconds', 'solver', 'outer_iterations', 'inner_iterations', 'rejected', 'suspect',
-            'slips', 'parts', 'drift', 'doubts', 'warnings']
+            'slips', 'parts', 'drift', 'confidence', 'doubts', 'warnings']
 
 
 @pytest.mark.parametrize('more', [(), ('--no-robust',), ('--robust', '--norm', 'l2')])
@@ -279,17 +279,22 @@ def test_a_doubt_is_said_even_quietly_with_the_times_of_a_bag_and_beside_its_dam
         assert len(damage) == damages and all('is damaged' in sentence for sentence in damage)
 
 
-def test_most_loops_refused_is_a_doubt(capsys, world, tmp_path):
-    """Three false loops to two true ones: the map is right, but who could know."""
+@pytest.mark.parametrize(('lies', 'code'), [(150, 0), (1800, 4)])
+def test_most_loops_refused_is_a_doubt_where_such_maps_were_wrong(capsys, world, tmp_path, lies,
+                                                                  code):
+    """Of maps with three false loops to two true ones nearly all were right."""
     bad = tmp_path / 'bad.g2o'
-    run(capsys, 'corrupt', world, bad, '--false-loops', 150)
-    out, err = run(capsys, 'solve', bad, '--json', code=4)
+    run(capsys, 'corrupt', world, bad, '--false-loops', lies)
+    out, err = run(capsys, 'solve', bad, '--json', code=code)
     report = json.loads(out)
     left_out = len(report['rejected'] + report['suspect'])
-    assert report['status'] == 'doubtful' and left_out >= 150
+    assert left_out >= lies and (report['confidence'] >= 0.9) == (code == 0)
+    if code == 0:
+        assert report['status'] == 'converged' and not report['doubts']
+        return
     assert [doubt['kind'] for doubt in report['doubts']] == ['mostly refused']
     assert sorted(report['doubts'][0]['loops']) == sorted(report['rejected'] + report['suspect'])
-    assert err.startswith(f'l1slam: doubtful: {left_out} loops, most of all, are refused or ')
+    assert err.startswith(f'l1slam: doubtful: {left_out:,} loops, most of all, are refused or ')
     assert len(err.splitlines()) == 1
 
 

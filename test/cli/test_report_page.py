@@ -183,8 +183,8 @@ def test_a_world_in_space_is_drawn_in_space(capsys, tmp_path):
 
 def test_a_slip_and_most_loops_refused_have_rivals(capsys, tmp_path):
     world, bad = tmp_path / 'world.g2o', tmp_path / 'bad.g2o'
-    run(capsys, 'simulate', world, '--poses', 150, '--edges', 250, '--seed', 7)
-    run(capsys, 'corrupt', world, bad, '--false-loops', 150)
+    run(capsys, 'simulate', world, '--poses', 150, '--edges', 157, '--seed', 7)
+    run(capsys, 'corrupt', world, bad, '--false-loops', 140)
     page, report = reported(capsys, bad)
     rival, = shown(page)['maps'][1:]
     assert rival['name'] == 'rival: every loop believed'

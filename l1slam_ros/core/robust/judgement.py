@@ -23,6 +23,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, lowest_of_components
+from l1slam_ros.core.robust.forecast import forecast
 from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.robust.odometry.slips import JOINING, SPANNING, SURE, common_steps, spanning
 from l1slam_ros.core.robust.pairwise_consistency import (
@@ -47,6 +48,8 @@ MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP, UNFINISHED, NORM, FAILED,
 
 # Of fewer loops most may well be refused, and be of one place; most are more than half by some.
 _HANDFUL, _MOST = 5, 0.55
+# From here on it is no doubt that most are refused.
+_CONFIDENT = 0.9
 # Refused loops that agree count if they are so many for each accepted one across.
 _AGAINST = 0.25
 
@@ -82,7 +85,9 @@ class Judgement:
     of each in a map, in the same units; slips : (k,) the odometry factors that slipped, not
     accepted; doubts : reasons not to rely on the map; settled : no more is to be found out from
     the factors that are there; drift : by how much more each metre of the odometry turns than it
-    says [rad/m].
+    says [rad/m]; confidence : how often maps that looked like this one were right, NaN where
+    nothing is recorded of such; is_refusal_doubted : the loops that it refused may well be true,
+    so they are to be judged again when there are more.
     """
 
     accepted: Mask
@@ -94,16 +99,13 @@ class Judgement:
     doubts: tuple[Doubt, ...] = ()
     settled: bool = True
     drift: float = 0.0
+    confidence: float = float('nan')
+    is_refusal_doubted: bool = False
 
     @property
     def doubt(self) -> Doubt | None:
         """The first reason not to rely on the map; None where all is well."""
         return self.doubts[0] if self.doubts else None
-
-    @property
-    def is_refusal_doubted(self) -> bool:
-        """Whether the loops that it refused make it doubtful."""
-        return any(doubt.kind in (MOSTLY_REFUSED, OTHER_MAP) for doubt in self.doubts)
 
     @staticmethod
     def nothing() -> 'Judgement':
@@ -122,7 +124,7 @@ class Judgement:
         factors = graph.between
         left_out = ~factors.is_odometry & ~factors.struck & ~self.accepted
         doubt = doubt_of(factors.pairs[left_out], graph.n_poses, FAILED, str(error))
-        return replace(self, doubts=(doubt,), settled=True)
+        return replace(self, doubts=(doubt,), settled=True, confidence=float('nan'))
 
     def of_all(self, graph: FactorGraph) -> 'Judgement':
         """
@@ -192,9 +194,16 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
     """Return what a state says of the factors that were given."""
     square, suspect = fits(growth)
     size, slip = growth.size, growth.cut & ~growth.gap
-    accepted = growth.accepted & ~slip
-    return Judgement(accepted[:size], suspect[:size], np.sqrt(square[:size]), growth.variance,
-                     _noise(growth)[:size], np.flatnonzero(slip[:size]), reasons, settled)
+    accepted, sigmas = (growth.accepted & ~slip)[:size], np.sqrt(square[:size])
+    loops, slips = growth.is_loop[:size], np.flatnonzero(slip[:size])
+    confidence = forecast(accepted[loops], suspect[:size][loops], sigmas[loops],
+                          growth.variance[1], len(slips))
+    doubted = any(doubt.kind in (MOSTLY_REFUSED, OTHER_MAP) for doubt in reasons)
+    # A count alone was no reason: of such maps, one in a hundred was wrong.
+    reasons = tuple(doubt for doubt in reasons
+                    if doubt.kind != MOSTLY_REFUSED or confidence < _CONFIDENT)
+    return Judgement(accepted, suspect[:size], sigmas, growth.variance, _noise(growth)[:size],
+                     slips, reasons, settled, confidence=confidence, is_refusal_doubted=doubted)
 
 
 def _noise(growth: Growth) -> Array:

@@ -101,7 +101,7 @@ def test_what_is_due(state, size, moment, make, judge):
 
 def test_a_judgement_that_doubts_what_it_refused_is_asked_until_there_are_twice_as_many_loops():
     doubt = Doubt(MOSTLY_REFUSED, 2, 0, 3)
-    doubtful = replace(JUDGEMENT, doubts=(doubt,))
+    doubtful = replace(JUDGEMENT, doubts=(doubt,), is_refusal_doubted=True)
     judged = RESTED.judged.after(doubtful, se2.identity(4), 2, False, NOW)
     assert (judged.doubted, judged.loops, judged.anew) == (2, 2, 2)
     # A judgement that has no doubt leaves it.

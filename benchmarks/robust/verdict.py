@@ -1,0 +1,223 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""
+How often a map was right, beside the forecast that was made of it: fits it, and counts its record.
+
+    python benchmarks/robust/verdict.py --datasets DIR [--seeds N] [--only GRAPH...]
+
+Graphs, made and recorded, get lies, slips, drift and misstated noise. A map is wrong where it is
+further from the truth than 1.5 times the map of the true loops alone, and 5 cm; where no truth is
+known, more than .25 m and .5% of the map's diagonal from that map. The weights are fitted on the
+graphs of `FIT`; the table counts those of `HELD`, of which nothing was used.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+# As a program of its own it finds its neighbours.
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from measuring import report_progress
+from robust.changes import changed, information_of
+from robust.places import Place, error_by_time, place, place_of
+from scipy.optimize import minimize
+
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.robust.batch_map import SolveOptions, solve
+from l1slam_ros.core.robust.forecast import terms_of
+from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
+
+FIT = ('world', 'sparse', 'intel', 'ring', 'tails')
+HELD = ('kitti_00', 'corridor', 'wide', 'fr079', 'manhattan3500', 'bicocca25b')
+# What is changed, by `changes.CHANGES` or 'drift', with its amounts; the lies, and their share.
+CONDITIONS: tuple[tuple[str, tuple[float | str, ...], str, float], ...] = (
+    ('', (), '', 0.0), *(('', (), 'random', share) for share in (0.3, 0.5, 0.7, 0.9)),
+    *(('', (), 'identity', share) for share in (0.5, 0.9)),
+    *(('', (), 'grouped', share) for share in (0.3, 0.5, 0.7)),
+    *(('slip', (what, count), 'random', 0.3)
+      for what in ('translation', 'rotation') for count in (1, 2)),
+    ('odometry', (3.0,), 'random', 0.3), ('odometry', (10.0,), 'random', 0.3),
+    *(('information', (part, times), 'random', 0.3)
+      for part in ('odometry', 'loops') for times in (1e-2, 1e2)),
+    ('thinned', (0.1,), 'random', 0.5), ('thinned', (0.3,), 'random', 0.5),
+    ('aliased', (3, 'own'), '', 0.0), ('aliased', (3, 'same'), '', 0.0),
+    ('half aliased', (12,), '', 0.0), ('drift', (0.01,), 'random', 0.3),
+    ('drift', (0.05,), 'random', 0.3))
+_RIDGE = 0.3
+_EDGES = (0.0, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One run: terms (6,) of the forecast, whether the map was wrong, whether it was doubted."""
+
+    graph: str
+    terms: Array
+    wrong: bool
+    doubted: bool
+
+
+def _ring(seed: int, tails: bool = False) -> Place:
+    """Return a lap, not quite round, closed at the place where it began."""
+    rng = np.random.default_rng(100 + seed)
+    n, loops = int(rng.integers(300, 900)), int(rng.integers(10, 40))
+    angle = 2 * np.pi * np.arange(n + loops) / n
+    radius = n / 6.3 * (1 + rng.uniform(0, 0.3) * np.sin(rng.integers(2, 6) * angle))
+    way = radius[:, None] * np.column_stack((np.cos(angle), np.sin(angle)))
+    along = np.gradient(way, axis=0)
+    truth = np.column_stack((way, np.unwrap(np.arctan2(along[:, 1], along[:, 0]))))
+    back = np.arange(loops)
+    return _measured(truth, back, back + n, (0.05, 0.05, 0.003), (0.1, 0.1, 0.02), rng, tails)
+
+
+def _corridor(seed: int, tails: bool = False) -> Place:
+    """Return a way along corridors and back, with loops of the way back."""
+    rng = np.random.default_rng(200 + seed)
+    length, legs = int(rng.integers(40, 90)), int(rng.integers(2, 5))
+    heading = np.repeat(np.cumsum(np.pi / 2 * rng.choice([-1, 1], legs)), length)
+    there = np.cumsum(np.column_stack((np.cos(heading), np.sin(heading))), axis=0)
+    back = there[::-1] + rng.normal(0, 0.2, there.shape)
+    truth = np.column_stack((np.concatenate((there, back)), np.unwrap(
+        np.concatenate((heading, heading[::-1] + np.pi)))))
+    first = rng.choice(len(there) - 10, max(12, len(there) // 6), replace=False)
+    return _measured(truth, first, len(truth) - 1 - first, (0.05, 0.05, 0.005), (0.3, 0.1, 0.02),
+                     rng, tails)
+
+
+def _measured(truth: Array, i: Array, j: Array, step: tuple[float, ...], loop: tuple[float, ...],
+              rng: np.random.Generator, tails: bool) -> Place:
+    """Return what is measured of a truth (n, 3); tails: of loops with two degrees of freedom."""
+    n, k = len(truth), np.arange(len(truth) - 1)
+    sigma = np.concatenate((np.tile(step, (n - 1, 1)), np.tile(loop, (len(i), 1))))
+    i, j = np.concatenate((k, i)), np.concatenate((k + 1, j))
+    noise = sigma * rng.standard_normal(sigma.shape)
+    if tails:
+        noise[n - 1:] *= np.abs(rng.standard_t(2, (len(noise) - n + 1, 1)))
+    graph = FactorGraph(se2, n)
+    graph.add_between(i, j, se2.retract(se2.between(truth[i], truth[j]), noise),
+                      np.eye(3) / sigma[:, :, None]**2)
+    return place_of('made', graph, None, error_by_time(truth[:, :2]))
+
+
+def _world(poses: int, loops: int, options: WorldOptions, seed: int) -> Place:
+    world = simulate_world(poses, poses - 1 + loops, options, np.random.default_rng(seed))
+    return place_of('made', world.graph, None, error_by_time(world.truth[:, :2]))
+
+
+MADE: dict[str, Callable[[int], Place]] = {
+    'world': lambda seed: _world(500, 109, WorldOptions(), seed),
+    'sparse': lambda seed: _world(400, 30, WorldOptions(odometry_sigma_rotation=0.004),
+                                  1000 + seed),
+    'wide': lambda seed: _world(900, 250, WorldOptions(
+        block=12, odometry_sigma_rotation=0.02, loop_sigma_translation=0.2,
+        loop_sigma_rotation=0.03), 2000 + seed),
+    'ring': _ring, 'corridor': _corridor,
+    'tails': lambda seed: (_ring if seed % 2 else _corridor)(50 + seed, True)}
+
+
+def _drifting(graph: FactorGraph, drift: float) -> FactorGraph:
+    """Return a graph whose odometry turns by so much more on each metre [rad/m]."""
+    factors, measurement = graph.between, graph.between.measurement.copy()
+    rows = factors.is_odometry
+    measurement[rows, 2] += drift * np.linalg.norm(measurement[rows, :2], axis=1)
+    new = FactorGraph(graph.manifold, graph.n_poses)
+    new.add_between(factors.i, factors.j, measurement, information_of(graph))
+    return new
+
+
+def _run(name: str, found: Place, condition: int, seed: int) -> Row:
+    change, amounts, lies, share = CONDITIONS[condition]
+    rng = np.random.default_rng((seed, condition, (FIT + HELD).index(name)))
+    if change == 'drift':
+        graph, clean, extra = _drifting(found.graph, float(amounts[0])), found.graph, None
+    else:
+        what = changed(found, change, amounts, rng)
+        graph, clean, extra = what.graph, what.clean, what.lies
+    if lies:
+        count = np.count_nonzero(~graph.between.is_odometry) * share / (1 - share)
+        graph = insert_loops(graph, FALSE_LOOPS[lies](graph, found.best, round(count), rng))
+    if extra is not None:
+        graph = insert_loops(graph, extra)
+    if found.is_false.any():
+        clean = found.graph.subset(~found.is_false)
+    best = solve(clean, None, SolveOptions(robust=False)).solution.poses[:, :2]
+    outcome = solve(graph, None, SolveOptions(robust=True))
+    judgement, poses = outcome.judgement, outcome.solution.poses[:, :2]
+    assert judgement is not None
+    rows = ~graph.between.is_odometry
+    terms = terms_of(judgement.accepted[rows], judgement.suspect[rows], judgement.sigmas[rows],
+                     judgement.variance[1], len(judgement.slips))
+    return Row(name, terms, _is_wrong(found, poses, best), bool(judgement.doubts))
+
+
+def _is_wrong(found: Place, positions: Array, best: Array) -> bool:
+    if found.truth_error is not None:
+        return found.truth_error(positions) > 1.5 * found.truth_error(best) + 0.05
+    diagonal = np.linalg.norm(np.ptp(best, axis=0))
+    return bool(absolute_trajectory_error(positions, best) > max(0.25, 0.005 * diagonal))
+
+
+def _fitted(rows: list[Row]) -> Array:
+    """Return the weights that make what became of some runs likeliest, drawn to zero a little."""
+    terms, wrong = np.array([row.terms for row in rows]), np.array([row.wrong for row in rows])
+    weights: Array = minimize(
+        lambda w: (np.logaddexp(0, terms @ w) - wrong * (terms @ w)).sum()
+        + _RIDGE * (w[1:]**2).sum(), np.zeros(terms.shape[1])).x
+    return weights
+
+
+def _tell(name: str, rows: list[Row], weights: Array) -> None:
+    wrong, doubted = (np.array([getattr(row, what) for row in rows])
+                      for what in ('wrong', 'doubted'))
+    forecast = 1 / (1 + np.exp(-np.array([row.terms for row in rows]) @ weights))
+    print(f'\n{name}: {len(rows)} runs; right {(~wrong & ~doubted).sum()}, right and doubted '
+          f'{(~wrong & doubted).sum()}, wrong and said {(wrong & doubted).sum()}, wrong and '
+          f'silent {(wrong & ~doubted).sum()}\n\n| confidence | runs | said | right |\n|---|---|'
+          '---|---|')
+    for low, high in zip(_EDGES, _EDGES[1:], strict=False):
+        among = (forecast >= low) & (forecast < high)
+        if among.any():
+            print(f'| {1 - high:.2f} to {1 - low:.2f} | {among.sum()} | '
+                  f'{1 - forecast[among].mean():.3f} | {1 - wrong[among].mean():.3f} |')
+
+
+def main() -> int:
+    """Run, fit and count."""
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--datasets', type=Path, required=True)
+    parser.add_argument('--seeds', type=int, default=3, help='of graphs that are made')
+    parser.add_argument('--only', nargs='+', choices=FIT + HELD, default=FIT + HELD)
+    given = parser.parse_args()
+    rows = []
+    for name in given.only:
+        for seed in range(given.seeds if name in MADE else 1):
+            found = MADE[name](seed) if name in MADE else place(given.datasets, name)
+            for condition in range(len(CONDITIONS)):
+                report_progress(f'{name} seed {seed}: {CONDITIONS[condition]}')
+                rows.append(_run(name, found, condition, seed))
+    weights = _fitted([row for row in rows if row.graph in FIT] or rows)
+    print('weights:', ', '.join(f'{weight:.2f}' for weight in weights))
+    for half in ('FIT', 'HELD'):
+        if among := [row for row in rows if row.graph in globals()[half]]:
+            _tell(half, among, weights)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

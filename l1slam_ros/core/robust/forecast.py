@@ -1,0 +1,53 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""
+How often maps that looked like this one were right: a forecast with a record.
+
+In: what is known at the end of a judgement. Out: a share of 1. It is a logistic regression of five
+terms on what became of made and of recorded graphs with lies; `benchmarks/robust/verdict.py` makes
+the graphs, fits the weights on half of them and counts on the other half how often it was right.
+"""
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
+
+# Of a map with no loop left out; then for the share of loops that is left out, each power of ten
+# by which loops are noisier than stated, the share that is suspect, each slip, and where so many
+# of those left out lie near that they may be true.
+_WEIGHTS = np.array([-5.44, 3.54, 1.01, 1.09, 0.70, 1.55])
+# [sigmas] A loop left out lies near below this; they are many above this share of the accepted.
+_NEAR, _MANY = 10.0, 0.1
+
+
+def forecast(accepted: Mask, suspect: Mask, sigmas: Array, variance: float, slips: int) -> float:
+    """
+    Return how often such maps were right; NaN without loops, of which nothing is recorded.
+
+    Parameters
+    ----------
+    accepted, suspect, sigmas : (k,) of each loop, as a judgement has them
+    variance : of loops as it was found, in units of what they state
+    slips : how many odometry factors were left out
+
+    """
+    if not len(accepted):
+        return float('nan')
+    terms = terms_of(accepted, suspect, sigmas, variance, slips)
+    return float(1 / (1 + np.exp(_WEIGHTS @ terms)))
+
+
+def terms_of(accepted: Mask, suspect: Mask, sigmas: Array, variance: float, slips: int) -> Array:
+    """Return what the weights are of, (6,); see `forecast`."""
+    left_out = ~accepted
+    near = np.count_nonzero(left_out & (sigmas < _NEAR))
+    return np.array([
+        1.0, left_out.mean(), np.log10(max(variance, 1.0)), np.log1p(10 * suspect.mean()), slips,
+        near > _MANY * max(np.count_nonzero(accepted), 1)])
