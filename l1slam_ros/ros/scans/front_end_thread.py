@@ -45,7 +45,7 @@ _BACKLOG = 20_000
 # [s] So often, at most, the path is read while there is nothing else to do; and the map looked at.
 _READ, _LOOK = 1.0, 0.1
 _REPEAT_WARNING = 5.0  # [s]
-# [s] What raises each time it is called shall not keep a core busy.
+# [s] Pause after an error, so that one which recurs does not keep a core busy.
 _BREATH = 0.05
 # Costs of so many scans are kept.
 _COSTS = 1000
