@@ -184,10 +184,16 @@ def test_modules_say_their_licence_and_what_they_are(module):
     assert ast.get_docstring(tree(module))
 
 
-# What runs while a robot drives: a reader holds each class and function at once.
+# A reader holds each class and function at once.
+MOST_ATTRIBUTES, MOST_METHODS, MOST_CODE, MOST_OF_A_FUNCTION = 15, 25, 260, 40
+# What is larger, and why. The list only shrinks: what has become small must be taken off it.
+LARGE = {
+    'core.robust.rounds.Growth': 'the state of a robust solve, which its trials copy as one',
+    'ros.threads.inputs.Inputs': 'subscriptions, their events and what was refused of them',
+}
+# What runs while a robot drives.
 RUNNING = [name for name in FILES if name.startswith(tuple(
     f'{PACKAGE}.core.{part}' for part in ('bordered', 'graph', 'running')))]
-MOST_ATTRIBUTES, MOST_METHODS, MOST_CODE, MOST_OF_A_FUNCTION = 15, 25, 260, 40
 
 
 def stored(node):
@@ -196,19 +202,38 @@ def stored(node):
             if isinstance(one, ast.Attribute) and isinstance(one.ctx, ast.Store)]
 
 
-@pytest.mark.parametrize('module', RUNNING)
-def test_classes_that_run_are_small(module):
+def sizes(module):
+    """Yield the name of each function and class of a module, what is counted, count and limit."""
     lines = code_lines(FILES[module])
-    assert len(lines) <= MOST_CODE
     for node in ast.walk(tree(module)):
+        if not isinstance(node, ast.FunctionDef | ast.ClassDef):
+            continue
+        name = f'{module}.{node.name}'.removeprefix(f'{PACKAGE}.')
         if isinstance(node, ast.FunctionDef):
-            assert len(lines & set(range(node.lineno, node.end_lineno + 1))) <= MOST_OF_A_FUNCTION
-        elif isinstance(node, ast.ClassDef):
+            own = lines & set(range(node.lineno, node.end_lineno + 1))
+            yield name, 'lines of code', len(own), MOST_OF_A_FUNCTION
+        else:
             methods = [one for one in node.body if isinstance(one, ast.FunctionDef)]
             fields = {one.target.id for one in node.body if isinstance(one, ast.AnnAssign)}
             fields |= {name for method in methods for of, name in stored(method) if of == 'self'}
-            assert len(methods) <= MOST_METHODS, f'{node.name} has {len(methods)} methods'
-            assert len(fields) <= MOST_ATTRIBUTES, f'{node.name} has {len(fields)} attributes'
+            yield name, 'methods', len(methods), MOST_METHODS
+            yield name, 'attributes', len(fields), MOST_ATTRIBUTES
+
+
+@pytest.mark.parametrize('module', FILES)
+def test_functions_and_classes_are_small(module):
+    for name, what, count, limit in sizes(module):
+        assert count <= limit or name in LARGE, f'{name} has {count} {what}'
+
+
+def test_only_what_is_large_is_listed_as_large():
+    large = {name for module in FILES for name, _, count, limit in sizes(module) if count > limit}
+    assert large == set(LARGE)
+
+
+@pytest.mark.parametrize('module', RUNNING)
+def test_modules_that_run_are_short(module):
+    assert len(code_lines(FILES[module])) <= MOST_CODE
 
 
 @pytest.mark.parametrize('module', RUNNING)

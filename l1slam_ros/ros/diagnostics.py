@@ -22,13 +22,13 @@ from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.inputs import Traffic
 from l1slam_ros.ros.threads.solver_thread import SolverThread
 
-# Seconds, which are as many publications.
+# [s], and the number of publications, which come once a second.
 _MINUTE = 60
 # [s] Loops may wait for so long to be judged.
 _BEHIND = 10.0
-# Of so many judged loops most may be refused without a warning: a few say little.
+# Below this number of judged loops there is no warning when most are refused.
 _FEW = 5
-# [m], [rad] What moves the robot by less is no jump: the last of a solve.
+# [m], [rad] A map that moves the robot by less is not reported as a jump.
 _STILL = 1e-3
 
 

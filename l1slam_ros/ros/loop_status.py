@@ -20,7 +20,7 @@ from l1slam_ros.core.running.snapshot import ACCEPTED, EXPIRED, LOOP_STATES, WAI
 from l1slam_ros.io.files import stamp_text
 from l1slam_ros.io.messages.serialisation import cdr, header_bytes, string_bytes
 
-# Who comes late still gets the last changes.
+# A late subscriber still gets the last changes.
 _DEPTH = 1000
 
 
@@ -44,7 +44,7 @@ class LoopStatus:
         self._waiting: set[tuple[int, int]] = set()
 
     def publish(self, states: LoopStates) -> None:
-        """Publish the loops whose state is another than at the last call; called by the worker."""
+        """Publish the loops whose state has changed since the last call; called by the worker."""
         known, count = len(self._in_graph), len(states.rows)
         if count < known:  # the map began anew
             known, self._waiting = 0, set()

@@ -38,7 +38,7 @@ _LOOPS = {'loops': ACCEPTED, 'suspect_loops': SUSPECT, 'rejected_loops': REJECTE
 _POINT, _LINE = 0.12, 0.05  # [m]
 # Keyframes or factors of one marker; what moves by less [m] is not sent again.
 _PIECE, _STILL = 500, 0.01
-_EVERY = 1.0  # [s] people look no faster
+_EVERY = 1.0  # [s] shortest time between two publications: people see no faster
 # Lifetime: for ever; not locked to the frame.
 _FOR_EVER = struct.pack('<iI?', 0, 0, False)
 # No texture, its header and format, coordinates on it, text, mesh, its file; no materials.
@@ -48,7 +48,7 @@ _NOTHING_ELSE = struct.pack('<IBxxxiIIBxxxIBxxxIIIBxxxIBxxxIBxxxI?', 1, 0, 0, 0,
 
 class GraphMarkers:
     """
-    Publishes the graph on the topic `graph`, for who looks.
+    Publishes the graph on the topic `graph` while it has subscribers.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class GraphMarkers:
 
     @property
     def behind(self) -> bool:
-        """Whether somebody looks who has not seen the last map."""
+        """Whether there is a subscriber that has not been sent the last map."""
         return self._someone_new or (self._waits and time.monotonic() - self._last >= _EVERY)
 
     def publish(self, frame: str, stamp: int, now: Snapshot) -> None:

@@ -85,10 +85,23 @@ class BackendNode(LifecycleNode):
         self._map_services = MapServices(
             self, self._backend, self._jobs, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
-        guarded = self.failures.guarded
         for sentence in *self._declared.unknown(), unusable_path(options.save_path):
             if sentence:
                 self.get_logger().warning(sentence)
+        self._connect_callbacks()
+        if options.autostart:
+            self.trigger_configure()
+            self.trigger_activate()
+        # Active first: who hears of a loaded map may send odometry at once.
+        self._map.tell()
+        self._jobs.start()
+        self._map_services.start()
+        self._solver.start(self._map.tell)
+        self._inputs.start()
+
+    def _connect_callbacks(self) -> None:
+        """Hear of new parameters and transitions, of jumps of the clock, and of each second."""
+        guarded = self.failures.guarded
         self.add_on_set_parameters_callback(self._on_set)
         change = self._service_change_state
         change.callback = partial(self._on_change_state, change.callback)
@@ -99,15 +112,6 @@ class BackendNode(LifecycleNode):
         # By a clock that goes on where simulated time stands still, or a bag has ended.
         self.create_timer(1.0, guarded('diagnostics', self._on_second),
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
-        if options.autostart:
-            self.trigger_configure()
-            self.trigger_activate()
-        # Active first: who hears of a loaded map may send odometry at once.
-        self._map.tell()
-        self._jobs.start()
-        self._map_services.start()
-        self._solver.start(self._map.tell)
-        self._inputs.start()
 
     def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Use messages from now on."""

@@ -9,7 +9,7 @@
 """
 The process of a node: SIGINT, SIGTERM and SIGHUP end it within two seconds, whatever it does.
 
-Imported and run before anything heavy, so that this holds while the rest is being imported, too.
+It is imported and run before anything heavy, so that signals work while the rest is imported, too.
 """
 
 import os
@@ -26,7 +26,7 @@ _BAD_INPUT = 2
 _PATIENCE, _THREADS = 1.2, 0.9
 # [s] And so much longer for a map that is being saved.
 _SAVING = 4.5
-# [s] What raises each time it is called shall not keep a core busy.
+# [s] Pause after an error, so that one which recurs does not keep a core busy.
 _BREATH = 0.05
 # [s] How long the interpreter lets the solver's own Python run before a callback may.
 _TURN = 5e-4

@@ -32,7 +32,7 @@ from l1slam_ros.io.sentences import doubt_sentence, offset_sentence
 from l1slam_ros.ros.threads.failures import Failures
 from l1slam_ros.ros.threads.job_queue import JobQueue
 
-# [s] So often is looked whether there is something to save.
+# [s] Period of the check whether there is something to save.
 _LOOK = 0.1
 
 

@@ -70,7 +70,7 @@ class Robot:
 
     @property
     def used(self):
-        return self.front_end._front_end.counts['scans']
+        return self.front_end._front_end.run.counts['scans']
 
     def until(self, condition, what):
         deadline = time.monotonic() + DEADLINE
@@ -146,7 +146,7 @@ def test_two_laps_make_a_map(robot, tmp_path, rng):
     r = robot(map_path=str(tmp_path / 'corridors.pgm'), **{'map_period': 0.5})
     r.drive(truth, wheels)
     r.until(lambda: r.received['path'] and len(r.received['path'][-1].poses)
-            == r.front_end._front_end.counts['keyframes'], 'the path has every keyframe')
+            == r.front_end._front_end.run.counts['keyframes'], 'the path has every keyframe')
     r.call('/backend/optimize')
     print(r.status(), r.status('map'))
     path = r.received['path'][-1]

@@ -39,7 +39,7 @@ from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 @dataclass(frozen=True)
 class Prediction:
     """
-    What the map says of r + J x before the factor tells: the innovation.
+    The innovation: what the map predicts for r + J x without the factor.
 
     residual : (k,) to expect; covariance : (k, k) of it, without the factor's own noise; rows :
     (k, rows) of F, to be; points (2,), blocks (2, k, k) : of the factor

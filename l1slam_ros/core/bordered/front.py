@@ -51,8 +51,8 @@ _SURE = 1000.0
 # Rows of a border, and keyframes it touches, that one more update has the time and the memory for.
 # What comes then waits for the next map.
 _MOST_ROWS, _MOST_POINTS = 1800, 1400
-# What to do with a factor: believe it; nothing, for the map has it or is to stay without it; or
-# find out by the gate.
+# What to do with a factor: accept it; skip it, for the map has it already or is to stay without
+# it; or gate it.
 BELIEVE, SKIP, GATE = 1, 0, -1
 
 
@@ -65,7 +65,7 @@ class Look:
     sigmas: float
 
 
-# Of a factor that it was to skip.
+# The look at a factor that was skipped.
 _SKIPPED = Look(False, False, np.nan)
 
 
@@ -224,7 +224,7 @@ class Front:
         return looks
 
     def _is_beyond(self, factors: BetweenFactors, row: int, what: int) -> bool:
-        """Tell whether a factor is for the next map."""
+        """Tell whether a factor must wait for the next map."""
         return (max(factors.i[row], factors.j[row]) > self.keyframes
                 or (what == BELIEVE and self._turns(factors, row))
                 or self.border > _MOST_ROWS or self._systems[L2].points > _MOST_POINTS)
@@ -236,7 +236,7 @@ class Front:
     def _look(self, factors: BetweenFactors, new: Linearised, at: int, what: int) -> Look | None:
         """Gate a factor, and make it part of the map where it is accepted; None: it cannot be."""
         own = np.diag(factors.sqrt_information[self.rows])
-        # What is silent of some component is for the judge.
+        # A factor that leaves a component unsaid is left to the judge.
         if what == GATE and (self._turns(factors, self.rows) or not own.all()):
             return Look(False, True, np.nan)
         first_seen = self.keyframes in (factors.i[self.rows], factors.j[self.rows])
@@ -253,7 +253,7 @@ class Front:
                 noise = np.sqrt(self._usual * np.hypot(left, self._mu))
                 l1.add(l1.predict(*new.of(L1, at)), noise)
         except np.linalg.LinAlgError:
-            # Beyond double precision: the next map may be able to.
+            # Beyond double precision here; the next map may be able to take it.
             return None
         return look
 

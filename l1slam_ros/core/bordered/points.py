@@ -27,7 +27,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
-# In the place of a keyframe, or of a point: one that is held fixed.
+# Stands for a keyframe, or a point, that is held fixed.
 FIXED = -1
 
 

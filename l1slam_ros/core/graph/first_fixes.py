@@ -97,7 +97,7 @@ def _windows(count: int, size: int, most: int) -> Indices:
 
 
 def _largest_group(count: int, windows: Indices, good: Mask) -> Indices:
-    """Return which of so many things hang together by what is good in windows, the most, (k,)."""
+    """Return the largest group of `count` things that good windows connect, (k,)."""
     first = windows[np.arange(len(windows)), np.argmax(good, axis=1)]
     lowest = lowest_of_components(np.repeat(first, good.sum(axis=1)), windows[good], count)
     return np.flatnonzero(lowest == np.argmax(np.bincount(lowest)))

@@ -13,8 +13,9 @@ In: a graph and its poses. Out: A and b, whitened, b the negative residual, the 
 Rows keep the order of the factors, columns that of the free keyframes.
 
 The gauge: the world never moves; where no factor names it, keyframe 0 does not either. Factors
-that leave a component unsaid may tie a part of the graph by less than it takes: a single position
-fix leaves the map free to turn. What nothing determines stays as it is: see `loose_keyframes`.
+that leave a component unsaid may tie a part of the graph only in some directions: a single
+position fix leaves the map free to turn. A motion that nothing determines stays zero: see
+`loose_keyframes`.
 """
 
 from dataclasses import dataclass, replace

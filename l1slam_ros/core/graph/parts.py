@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Graphs in several parts, made whole for a solver, at no cost to what they say.
+Graphs in several parts, tied together for a solver without changing their optimum.
 
 In: a graph whose odometry has gaps, or that nothing accepted ties together. Out: the same with a
 factor in each gap that no other factor speaks against.

@@ -89,11 +89,8 @@ def factorise(panels, first, start, pattern, offset, stride, owner, share, mine,
     Returns the first position whose pivot is not positive; the number of positions when all are.
     """
     count, n, d = len(first) - 1, first[-1], len(size)
-    local, tallest = np.empty(n, np.int64), 0
-    for s in range(count):
-        tallest = max(tallest, (start[s + 1] - start[s]) * d)
-        if share[s] < mine:
-            _enqueue(s, reach, start, pattern, owner, share, mine, lists)
+    local = np.empty(n, np.int64)
+    tallest = d * _begin_share(reach, start, pattern, owner, share, mine, lists)
     place, target = np.empty(tallest, np.int64), np.empty(tallest, np.int64)
     least = np.empty(tallest)
     for s in range(count):
@@ -138,6 +135,17 @@ def _within(rows, end):
     while count < len(rows) and rows[count] < end:
         count += 1
     return count
+
+
+@compiled
+def _begin_share(reach, start, pattern, owner, share, mine, lists):
+    """Enqueue the supernodes of earlier shares; return how many rows the tallest of all has."""
+    tallest = 0
+    for s in range(len(share)):
+        tallest = max(tallest, start[s + 1] - start[s])
+        if share[s] < mine:
+            _enqueue(s, reach, start, pattern, owner, share, mine, lists)
+    return tallest
 
 
 @compiled

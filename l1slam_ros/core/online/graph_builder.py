@@ -37,7 +37,7 @@ from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
 from l1slam_ros.core.online.odometry.plausibility import UNSEEN_TURN, Point
 from l1slam_ros.core.options import Options, option
 
-# What a gap in the odometry is to the map: the cause it is counted by, and what is said of it.
+# Each kind of gap in the odometry: the cause it is counted by, and its sentence.
 _SAID = {'new_segment': ('new_part', 'a new part of the map begins where the last one ends'),
          'reset': ('reset', 'the map begins anew'),
          'ignore': ('moved', 'the robot is taken to be where it was')}
@@ -105,7 +105,7 @@ class GraphBuilder:
         self._moved, self._glued = False, True
 
     def set_options(self, options: GraphBuilderOptions) -> None:
-        """Go on by other options; what is in the graph stays."""
+        """Use other options from now on; what is in the graph stays."""
         self.options = options
 
     def add_odometry(self, sample: OdometrySample) -> bool:
@@ -130,7 +130,7 @@ class GraphBuilder:
             self._add(point)
             used = True
         track = self.track  # a new one, maybe
-        # Loops that are due become factors by the samples as they came.
+        # Loops that are due are carried by the samples as they came, so thinning waits for them.
         if track.may_be_thinned and not self.loops.waiting.is_due(track.last):
             track.thin()
         return used
@@ -239,7 +239,7 @@ class GraphBuilder:
         self._motion = KeyframeMotion(self.graph.manifold, stamp, pose)
 
     def _forget(self) -> None:
-        """Begin anew; loops that came may yet find odometry of their times."""
+        """Begin anew; loops that wait are kept, since odometry of their times may still come."""
         self._begin(FactorGraph(self.graph.manifold))
         self._resumed = False
         self.loops.forget()
@@ -256,7 +256,7 @@ class GraphBuilder:
             loops.struck_pairs)
 
     def restore(self, state: BuilderState) -> None:
-        """Go on where a run ended; odometry that begins elsewhere begins a part there."""
+        """Continue where a run ended; odometry that does not continue there begins a new part."""
         self._begin(state.graph)
         # In a file a loop across a gap looks like odometry.
         steps = self.graph.between.step_to

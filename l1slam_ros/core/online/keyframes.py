@@ -22,7 +22,7 @@ from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.graph.measurements import OdometrySample
 from l1slam_ros.core.options import Options, option
 
-# Ten steps of 5 cm are half a metre, though the difference of coordinates be a rounding less.
+# Ten steps of 5 cm count as half a metre, though rounding may make their sum a little less.
 _ALMOST = 1 - 1e-9
 # So many messages without a keyframe are summed up at once: memory for more is not needed.
 _SUMMED = 512
@@ -68,7 +68,7 @@ def reduced_covariance(manifold: Manifold, covariance: Array) -> Array:
 
 
 class Level:
-    """What poses of the odometry have beside those of the map: in the plane no z, and no tilt."""
+    """The components of odometry poses that poses of the map lack: in the plane z and tilt."""
 
     def __init__(self, manifold: Manifold):
         self._manifold = manifold
@@ -185,7 +185,7 @@ class KeyframeMotion:
         self._metres += metres
         self._radians += radians
         if covariance is None:
-            self._stated = None  # one message without a covariance: the model speaks for all
+            self._stated = None  # one message has no covariance: the model is used for all
         elif self._stated is not None and len(self._stated) >= _SUMMED:
             self._sum_up()
         if self._stated is not None and covariance is not None:
@@ -194,7 +194,7 @@ class KeyframeMotion:
         self._ends[1], self._stamp = pose[0], stamp
 
     def _sum_up(self) -> None:
-        """Let one covariance stand for those of all messages so far."""
+        """Replace the covariances of all messages so far by their sum."""
         end = self._poses[-1]
         total = self._seen_from(end)
         self._poses, self._stated = [end], None if total is None else [total.sum(axis=0)]

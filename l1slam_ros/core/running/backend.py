@@ -46,9 +46,9 @@ from l1slam_ros.core.running.snapshot import (
 )
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
-# What poses live on, by the dimension of the world.
+# The manifold of the poses, by the dimension of the world.
 _MANIFOLDS: dict[int, Manifold] = {2: se2, 3: se3}
-# [s] In the background nothing has come for a while when it has not for so long.
+# [s] With `background=True`: the back end is idle when nothing has come for so long.
 _PAUSE = 0.2
 
 
@@ -63,7 +63,7 @@ class RobustOptions(Options):
 
 @dataclass(frozen=True)
 class BackendOptions(GraphBuilderOptions):
-    """Everything the back end can be told; a mapping may say what its node is told besides."""
+    """All options of the back end; a mapping may also hold options that only its node has."""
 
     PASSED_OVER = OF_THE_NODE
 
@@ -87,7 +87,7 @@ class Backend:
     manifold : what the poses live on
     options : as they are now
     base_frame : of the robot, as far as is known; no reset forgets it
-    calm : what goes on behind waits for its end, `with backend.calm:`
+    calm : background work pauses inside `with backend.calm:`
 
     Raises
     ------
@@ -122,7 +122,7 @@ class Backend:
         self.close()
 
     def close(self) -> None:
-        """End what is at work behind; raise what went wrong there, if anything did."""
+        """End the background threads; raise the error that one of them met, if any."""
         try:
             if self._background is not None:
                 self._background.close()
@@ -190,11 +190,11 @@ class Backend:
     def update(self, budget: float = 0.1,
                stopped: Stopped = lambda: False) -> Improvement | None:
         """
-        Take what has come into the map, and let it be improved; None: there was nothing to do.
+        Take new factors into the map and start background work; None: there was nothing to do.
 
         What has come, up to some twenty milliseconds of work, is in the map when this returns. It
-        waits up to `budget` seconds for what goes on behind, and leaves the rest there; where the
-        map is updated in the background, it does not wait.
+        waits up to `budget` seconds for the background work, which then goes on by itself; with
+        `background=True` it does not wait.
 
         Raises
         ------
@@ -209,7 +209,7 @@ class Backend:
         """
         Judge all loops and solve to the end; None: there are no factors yet.
 
-        What is under way makes way, but for other calls of this: one follows the other.
+        Work that is under way is interrupted; another call of `settle` is finished first.
 
         Raises
         ------
@@ -219,14 +219,14 @@ class Backend:
         return self._updates.settle(stopped)
 
     def alone(self, urgent: bool = False) -> AbstractContextManager[None]:
-        """Let nothing be solved, nor begin to be; urgent : a `settle` under way waits, too."""
+        """Keep all solving stopped within the block; urgent : interrupts a `settle`, too."""
         return self._updates.alone(urgent)
 
     def _help(self, idle: bool, stopped: Stopped) -> bool:
         """Update in the background; return whether more may be to do later."""
         if not idle and time.monotonic() < self._called + _PAUSE:
-            return True  # who updates by himself would have to wait for it
-        # What found nothing to do may only have had to wait until nothing comes.
+            return True  # a caller's own update would have to wait for it
+        # Where there was nothing to do, there may be once the back end is idle.
         return self._updates.update(0.0, stopped, idle) is not None or not idle
 
     def _wake(self) -> None:
@@ -238,7 +238,7 @@ class Backend:
 
     @property
     def revisions(self) -> Revisions:
-        """The number that counts changes: by it is known whether what is kept is stale."""
+        """The number that counts changes; a kept result is stale if its own number is lower."""
         return self._keeper.revisions
 
     @property
@@ -272,7 +272,7 @@ class Backend:
         return Counts(self._counted[1], refused, told)
 
     def behind(self) -> Behind:
-        """Return what goes on behind updates."""
+        """Return the state of the background work."""
         state, _, size = self._keeper.look()
         return Behind.of(state, size.loops, time.monotonic(), self._updates.failing)
 
@@ -310,7 +310,7 @@ def _before_fork() -> None:
         _at_rest.enter_context(backend.alone(urgent=True))
 
 
-# Threads do not come along into a process that is forked, but what they have locked does, of ours,
-# numba's and Python's: so nothing is at work meanwhile.
+# A forked process inherits locks, but not the threads that hold them, of ours, numba's and
+# Python's. So all background work stops during a fork.
 os.register_at_fork(before=_before_fork, after_in_parent=_at_rest.close,
                     after_in_child=_at_rest.close)

@@ -29,13 +29,12 @@ from l1slam_ros.core.graph.factor_graph import BetweenFactors
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.robust.judgement import Judgement
 
-# Who said last what stands in a row. Nobody: the factor stood in a graph that was solved without
-# a look at it.
+# Who set a row last. Nobody: the factor was in a graph that was solved without judging it.
 NOBODY, FRONT, JUDGE, PERSON = range(4)
 
 # accepted, suspect, sigmas, noise : see `Judgement`, noise is NaN until a judgement; said_by : one
-# of the above; in_map : the map that is published is of it; proved : so is the one of which a
-# lower bound was proved.
+# of the above; in_map : the published map uses it; proved : the map whose lower bound was proved
+# uses it.
 ROW = np.dtype([('accepted', bool), ('suspect', bool), ('in_map', bool), ('proved', bool),
                 ('said_by', np.int32), ('sigmas', float), ('noise', float)])
 
@@ -48,8 +47,9 @@ class FactorTable:
     """
     The table at one moment; what comes later is written elsewhere.
 
-    rows : (m,) of `ROW`, in the order of the factors; looked : at so many of the first ones
-    somebody has looked; is_map_of_accepted : whether the map is of those of them that are accepted
+    rows : (m,) of `ROW`, in the order of the factors; looked : how many of the first rows the
+    front or the judge has examined; is_map_of_accepted : whether the map uses the accepted ones of
+    these, and no other
     """
 
     rows: Any
@@ -73,7 +73,7 @@ class FactorTable:
 
     @property
     def accepted(self) -> Mask:
-        """Which of the factors that somebody looked at are accepted, (looked,) bool."""
+        """Which of the examined factors are accepted, (looked,) bool."""
         accepted: Mask = self.rows['accepted'][:self.looked]
         return accepted
 
@@ -89,7 +89,7 @@ class FactorTable:
                        sigmas=rows['sigmas'], noise=rows['noise'])
 
     def behind(self, judgement: Judgement) -> Judgement:
-        """Return a judgement of the first factors, with what stands here of those behind them."""
+        """Return a judgement of the first factors, extended by the rows of the later ones."""
         rest = self.rows[len(judgement.accepted):self.looked]
         return replace(judgement, accepted=np.append(judgement.accepted, rest['accepted']),
                        suspect=np.append(judgement.suspect, rest['suspect']),
@@ -99,14 +99,14 @@ class FactorTable:
         """Return the table with rows for the next factors, which the front took."""
         if not looks:
             return self
-        # Behind rows that somebody else has appended by now, there is no room.
+        # Where another table has appended rows in the same memory by now, there is no room.
         store = self._store if len(self._store) == self.looked else FactorTable.of(
             self.rows[:self.looked])._store
         store.extend(_rows_of_looks(looks))
         return FactorTable(store.view(), len(store), self.is_map_of_accepted, store)
 
     def told(self, factors: BetweenFactors) -> 'FactorTable':
-        """Return the table in which a person has the last word; itself where nothing changes."""
+        """Return the table with a person's decisions applied; itself where nothing changes."""
         if not (factors.trusted.any() or factors.struck.any()):
             return self
         before = self.accepted
@@ -121,7 +121,7 @@ class FactorTable:
         return FactorTable.of(rows)
 
     def judged(self, judgement: Judgement, factors: BetweenFactors) -> 'FactorTable':
-        """Return the table with what was judged of the first factors, unless a person says."""
+        """Return the table with the first factors as judged; a person's decisions stay."""
         rows = _rows(judgement, JUDGE)
         rows['accepted'] = _by_person(judgement.accepted, factors)
         rows['said_by'][rows['accepted'] != judgement.accepted] = PERSON
@@ -184,8 +184,8 @@ class FactorTable:
         """
         Return what a new front does with the factors, as far as anybody looked at them.
 
-        part : (k,) bool, those of the first factors that its map is of; again : at what was not
-        accepted it looks again: beside what is accepted now more may fit
+        part : (k,) bool, those of the first factors that its map is of; again : examine factors
+        that were not accepted once more: others may fit the new map
         """
         known = self.accepted
         what = np.full(max(len(part), len(known)), GATE)

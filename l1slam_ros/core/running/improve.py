@@ -60,13 +60,13 @@ from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 # Where the weights of reweighted steps turn over, in mean |e|: at first, from one to the next, and
 # at last.
 _SMOOTHING, _SHARPER, _SHARPEST = 0.1, 0.3, 1e-2
-# Linearisations of one round, and iterations of one where a front carries what is far: more and
-# it is late.
+# Linearisations of one round, and iterations of one linearisation where there is a front: with
+# more, the map comes too late.
 _OUTER, _INNER = 2, 120
-# Steps of Gauss-Newton that the gate's map gets each time it is made.
+# Gauss-Newton steps for the least squares map of the gate, each time it is made.
 _L2_STEPS = 4
 
-# Called on the way, often; raises `Interrupted` where the work shall stop.
+# A check that is called often; it raises `Interrupted` where the work shall stop.
 Check = Callable[[], None]
 
 
@@ -120,7 +120,7 @@ class Improvement:
 
     @property
     def falls(self) -> bool:
-        """Whether another round at once is worth it: iterations ended on the way down."""
+        """Whether another round is worth it: the cost was still falling when iterations ended."""
         return (self.status not in (Status.CONVERGED, Status.STALLED)
                 and is_far(self.cost_before, self.cost))
 
@@ -180,7 +180,7 @@ def _nearest(problem: Problem) -> tuple[Array, Array, float]:
     """Return the best poses to start from, their residual, and the cost where the map is."""
     graph, starts = problem.part, problem.starts
     if graph.between.is_absolute.any():
-        # The map may not have come to the world yet.
+        # The map may not have been moved to its absolute poses yet.
         starts = [*starts, placed(graph, problem.poses)]
     return _best(graph, starts, l1_cost)
 
@@ -195,7 +195,7 @@ def _best(graph: FactorGraph, starts: list[Array],
 
 
 def _dual_of(problem: Problem, e: Array) -> Array:
-    """Return the dual to start from, (rows,): what is kept, else what the residual asks for."""
+    """Return the dual to start from, (rows,): the kept one, else one made of the residual."""
     dual = problem.dual.reshape(-1, problem.graph.manifold.TANGENT_SIZE)
     kept = dual[problem.judgement.accepted]
     asked = (e / np.hypot(e, smoothing(e))).reshape(kept.shape)
@@ -272,7 +272,7 @@ def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
 def _improvement(solution: Solution, problem: Problem, judgement: Judgement, before: float,
                  steps: int, start: float) -> Improvement:
     accepted = judgement.accepted
-    # The rows of what is not believed have no dual yet.
+    # Factors that are not accepted have no dual yet.
     dual = np.zeros((len(accepted), problem.graph.manifold.TANGENT_SIZE))
     dual[accepted] = solution.dual.reshape(-1, dual.shape[1])
     return Improvement(problem.map, solution.poses, dual.ravel(), judgement,

@@ -33,7 +33,7 @@ from l1slam_ros.core.running.improve import Improvement
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.solvers.optimality import Status
 
-# In the place of how many loops were judged: a person has spoken since.
+# Stands for the number of judged loops when a person has decided something since.
 _TOLD_SINCE = -1
 
 
@@ -63,11 +63,11 @@ class Judged:
     """
     What the judge has done, and when [s].
 
-    loops : of so many there is a judgement; anew : of so many there is one from the graph alone;
-    doubted : so many there were when a judgement last doubted those that it refused; poses :
-    (n, p) the L2 map of the last one, None: there is none; wanted : the front has left a loop that
-    fits; compared : the map that was last compared with that of another norm; began, ended, took :
-    of the last one that went on from the one before; anew_ended, anew_took : of the last one anew
+    loops : how many were judged; anew : how many were judged from the graph alone;
+    doubted : how many there were when a judgement last doubted its own refusals; poses : (n, p)
+    the L2 map of the last one, None: there is none; wanted : the front has left a loop that fits;
+    compared : the map that was last compared with that of another norm; began, ended, took : of
+    the last one that went on from the one before; anew_ended, anew_took : of the last one anew
     """
 
     loops: int
@@ -141,7 +141,7 @@ class MapState:
 
     @property
     def is_stale(self) -> bool:
-        """Whether the map is not of the factors that are accepted, or are to be."""
+        """Whether the map uses other factors than those that are accepted, or are to be."""
         return self.pending is not None or not self.table.is_map_of_accepted
 
     @property
@@ -157,13 +157,13 @@ class MapState:
         """
         Return whether all of so many loops were judged from the graph alone.
 
-        What was believed when little was known stays as long as it fits: at rest there is time to
-        ask whether it would be believed now.
+        A loop that was accepted early stays accepted as long as it fits. At rest there is time to
+        judge whether it would be accepted now.
         """
         return self.all_judged(loops) and (not self.robust or self.judged.anew == loops)
 
     def told(self, factors: BetweenFactors) -> 'MapState':
-        """Return the state once a person's word on some factors counts."""
+        """Return the state with a person's decisions on some factors applied."""
         table = self.table.told(factors)
         if table is self.table:
             return self

@@ -15,8 +15,8 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.solvers.optimality import Status
 
-# A large map gets but one linearisation into an update, and never meets a test that takes two of
-# them. It is at rest when so many updates in a row lowered the cost by less than is looked for.
+# An update of a large map has time for one linearisation, and the test of convergence needs two.
+# So the map is at rest when so many updates in a row lowered the cost by less than the tolerance.
 _QUIET_UPDATES = 5
 
 

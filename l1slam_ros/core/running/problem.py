@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What there is to minimise: a graph, what is believed of it, and a warm start.
+The problem to minimise: a graph, the judgement of its factors, and a warm start.
 
 In: what a back end has at one moment. Out: the same as judge and solvers want it, see `as_one`: of
 one piece, without what a person struck out. What was made of that, `Improvement.of_all` gives back

@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-The back end at one moment: taken in a moment, and read at leisure while the back end goes on.
+The back end at one moment: a cheap copy that is read while the back end goes on.
 
 In: references to arrays that are never written to again. Out: what is worked out of them, the
 problem of the next update first of all.
@@ -29,7 +29,7 @@ from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.running.problem import Problem
 from l1slam_ros.core.solvers.block_cholesky import Pattern
 
-# What can become of a loop; `LoopStates.state` counts in this order.
+# The states of a loop; `LoopStates.state` holds indices of this tuple.
 LOOP_STATES = ('waiting', 'suspect', 'accepted', 'rejected', 'expired')
 WAITING, SUSPECT, ACCEPTED, REJECTED, EXPIRED = range(len(LOOP_STATES))
 
@@ -93,9 +93,9 @@ class Behind:
     What goes on behind updates.
 
     age : [s] of the map that was factored, NaN: there is none; rows : of loops that came since;
-    loops : not judged yet; bound : what no map of the accepted factors that is near this one has
-    less L1 cost than, and its age [s], NaN: nothing was proved of them; failing : the last work
-    failed, told or not.
+    loops : not judged yet; bound : a lower bound on the L1 cost of all maps of the accepted
+    factors near this one, and its age [s], NaN: nothing was proved of them; failing : the last
+    work failed, told or not.
     """
 
     age: float

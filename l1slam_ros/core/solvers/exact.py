@@ -9,7 +9,8 @@
 """
 The exact L1 map of a graph: rough L2 first where that helps, then one interior-point run.
 
-In: a graph and poses. Out: poses at a local optimum, and what a dual proves of what is left.
+In: a graph and poses. Out: poses at a local optimum, and the bound that a dual proves on the cost
+that may be left.
 """
 
 import numpy as np

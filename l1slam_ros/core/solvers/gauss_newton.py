@@ -45,8 +45,8 @@ _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING, _HARDLY = 1e-8, 3e-10, 1e6, 1e-6
 # A map to within its noise: Gauss-Newton begins where chi2 is at most so many times what the noise
 # makes of it, and takes so many steps at most.
 _FITS, _NOISE_STEPS = 3, 60
-# Of chi2. What a step was wrong by is to first order in the length of what is left to go, what is
-# left of chi2 to second.
+# Relative to chi2. The error of what a step promised is of first order in the way that is left,
+# the rest of chi2 is of second order.
 _SURPRISE = 0.1
 
 
@@ -100,8 +100,8 @@ def _descend(
     """
     Return what `gauss_newton` does, and the system that it solved last, None: a damped one.
 
-    surprise : an undamped step that lowers the cost by what its linear problem says, but for so
-    much, is the last one
+    surprise : stop after an undamped step whose decrease of the cost differs from that of its
+    linear problem by no more than this
     """
     residual = whitened_residual(graph, poses)
     history = [norm.cost(residual)]

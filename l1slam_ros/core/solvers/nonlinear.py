@@ -22,7 +22,12 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.linear_system import linearise, step_poses, whitened_residual
+from l1slam_ros.core.graph.linear_system import (
+    LinearSystem,
+    linearise,
+    step_poses,
+    whitened_residual,
+)
 from l1slam_ros.core.names import NORMS, SAME
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
@@ -114,11 +119,8 @@ def minimise(
             status, gap = Status.CONVERGED, 0.0
             break
         system = linearise(graph, poses, residual)
-        if cholesky and (dual is None or (outer and is_far(*history[-2:]))):
-            x, dual = reweighted_start(system, cholesky)
-        else:
-            x = np.zeros(system.size * system.block_size)
-            dual = np.zeros(len(residual)) if dual is None else dual
+        anew = dual is None or (outer > 0 and is_far(*history[-2:]))
+        x, dual = _start(system, dual, cholesky if anew else None)
         effort = options.inner.iterations * _MORE_EFFORT**small_steps
         solution = minimise_l1_halpern(system, x, dual, replace(options.inner, iterations=effort),
                                        weight, deadline)
@@ -141,6 +143,16 @@ def minimise(
     dual = np.zeros(len(residual)) if dual is None else dual
     return Solution(poses, history[-1], status, len(history) - 1, inner, np.array(history), dual,
                     gap)
+
+
+def _start(
+    system: LinearSystem, dual: Array | None, cholesky: BlockCholesky | None
+) -> tuple[Array, Array]:
+    """Return where a linear problem begins, (columns,) and (rows,): by `cholesky` if given."""
+    if cholesky:
+        return reweighted_start(system, cholesky)
+    x = np.zeros(system.size * system.block_size)
+    return x, np.zeros(len(system.b)) if dual is None else dual
 
 
 def is_far(before: float, after: float) -> bool:

@@ -124,40 +124,85 @@ def minimise_l1_halpern(
                               run.weight)
 
 
-class _Run:
-    """One solve: the arrays of the compiled loop, and where in the problem its origin is."""
+class _Arrays:
+    """The arrays of the compiled loop, in single precision, and calls of it."""
 
-    def __init__(self, system: LinearSystem, x: Array, y: Array, weight: float | None):
-        self._system, k = system, system.block_size
-        scaled, self._inverse = scaled_system(system)
+    def __init__(self, system: LinearSystem, scaled: LinearSystem, y: Array):
+        self._size, k = system.block_size, system.block_size
         self._layout = Tiles(system.keyframe, system.size, kernels.halpern.LANES)
         columns = scaled.blocks.reshape(-1, 2 * k * k)
         dual = np.clip(y, -1, 1).reshape(-1, k)
         self._tiles = self._layout.pack(np.concatenate((columns, dual, dual, dual), axis=1))
-        self._b, self._y, self._y0 = (
+        self.b, self.y, self._y0 = (
             self._tiles[:, row: row + k] for row in range(2 * k * k, 2 * k * k + 3 * k, k))
-        self._x, self._z, self._g, self._x_bar, self._g_bar = np.zeros(
+        self.x, self._z, self._g, self.x_bar, self.g_bar = np.zeros(
             (5, system.size + 1, k), np.float32)
-        self._y_bar = np.empty((len(self._tiles), k, kernels.halpern.LANES), np.float32)
+        self.y_bar = np.empty((len(self._tiles), k, kernels.halpern.LANES), np.float32)
+        self._g[:-1] = scaled.transposed_times(dual.ravel()).reshape(-1, k)
+
+    def set_origin(self, residual: Array) -> None:
+        """Let x count from where A x - b is `residual`, (rows,)."""
+        self.b[:] = self._layout.pack(-residual.reshape(-1, self._size))
+        self.x[:] = 0
+
+    def iterate(self, weight: float, since: int, count: int) -> None:
+        """Do `count` iterations; since : those since the restart."""
+        self._call(kernels.halpern.iterate, self.x, self._z, self._g, weight, since, count)
+
+    def look(self, weight: float) -> tuple[float, float, float]:
+        """Set the candidate; return the squared fixed-point residual, its cost and dual value."""
+        squared, cost, dual = self._call(
+            kernels.halpern.look, self.x, self._g, weight, self.x_bar, self.g_bar,
+            self._flat(self.y_bar))
+        return squared, cost, dual
+
+    def movement(self) -> tuple[Any, Any]:
+        """Return how far the candidate is from the last restart: primal and dual."""
+        return np.linalg.norm(self.x_bar), np.linalg.norm(self.y_bar - self._y0)
+
+    def restart(self) -> None:
+        """Go on from the candidate, which is the origin of x now."""
+        self.y[:] = self._y0[:] = self.y_bar
+        self._g[:] = self.g_bar
+        self.x_bar[:] = 0
+
+    def dual(self) -> Array:
+        """Return y of the candidate, (rows,)."""
+        return self._layout.unpack(self.y_bar).ravel()
+
+    def _call(self, kernel: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a compiled loop; its K tells the compiler the block size."""
+        return kernel(self._flat(self._tiles), self._layout.keyframes, *arguments,
+                      (0,) * self._size)
+
+    @staticmethod
+    def _flat(tiles: Single) -> Single:
+        return tiles.reshape(len(tiles), -1)
+
+
+class _Run:
+    """One solve: where in the problem the origin of the loop is, and when it restarts."""
+
+    def __init__(self, system: LinearSystem, x: Array, y: Array, weight: float | None):
+        self._system = system
+        scaled, self._inverse = scaled_system(system)
+        self._arrays = _Arrays(system, scaled, y)
         # Iterations since the restart, and the residuals of its first and its latest look.
         self._since = 0
         self._residuals: tuple[float, ...] = ()
         # The origin of the loop's x, and how far, scaled, it has come from the start.
-        self._origin, self._offset = np.array(x, float), np.zeros((system.size, k))
+        self._origin = np.array(x, float)
+        self._offset = np.zeros((system.size, system.block_size))
         self.cost = self._set_origin()
         self.weight = weight or self._typical_weight(self.cost)
-        self._g[:-1] = scaled.transposed_times(dual.ravel()).reshape(-1, k)
 
     def advance(self, count: int) -> tuple[float, float, float]:
         """Return the fixed-point residual, the cost and the gap after `count` more iterations."""
-        self._call(kernels.halpern.iterate, self._x, self._z, self._g, self.weight, self._since,
-                   count)
+        self._arrays.iterate(self.weight, self._since, count)
         self._since += count
-        squared, cost, dual = self._call(
-            kernels.halpern.look, self._x, self._g, self.weight, self._x_bar, self._g_bar,
-            self._flat(self._y_bar))
-        box = np.abs(self._offset + self._x_bar[:-1]) + 1 / self.weight
-        g = self._g_bar[:-1]
+        squared, cost, dual = self._arrays.look(self.weight)
+        box = np.abs(self._offset + self._arrays.x_bar[:-1]) + 1 / self.weight
+        g = self._arrays.g_bar[:-1]
         gap = cost - dual + (g * self._offset).sum() + (np.abs(g) * box).sum()
         return float(np.sqrt(max(squared, 0.0))), cost, float(gap)
 
@@ -173,41 +218,27 @@ class _Run:
 
     def restart(self, cost: float) -> None:
         """Go on from the candidate; cost : its |A x - b|_1."""
-        moved = np.linalg.norm(self._x_bar)
-        turned = np.linalg.norm(self._y_bar - self._y0)
+        moved, turned = self._arrays.movement()
         if moved > 0 and turned > 0:
             typical = self._typical_weight(cost)
             self.weight = float(np.clip(np.sqrt(self.weight * turned / moved),
                                         typical / _WEIGHT_RANGE, typical * _WEIGHT_RANGE))
         self._origin = self.candidate()[0]
-        self._offset += self._x_bar[:-1]
+        self._offset += self._arrays.x_bar[:-1]
         self._set_origin()
-        self._y[:] = self._y0[:] = self._y_bar
-        self._g[:] = self._g_bar
-        self._x_bar[:] = 0  # the origin is the candidate now
+        self._arrays.restart()
 
     def candidate(self) -> tuple[Array, Array]:
         """Return x (columns,) and y (rows,) as of the last look."""
-        step = self._inverse @ self._x_bar[:-1, :, None].astype(float)
-        return (self._origin + step.ravel(),
-                self._layout.unpack(self._y_bar).ravel())
+        step = self._inverse @ self._arrays.x_bar[:-1, :, None].astype(float)
+        return self._origin + step.ravel(), self._arrays.dual()
 
     def _set_origin(self) -> float:
-        """Let x of the loop count from the origin; returns the cost there."""
+        """Let x of the loop count from the origin; return the cost there."""
         residual = self._system.times(self._origin) - self._system.b
-        self._b[:] = self._layout.pack(-residual.reshape(-1, self._system.block_size))
-        self._x[:] = 0
+        self._arrays.set_origin(residual)
         self._since, self._residuals = 0, ()
         return l1_cost(residual)
 
     def _typical_weight(self, cost: float) -> float:
         return _BALANCE / max(cost / len(self._system.b), _EXACT)
-
-    def _call(self, kernel: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a compiled loop; its K tells the compiler the block size."""
-        return kernel(self._flat(self._tiles), self._layout.keyframes, *arguments,
-                      (0,) * self._system.block_size)
-
-    @staticmethod
-    def _flat(tiles: Single) -> Single:
-        return tiles.reshape(len(tiles), -1)

@@ -55,11 +55,11 @@ class ScanDiagnostics:
         values: dict[str, object] = {
             f'{topic}.{name}': value for topic, traffic in self._topics.items()
             for name, value in traffic.values().items()}
-        values |= {name: front_end.counts[name]
+        values |= {name: front_end.run.counts[name]
                    for name in ('scans', 'keyframes', 'parts', 'loops')}
         values['waiting'] = queue.waiting
         values |= {f'refused.{cause}': count for cause, count in sorted(lost.items())}
-        median, most = front_end.cost()
+        median, most = front_end.run.cost()
         values |= {'scan_seconds.median': f'{median:.5f}', 'scan_seconds.p99': f'{most:.5f}',
                    'map.cells': self._drawer.cells}
         level, sentence = self._judgement(lately)

@@ -12,6 +12,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -31,7 +32,7 @@ from l1slam_ros.core.scans.points import Mount, Scan
 from l1slam_ros.io.messages.conversion import odometry_in
 from l1slam_ros.ros.scans.map_drawer import MapDrawer
 from l1slam_ros.ros.scans.messages import covariance_in, path_in, scan_in
-from l1slam_ros.ros.scans.mounting import StaticTransforms
+from l1slam_ros.ros.scans.mounting import RobotFrames
 from l1slam_ros.ros.scans.options import ScanLoopsOptions
 from l1slam_ros.ros.scans.placing import Placing
 from l1slam_ros.ros.scans.publishing import ScanPublisher
@@ -41,20 +42,123 @@ from l1slam_ros.ros.threads.failures import Failures
 
 # So many messages are kept until there is time for them.
 _BACKLOG = 20_000
-# [s] How long /tf_static may take to say where the laser is.
-_MOUNTING = 2.0
 # [s] So often, at most, the path is read while there is nothing else to do; and the map looked at.
 _READ, _LOOK = 1.0, 0.1
 _REPEAT_WARNING = 5.0  # [s]
-# [s] What raises each time it is called shall not keep a core busy.
+# [s] Pause after an error, so that one which recurs does not keep a core busy.
 _BREATH = 0.05
 # Costs of so many scans are kept.
 _COSTS = 1000
 
 
+class RunOfScans:
+    """
+    Follows the robot from scan to scan, publishes what comes of it, and has the map drawn.
+
+    Parameters
+    ----------
+    options : returns them as they are now
+    frames : of the robot
+    publisher : of odometry and loops
+    drawer : of the map
+    logger : to warn with
+
+    Attributes
+    ----------
+    counts : of what has been made
+    costs : of the last scans [s]
+
+    """
+
+    def __init__(self, options: Callable[[], ScanLoopsOptions], frames: RobotFrames,
+                 publisher: ScanPublisher, drawer: MapDrawer, logger: Any):
+        self._options, self._frames, self._logger = options, frames, logger
+        self._publisher, self._drawer = publisher, drawer
+        self.counts = Counter[str]()
+        self.costs: deque[float] = deque(maxlen=_COSTS)
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Begin with no scan seen."""
+        options = self._options()
+        self._front_end = ScanFrontEnd(options, self._frames.mount or Mount())
+        self._odometry = IncrementalOdometry(options.keyframe)
+        self._placing = Placing()
+        self._path, self._read = b'', 0.0
+        self._drawer.begin_anew()
+
+    def set_path(self, data: bytes) -> None:
+        """Keep a serialised path until there is time to read it."""
+        self._path = data
+
+    def add_known(self, stamp: int, covariance: Array) -> None:
+        """Hear how well a pose of the path is known, (3, 3) at its stamp [ns]."""
+        self._placing.add_known(stamp, covariance)
+
+    def follow(self, scan: Scan, wheels: Array) -> None:
+        """Follow the robot to a scan, the wheels being at a pose (3,); publish what came of it."""
+        began = time.thread_time()
+        keyframes = self._front_end.keyframes
+        before = keyframes[-1].part if keyframes else 0
+        step = self._front_end.add(scan, wheels)
+        begins = self._front_end.keyframes[-1].part != before
+        pose, covariance = self._odometry.tell(scan.stamp, step, begins)
+        self._publisher.odometry(self._frames.base, scan.stamp, pose, covariance)
+        self._publisher.wheels_frame(self._frames.wheels, scan.stamp, pose, wheels)
+        self._placing.add_odometry(scan.stamp, step.pose)
+        self._warn(step, begins)
+        if step.keyframe is not None:
+            self._place()
+        # Comparisons of keyframes wait for each other: a few are made with each scan.
+        for loop in self._front_end.loops():
+            self._publisher.loop(self._frames.base, self._front_end.keyframes, loop)
+            self.counts['loops'] += 1
+        self.counts['scans'] += 1
+        self.costs.append(time.thread_time() - began)
+        self._count()
+
+    def place_if_due(self) -> None:
+        """Read a path that has come, if the last one was read a while ago."""
+        if self._path and time.monotonic() - self._read > _READ:
+            self._place()
+
+    def cost(self) -> tuple[float, float]:
+        """Return what the last scans cost, median and 99% quantile [s] of a core."""
+        median, most = np.quantile(list(self.costs) or [0.0], (0.5, 0.99)).tolist()
+        return median, most
+
+    def _warn(self, step: Step, begins: bool) -> None:
+        if begins:
+            self._logger.warning(step.said)
+        elif step.said:
+            self._logger.warning(step.said, throttle_duration_sec=_REPEAT_WARNING)
+
+    def _count(self) -> None:
+        keyframes = self._front_end.keyframes
+        self.counts['keyframes'] = len(keyframes)
+        self.counts['parts'] = keyframes[-1].part + 1 if keyframes else 0
+
+    def _place(self) -> None:
+        """Let front end and map know where the path has the keyframes."""
+        if self._path:
+            self._placing.set_path(*path_in(deserialize_message(self._path, Path)))
+            self._path, self._read = b'', time.monotonic()
+        keyframes = self._front_end.keyframes
+        poses = self._placing.place(keyframes)
+        if not len(poses):
+            return
+        placed = keyframes[: len(poses)]
+        self._front_end.place(poses, self._placing.spread(placed))
+        joined = self._placing.joined(placed)
+        self._drawer.follow(self._placing.frame, placed[-1].stamp, {
+            number: (keyframe.points, pose)
+            for number, (keyframe, pose) in enumerate(zip(placed, poses, strict=True))
+            if keyframe.part in joined})
+
+
 class FrontEndThread:
     """
-    Takes messages in the order they came, and publishes what comes of them.
+    Takes messages in the order they came, and follows the robot with them.
 
     Parameters
     ----------
@@ -69,8 +173,7 @@ class FrontEndThread:
     ----------
     refused : cause -> how many messages could not be used
     queue : the scans that wait
-    counts : of what has been made
-    costs : of the last scans [s]
+    run : the scans that were used
     ready : whether its loops are compiled
 
     """
@@ -78,30 +181,17 @@ class FrontEndThread:
     def __init__(self, node: Node, options: Callable[[], ScanLoopsOptions],
                  publisher: ScanPublisher, drawer: MapDrawer, failures: Failures, static: bool):
         self._logger, self._options = node.get_logger(), options
-        self._publisher, self._drawer, self._failures = publisher, drawer, failures
-        self._static = StaticTransforms() if static else None
-        self.refused, self.counts = Counter[str](), Counter[str]()
-        self.costs: deque[float] = deque(maxlen=_COSTS)
+        self._drawer, self._failures = drawer, failures
+        self._frames = RobotFrames(options, self._logger, static)
+        self.refused = Counter[str]()
+        self.queue, self.ready = ScanQueue(), False
+        self._restarts = self.queue.restarts
+        self.run = RunOfScans(options, self._frames, publisher, drawer, self._logger)
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=_BACKLOG)
         self._woken, self._closing = threading.Event(), False
-        self._uses = {'scan': self._on_scan, 'odom': self._on_odometry, 'path': self._on_path,
+        self._uses = {'scan': self._on_scan, 'odom': self._on_odometry, 'path': self.run.set_path,
                       'pose_with_covariance': self._on_covariance, '/tf_static': self._on_static}
-        self._base, self._wheels_frame, self._laser = options().base_frame, '', ''
-        self._mount: Mount | None = None
-        self._mounting = 0.0
-        self.queue, self.ready = ScanQueue(), False
         self._thread = threading.Thread(target=self._work, name='front end', daemon=True)
-        self._begin_anew()
-
-    def _begin_anew(self) -> None:
-        """Begin with no scan seen."""
-        options = self._options()
-        self._front_end = ScanFrontEnd(options, self._mount or Mount())
-        self._told = IncrementalOdometry(options.keyframe)
-        self._placing = Placing()
-        self._path, self._read = b'', 0.0
-        self._restarts = self.queue.restarts
-        self._drawer.begin_anew()
 
     def start(self) -> None:
         """Begin."""
@@ -149,121 +239,45 @@ class FrontEndThread:
         if self.queue.restarts != self._restarts:
             self._logger.warning('the stamps of odom went back: scans and map begin anew')
             self._begin_anew()
-        if self._is_mounted() and (taken := self.queue.take(self._options().scan_wait)):
-            self._follow(*taken)
+        if self._frames.find_mount():
+            self._begin_anew()
+        mounted = self._frames.mount is not None
+        if mounted and (taken := self.queue.take(self._options().scan_wait)):
+            self.run.follow(*taken)
+            self._warn_of_left_out()
             return True
-        if self._path and time.monotonic() - self._read > _READ:
-            self._place()
+        self.run.place_if_due()
         return self._drawer.work()
 
     def _on_scan(self, data: bytes) -> None:
         message = deserialize_message(data, LaserScan)
         self.queue.add_scan(scan_in(message, self._options().range_max))
-        self._laser = message.header.frame_id.removeprefix('/')
+        self._frames.laser = message.header.frame_id.removeprefix('/')
 
     def _on_odometry(self, data: bytes) -> None:
-        self._wheels_frame, sample = odometry_in(data)
-        frame = sample.frame.removeprefix('/')
-        self._base = self._base or frame or 'base_link'
-        if frame not in (self._base, ''):
-            raise MessageError('child_frame', f'odometry of {frame!r}; expected that of '
-                               f'{self._base!r}')
+        frame, sample = odometry_in(data)
+        self._frames.hear_odometry(frame, sample.frame)
         self.queue.add_wheels(sample.stamp, se2.from_pose3(sample.pose3[None])[0])
 
-    def _on_path(self, data: bytes) -> None:
-        self._path = data
-
     def _on_covariance(self, data: bytes) -> None:
-        self._placing.add_known(*covariance_in(
+        self.run.add_known(*covariance_in(
             deserialize_message(data, PoseWithCovarianceStamped)))
 
     def _on_static(self, data: bytes) -> None:
         from tf2_msgs.msg import TFMessage
 
-        if self._static is not None:
-            self._static.add(deserialize_message(data, TFMessage))
+        self._frames.hear_static(deserialize_message(data, TFMessage))
 
     def _refuse(self, error: L1SlamError) -> None:
         self.refused[error.cause if isinstance(error, MessageError) else 'unusable'] += 1
         self._logger.warning(f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
 
-    def _is_mounted(self) -> bool:
-        """Find out where the laser is, once scans and odometry come; return whether it is."""
-        if self._mount is not None:
-            return True
-        if not self._laser or not self._base:
-            return False
-        now = time.monotonic()
-        self._mounting = self._mounting or now
-        mount, how = self._options().mount(), 'as laser_pose says'
-        if mount is None and self._static is not None:
-            mount, how = self._static.mount(self._base, self._laser), 'as /tf_static says'
-            if mount is None and now - self._mounting < _MOUNTING:
-                return False
-        if mount is None:
-            mount, how = Mount(), 'for neither laser_pose nor /tf_static says otherwise'
-        upside_down = ', upside down' if mount.upside_down else ''
-        self._logger.info(f'the laser {self._laser!r} is at x {mount.x:g} m, y {mount.y:g} m, yaw '
-                          f'{mount.yaw:g} rad{upside_down} of {self._base!r}, {how}')
-        self._mount = mount
-        self._begin_anew()
-        return True
+    def _begin_anew(self) -> None:
+        self.run.begin_anew()
+        self._restarts = self.queue.restarts
 
-    def _follow(self, scan: Scan, wheels: Array) -> None:
-        """Follow the robot to a scan, and tell what came of it."""
-        began = time.thread_time()
-        keyframes = self._front_end.keyframes
-        before = keyframes[-1].part if keyframes else 0
-        step = self._front_end.add(scan, wheels)
-        begins = self._front_end.keyframes[-1].part != before
-        pose, covariance = self._told.tell(scan.stamp, step, begins)
-        self._publisher.odometry(self._base, scan.stamp, pose, covariance)
-        self._publisher.wheels_frame(self._wheels_frame, scan.stamp, pose, wheels)
-        self._placing.add_odometry(scan.stamp, step.pose)
-        self._say(step, begins)
-        if step.keyframe is not None:
-            self._place()
-        # Comparisons of keyframes wait for each other: a few are made with each scan.
-        for loop in self._front_end.loops():
-            self._publisher.loop(self._base, self._front_end.keyframes, loop)
-            self.counts['loops'] += 1
-        self.counts['scans'] += 1
-        self.costs.append(time.thread_time() - began)
-        self._count()
-
-    def _say(self, step: Step, begins: bool) -> None:
-        if begins:
-            self._logger.warning(step.said)
-        elif step.said:
-            self._logger.warning(step.said, throttle_duration_sec=_REPEAT_WARNING)
+    def _warn_of_left_out(self) -> None:
         if left := self.queue.counts['left_out']:
             self._logger.warning(f'{left} scans were left out: they come faster than they are '
                                  'used; expected a laser that is slower, or a machine that is '
                                  'faster', once=True)
-
-    def _count(self) -> None:
-        keyframes = self._front_end.keyframes
-        self.counts['keyframes'] = len(keyframes)
-        self.counts['parts'] = keyframes[-1].part + 1 if keyframes else 0
-
-    def _place(self) -> None:
-        """Let front end and map know where the path has the keyframes."""
-        if self._path:
-            self._placing.set_path(*path_in(deserialize_message(self._path, Path)))
-            self._path, self._read = b'', time.monotonic()
-        keyframes = self._front_end.keyframes
-        poses = self._placing.place(keyframes)
-        if not len(poses):
-            return
-        placed = keyframes[: len(poses)]
-        self._front_end.place(poses, self._placing.spread(placed))
-        joined = self._placing.joined(placed)
-        self._drawer.follow(self._placing.frame, placed[-1].stamp, {
-            number: (keyframe.points, pose)
-            for number, (keyframe, pose) in enumerate(zip(placed, poses, strict=True))
-            if keyframe.part in joined})
-
-    def cost(self) -> tuple[float, float]:
-        """Return what the last scans cost, median and 99% quantile [s] of a core."""
-        median, most = np.quantile(list(self.costs) or [0.0], (0.5, 0.99)).tolist()
-        return median, most

@@ -6,8 +6,10 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Where the laser is on the robot, by /tf_static."""
+"""The frames of the robot, and where the laser is in them: as an option or /tf_static says."""
 
+import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,10 @@ from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans.points import Mount
 from l1slam_ros.io.messages.conversion import checked_pose3
+from l1slam_ros.ros.scans.options import ScanLoopsOptions
 
+# [s] How long /tf_static may take to say where the laser is.
+_MOUNTING = 2.0
 # More links from a laser to a robot are a circle.
 _LINKS = 100
 # A laser whose axis is farther off the vertical than by this cosine sees no floor plan.
@@ -58,6 +63,81 @@ class StaticTransforms:
             frame, pose3 = self._parents[frame]
             pose = se3.compose(se3.from_pose3(pose3[None]), pose)
         return None
+
+
+class RobotFrames:
+    """
+    The names of the robot's frames as messages give them, and where the laser is.
+
+    Parameters
+    ----------
+    options : returns them as they are now
+    logger : to say where the laser is
+    static : whether /tf_static is heard
+
+    Attributes
+    ----------
+    base : of the robot
+    wheels : in which its odometry is
+    laser : of the scans
+    mount : where the laser is in `base`; None: not known yet
+
+    """
+
+    def __init__(self, options: Callable[[], ScanLoopsOptions], logger: Any, static: bool):
+        self._options, self._logger = options, logger
+        self._transforms = StaticTransforms() if static else None
+        self.base, self.wheels, self.laser = options().base_frame, '', ''
+        self.mount: Mount | None = None
+        # [s] When it was first asked where the laser is.
+        self._asked = 0.0
+
+    def hear_static(self, message: Any) -> None:
+        """Take in a tf2_msgs/TFMessage of /tf_static."""
+        if self._transforms is not None:
+            self._transforms.add(message)
+
+    def hear_odometry(self, wheels: str, child: str) -> None:
+        """
+        Take in the two frames of an odometry message; the first one names the robot's.
+
+        Raises
+        ------
+        MessageError : it is the odometry of another frame.
+
+        """
+        self.wheels = wheels
+        frame = child.removeprefix('/')
+        self.base = self.base or frame or 'base_link'
+        if frame not in (self.base, ''):
+            raise MessageError('child_frame', f'odometry of {frame!r}; expected that of '
+                               f'{self.base!r}')
+
+    def find_mount(self) -> bool:
+        """
+        Find out where the laser is, once; return whether it was found in this call.
+
+        Raises
+        ------
+        MessageError : the laser does not look along a floor.
+
+        """
+        if self.mount is not None or not self.laser or not self.base:
+            return False
+        now = time.monotonic()
+        self._asked = self._asked or now
+        mount, how = self._options().mount(), 'as laser_pose says'
+        if mount is None and self._transforms is not None:
+            mount, how = self._transforms.mount(self.base, self.laser), 'as /tf_static says'
+            if mount is None and now - self._asked < _MOUNTING:
+                return False
+        if mount is None:
+            mount, how = Mount(), 'for neither laser_pose nor /tf_static says otherwise'
+        upside_down = ', upside down' if mount.upside_down else ''
+        self._logger.info(f'the laser {self.laser!r} is at x {mount.x:g} m, y {mount.y:g} m, yaw '
+                          f'{mount.yaw:g} rad{upside_down} of {self.base!r}, {how}')
+        self.mount = mount
+        return True
 
 
 def _mount(laser: str, pose3: Array) -> Mount:

@@ -97,8 +97,7 @@ class Placing:
         """
         Return the parts of the run whose place in the map is known: the first, and those joined.
 
-        The back end says how well a pose of a part that nothing joins is known as well as of any
-        other: by next to nothing.
+        Of a part that nothing joins, the back end publishes covariances, too; they are huge.
         """
         found = {keyframes[0].part} if keyframes else set()
         stamps = [keyframe.stamp for keyframe in keyframes]

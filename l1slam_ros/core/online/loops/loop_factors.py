@@ -72,7 +72,7 @@ class LoopFactors:
 
     def forget(self) -> None:
         """Begin with an empty graph; loops that wait may yet find odometry of their times."""
-        # The clock that they came by was none, or goes otherwise now.
+        # Their times of arrival are of another clock.
         self.waiting.begin_anew(lambda stamp: stamp, 0)
         # The loops that came, by their identities; and their rows once they are factors.
         self._seen = {one.key for one in self.waiting.all() if not one.loop.struck}
@@ -146,7 +146,7 @@ class LoopFactors:
                 self._expired.extend(np.array([one.loop.stamps]))
             self._refuse('expired', one.loop, f'waited for odometry until {track.last_stamp} ns; '
                          'expected odometry of its times')
-            # Sent again when odometry has come that far, it is welcome.
+            # A loop that is sent again once odometry has come that far is used.
             self._seen.discard(one.key)
         return self._add_due(due, graph, track, options) if due else 0
 
@@ -159,7 +159,7 @@ class LoopFactors:
         new: list[int] = []
         before, came = len(graph.between), len(self.rows)
         for k in can:
-            # One that is there is vouched for by now: no second factor.
+            # A person vouches for a loop that is in the graph already: there is no second factor.
             if not due[k].loop.struck and (self._verbatim or due[k].key not in self._row_of):
                 self._row_of[due[k].key] = before + len(new)
                 new.append(k)

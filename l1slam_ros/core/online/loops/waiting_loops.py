@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Loop closures that wait for odometry to reach their times, or for their time to be over."""
+"""Loop closures that wait for odometry to reach their times, until they expire."""
 
 import heapq
 from collections.abc import Callable, Iterable
@@ -83,7 +83,7 @@ class WaitingLoops:
 
     def begin_anew(self, time: Callable[[int], int], arrival: int | None = None) -> None:
         """
-        Look anew what stamps mean: the odometry went back in time.
+        Interpret all stamps again, after the odometry went back in time.
 
         time : of a stamp; arrival : when all are to have come, None: as they did
         """

@@ -48,7 +48,7 @@ _BACK = 0.5
 _GAP = 2.0
 # [rad] A smaller turn is not told of.
 _TOLD = 0.1
-# So much of a frame's name is quoted.
+# The number of letters of a frame's name that are quoted.
 _QUOTED = 40
 
 
@@ -247,7 +247,7 @@ class OdometryStream:
         return [point]
 
     def _explain(self, last: Point, held: Point, after: Step | None) -> None:
-        """Say of a held sample that is used what is not known of the motion to it."""
+        """Tell what is not known of the motion to a held sample that is used now."""
         step, recent = Step(self._manifold, last, held), self._recent
         if held.doubt == 'old_stamp' or (
                 held.doubt == 'jump' and recent.jumps(last, held, step, after)):
@@ -268,7 +268,7 @@ class OdometryStream:
         return 'unsure' if self._recent.unsure(last, point, step) else ''
 
     def _goes_on(self, last: Point, held: Point, point: Point) -> bool:
-        """Tell whether a sample speaks for the one that is held."""
+        """Tell whether a sample continues the motion of the held one, and so confirms it."""
         if point.stamp <= held.stamp or (held.doubt == 'old_stamp' and point.stamp > last.stamp):
             return False
         after = Step(self._manifold, held, point)

@@ -33,13 +33,14 @@ _RECENT = 16
 _BLOCK = 512
 # [m], [rad] What interpolation may miss: the least standard deviation of a measurement.
 _MISSED = LEAST_VARIANCE**0.5
-# A round that spares less than such a part of the samples is the last.
+# Thinning ends with a round that leaves out less than this part of the samples.
 _WORTH = 1 / 8
 
 # [ns] Between the last sample before stamps went back, and the first after.
 _BETWEEN = 1_000_000_000
 
-# Who went by a place makes no more of a detour over it, times and [m].
+# A robot passed a place if the way over it is longer than the direct one by no more than this
+# factor and this length [m].
 _DETOUR, _BESIDE = 2.0, 0.1
 
 

@@ -49,11 +49,10 @@ _AT_ONCE = 4
 
 class Revisions(NamedTuple):
     """
-    The one number that counts the changes of a back end, and where it stood at some of them.
+    The number that counts the changes of a back end, and its value at some of them.
 
-    now : there may be something new to do or to tell since any lower one; map : since then the
-    poses of the map are what they are; grown : since then the graph has its size; graph : the
-    graph began then, which names it
+    now : the latest; map : when the poses of the map last changed; grown : when the graph last
+    grew; graph : when the graph began, which names it
     """
 
     now: int = 0
@@ -117,7 +116,8 @@ class Keeper:
                 elif graph.n_poses != keyframes:
                     self._revisions = self._revisions.after(grown=True)
                 elif len(builder.loops.waiting):
-                    # Any sample may be the one that they wait for, or one too many.
+                    # Any sample may be the one that a loop waits for, or the one at which it
+                    # expires.
                     self._revisions = self._revisions.after()
 
     def add_loop(self, loop: LoopClosure) -> None:
@@ -165,7 +165,7 @@ class Keeper:
 
     @contextmanager
     def reading(self) -> Iterator[GraphBuilder]:
-        """Give the builder to be read, while nothing changes."""
+        """Give the builder to be read; nothing changes within the block."""
         with self._graph_lock:
             yield self._builder
 
@@ -176,7 +176,7 @@ class Keeper:
 
     @contextmanager
     def standing(self) -> Iterator[Snapshot]:
-        """Let nothing change; give a snapshot, see `snapshot`."""
+        """Give a snapshot, see `snapshot`; nothing changes within the block."""
         with self._front_lock:
             front = self._front
             views = front.views if front else ()
@@ -234,7 +234,7 @@ class Keeper:
                 if not self._take_some():
                     break
             taken = True
-            time.sleep(0)  # who waits for the lock would else wait for the deadline
+            time.sleep(0)  # else a thread that waits for the lock would wait for the deadline
         if taken:
             with self._front_lock:
                 state = self._state
@@ -297,7 +297,7 @@ class Keeper:
                 self._solver.outer_tolerance, time.monotonic())
             self._front = front
             self._move(newest)
-        # To give its memory back takes long: it shall not be an update that does so last.
+        # To free its memory takes long, so an update must not hold the last reference.
         with self._front_lock:
             pass
         del former

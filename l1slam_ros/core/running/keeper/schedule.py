@@ -19,11 +19,11 @@ from typing import NamedTuple
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.running.map_state import MapState
 
-# A map is factored anew from so many factors on that came since, those of five keyframes; on a
-# large one, from one for so many keyframes on: what goes on behind costs each keyframe the same,
-# however large the map is.
+# A map is factored anew when so many factors have come since, those of five keyframes. A large map
+# is factored anew when one factor has come for so many of its keyframes: the cost of this for each
+# keyframe does not grow with the map.
 _FEWEST, _KEYFRAMES_EACH = 10, 200
-# [s] While loops come none of which fits, they are judged so often.
+# [s] The period of judgements while loops come and none of them fits.
 _JUDGE_EVERY = 2.0
 
 
@@ -61,7 +61,7 @@ class Moment(NamedTuple):
 
 
 def due(state: MapState, size: Size, moment: Moment) -> tuple[Work | None, Work | None]:
-    """Return what is due of the worker that makes maps, and of the one that judges."""
+    """Return the work that is due for the worker that makes maps, and for the one that judges."""
     make = is_map_due(state, size, moment.idle)
     return (_map(state, moment.idle) if make else None,
             _judgement(state, size, moment, make))
@@ -76,7 +76,8 @@ def _map(state: MapState, idle: bool) -> Work:
 def _judgement(state: MapState, size: Size, moment: Moment, make: bool) -> Work | None:
     anew = is_anew_due(state, size, moment)
     if is_judge_due(state, size, moment):
-        # At rest first from what is believed on: that takes less time, and mostly finds as much.
+        # At rest it first starts from the accepted loops: that is faster, and mostly finds as
+        # much.
         return Work.JUDGE_ANEW if anew else Work.JUDGE
     compared = state.judged.compared is state.optimised
     final = moment.idle and not make and state.all_judged_anew(size.loops)
@@ -90,7 +91,7 @@ def is_map_due(state: MapState, size: Size, idle: bool) -> bool:
     optimised, carried = state.optimised, state.carried
     behind = (len(optimised.poses) < size.keyframes or len(optimised.dual) < size.rows
               or not optimised.at_rest)
-    # The front goes by the noise that was known when it was made.
+    # The front uses the noise that was known when it was made.
     other_noise = idle and carried is not None and bool(
         (carried.variance != state.of_all.variance).any())
     return bool(size.keyframes) and (state.is_stale or state.falls or other_noise
@@ -108,9 +109,9 @@ def is_judge_due(state: MapState, size: Size, moment: Moment) -> bool:
     """
     Return whether to judge all loops.
 
-    At rest until all are judged from the graph alone; else where there is as much time as it
-    takes, or the last judgement is long over. That is sooner where the front left a loop that
-    fits, or there is no front that gates them.
+    At rest it is due until all loops are judged from the graph alone. Otherwise it is due where
+    there is enough time for it, or where the last judgement is long ago. That is sooner where the
+    front left a loop that fits, or there is no front that gates them.
     """
     if moment.idle:
         return not state.all_judged_anew(size.loops)

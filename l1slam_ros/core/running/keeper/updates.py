@@ -39,7 +39,7 @@ from l1slam_ros.core.running.keeper.workers import (
 )
 from l1slam_ros.core.running.problem import as_one
 
-# [s] So long an update may take what has come, whatever the budget.
+# [s] The longest time an update takes in new factors, whatever the budget.
 _LEAST_TIME = 0.02
 
 
@@ -50,11 +50,11 @@ class Updates:
     Parameters
     ----------
     keeper : of the map
-    done : called when some work behind has ended
+    done : called when some background work has ended
 
     Attributes
     ----------
-    calm : what goes on behind waits for its end
+    calm : background work pauses while it lasts
 
     """
 
@@ -67,7 +67,7 @@ class Updates:
 
     @property
     def failing(self) -> bool:
-        """Whether what went on behind failed the last time that it came to an end."""
+        """Whether the background work that ended last failed."""
         return self._workers.failing
 
     def update(self, budget: float, stopped: Stopped, idle: bool | None = None,
@@ -99,7 +99,7 @@ class Updates:
                     return self._account(before.began, start)
             if came or not idle or keeper.state.last is not before.last:
                 return self._account(before.began, start)
-            # What failed since it was asked is still to do.
+            # Work that failed since the check is still to do.
             self._workers.check()
             self._rested = seen.now
         return None
@@ -111,7 +111,7 @@ class Updates:
         return state.account(size.loops, time.monotonic() - start)
 
     def _begin_due(self, idle: bool, budget: float, check: Check) -> bool:
-        """Let the workers begin what is due; return whether any is at work."""
+        """Start the work that is due; return whether any worker is busy."""
         moment = Moment(time.monotonic(), idle, budget)
         state, _, size = self._keeper.look()
         make, judge = due(state, size, moment)
@@ -122,7 +122,7 @@ class Updates:
         return self._workers.busy
 
     def _check(self, began: int, stopped: Stopped) -> Check:
-        """Return what raises `Interrupted` where work for a map is not wanted any more."""
+        """Return a check that raises `Interrupted` where work for a map is not wanted any more."""
         return until(lambda: bool(self._claims or self._urgent) or stopped()
                      or self._keeper.state.began != began)
 
@@ -178,5 +178,5 @@ class Updates:
             self._update_lock.release()
 
     def check(self) -> None:
-        """Raise what some work behind has raised, once."""
+        """Raise the error that background work has raised, once."""
         self._workers.check()

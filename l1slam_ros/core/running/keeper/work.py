@@ -52,7 +52,7 @@ def make_map(keeper: Keeper, exact: bool, budget: float, check: Check) -> None:
     del now  # holds the factors of a front that may be replaced meanwhile
     problem = as_one(whole)
     if pending is None:
-        # What is made of less than is believed by then, would be late.
+        # A map of fewer factors than are accepted by then would be out of date.
         check = until(lambda: keeper.state.pending is not None, check)
     if exact:
         check = until(lambda: is_late(keeper.state), check)
@@ -87,7 +87,7 @@ def judge_all(keeper: Keeper, anew: bool, idle: bool, check: Check) -> None:
 
 
 def compare_norms(keeper: Keeper, check: Check) -> None:
-    """Doubt the map where another norm has another one."""
+    """Doubt the map where another norm gives a different map."""
     now = keeper.snapshot()
     problem = as_one(now.problem())
     doubts = doubts_of_norm(problem.graph, problem.judgement, problem.poses, check)

@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Threads that only carry out: what to do, and when, others say.
+Threads that only carry out work; their callers decide what to do, and when.
 
 In: pieces of work, as functions. Out: their end, or what they raised.
 """
@@ -19,10 +19,10 @@ from contextlib import contextmanager
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.running.improve import Check
 
-# [s] How often who waits looks whether to stop.
+# [s] How often a waiting thread checks whether to stop.
 LOOK = 0.05
 
-# Asked on the way, often: whether to stop.
+# A check that is called often during work; it raises where the work shall stop.
 Stopped = Callable[[], bool]
 
 
@@ -49,10 +49,10 @@ def held(lock: threading.Lock, check: Callable[[], None]) -> Iterator[None]:
 
 class Calm:
     """
-    While it lasts, work that nobody waits for makes way for what somebody does.
+    While it lasts, background work pauses in favour of work that a caller waits for.
 
-    The interpreter is one, and to get it back from threads that compute may take longer than the
-    work. For one thread at a time: `with calm:`.
+    There is one interpreter lock, and to get it back from threads that compute may take longer
+    than the work. For one thread at a time: `with calm:`.
     """
 
     def __init__(self) -> None:
@@ -158,7 +158,7 @@ class Worker:
 
 class Workers:
     """
-    The two that go on behind updates: one makes maps, one judges.
+    The two background workers: one makes maps, one judges loops.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ class Workers:
         return self.mapper.failed or self.judge.failed
 
     def tell(self) -> None:
-        """Wake who waits for the end of some work."""
+        """Wake the threads that wait for the end of some work."""
         self._ended.set()
         self._done()
 
