@@ -56,9 +56,9 @@ if TYPE_CHECKING:
 # is of, and raises FileError.
 GRAPH_READERS: dict[str, Callable[[Path, str], GraphRecord]] = {
     '.g2o': read_graph_file,
-    '.graph': read_graph_file,
     '.jrl': read_jrl_file,
     '.cbor': read_jrl_file,
+    '.graph': read_graph_file,
 }
 
 
