@@ -7,16 +7,16 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-One graph cut into robots: are the same loops believed as in one piece?
+One graph cut into robots: whether the same loops are believed as in one piece.
 
     python benchmarks/fleet/cut.py --datasets DIR [--graphs manhattan3500,city10000,building]
         [--robots 2,5,20] [--lies 0.3]
 
-To the graph false loops of the kind `random` are added, so many for each loop. Its keyframes then go
-in equal pieces to so many robots, each with a letter in its vertex ids, as a g2o file: the edges are
-the same, but at a cut there is no odometry. Printed is for how many loops the verdict is another
-one, and how far the L1 optimum of the loops that the cut graph accepts lies from that of the same
-loops in the graph in one piece.
+To the graph false loops of the kind `random` are added, so many for each loop. Its keyframes then
+go in equal pieces to so many robots, each with a letter in its vertex ids, as a g2o file: the
+edges are the same, but at a cut there is no odometry. Printed is for how many loops the verdict is
+another one, and how far the L1 optimum of the loops that the cut graph accepts is from that of the
+same loops in the graph in one piece.
 """
 
 import argparse

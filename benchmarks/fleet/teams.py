@@ -7,15 +7,16 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A simulated team of the size of COSMO-Bench's ntu_r5_00: how near is the map to the best one?
+A simulated team of the size of COSMO-Bench's ntu_r5_00: how near the map is to the best one.
 
-    python benchmarks/fleet/teams.py [--worlds streets,building] [--kinds random,grouped] [--seeds 3]
+    python benchmarks/fleet/teams.py [--worlds streets,building] [--kinds random,grouped]
+        [--seeds 3]
 
-Five robots drive 8.94 km together and close 2,019 loops, 868 of them between robots; false are 3.6%
-of those within a robot and 2.9% of those between. Each team goes through a JRL file, with its truth
-and flags. Printed is the position error (RMSE after alignment) of `l1slam solve` over that of the L1
-map without the false loops, the false ones that are kept, the true ones that are left out, and in
-how many parts the map is.
+Five robots drive 8.94 km together and close 2,019 loops, 868 of them between robots; false are
+3.6% of those within a robot and 2.9% of those between. Each team goes through a JRL file, with its
+truth and flags. Printed is the position error (RMSE after alignment) of `l1slam solve` over that
+of the L1 map without the false loops, the false ones that are kept, the true ones that are left
+out, and in how many parts the map is.
 """
 
 import argparse
@@ -39,12 +40,14 @@ from l1slam_ros.io.jrl.writing import write_jrl_file
 ROBOTS, POSES, STEP = 5, 4470, 2.0
 # Within a robot and between robots: loops, and how many of them are false.
 LOOPS, FALSE = (1151, 868), (41, 25)
-# So many times as many are drawn, of which some are chosen.
-_DRAWN = 8
+# So many times as many are drawn, of which some are chosen: true ones, and false ones, of which few
+# are within a robot.
+_DRAWN, _FALSE_DRAWN = 8, 40
 
 
 def team(name: str, kind: str, seed: int, loops: tuple[int, int] = LOOPS,
-         false: tuple[int, int] = FALSE, poses: int = POSES) -> tuple[GraphRecord, np.ndarray, np.ndarray]:
+         false: tuple[int, int] = FALSE,
+         poses: int = POSES) -> tuple[GraphRecord, np.ndarray, np.ndarray]:
     """Return the graph of a team, which factors are false (m,), and the true poses (n, p)."""
     rng = np.random.default_rng(seed)
     world = simulate_world(poses, poses - 1 + _DRAWN * sum(loops), WorldOptions(step=STEP), rng,
@@ -57,7 +60,7 @@ def team(name: str, kind: str, seed: int, loops: tuple[int, int] = LOOPS,
     steps = steps[same_robot(graph, steps, robot)]
     true = _chosen(graph, np.flatnonzero(~graph.between.is_odometry), robot,
                    (loops[0] - false[0], loops[1] - false[1]), rng)
-    lies = FALSE_LOOPS[kind](graph, world.truth, _DRAWN * sum(false), rng)
+    lies = FALSE_LOOPS[kind](graph, world.truth, _FALSE_DRAWN * sum(false), rng)
     lying = graph.without_factors()
     lying.add_between(lies.i, lies.j, lies.measurement, lies.information)
     wrong = _chosen(lying, np.arange(len(lies.i)), robot, false, rng)
@@ -125,8 +128,7 @@ def main() -> None:
     parser.add_argument('--seeds', type=int, default=3)
     arguments = parser.parse_args()
     print('| world | kind | seed | error, lies known [m] | error [m] | ratio | false kept | '
-          'true left out | parts | seconds | doubts |\n|---|---|---|---|---|---|---|---|---|---|---|',
-          flush=True)
+          'true left out | parts | seconds | doubts |\n' + '|---' * 11 + '|', flush=True)
     for name in arguments.worlds.split(','):
         for kind in arguments.kinds.split(','):
             for seed in range(arguments.seeds):
