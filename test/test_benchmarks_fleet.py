@@ -30,10 +30,10 @@ def suite(name):
 @pytest.mark.parametrize('world', ['streets', 'building'])
 def test_a_team_has_the_loops_that_were_asked_for(world):
     teams = suite('teams')
-    record, is_false, truth = teams.team(world, 'random', 0, (150, 110), (8, 6), 500)
+    record, is_false, truth = teams.team(world, 'random', 0, (100, 110), (8, 6), 500)
     graph = record.graph
     i, j = graph.between.pairs[~graph.between.is_odometry].T
-    assert len(i) == 260 and (graph.robot[i] != graph.robot[j]).sum() == 110
+    assert len(i) == 210 and (graph.robot[i] != graph.robot[j]).sum() == 110
     assert is_false.sum() == 14 and len(truth) == 500
     assert len(graph.firsts) == teams.ROBOTS - 1
     # So many odometry factors, that the robots stand apart but for their loops.

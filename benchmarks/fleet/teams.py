@@ -40,8 +40,8 @@ from l1slam_ros.io.jrl.writing import write_jrl_file
 ROBOTS, POSES, STEP = 5, 4470, 2.0
 # Within a robot and between robots: loops, and how many of them are false.
 LOOPS, FALSE = (1151, 868), (41, 25)
-# So many times as many are drawn, of which some are chosen: true ones, and false ones, of which few
-# are within a robot.
+# So many times as many are drawn, of which some are chosen: true ones, and false ones, of which
+# few are within a robot.
 _DRAWN, _FALSE_DRAWN = 8, 40
 
 
