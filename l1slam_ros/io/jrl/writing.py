@@ -71,7 +71,7 @@ def write_jrl_file(path: str | os.PathLike[str], record: GraphRecord,
 def _log_of(path: Path, record: GraphRecord, truth: Array | None) -> RobotLog:
     """Return what a graph's log says, as it came, or made up."""
     log, count = record.log, len(record.graph.between)
-    if log is None:
+    if log is None or len(log.entries) > count:  # or it is of another graph
         log = _new_log(path, record)
     elif len(log.entries) < count:  # some were added to the graph that was read
         log = _longer(log, record)
