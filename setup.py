@@ -69,6 +69,8 @@ setup(
         'completion': ['argcomplete>=3.1'],
         # `l1slam solve --report`; the library that Ubuntu 24.04 ships, or newer.
         'report': ['plotly>=5.15'],
+        # JRL files in their compressed form; older ones bound less of what strangers write.
+        'cbor': ['cbor2>=6.3'],
         # Newer style tools find other things, and a test asserts that they find none.
         # setuptools: a test builds the wheel, and from 70.1 on it can do so by itself.
         # pip: tests install into other environments, which from 22.3 on it can do.
@@ -80,6 +82,7 @@ setup(
             'mypy~=2.4.1',
             'packaging',
             'argcomplete>=3.1',
+            'cbor2>=6.3',
             'plotly>=5.15',
             'pip>=22.3',
             'setuptools>=70.1',

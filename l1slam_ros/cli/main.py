@@ -26,12 +26,12 @@ from l1slam_ros.io.progress import say
 from l1slam_ros.paper import printed as paper
 
 BAD_INPUT, READ_IN_PART, DOUBTFUL, INTERRUPTED, BROKEN_PIPE = 2, 3, 4, 130, 141
-_INPUT = ('.g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, .bag of ROS 1, or a CARMEN log '
-          'with scans: .clf, .log, .bz2, .gz')
+_INPUT = ('.g2o, TORO .graph, .jrl or its .cbor, a rosbag2 directory, .mcap, .db3, .bag of ROS 1, '
+          'or a CARMEN log with scans: .clf, .log, .bz2, .gz')
 _WORD = ('beside a graph INPUT.trusted.txt and INPUT.struck.txt, lines `i j` of vertex ids, may '
          'vouch for loops and strike loops out')
-_OUTPUT = '.g2o, .tum, or a name without a suffix for a bag directory'
-_GRAPH_OUTPUT = '.g2o, or a name without a suffix for a bag directory'
+_OUTPUT = '.g2o, .jrl or its .cbor, .tum, or a name without a suffix for a bag directory'
+_GRAPH_OUTPUT = '.g2o, .jrl or its .cbor, or a name without a suffix for a bag directory'
 _KIND = ('random: far poses said to be near each other; identity: at the very same place; '
          'grouped: 10 to 20 in a row that agree (default: %(default)s)')
 _FIRST_STEPS = """\
@@ -172,9 +172,9 @@ def _add_solve(parser: argparse.ArgumentParser) -> None:
     add('--inner', type=int, metavar='N', help='most primal-dual iterations of each')
     add('--output', type=Path, metavar='OUT', help=_OUTPUT)
     add('--reference', metavar='TRUTH',
-        help='print the position error to it: TUM, g2o, `id x y theta` text, CSV of `stamp, x, y, '
-        "theta`, or a bag's topic, BAG:/TOPIC, where `bag` is INPUT; interpolated at the "
-        'stamps of the poses')
+        help='print the position error to it: TUM, g2o, .jrl, `id x y theta` text, CSV of '
+        "`stamp, x, y, theta`, or a bag's topic, BAG:/TOPIC, where `bag` is INPUT; interpolated "
+        'at the stamps of the poses')
     add('--plot', type=Path, metavar='PNG', help='draw the map and its cost; .svg and .pdf too')
     add('--scans', metavar='TOPIC',
         help='of a bag: make the graph of the laser scans on this topic and of --odom-topic; a '

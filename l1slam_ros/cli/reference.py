@@ -20,7 +20,7 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.io.files import NANOSECONDS, counted
 from l1slam_ros.io.formats import is_bag
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.io.graphs.side_files import named_loops
+from l1slam_ros.io.graphs.side_files import beside, named_loops
 from l1slam_ros.io.scans.scan_path import ScanPath
 from l1slam_ros.io.trajectory import Reference, read_reference
 
@@ -151,9 +151,13 @@ def known_false(path: Path, record: GraphRecord) -> Mask:
     """
     Return which factors are false loops, (m,) bool, by the file beside the input `path`, if any.
 
+    Or else by what the input itself says.
+
     Raises
     ------
     FileError : that file is damaged, or names an edge that the graph does not have.
 
     """
+    if record.log is not None and not beside(path, 'false').exists():
+        return record.log.known_false
     return named_loops(path, 'false', record.ids, record.graph.between)

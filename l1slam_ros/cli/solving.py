@@ -43,6 +43,7 @@ from l1slam_ros.io.sentences import (
     doubted,
     doubted_rows,
     judgement_sentences,
+    known_false_sentence,
     offset_sentence,
 )
 
@@ -89,6 +90,8 @@ def solve(arguments: argparse.Namespace) -> Ending:
     elif not arguments.quiet:
         _print_report(report, record, _cost_name(asked), outcome)
         for sentence in judgement_sentences(record, judgement) if judgement else ():
+            print(sentence)
+        for sentence in known_false_sentence(record, judgement):
             print(sentence)
     return ending
 

@@ -68,6 +68,12 @@ def numbers(record: GraphRecord) -> list[tuple[str, str]]:
         rows.insert(1, ('robots', f'{len(names)}: {", ".join(names)}'))
     if absolute:
         rows.insert(-1, ('absolute', f'{absolute:,}'))
+    if record.log is not None and record.log.false is not None:
+        between = is_loop & (graph.robot[factors.i] != graph.robot[factors.j])
+        false = record.log.false
+        rows.insert(-1, ('known false', f'{int((false & ~between).sum()):,} within a robot, '
+                         f'{int((false & between).sum()):,} of {int(between.sum()):,} between '
+                         'robots, as the file says'))
     if record.stamps is not None:
         rows.append(('time', f'{(record.stamps[-1] - record.stamps[0]) / NANOSECONDS:,.1f} s'))
     if record.poses is not None:

@@ -66,6 +66,7 @@ class MissingError(L1SlamError):
 _OPTIONAL = {
     **dict.fromkeys(('rosbags', 'mcap', 'lz4', 'zstandard'),
                     'bags are read and written by it, expected `pip install rosbags mcap`'),
+    'cbor2': 'JRL files in CBOR are read and written by it, expected `pip install cbor2`',
     'matplotlib': 'pictures are drawn by it, expected `pip install matplotlib` or the package '
                   'python3-matplotlib',
 }

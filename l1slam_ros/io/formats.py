@@ -40,7 +40,12 @@ from l1slam_ros.io.bags.topics import BAG_SUFFIXES, DEFAULT_TOPICS, Topics
 from l1slam_ros.io.files import require_file, require_folder
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 from l1slam_ros.io.graphs.left_out import left_out_of, nothing_left_out
+from l1slam_ros.io.graphs.robot_log import RobotLog
 from l1slam_ros.io.graphs.side_files import BESIDE, WRITTEN_BESIDE, beside
+from l1slam_ros.io.jrl.document import cbor_library, is_cbor
+from l1slam_ros.io.jrl.layout import JRL_SUFFIXES
+from l1slam_ros.io.jrl.reading import read_jrl_file
+from l1slam_ros.io.jrl.writing import write_jrl_file
 from l1slam_ros.io.ours import refuse_others
 from l1slam_ros.io.trajectory import write_tum
 
@@ -51,6 +56,8 @@ if TYPE_CHECKING:
 # is of, and raises FileError.
 GRAPH_READERS: dict[str, Callable[[Path, str], GraphRecord]] = {
     '.g2o': read_graph_file,
+    '.jrl': read_jrl_file,
+    '.cbor': read_jrl_file,
     '.graph': read_graph_file,
 }
 
@@ -66,6 +73,7 @@ class _Origin(NamedTuple):
     stamps: Indices | None = None
     left_out: np.ndarray | None = None
     comments: tuple[tuple[int, str], ...] = ()
+    log: RobotLog | None = None
 
 
 # By the graphs that `read_graph` returned, which know nothing of files.
@@ -80,7 +88,7 @@ def read_input(path: Path, options: 'GraphBuilderOptions | None' = None,
 
     Parameters
     ----------
-    path : .g2o, .graph, .mcap, .db3, .bag (ROS 1) or a rosbag2 directory
+    path : .g2o, .graph, .jrl, its .cbor, .mcap, .db3, .bag (ROS 1) or a rosbag2 directory
     options : what makes keyframes of a bag's messages; None: the node's defaults. Where the bag's
         note says it otherwise, defaults give way
     topics : where in a bag to look
@@ -159,8 +167,12 @@ def check_output(path: Path, inputs: Iterable[Path] = (), force: bool = False,
     also : what will be written beside it besides, as `truth`
 
     """
-    if path.suffix.lower() not in ('.g2o', '.tum', ''):
-        raise FileError(path, 'unknown suffix; expected .g2o, .tum, or none for a bag directory')
+    suffix = path.suffix.lower()
+    if suffix not in ('.g2o', *JRL_SUFFIXES, '.tum', ''):
+        raise FileError(path, f'unknown suffix; expected .g2o, {", ".join(JRL_SUFFIXES)}, .tum, '
+                        'or none for a bag directory')
+    if is_cbor(path):
+        cbor_library()
     if path.suffix:
         require_file(path)
     else:
@@ -169,7 +181,7 @@ def check_output(path: Path, inputs: Iterable[Path] = (), force: bool = False,
 
         require_folder(path)
         refuse_other_than_bag(path)
-    if path.suffix.lower() == '.g2o':
+    if suffix in ('.g2o', *JRL_SUFFIXES):
         also = (*WRITTEN_BESIDE, *also)
     refuse_others([path, *(beside(path, what) for what in also)], inputs, force)
 
@@ -179,8 +191,8 @@ def check_graph_output(path: Path, inputs: Iterable[Path] = (), force: bool = Fa
     """Refuse, as `check_output`, an output that does not hold a graph."""
     check_output(path, inputs, force, also)
     if path.suffix.lower() == '.tum':
-        raise FileError(path, 'a trajectory has no edges; expected .g2o, or no suffix for a bag '
-                        'directory')
+        raise FileError(path, 'a trajectory has no edges; expected .g2o, '
+                        f'{", ".join(JRL_SUFFIXES)}, or no suffix for a bag directory')
 
 
 def write_output(path: Path, record: GraphRecord, truth: Array | None = None,
@@ -188,7 +200,8 @@ def write_output(path: Path, record: GraphRecord, truth: Array | None = None,
     """
     Write a graph with its poses, in the format that the suffix names; none: a bag.
 
-    truth : (n, p) poses, which a bag has a topic for; force : whether to replace what others wrote
+    truth : (n, p) poses, which bags and JRL files have a place for; force : whether to replace
+    what others wrote
 
     Raises
     ------
@@ -199,6 +212,8 @@ def write_output(path: Path, record: GraphRecord, truth: Array | None = None,
     check_output(path, force=force)
     if path.suffix.lower() == '.g2o':
         write_graph_file(path, record)
+    elif path.suffix.lower() in JRL_SUFFIXES:
+        write_jrl_file(path, record, truth)
     elif path.suffix.lower() == '.tum':
         write_tum(path, record.times, stored_poses(record), record.graph.manifold)
     else:
@@ -220,7 +235,7 @@ def read_graph(path: str | os.PathLike[str], *, odom_topic: str = DEFAULT_TOPICS
 
     Parameters
     ----------
-    path : .g2o, TORO .graph, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1
+    path : .g2o, TORO .graph, .jrl or its .cbor, a rosbag2 directory, .mcap, .db3, or .bag of ROS 1
     odom_topic, loop_topic : where a bag has its odometry and its loops, or pose graphs of a front
         end, see `l1slam solve --help`; of a graph file they say nothing
     rotation_information : what the rotation block of the information in a 3D g2o file is of,
@@ -239,7 +254,8 @@ def read_graph(path: str | os.PathLike[str], *, odom_topic: str = DEFAULT_TOPICS
                         rotation_information=rotation_information)
     for sentence in filter(None, (*record.skipped, record.damage)):
         warnings.warn(sentence, stacklevel=2)
-    _ORIGINS[record.graph] = _Origin(record.ids, record.stamps, record.left_out, record.comments)
+    _ORIGINS[record.graph] = _Origin(record.ids, record.stamps, record.left_out, record.comments,
+                                     record.log)
     return record.graph, record.poses
 
 
@@ -254,7 +270,8 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
 
     Parameters
     ----------
-    path : .g2o, .tum (the poses alone), or a name without a suffix for a bag directory
+    path : .g2o, .jrl or its .cbor, .tum (the poses alone), or a name without a suffix for a bag
+        directory
     rotation_information : see `read_graph`
     inliers : (m,) bool of the factors, as of a `Solution`: the others are written as what was left
         out, which other programs do not use; None: those of the solution whose poses these are, or
@@ -292,7 +309,8 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
         left_out = np.concatenate((left_out, nothing_left_out(len(factors) - len(left_out))))
     write_output(Path(path), GraphRecord(
         graph, poses, origin.ids, origin.stamps, left_out=left_out,
-        rotation_information=rotation_information, comments=origin.comments, drift=drift),
+        rotation_information=rotation_information, comments=origin.comments, drift=drift,
+        log=origin.log),
         force=force)
 
 

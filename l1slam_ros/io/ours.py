@@ -12,6 +12,7 @@ What this program may replace: what it wrote, told by a mark in it, and nothing 
     text              a comment, `MARK`, the first line, of a graph the last: GTSAM reads no edge
                       behind a comment; of a saved map the lines of `remarks`
     report            the first line, `REPORT_MARK`
+    .jrl, .cbor       the last text, `WROTE`
     .png, .svg, .pdf  the field for the program that drew the picture; of a .pgm a comment
     bag directory     in each .mcap the field for the library that wrote it
 
@@ -28,8 +29,9 @@ from l1slam_ros.io.files import reported
 from l1slam_ros.io.remarks import KEYWORD
 
 PROGRAM = 'l1slam_ros'
-MARK = f'# {PROGRAM} wrote this file and may replace it'
-REPORT_MARK = f'<!-- {PROGRAM} wrote this file and may replace it -->'
+WROTE = f'{PROGRAM} wrote this file and may replace it'
+MARK = f'# {WROTE}'
+REPORT_MARK = f'<!-- {WROTE} -->'
 _FIRST_LINES = f'{MARK}\n'.encode(), f'{REPORT_MARK}\n'.encode()
 # The begin of a file -> what tells ours from others: PNG, PDF, SVG.
 _PICTURES = {
@@ -69,6 +71,7 @@ def is_ours(path: str | os.PathLike[str]) -> bool:
     return (not first or first.startswith(_FIRST_LINES)
             or KEYWORD.encode() in first.partition(b'\n')[0]
             or last.endswith(f'\n{MARK}\n'.encode())
+            or last.rstrip(b'"}\n').endswith(WROTE.encode())
             or any(first.startswith(begin) and (mark in first or mark in last)
                    for begin, mark in _PICTURES.items()))
 

@@ -106,6 +106,19 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
         yield _TOGETHER
 
 
+def known_false_sentence(record: GraphRecord, judgement: Judgement | None) -> Iterator[str]:
+    """Yield how what is left out agrees with what the file says is false, where it says so."""
+    if judgement is None or record.log is None or record.log.false is None:
+        return
+    factors, false = record.graph.between, record.log.false
+    is_loop = ~factors.is_odometry & ~factors.is_absolute
+    left_out = ~judgement.accepted | judgement.suspect
+    false, true = false & is_loop, ~false & is_loop
+    yield (f'of {counted(int(false.sum()), "loop")} that the file says are false '
+           f'{int((false & ~left_out).sum()):,} are kept, of the {int(true.sum()):,} others '
+           f'{int((true & left_out).sum()):,} are left out')
+
+
 def offset_sentence(manifold: Manifold, offset: Array | None) -> Iterator[str]:
     """Yield that loops lack a step (k,); None: they lack nothing."""
     if offset is not None:

@@ -15,6 +15,7 @@ TUM: `stamp x y z qx qy qz qw`, stamps in seconds, exact to the nanosecond.
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -33,6 +34,8 @@ from l1slam_ros.io.files import (
     write_lines,
 )
 from l1slam_ros.io.graphs.graph_file import read_vertices
+from l1slam_ros.io.jrl.layout import JRL_SUFFIXES
+from l1slam_ros.io.jrl.reading import read_truth
 from l1slam_ros.io.ours import marked
 
 _TUM_COLUMNS = 8
@@ -79,8 +82,8 @@ def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2,
     """
     Read reference poses: TUM, a graph file's vertices, `id x y theta`, or `stamp, x, y, theta`.
 
-    Which of them it is, the first line tells: commas make a CSV file, whose first column is a
-    stamp, and which a line of words may head.
+    Of a JRL file they are its groundtruth. Of the others, which it is, the first line tells:
+    commas make a CSV file, whose first column is a stamp, and which a line of words may head.
 
     by_stamps : let a graph file go by the stamps beside it, if any
 
@@ -89,6 +92,8 @@ def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2,
     FileError : naming the line, when the file is none of them.
 
     """
+    if Path(path).suffix.lower() in JRL_SUFFIXES:
+        return Reference(*read_truth(Path(path), manifold), stamped=False)
     lines = read_lines(path)
     if not lines.texts:
         raise FileError(path, 'the file is empty; expected reference poses')

@@ -39,7 +39,8 @@ from l1slam_ros.io.files import (
 )
 from l1slam_ros.io.graphs.anchors import anchors_of, fixed_in
 from l1slam_ros.io.graphs.left_out import MEASURED, STRUCK, commented, in_place, nothing_left_out
-from l1slam_ros.io.graphs.robots import robots_of
+from l1slam_ros.io.graphs.robot_log import RobotLog
+from l1slam_ros.io.graphs.robots import keyframes_of
 from l1slam_ros.io.graphs.rows import (
     Rows,
     expected_tags,
@@ -76,7 +77,8 @@ class GraphRecord:
     rotation_information : what the rotation block in a g2o file of it is of, of `names`;
     remarks : of a saved map; left_out : (m,) why a map was made without each factor, of
     `left_out`, or empty; comments : lines of others, each with how many factors stand before it;
-    drift : see `Judgement`, of the map: its odometry is to be written corrected.
+    drift : see `Judgement`, of the map: its odometry is to be written corrected; log : what a log
+    of several robots says besides.
     """
 
     graph: FactorGraph
@@ -90,6 +92,7 @@ class GraphRecord:
     left_out: np.ndarray | None = None
     comments: tuple[tuple[int, str], ...] = ()
     drift: float = 0.0
+    log: RobotLog | None = None
 
     @property
     def times(self) -> Indices:
@@ -125,9 +128,7 @@ def read_graph_file(path: str | os.PathLike[str],
         kept = ~np.isin(ids, anchors)
         ids, vertices = ids[kept], vertices.chosen(kept) if len(vertices) else vertices
         edges = edges.chosen(np.flatnonzero(np.isin(edges.ids, anchors).sum(axis=1) == 0))
-    graph = FactorGraph(manifold)
-    for robot, count in enumerate(np.unique(robots_of(ids), return_counts=True)[1].tolist()):
-        graph.add_poses(count, robot)
+    graph = keyframes_of(ids, manifold)
     order, left_out, as_measured = in_place(edges.lines, lines.left_out)
     stand, edges = edges.lines[order], edges.chosen(as_measured)
     _add_edges(path, graph, ids, edges, remarks, left_out == STRUCK)

@@ -10,7 +10,8 @@
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.geometry.manifold import Indices, Manifold
+from l1slam_ros.core.graph.factor_graph import FactorGraph
 
 # A symbol has a character in its highest byte, and an index below.
 _INDEX_BITS = 56
@@ -27,3 +28,11 @@ def robots_of(ids: Indices) -> Indices:
 def robot_names(ids: Indices) -> list[str]:
     """Return the letters of the robots of some vertex ids, in order; numbers have no name."""
     return [chr(code) for code in np.unique(robots_of(ids)).tolist() if code]
+
+
+def keyframes_of(ids: Indices, manifold: Manifold) -> FactorGraph:
+    """Return a graph of a keyframe for each vertex id (n,), ascending; each robot has a chain."""
+    graph = FactorGraph(manifold)
+    for robot, count in enumerate(np.unique(robots_of(ids), return_counts=True)[1].tolist()):
+        graph.add_poses(count, robot)
+    return graph

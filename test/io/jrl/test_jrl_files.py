@@ -1,0 +1,359 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""JRL files: what their own library writes is read, and what we write it can read."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from l1slam_ros.cli.main import main
+from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.geometry import se2, se3
+from l1slam_ros.core.graph.factor_graph import WORLD
+from l1slam_ros.io.formats import read_graph, write_graph
+from l1slam_ros.io.graphs.graph_file import read_graph_file, write_graph_file
+from l1slam_ros.io.graphs.left_out import left_out_of
+from l1slam_ros.io.jrl.reading import read_jrl_file, read_truth
+from l1slam_ros.io.jrl.writing import write_jrl_file
+from l1slam_ros.io.ours import is_ours
+
+A, B = ord('a') << 56, ord('b') << 56
+SECOND = 10**9
+
+
+def pose2(x, y, theta):
+    return {'type': 'Pose2', 'x': x, 'y': y, 'theta': theta}
+
+
+def pose3(x, yaw):
+    return {'type': 'Pose3', 'translation': [x, 0.5, 0.25],
+            'rotation': [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]}
+
+
+def between(i, j, pose, covariance):
+    return {'type': f'BetweenFactor{pose["type"]}', 'key1': i, 'key2': j, 'measurement': pose,
+            'covariance': covariance}
+
+
+def plane(i, j, x):
+    return between(i, j, pose2(x, 0.0, 0.1), [0.04, 0.01, 0, 0.01, 0.05, 0, 0, 0, 0.01])
+
+
+def team():
+    """Two robots in the plane as the library writes them: null where there is nothing."""
+    prior = {'type': 'PriorFactorPose2', 'key': A, 'prior': pose2(1, 2, 0.5),
+             'covariance': [0.01, 0, 0, 0, 0.01, 0, 0, 0, 0.01]}
+    distance = {'type': 'RangeFactorPose2', 'key1': A, 'key2': B, 'measurement': 3.0,
+                'covariance': [0.1]}
+    t = 1_700_000_000 * SECOND
+    return {
+        'name': 'team', 'robots': [97, 98],
+        'measurements': {
+            'a': [{'stamp': t, 'measurements': [prior]},
+                  {'stamp': t + 2 * SECOND, 'measurements': [plane(A, A + 1, 1.0), distance]},
+                  {'stamp': t + 4 * SECOND, 'measurements': [
+                      plane(A + 1, A + 2, 1.0), plane(A, A + 2, 2.0), plane(A + 2, B, 0.5)]}],
+            'b': [{'stamp': t + SECOND},
+                  {'stamp': t + 3 * SECOND, 'measurements': [plane(B, B + 1, 1.0)]}]},
+        'groundtruth': {'a': [{'key': A + k, **pose2(k, 0, 0)} for k in range(3)],
+                        'b': [{'key': B + k, **pose2(3 + k, 0, 0)} for k in range(2)]},
+        'initialization': {
+            'a': [{'key': A + k, **pose2(k + 0.125, 0, 0)} for k in range(3)]
+            + [{'key': B, **pose2(99, 0, 0)}],
+            'b': [{'key': B + k, **pose2(3 + k, 0, 0.5)} for k in range(2)]},
+        'potential_outlier_factors': {'a': [[2, 1], [2, 2]], 'b': None},
+        'outlier_factors': {'a': [[2, 2]], 'b': []}}
+
+
+def space():
+    covariance = np.diag([1e-4, 2e-4, 3e-4, 0.01, 0.02, 0.03])
+    covariance[0, 4] = covariance[4, 0] = 5e-4
+    listed = covariance.ravel().tolist()
+    return {'name': 'space', 'robots': [97], 'measurements': {'a': [
+        {'stamp': k, 'measurements': [between(A + k, A + k + 1, pose3(1.0, 0.25), listed)]}
+        for k in range(4)]}}
+
+
+@pytest.fixture
+def put(tmp_path):
+    def file(document, name='team.jrl'):
+        path = tmp_path / name
+        if name.endswith('.cbor'):
+            path.write_bytes(pytest.importorskip('cbor2').dumps(document))
+        else:
+            path.write_text(document if isinstance(document, str) else json.dumps(document))
+        return path
+    return file
+
+
+def as_the_library_reads(path):
+    """
+    What the library's parser asks of a file, with its errors: an independent reading of it.
+
+    It takes `name`, `robots`, `measurements`, and where they are there the four others; of a
+    factor `key` and `prior`, or `key1`, `key2` and `measurement`, and `covariance`.
+    """
+    document = (pytest.importorskip('cbor2').loads(path.read_bytes()) if path.suffix == '.cbor'
+                else json.loads(path.read_text()))
+    size = {'Pose2': 3, 'Pose3': 6}
+
+    def value(of):
+        if of['type'] == 'Pose2':
+            return [float(of[name]) for name in ('x', 'y', 'theta')]
+        t, q = of['translation'], of['rotation']
+        assert len(t) == 3 and len(q) == 4
+        return [*map(float, t), *map(float, q)]
+
+    factors = {}
+    assert isinstance(document['name'], str)
+    for robot in map(chr, document['robots']):
+        for k, entry in enumerate(document['measurements'][robot] or ()):
+            assert isinstance(entry['stamp'], int) and entry['stamp'] >= 0
+            for m, factor in enumerate(entry.get('measurements') or ()):
+                kind, _, pose = factor['type'].partition('Factor')
+                keys = [factor['key']] if kind == 'Prior' else [factor['key1'], factor['key2']]
+                assert kind in ('Prior', 'Between') and all(type(key) is int for key in keys)
+                covariance = np.array(factor['covariance'], float).reshape(size[pose], size[pose])
+                assert (np.linalg.eigvalsh(covariance) > 0).all()
+                factors[robot, k, m] = (
+                    keys, value(factor['prior' if kind == 'Prior' else 'measurement']), covariance)
+    values = {name: {v['key']: value(v) for listed in (document.get(name) or {}).values()
+                     for v in listed or ()} for name in ('groundtruth', 'initialization')}
+    flags = {name: {(robot, *pair) for robot, pairs in (document.get(name) or {}).items()
+                    for pair in pairs or ()}
+             for name in ('potential_outlier_factors', 'outlier_factors')}
+    assert flags['outlier_factors'] <= factors.keys()
+    return document, factors, values, flags
+
+
+@pytest.mark.parametrize('name', ['team.jrl', 'team.jrl.cbor'])
+def test_a_team_is_read(put, name):
+    record = read_jrl_file(put(team(), name))
+    factors = record.graph.between
+    assert_array_equal(record.ids, [A, A + 1, A + 2, B, B + 1])
+    assert_array_equal(record.graph.predecessor, [-1, 0, 1, -1, 3])
+    assert_array_equal(record.graph.robot, [0, 0, 0, 1, 1])
+    assert_array_equal(factors.i, [WORLD, 0, 1, 0, 2, 3])
+    assert_array_equal(factors.is_odometry, [False, True, True, False, False, True])
+    assert_array_equal(record.log.known_false, [False, False, False, False, True, False])
+    assert_array_equal((record.stamps - record.stamps[0]) // SECOND, [0, 2, 4, 1, 3])
+    # Of a key of which two robots say something its own robot is right.
+    assert_allclose(record.poses[:, 0], [0.125, 1.125, 2.125, 3, 4])
+    assert record.skipped == ('1 RangeFactorPose2 is not used: no pose factor',)
+    covariance = np.linalg.inv(np.swapaxes(factors.sqrt_information, 1, 2)
+                               @ factors.sqrt_information)
+    assert_allclose(covariance[1], [[0.04, 0.01, 0], [0.01, 0.05, 0], [0, 0, 0.01]], atol=1e-15)
+
+
+def test_covariances_in_space_have_the_rotation_first(put):
+    record = read_jrl_file(put(space()))
+    root = record.graph.between.sqrt_information[0]
+    covariance = np.linalg.inv(root.T @ root)
+    assert_allclose(np.diagonal(covariance), [0.01, 0.02, 0.03, 1e-4, 2e-4, 3e-4])
+    assert covariance[1, 3] == pytest.approx(5e-4)
+    assert_allclose(record.graph.between.measurement[0],
+                    [1, 0.5, 0.25, 0, 0, math.sin(0.125), math.cos(0.125)])
+    assert record.stamps is None and record.poses is None
+
+
+@pytest.mark.parametrize('document', [team, space])
+@pytest.mark.parametrize('name', ['out.jrl', 'out.cbor'])
+def test_written_it_is_what_was_read(put, tmp_path, document, name):
+    """Keys, stamps, entries, flags, truth, numbers: by the reading of the library."""
+    source = put(document())
+    record, out = read_jrl_file(source), tmp_path / name
+    write_jrl_file(out, record)
+    first, factors, values, flags = as_the_library_reads(source) if document is space else (
+        as_the_library_reads(put(without_ranges(document()))))
+    again, factors_again, values_again, flags_again = as_the_library_reads(out)
+    assert values == values_again and flags == flags_again and is_ours(out)
+    assert factors.keys() == factors_again.keys()
+    for key, (keys, value, covariance) in factors.items():
+        assert factors_again[key][0] == keys
+        assert_allclose(factors_again[key][1], value, rtol=1e-15, atol=1e-15)
+        assert_allclose(factors_again[key][2], covariance, rtol=1e-13, atol=1e-18)
+    for name_ in ('name', 'robots'):
+        assert first[name_] == again[name_]
+    assert [[entry['stamp'] for entry in entries] for entries in first['measurements'].values()
+            ] == [[entry['stamp'] for entry in entries]
+                  for entries in again['measurements'].values()]
+    back = read_jrl_file(out)
+    assert_array_equal(back.ids, record.ids)
+    assert_array_equal(back.graph.between.pairs, record.graph.between.pairs)
+
+
+def without_ranges(document):
+    for entries in document['measurements'].values():
+        for entry in entries:
+            if 'measurements' in entry:
+                entry['measurements'] = [factor for factor in entry['measurements']
+                                         if 'Range' not in factor['type']]
+    return document
+
+
+def test_what_was_left_out_is_an_outlier_and_comes_back(put, tmp_path):
+    record, out = read_jrl_file(put(team())), tmp_path / 'out.jrl'
+    inliers = np.array([True, True, True, False, True, True])
+    left_out = left_out_of(inliers, record.graph.between)
+    write_jrl_file(out, replace(record, left_out=left_out))
+    _, _, _, flags = as_the_library_reads(out)
+    assert flags['outlier_factors'] == {('a', 2, 1)}
+    back = read_jrl_file(out)
+    assert_array_equal(back.left_out, left_out)
+    # What the first file knew to be false is still known.
+    assert_array_equal(back.log.known_false, record.log.known_false)
+
+
+def test_odometry_that_is_corrected_comes_back_as_it_was_measured(put, tmp_path):
+    record, out = read_jrl_file(put(team())), tmp_path / 'out.jrl'
+    write_jrl_file(out, replace(record, drift=0.01))
+    _, factors, _, _ = as_the_library_reads(out)
+    assert factors['a', 1, 0][1] == pytest.approx([1.0, 0.0, 0.11])
+    assert_array_equal(read_jrl_file(out).graph.between.measurement,
+                       record.graph.between.measurement)
+
+
+@pytest.mark.parametrize('world', ['streets', 'building'])
+def test_a_graph_file_goes_there_and_back(tmp_path, world):
+    g2o, jrl, again = (tmp_path / name for name in ('a.g2o', 'a.cbor', 'b.g2o'))
+    assert main(['simulate', str(g2o), '--poses', '60', '--edges', '90', '--world', world]) == 0
+    assert main(['convert', str(g2o), str(jrl)]) == 0
+    as_the_library_reads(jrl)
+    assert main(['convert', str(jrl), str(again)]) == 0
+    mine, theirs = read_graph_file(g2o), read_graph_file(again)
+    assert_array_equal(mine.ids, theirs.ids)
+    assert mine.stamps is None and theirs.stamps is None
+    assert_array_equal(mine.graph.between.pairs, theirs.graph.between.pairs)
+    assert_allclose(mine.graph.between.measurement, theirs.graph.between.measurement, atol=1e-15)
+    assert_allclose(mine.graph.between.sqrt_information, theirs.graph.between.sqrt_information,
+                    rtol=1e-12, atol=1e-12)
+
+
+def test_times_and_what_is_not_said_survive(tmp_path):
+    """A position without a heading is a prior whose heading has an enormous variance."""
+    g2o, jrl, again = (tmp_path / name for name in ('a.g2o', 'a.jrl', 'b.g2o'))
+    g2o.write_text('EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 0 1 0 0 1 0 1\n'
+                   'EDGE_PRIOR_SE2_XY 2 5 6 4 1 4\n')
+    record = replace(read_graph_file(g2o), stamps=np.array([5, 6, 7]) * SECOND)
+    write_jrl_file(jrl, record)
+    as_the_library_reads(jrl)
+    write_graph_file(again, read_jrl_file(jrl))
+    back = read_graph_file(again)
+    assert 'EDGE_PRIOR_SE2_XY 2 5.0 6.0 ' in again.read_text()
+    assert_allclose(back.graph.between.sqrt_information,
+                    record.graph.between.sqrt_information, rtol=1e-12, atol=1e-12)
+    assert_array_equal(back.stamps, record.stamps)
+
+
+def test_the_commands_take_it(put, tmp_path, capsys):
+    path = put(team())
+    assert main(['info', str(path)]) == 0
+    said = capsys.readouterr().out
+    assert 'robots      2: a, b' in said
+    assert 'known false 0 within a robot, 1 of 1 between robots' in said
+    out = tmp_path / 'solved.jrl'
+    assert main(['solve', str(path), '--robust', '--reference', str(path), '--output', str(out),
+                 ]) in (0, 4)
+    assert 'of 1 loop that the file says are false' in capsys.readouterr().out
+    assert main(['solve', str(out), '--output', str(out)]) == 2  # an input is no output
+    assert main(['plot', str(out), '--output', str(tmp_path / 'a.png')]) == 0
+    assert main(['convert', str(path), str(out)]) == 0  # ours may be replaced
+    stranger = put(team(), 'theirs.jrl')
+    assert main(['convert', str(out), str(stranger)]) == 2
+    assert 'was not written by' in capsys.readouterr().err
+
+
+def test_in_python(put, tmp_path):
+    out = tmp_path / 'out.jrl'
+    with pytest.warns(UserWarning, match='RangeFactorPose2'):
+        graph, poses = read_graph(put(team()))
+    graph.add_between(np.array([1]), np.array([4]), np.zeros((1, 3)), np.eye(3)[None])
+    write_graph(out, graph, poses)
+    document, factors, _, _ = as_the_library_reads(out)
+    assert factors['b', 1, 1][0] == [A + 1, B + 1] and document['name'] == 'team'
+
+
+def test_truth(put):
+    ids, poses = read_truth(put(team()), se3)
+    assert_array_equal(ids, [A, A + 1, A + 2, B, B + 1])
+    assert poses.shape == (5, 7)
+    with pytest.raises(FileError, match='has no groundtruth'):
+        read_truth(put(space(), 'b.jrl'), se2)
+
+
+def changed(path, value):
+    document = team()
+    *way, last = path
+    part = document
+    for step in way:
+        part = part[step]
+    if value is None:
+        del part[last]
+    else:
+        part[last] = value
+    return document
+
+
+@pytest.mark.parametrize('path, value, said', [
+    (('measurements',), None, 'measurements: nothing; expected a value'),
+    (('measurements', 'a', 1, 'stamp'), -1, 'measurements.a[1].stamp: -1; expected a whole'),
+    (('measurements', 'a', 1, 'stamp'), True, 'measurements.a[1].stamp: True; expected a whole'),
+    (('measurements', 'a', 1, 'measurements'), {}, 'measurements: an object of 0 members'),
+    (('measurements', 'a', 1, 'measurements', 0, 'key2'), 2**64, 'a number beyond 64 bits'),
+    (('measurements', 'a', 1, 'measurements', 0, 'covariance'), [1.0] * 8,
+     'measurements.a[1].measurements[0].covariance: a list of 8; expected a list of 9 numbers'),
+    (('measurements', 'a', 1, 'measurements', 0, 'covariance'), [0.0] * 9, 'variances of 1e-30'),
+    (('measurements', 'a', 1, 'measurements', 0, 'covariance'), [1, 1, 0, 0, 1, 0, 0, 0, 1],
+     'expected a symmetric matrix'),
+    (('measurements', 'a', 1, 'measurements', 0, 'measurement', 'x'), 'here',
+     "measurements.a[1].measurements[0].measurement.x: 'here'; expected a number"),
+    (('measurements', 'a', 1, 'measurements', 0, 'measurement'), pose3(1, 0), 'measurement.x'),
+    (('measurements', 'a', 1, 'measurements', 0),
+     between(A, A + 1, pose3(1, 0), np.eye(6).ravel().tolist()), 'expected all poses in the'),
+    (('robots',), [[]], 'robots[0]: a list of 0; expected the number of a character'),
+    (('outlier_factors', 'a'), [[1]], 'outlier_factors.a[0]: a list of 1'),
+    (('groundtruth', 'a', 0, 'theta'), None, 'groundtruth.a[0].theta: nothing'),
+])
+def test_what_is_wrong_is_named(put, path, value, said):
+    file = put(changed(path, value))
+    with pytest.raises(FileError) as caught:
+        read_jrl_file(file)
+    assert said in str(caught.value) and '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('text, said', [
+    ('', 'no JSON'), ('[' * 100_000, 'without an end'), ('[1]', 'expected an object'),
+    ('{"a":' * 3000, 'without an end'), ('1' * 5000, 'too many digits'), ('{"a": NaN', 'no JSON'),
+    ('{"measurements": {}}', 'no edges'), ('{"measurements": {"ab": []}}', 'single character')])
+def test_text_that_is_none(put, text, said):
+    with pytest.raises(FileError, match=said):
+        read_jrl_file(put(text))
+
+
+@pytest.mark.parametrize('content', [
+    '', '81' * 1000, '9bffffffffffffffff', '7bffffffffffffffff61', 'd81c80', '9f00ff',
+    '82d81c80d81d00', 'c4821b0000000fffffffff03', 'ffff', 'a1808080'])
+def test_cbor_that_asks_for_more_than_it_is(tmp_path, content):
+    pytest.importorskip('cbor2')
+    path = tmp_path / 'a.cbor'
+    path.write_bytes(bytes.fromhex(content))
+    with pytest.raises(FileError):
+        read_jrl_file(path)
+
+
+def test_a_file_too_large_is_not_read(tmp_path):
+    path = tmp_path / 'a.jrl'
+    with path.open('wb') as file:
+        file.truncate(2**29 + 1)
+    with pytest.raises(FileError, match='expected at most 536,870,912'):
+        read_jrl_file(path)
