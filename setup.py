@@ -69,6 +69,8 @@ setup(
         'completion': ['argcomplete>=3.1'],
         # `l1slam solve --report`; the library that Ubuntu 24.04 ships, or newer.
         'report': ['plotly>=5.15'],
+        # `l1slam batch`; `table.parquet` besides where pyarrow is.
+        'fleet': ['distributed>=2024.1'],
         # Newer style tools find other things, and a test asserts that they find none.
         # setuptools: a test builds the wheel, and from 70.1 on it can do so by itself.
         # pip: tests install into other environments, which from 22.3 on it can do.
@@ -81,6 +83,7 @@ setup(
             'packaging',
             'argcomplete>=3.1',
             'plotly>=5.15',
+            'distributed>=2024.1',
             'pip>=22.3',
             'setuptools>=70.1',
         ],
