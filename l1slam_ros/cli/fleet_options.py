@@ -6,10 +6,12 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""The options of the commands that are about many recordings: batch."""
+"""The options of the commands that are about many recordings: batch and merge."""
 
 import argparse
 from pathlib import Path
+
+from l1slam_ros.core import names
 
 
 def add_batch(parser: argparse.ArgumentParser) -> None:
@@ -37,3 +39,24 @@ def add_batch(parser: argparse.ArgumentParser) -> None:
         '(default: %(default)s)')
     add('--memory', type=float, default=4.0, metavar='GB',
         help='that one recording may take, of address space (default: %(default)s)')
+
+
+def add_merge(parser: argparse.ArgumentParser) -> None:
+    """Add what `merge` takes, but for how an input is read."""
+    add = parser.add_argument
+    add('input', type=Path, nargs='+', metavar='INPUT',
+        help='two or more of what `solve` takes; an edge of a graph file may lead to a vertex of '
+        'another one')
+    add('--output', type=Path, required=True, metavar='OUT', help='.g2o, as `solve` writes it')
+    add('--loops', type=Path, metavar='FILE',
+        help='loops between inputs: edges as of g2o, their vertices written NUMBER:ID, the number '
+        'of the input, from 1, and its vertex: `EDGE_SE2 1:17 2:305 dx dy dtheta ...`')
+    add('--norm', choices=names.NORMS, help='as of `solve`')
+    add('--robust', action=argparse.BooleanOptionalAction, help='as of `solve`')
+    add('--reference', metavar='TRUTH', help='as of `solve`, with the ids of the merged map')
+    add('--force', action='store_true', help='replace OUT, though l1slam did not write it')
+    add('--json', action='store_true', help='one object on standard output, as of `solve`')
+    add('--quiet', action='store_true', help='no progress, no summary, no warning')
+    # What else `solve` can be told.
+    parser.set_defaults(start=names.STARTS[0], loop_norm=None, solver=names.SOLVERS[0],
+                        outer=None, inner=None, plot=None, grid=None, report=None)
