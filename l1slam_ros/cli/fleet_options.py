@@ -51,6 +51,9 @@ def add_merge(parser: argparse.ArgumentParser) -> None:
     add('--loops', type=Path, metavar='FILE',
         help='loops between inputs: edges as of g2o, their vertices written NUMBER:ID, the number '
         'of the input, from 1, and its vertex: `EDGE_SE2 1:17 2:305 dx dy dtheta ...`')
+    add('--scans', nargs='?', const='/scan', metavar='TOPIC',
+        help='all inputs are CARMEN logs, or bags with scans on this topic (%(const)s): find the '
+        'loops between them by their scans, too')
     add('--norm', choices=names.NORMS, help='as of `solve`')
     add('--robust', action=argparse.BooleanOptionalAction, help='as of `solve`')
     add('--reference', metavar='TRUTH', help='as of `solve`, with the ids of the merged map')

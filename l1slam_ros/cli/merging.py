@@ -17,8 +17,13 @@ from l1slam_ros.cli.solving import asked_of, solved
 from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.robust.batch_map import Outcome
 from l1slam_ros.fleet.merging import Merged, Part, apart_sentences, merged, parts_beside
+from l1slam_ros.fleet.rivals import rival_doubts
+from l1slam_ros.fleet.scanning import Found, scanned
 from l1slam_ros.io import formats
+from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, compile_now
+from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import read_graph_file, read_one_of_several
+from l1slam_ros.io.progress import Progress
 
 _FEWEST = 2
 
@@ -33,8 +38,8 @@ def merge(arguments: argparse.Namespace) -> Ending:
                         'hold one drive')
     formats.check_output(arguments.output, inputs(
         arguments, arguments.reference, arguments.loops), arguments.force)
-    whole = merged([_part(arguments, path) for path in paths], arguments.loops,
-                   arguments.rotation_information)
+    parts, found = _parts(arguments, paths)
+    whole = merged(parts, arguments.loops, found, arguments.rotation_information)
 
     def settled(outcome: Outcome) -> tuple[Outcome, list[str]]:
         return _settled(outcome, whole, paths)
@@ -42,6 +47,20 @@ def merge(arguments: argparse.Namespace) -> Ending:
     # What is wrong with the whole is of no input alone.
     return solved(argparse.Namespace(**{**vars(arguments), 'input': arguments.output}),
                   asked_of(arguments), whole.record, None, settled)
+
+
+def _parts(arguments: argparse.Namespace, paths: list[Path]) -> tuple[list[Part], Found | None]:
+    """Return all inputs, and the loops between them that the front end found, if asked to."""
+    if arguments.scans is None:
+        return [_part(arguments, path) for path in paths], None
+    compile_now((*SPARSE, *JUDGEMENT), arguments.quiet)
+    with Progress(None, 'scan', arguments.quiet, 'matching scans') as progress:
+        def report(scans: int, of_all: int, loops: int) -> None:
+            progress.reach(scans, of_all)
+            progress.advance(0, counted(loops, 'loop'))
+
+        records, found = scanned(paths, arguments.odom_topic, arguments.scans, report)
+    return [Part(path, record) for path, record in zip(paths, records, strict=True)], found
 
 
 def _part(arguments: argparse.Namespace, path: Path) -> Part:
@@ -52,8 +71,12 @@ def _part(arguments: argparse.Namespace, path: Path) -> Part:
 
 def _settled(outcome: Outcome, whole: Merged, paths: list[Path]) -> tuple[Outcome, list[str]]:
     """Return the outcome with unjoined parts beside each other, and a sentence on each."""
-    graph = outcome.judgement.believed(whole.record.graph) if outcome.judgement else (
-        whole.record.graph.without_struck())
+    graph, judgement = whole.record.graph.without_struck(), outcome.judgement
+    if judgement:
+        rivals = rival_doubts(whole.record.graph, outcome.solution.poses, judgement.accepted,
+                              whole.of_input)
+        judgement = replace(judgement, doubts=(*judgement.doubts, *rivals))
+        graph = judgement.believed(whole.record.graph)
     poses = parts_beside(graph, outcome.solution.poses)
-    return (replace(outcome, solution=replace(outcome.solution, poses=poses)),
+    return (replace(outcome, judgement=judgement, solution=replace(outcome.solution, poses=poses)),
             apart_sentences(graph, whole.of_input, paths))

@@ -32,6 +32,7 @@ from l1slam_ros.core.graph.factor_graph import (
 )
 from l1slam_ros.core.names import QUATERNION
 from l1slam_ros.fleet.numbering import numbered
+from l1slam_ros.fleet.scanning import Found
 from l1slam_ros.io.files import TextLines, counted, quoted, read_lines
 from l1slam_ros.io.formats import named
 from l1slam_ros.io.graphs.graph_file import GraphRecord, roots_of
@@ -68,7 +69,7 @@ class Merged:
     of_input: Indices
 
 
-def merged(parts: Sequence[Part], loops: Path | None,
+def merged(parts: Sequence[Part], loops: Path | None, found: Found | None = None,
            rotation_information: str = QUATERNION) -> Merged:
     """
     Return one graph of all parts.
@@ -78,6 +79,7 @@ def merged(parts: Sequence[Part], loops: Path | None,
     parts : two or more
     loops : a file of edges between them, whose vertices are `NUMBER:ID`, the number of the part,
         from 1, and the vertex in it
+    found : loops that a front end found
     rotation_information : of that file, see `GraphRecord`
 
     Raises
@@ -110,6 +112,11 @@ def merged(parts: Sequence[Part], loops: Path | None,
         if part.beyond is not None and len(part.beyond):
             said += _append(graph, part.path, part.beyond,
                             _ends(parts, own, number, part.beyond))
+    if found is not None:
+        i, j = (np.array([own[number][vertex] for number, vertex in zip(
+            found.inputs[:, end], found.ids[:, end], strict=True)], np.int64) for end in (0, 1))
+        graph.append_between(i, j, found.measurement, found.roots)
+        said += found.said
     if loops is not None:
         said += _append(graph, loops, *_listed(parts, own, loops, rotation_information))
     stamps = [part.record.stamps for part in parts]
