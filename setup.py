@@ -71,6 +71,8 @@ setup(
         'report': ['plotly>=5.15'],
         # JRL files in their compressed form; older ones bound less of what strangers write.
         'cbor': ['cbor2>=6.3'],
+        # `l1slam batch`; `table.parquet` besides where pyarrow is.
+        'fleet': ['distributed>=2024.1'],
         # Newer style tools find other things, and a test asserts that they find none.
         # setuptools: a test builds the wheel, and from 70.1 on it can do so by itself.
         # pip: tests install into other environments, which from 22.3 on it can do.
@@ -84,6 +86,7 @@ setup(
             'argcomplete>=3.1',
             'cbor2>=6.3',
             'plotly>=5.15',
+            'distributed>=2024.1',
             'pip>=22.3',
             'setuptools>=70.1',
         ],

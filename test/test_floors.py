@@ -30,7 +30,7 @@ ROS = {
 FLOORS = (
     ('core.kernels',), ('core.geometry',), ('core.graph', 'core.scans'), ('core.solvers',),
     ('core.robust',), ('core.bordered', 'core.worlds'), ('core.online',), ('core.running',),
-    ('io',), ('paper',), ('cli', 'ros'),
+    ('io',), ('paper', 'fleet'), ('cli', 'ros'),
 )
 # Only the algorithms that join them may know both a linear system and poses.
 BLIND = {f'{PACKAGE}.core.{name}': {f'{PACKAGE}.core.{other}' for other in others}

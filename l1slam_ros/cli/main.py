@@ -19,6 +19,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from l1slam_ros.cli.fleet_options import add_batch, add_merge
 from l1slam_ros.core import names
 from l1slam_ros.core.errors import L1SlamError, optional_libraries
 from l1slam_ros.io.bags.topics import DEFAULT_TOPICS
@@ -46,8 +47,9 @@ exit codes:
   0  done
   2  bad input or arguments, said in one line; nothing written
   3  done, but only a part of the input was used: it is damaged, or the loops of a bag did not get
-     in, because most were refused or none of their topics was read
-  4  solve: the best map is written, but it is doubtful (also where the code would be 3)
+     in, because most were refused or none of their topics was read; batch: some recordings failed
+     or were used only in part
+  4  solve, merge: the best map is written, but it is doubtful (also where the code would be 3)
 
 completion of commands and options by the TAB key, in bash and zsh, where argcomplete is
 installed (pip install argcomplete, or the package python3-argcomplete):
@@ -191,6 +193,16 @@ def _add_solve(parser: argparse.ArgumentParser) -> None:
     _add_reading(parser)
 
 
+def _add_batch(parser: argparse.ArgumentParser) -> None:
+    add_batch(parser)
+    _add_reading(parser)
+
+
+def _add_merge(parser: argparse.ArgumentParser) -> None:
+    add_merge(parser)
+    _add_reading(parser)
+
+
 def _add_convert(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('input', type=Path, metavar='INPUT', help=_INPUT)
     parser.add_argument('output', type=Path, metavar='OUTPUT', help=_OUTPUT)
@@ -261,6 +273,10 @@ def _add_reproduce(parser: argparse.ArgumentParser) -> None:
 _COMMANDS: dict[str, tuple[str, str, str, Callable[[argparse.ArgumentParser], None]]] = {
     'solve': ('solving', 'optimise a graph or a bag',
               'graph.g2o --output solved.g2o --plot map.png', _add_solve),
+    'merge': ('merging', 'make one map of several drives or robots',
+              'monday.g2o tuesday.mcap --loops between.txt --output both.g2o', _add_merge),
+    'batch': ('batching', 'solve each recording of a folder, on all cores or on a cluster',
+              'recordings --output results', _add_batch),
     'convert': ('commands', 'turn a graph file into a bag, or back', 'graph.g2o bag',
                 _add_convert),
     'simulate': ('worlds', 'make a world, its truth known',

@@ -11,7 +11,7 @@
 import argparse
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -54,8 +54,20 @@ if TYPE_CHECKING:
 def solve(arguments: argparse.Namespace) -> Ending:
     """Optimise a graph; print, write and draw what came out."""
     _check_outputs(arguments)
-    asked = _asked(arguments)
+    asked = asked_of(arguments)
     record, made = _read(arguments)
+    return solved(arguments, asked, record, made)
+
+
+def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphRecord,
+           made: 'ScanMap | None',
+           settled: Callable[[Outcome], tuple[Outcome, list[str]]] = lambda outcome: (outcome, []),
+           ) -> Ending:
+    """
+    Optimise a graph that was read; print, write and draw what came out.
+
+    made : what scans made besides; settled : what is still to be done with the outcome, and said
+    """
     truth = read_truth(
         arguments.reference, record, arguments.input, made.path if made else None) if (
         arguments.reference) else None
@@ -64,8 +76,9 @@ def solve(arguments: argparse.Namespace) -> Ending:
     if arguments.plot:
         known_false(arguments.input, record)  # damaged, it is refused before the work
     compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
-    outcome = _solved(arguments, record, asked)
-    remarks = [*_remarks(outcome), *offset_sentence(record.graph.manifold, outcome.offset)]
+    outcome, sentences = settled(_outcome(arguments, record, asked))
+    remarks = [*_remarks(outcome), *sentences,
+               *offset_sentence(record.graph.manifold, outcome.offset)]
     warn(remarks, arguments.quiet)
     judgement = outcome.judgement
     ending = Ending(record.damage, doubt_sentence(
@@ -134,7 +147,7 @@ def _write_grid(path: Path, made: 'ScanMap', outcome: Outcome) -> None:
     write_grid(path, draw(made.points, outcome.solution.poses))
 
 
-def _solved(arguments: argparse.Namespace, record: GraphRecord, asked: SolveOptions) -> Outcome:
+def _outcome(arguments: argparse.Namespace, record: GraphRecord, asked: SolveOptions) -> Outcome:
     l1, l2 = asked.options, asked.least_squares
     steps = l1.outer_iterations if asked.norm == 'l1' else l2.iterations
     quiet = arguments.quiet
@@ -176,7 +189,8 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
         check_report(arguments.report, read, arguments.force)
 
 
-def _asked(arguments: argparse.Namespace) -> SolveOptions:
+def asked_of(arguments: argparse.Namespace) -> SolveOptions:
+    """Return how a graph is to be solved."""
     solver, least_squares, robust = OptimiserOptions(), LeastSquaresOptions(), arguments.robust
     if arguments.params_file:
         options = read_params_file(arguments.params_file)

@@ -67,6 +67,8 @@ _OPTIONAL = {
     **dict.fromkeys(('rosbags', 'mcap', 'lz4', 'zstandard'),
                     'bags are read and written by it, expected `pip install rosbags mcap`'),
     'cbor2': 'JRL files in CBOR are read and written by it, expected `pip install cbor2`',
+    **dict.fromkeys(('dask', 'distributed'),
+                    'many recordings are solved on it, expected `pip install distributed`'),
     'matplotlib': 'pictures are drawn by it, expected `pip install matplotlib` or the package '
                   'python3-matplotlib',
 }

@@ -91,9 +91,11 @@ def longest_run(growth: Growth, rows: Indices) -> Group:
     count = np.bincount(one[number[one] == number[other]], minlength=len(rows))
     count[number != np.bincount(number[count >= _MATES], minlength=1).argmax()] = 0
     run = np.argsort(-count, kind='stable')[:np.count_nonzero(count >= _MATES)]
+    if len(run) < max(_RUN, len(rows) / 2 + 1):
+        return NO_GROUP
     poses = growth.graph.manifold.positions(growth.poses)
     ways = [np.ptp(poses[ends[rows[run]]], axis=0) for ends in (growth.low, growth.high)]
-    if len(run) < max(_RUN, len(rows) / 2 + 1) or min(way.max() for way in ways) < _RUN_WAY:
+    if min(way.max() for way in ways) < _RUN_WAY:
         return NO_GROUP
     return Group(rows[run], number[run[:1]])
 

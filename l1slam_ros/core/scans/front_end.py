@@ -74,6 +74,11 @@ class ScanFrontEnd:
         self._last = scan.stamp, wheels
         return self._odometry.add(scan.stamp, points_of(scan, self._mount, self._velocity), wheels)
 
+    def begin_drive(self, mount: Mount) -> None:
+        """Let the next scan be the first of another drive, by a laser mounted like this."""
+        self._mount, self._velocity, self._last = mount, None, None
+        self._odometry.end_drive()
+
     def place(self, poses: Array, spread: Array) -> None:
         """
         Hear where the first keyframes lie in the map.

@@ -112,7 +112,7 @@ class ScanOdometry:
         """Follow the robot to a scan; wheels : (3,) its pose by the wheels at that stamp."""
         if self._wheels is None or self._field is None:
             self._wheels = wheels
-            return self._begin(stamp, points, 0)
+            return self._begin(stamp, points)
         motion = se2.between(self._wheels[None], wheels[None])[0]
         self._wheels = wheels
         start = self._pose
@@ -125,8 +125,14 @@ class ScanOdometry:
         said = self._follow(start, expected, motion, predicted, points)
         if self._unmatched >= _LOST_AFTER:
             self._unmatched, self._blind = 0, np.zeros(3)
-            return self._begin(stamp, points, self.keyframes[-1].part + 1)
+            return self._begin(stamp, points, 'the scans show nothing known any more; a new part '
+                               'of the map begins')
         return self._step(stamp, points, said)
+
+    def end_drive(self) -> None:
+        """Let the next scan be the first of another drive: a part of its own."""
+        self._wheels, self._unmatched, self._distrusted = None, 0, 0
+        self._blind = np.zeros(3)
 
     def _follow(self, start: Array, expected: Array, motion: Array, predicted: Array,
                 points: Points) -> str:
@@ -181,12 +187,12 @@ class ScanOdometry:
         self._keep(keyframe)
         return Step(self._pose, keyframe, covariance, said)
 
-    def _begin(self, stamp: int, points: Points, part: int) -> Step:
-        travelled = self.keyframes[-1].travelled if self.keyframes else 0.0
-        keyframe = Keyframe(stamp, self._pose, points, part, travelled)
-        self._keep(keyframe)
-        said = '' if part == 0 else (
-            'the scans show nothing known any more; a new part of the map begins')
+    def _begin(self, stamp: int, points: Points, said: str = '') -> Step:
+        part, travelled = 0, 0.0
+        if self.keyframes:
+            part, travelled = self.keyframes[-1].part + 1, self.keyframes[-1].travelled
+        self._keep(Keyframe(stamp, self._pose, points, part, travelled))
+        keyframe = self.keyframes[-1]
         return Step(self._pose, keyframe, FLOOR, said)
 
     def _keep(self, keyframe: Keyframe) -> None:

@@ -113,6 +113,22 @@ def read_graph_file(path: str | os.PathLike[str],
     FileError : naming the line, when the file is no such graph or those beside it are of another.
 
     """
+    record, beyond = read_one_of_several(path, rotation_information)
+    if len(beyond):
+        _index(path, record.ids, beyond)
+    return record
+
+
+def read_one_of_several(path: str | os.PathLike[str],
+                        rotation_information: str = QUATERNION) -> tuple[GraphRecord, Rows]:
+    """
+    Read, as `read_graph_file`, one file of several, and its edges to vertices that it has not.
+
+    Raises
+    ------
+    FileError : naming the line, when the file is no such graph or those beside it are of another.
+
+    """
     lines = lines_by_tag(path)
     groups, remarks = lines.groups, lines.remarks
     manifold = manifold_of(path, groups)
@@ -129,6 +145,8 @@ def read_graph_file(path: str | os.PathLike[str],
         ids, vertices = ids[kept], vertices.chosen(kept) if len(vertices) else vertices
         edges = edges.chosen(np.flatnonzero(np.isin(edges.ids, anchors).sum(axis=1) == 0))
     graph = keyframes_of(ids, manifold)
+    inside: Mask = np.isin(edges.ids, ids).all(axis=1) | edges.alone
+    edges, beyond = edges.chosen(inside), edges.chosen(~inside)
     order, left_out, as_measured = in_place(edges.lines, lines.left_out)
     stand, edges = edges.lines[order], edges.chosen(as_measured)
     _add_edges(path, graph, ids, edges, remarks, left_out == STRUCK)
@@ -136,13 +154,12 @@ def read_graph_file(path: str | os.PathLike[str],
     ends = np.concatenate(([0], used + 1))
     before = ends[np.searchsorted(
         stand[used], [number for number, _ in lines.comments])].tolist()
-    return GraphRecord(graph, vertices.pose if len(vertices) else None, ids,
-                       _stamps(path, ids, remarks),
-                       (*circles, *indefinite, *_skipped(groups, ids, anchors)),
-                       rotation_information=rotation_information, remarks=remarks,
-                       left_out=left_out,
-                       comments=tuple(zip(before, (text for _, text in lines.comments),
-                                          strict=True)))
+    record = GraphRecord(
+        graph, vertices.pose if len(vertices) else None, ids, _stamps(path, ids, remarks),
+        (*circles, *indefinite, *_skipped(groups, ids, anchors)),
+        rotation_information=rotation_information, remarks=remarks, left_out=left_out,
+        comments=tuple(zip(before, (text for _, text in lines.comments), strict=True)))
+    return record, beyond
 
 
 def read_vertices(path: str | os.PathLike[str],
@@ -196,7 +213,7 @@ def _add_edges(path: str | os.PathLike[str], graph: FactorGraph, ids: Indices, e
                remarks: Remarks, struck_here: Mask) -> None:
     i, j = _index(path, ids, edges).T
     i, none = np.where(edges.alone, WORLD, i), np.zeros(len(edges), bool)
-    roots = _roots(path, edges)
+    roots = roots_of(path, edges)
     doubted = BetweenFactors(i, j, edges.pose, roots, none, none, graph.predecessor)
     trusted, struck = (remarks['trusted'], remarks['struck']) if remarks else (
         named_loops(path, name, ids, doubted) for name in ('trusted', 'struck'))
@@ -216,7 +233,7 @@ def _index(path: object, ids: Indices, rows: Rows) -> Indices:
     return index
 
 
-def _roots(path: object, rows: Rows) -> Array:
+def roots_of(path: object, rows: Rows) -> Array:
     """Return the square roots of the information, (m, d, d); each must have one."""
     def works(part: slice) -> bool:
         try:

@@ -15,6 +15,7 @@ from pathlib import Path
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.io.formats import LOG_SUFFIXES, is_bag, is_log
 from l1slam_ros.io.scans.carmen import read_carmen
+from l1slam_ros.io.scans.laser_log import LaserLog
 from l1slam_ros.io.scans.to_graph import ScanMap, map_scans
 
 
@@ -33,17 +34,7 @@ def read_scans(path: Path, odom_topic: str, scan_topic: str | None,
     FileError : it cannot be read, or holds no scans.
 
     """
-    if is_log(path):
-        log = read_carmen(path)
-    elif is_bag(path) and scan_topic:
-        from l1slam_ros.io.bags.reader import bag_summary
-        from l1slam_ros.io.scans.bag_scans import read_bag_scans
-
-        bag_summary(path)  # what is no bag is said as such
-        log = read_bag_scans(path, odom_topic, scan_topic)
-    else:
-        raise FileError(path, 'holds no scans; expected a bag, or a CARMEN log: '
-                        f'{", ".join(LOG_SUFFIXES)}')
+    log = read_log(path, odom_topic, scan_topic)
     made = map_scans(zip(log.scans, log.wheels, strict=True), log.mount,
                      lambda scans, loops: report(scans, len(log.scans), loops))
     if made.record.graph.n_poses < 2:
@@ -52,3 +43,24 @@ def read_scans(path: Path, odom_topic: str, scan_topic: str | None,
     record = made.record
     return replace(made, record=replace(
         record, skipped=(*log.skipped, *record.skipped), damage=log.damage))
+
+
+def read_log(path: Path, odom_topic: str, scan_topic: str | None) -> LaserLog:
+    """
+    Return the scans of a log, or of a bag's topic, and the wheels; see `read_scans`.
+
+    Raises
+    ------
+    FileError : it cannot be read, or holds no scans.
+
+    """
+    if is_log(path):
+        return read_carmen(path)
+    elif is_bag(path) and scan_topic:
+        from l1slam_ros.io.bags.reader import bag_summary
+        from l1slam_ros.io.scans.bag_scans import read_bag_scans
+
+        bag_summary(path)  # what is no bag is said as such
+        return read_bag_scans(path, odom_topic, scan_topic)
+    raise FileError(path, 'holds no scans; expected a bag, or a CARMEN log: '
+                    f'{", ".join(LOG_SUFFIXES)}')

@@ -61,10 +61,24 @@ def map_scans(scans: Iterable[tuple[Scan, Array]], mount: Mount,
     options : of the front end
 
     """
-    made = _Making(ScanFrontEnd(options, mount))
-    for count, (scan, wheels) in enumerate(scans, 1):
-        if made.take(scan, wheels):
-            report(count, made.loops)
+    return map_drives([(scans, mount)], report, options)
+
+
+def map_drives(drives: Iterable[tuple[Iterable[tuple[Scan, Array]], Mount]],
+               report: Callable[[int, int], None] = lambda scans, loops: None,
+               options: FrontEndOptions = FrontEndOptions()) -> ScanMap:  # noqa: B008
+    """
+    Return, as `map_scans`, the graph of the scans of several drives, loops between them included.
+
+    drives : scans and mount of each; in the graph each is a robot, numbered from 0
+    """
+    made, count = _Making(ScanFrontEnd(options)), 0
+    for scans, mount in drives:
+        made.begin_drive(mount)
+        for scan, wheels in scans:
+            count += 1
+            if made.take(scan, wheels):
+                report(count, made.loops)
     return made.finished()
 
 
@@ -72,13 +86,18 @@ class _Making:
     """A graph that grows with the scans."""
 
     def __init__(self, front_end: ScanFrontEnd):
-        self.loops = 0
+        self.loops, self._drive = 0, -1
         self._front_end, self._graph = front_end, FactorGraph(se2)
         self._mapped = 0  # loops in the map that the front end knows
         self._said: list[str] = []
         self._stamps: list[int] = []
         self._poses: list[Array] = []
         self._last: list[int] = []
+
+    def begin_drive(self, mount: Mount) -> None:
+        """Let the next scan be of another drive."""
+        self._drive += 1
+        self._front_end.begin_drive(mount)
 
     def take(self, scan: Scan, wheels: Array) -> bool:
         """Take a scan; tell whether it is a keyframe."""
@@ -100,10 +119,10 @@ class _Making:
         """Append the newest keyframe, and its odometry where it goes on from the one before."""
         keyframes = self._front_end.keyframes
         if len(keyframes) < 2 or keyframes[-1].part != keyframes[-2].part:
-            self._graph.add_poses(1)
+            self._graph.add_poses(1, self._drive)
             return
         motion = se2.between(keyframes[-2].pose[None], keyframes[-1].pose[None])
-        self._graph.append_step(motion, root_of_inverse(step.covariance[None]))
+        self._graph.append_step(motion, root_of_inverse(step.covariance[None]), self._drive)
 
     def _add(self, loops: list[ScanLoop]) -> None:
         self.loops += len(loops)

@@ -1,0 +1,162 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""
+`l1slam batch` over many small recordings, some of them hostile: results, kills, and what it costs.
+
+    python benchmarks/fleet/batch.py [--recordings 1000] [--hostile 20] [--poses 300] [--kills 4]
+        [--folder DIR]
+
+Every third recording is a bag, the others are g2o files. They are solved by two workers, by one,
+and by two while the command and its workers are killed; the tables must be the same bytes. All
+stays in the folder, and what is there already is not made again.
+"""
+
+import argparse
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from hostile import HOSTILE
+
+from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
+from l1slam_ros.io import formats
+from l1slam_ros.io.graphs.graph_file import GraphRecord
+
+_COMMAND = ('import sys; from l1slam_ros.cli.main import main; sys.exit(main())')
+
+
+def parse() -> argparse.Namespace:
+    """Return the arguments."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').strip().splitlines()[0])
+    parser.add_argument('--recordings', type=int, default=1000, help='the hostile ones included')
+    parser.add_argument('--hostile', type=int, default=20)
+    parser.add_argument('--poses', type=int, default=300, help='of the largest recording')
+    parser.add_argument('--kills', type=int, default=4, help='of the command, and of a worker')
+    parser.add_argument('--folder', type=Path, help='where to work (default: a temporary one)')
+    return parser.parse_args()
+
+
+def make(folder: Path, count: int, hostile: int, poses: int) -> None:
+    """Make the recordings, of `poses` / 4 to `poses` poses, twenty to a folder."""
+    every = count // hostile
+    for number in range(count):
+        path = folder / f'day{number // 20:03d}' / f'run{number:05d}'
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if number % every == every // 2:
+            HOSTILE[number // every % len(HOSTILE)](path)
+            continue
+        rng = np.random.default_rng(number)
+        n = int(rng.integers(poses // 4, poses + 1))
+        world = simulate_world(n, int(1.6 * n), WorldOptions(), rng)
+        lies = FALSE_LOOPS['random'](world.graph, world.truth, n // 50, rng)
+        world = with_false_loops(world, lies)
+        formats.write_output(path if number % 3 == 0 else path.with_suffix('.g2o'),
+                             GraphRecord(world.graph, world.odometry, np.arange(n)))
+
+
+def start(folder: Path, output: Path, *options: str) -> 'subprocess.Popen[str]':
+    """Start the command."""
+    return subprocess.Popen(
+        [sys.executable, '-c', _COMMAND, 'batch', str(folder), '--output', str(output), *options],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+
+def whole(folder: Path, output: Path, workers: int) -> float:
+    """Run it to its end; return how long it took [s]."""
+    began = time.perf_counter()
+    process = start(folder, output, '--workers', str(workers))
+    said = process.communicate()[1]
+    seconds = time.perf_counter() - began
+    print(f'{workers} worker(s): code {process.returncode}, {seconds:.1f} s, load of the machine '
+          f'{os.getloadavg()[0]:.2f}; {said.strip().splitlines()[-1]}', flush=True)
+    return seconds
+
+
+def killed(folder: Path, output: Path, kills: int, seconds: float) -> None:
+    """Kill the command so many times while it runs, and each time a worker before; resume."""
+    for number in range(kills + 1):
+        process = start(folder, output, '--workers', '2', *(['--resume'] if number else []))
+        if number < kills:
+            time.sleep(seconds / (kills + 1) / 2)
+            for line in lines(output)[-1:]:
+                os.kill(int(line['worker'].rpartition(':')[2]), signal.SIGKILL)
+            time.sleep(seconds / (kills + 1) / 2)
+            process.kill()
+        process.wait()
+        print(f'killed: code {process.returncode}, {len(lines(output)):,} done', flush=True)
+
+
+def lines(output: Path) -> list[dict[str, object]]:
+    """Return what the log says of recordings."""
+    path = output / 'log.jsonl'
+    text = path.read_text().split('\n')[1:-1] if path.exists() else []
+    return [line for line in map(json.loads, text) if 'recording' in line]
+
+
+def report(folder: Path, results: list[Path], seconds: list[float]) -> None:
+    """Print what came out, and what a recording costs."""
+    with open(results[0] / 'table.csv', newline='') as file:
+        rows = list(csv.DictReader(file))
+    failed = [row for row in rows if row['status'] == 'failed']
+    print(f'{len(rows):,} recordings, {len(rows) - len(failed):,} maps, {len(failed)} sentences:')
+    for row in failed:
+        print(f'  {row["sentence"]}')
+    for name in ('table.csv', 'maps'):
+        same = all(content(output / name) == content(results[0] / name) for output in results)
+        print(f'{name}: {"the same bytes" if same else "NOT THE SAME"} in all {len(results)} runs')
+    twice = len(lines(results[-1])) - len({line['recording'] for line in lines(results[-1])})
+    print(f'recordings done twice over the kills: {twice}')
+    found = [line for line in lines(results[1]) if line['row']['status'] != 'failed']
+    cpu = np.array([line['cpu_seconds'] for line in found])
+    peak = max(line['peak_bytes'] for line in lines(results[1]))
+    print(f'two workers take {seconds[0] / seconds[1]:.2f} of the time of one')
+    print(f'processor: {cpu.mean():.3f} s a recording, {cpu.max():.3f} s at most; with one worker '
+          f'{seconds[1] / len(rows):.3f} s by the clock, all included; most memory '
+          f'{peak / 1e6:.0f} MB')
+    for name, path in (('read', folder), ('maps', results[0] / 'maps'),
+                       ('log', results[0] / 'log.jsonl'), ('CSV', results[0] / 'table.csv'),
+                       ('parquet', results[0] / 'table.parquet')):
+        print(f'{name}: {size(path) / len(rows):,.0f} bytes a recording')
+
+
+def content(path: Path) -> dict[str, bytes]:
+    """Return all bytes of a file, or of the files of a folder, by their names."""
+    files = [path] if path.is_file() else sorted(path.rglob('*'))
+    return {str(file.relative_to(path)): file.read_bytes() for file in files if file.is_file()}
+
+
+def size(path: Path) -> int:
+    """Return how many bytes a file or a folder has."""
+    files = [path] if path.is_file() else path.rglob('*')
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+def main() -> None:
+    """Run all of it."""
+    arguments = parse()
+    place = arguments.folder or Path(tempfile.mkdtemp(prefix='l1slam_fleet_'))
+    folder = place / 'recordings'
+    if not folder.exists():
+        make(folder, arguments.recordings, arguments.hostile, arguments.poses)
+    results = [place / f'results{k}' for k in range(3)]
+    seconds = [whole(folder, results[k], 2 - k) for k in (0, 1)]
+    killed(folder, results[2], arguments.kills, seconds[0])
+    report(folder, results, seconds)
+
+
+if __name__ == '__main__':
+    main()

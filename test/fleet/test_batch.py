@@ -1,0 +1,258 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""`l1slam batch`, in processes of its own: hostile recordings, kills, other places to work."""
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+pytest.importorskip('distributed')
+
+from bad_jobs import begin
+from command import run
+
+from l1slam_ros.fleet.finding import find
+from l1slam_ros.fleet.isolated import Job, Limits, run_job
+
+DASK = [sys.executable, '-m', 'distributed.cli.dask_']
+SECONDS = 120  # of patience
+
+
+@pytest.fixture(scope='module')
+def recordings(tmp_path_factory):
+    """Six recordings, two of them hostile; the last one in order takes longest."""
+    from l1slam_ros.cli.main import main
+    folder = tmp_path_factory.mktemp('recordings')
+    (folder / 'deep').mkdir()
+    for name, poses in (('a.g2o', 40), ('deep/b.g2o', 50), ('c.graph', 60), ('z.g2o', 1500)):
+        made = folder / name
+        main(['simulate', str(made.with_suffix('.g2o')), '--poses', str(poses), '--edges',
+              str(int(1.5 * poses)), '--false-loops', '2'])
+        made.with_suffix('.g2o').rename(made)
+    (folder / 'deep' / 'nonsense.g2o').write_text('a poem\n')
+    (folder / 'empty.mcap').touch()
+    return folder
+
+
+@pytest.fixture(scope='module')
+def done(recordings, tmp_path_factory):
+    """What comes of them, on two workers."""
+    output = tmp_path_factory.mktemp('done') / 'results'
+    ended = command(recordings, output)
+    assert ended.wait(SECONDS) == 3
+    return output, ended.stderr.read()
+
+
+def command(folder, output, *options):
+    """Start the command on two workers."""
+    where = () if {'--scheduler', '--workers'} & {*options} else ('--workers', '2')
+    return subprocess.Popen(
+        [sys.executable, '-c', 'import sys; from l1slam_ros.cli.main import main; '
+         'sys.exit(main())', 'batch', folder, '--output', output, *where, *options],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def rows(output):
+    with open(output / 'table.csv', newline='') as file:
+        return {row['recording']: row for row in csv.DictReader(file)}
+
+
+def log(output):
+    """Return the whole lines of a log that are about recordings."""
+    path = output / 'log.jsonl'
+    lines = path.read_text().split('\n')[1:-1] if path.exists() else []
+    return [line for line in map(json.loads, lines) if 'recording' in line]
+
+
+def files(output):
+    return {path.relative_to(output).as_posix(): path.read_bytes()
+            for path in output.rglob('*') if path.is_file() and path.name != 'log.jsonl'}
+
+
+def until_one_is_done(process, output):
+    while not log(output):
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(.002)
+    return log(output)
+
+
+def test_each_recording_has_its_map_or_its_sentence(recordings, done, tmp_path, capsys):
+    output, said = done
+    assert 'of 6 recordings 2 failed' in said and str(output / 'table.csv') in said
+    found = rows(output)
+    assert list(found) == ['a.g2o', 'c.graph', 'deep/b.g2o', 'deep/nonsense.g2o', 'empty.mcap',
+                           'z.g2o']
+    assert {name for name, row in found.items() if row['status'] == 'failed'} == {
+        'deep/nonsense.g2o', 'empty.mcap'}
+    assert "deep/nonsense.g2o:1: unknown tag 'a'" in found['deep/nonsense.g2o']['sentence']
+    assert 'damaged' in found['empty.mcap']['sentence']
+    assert sorted(line['recording'] for line in log(output)) == list(found)
+    for name, row in found.items():
+        if row['status'] != 'failed':
+            run(capsys, 'solve', recordings / name, '--output', tmp_path / 'alone.g2o', '--quiet')
+            assert (output / row['map']).read_bytes() == (tmp_path / 'alone.g2o').read_bytes()
+            assert row['rejected'] == '2'
+
+
+def test_table_is_in_parquet_too_where_pyarrow_is(done):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    output, _ = done
+    table = parquet.read_table(output / 'table.parquet')
+    assert table['recording'].to_pylist() == list(rows(output))
+    assert table['final_cost'][3].as_py() is None
+
+
+def test_one_worker_writes_the_same_bytes(recordings, done, tmp_path):
+    ended = command(recordings, tmp_path / 'results', '--workers', '1')
+    assert ended.wait(SECONDS) == 3
+    assert files(tmp_path / 'results') == files(done[0])
+
+
+def test_what_a_kill_left_undone_is_done_and_no_more(recordings, done, tmp_path):
+    output = tmp_path / 'results'
+    killed = command(recordings, output)
+    before = until_one_is_done(killed, output)
+    killed.kill()
+    assert killed.wait(SECONDS) == -signal.SIGKILL
+    before = log(output)
+    with open(output / 'log.jsonl', 'a') as file:
+        file.write('{"recording": "z.g2')  # as a kill amid a line leaves it
+    ended = command(recordings, output, '--resume')
+    assert ended.wait(SECONDS) == 3, ended.stderr.read()
+    assert files(output) == files(done[0])
+    assert log(output)[:len(before)] == before
+    assert len(log(output)) == 6 and len({line['recording'] for line in log(output)}) == 6
+
+
+def test_a_worker_that_is_killed_costs_nothing(recordings, done, tmp_path):
+    output = tmp_path / 'results'
+    ended = command(recordings, output)
+    for line in until_one_is_done(ended, output)[-1:]:
+        os.kill(int(line['worker'].rpartition(':')[2]), signal.SIGKILL)
+    assert ended.wait(SECONDS) == 3
+    assert files(output) == files(done[0])
+
+
+def test_a_scheduler_and_a_worker_of_their_own_do_the_same(recordings, done, tmp_path):
+    where = tmp_path / 'scheduler.json'
+    quiet = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.DEVNULL, 'cwd': tmp_path}
+    others = [subprocess.Popen([*DASK[:2], f'{DASK[2]}scheduler', '--host', '127.0.0.1', '--port',
+                                '0', '--no-dashboard', '--scheduler-file', where], **quiet)]
+    try:
+        while not where.exists():
+            assert others[0].poll() is None
+            time.sleep(.05)
+        others.append(subprocess.Popen(
+            [*DASK[:2], f'{DASK[2]}worker', '--scheduler-file', where, '--nthreads', '2',
+             '--no-dashboard', '--host', '127.0.0.1'], **quiet))
+        address = json.loads(where.read_text())['address']
+        ended = command(recordings, tmp_path / 'results', '--scheduler', address)
+        assert ended.wait(SECONDS) == 3, ended.stderr.read()
+    finally:
+        for other in others[::-1]:
+            other.terminate()
+            other.wait(SECONDS)
+    assert files(tmp_path / 'results') == files(done[0])
+
+
+def test_what_changed_and_what_failed_is_done_again(recordings, done, tmp_path, capsys):
+    folder, output = tmp_path / 'in', tmp_path / 'results'
+    shutil.copytree(recordings, folder)
+    shutil.copytree(done[0], output)
+    (folder / 'z.g2o').unlink()
+    for name in rows(output):
+        if name != 'z.g2o':  # the copy keeps the times of the files
+            assert (folder / name).stat().st_mtime_ns == (recordings / name).stat().st_mtime_ns
+    shutil.copy(recordings / 'a.g2o', folder / 'empty.mcap')
+    (folder / 'a.g2o').write_text('no graph any more\n')
+    run(capsys, 'batch', folder, '--output', output, '--resume', '--workers', '1', code=3)
+    assert sorted(line['recording'] for line in log(output)[6:]) == ['a.g2o', 'empty.mcap']
+    assert rows(output)['a.g2o']['status'] == 'failed' and 'z.g2o' not in rows(output)
+    run(capsys, 'batch', folder, '--output', output, '--resume', 'failed', '--workers', '1',
+        code=3)
+    assert sorted(line['recording'] for line in log(output)[8:]) == [
+        'a.g2o', 'deep/nonsense.g2o', 'empty.mcap']
+
+
+def test_nothing_of_others_is_replaced(recordings, done, tmp_path, capsys):
+    output = tmp_path / 'results'
+    output.mkdir()
+    (output / 'mine').write_text('kept')
+    assert 'not empty' in run(capsys, 'batch', recordings, '--output', output, code=2)[1]
+    assert 'no such file' in run(
+        capsys, 'batch', recordings, '--output', output, '--resume', code=2)[1]
+    assert [path.name for path in output.iterdir()] == ['mine']
+    assert 'expected --resume' in run(capsys, 'batch', recordings, '--output', done[0], code=2)[1]
+    copy = tmp_path / 'copy'
+    shutil.copytree(done[0], copy)
+    (copy / 'table.csv').write_text('my own notes\n')
+    assert 'not replaced' in run(
+        capsys, 'batch', recordings, '--output', copy, '--resume', code=2)[1]
+    assert (copy / 'table.csv').read_text() == 'my own notes\n'
+
+
+def test_it_is_taken_up_as_it_was_begun_or_not_at_all(recordings, done, capsys):
+    before = (done[0] / 'log.jsonl').read_bytes()
+    said = run(capsys, 'batch', recordings, '--output', done[0], '--resume', '--odom-topic', '/o',
+               code=2)[1]
+    assert 'give the same options' in said
+    run(capsys, 'batch', recordings, '--output', done[0], '--resume', code=3)
+    assert (done[0] / 'log.jsonl').read_bytes() == before
+
+
+def test_without_dask_one_sentence_says_what_to_install(
+        recordings, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'dask', None)
+    said = run(capsys, 'batch', recordings, '--output', tmp_path / 'results', code=2)[1]
+    assert said.count('\n') == 1 and 'pip install distributed' in said
+
+
+@pytest.mark.parametrize(('options', 'sentence'), [
+    (('--workers', '0'), '--workers is 0'), (('--retries', '-1'), '--retries is -1'),
+    (('--seconds', '0'), '--seconds is 0'), (('--memory', 'nan'), '--memory is nan'),
+    (('--scheduler', 'nowhere://x'), 'nobody answers')])
+def test_what_cannot_be_asked_for_is_refused(recordings, tmp_path, capsys, options, sentence):
+    said = run(capsys, 'batch', recordings, '--output', tmp_path / 'results', *options, code=2)[1]
+    assert sentence in said and said.count('\n') == 1
+
+
+@pytest.mark.parametrize(('what', 'sentence'), [
+    ('bomb', 'ended with code 1 and said nothing, 2 times'),
+    ('endless', 'took more than 1 s of the processor'), ('clock', 'took more than 10 s by the'),
+    ('crash', 'ended by signal 11, Segmentation fault, 2 times')])
+def test_what_ends_a_process_is_said(tmp_path, what, sentence):
+    job = Job('name', 'input', str(tmp_path / 'map'), (what,))
+    seconds = 60 if what == 'bomb' else 1
+    row = run_job(begin, job, Limits(seconds, 2 * 10**9), 1)['row']
+    assert row['recording'] == 'name' and row['status'] == 'failed'
+    assert sentence in row['sentence']
+
+
+@pytest.mark.parametrize('what', ['crash_once', 'end_all_once'])
+def test_what_crashes_once_is_tried_again(tmp_path, what):
+    job = Job('name', 'input', str(tmp_path / 'map'), (what,))
+    ended = run_job(begin, job, Limits(1, 2 * 10**9), 1)
+    assert ended['row'] == {'recording': 'name', 'status': 'converged'} and ended['attempts'] == 2
+
+
+def test_recordings_are_found_however_deep_and_bags_as_a_whole(tmp_path):
+    for name in ('b/bag/metadata.yaml', 'b/bag/bag_0.mcap', 'b/loose.mcap', 'a.G2O', 'notes.txt',
+                 '.hidden/x.g2o', 'out/maps/a.g2o', 'metadata.yaml'):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text('x')
+    (tmp_path / 'b' / 'circle').symlink_to(tmp_path)
+    found = [one.name for one in find(tmp_path, tmp_path / 'out')]
+    assert found == ['a.G2O', 'b/bag', 'b/loose.mcap']
