@@ -142,7 +142,8 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
         'quaternion, as g2o has it, or the angle (default: %(default)s)')
     for name, default, what in (
         ('odom', DEFAULT_TOPICS.odometry, 'nav_msgs/Odometry; or, as a whole, the pose graph of '
-         'an rtabmap_msgs/MapGraph or pose_graph_tools_msgs/PoseGraph'),
+         'an rtabmap_msgs/MapGraph, pose_graph_tools_msgs/PoseGraph, slam_toolbox/PoseGraph or '
+         'cslam_common_interfaces/KeyframeOdom'),
         ('loop', DEFAULT_TOPICS.loops, 'geometry_msgs/PoseWithCovarianceStamped, or the loops of '
          'such a pose graph'),
     ):

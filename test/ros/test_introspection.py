@@ -25,6 +25,8 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosbags.typesys import Stores, get_typestore
 
 from l1slam_ros.io.graphs.saved_map import load_map
+from l1slam_ros.ros.scans.options import ScanLoopsOptions
+from l1slam_ros.ros.shell.arguments import help_of
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / 'config'
@@ -51,7 +53,11 @@ SERVICES = {
 }
 LATCHED = {'/path', '/graph', '/loop_status'}
 # Only where their messages are installed.
-ELSEWHERE = {'/map_graph', '/pose_graph', '/tf'}
+ELSEWHERE = {'/map_graph', '/pose_graph', '/tf', '/slam_toolbox/pose_graph',
+             '/slam_toolbox/new_node_event', '/cslam/keyframe_odom',
+             '/cslam/intra_robot_loop_closure', '/cslam/inter_robot_loop_closure'}
+# What the layouts show besides: of scan_loops, see its own tests.
+SCANS = {'/map': 'nav_msgs/msg/OccupancyGrid', '/scan': 'sensor_msgs/msg/LaserScan'}
 # The types of what every node has, a managed one too.
 OF_ROS = 'lifecycle_msgs/', 'rcl_interfaces/', 'type_description_interfaces/'
 # name -> default, unit; those that only the start can set are marked.
@@ -161,15 +167,26 @@ def test_rviz_displays_each_topic_as_what_it_is():
     shown = {'/' + display['Topic']['Value']: (
         display['Class'].split('/')[1], display['Topic']['Durability Policy'] != 'Volatile')
         for display in rviz()['Displays'] if 'Topic' in display}
-    assert shown == {topic: (OUTPUTS[topic].split('/')[2].removesuffix('Stamped'),
-                             topic in LATCHED) for topic in shown} and len(shown) == 4
+    scans = {'/map': ('Map', True), '/scan': ('LaserScan', False)}
+    outputs = {topic: (OUTPUTS[topic].split('/')[2].removesuffix('Stamped'), topic in LATCHED)
+               for topic in shown.keys() - scans.keys()}
+    assert shown == outputs | scans and len(shown) == 6
+
+
+def test_the_layouts_show_what_scan_loops_hears_and_says():
+    """Its topics, with their types. A laser publishes with best effort, as a rule."""
+    help_text = help_of('scan_loops', ScanLoopsOptions())
+    for topic, kind in SCANS.items():
+        assert f'{topic.removeprefix("/")} ({kind.replace("/msg/", "/")})' in help_text
+    (scan,) = (one for one in rviz()['Displays'] if one.get('Name') == 'Scan')
+    assert scan['Topic']['Reliability Policy'] == 'Best Effort'
 
 
 def test_foxglove_shows_topics_that_there_are():
     panels = foxglove()
     shown = panels['3D!map']['topics'].keys() | {
         panels['DiagnosticSummary!all']['topicToRender'], panels['RawMessages!loops']['topicPath']}
-    assert shown < OUTPUTS.keys() and len(shown) == 6
+    assert shown < OUTPUTS.keys() | SCANS.keys() and len(shown) == 8
 
 
 def test_a_person_can_say_in_both_where_the_robot_is():

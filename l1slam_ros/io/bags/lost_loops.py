@@ -20,7 +20,7 @@ from pathlib import Path
 from l1slam_ros.io.bags.reader import TopicSummary, bag_summary, read_messages
 from l1slam_ros.io.bags.topics import ABSOLUTE_TOPIC, FALSE_LOOP_TOPIC, ODOMETRY_TYPE, POSE_TYPE
 from l1slam_ros.io.files import counted
-from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH
+from l1slam_ros.io.messages.front_ends import LOOP_TYPES
 
 # The frame of a loop, near enough: what of it is wrong is told by who reads the topic.
 _LOOP_FRAME = re.compile(r'.+@[0-9]+\.[0-9]+')
@@ -89,7 +89,7 @@ def _unread(path: Path, read: Collection[str],
     sources = [topic.name for topic in topics if topic.msgtype == ODOMETRY_TYPE]
     found = []
     for topic in others:
-        if topic.name in shaped or topic.msgtype in (MAP_GRAPH, POSE_GRAPH):
+        if topic.name in shaped or topic.msgtype in LOOP_TYPES:
             nearest = max([odometry, *sources], key=lambda name: _shared(name, topic.name))
             beside = f' --odom-topic {nearest}' if nearest != odometry else ''
             found.append((topic, f'--loop-topic {topic.name}{beside}'))

@@ -32,9 +32,9 @@ from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptio
 from l1slam_ros.core.online.keyframes import (
     KeyframeOptions,
     OdometryOptions,
-    diagonal_covariance,
 )
 from l1slam_ros.io.bags.damaged.walk import BagMessage
+from l1slam_ros.io.bags.foreign_topics import Foreign, foreign_graph
 from l1slam_ros.io.bags.from_graph import (
     GRAPH_NOTE,
     LEFT_OUT,
@@ -58,7 +58,7 @@ from l1slam_ros.io.files import counted
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.left_out import SLIP, nothing_left_out
 from l1slam_ros.io.messages import conversion
-from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
+from l1slam_ros.io.messages.front_ends import LOOP_TYPES
 from l1slam_ros.io.trajectory import Reference
 
 _EVERY = KeyframeOptions(0.0, 0.0, 0.0)
@@ -88,10 +88,12 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
     note = read_note(path)
     in_space = dimension == 3 or note.get('dimension') == SPACE_NOTE['dimension']
     options = _noted_options(options or GraphBuilderOptions(), note)
-    growing = _Growing(se3 if in_space else se2, options, topics,
+    topics, foreign = foreign_graph(path, topics)
+    growing = _Growing(se3 if in_space else se2, options, topics, foreign,
                        note.get('messages') == VERBATIM_NOTE['messages'])
     damage: list[str] = []
-    for message in read_messages(path, topics.types(), damage.append):
+    read = topics.types() | (foreign.topics if foreign else {})
+    for message in read_messages(path, read, damage.append):
         growing.take(message)
     record = growing.record('; '.join(damage))
     if options.keyframe == _EVERY:
@@ -101,7 +103,7 @@ def graph_from_bag(path: Path, options: GraphBuilderOptions | None, topics: Topi
         raise FileError(path, '; '.join([
             f'{counted(record.graph.n_poses, "keyframe")} from {topics.odometry}; '
             'expected 2 or more',
-            *_alternatives(path, topics.odometry, ODOMETRY_TYPE, MAP_GRAPH, POSE_GRAPH),
+            *_alternatives(path, topics.odometry, ODOMETRY_TYPE, *LOOP_TYPES),
             *record.skipped, *damage]))
     for topic in sorted(topics.types().keys() - DEFAULT_TOPICS.types().keys() - growing.seen):
         raise FileError(path, '; '.join([
@@ -114,21 +116,21 @@ class _Growing:
     """A graph that grows message by message."""
 
     def __init__(self, manifold: Manifold, options: GraphBuilderOptions, topics: Topics,
-                 verbatim: bool):
+                 foreign: Foreign | None, verbatim: bool):
         self._builder = GraphBuilder(manifold, options, verbatim)
         self._topics, self._types = topics, topics.types()
         self._map_frame = ''
-        self._graphs, self._is_graph = PoseGraphs(), False
+        self._foreign = foreign
+        self._graph = foreign.graph() if foreign else None
         self._loops = LoopCount()
         self.seen: set[str] = set()
 
     def take(self, message: BagMessage) -> None:
         """Use a message, or note why not."""
-        topic, expected = message.topic, self._types[message.topic]
+        topic, expected = message.topic, self._types.get(message.topic, message.msgtype)
         self.seen.add(topic)
         try:
-            if message.msgtype in (MAP_GRAPH, POSE_GRAPH) and topic in (
-                    self._topics.odometry, self._topics.loops):
+            if self._foreign and self._foreign.topics.get(topic) == message.msgtype:
                 self._add_graph(message.data, topic)
                 return
             if topic in (self._topics.loops, TRUSTED_LOOP_TOPIC):
@@ -156,14 +158,18 @@ class _Growing:
         if topic in self._loops.came:
             self._loops.refuse(topic, sentence)
 
+    @property
+    def _is_graph(self) -> bool:
+        return self._foreign is not None and self._foreign.is_whole
+
     def _add_graph(self, message: Any, topic: str) -> None:
-        self._is_graph |= topic == self._topics.odometry
-        for found in self._graphs.take(message):
-            self._loops.came[topic] += 1
+        assert self._foreign is not None and self._graph is not None
+        for found in self._graph.take(message, topic):
+            self._loops.came[self._foreign.main] += 1
             if not isinstance(found, LoopClosure):
-                # Of the whole graph no keyframe's time need be known.
-                if not (self._is_graph and found.cause == 'keyframe'):
-                    self._refuse(topic, found.cause, str(found))
+                # Of the whole graph no keyframe's time need be known, and it may be of several.
+                if not (self._is_graph and found.cause in ('keyframe', 'robot')):
+                    self._refuse(self._foreign.main, found.cause, str(found))
             elif not self._is_graph:
                 self._builder.add_loop(found)
 
@@ -179,11 +185,10 @@ class _Growing:
     def record(self, damage: str) -> GraphRecord:
         """Return the graph that has grown; damage : of the bag."""
         builder = self._builder
-        if self._is_graph:
-            manifold, loop = builder.graph.manifold, builder.options.loop
-            graph, ids = self._graphs.graph(manifold, diagonal_covariance(
-                manifold, loop.sigma_translation, loop.sigma_rotation))
-            return GraphRecord(graph, None, ids, None, tuple(builder.notes.sentences()), damage)
+        if self._is_graph and self._graph is not None:
+            graph, ids = self._graph.graph(builder.graph.manifold, builder.options)
+            return GraphRecord(graph, None, ids, None,
+                               (*builder.notes.sentences(), *self._graph.sentences()), damage)
         builder.finish()
         builder.add_due_loops()
         skipped = builder.notes.sentences()

@@ -17,6 +17,11 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 _INDEX_BITS = 56
 
 
+def symbol(letter: str, index: int) -> int:
+    """Return the vertex id of a robot's keyframe."""
+    return ord(letter) << _INDEX_BITS | index
+
+
 def robots_of(ids: Indices) -> Indices:
     """Return the character code of the robot of each vertex id, (n,); 0: the id has no letter."""
     codes = ids >> _INDEX_BITS

@@ -44,7 +44,8 @@ from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.io.files import quoted
 from l1slam_ros.io.messages import conversion
-from l1slam_ros.io.messages.pose_graphs import MAP_GRAPH, POSE_GRAPH, PoseGraphs
+from l1slam_ros.io.messages.edge_graph import EdgeGraph
+from l1slam_ros.io.messages.front_ends import FRONT_ENDS
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.robot import RobotPublisher
 from l1slam_ros.ros.threads.failures import Failures, reason
@@ -192,11 +193,13 @@ class Inputs:
         for name in conversion.LOOPS:
             self._subscribe(PoseWithCovarianceStamped, name, partial(self._on_loop, name))
         # Pose graphs of other front ends, where their messages are installed.
-        for msgtype, name in (MAP_GRAPH, 'map_graph'), (POSE_GRAPH, 'pose_graph'):
-            package, _, kind = msgtype.split('/')
-            with suppress(ImportError):
-                self._subscribe(getattr(import_module(f'{package}.msg'), kind), name,
-                                partial(self._on_pose_graph, PoseGraphs()))
+        for front_end in FRONT_ENDS:
+            use = partial(self._on_pose_graph, front_end.graph())
+            for name, msgtype in front_end.topics.items():
+                package, _, kind = msgtype.split('/')
+                # Of an older release of the package, too, that has not all of the messages.
+                with suppress(ImportError, AttributeError):
+                    self._subscribe(getattr(import_module(f'{package}.msg'), kind), name, use)
         # Last: not every DDS says when a message came, and a loop may come before its odometry.
         self._subscribe(Odometry, 'odom', self._on_odometry, raw=True)
 
@@ -331,7 +334,7 @@ class Inputs:
         self._backend.add_loop(conversion.LOOPS[name](
             message, self._backend.base_frame.name, self._map_frame))
 
-    def _on_pose_graph(self, graphs: PoseGraphs, message: Any) -> None:
+    def _on_pose_graph(self, graphs: EdgeGraph, message: Any) -> None:
         for found in graphs.take(message):
             try:
                 if not isinstance(found, LoopClosure):

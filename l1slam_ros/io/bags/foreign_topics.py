@@ -1,0 +1,60 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""Which topics of a bag have the graph of another front end."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from l1slam_ros.io.bags.reader import bag_summary
+from l1slam_ros.io.bags.topics import DEFAULT_TOPICS, Topics
+from l1slam_ros.io.messages.edge_graph import EdgeGraph
+from l1slam_ros.io.messages.front_ends import FRONT_ENDS, FrontEnd, front_end_of
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """
+    The topics of a front end's graph, with their types, and which of them names it.
+
+    is_whole : the graph is taken as it is; else only its loops.
+    """
+
+    graph: type[EdgeGraph]
+    topics: dict[str, str]
+    main: str
+    is_whole: bool
+
+
+def foreign_graph(path: Path, topics: Topics) -> tuple[Topics, Foreign | None]:
+    """
+    Return where to look, and what of it is the graph of another front end, if any is.
+
+    A bag that has nothing on the default topic of the odometry, and the messages of one front
+    end that tells its odometry, is taken for one of that: of all robots in it.
+    """
+    types = {topic.name: topic.msgtype for topic in bag_summary(path).topics if topic.count}
+    for name, is_whole in (topics.odometry, True), (topics.loops, False):
+        front_end = front_end_of(types.get(name, ''))
+        if front_end is not None:
+            return topics, Foreign(front_end.graph, _beside(name, types, front_end), name,
+                                   is_whole)
+    found = [one for one in FRONT_ENDS if one.is_found
+             and one.loops_or_keyframes() & set(types.values())]
+    if topics.odometry != DEFAULT_TOPICS.odometry or topics.odometry in types or len(found) != 1:
+        return topics, None
+    of_type = {name: kind for name, kind in types.items() if kind in found[0].topics.values()}
+    main = min(name for name, kind in of_type.items() if kind in found[0].loops_or_keyframes())
+    return replace(topics, odometry=main), Foreign(found[0].graph, of_type, main, True)
+
+
+def _beside(main: str, types: dict[str, str], front_end: FrontEnd) -> dict[str, str]:
+    """Return the topics of a front end with the namespace of one of them, and their types."""
+    space = main.rpartition('/')[0]
+    return {name: kind for name, kind in types.items()
+            if kind in front_end.topics.values() and name.rpartition('/')[0] == space}
