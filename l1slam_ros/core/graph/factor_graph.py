@@ -236,6 +236,18 @@ class FactorGraph:
         self._predecessor.extend(before)
         self._factors = None
 
+    def drive(self, robot: Indices) -> None:
+        """Let the keyframes be of these robots, (n,), each follow the last one of its robot."""
+        order = np.argsort(robot, kind='stable')
+        before = np.full(len(robot), NO_PREDECESSOR)
+        same = np.diff(robot[order]) == 0
+        before[order[1:][same]] = order[:-1][same]
+        self._robot = GrowingArray((), np.int64)
+        self._robot.extend(robot)
+        self._last = {one: int(np.flatnonzero(robot == one)[-1])
+                      for one in np.unique(robot).tolist()}
+        self.follow(np.arange(len(robot)), before)
+
     def add_between(self, i: Indices, j: Indices, measurement: Array, information: Array,
                     trusted: Mask | bool = False) -> None:
         """

@@ -27,6 +27,7 @@ from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.map_state import MapState
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.running.problem import Problem
+from l1slam_ros.core.running.robot_maps import RobotMap, robot_maps
 from l1slam_ros.core.solvers.block_cholesky import Pattern
 
 # What can become of a loop; `LoopStates.state` counts in this order.
@@ -67,11 +68,16 @@ class SavedMap:
 
 @dataclass(frozen=True)
 class Robot:
-    """Where the robot is: stamp [ns] and pose (1, p) of its odometry, and map -> odom (1, p)."""
+    """
+    Where a robot is: stamp [ns] and pose (1, p) of its odometry, and map -> odom (1, p).
+
+    joined : the map is that of the first robot, else one of its own
+    """
 
     stamp: int
     odometry: Array
     map_to_odom: Array
+    joined: bool = True
 
 
 class Counts(NamedTuple):
@@ -121,8 +127,8 @@ class Snapshot:
     What a back end knows.
 
     state : of its map; graph : the factors so far; stamps (n,) [ns] and odometry (n, p) of the
-    keyframes; map_to_odom : (1, p); loop_rows, loop_stamps : see `LoopFactors`; views : the L1 and
-    L2 map of the front, where there is one; pattern : see `Problem`.
+    keyframes; map_to_odom : (1, p) of the first robot; loop_rows, loop_stamps, loop_robots : see
+    `LoopFactors`; views : the L1 and L2 map of the front, where there is one; pattern : see `Problem`.
     """
 
     state: MapState
@@ -132,6 +138,7 @@ class Snapshot:
     map_to_odom: Array
     loop_rows: Indices
     loop_stamps: tuple[Indices, Indices, Indices]
+    loop_robots: tuple[Indices, Indices]
     views: tuple[View, ...]
     pattern: Pattern | None
 
@@ -145,6 +152,20 @@ class Snapshot:
         """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
         return self._followed(
             self.views[0].poses if self.views else self.state.optimised.poses, self.odometry)
+
+    @cached_property
+    def robot_maps(self) -> dict[int, RobotMap]:
+        """The map that each robot is in, by its number."""
+        graph = self.graph
+        return robot_maps(graph.manifold, graph.robot, graph.between, self.judgement.accepted,
+                          lambda keyframes: self.odometry[keyframes],
+                          lambda keyframes: self.poses[keyframes])
+
+    def poses_in_map(self, robot: int) -> tuple[Indices, Array]:
+        """Return the keyframes of a robot, (k,), and where they are in its map, (k, p)."""
+        keyframes = np.flatnonzero(self.graph.robot == robot)
+        poses, turn = self.poses[keyframes], self.robot_maps.get(robot, RobotMap(True, None)).turn
+        return keyframes, poses if turn is None else self.graph.manifold.compose(turn, poses)
 
     def _followed(self, poses: Array, others: Array) -> Array:
         """
