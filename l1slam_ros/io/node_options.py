@@ -8,6 +8,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the node can be told, and the YAML file that tells it; without ROS, for `l1slam` too."""
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,8 @@ from l1slam_ros.core.options import Options, Scalar, dotted, option
 from l1slam_ros.core.running.backend import BackendOptions
 from l1slam_ros.io.bounded import read_yaml
 
+# Of a robot: it begins names of topics.
+_NAME = re.compile('[A-Za-z][A-Za-z0-9_]*')
 # The name of the node, unless it was given another.
 _NODE = 'backend'
 
@@ -57,6 +60,9 @@ class NodeOptions(BackendOptions):
         60.0, 'with a save_path, within what time a changed map is saved, and at the end; 0: off',
         's', 0, 1e9)
     load_on_start: bool = option(False, 'load the map of save_path at start', fixed=True)
+    robots: tuple[str, ...] = option(
+        (), 'names of several robots, each with its own topics and frames below its name, in one '
+        'map; empty: one robot without a name', fixed=True)
     update: UpdateOptions = UpdateOptions()
 
     def __post_init__(self) -> None:
@@ -69,6 +75,10 @@ class NodeOptions(BackendOptions):
         if '' in frames or frames[0] == frames[1]:
             raise OptionError(f'map_frame is {frames[0]!r} and odom_frame {frames[1]!r}, expected '
                               'two names that differ')
+        wrong = [name for name in self.robots if not _NAME.fullmatch(name)]
+        if wrong or len(set(self.robots)) < len(self.robots):
+            raise OptionError(f'robots is {list(self.robots)}, expected names of letters, digits '
+                              'and underscores that differ')
         if self.save_path and not self.save_path.endswith('.g2o'):
             raise OptionError(f'save_path is {self.save_path!r}, expected the name of a .g2o file')
 

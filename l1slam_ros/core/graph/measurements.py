@@ -71,8 +71,9 @@ class LoopClosure:
     in the axes of the measured pose, those of the map where an absolute pose has no heading: its
     component says nothing if the variance is 0 or less, infinite or above 1e6; trusted : a person
     or a marker vouches for it; struck : it is a person's word that the loop of these stamps is
-    false, whatever it measures; robot : the number of the robot whose pose it is; reference_robot :
-    of the one from which it is seen, whose stamp the reference is, None: of the same.
+    false, whatever it measures; robot : the number of the robot whose pose it is;
+    reference_robot : of the one from which it is seen, whose stamp the reference is, None: of the
+    same.
     """
 
     reference_stamp: int | None

@@ -219,17 +219,19 @@ class RobotOdometry:
                                    self._shared.options.odometry, self._shared.verbatim, unseen)
         self.track.append(point.stamp, pose, motion is not None, point.reach)
         if motion is not None:
-            self._shared.notes.warn_bounds('odometry', point.stamp, self._motion.bounded, MOST_OF_ODOMETRY)
+            self._shared.notes.warn_bounds(
+                'odometry', point.stamp, self._motion.bounded, MOST_OF_ODOMETRY)
             self._note_slope(point.sample)
-            self._shared.graph.append_step(motion[0], root_of_inverse(motion[1][None]), self._robot)
+            self._shared.graph.append_step(
+                motion[0], root_of_inverse(motion[1][None]), self._robot)
             self._number_keyframe()
 
     def _note_slope(self, sample: OdometrySample) -> None:
         length, angle = self._level.dropped(sample, self._shared.options.keyframe)
         if length or angle:
-            self._shared.notes.warn('slope', f'odometry at {sample.stamp} ns has left the plane by '
-                            f'{length:.3g} m and {angle:.2g} rad, which are dropped; expected '
-                            'dimension 3 for a robot on slopes')
+            self._shared.notes.warn(
+                'slope', f'odometry at {sample.stamp} ns has left the plane by {length:.3g} m and '
+                f'{angle:.2g} rad, which are dropped; expected dimension 3 for a robot on slopes')
 
     def _begin_part(self, stamp: int, pose: Array) -> None:
         """Begin a part of the map with a keyframe."""

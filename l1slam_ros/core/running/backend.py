@@ -270,9 +270,7 @@ class Backend:
         return self._keeper.robot(robot)
 
     def moved(self, robot: int = 0) -> tuple[Array, Array]:
-        """
-        Return map -> odom of a robot as it was when this was asked before, and is, (1, p) each.
-        """
+        """Return map -> odom of a robot as it was when this was asked before, and is, (1, p)."""
         return self._keeper.moved(robot)
 
     def counts(self) -> Counts:

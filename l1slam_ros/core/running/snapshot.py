@@ -56,7 +56,7 @@ class SavedMap:
     All that another back end goes on from.
 
     judgement : of all factors; robust : loops were doubted; graph_began : names the graph in its
-    back end, see `Revisions`
+    back end, see `Revisions`; robots : their names by their numbers, as far as they have any
     """
 
     builder: BuilderState
@@ -64,6 +64,7 @@ class SavedMap:
     judgement: Judgement
     robust: bool
     graph_began: int = 0
+    robots: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,8 @@ class Snapshot:
 
     state : of its map; graph : the factors so far; stamps (n,) [ns] and odometry (n, p) of the
     keyframes; map_to_odom : (1, p) of the first robot; loop_rows, loop_stamps, loop_robots : see
-    `LoopFactors`; views : the L1 and L2 map of the front, where there is one; pattern : see `Problem`.
+    `LoopFactors`; views : the L1 and L2 map of the front, where there is one; pattern : see
+    `Problem`.
     """
 
     state: MapState

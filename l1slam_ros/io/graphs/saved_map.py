@@ -147,7 +147,8 @@ def _remarks(saved: SavedMap) -> dict[str, Any]:
               for record in (state, saved.optimised, judgement) for f in fields(record)}
     for name in 'graph', 'poses', *_OF_ROBOTS:
         del values[name]
-    return values | _of_robots(state) | {
+    names = {'robots': list(saved.robots)} if saved.robots else {}
+    return values | _of_robots(state) | names | {
         'doubts': [asdict(doubt) for doubt in judgement.doubts], 'robust': saved.robust,
         'trusted': state.graph.between.trusted, 'struck': state.graph.between.struck,
         'seen': [[key.hex(), state.seen[key]] for key in sorted(state.seen)],
@@ -203,7 +204,8 @@ def _read(path: Path) -> SavedMap:
         state = _with_robots(state, values)
         values = {name: value for name, value in values.items() if name not in _OF_ROBOTS}
     return SavedMap(replace(_restored(state, values), waiting=waiting, seen=seen),
-                    _restored(optimised, values), judgement, values['robust'])
+                    _restored(optimised, values), judgement, values['robust'],
+                    robots=tuple(values.get('robots', ())))
 
 
 def _restored(record: _Record, values: dict[str, Any]) -> _Record:

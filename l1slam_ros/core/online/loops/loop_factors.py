@@ -239,7 +239,7 @@ class LoopFactors:
 
         first : when the odometry of their robots begins, (m, 2) [ns]
         """
-        early = (_times(loops)[0] < first).any(axis=1)
+        early = np.logical_or(*(_times(loops)[0] < first).T)
         same = (pairs[:, 0] == pairs[:, 1]) & ~early & ~np.array(
             [one.loop.is_absolute for one in loops])
         for row in np.flatnonzero(early | same).tolist():

@@ -128,17 +128,17 @@ class WaitingLoops:
 
     def due(self, clocks: Mapping[int, int]) -> list[WaitingLoop]:
         """Take out the loops whose times odometry has reached, in the order they came."""
-        found = {}
+        found: dict[int, WaitingLoop] = {}
         for robot, now in clocks.items():
             if robot in self._queues:
                 found.update(self._queues[robot].due(now))
-        due = {}
+        due: dict[int, WaitingLoop] = {}
         for number, one in sorted(found.items()):
-            robot = one.awaits(clocks)
-            if robot is None:
+            other = one.awaits(clocks)
+            if other is None:
                 due[number] = one
             else:  # the other one's odometry is behind
-                self._put(robot, number, one, clocks.get(robot, 0))
+                self._put(other, number, one, clocks.get(other, 0))
         self._stamps = None if due else self._stamps
         return list(due.values())
 

@@ -9,6 +9,7 @@
 """The odometry of all robots together: what `OdometryTrack` tells of one, by robot and time."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -68,7 +69,7 @@ class Tracks:
         """Poses of all keyframes, each in what is kept of its robot's odometry, (n, p)."""
         return self._of_all(lambda track: track.keyframe_poses)
 
-    def _of_all(self, of: Callable[[OdometryTrack], Array]) -> Array:
+    def _of_all(self, of: Callable[[OdometryTrack], Any]) -> Any:
         """Return what tracks have of their keyframes, in the order of the graph."""
         tracks = [self._tracks[robot] for robot in self.begun]
         if len(tracks) < 2:
@@ -106,10 +107,10 @@ class Tracks:
         return self._by_robot(robots, lambda track, at: track.poses_of(
             np.searchsorted(track.numbers.view(), keyframes[at])))
 
-    def _by_robot(self, robots: Indices, of: Callable[[OdometryTrack, Indices], Array],
-                  kind: type = float) -> Array:
+    def _by_robot(self, robots: Indices, of: Callable[[OdometryTrack, Indices], Any],
+                  kind: type = float) -> Any:
         """Return what tracks say, one after the other, each of the rows of its robot."""
-        said: Array | None = None
+        said: Any = None
         for robot in np.unique(robots).tolist():
             rows = np.flatnonzero(robots == robot)
             values = np.asarray(of(self._tracks[robot], rows))

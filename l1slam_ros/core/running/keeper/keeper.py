@@ -193,7 +193,8 @@ class Keeper:
                 views = views if front is self._front else ()
                 yield Snapshot(
                     self._state, builder.graph.copy(), builder.keyframe_stamps,
-                    builder.keyframe_poses, self._map_to_odom(0), loops.rows, loops.stamps, loops.robots, views, front.pattern if front and views else None)
+                    builder.keyframe_poses, self._map_to_odom(0), loops.rows, loops.stamps,
+                    loops.robots, views, front.pattern if front and views else None)
 
     def saved(self) -> SavedMap | None:
         """See `Backend.saved`."""
