@@ -155,7 +155,7 @@ def test_every_option_has_a_meaning(kind):
         if isinstance(value, float) and meaning.high is not None:
             assert meaning.unit, f'{name} has no unit; a ratio has the unit 1'
         ranged = meaning.low is not None and meaning.high is not None
-        assert ranged or meaning.choices or isinstance(value, bool | str), name
+        assert ranged or meaning.choices or isinstance(value, bool | str | tuple), name
         assert meaning.allows(value)
         assert not (ranged and meaning.choices)
 

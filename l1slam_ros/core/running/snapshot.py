@@ -169,6 +169,14 @@ class Snapshot:
         poses, turn = self.poses[keyframes], self.robot_maps.get(robot, RobotMap(True, None)).turn
         return keyframes, poses if turn is None else self.graph.manifold.compose(turn, poses)
 
+    @property
+    def drawn(self) -> Array:
+        """All keyframes as seen from the map of the first robot, (n, p)."""
+        first = self.robot_maps.get(0)
+        if first is None or first.turn is None or not first.joined:
+            return self.poses
+        return self.graph.manifold.compose(first.turn, self.poses)
+
     def _followed(self, poses: Array, others: Array) -> Array:
         """
         Return poses (k, p), and behind them the other keyframes as they follow in others (n, p).
