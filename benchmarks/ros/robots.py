@@ -132,8 +132,8 @@ def rendezvous(keyframes: int) -> None:
             robot = backend.robot(1)
             if robot is not None and robot.joined:
                 break
-        print(f'{len(between)} loops between them: updates of {max(seconds) * 1e3:.1f} ms at most, '
-              f'in one map after {time.monotonic() - began:.2f} s')
+        print(f'{len(between)} loops between them: updates take {max(seconds) * 1e3:.1f} ms at '
+              f'most, in one map after {time.monotonic() - began:.2f} s')
 
 
 def _update(backend: Backend) -> float:

@@ -87,20 +87,13 @@ class BackendNode(LifecycleNode):
         self._map_services = MapServices(
             self, self._backend, self._jobs, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
-        guarded = self.failures.guarded
         for sentence in *self._declared.unknown(), unusable_path(options.save_path):
             if sentence:
                 self.get_logger().warning(sentence)
         self.add_on_set_parameters_callback(self._on_set)
         change = self._service_change_state
         change.callback = partial(self._on_change_state, change.callback)
-        self._jumps = self.get_clock().create_jump_callback(
-            JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
-                          on_clock_change=False),
-            post_callback=guarded('time jump', self._on_time_jump))
-        # By a clock that goes on where simulated time stands still, or a bag has ended.
-        self.create_timer(1.0, guarded('diagnostics', self._on_second),
-                          clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._watch_clocks()
         if options.autostart:
             self.trigger_configure()
             self.trigger_activate()
@@ -110,6 +103,16 @@ class BackendNode(LifecycleNode):
         self._map_services.start()
         self._solver.start(self._map.tell)
         self._inputs.intake.start()
+
+    def _watch_clocks(self) -> None:
+        guarded = self.failures.guarded
+        self._jumps = self.get_clock().create_jump_callback(
+            JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1),
+                          on_clock_change=False),
+            post_callback=guarded('time jump', self._on_time_jump))
+        # By a clock that goes on where simulated time stands still, or a bag has ended.
+        self.create_timer(1.0, guarded('diagnostics', self._on_second),
+                          clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Use messages from now on."""

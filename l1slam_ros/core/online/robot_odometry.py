@@ -15,6 +15,7 @@ Loops join the parts, if there are any.
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -46,6 +47,7 @@ class GrowingGraph:
     options, verbatim : as above
     graph, loops, notes : see `GraphBuilder`
     tracks : the odometry of each robot
+    members : called when the graph begins anew
 
     """
 
@@ -53,11 +55,14 @@ class GrowingGraph:
         self.options, self.verbatim = options, verbatim
         self.notes = Notes()
         self.loops = LoopFactors(manifold, self.notes, verbatim)
+        self.members: list[Callable[[], None]] = []
         self.begin(FactorGraph(manifold))
 
     def begin(self, graph: FactorGraph) -> None:
         """Begin with a graph, of which no keyframe is known yet."""
         self.graph, self.tracks = graph, Tracks(graph.manifold)
+        for begin in self.members:
+            begin()
 
     def forget(self) -> None:
         """Begin anew; loops that came may yet find odometry of their times."""
@@ -85,6 +90,7 @@ class RobotOdometry:
 
     Attributes
     ----------
+    manifold : what the poses live on
     stream : passes on what is the robot's motion, and holds what may not be
     track : the odometry so far, its keyframes and gaps
     offset : (1, p) see `GraphBuilder`
@@ -93,30 +99,22 @@ class RobotOdometry:
 
     def __init__(self, robot: int, shared: GrowingGraph, base_frame: BaseFrame):
         self._robot, self._shared, self._base_frame = robot, shared, base_frame
-        self._manifold = shared.graph.manifold
-        self.stream = OdometryStream(self._manifold, shared.notes, base_frame)
+        self.manifold = shared.graph.manifold
+        self.stream = OdometryStream(self.manifold, shared.notes, base_frame)
         self._motion: KeyframeMotion
-        self._resumed = False
         self.begin()
+        shared.members.append(self.begin)
 
     def begin(self) -> None:
         """Begin with the graph that there is, of which no keyframe of the robot is known yet."""
-        self.track = OdometryTrack(self._manifold)
-        self._shared.tracks.add(self._robot, self.track)
-        self.offset, self._level = self._manifold.identity(1), Level(self._manifold)
-        self._moved, self._glued = False, True
-
-    def forget(self) -> None:
-        """Let the graph begin anew."""
-        self._shared.forget()
         self._resumed = False
-        self.begin()
+        self.track = OdometryTrack(self.manifold)
+        self._shared.tracks.add(self._robot, self.track)
+        self.offset, self._level = self.manifold.identity(1), Level(self.manifold)
+        self._moved, self._glued = False, True
 
     def add(self, sample: OdometrySample) -> bool:
         """See `GraphBuilder.add_odometry`."""
-        if self._shared.tracks.of(self._robot) is not self.track:
-            self._resumed = False
-            self.begin()  # another robot has let the graph begin anew
         ignore, track = self._shared.options.on_time_jump == 'ignore', self.track
         if ignore and not self._glued and sample.stamp <= track.last_stamp:
             raise MessageError('old_stamp', f'odometry stamp {sample.stamp} ns is not after the '
@@ -156,7 +154,7 @@ class RobotOdometry:
                 not 0 < behind <= self._shared.options.odometry.reorder):
             return False
         if self._moved:
-            pose = self._manifold.compose(self.offset, pose)
+            pose = self.manifold.compose(self.offset, pose)
         beside = track.went_by(point.stamp, pose)
         if beside is None or point.stamp < track.keyframe_stamps[-1]:
             where = 'after a later keyframe' if beside is not None else (
@@ -172,8 +170,8 @@ class RobotOdometry:
         if point.anew and (self._resumed or self._shared.has_others(self._robot)):
             self._glued = False  # the odometry begins again
         elif point.anew:
-            self.forget()
-        on_gap, pose, manifold = self._shared.options.on_time_jump, point.pose, self._manifold
+            self._shared.forget()
+        on_gap, pose, manifold = self._shared.options.on_time_jump, point.pose, self.manifold
         goes_on = self._glued or self.track.goes_on(point.stamp, pose, self.offset)
         gap = self._gap(point, goes_on)
         if gap:
@@ -182,7 +180,7 @@ class RobotOdometry:
             self._shared.notes.tell(cause, f'{gap}; {said}')
             self._level = Level(manifold)
             if on_gap == 'reset':
-                self.forget()
+                self._shared.forget()
         if not len(self.track):
             self._begin_part(point.stamp, pose)
             return
@@ -238,7 +236,7 @@ class RobotOdometry:
         self.track.append(stamp, pose, is_keyframe=True)
         self._shared.graph.add_poses(1, self._robot, begins_part=True)
         self._number_keyframe()
-        self._motion = KeyframeMotion(self._manifold, stamp, pose)
+        self._motion = KeyframeMotion(self.manifold, stamp, pose)
 
     def _number_keyframe(self) -> None:
         """Note that the newest keyframe of the graph is the track's newest."""
@@ -259,14 +257,13 @@ class RobotOdometry:
         stamps (k,), odometry (k, p), numbers (k,) : of the robot's keyframes; firsts : keyframes
         with which parts begin
         """
-        self.begin()
         track = self.track
         parts = np.flatnonzero(np.isin(numbers[1:], firsts)) + 1
         for part in np.split(np.arange(len(numbers)), parts):
             track.extend_by_part(stamps[part], odometry[part])
         track.numbers.extend(numbers)
         self.offset = end.offset
-        self._motion = KeyframeMotion(self._manifold, track.last_stamp, track.last_pose)
+        self._motion = KeyframeMotion(self.manifold, track.last_stamp, track.last_pose)
         if end.end > track.last_stamp:
             track.append(end.end, end.end_pose, is_keyframe=False)
             by_model = self._shared.options.odometry.covariance_source == 'model'
@@ -274,4 +271,4 @@ class RobotOdometry:
                 end.end, end.end_pose, None if by_model else end.end_covariance)
         self._glued, self._moved, self._resumed = False, True, True
         self.stream = OdometryStream(
-            self._manifold, self._shared.notes, self._base_frame, resumed=True)
+            self.manifold, self._shared.notes, self._base_frame, resumed=True)

@@ -16,6 +16,7 @@ import os
 import time
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from functools import cache
 from weakref import WeakSet
 
 from l1slam_ros.core.errors import GraphError, OptionError, require
@@ -86,7 +87,8 @@ class Backend:
     ----------
     manifold : what the poses live on
     options : as they are now
-    base_frame : of the first robot, as far as is known; no reset forgets it
+    base_frame, base_frame_of : of the first robot, and of one by its number, as far as they are
+        known; no reset forgets them
     calm : what goes on behind waits for its end, `with backend.calm:`
 
     Raises
@@ -103,7 +105,7 @@ class Backend:
         if dimension not in _MANIFOLDS:
             raise OptionError(f'dimension is {dimension!r}, expected 2 or 3')
         self.manifold, self.options = _MANIFOLDS[dimension], options
-        self._base_frames: dict[int, BaseFrame] = {}
+        self.base_frame_of = cache(lambda _: BaseFrame(options.base_frame))
         self.base_frame = self.base_frame_of(0)
         self._keeper = Keeper(_builder(self), options.solver, options.robust.enabled)
         self._updates = Updates(self._keeper, self._wake)
@@ -260,10 +262,6 @@ class Backend:
     def loop_states(self) -> LoopStates:
         """Return what has become of each loop, those of the graph first, in its order."""
         return self.snapshot().loop_states()
-
-    def base_frame_of(self, robot: int) -> BaseFrame:
-        """Return that of a robot, as far as is known."""
-        return self._base_frames.setdefault(robot, BaseFrame(self.options.base_frame))
 
     def robot(self, robot: int = 0) -> Robot | None:
         """Return where a robot is; None: no odometry has said yet where it is in this map."""

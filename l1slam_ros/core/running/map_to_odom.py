@@ -56,7 +56,7 @@ class MapToOdom:
 
     def now(self, robot: RobotOdometry) -> Array:
         """Return the transform; robot : whose it is."""
-        offset, manifold = robot.offset, robot.track.manifold
+        offset, manifold = robot.offset, robot.manifold
         if self._newest.keyframe < 0:
             return manifold.identity(1)
         if self._known is None or self._known[0] is not offset:

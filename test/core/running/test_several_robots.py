@@ -8,12 +8,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several robots in one back end: their maps, what joins them, and what is saved of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from problems import seconds
 from team import Team, believed_by
 
+from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.running.backend import Backend, BackendOptions
@@ -120,3 +123,31 @@ def test_a_robot_comes_late_and_may_be_any(tmp_path):
     for robot in (0, 1):
         truth = se2.between(np.tile(team.truth[:1], (40, 1)), team.truth[team.robot == robot])
         assert np.abs(now.poses_in_map(robot)[1] - truth)[:, :2].max() < 0.7
+
+
+def test_a_reset_by_one_robot_is_one_for_all():
+    reset = BackendOptions.from_mapping({'on_time_jump': 'reset'})
+    team, backend = Team(n=40, edges=60, lies=0), Backend(reset)
+    for k in range(20):
+        backend.add_odometry(team.sample(k), 0)
+        backend.add_odometry(team.sample(20 + k), 1)
+    backend.settle()
+    for k in range(5):  # its clock was set back
+        backend.add_odometry(team.sample(k), 0)
+    now = backend.snapshot()
+    assert set(now.graph.robot.tolist()) == {0} and len(now.poses) == now.graph.n_poses < 10
+    for k in range(15, 20):
+        backend.add_odometry(replace(team.sample(20 + k), stamp=seconds(40 + k)), 1)
+    backend.settle()
+    now = backend.snapshot()
+    assert set(now.graph.robot.tolist()) == {0, 1}
+    # Its first keyframe is where its odometry has it.
+    keyframes, poses = now.poses_in_map(1)
+    assert_allclose(poses[0], now.odometry[keyframes[0]], atol=1e-12)
+
+
+@pytest.mark.parametrize('robot', [-1, 'r1', None, 0.5])
+def test_no_number_of_a_robot(robot):
+    team = Team(n=4, edges=4, lies=0)
+    with pytest.raises(OptionError, match='the robot is'):
+        Backend(EVERY).add_odometry(team.sample(0), robot)

@@ -77,11 +77,6 @@ class OdometryTrack:
         return len(self._times)
 
     @property
-    def manifold(self) -> Manifold:
-        """What the poses live on."""
-        return self._manifold
-
-    @property
     def first(self) -> int:
         """Time of the first sample [ns]."""
         return int(self._times.view()[0])

@@ -193,8 +193,9 @@ class Keeper:
                 views = views if front is self._front else ()
                 yield Snapshot(
                     self._state, builder.graph.copy(), builder.keyframe_stamps,
-                    builder.keyframe_poses, self._map_to_odom(0), loops.rows, loops.stamps,
-                    loops.robots, views, front.pattern if front and views else None)
+                    builder.keyframe_poses, self._odom_of(0).now(builder.robots[0]), loops.rows,
+                    loops.stamps, loops.robots, views,
+                    front.pattern if front and views else None)
 
     def saved(self) -> SavedMap | None:
         """See `Backend.saved`."""
@@ -216,16 +217,13 @@ class Keeper:
             last = odometry.stream.last if odometry else None
             if odometry is None or last is None:
                 return None
-            now = self._map_to_odom(robot)
-            return Robot(last.stamp, last.pose, now, self._odom_of(robot).joined)
+            odom = self._odom_of(robot)
+            return Robot(last.stamp, last.pose, odom.now(odometry), odom.joined)
 
     def moved(self, robot: int) -> tuple[Array, Array]:
         """See `Backend.moved`."""
         with self._graph_lock:
             return self._odom_of(robot).moved(self._builder.robots[robot])
-
-    def _map_to_odom(self, robot: int) -> Array:
-        return self._odom_of(robot).now(self._builder.robots[robot])
 
     def _odom_of(self, robot: int) -> MapToOdom:
         """Return map -> odom of a robot; the graph is locked."""
