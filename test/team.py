@@ -14,6 +14,7 @@ from problems import covariance6, seconds
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.parts import give_to
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.running.snapshot import ACCEPTED
 from l1slam_ros.core.worlds.false_loops import random_false_loops
@@ -42,7 +43,7 @@ class Team:
         graph = world.graph.subset(~seam)
         self.graph = FactorGraph(se2, 0)
         self.graph.add_poses(n)
-        self.graph.drive(self.robot)
+        give_to(self.graph, self.robot)
         f = graph.between
         self.graph.append_between(f.i, f.j, f.measurement, f.sqrt_information)
         self.truth, self.factors = world.truth, self.graph.between

@@ -61,9 +61,14 @@ class NodeOptions(BackendOptions):
         's', 0, 1e9)
     load_on_start: bool = option(False, 'load the map of save_path at start', fixed=True)
     robots: tuple[str, ...] = option(
-        (), 'names of several robots, each with its own topics and frames below its name, in one '
-        'map; empty: one robot without a name', fixed=True)
+        ('',), 'names of several robots, each with its own topics and frames below its name, in '
+        'one map; one that is empty: one robot without a name', fixed=True)
     update: UpdateOptions = UpdateOptions()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of robots, none: there is one without a name."""
+        return () if self.robots == ('',) else self.robots
 
     def __post_init__(self) -> None:
         """Check every field, and those that only make sense together."""
@@ -75,8 +80,10 @@ class NodeOptions(BackendOptions):
         if '' in frames or frames[0] == frames[1]:
             raise OptionError(f'map_frame is {frames[0]!r} and odom_frame {frames[1]!r}, expected '
                               'two names that differ')
-        wrong = [name for name in self.robots if not _NAME.fullmatch(name)]
-        if wrong or len(set(self.robots)) < len(self.robots):
+        # In a parameter file ROS reads no list of nothing.
+        object.__setattr__(self, 'robots', self.robots or ('',))
+        wrong = not all(_NAME.fullmatch(name) for name in self.names)
+        if wrong or len({*self.names}) < len(self.robots) > 1:
             raise OptionError(f'robots is {list(self.robots)}, expected names of letters, digits '
                               'and underscores that differ')
         if self.save_path and not self.save_path.endswith('.g2o'):

@@ -79,7 +79,7 @@ class BackendNode(LifecycleNode):
         if options.load_on_start:
             self._map_file.load_at_start(self.get_logger().info)
         self._robots = [RobotPublisher(self, self._backend, self._declared, number, name)
-                        for number, name in enumerate(options.robots or ('',))]
+                        for number, name in enumerate(options.robots)]
         self._inputs = Inputs(self, self._backend, options, self.failures, self._robots)
         self._diagnostics = Diagnostics(self, self._inputs.traffic, self._solver, self.failures)
         self._map = MapPublisher(

@@ -16,6 +16,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.graph.parts import give_to
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class BuilderState:
                 robots.shape)
 
         graph = self.graph.copy()
-        graph.drive(turned(graph.robot))
+        give_to(graph, turned(graph.robot))
         first, *others = sorted((replace(end, robot=number[end.robot]) for end in self.ends),
                                 key=lambda end: end.robot)
         loops, expired = (

@@ -22,6 +22,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import sigmas
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.parts import give_to
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.block_cholesky import Pattern
 from l1slam_ros.core.solvers.solve import AUTO, PRIMAL_DUAL, Method, choose
@@ -109,7 +110,7 @@ def by_robot(problem: Problem) -> tuple[Problem, Indices]:
         return problem, order
     place = np.argsort(order)
     whole, factors = FactorGraph(graph.manifold, len(order)), graph.between
-    whole.drive(graph.robot[order])
+    give_to(whole, graph.robot[order])
     before = graph.predecessor[order]
     whole.follow(np.arange(len(order)), np.where(before < 0, before, place[before]))
     whole.append_between(

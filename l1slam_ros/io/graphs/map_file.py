@@ -53,7 +53,7 @@ class MapFile:
         self._backend, self._options, self._warn = backend, options, warn
         self.is_saving, self._one = False, threading.Lock()
         # Names of robots by their numbers, behind those of the node the ones of a loaded map.
-        self._robots = options().robots
+        self._robots = options().names
         # When the last save began, or the node; and whether there was one.
         self._began, self._tried = time.monotonic(), False
         # Where the map was saved or loaded last, and its revision then.
@@ -144,7 +144,7 @@ class MapFile:
 
     def _by_name(self, saved: SavedMap) -> SavedMap:
         """Return a map whose robots have the numbers that those of their names have here."""
-        own = self._options().robots
+        own = self._options().names
         self._robots = own + tuple(name for name in saved.robots if name not in own)
         number = {was: self._robots.index(name) for was, name in enumerate(saved.robots)}
         if not own or all(was == now for was, now in number.items()):

@@ -23,6 +23,7 @@ import numpy as np
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.graph.parts import give_to
 from l1slam_ros.core.online.builder_state import BuilderState, TrackEnd
 from l1slam_ros.core.robust.judgement import Doubt, Judgement
 from l1slam_ros.core.running.optimised import Optimised
@@ -170,7 +171,7 @@ def _of_robots(state: BuilderState) -> dict[str, Any]:
 
 def _with_robots(state: BuilderState, values: dict[str, Any]) -> BuilderState:
     """Return a state with what was saved of whose is what."""
-    state.graph.drive(np.array(values['keyframe_robots']))
+    give_to(state.graph, np.array(values['keyframe_robots']))
     others = tuple(
         TrackEnd(robot, np.array(offset), end, np.array(pose), np.array(covariance))
         for robot, offset, end, pose, covariance in values['others'])

@@ -175,6 +175,8 @@ class Intake:
                 kind, name, use, QoSProfile(depth=_DEPTH), raw=raw, callback_group=self._group,
                 qos_overriding_options=QoSOverridingOptions.with_default_policies())
         except Exception as error:  # by what is said of its QoS, rclpy raises anything
+            if not self._node.context.ok():  # a signal has shut ROS down just now
+                raise
             raise OptionError(f'{name} cannot be subscribed to: {reason(error)}') from error
         traffic = Traffic(subscription.get_publisher_count)
         self._topics.append(_Topic(name, subscription, traffic, use))
