@@ -42,13 +42,19 @@ class Bench:
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.backend)
         self.executor.add_node(self.peer)
-        self.publishers = {topic: self.peer.create_publisher(kind, topic, QoSProfile(depth=1000))
-                           for topic, kind in TYPES.items()}
-        self.received = {'path': [], 'pose': [], 'map_to_odom': [], '/diagnostics': []}
+        # Of several robots, below their names.
+        names = [f'{name}/' for name in parameters.get('robots', ())] or ['']
+        self.publishers = {
+            topic: self.peer.create_publisher(kind, topic, QoSProfile(depth=1000))
+            for topic, kind in ((f'/{name}{topic[1:]}', kind) for name in names
+                                for topic, kind in TYPES.items())}
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.listen(Path, 'path', latched)
-        self.listen(PoseStamped, 'pose', 1000)
-        self.listen(TransformStamped, 'map_to_odom', 1000)
+        self.received = {f'{name}{topic}': [] for name in names
+                         for topic in ('path', 'pose', 'map_to_odom')} | {'/diagnostics': []}
+        for name in names:
+            self.listen(Path, f'{name}path', latched)
+            self.listen(PoseStamped, f'{name}pose', 1000)
+            self.listen(TransformStamped, f'{name}map_to_odom', 1000)
         self.listen(DiagnosticArray, '/diagnostics', 100)
         self.until(lambda: all(p.get_subscription_count() for p in self.publishers.values()),
                    'the node subscribes')

@@ -24,4 +24,4 @@ OF_ROS = frozenset(('use_sim_time', 'start_type_description_service', 'qos_overr
 OF_THE_NODE = OF_ROS | {
     'autostart', 'dimension', 'map_frame', 'odom_frame', 'publish_tf',
     'transform_period', 'transform_tolerance', 'save_path', 'autosave_period', 'load_on_start',
-    'update'}
+    'robots', 'update'}

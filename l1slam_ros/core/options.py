@@ -9,8 +9,8 @@
 """
 Options: frozen dataclasses whose fields carry their meaning, unit and range.
 
-They become ROS parameters and lines of a YAML file, so a field is a bool, int, float or str, or
-another `Options`. A default is written once, at its field.
+They become ROS parameters and lines of a YAML file, so a field is a bool, int, float, str or
+strings, or another `Options`. A default is written once, at its field.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,7 +19,7 @@ from typing import Any, ClassVar, TypeVar
 
 from l1slam_ros.core.errors import OptionError, require
 
-Scalar = bool | int | float | str
+Scalar = bool | int | float | str | tuple[str, ...]
 AnyOptions = TypeVar('AnyOptions', bound='Options')
 
 
@@ -47,7 +47,7 @@ class Meaning:
             return value in self.choices
         if self.low is None or self.high is None:
             return True
-        return not isinstance(value, str) and self.low <= value <= self.high
+        return isinstance(value, int | float) and self.low <= value <= self.high
 
 
 def option(default: Scalar, doc: str, unit: str = '', low: float | None = None,
@@ -79,9 +79,13 @@ class Options:
             if kind is float and type(value) is int:
                 value = float(value)
                 object.__setattr__(self, f.name, value)
+            if kind is tuple and isinstance(value, list | tuple) and all(
+                    type(one) is str for one in value):
+                value = tuple(value)
+                object.__setattr__(self, f.name, value)
             if type(value) is not kind:
                 raise OptionError(f'{f.name} is {value!r}, expected a value of type '
-                                  f'{kind.__name__}')
+                                  f'{"list of str" if kind is tuple else kind.__name__}')
             if not meaning.allows(value):
                 raise OptionError(f'{f.name} is {value!r}, expected {meaning.expected()}')
 

@@ -8,6 +8,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the node can be told, and the YAML file that tells it; without ROS, for `l1slam` too."""
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,8 @@ from l1slam_ros.core.options import Options, Scalar, dotted, option
 from l1slam_ros.core.running.backend import BackendOptions
 from l1slam_ros.io.bounded import read_yaml
 
+# Of a robot: it begins names of topics.
+_NAME = re.compile('[A-Za-z][A-Za-z0-9_]*')
 # The name of the node, unless it was given another.
 _NODE = 'backend'
 
@@ -57,7 +60,15 @@ class NodeOptions(BackendOptions):
         60.0, 'with a save_path, within what time a changed map is saved, and at the end; 0: off',
         's', 0, 1e9)
     load_on_start: bool = option(False, 'load the map of save_path at start', fixed=True)
+    robots: tuple[str, ...] = option(
+        ('',), 'names of several robots, each with its own topics and frames below its name, in '
+        'one map; one that is empty: one robot without a name', fixed=True)
     update: UpdateOptions = UpdateOptions()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of robots, none: there is one without a name."""
+        return () if self.robots == ('',) else self.robots
 
     def __post_init__(self) -> None:
         """Check every field, and those that only make sense together."""
@@ -69,6 +80,12 @@ class NodeOptions(BackendOptions):
         if '' in frames or frames[0] == frames[1]:
             raise OptionError(f'map_frame is {frames[0]!r} and odom_frame {frames[1]!r}, expected '
                               'two names that differ')
+        # In a parameter file ROS reads no list of nothing.
+        object.__setattr__(self, 'robots', self.robots or ('',))
+        wrong = not all(_NAME.fullmatch(name) for name in self.names)
+        if wrong or len({*self.names}) < len(self.robots) > 1:
+            raise OptionError(f'robots is {list(self.robots)}, expected names of letters, digits '
+                              'and underscores that differ')
         if self.save_path and not self.save_path.endswith('.g2o'):
             raise OptionError(f'save_path is {self.save_path!r}, expected the name of a .g2o file')
 

@@ -9,17 +9,18 @@
 """What the node says of itself on /diagnostics, once a second."""
 
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.running.improve import Improvement
-from l1slam_ros.core.running.snapshot import Behind
+from l1slam_ros.core.running.snapshot import Behind, Robot
 from l1slam_ros.ros.threads.failures import Failures
-from l1slam_ros.ros.threads.inputs import Traffic
+from l1slam_ros.ros.threads.intake import Traffic
 from l1slam_ros.ros.threads.solver_thread import SolverThread
 
 # [s], and the number of publications, which come once a second.
@@ -30,6 +31,36 @@ _BEHIND = 10.0
 _FEW = 5
 # [m], [rad] A map that moves the robot by less is not reported as a jump.
 _STILL = 1e-3
+
+
+class RobotLine(NamedTuple):
+    """
+    What there is to say of a robot.
+
+    robot : where it is, None: nothing has come; map_frame : returns that of its map by whether it
+    is joined to the first one
+    """
+
+    name: str
+    robot: Robot | None
+    map_frame: Callable[[bool], str]
+
+    def status(self, node: str, topics: Mapping[str, Traffic]) -> DiagnosticStatus:
+        """Return what is said of it by a node of some name; topics : see `Diagnostics`."""
+        level, robot = DiagnosticStatus.OK, self.robot
+        frame = self.map_frame(robot is not None and robot.joined)
+        sentence = f'in {frame}'
+        if robot is None:
+            level, sentence = DiagnosticStatus.STALE, 'no odometry has come'
+        elif not robot.joined:
+            sentence += ': nothing that is believed joins it to the first robot'
+        values = {'map_frame': frame, 'joined': robot is not None and robot.joined} | {
+            name.removeprefix(f'{self.name}/') + f'.{key}': value
+            for name, traffic in topics.items() if name.startswith(f'{self.name}/')
+            for key, value in traffic.last.items()}
+        return DiagnosticStatus(
+            level=level, name=f'{node}: {self.name}', message=sentence, hardware_id=self.name,
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
 
 
 class Diagnostics:
@@ -60,20 +91,26 @@ class Diagnostics:
         self._last = improvement
         self._updates += 1
 
-    def note_jump(self, manifold: Manifold, before: Array, after: Array) -> None:
-        """Remember how far a new map moved the robot: its pose (1, p) before [m] and after."""
+    def note_jump(self, manifold: Manifold, before: Array, after: Array, prefix: str) -> None:
+        """
+        Remember how far a new map moved a robot: its pose (1, p) before [m] and after.
+
+        prefix : of its names
+        """
         metres, radians = (float(way[0]) for way in manifold.motion(manifold.local(before, after)))
         if max(metres, radians) > _STILL:
-            self._jump = {'jump.translation': f'{metres:.4f}', 'jump.rotation': f'{radians:.5f}'}
+            self._jump |= {f'{prefix}jump.translation': f'{metres:.4f}',
+                           f'{prefix}jump.rotation': f'{radians:.5f}'}
 
     def publish(self, counts: Mapping[str, int], behind: Behind, refused: Counter[str],
-                told: Counter[str], twins: str) -> None:
+                told: Counter[str], twins: str, robots: Sequence[RobotLine] = ()) -> None:
         """
-        Publish one status.
+        Publish one status, and one of each robot.
 
         counts : sizes of the graph; behind : what goes on behind updates; refused : cause -> how
         many messages, since the start; told : how often the odometry did not go on as robots move,
-        by what was made of it; twins : what is wrong with the node's name, empty: nothing.
+        by what was made of it; twins : what is wrong with the node's name, empty: nothing;
+        robots : those that have names.
         """
         lately, broken = refused - self._minute[0][0], told - self._minute[0][1]
         self._minute.append((Counter(refused), Counter(told)))
@@ -99,7 +136,8 @@ class Diagnostics:
         status = DiagnosticStatus(
             level=level, name=f'{name}: map', message=sentence, hardware_id=name,
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
-        message = DiagnosticArray(status=[status])
+        lines = [one.status(name, self._topics) for one in robots]
+        message = DiagnosticArray(status=[status, *lines])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
 
@@ -111,9 +149,9 @@ class Diagnostics:
             return DiagnosticStatus.ERROR, '; '.join(
                 f'{what} failed: {why}' for what, why in failures.items())
         wrong = [twins] if twins else []
-        sources = self._topics['odom'].publishers()
-        if sources > 1:
-            wrong.append(f'odom has {sources} publishers; expected one')
+        for name, traffic in self._topics.items():
+            if name.endswith('odom') and (sources := traffic.publishers()) > 1:
+                wrong.append(f'{name} has {sources} publishers; expected one')
         if lately:
             wrong.append('refused in the last minute: ' + ', '.join(
                 f'{count} {cause}' for cause, count in sorted(lately.items())))

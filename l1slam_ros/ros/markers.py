@@ -102,7 +102,7 @@ class GraphMarkers:
 def _namespaces(now: Snapshot) -> Iterator[tuple[str, int, float, Array, np.ndarray]]:
     """Yield name, type and size of what is drawn, its points (k, 3) and their colours (k, 4)."""
     manifold, factors, loops = now.graph.manifold, now.graph.between, now.loop_states()
-    points = manifold.to_pose3(now.poses)[:, :3]
+    points = manifold.to_pose3(now.drawn)[:, :3]
     begin, end = points[np.maximum(factors.i, 0)], points[factors.j]
     world = factors.i == WORLD
     begin[world] = manifold.to_pose3(factors.measurement[world])[:, :3]

@@ -29,7 +29,7 @@ from rclpy.parameter import Parameter
 from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.io.graphs.map_file import MapFile, unusable_path
 from l1slam_ros.io.node_options import NodeOptions
-from l1slam_ros.ros.diagnostics import Diagnostics
+from l1slam_ros.ros.diagnostics import Diagnostics, RobotLine
 from l1slam_ros.ros.parameters import NodeParameters
 from l1slam_ros.ros.publishing import MapPublisher
 from l1slam_ros.ros.robot import RobotPublisher
@@ -78,10 +78,12 @@ class BackendNode(LifecycleNode):
         self._map_file = MapFile(self._backend, lambda: self.options, self.get_logger().warning)
         if options.load_on_start:
             self._map_file.load_at_start(self.get_logger().info)
-        self._robot = RobotPublisher(self, self._backend, self._declared)
-        self._inputs = Inputs(self, self._backend, options, self.failures, self._robot)
+        self._robots = [RobotPublisher(self, self._backend, self._declared, number, name)
+                        for number, name in enumerate(options.robots)]
+        self._inputs = Inputs(self, self._backend, options, self.failures, self._robots)
         self._diagnostics = Diagnostics(self, self._inputs.traffic, self._solver, self.failures)
-        self._map = MapPublisher(self, self._backend, self._declared, self._diagnostics)
+        self._map = MapPublisher(
+            self, self._backend, self._declared, self._diagnostics, self._robots)
         self._map_services = MapServices(
             self, self._backend, self._jobs, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
@@ -97,7 +99,7 @@ class BackendNode(LifecycleNode):
         self._jobs.start()
         self._map_services.start()
         self._solver.start(self._map.tell)
-        self._inputs.start()
+        self._inputs.intake.start()
 
     def _connect_callbacks(self) -> None:
         """Hear of new parameters and transitions, of jumps of the clock, and of each second."""
@@ -115,13 +117,13 @@ class BackendNode(LifecycleNode):
 
     def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Use messages from now on."""
-        self._inputs.active = True
-        self._inputs.wake()
+        self._inputs.intake.active = True
+        self._inputs.intake.wake()
         return TransitionCallbackReturn.SUCCESS
 
     def on_deactivate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Leave messages alone, and the map as it is."""
-        self._inputs.active = False
+        self._inputs.intake.active = False
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
@@ -153,7 +155,7 @@ class BackendNode(LifecycleNode):
         """End the threads and the node; return whether they ended within some seconds."""
         deadline = time.monotonic() + seconds
         self._solver.close(0.0)  # what it works at for a job stops
-        ended = self._inputs.close(seconds)
+        ended = self._inputs.intake.close(seconds)
         self._map_services.close()
         ended &= self._jobs.close(seconds)
         ended &= self._map_services.is_closed(max(deadline - time.monotonic(), 0.0) + _SAVING)
@@ -175,20 +177,26 @@ class BackendNode(LifecycleNode):
         return SetParametersResult(successful=not wrong, reason=wrong)
 
     def _on_time_jump(self, _: TimeJump) -> None:
-        self._robot.forget()
+        for robot in self._robots:
+            robot.forget()
         if self.options.on_time_jump == 'reset':
             self.get_logger().warning('the clock jumped back: the map begins anew')
             self._map_services.begin_anew('time jump')
 
     def _on_second(self) -> None:
-        self._inputs.look_at_events()
+        self._inputs.intake.look_at_events()
         for sentence in self._backend.news():
             self.get_logger().warning(sentence)
         counts = self._backend.counts()
         self._diagnostics.publish(
             counts.sizes, self._backend.behind(),
             self._inputs.refused.copy() + Counter(counts.refused), Counter(counts.told),
-            self._twins())
+            self._twins(), self._lines())
+
+    def _lines(self) -> list[RobotLine]:
+        """Return what is said of each robot that has a name."""
+        return [RobotLine(one.name, self._backend.robot(one.number), one.map_frame)
+                for one in self._robots if one.name]
 
     def _twins(self) -> str:
         """Return what is wrong where another node has this one's name; else nothing."""

@@ -46,7 +46,9 @@ class NodeParameters(Generic[AnyOptions]):
                  on_change: Callable[[AnyOptions], None]):
         self._node, self._on_change = node, on_change
         try:
-            given = {name: node.declare_parameter(name, value, _descriptor(value, meaning)).value
+            given = {name: node.declare_parameter(
+                name, list(value) if isinstance(value, tuple) else value,
+                _descriptor(value, meaning)).value
                      for name, (value, meaning) in flatten(defaults).items()}
         except ParameterException as error:
             raise OptionError(str(error)) from error

@@ -8,17 +8,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map on its topics, as often as there is something new in it."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.core.running.improve import Improvement
+from l1slam_ros.core.running.snapshot import Snapshot
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.messages.serialisation import path_bytes, pose_bytes
 from l1slam_ros.io.node_options import NodeOptions
@@ -26,6 +30,7 @@ from l1slam_ros.ros.diagnostics import Diagnostics
 from l1slam_ros.ros.loop_status import LoopStatus
 from l1slam_ros.ros.markers import GraphMarkers
 from l1slam_ros.ros.parameters import NodeParameters
+from l1slam_ros.ros.robot import RobotPublisher
 
 
 class MapPublisher:
@@ -37,18 +42,21 @@ class MapPublisher:
     node : to publish from
     backend : whose map
     parameters : of the node
-    diagnostics : told of updates, and of how far they moved the robot
+    diagnostics : told of updates, and of how far they moved the robots
+    robots : each has a path of its own
 
     """
 
     def __init__(self, node: Node, backend: Backend, parameters: NodeParameters[NodeOptions],
-                 diagnostics: Diagnostics):
-        self._backend, self._diagnostics = backend, diagnostics
+                 diagnostics: Diagnostics, robots: Sequence[RobotPublisher]):
+        self._backend, self._diagnostics, self._robots = backend, diagnostics, robots
         self._frame = parameters.options.map_frame
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._path = node.create_publisher(Path, 'path', latched)
-        self.covariance = node.create_publisher(
-            PoseWithCovarianceStamped, 'pose_with_covariance', 10)
+        self._paths = [node.create_publisher(Path, f'{robot.prefix}path', latched)
+                       for robot in robots]
+        self.covariances = [node.create_publisher(
+            PoseWithCovarianceStamped, f'{robot.prefix}pose_with_covariance', 10)
+            for robot in robots]
         self._markers, self._loop_status = GraphMarkers(node), LoopStatus(node)
         # The revision that was published last.
         self._published = 0
@@ -68,30 +76,45 @@ class MapPublisher:
         self._published = revisions.now
 
     def _publish_map(self) -> None:
-        now, manifold = self._backend.snapshot(), self._backend.manifold
+        now = self._backend.snapshot()
         poses, loops = now.poses, now.loop_states()
         if not np.isfinite(poses).all() or not np.isfinite(now.map_to_odom).all():
             raise ArithmeticError('a pose of the map is not finite: it is not published')
-        robot = self._backend.robot()
+        for robot, path, covariance in zip(
+                self._robots, self._paths, self.covariances, strict=True):
+            self._publish_robot(now, robot, path, covariance)
+        self._loop_status.publish(loops)
+        self._markers.publish(self._frame, self._newest(), now)
+
+    def _publish_robot(self, now: Snapshot, one: RobotPublisher, path: Publisher,
+                       covariance: Publisher) -> None:
+        """Publish the path of a robot; without a name it has all keyframes there are."""
+        manifold, robot = self._backend.manifold, self._backend.robot(one.number)
         if robot is not None:
             before, after = (manifold.compose(transform, robot.odometry)
-                             for transform in self._backend.moved())
-            self._diagnostics.note_jump(manifold, before, after)
-        stamp = self._newest()
-        self._path.publish(path_bytes(self._frame, stamp, now.stamps, manifold.to_pose3(poses)))
-        self._loop_status.publish(loops)
-        self._markers.publish(self._frame, stamp, now)
-        if self.covariance.get_subscription_count() and len(poses):
-            covariance = self._backend.marginal_covariance(len(poses) - 1)
+                             for transform in self._backend.moved(one.number))
+            self._diagnostics.note_jump(manifold, before, after, one.prefix)
+        keyframes, poses, frame = np.arange(len(now.poses)), now.poses, self._frame
+        if one.name:
+            keyframes, poses = now.poses_in_map(one.number)
+            maps = now.robot_maps
+            frame = one.map_frame(maps[one.number].joined if one.number in maps else False)
+            if not len(keyframes) and not path.get_subscription_count():
+                return
+        stamps = now.stamps[keyframes]
+        stamp = robot.stamp if robot is not None else 0
+        path.publish(path_bytes(frame, stamp, stamps, manifold.to_pose3(poses)))
+        if covariance.get_subscription_count() and len(poses):
+            known = self._backend.marginal_covariance(int(keyframes[-1]))
             # None: a later map knows it, if any.
-            if covariance is not None:
-                self.covariance.publish(pose_with_covariance(
-                    self._frame, int(now.stamps[-1]), manifold, poses[-1:], covariance))
+            if known is not None:
+                covariance.publish(pose_with_covariance(
+                    frame, int(stamps[-1]), manifold, poses[-1:], known))
 
     def _newest(self) -> int:
         """Return the stamp of the newest odometry [ns], 0 where there is none."""
-        robot = self._backend.robot()
-        return robot.stamp if robot is not None else 0
+        robots = (self._backend.robot(one.number) for one in self._robots)
+        return max((robot.stamp for robot in robots if robot is not None), default=0)
 
 
 def pose_with_covariance(frame: str, stamp: int, manifold: Manifold, pose: Array,

@@ -82,13 +82,16 @@ class RobotPublisher:
     node : to publish from
     backend : which knows where the robot is
     parameters : of the node, with the options as they are now
+    number, name : of the robot; its topics and frames are below its name, empty: it has none
 
     """
 
-    def __init__(self, node: Node, backend: Backend, parameters: NodeParameters[NodeOptions]):
-        self._backend, self._parameters = backend, parameters
-        self._pose = node.create_publisher(PoseStamped, 'pose', 10)
-        self._transform = node.create_publisher(TransformStamped, 'map_to_odom', 10)
+    def __init__(self, node: Node, backend: Backend, parameters: NodeParameters[NodeOptions],
+                 number: int = 0, name: str = ''):
+        self._backend, self._parameters, self.number, self.name = backend, parameters, number, name
+        self._pose = node.create_publisher(PoseStamped, f'{self.prefix}pose', 10)
+        self._transform = node.create_publisher(
+            TransformStamped, f'{self.prefix}map_to_odom', 10)
         self._tf = None
         if parameters.options.publish_tf and TFMessage is not None:
             self._tf = node.create_publisher(TFMessage, '/tf', 100)
@@ -97,6 +100,21 @@ class RobotPublisher:
         self._due = 0.0
         # The newest as a pose of the manifold, and as it is published.
         self._last = (backend.manifold.identity(0),) * 2
+
+    @property
+    def prefix(self) -> str:
+        """What the names of its topics and frames begin with."""
+        return f'{self.name}/' if self.name else ''
+
+    @property
+    def odom_frame(self) -> str:
+        """The frame of its odometry."""
+        return f'{self.prefix}{self._parameters.options.odom_frame}'
+
+    def map_frame(self, joined: bool) -> str:
+        """Return the frame of its map, joined : which is that of the first robot."""
+        own = '' if joined else self.prefix
+        return f'{own}{self._parameters.options.map_frame}'
 
     def answer(self) -> None:
         """
@@ -112,7 +130,7 @@ class RobotPublisher:
             self._publish(robot)
         pose = manifold.compose(robot.map_to_odom, robot.odometry)
         self._pose.publish(pose_bytes(
-            self._parameters.options.map_frame, robot.stamp, manifold.to_pose3(pose)[0]))
+            self.map_frame(robot.joined), robot.stamp, manifold.to_pose3(pose)[0]))
 
     def forget(self) -> None:
         """Publish no transform until there is other odometry: its stamps are of another time."""
@@ -132,7 +150,7 @@ class RobotPublisher:
         return self._due - now
 
     def _look(self) -> Robot | None:
-        robot = self._backend.robot()
+        robot = self._backend.robot(self.number)
         if robot is not None:
             if robot.stamp < self._newest:
                 self._stamp = 0  # time itself went back
@@ -152,17 +170,16 @@ class RobotPublisher:
         if not self._stamp:
             # Before the first there is nothing to look up.
             self._stamp = robot.stamp
-            self._send()
+            self._send(robot)
         # tf2 ignores a second transform of one time, and warns of it.
         self._stamp = min(max(robot.stamp + self._ahead(), self._stamp + 1), LAST_STAMP)
-        self._send()
+        self._send(robot)
         now = time.monotonic()
         late, period = now - self._due, self._parameters.options.transform_period
         self._due = now + period - (late if 0 <= late < period else 0.0)
 
-    def _send(self) -> None:
-        options = self._parameters.options
-        said = options.map_frame, options.odom_frame, self._stamp, self._last[1]
+    def _send(self, robot: Robot) -> None:
+        said = self.map_frame(robot.joined), self.odom_frame, self._stamp, self._last[1]
         self._transform.publish(transform_bytes(*said))
         if self._tf is not None:
             self._tf.publish(transform_bytes(*said, in_sequence=True))

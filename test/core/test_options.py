@@ -155,7 +155,7 @@ def test_every_option_has_a_meaning(kind):
         if isinstance(value, float) and meaning.high is not None:
             assert meaning.unit, f'{name} has no unit; a ratio has the unit 1'
         ranged = meaning.low is not None and meaning.high is not None
-        assert ranged or meaning.choices or isinstance(value, bool | str), name
+        assert ranged or meaning.choices or isinstance(value, bool | str | tuple), name
         assert meaning.allows(value)
         assert not (ranged and meaning.choices)
 
@@ -164,6 +164,8 @@ def test_every_option_has_a_meaning(kind):
     ({'map_frame': ''}, "map_frame is '' and odom_frame 'odom', expected two names that differ"),
     ({'odom_frame': ''}, "map_frame is 'map' and odom_frame '', expected two names that differ"),
     ({'odom_frame': 'map'}, "map_frame is 'map' and odom_frame 'map', expected two names"),
+    ({'robots': ('r1', 'r1')}, r"robots is \['r1', 'r1'\], expected names"),
+    ({'robots': ('a/b',)}, r"robots is \['a/b'\], expected names"),
     ({'save_path': '/maps'}, "save_path is '/maps', expected the name of a .g2o file")])
 def test_names_that_cannot_be_used_are_refused(values, said):
     with pytest.raises(OptionError, match=said):
@@ -190,8 +192,9 @@ def test_the_shipped_file_equals_the_defaults():
     content = yaml.safe_load(SHIPPED.read_text())
     assert list(content) == ['/**'] and list(content['/**']) == ['ros__parameters']
     pairs = list(dotted(content['/**']['ros__parameters']))
-    shipped, defaults = dict(pairs), {name: value for name, (value, _) in
-                                      flatten(NodeOptions()).items()}
+    shipped, defaults = dict(pairs), {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, (value, _) in flatten(NodeOptions()).items()}
     assert len(pairs) == len(shipped)
     assert shipped == defaults
     assert {name: type(value) for name, value in shipped.items()} == {

@@ -25,7 +25,7 @@ from l1slam_ros.core.running.keeper import updates, work
 from l1slam_ros.io.graphs import saved_map
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.ros import publishing
-from l1slam_ros.ros.threads import inputs
+from l1slam_ros.ros.threads import intake
 
 FAULTS = ['ValueError', 'MemoryError', 'nan']
 
@@ -149,8 +149,8 @@ def test_a_callback_that_fails(bench, monkeypatch, kind):
 
 def test_an_intake_that_fails(bench, monkeypatch):
     """At its begin, as where a signal shuts ROS down just then."""
-    ros = SimpleNamespace(WaitSet=inputs.rclpy_implementation.WaitSet)
-    monkeypatch.setattr(inputs, 'rclpy_implementation', ros)
+    ros = SimpleNamespace(WaitSet=intake.rclpy_implementation.WaitSet)
+    monkeypatch.setattr(intake, 'rclpy_implementation', ros)
     fault = Fault(monkeypatch, ros, 'WaitSet', 'MemoryError')
     fault.on = True
     b = bench()

@@ -141,7 +141,7 @@ def test_the_covariance_is_that_of_a_dense_inverse(bench, tmp_path):
     b = bench(**EVERY_MESSAGE)
     heard = []
     b.peer.create_subscription(PoseWithCovarianceStamped, 'pose_with_covariance', heard.append, 10)
-    b.until(lambda: b.backend._map.covariance.get_subscription_count(), 'somebody listens')
+    b.until(lambda: b.backend._map.covariances[0].get_subscription_count(), 'somebody listens')
     b.play(tmp_path / 'bag')
     b.until(lambda: heard and heard[-1].header.stamp == b.path().poses[-1].header.stamp
             and b.backend._backend.update(0.0) is None, 'the map is done')

@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from l1slam_ros.ros.threads.inputs import Traffic
+from l1slam_ros.ros.threads.intake import Traffic
 
 
 def count(numbers, publishers=1):

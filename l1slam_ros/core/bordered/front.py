@@ -179,12 +179,10 @@ class Front:
         return (View(self._manifold, first[:, L1], self._fixed, self._systems[L1].steps()),
                 View(self._manifold, first[:, L2], self._fixed, self._systems[L2].steps()))
 
-    @property
-    def newest(self) -> Array:
-        """The L1 pose of the last keyframe it knows, (1, p)."""
-        last = self.keyframes - 1
-        step = self._systems[L1].step([max(last - self._fixed, FIXED)])
-        return self._manifold.retract(self._first.view()[last:last + 1, L1], step)
+    def poses_of(self, keyframes: Indices) -> Array:
+        """Return the L1 poses of some keyframes that it knows, (m, p)."""
+        steps = self._systems[L1].step(np.maximum(keyframes - self._fixed, FIXED).tolist())
+        return self._manifold.retract(self._first.view()[keyframes, L1], steps)
 
     def covariance(self, keyframe: int) -> Array:
         """Return the covariance of a keyframe's step from the L2 map, (k, k)."""

@@ -113,8 +113,7 @@ class FactorGraph:
         self.manifold = manifold
         p, d = manifold.POSE_SIZE, manifold.TANGENT_SIZE
         self._predecessor, self._robot = GrowingArray((), np.int64), GrowingArray((), np.int64)
-        # By robot.
-        self._last: dict[int, int] = {}
+        self._last: dict[int, int] = {}  # by robot
         self._between = [GrowingArray((), np.int64), GrowingArray((), np.int64),
                          GrowingArray((p,)), GrowingArray((d, d)), GrowingArray((), np.bool_),
                          GrowingArray((), np.bool_)]
@@ -217,23 +216,27 @@ class FactorGraph:
         before = np.arange(first - 1, first + count - 1)
         before[:1] = NO_PREDECESSOR if begins_part else self._last.get(robot, NO_PREDECESSOR)
         self._predecessor.extend(before)
-        before[:] = robot
-        self._robot.extend(before)
+        self._robot.extend(np.full(count, robot))
         self._last[robot] = self.n_poses - 1
         self._factors = None
 
     def append_step(self, measurement: Array, sqrt_information: Array, robot: int = 0) -> None:
         """Append a keyframe and the factor to it from the robot's last: (1, p), (1, d, d)."""
         self.add_poses(1, robot)
-        i = self.predecessor[-1:]
-        self.append_between(i, np.array([self.n_poses - 1]), measurement, sqrt_information)
+        self.append_between(self.predecessor[-1:], np.array([self.n_poses - 1]), measurement,
+                            sqrt_information)
 
-    def follow(self, keyframes: Indices, predecessors: Indices | int) -> None:
-        """Let some keyframes (k,) have other predecessors; what was seen before stays."""
-        before = self.predecessor.copy()
+    def follow(self, keyframes: Indices, predecessors: Indices | int,
+               robot: Indices | None = None) -> None:
+        """Let some keyframes (k,) have other predecessors, all be of these robots, (n,)."""
+        before = self.predecessor.copy()  # what was seen before stays
         before[keyframes] = predecessors
         self._predecessor = GrowingArray((), np.int64)
         self._predecessor.extend(before)
+        if robot is not None:
+            self._robot = GrowingArray((), np.int64)
+            self._robot.extend(robot)
+            self._last = {one: k for k, one in enumerate(robot.tolist())}
         self._factors = None
 
     def add_between(self, i: Indices, j: Indices, measurement: Array, information: Array,
@@ -242,15 +245,14 @@ class FactorGraph:
         Append between factors: i, j (m,), measurement (m, p), information (m, d, d), trusted (m,).
 
         Where i is `WORLD` the measurement is the pose of keyframe j in the map frame. Components
-        without any information, whole rows and columns of zeros, say nothing.
+        without any information, whole rows and columns of zeros, say nothing. Nothing is appended
+        when anything is wrong.
 
         Raises
         ------
         GraphError : an index without a keyframe, a self loop, a measurement that is not finite.
         NoiseError : an information matrix that is not positive definite where it says something,
             or that says nothing at all.
-
-        Nothing is appended when anything is wrong.
 
         """
         i, j = np.atleast_1d(i), np.atleast_1d(j)

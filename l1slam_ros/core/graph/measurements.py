@@ -71,7 +71,9 @@ class LoopClosure:
     in the axes of the measured pose, those of the map where an absolute pose has no heading: its
     component says nothing if the variance is 0 or less, infinite or above 1e6; trusted : a person
     or a marker vouches for it; struck : it is a person's word that the loop of these stamps is
-    false, whatever it measures.
+    false, whatever it measures; robot : the number of the robot whose pose it is;
+    reference_robot : of the one from which it is seen, whose stamp the reference is, None: of the
+    same.
     """
 
     reference_stamp: int | None
@@ -80,6 +82,13 @@ class LoopClosure:
     covariance: Array
     trusted: bool = False
     struck: bool = False
+    robot: int = 0
+    reference_robot: int | None = None
+
+    @property
+    def robots(self) -> tuple[int, int]:
+        """Whose times the two `stamps` are."""
+        return self.robot if self.reference_robot is None else self.reference_robot, self.robot
 
     @property
     def is_absolute(self) -> bool:
@@ -94,7 +103,7 @@ class LoopClosure:
 
 def in_order(loop: LoopClosure) -> LoopClosure:
     """
-    Return a sound loop as the later keyframe, seen from the earlier one.
+    Return a sound loop of one robot as the later keyframe, seen from the earlier one.
 
     Z becomes Z^-1; X = Z exp(e), so X^-1 = Z^-1 exp(-Ad(Z) e), and C becomes Ad(Z) C Ad(Z)'.
 
@@ -104,9 +113,9 @@ def in_order(loop: LoopClosure) -> LoopClosure:
         turned one.
 
     """
-    reference = loop.reference_stamp
-    if reference is None or reference <= loop.stamp:
-        return loop
+    reference, (one, other) = loop.reference_stamp, loop.robots
+    if reference is None or one != other or reference <= loop.stamp:
+        return loop  # robots have clocks of their own
     if not np.isfinite(loop.covariance).all():
         raise MessageError('order', f'a loop from {reference} ns back to {loop.stamp} ns leaves a '
                            'component unsaid; expected its earlier time first')

@@ -17,10 +17,17 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels
+from l1slam_ros.core.graph.factor_graph import NO_PREDECESSOR, FactorGraph, component_labels
 
 # A gap: each number of the odometry is so many times vaguer, in the mean; and no number is less.
 _VAGUE, _TINY = 21.5, 1e-300
+
+
+def give_to(graph: FactorGraph, robot: Indices) -> None:
+    """Let keyframes be of these robots, (n,), each follow the last one of its robot."""
+    order, before = np.argsort(robot, kind='stable'), np.full(len(robot), NO_PREDECESSOR)
+    before[order[1:]] = np.where(np.diff(robot[order]), NO_PREDECESSOR, order[:-1])
+    graph.follow(np.arange(len(robot)), before, robot)
 
 
 def odometry_gaps(graph: FactorGraph) -> Indices:

@@ -9,13 +9,30 @@
 """What a graph builder has made of messages, as it is saved."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure
+from l1slam_ros.core.graph.parts import give_to
+
+
+@dataclass(frozen=True)
+class TrackEnd:
+    """
+    Where the odometry of a robot has come to.
+
+    robot : its number; offset (1, p) : see `GraphBuilder`; end : stamp [ns] of the last sample,
+    end_pose (1, p) and end_covariance (d, d) of the motion to it from the last keyframe
+    """
+
+    robot: int
+    offset: Array
+    end: int
+    end_pose: Array
+    end_covariance: Array
 
 
 @dataclass(frozen=True)
@@ -23,12 +40,13 @@ class BuilderState:
     """
     What a graph builder has made of messages, for another to go on from.
 
-    graph : the factors; stamps (n,) [ns] and odometry (n, p) of the keyframes; offset : see
-    `GraphBuilder`; end : stamp [ns] of the last sample, end_pose (1, p) and end_covariance (d, d)
-    of the motion to it from the last keyframe; loop_rows (k,), loop_stamps (k, 2) and expired
-    (l, 2) [ns] : see `GraphBuilder`; waiting : loops, and how long each has waited [ns]; seen : of
-    each loop that came, by its identity, its factor, -1 for none; struck_pairs (s, 2) : the
-    keyframes between which loops are struck out, those to come too.
+    graph : the factors; stamps (n,) [ns] and odometry (n, p) of the keyframes; offset, end,
+    end_pose, end_covariance : of the first robot, see `TrackEnd`; loop_rows (k,),
+    loop_stamps (k, 2) and expired (l, 2) [ns] : see `GraphBuilder`; waiting : loops, and how long
+    each has waited [ns]; seen : of each loop that came, by its identity, its factor, -1 for none;
+    struck_pairs (s, 2) : the keyframes between which loops are struck out, those to come too;
+    robot : the number of the first robot; others : the ends of the other ones; loop_robots (k, 2),
+    expired_robots (l, 2) : whose times the stamps of loops are, none: those of the first robot.
     """
 
     graph: FactorGraph
@@ -44,6 +62,38 @@ class BuilderState:
     waiting: tuple[tuple[LoopClosure, int], ...]
     seen: Mapping[bytes, int]
     struck_pairs: Indices
+    robot: int = 0
+    others: tuple[TrackEnd, ...] = ()
+    loop_robots: Indices | None = None
+    expired_robots: Indices | None = None
+
+    @property
+    def ends(self) -> tuple[TrackEnd, ...]:
+        """Where the odometry of each robot has come to."""
+        return TrackEnd(self.robot, self.offset, self.end, self.end_pose,
+                        self.end_covariance), *self.others
+
+    def renumbered(self, number: Mapping[int, int]) -> 'BuilderState':
+        """Return the state where robots have other numbers."""
+        def turned(robots: Indices) -> Indices:
+            return np.array([number[one] for one in robots.ravel().tolist()], np.int64).reshape(
+                robots.shape)
+
+        graph = self.graph.copy()
+        give_to(graph, turned(graph.robot))
+        first, *others = sorted((replace(end, robot=number[end.robot]) for end in self.ends),
+                                key=lambda end: end.robot)
+        loops, expired = (
+            turned(np.full((k, 2), self.robot) if robots is None else robots) for robots, k in (
+                (self.loop_robots, len(self.loop_rows)),
+                (self.expired_robots, len(self.expired))))
+        waiting = tuple((replace(loop, robot=number[loop.robot],
+                                 reference_robot=number[loop.robots[0]]), age)
+                        for loop, age in self.waiting)
+        return replace(
+            self, graph=graph, robot=first.robot, offset=first.offset, end=first.end,
+            end_pose=first.end_pose, end_covariance=first.end_covariance, others=tuple(others),
+            loop_robots=loops, expired_robots=expired, waiting=waiting)
 
     @staticmethod
     def of_graph(graph: FactorGraph, poses: Array, stamps: Indices) -> 'BuilderState':

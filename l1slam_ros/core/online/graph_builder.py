@@ -9,54 +9,24 @@
 """
 How the graph grows: odometry samples and loop closures in, keyframes and factors out.
 
-Where the odometry does not go on from where it was (stamps go back, its frame is another one), a
-new part of the map begins: at the end of the one before, which is a guess that no factor says.
-Loops join the parts, if there are any.
+Of one robot or of several: their keyframes come in any order, each follows one of its own robot.
+Where a robot's odometry does not go on, see `robot_odometry`. A robot begins a part of the map.
 """
 
-import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
-from l1slam_ros.core.errors import MessageError
-from l1slam_ros.core.geometry.manifold import Array, Manifold
-from l1slam_ros.core.geometry.noise import MOST_OF_ODOMETRY, root_of_inverse
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import NO_PREDECESSOR, FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, Notes, OdometrySample
 from l1slam_ros.core.online.builder_state import BuilderState
-from l1slam_ros.core.online.keyframes import (
-    KeyframeMotion,
-    KeyframeOptions,
-    Level,
-    OdometryOptions,
-)
-from l1slam_ros.core.online.loops.loop_factors import LoopFactors, LoopOptions
+from l1slam_ros.core.online.loops.loop_factors import LoopFactors
 from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame, OdometryStream
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
-from l1slam_ros.core.online.odometry.plausibility import UNSEEN_TURN, Point
-from l1slam_ros.core.options import Options, option
-
-# Each kind of gap in the odometry: the cause it is counted by, and its sentence.
-_SAID = {'new_segment': ('new_part', 'a new part of the map begins where the last one ends'),
-         'reset': ('reset', 'the map begins anew'),
-         'ignore': ('moved', 'the robot is taken to be where it was')}
-
-
-@dataclass(frozen=True)
-class GraphBuilderOptions(Options):
-    """What makes keyframes and factors of messages."""
-
-    keyframe: KeyframeOptions = KeyframeOptions()
-    odometry: OdometryOptions = OdometryOptions()
-    loop: LoopOptions = LoopOptions()
-    on_time_jump: str = option(
-        'new_segment', "when the ROS clock or the odometry's stamps jump back, or odometry jumps "
-        'further than any robot moves: the map stays and a new part begins, which loops may join '
-        'to it; or the map begins anew; or the robot is taken to be where it was, and old stamps '
-        'are dropped', '', choices=tuple(_SAID))
-    base_frame: str = option(
-        '', "the robot's frame; empty: the first child_frame_id seen", fixed=True)
+from l1slam_ros.core.online.options import GraphBuilderOptions as GraphBuilderOptions
+from l1slam_ros.core.online.robot_odometry import GrowingGraph, RobotOdometry
 
 
 class GraphBuilder:
@@ -69,48 +39,90 @@ class GraphBuilder:
     options : see `GraphBuilderOptions`
     verbatim : the messages are those of a graph: each is a measurement as it is stated, none a
         loop sent again or odometry that jumps
-    base_frame : tells whose odometry it is; None: by the options alone
+    base_frames : of each robot by its number, what tells whose odometry it is; None: by the
+        options alone
 
     Attributes
     ----------
-    graph : the factor graph so far; loops enter it in `add_due_loops`
-    base_frame : as far as is known
-    stream : passes on what is the robot's motion, and holds what may not be
-    track : the odometry so far, its keyframes and gaps
-    loops : those in the graph, and those that wait
-    notes : of messages that were not used, or otherwise than they say
-    offset : (1, p) takes poses of the odometry frame to those kept here: the identity, until
-        after `restore`, or at a gap, the odometry goes on from where the robot was
+    robots : the odometry of each robot, by its number
 
     """
 
     def __init__(self, manifold: Manifold, options: GraphBuilderOptions, verbatim: bool = False,
-                 base_frame: BaseFrame | None = None):
-        self.options = options
-        self.graph = FactorGraph(manifold)
-        self.notes = Notes()
-        self._verbatim = verbatim
-        self.base_frame = base_frame or BaseFrame(options.base_frame)
-        self.stream = OdometryStream(manifold, self.notes, self.base_frame)
-        self.loops = LoopFactors(manifold, self.notes, verbatim)
-        self._motion: KeyframeMotion
-        self._resumed = False
-        self._begin(FactorGraph(manifold))
+                 base_frames: Callable[[int], BaseFrame] | None = None):
+        self._base_frame_of = base_frames or cache(lambda _: BaseFrame(options.base_frame))
+        self._shared = GrowingGraph(manifold, options, verbatim)
+        self.robots: dict[int, RobotOdometry] = {}
+        self._odometry_of(0)
 
-    def _begin(self, graph: FactorGraph) -> None:
-        """Begin with a graph, of which no keyframe is known yet."""
-        self.graph = graph
-        self.track = OdometryTrack(graph.manifold)
-        self.offset, self._level = graph.manifold.identity(1), Level(graph.manifold)
-        self._moved, self._glued = False, True
+    def _odometry_of(self, robot: int) -> RobotOdometry:
+        if robot not in self.robots:
+            self.robots[robot] = RobotOdometry(
+                robot, self._shared, self._base_frame_of(robot))
+        return self.robots[robot]
+
+    @property
+    def options(self) -> GraphBuilderOptions:
+        """The options as they are now."""
+        return self._shared.options
+
+    @property
+    def graph(self) -> FactorGraph:
+        """The factor graph so far; loops enter it in `add_due_loops`."""
+        return self._shared.graph
+
+    @property
+    def loops(self) -> LoopFactors:
+        """Those in the graph, and those that wait."""
+        return self._shared.loops
+
+    @property
+    def notes(self) -> Notes:
+        """Of messages that were not used, or otherwise than they say."""
+        return self._shared.notes
+
+    @property
+    def base_frame(self) -> BaseFrame:
+        """That of the first robot, as far as is known."""
+        return self._base_frame_of(0)
+
+    @property
+    def stream(self) -> OdometryStream:
+        """That of the first robot: passes on what is its motion, and holds what may not be."""
+        return self.robots[0].stream
+
+    @property
+    def track(self) -> OdometryTrack:
+        """The odometry of the first robot so far, its keyframes and gaps."""
+        return self.robots[0].track
+
+    @property
+    def offset(self) -> Array:
+        """
+        Return what takes poses of the first robot's odometry frame to those kept here, (1, p).
+
+        The identity, until after `restore`, or at a gap, the odometry goes on from where the robot
+        was.
+        """
+        return self.robots[0].offset
+
+    @property
+    def keyframe_stamps(self) -> Indices:
+        """Stamps of all keyframes, (n,) [ns]."""
+        return self._shared.tracks.keyframe_stamps
+
+    @property
+    def keyframe_poses(self) -> Array:
+        """Poses of all keyframes in what is kept of their odometry, (n, p)."""
+        return self._shared.tracks.keyframe_poses
 
     def set_options(self, options: GraphBuilderOptions) -> None:
-        """Use other options from now on; what is in the graph stays."""
-        self.options = options
+        """Go on by other options; what is in the graph stays."""
+        self._shared.options = options
 
-    def add_odometry(self, sample: OdometrySample) -> bool:
+    def add_odometry(self, sample: OdometrySample, robot: int = 0) -> bool:
         """
-        Add one sample; return whether the robot is where it says, or a later one.
+        Add one sample of a robot; return whether the robot is where it says, or a later one.
 
         If not it is late and put in its place, see `OdometryOptions`, or it is held, as its
         predecessor does not explain it, see `odometry_stream`: the next one decides.
@@ -121,165 +133,44 @@ class GraphBuilder:
             last one; nothing is added.
 
         """
-        ignore, track = self.options.on_time_jump == 'ignore', self.track
-        if ignore and not self._glued and sample.stamp <= track.last_stamp:
-            raise MessageError('old_stamp', f'odometry stamp {sample.stamp} ns is not after the '
-                               f'last one, {track.last_stamp} ns')
-        used = False
-        for point in self.stream.take(sample, self._verbatim, not ignore, self._put_in_place):
-            self._add(point)
-            used = True
-        track = self.track  # a new one, maybe
-        # Loops that are due are carried by the samples as they came, so thinning waits for them.
-        if track.may_be_thinned and not self.loops.waiting.is_due(track.last):
-            track.thin()
-        return used
-
-    def _put_in_place(self, point: Point) -> bool:
-        """
-        Take a sample in that came late; return False: that is more than `odometry.reorder`.
-
-        What is known from one keyframe to the next, stays: a message before the last one is
-        dropped, and so is one of a place that the robot did not go by.
-
-        Raises
-        ------
-        MessageError : `old_stamp`, it is dropped.
-
-        """
-        track, pose = self.track, point.pose
-        behind = (track.last_stamp - point.stamp) * 1e-9
-        if self._verbatim or not self._glued or (
-                not 0 < behind <= self.options.odometry.reorder):
-            return False
-        if self._moved:
-            pose = self.graph.manifold.compose(self.offset, pose)
-        beside = track.went_by(point.stamp, pose)
-        if beside is None or point.stamp < track.keyframe_stamps[-1]:
-            where = 'after a later keyframe' if beside is not None else (
-                'and says where the robot did not go')
-            raise MessageError('old_stamp', f'odometry stamp {point.stamp} ns came {behind:.3g} s '
-                               f'late, {where}; expected stamps that rise')
-        self._motion.insert(point.sample, pose, beside, self.options.odometry)
-        track.insert(point.stamp, pose)
-        return True
+        return self._odometry_of(robot).add(sample)
 
     def finish(self) -> None:
-        """Use the last sample of all, if it is held for a pause alone; see `held`."""
-        for point in self.stream.finish():
-            self._add(point)
-
-    def _add(self, point: Point) -> None:
-        """Add a sample of the robot's motion."""
-        if point.anew and self._resumed:
-            self._glued = False  # the odometry begins again
-        elif point.anew:
-            self._forget()
-        on_gap, pose, manifold = self.options.on_time_jump, point.pose, self.graph.manifold
-        goes_on = self._glued or self.track.goes_on(point.stamp, pose, self.offset)
-        gap = self._gap(point, goes_on)
-        if gap:
-            self.add_due_loops()  # what came before is of that time
-            cause, said = _SAID[on_gap]
-            self.notes.tell(cause, f'{gap}; {said}')
-            self._level = Level(manifold)
-            if on_gap == 'reset':
-                self._forget()
-        if not self.graph.n_poses:
-            self._begin_part(point.stamp, pose)
-            return
-        if gap or not goes_on:
-            self.offset = manifold.compose(self.track.last_pose, manifold.inverse(pose))
-            self._moved = True
-        self._glued = True
-        if self._moved:
-            pose = manifold.compose(self.offset, pose)
-        if gap and on_gap == 'new_segment':
-            if self.track.begin_part(point.stamp, point.reach):
-                self.loops.waiting.begin_anew(self.track.time)
-            self._begin_part(point.stamp, pose)
-        else:
-            self._go_on(point, pose)
-
-    def _gap(self, point: Point, goes_on: bool) -> str:
-        """Return why no motion is known to a sample from the one before; empty: it is known."""
-        if not self._glued and point.stamp <= self.track.last_stamp:
-            return f'odometry stamp {point.stamp} ns is before the end of the map'
-        if not goes_on and self.options.on_time_jump == 'new_segment':
-            return f'odometry at {point.stamp} ns begins elsewhere than the map ends'
-        return point.gap
-
-    def _go_on(self, point: Point, pose: Array) -> None:
-        """Continue to a sample at `pose` (1, p); where that makes a keyframe, add its factor."""
-        unseen, turned = None, min(UNSEEN_TURN * point.seconds, math.pi)
-        if point.gap or point.unsure:
-            unseen = point.unseen, turned
-        if point.unsure:
-            self.notes.tell('unsure', f'{point.unsure}; it counts as uncertain by '
-                            f'{point.unseen:.3g} m and {turned:.2g} rad')
-        motion = self._motion.step(point.sample, pose, self.options.keyframe,
-                                   self.options.odometry, self._verbatim, unseen)
-        self.track.append(point.stamp, pose, motion is not None, point.reach)
-        if motion is not None:
-            self.notes.warn_bounds('odometry', point.stamp, self._motion.bounded, MOST_OF_ODOMETRY)
-            self._note_slope(point.sample)
-            self.graph.append_step(motion[0], root_of_inverse(motion[1][None]))
-
-    def _note_slope(self, sample: OdometrySample) -> None:
-        length, angle = self._level.dropped(sample, self.options.keyframe)
-        if length or angle:
-            self.notes.warn('slope', f'odometry at {sample.stamp} ns has left the plane by '
-                            f'{length:.3g} m and {angle:.2g} rad, which are dropped; expected '
-                            'dimension 3 for a robot on slopes')
-
-    def _begin_part(self, stamp: int, pose: Array) -> None:
-        """Begin a part of the map with a keyframe."""
-        self.track.append(stamp, pose, is_keyframe=True)
-        self.graph.add_poses(1, begins_part=True)
-        self._motion = KeyframeMotion(self.graph.manifold, stamp, pose)
-
-    def _forget(self) -> None:
-        """Begin anew; loops that wait are kept, since odometry of their times may still come."""
-        self._begin(FactorGraph(self.graph.manifold))
-        self._resumed = False
-        self.loops.forget()
+        """Use the last sample of each robot, if it is held for a pause alone; see `held`."""
+        for one in self.robots.values():
+            one.finish()
 
     def grown(self) -> BuilderState:
         """Return what another builder goes on from; there are keyframes."""
-        track, loops = self.track, self.loops
+        shared, loops = self._shared, self.loops
+        tracks = shared.tracks
         in_graph, _, expired = loops.stamps
+        ends = [self.robots[robot].end() for robot in tracks.begun]
+        first, *others = ends
+        # With the first robot alone all is its own.
+        whose = loops.robots if others or first.robot else (None, None)
         return BuilderState(
-            self.graph.copy(), track.keyframe_stamps, track.keyframe_poses, self.offset,
-            track.last_stamp, track.last_pose,
-            self._motion.covariance(self.options.odometry, self._verbatim),
-            loops.rows, in_graph, expired, loops.waiting.arrivals(track.last), loops.seen(),
-            loops.struck_pairs)
+            self.graph.copy(), self.keyframe_stamps, self.keyframe_poses, first.offset,
+            first.end, first.end_pose, first.end_covariance, loops.rows, in_graph, expired,
+            loops.waiting.arrivals(tracks.clocks), loops.seen(), loops.struck_pairs,
+            first.robot, tuple(others), *whose)
 
     def restore(self, state: BuilderState) -> None:
-        """Continue where a run ended; odometry that does not continue there begins a new part."""
-        self._begin(state.graph)
+        """Go on where a run ended; odometry that begins elsewhere begins a part there."""
+        self._shared.begin(state.graph)
         # In a file a loop across a gap looks like odometry.
         steps = self.graph.between.step_to
         firsts = np.flatnonzero((steps[1:] < 0) | np.isin(steps[1:], state.loop_rows)) + 1
         self.graph.follow(firsts, NO_PREDECESSOR)
-        track, stamps = self.track, state.stamps
-        for part in np.split(np.arange(len(stamps)), firsts):
-            track.extend_by_part(stamps[part], state.odometry[part])
-        self.offset = state.offset
-        self._motion = KeyframeMotion(self.graph.manifold, track.last_stamp, track.last_pose)
-        if state.end > track.last_stamp:
-            track.append(state.end, state.end_pose, is_keyframe=False)
-            by_model = self.options.odometry.covariance_source == 'model'
-            self._motion.add_known(
-                state.end, state.end_pose, None if by_model else state.end_covariance)
-        self._glued, self._moved, self._resumed = False, True, True
-        self.stream = OdometryStream(
-            self.graph.manifold, self.notes, self.base_frame, resumed=True)
-        self.loops.restore(state, track, self.options.loop)
+        for end in state.ends:
+            of_robot = np.flatnonzero(self.graph.robot == end.robot)
+            self._odometry_of(end.robot).restore(
+                end, state.stamps[of_robot], state.odometry[of_robot], of_robot, firsts)
+        self.loops.restore(state, self._shared.tracks, self.options.loop)
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Take a loop closure or an absolute pose in, once; see `add_due_loops`."""
-        self.loops.add(loop, self.track, self.options.loop)
+        self.loops.add(loop, self._shared.tracks, self.options.loop)
 
     def add_due_loops(self) -> int:
         """
@@ -288,4 +179,4 @@ class GraphBuilder:
         Loops that can never become one are counted in `refused`: `before_start` (a time before
         the first odometry), `same_keyframe`, `expired`.
         """
-        return self.loops.add_due(self.graph, self.track, self.options.loop)
+        return self._shared.add_due_loops()

@@ -48,6 +48,7 @@ def terms_of(accepted: Mask, suspect: Mask, sigmas: Array, variance: float, slip
     """Return what the weights are of, (6,); see `forecast`."""
     left_out = ~accepted
     near = np.count_nonzero(left_out & (sigmas < _NEAR))
+    are_many = near > _MANY * max(int(np.count_nonzero(accepted)), 1)
     return np.array([
         1.0, left_out.mean(), np.log10(max(variance, 1.0)), np.log1p(10 * suspect.mean()), slips,
-        near > _MANY * max(np.count_nonzero(accepted), 1)])
+        are_many])

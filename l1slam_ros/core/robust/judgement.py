@@ -126,6 +126,18 @@ class Judgement:
         doubt = doubt_of(factors.pairs[left_out], graph.n_poses, FAILED, str(error))
         return replace(self, doubts=(doubt,), settled=True, confidence=float('nan'))
 
+    def renumbered(self, number: Indices) -> 'Judgement':
+        """Return the judgement where keyframes have other numbers, (n,), in what is doubted."""
+        if (np.diff(number) == 1).all():
+            return self
+        doubts = []
+        for doubt in self.doubts:
+            pairs = np.sort(number[np.array(doubt.pairs, np.int64).reshape(-1, 2)], axis=1)
+            ends = number[doubt.first:doubt.last + 1] if not len(pairs) else pairs
+            doubts.append(replace(doubt, first=int(ends.min()), last=int(ends.max()),
+                                  pairs=listed(pairs)))
+        return replace(self, doubts=tuple(doubts))
+
     def of_all(self, graph: FactorGraph) -> 'Judgement':
         """
         Return the judgement of all factors of a graph, from this one of those that are not struck.

@@ -16,6 +16,7 @@ import os
 import time
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
+from functools import cache
 from weakref import WeakSet
 
 from l1slam_ros.core.errors import GraphError, OptionError, require
@@ -86,8 +87,9 @@ class Backend:
     ----------
     manifold : what the poses live on
     options : as they are now
-    base_frame : of the robot, as far as is known; no reset forgets it
-    calm : background work pauses inside `with backend.calm:`
+    base_frame, base_frame_of : of the first robot, and of one by its number, as far as they are
+        known; no reset forgets them
+    calm : what goes on behind waits for its end, `with backend.calm:`
 
     Raises
     ------
@@ -103,7 +105,8 @@ class Backend:
         if dimension not in _MANIFOLDS:
             raise OptionError(f'dimension is {dimension!r}, expected 2 or 3')
         self.manifold, self.options = _MANIFOLDS[dimension], options
-        self.base_frame = BaseFrame(options.base_frame)
+        self.base_frame_of = cache(lambda _: BaseFrame(options.base_frame))
+        self.base_frame = self.base_frame_of(0)
         self._keeper = Keeper(_builder(self), options.solver, options.robust.enabled)
         self._updates = Updates(self._keeper, self._wake)
         self.calm = self._updates.calm
@@ -133,16 +136,22 @@ class Backend:
 
     # What comes in.
 
-    def add_odometry(self, sample: OdometrySample) -> bool:
-        """Add one sample; return whether it is used, see `GraphBuilder.add_odometry`."""
+    def add_odometry(self, sample: OdometrySample, robot: int = 0) -> bool:
+        """
+        Add one sample of a robot; return whether it is used, see `GraphBuilder.add_odometry`.
+
+        robot : its number, 0 the first one's, whose frame is that of the map
+        """
         require_sound(sample, OdometrySample)
-        used = self._keeper.add_odometry(sample)
+        _require_robots(robot)
+        used = self._keeper.add_odometry(sample, robot)
         self._wake()
         return used
 
     def add_loop(self, loop: LoopClosure) -> None:
         """Add one loop closure, turned round if it leads back; see `GraphBuilder.add_loop`."""
         require_sound(loop, LoopClosure)
+        _require_robots(*loop.robots)
         self._keeper.add_loop(in_order(loop))
         self._wake()
 
@@ -254,13 +263,13 @@ class Backend:
         """Return what has become of each loop, those of the graph first, in its order."""
         return self.snapshot().loop_states()
 
-    def robot(self) -> Robot | None:
-        """Return where the robot is; None: no odometry has said yet where it is in this map."""
-        return self._keeper.robot()
+    def robot(self, robot: int = 0) -> Robot | None:
+        """Return where a robot is; None: no odometry has said yet where it is in this map."""
+        return self._keeper.robot(robot)
 
-    def moved(self) -> tuple[Array, Array]:
-        """Return map -> odom as it was when this was asked before, and as it is, (1, p) each."""
-        return self._keeper.moved()
+    def moved(self, robot: int = 0) -> tuple[Array, Array]:
+        """Return map -> odom of a robot as it was when this was asked before, and is, (1, p)."""
+        return self._keeper.moved(robot)
 
     def counts(self) -> Counts:
         """Return how large the graph is, and what was noted of messages."""
@@ -297,8 +306,15 @@ def _require_options(options: object) -> None:
             'BackendOptions; BackendOptions.from_mapping makes them of a mapping')
 
 
+def _require_robots(*robots: int) -> None:
+    for robot in robots:
+        require(int, 'the robot', robot, 'its number, 0 or more')
+        if robot < 0:
+            raise OptionError(f'the robot is {robot}, expected its number, 0 or more')
+
+
 def _builder(backend: Backend) -> GraphBuilder:
-    return GraphBuilder(backend.manifold, backend.options, base_frame=backend.base_frame)
+    return GraphBuilder(backend.manifold, backend.options, base_frames=backend.base_frame_of)
 
 
 _ALL: WeakSet[Backend] = WeakSet()

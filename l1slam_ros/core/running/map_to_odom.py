@@ -6,28 +6,27 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Where the odometry frame is in the map: what the last keyframe of the map says."""
+"""Where the odometry frame of a robot is in its map: what the last keyframe of the map says."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from l1slam_ros.core.bordered.front import Front
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.online.graph_builder import GraphBuilder
+from l1slam_ros.core.online.robot_odometry import RobotOdometry
 
 
 class Newest(NamedTuple):
-    """The last keyframe of the map, which keyframes to come follow, -1: none; its pose (1, p)."""
+    """
+    The last keyframe of a robot in the map, which its keyframes to come follow.
+
+    keyframe : its number among those of the robot, -1: there is none; pose : (1, p) in the map of
+    the robot; joined : that is the map of the first robot
+    """
 
     keyframe: int
     pose: Array
-
-    @staticmethod
-    def of(poses: Array, front: Front | None) -> 'Newest':
-        """Return that of a map, poses (n, p), or of its front where there is one."""
-        return (Newest(front.keyframes - 1, front.newest) if front
-                else Newest(len(poses) - 1, poses[-1:]))
+    joined: bool = True
 
 
 class MapToOdom:
@@ -38,30 +37,35 @@ class MapToOdom:
         # Before the first map and after the last that nobody asked for yet.
         self._moved: tuple[Array, Array] | None = None
 
+    @property
+    def joined(self) -> bool:
+        """Whether the map is that of the first robot."""
+        return self._newest.joined
+
     def begin(self, newest: Newest) -> None:
         """Begin where another map ends."""
         self._newest = newest
         # Asked for with every sample: worked out when an update or a new offset changes it.
         self._known: tuple[Array, Array] | None = None
 
-    def move(self, builder: GraphBuilder, newest: Newest) -> None:
+    def move(self, robot: RobotOdometry, newest: Newest) -> None:
         """Go on where the map ends by now."""
-        before = self.now(builder)
+        before = self.now(robot)
         self.begin(newest)
-        self._moved = (self._moved or (before,))[0], self.now(builder)
+        self._moved = (self._moved or (before,))[0], self.now(robot)
 
-    def now(self, builder: GraphBuilder) -> Array:
-        """Return the transform; builder : of the graph."""
-        offset, manifold = builder.offset, builder.graph.manifold
+    def now(self, robot: RobotOdometry) -> Array:
+        """Return the transform; robot : whose it is."""
+        offset, manifold = robot.offset, robot.manifold
         if self._newest.keyframe < 0:
             return manifold.identity(1)
         if self._known is None or self._known[0] is not offset:
-            odometry = builder.track.poses_of(np.array([self._newest.keyframe]))
+            odometry = robot.track.poses_of(np.array([self._newest.keyframe]))
             to_kept = manifold.compose(self._newest.pose, manifold.inverse(odometry))
             self._known = offset, manifold.compose(to_kept, offset)
         return self._known[1]
 
-    def moved(self, builder: GraphBuilder) -> tuple[Array, Array]:
+    def moved(self, robot: RobotOdometry) -> tuple[Array, Array]:
         """Return the transform as it was when this was asked before, and as it is now."""
-        (before, after), self._moved = self._moved or 2 * (self.now(builder),), None
+        (before, after), self._moved = self._moved or 2 * (self.now(robot),), None
         return before, after

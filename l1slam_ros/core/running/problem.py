@@ -22,6 +22,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import sigmas
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.parts import give_to
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.block_cholesky import Pattern
 from l1slam_ros.core.solvers.solve import AUTO, PRIMAL_DUAL, Method, choose
@@ -94,6 +95,29 @@ def as_one(problem: Problem) -> Problem:
             suspect=np.append(judgement.suspect[rows], np.zeros(g, bool)),
             sigmas=np.append(judgement.sigmas[rows], np.zeros(g)),
             noise=np.append(judgement.noise[rows], np.ones(g))))
+
+
+def by_robot(problem: Problem) -> tuple[Problem, Indices]:
+    """
+    Return the problem with the keyframes of one robot behind those of another, and its order.
+
+    What is near along the way has numbers near each other then, as the judge wants it. The order
+    (n,) has the number that each keyframe had.
+    """
+    graph = problem.graph
+    order = np.argsort(graph.robot, kind='stable')
+    if (np.diff(order) == 1).all():
+        return problem, order
+    place = np.argsort(order)
+    whole, factors = FactorGraph(graph.manifold, len(order)), graph.between
+    give_to(whole, graph.robot[order])
+    before = graph.predecessor[order]
+    whole.follow(np.arange(len(order)), np.where(before < 0, before, place[before]))
+    whole.append_between(
+        np.where(factors.is_absolute, factors.i, place[factors.i]), place[factors.j],
+        factors.measurement, factors.sqrt_information, factors.trusted, factors.struck)
+    return replace(problem, graph=whole, starts=[poses[order] for poses in problem.starts],
+                   pattern=None), order
 
 
 def _tied(graph: FactorGraph, poses: Array, firsts: Indices) -> FactorGraph:

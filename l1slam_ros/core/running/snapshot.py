@@ -27,6 +27,7 @@ from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.map_state import MapState
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.running.problem import Problem
+from l1slam_ros.core.running.robot_maps import RobotMap, robot_maps
 from l1slam_ros.core.solvers.block_cholesky import Pattern
 
 # The states of a loop; `LoopStates.state` holds indices of this tuple.
@@ -55,7 +56,7 @@ class SavedMap:
     All that another back end goes on from.
 
     judgement : of all factors; robust : loops were doubted; graph_began : names the graph in its
-    back end, see `Revisions`
+    back end, see `Revisions`; robots : their names by their numbers, as far as they have any
     """
 
     builder: BuilderState
@@ -63,15 +64,21 @@ class SavedMap:
     judgement: Judgement
     robust: bool
     graph_began: int = 0
+    robots: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Robot:
-    """Where the robot is: stamp [ns] and pose (1, p) of its odometry, and map -> odom (1, p)."""
+    """
+    Where a robot is: stamp [ns] and pose (1, p) of its odometry, and map -> odom (1, p).
+
+    joined : the map is that of the first robot, else one of its own
+    """
 
     stamp: int
     odometry: Array
     map_to_odom: Array
+    joined: bool = True
 
 
 class Counts(NamedTuple):
@@ -121,8 +128,9 @@ class Snapshot:
     What a back end knows.
 
     state : of its map; graph : the factors so far; stamps (n,) [ns] and odometry (n, p) of the
-    keyframes; map_to_odom : (1, p); loop_rows, loop_stamps : see `LoopFactors`; views : the L1 and
-    L2 map of the front, where there is one; pattern : see `Problem`.
+    keyframes; map_to_odom : (1, p) of the first robot; loop_rows, loop_stamps, loop_robots : see
+    `LoopFactors`; views : the L1 and L2 map of the front, where there is one; pattern : see
+    `Problem`.
     """
 
     state: MapState
@@ -132,6 +140,7 @@ class Snapshot:
     map_to_odom: Array
     loop_rows: Indices
     loop_stamps: tuple[Indices, Indices, Indices]
+    loop_robots: tuple[Indices, Indices]
     views: tuple[View, ...]
     pattern: Pattern | None
 
@@ -145,6 +154,28 @@ class Snapshot:
         """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
         return self._followed(
             self.views[0].poses if self.views else self.state.optimised.poses, self.odometry)
+
+    @cached_property
+    def robot_maps(self) -> dict[int, RobotMap]:
+        """The map that each robot is in, by its number."""
+        graph = self.graph
+        return robot_maps(graph.manifold, graph.robot, graph.between, self.judgement.accepted,
+                          lambda keyframes: self.odometry[keyframes],
+                          lambda keyframes: self.poses[keyframes])
+
+    def poses_in_map(self, robot: int) -> tuple[Indices, Array]:
+        """Return the keyframes of a robot, (k,), and where they are in its map, (k, p)."""
+        keyframes = np.flatnonzero(self.graph.robot == robot)
+        poses, turn = self.poses[keyframes], self.robot_maps.get(robot, RobotMap(True, None)).turn
+        return keyframes, poses if turn is None else self.graph.manifold.compose(turn, poses)
+
+    @property
+    def drawn(self) -> Array:
+        """All keyframes as seen from the map of the first robot, (n, p)."""
+        first = self.robot_maps.get(0)
+        if first is None or first.turn is None or not first.joined:
+            return self.poses
+        return self.graph.manifold.compose(first.turn, self.poses)
 
     def _followed(self, poses: Array, others: Array) -> Array:
         """

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from l1slam_ros.core.errors import FileError, OptionError
@@ -51,6 +52,8 @@ class MapFile:
                  warn: Callable[[str], object]):
         self._backend, self._options, self._warn = backend, options, warn
         self.is_saving, self._one = False, threading.Lock()
+        # Names of robots by their numbers, behind those of the node the ones of a loaded map.
+        self._robots = options().names
         # When the last save began, or the node; and whether there was one.
         self._began, self._tried = time.monotonic(), False
         # Where the map was saved or loaded last, and its revision then.
@@ -108,6 +111,8 @@ class MapFile:
 
     def _write(self, path: Path, saved: SavedMap | None, revision: int) -> str:
         self._tried = True
+        if saved is not None and self._robots:
+            saved = replace(saved, robots=self._robots)
         sentence = save_map(path, saved)
         self._known = path, revision
         self._ours = path, _end_of(path), saved.graph_began if saved else 0
@@ -126,6 +131,7 @@ class MapFile:
         path = self._path()
         end = _end_of(path)
         saved, sentence, whole = load_map(path)
+        saved = self._by_name(saved)
         with named(path):
             graph = self._backend.restore(saved)
         self._known = path, self._backend.revisions.now
@@ -135,6 +141,18 @@ class MapFile:
         before = before_of(path)
         self._ours_before = (before, _end_of(before)) if is_map(before) else ()
         return sentence, whole
+
+    def _by_name(self, saved: SavedMap) -> SavedMap:
+        """Return a map whose robots have the numbers that those of their names have here."""
+        own = self._options().names
+        self._robots = own + tuple(name for name in saved.robots if name not in own)
+        number = {was: self._robots.index(name) for was, name in enumerate(saved.robots)}
+        if not own or all(was == now for was, now in number.items()):
+            return saved
+        builder = saved.builder
+        for end in builder.ends:  # of no name
+            number.setdefault(end.robot, len(number) + len(self._robots))
+        return replace(saved, builder=builder.renumbered(number))
 
     def load_at_start(self, tell: Callable[[str], object]) -> None:
         """Load the map if there is one; tell so, or warn where there is a damaged one."""

@@ -118,7 +118,8 @@ def _text(data: bytes, place: int, length: int) -> tuple[str, int]:
     return bytes(data[place: end - 1]).decode(), end
 
 
-def loop_closure(message: Any, base_frame: str, trusted: bool) -> LoopClosure:
+def loop_closure(message: Any, base_frame: str, trusted: bool,
+                 ordered: bool = True) -> LoopClosure:
     """
     Return what a geometry_msgs/PoseWithCovarianceStamped says about two times.
 
@@ -127,17 +128,18 @@ def loop_closure(message: Any, base_frame: str, trusted: bool) -> LoopClosure:
     message : its `header.frame_id` names the earlier time, see `reference_frame_id`
     base_frame : the frame that must be named there; empty: any
     trusted : whether a person or a marker vouches for it
+    ordered : the reference has to be earlier than the stamp; not so between two robots
 
     Raises
     ------
     MessageError : it cannot be used.
 
     """
-    return LoopClosure(*_ends(message, base_frame), _pose3(message.pose.pose),
+    return LoopClosure(*_ends(message, base_frame, ordered), _pose3(message.pose.pose),
                        _covariance(message.pose.covariance), trusted)
 
 
-def false_loop(message: Any, base_frame: str) -> LoopClosure:
+def false_loop(message: Any, base_frame: str, ordered: bool = True) -> LoopClosure:
     """
     Return the word that the loop of two times is false, named as in `loop_closure`.
 
@@ -148,7 +150,7 @@ def false_loop(message: Any, base_frame: str) -> LoopClosure:
     MessageError : it names no two times.
 
     """
-    return LoopClosure(*_ends(message, base_frame), np.array((0.0, 0, 0, 0, 0, 0, 1)),
+    return LoopClosure(*_ends(message, base_frame, ordered), np.array((0.0, 0, 0, 0, 0, 0, 1)),
                        np.zeros((6, 6)), struck=True)
 
 
@@ -185,6 +187,13 @@ LOOPS: dict[str, Callable[[Any, str, str], LoopClosure]] = {
     'trusted_loop_closures': lambda message, base, _: loop_closure(message, base, True),
     'false_loop_closures': lambda message, base, _: false_loop(message, base),
     'absolute_poses': lambda message, _, of_map: absolute_pose(message, of_map)}
+
+
+# The same of a loop between two robots, by the frame of the one from which the other is seen.
+LOOPS_BETWEEN: dict[str, Callable[[Any, str], LoopClosure]] = {
+    'loop_closures': lambda message, base: loop_closure(message, base, False, False),
+    'trusted_loop_closures': lambda message, base: loop_closure(message, base, True, False),
+    'false_loop_closures': lambda message, base: false_loop(message, base, False)}
 
 
 def stamped_pose(message: Any) -> tuple[int, Array]:
@@ -242,11 +251,11 @@ def checked_pose3(t: Any, q: Any) -> Array:
     return sound_pose3((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
 
 
-def _ends(message: Any, base_frame: str) -> tuple[int, int]:
+def _ends(message: Any, base_frame: str, ordered: bool) -> tuple[int, int]:
     """Return reference and stamp of a loop [ns]."""
     stamp = stamp_of(message.header)
     reference = _reference_stamp(message.header.frame_id, base_frame)
-    if reference >= stamp:
+    if ordered and reference >= stamp:
         raise MessageError('order', f'reference {stamp_text(reference)} of a loop; '
                            f'expected one earlier than its stamp {stamp_text(stamp)}')
     return reference, stamp

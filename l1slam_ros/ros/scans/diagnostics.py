@@ -17,7 +17,7 @@ from rclpy.node import Node
 from l1slam_ros.ros.scans.front_end_thread import FrontEndThread
 from l1slam_ros.ros.scans.map_drawer import MapDrawer
 from l1slam_ros.ros.threads.failures import Failures
-from l1slam_ros.ros.threads.inputs import Traffic
+from l1slam_ros.ros.threads.intake import Traffic
 
 # Seconds, which are as many publications.
 _MINUTE = 60

@@ -35,7 +35,7 @@ from l1slam_ros.ros.scans.map_drawer import MapDrawer
 from l1slam_ros.ros.scans.options import ScanLoopsOptions
 from l1slam_ros.ros.scans.publishing import ScanPublisher
 from l1slam_ros.ros.threads.failures import Failures, reason
-from l1slam_ros.ros.threads.inputs import Traffic
+from l1slam_ros.ros.threads.intake import Traffic
 from l1slam_ros.ros.threads.job_queue import JobQueue
 
 try:

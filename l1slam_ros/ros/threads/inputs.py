@@ -7,39 +7,25 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What the node hears: messages of every topic -> the back end, in a thread that does nothing else.
+What the node hears: messages of every topic, of each robot -> the back end; see `intake`.
 
-Each time that rclpy's executor wakes, it makes a wait set anew of all that a node has, services,
-timers and events: 1.5 ms, ten times what a message of the odometry costs. The wait set here is
-made once, of subscriptions alone. What DDS has queued up is taken over first, some microseconds a
-message, before anything is made of it: a queue of DDS that is full drops messages without a word.
-Messages of all topics are used in the order they came: a loop that was sent before the stamps of
-the odometry went back is of the time before. None of it is compiled code.
+A robot that has a name has its topics below it. Its frames may begin with the name, or not.
 """
 
 import math
-import threading
-import time
-from bisect import bisect_right
-from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.guard_condition import GuardCondition
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from l1slam_ros.core.errors import L1SlamError, MessageError, OptionError
+from l1slam_ros.core.errors import L1SlamError, MessageError
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.io.files import quoted
@@ -48,107 +34,13 @@ from l1slam_ros.io.messages.edge_graph import EdgeGraph
 from l1slam_ros.io.messages.front_ends import FRONT_ENDS
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.robot import RobotPublisher
-from l1slam_ros.ros.threads.failures import Failures, reason
+from l1slam_ros.ros.threads.failures import Failures
+from l1slam_ros.ros.threads.intake import Intake
 
-_DEPTH = 1000
-# So many are used before DDS is asked for more.
-_AT_ONCE = 100
-# More are left to DDS, to drop: ten seconds of a fast topic, some megabytes.
-_BACKLOG = 10_000
 # Odometry behind which so much waits is not answered, but for the last: there is no time for it, a
 # publication gives Python up and waits for its turn, and the robot is elsewhere by now.
 _ANSWERED = 5
-# [s] What raises each time it is called shall not keep a core busy.
-_BREATH = 0.05
 _REPEAT_WARNING = 5.0  # [s]
-# [s] The rate of messages is that of so long.
-_WINDOW = 5.0
-
-
-class Traffic:
-    """
-    The messages of one topic.
-
-    Publishers number their messages, and the numbers come along. So whatever got lost on the way
-    leaves a gap, also what a full queue has dropped: of that Fast DDS does not tell otherwise.
-    The numbers do not say whose they are. With several publishers each message is taken to follow
-    the nearest number before its own: who lost how many may be mixed up by that, the sum is not.
-
-    Parameters
-    ----------
-    publishers : returns how many there are now
-
-    Attributes
-    ----------
-    received, lost : how many messages
-    other_source : whether the numbers began anew with the last one: of another publisher, or of
-        one that was restarted
-
-    """
-
-    def __init__(self, publishers: Callable[[], int]):
-        self.received = self.lost = 0
-        self.other_source = False
-        self.publishers = publishers
-        # The last number of each publisher, of who spoke last in front.
-        self._numbers: list[int] = []
-        self._marks = deque([(time.monotonic(), 0)])
-
-    def note(self, information: Mapping[str, int | None]) -> None:
-        """Count a message; information : what rclpy says about it."""
-        self.received += 1
-        self.other_source = False
-        number = information.get('publication_sequence_number')
-        if number is None:
-            return
-        numbers = self._numbers
-        if numbers and number == numbers[0] + 1:
-            numbers[0] = number
-            return
-        before = [last for last in numbers if last < number]
-        if number - 1 not in before and len(numbers) < self.publishers():
-            before = []
-        if before:
-            nearest = max(before)
-            numbers.remove(nearest)
-            self.lost += number - nearest - 1
-        else:
-            self.other_source = bool(numbers)
-        numbers.insert(0, number)
-
-    def values(self) -> dict[str, str]:
-        """Return `received`, `rate` [1/s] and `lost`; to be called about once a second."""
-        del self._numbers[max(self.publishers(), 1):]
-        now = time.monotonic()
-        self._marks.append((now, self.received))
-        while len(self._marks) > 2 and now - self._marks[1][0] >= _WINDOW:
-            self._marks.popleft()
-        since, before = self._marks[0]
-        rate = (self.received - before) / max(now - since, 1e-9)
-        return {'received': str(self.received), 'rate': f'{rate:.1f}', 'lost': str(self.lost)}
-
-
-class _Apart(ReentrantCallbackGroup):  # type: ignore[misc]
-    """Leaves all in it to others than the executor."""
-
-    def can_execute(self, _: Any) -> bool:
-        return False
-
-
-class _Topic(NamedTuple):
-    name: str
-    subscription: Any
-    traffic: Traffic
-    use: Callable[[Any], None]
-
-
-class _Message(NamedTuple):
-    """A message, what rclpy says about it, and when it came [ns]."""
-
-    received: int
-    topic: _Topic
-    content: Any
-    information: Any
 
 
 class Inputs:
@@ -161,189 +53,140 @@ class Inputs:
     backend : to append to
     options : of the node
     failures : where to tell what nobody foresaw
-    robot : answers a sample of the odometry that is used, but not if more wait behind it; its
+    robots : answer a sample of their odometry that is used, but not if more wait behind it; their
         `tick` is called after messages, and again after as many seconds as it returns
 
     Attributes
     ----------
-    active : whether messages are used, and transforms are published
-    traffic : of each topic by its name
+    intake : hands messages over
     refused : cause -> how many messages could not be used
 
     """
 
     def __init__(self, node: Node, backend: Backend, options: NodeOptions, failures: Failures,
-                 robot: RobotPublisher):
-        self._node, self._backend, self._failures = node, backend, failures
-        self._robot = robot
+                 robots: Sequence[RobotPublisher]):
+        self._node, self._backend, self._robots = node, backend, robots
         self._map_frame, self._odom_frame = options.map_frame, options.odom_frame
-        self._group, self.active = _Apart(), False
-        self._closing = self._unanswered = False
+        self._unanswered: set[RobotPublisher] = set()
+        # Robots that nobody named, and that was said.
+        self._strangers: set[str] = set()
         self.refused: Counter[str] = Counter()
-        self._topics: list[_Topic] = []
-        # As they came, and of each topic in its turn.
-        self._queue: deque[_Message] = deque()
-        self._new: list[_Message] = []
-        self._guard = GuardCondition(None, None, context=node.context)
-        self._thread = threading.Thread(target=self._work, name='intake', daemon=True)
-        self._subscribe_all()
-        self.traffic = {topic.name: topic.traffic for topic in self._topics}
+        self.intake = Intake(node, failures, self._answer, self._tick)
+        for robot in robots:
+            self._subscribe(robot)
 
-    def _subscribe_all(self) -> None:
+    @property
+    def traffic(self) -> dict[str, Any]:
+        """How the messages of each topic come, by its name."""
+        return self.intake.traffic
+
+    def _subscribe(self, robot: RobotPublisher) -> None:
+        """Subscribe to the topics of a robot."""
         for name in conversion.LOOPS:
-            self._subscribe(PoseWithCovarianceStamped, name, partial(self._on_loop, name))
+            self.intake.subscribe(PoseWithCovarianceStamped, f'{robot.prefix}{name}',
+                                  self._guarded(partial(self._on_loop, robot, name)))
         # Pose graphs of other front ends, where their messages are installed.
         for front_end in FRONT_ENDS:
-            use = partial(self._on_pose_graph, front_end.graph())
+            use = partial(self._on_pose_graph, front_end.graph(), robot=robot.number)
             for name, msgtype in front_end.topics.items():
                 package, _, kind = msgtype.split('/')
                 # Of an older release of the package, too, that has not all of the messages.
                 with suppress(ImportError, AttributeError):
-                    self._subscribe(getattr(import_module(f'{package}.msg'), kind), name, use)
+                    self.intake.subscribe(getattr(import_module(f'{package}.msg'), kind),
+                                          f'{robot.prefix}{name}', use)
         # Last: not every DDS says when a message came, and a loop may come before its odometry.
-        self._subscribe(Odometry, 'odom', self._on_odometry, raw=True)
+        self.intake.subscribe(Odometry, f'{robot.prefix}odom',
+                              self._guarded(partial(self._on_odometry, robot)), raw=True)
 
-    def _subscribe(self, kind: Any, name: str, use: Callable[[Any], None],
-                   raw: bool = False) -> None:
-        """Subscribe to a topic; raw : its messages are used as bytes."""
-        try:
-            subscription = self._node.create_subscription(
-                kind, name, use, QoSProfile(depth=_DEPTH), raw=raw, callback_group=self._group,
-                qos_overriding_options=QoSOverridingOptions.with_default_policies())
-        except Exception as error:  # by what is said of its QoS, rclpy raises anything
-            raise OptionError(f'{name} cannot be subscribed to: {reason(error)}') from error
-        traffic = Traffic(subscription.get_publisher_count)
-        self._topics.append(_Topic(name, subscription, traffic, use))
-
-    def start(self) -> None:
-        """Begin; there is nothing to subscribe to any more."""
-        self._thread.start()
-
-    def wake(self) -> None:
-        """Look now whether a transform is to be published."""
-        self._guard.trigger()
-
-    def look_at_events(self) -> None:
-        """
-        Call back what has happened to the subscriptions: publishers whose QoS does not match.
-
-        To be called now and then: who waits for such events wakes for each message.
-        """
-        context = self._node.context
-        events = [event for one in self._topics for event in one.subscription.event_handlers]
-        with context.handle:
-            waiting = rclpy_implementation.WaitSet(0, 0, 0, 0, 0, len(events), context.handle)
-            waiting.clear_entities()
-            for event in events:
-                event.add_to_wait_set(waiting)
-            waiting.wait(0)
-            for event in events:
-                if event.is_ready(waiting):
-                    event.callback(event.take_data())
-
-    def close(self, seconds: float) -> bool:
-        """End the thread; return whether it ended within some seconds."""
-        self._closing = True
-        self.wake()
-        self._thread.join(seconds)
-        return not self._thread.is_alive()
-
-    def _work(self) -> None:
-        context = self._node.context
-        with context.handle, self._guard.handle:
-            waiting, seconds = None, math.inf
-            while not self._closing and context.ok():
-                try:
-                    waiting = waiting or rclpy_implementation.WaitSet(
-                        len(self._topics), 1, 0, 0, 0, 0, context.handle)
-                    self._wait(waiting, 0.0 if self._backlog else seconds)
-                    self._take()
-                    self._use()
-                    seconds = self._robot.tick() if self.active else math.inf
-                    self._failures.over('intake')
-                except Exception as error:
-                    self._failures.note('intake', error)
-                    time.sleep(_BREATH)
-
-    def _wait(self, waiting: Any, seconds: float) -> None:
-        """Wait for messages, for so long."""
-        waiting.clear_entities()
-        for one in self._topics:
-            waiting.add_subscription(one.subscription.handle)
-        waiting.add_guard_condition(self._guard.handle)
-        waiting.wait(-1 if math.isinf(seconds) else max(round(seconds * 1e9), 0))
-
-    @property
-    def _backlog(self) -> int:
-        return len(self._queue) + len(self._new)
-
-    def _take(self) -> None:
-        """Take over what has come of every topic."""
-        for topic in self._topics:
-            subscription = topic.subscription
-            with subscription.handle:
-                while self._backlog < _BACKLOG and (taken := subscription.handle.take_message(
-                        subscription.msg_type, subscription.raw)) is not None:
-                    content, information = taken
-                    self._new.append(_Message(
-                        information['received_timestamp'], topic, content, information))
-
-    def _use(self) -> None:
-        """Use some of the messages in the order they came."""
-        if self._new and not self._queue:
-            until = max(message.received for message in self._new)
-            # While one topic was emptied, older messages may have come of those before.
-            self._take()
-            self._new.sort(key=itemgetter(0))
-            count = bisect_right(self._new, until, key=itemgetter(0))
-            self._queue, self._new = deque(self._new[:count]), self._new[count:]
-        for _ in range(min(_AT_ONCE, len(self._queue))):
-            _, topic, content, information = self._queue.popleft()
-            topic.traffic.note(information)
-            if not self.active:
-                continue
+    def _guarded(self, use: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Return what uses messages, and counts those that cannot be."""
+        def guard(content: Any) -> None:
             try:
-                topic.use(content)
+                use(content)
             except L1SlamError as error:
                 self._refuse(error)
-            except Exception as error:
-                self._failures.note(topic.name, error)
-                continue
-            self._failures.over(topic.name)
-        if not self._backlog:
-            self._answer()
 
-    def _on_odometry(self, data: bytes) -> None:
+        return guard
+
+    def _on_odometry(self, robot: RobotPublisher, data: bytes) -> None:
         frame, sample = conversion.odometry_in(data)
-        if frame.removeprefix('/') not in (self._odom_frame, ''):
+        if self._own(robot, frame) not in (self._odom_frame, ''):
             self._node.get_logger().warning(
                 f'odometry in frame {quoted(frame)} is used, but {self._map_frame} -> '
-                f'{self._odom_frame} is published; expected odom_frame to be its name', once=True)
-        if self.traffic['odom'].other_source:
+                f'{robot.odom_frame} is published; expected odom_frame to be its name',
+                once=True)
+        if robot.prefix:
+            sample = replace(sample, frame=self._own(robot, sample.frame))
+        if self.traffic[f'{robot.prefix}odom'].other_source:
             sample = replace(sample, other_source=True)
-        self._unanswered |= self._backend.add_odometry(sample)
-        if self._backlog < _ANSWERED:
+        if self._backend.add_odometry(sample, robot.number):
+            self._unanswered.add(robot)
+        if self.intake.backlog < _ANSWERED:
             self._answer()
 
+    def _own(self, robot: RobotPublisher, frame: str) -> str:
+        """Return a frame of a robot without the robot's name."""
+        return frame.removeprefix('/').removeprefix(robot.prefix)
+
     def _answer(self) -> None:
-        if self._unanswered:
-            self._unanswered = False
-            self._robot.answer()
+        for robot in self._robots:
+            if robot in self._unanswered:
+                self._unanswered.remove(robot)
+                robot.answer()
 
-    def _on_loop(self, name: str, message: Any) -> None:
-        self._backend.add_loop(conversion.LOOPS[name](
-            message, self._backend.base_frame.name, self._map_frame))
+    def _tick(self) -> float:
+        return min((robot.tick() for robot in self._robots), default=math.inf)
 
-    def _on_pose_graph(self, graphs: EdgeGraph, message: Any) -> None:
+    def _on_loop(self, robot: RobotPublisher, name: str, message: Any) -> None:
+        base = self._backend.base_frame_of(robot.number).name
+        if not robot.prefix or name not in conversion.LOOPS_BETWEEN:
+            loop = conversion.LOOPS[name](message, base, self._map_frame)
+            self._backend.add_loop(replace(loop, robot=robot.number) if robot.number else loop)
+            return
+        other = self._reference(robot, message.header.frame_id)
+        message.header.frame_id = self._own(other, message.header.frame_id)
+        if other is robot:
+            loop = conversion.LOOPS[name](message, base, self._map_frame)
+        else:
+            loop = conversion.LOOPS_BETWEEN[name](
+                message, self._backend.base_frame_of(other.number).name)
+        self._backend.add_loop(replace(
+            loop, robot=robot.number, reference_robot=other.number))
+
+    def _reference(self, robot: RobotPublisher, frame: str) -> RobotPublisher:
+        """
+        Return the robot that the reference frame of a loop names, else the one that sent it.
+
+        Raises
+        ------
+        MessageError : `robot`, it names one that the node does not know.
+
+        """
+        frame = frame.removeprefix('/')
+        for other in self._robots:
+            if frame.startswith(other.prefix):
+                return other
+        if '/' not in frame:
+            return robot
+        raise MessageError('robot', f'frame {quoted(frame)} of a loop names another robot; '
+                           f'expected one of {", ".join(one.name for one in self._robots)}')
+
+    def _on_pose_graph(self, graphs: EdgeGraph, message: Any, robot: int = 0) -> None:
         for found in graphs.take(message):
             try:
                 if not isinstance(found, LoopClosure):
                     raise found
-                self._backend.add_loop(found)
+                self._backend.add_loop(replace(found, robot=robot))
             except L1SlamError as error:
                 self._refuse(error)
 
     def _refuse(self, error: L1SlamError) -> None:
-        self.refused[error.cause if isinstance(error, MessageError) else 'unusable'] += 1
+        cause = error.cause if isinstance(error, MessageError) else 'unusable'
+        self.refused[cause] += 1
+        stranger = str(error).partition('@')[0] if cause == 'robot' else ''
+        if stranger in self._strangers:
+            return
+        if stranger:
+            self._strangers.add(stranger)
         self._node.get_logger().warning(
             f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)

@@ -125,20 +125,20 @@ def test_nobody_sees_the_front_of_a_map_that_was_replaced(monkeypatch):
 
 
 def test_nobody_follows_the_end_of_a_map_that_was_replaced(monkeypatch):
-    backend, newest = Backend(EVERY), Front.newest.fget
+    backend, poses_of = Backend(EVERY), Front.poses_of
     drive(backend, 0, 5)
     while backend.update(DEADLINE) is not None:
         pass
 
-    def slowly(front):
-        seen = newest(front)
+    def slowly(front, keyframes):
+        seen = poses_of(front, keyframes)
         backend.reset()
         drive(backend, 100, 102)
         return seen
 
     drive(backend, 5, 6)
     with monkeypatch.context() as patched:
-        patched.setattr(Front, 'newest', property(slowly))
+        patched.setattr(Front, 'poses_of', slowly)
         with pytest.raises(Interrupted):
             backend.update(DEADLINE)
     now = backend.snapshot()

@@ -29,8 +29,9 @@ from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.measurements import LoopClosure, Notes
 from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.online.keyframes import diagonal_covariance, reduced_covariance
+from l1slam_ros.core.online.loops.carried import carried
 from l1slam_ros.core.online.loops.waiting_loops import WaitingLoop, WaitingLoops
-from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
+from l1slam_ros.core.online.odometry.tracks import Tracks
 from l1slam_ros.core.options import Options, option
 
 
@@ -72,15 +73,16 @@ class LoopFactors:
 
     def forget(self) -> None:
         """Begin with an empty graph; loops that wait may yet find odometry of their times."""
-        # Their times of arrival are of another clock.
-        self.waiting.begin_anew(lambda stamp: stamp, 0)
+        # The clock that they came by was none, or goes otherwise now.
+        self.waiting.forget_clocks()
         # The loops that came, by their identities; and their rows once they are factors.
         self._seen = {one.key for one in self.waiting.all() if not one.loop.struck}
         self._row_of: dict[bytes, int] = {}
         # Keyframes of the loops that are struck out, those to come too.
         self._struck: set[tuple[int, int]] = set()
-        self._expired = GrowingArray((2,), np.int64)
-        self._stamps = GrowingArray((2,), np.int64)
+        # Of the stamps of loops, reference and end, and of the robots of these.
+        self._expired, self._expired_robots = (GrowingArray((2,), np.int64) for _ in range(2))
+        self._stamps, self._robots = (GrowingArray((2,), np.int64) for _ in range(2))
         self._rows = GrowingArray((), np.int64)
 
     @property
@@ -91,6 +93,11 @@ class LoopFactors:
         Those in the graph are in the order of `rows`, to which they stay tied.
         """
         return self._stamps.view(), self.waiting.stamps(), self._expired.view()
+
+    @property
+    def robots(self) -> tuple[Indices, Indices]:
+        """Whose times the stamps of the loops in the graph and expired are, (k, 2) each."""
+        return self._robots.view(), self._expired_robots.view()
 
     @property
     def rows(self) -> Indices:
@@ -106,56 +113,76 @@ class LoopFactors:
         """Return of each loop that came, by its identity, its factor, -1 for none."""
         return {key: self._row_of.get(key, -1) for key in self._seen}
 
-    def restore(self, state: BuilderState, track: OdometryTrack, options: LoopOptions) -> None:
+    def restore(self, state: BuilderState, tracks: Tracks, options: LoopOptions) -> None:
         """Go on with the loops of an earlier run."""
-        self._note(state.loop_rows, state.loop_stamps)
+        none = np.full((len(state.loop_rows), 2), state.robot)
+        self._note(state.loop_rows, state.loop_stamps,
+                   none if state.loop_robots is None else state.loop_robots)
         self._expired.extend(state.expired)
+        self._expired_robots.extend(
+            np.full(state.expired.shape, state.robot) if state.expired_robots is None
+            else state.expired_robots)
         for loop, age in state.waiting:
-            self.add(loop, track, options, age)
+            self.add(loop, tracks, options, age)
         self._seen.update(state.seen)
         self._row_of.update({key: row for key, row in state.seen.items() if row >= 0})
         self._struck.update(map(tuple, state.struck_pairs.tolist()))
 
-    def add(self, loop: LoopClosure, track: OdometryTrack, options: LoopOptions,
+    def add(self, loop: LoopClosure, tracks: Tracks, options: LoopOptions,
             age: int = 0) -> None:
         """Take a loop closure or an absolute pose in, once, that came so long ago [ns]."""
         covariance = self._covariance(loop, options)
         if covariance is None:
             return
         measurement = _said(self._manifold, loop, covariance)
-        key = noise.loop_identity(*loop.stamps, measurement, covariance)
+        key, robots = noise.loop_identity(*loop.stamps, measurement, covariance), loop.robots
+        if any(robots):
+            key += np.array(robots).tobytes()
         # Of what a person says the last word counts, though it was said before.
         if not loop.struck:
             if key in self._seen and not (loop.trusted or self._verbatim):
                 self._refuse('repeated', loop, 'was sent before; expected each loop once')
                 return
             self._seen.add(key)
-        begin, end = map(track.time, loop.stamps)
-        arrival = track.last - age if len(track) else 0
-        self.waiting.add(WaitingLoop(loop, arrival, begin, end, measurement, covariance, key))
+        begin, end = map(tracks.time, robots, loop.stamps)
+        first, last = (tracks.ago(robot, age) for robot in robots)
+        self.waiting.add(
+            WaitingLoop(loop, (first, last), begin, end, measurement, covariance, key))
 
-    def add_due(self, graph: FactorGraph, track: OdometryTrack, options: LoopOptions) -> int:
+    def add_due(self, graph: FactorGraph, tracks: Tracks, options: LoopOptions) -> int:
         """Make factors of the loops whose times odometry has reached; return how many."""
-        if not len(self.waiting) or not len(track):
+        if not len(self.waiting):
             return 0
-        now = track.last
-        due = self.waiting.due(now)
-        since = now - int(options.wait * 1e9)
-        for one in self.waiting.expired(since) if track.first < since else ():
+        clocks = tracks.clocks
+        due = self.waiting.due(clocks)
+        for robot, now in clocks.items():
+            since, track = now - int(options.wait * 1e9), tracks.of(robot)
+            if track is not None and track.first < since:
+                self._expire(robot, since, track.last_stamp)
+        return self._add_due(due, graph, tracks, options) if due else 0
+
+    def _expire(self, robot: int, since: int, stamp: int) -> None:
+        """Give up what waits for a robot since before `since` [ns]; stamp : its last [ns]."""
+        for one in self.waiting.expired(robot, since):
             if not one.loop.struck:
                 self._expired.extend(np.array([one.loop.stamps]))
-            self._refuse('expired', one.loop, f'waited for odometry until {track.last_stamp} ns; '
+                self._expired_robots.extend(np.array([one.loop.robots]))
+            self._refuse('expired', one.loop, f'waited for odometry until {stamp} ns; '
                          'expected odometry of its times')
             # A loop that is sent again once odometry has come that far is used.
             self._seen.discard(one.key)
-        return self._add_due(due, graph, track, options) if due else 0
 
-    def _add_due(self, due: list[WaitingLoop], graph: FactorGraph, track: OdometryTrack,
+    def _add_due(self, due: list[WaitingLoop], graph: FactorGraph, tracks: Tracks,
                  options: LoopOptions) -> int:
-        times = np.array([(one.begin, one.end) for one in due])
-        known = track.known_until(np.array([one.arrival for one in due]), times[:, 1])
-        pairs = track.nearest_keyframe(times.ravel(), np.repeat(known, 2)).reshape(-1, 2)
-        can = np.flatnonzero(self._can_be_factors(due, pairs, track.first)).tolist()
+        times, robots = _times(due)
+        arrivals = np.array([one.arrivals for one in due])
+        own = robots[:, 0] == robots[:, 1]
+        # What one robot saw of itself was known with its later end.
+        until = np.where(own[:, None], times[:, 1:], times)
+        known = tracks.known_until(robots.ravel(), arrivals.ravel(), until.ravel())
+        pairs = tracks.nearest_keyframe(robots.ravel(), times.ravel(), known).reshape(-1, 2)
+        first = tracks.first(robots.ravel()).reshape(-1, 2)
+        can = np.flatnonzero(self._can_be_factors(due, pairs, first)).tolist()
         new: list[int] = []
         before, came = len(graph.between), len(self.rows)
         for k in can:
@@ -164,7 +191,7 @@ class LoopFactors:
                 self._row_of[due[k].key] = before + len(new)
                 new.append(k)
         if new:
-            self._append([due[k] for k in new], pairs[new], graph, track, options)
+            self._append([due[k] for k in new], pairs[new], graph, tracks, options)
         for k in can:
             # A word is of loops that came before it, though others become factors with them.
             self._say(due[k], (int(pairs[k, 0]), int(pairs[k, 1])), graph,
@@ -172,22 +199,22 @@ class LoopFactors:
         return len(new)
 
     def _append(self, loops: list[WaitingLoop], pairs: Indices, graph: FactorGraph,
-                track: OdometryTrack, options: LoopOptions) -> None:
+                tracks: Tracks, options: LoopOptions) -> None:
         """Carry loops to the keyframes pairs (m, 2), and make factors of them."""
         manifold, m = self._manifold, len(loops)
-        begin, end = np.array([(one.begin, one.end) for one in loops]).T
-        at, keyframes = track.at(np.append(begin, end)), track.poses_of(pairs.T.ravel())
+        times, robots = (column.T.ravel() for column in _times(loops))
+        at, keyframes = tracks.at(robots, times), tracks.poses_of(robots, pairs.T.ravel())
         ways = manifold.between(np.concatenate((keyframes[:m], at[m:])),
                                 np.concatenate((at[:m], keyframes[m:])))
-        unseen = track.unseen(np.append(begin, end))
-        measurement, covariance, sound = _carried(
+        unseen = tracks.unseen(robots, times)
+        measurement, covariance, sound = carried(
             manifold, loops, ways[:m], ways[m:], unseen.reshape(2, m, 2))
         covariance = np.where(sound[:, None, None], covariance, self._model(options))
         i = np.where([one.loop.is_absolute for one in loops], WORLD, pairs[:, 0])
         graph.append_between(i, pairs[:, 1], measurement, noise.root_of_inverse(covariance),
                              np.array([one.loop.trusted for one in loops]))
         rows = len(graph.between) + np.arange(-m, 0)
-        self._note(rows, np.array([one.loop.stamps for one in loops]))
+        self._note(rows, np.array([one.loop.stamps for one in loops]), robots.reshape(2, m).T)
 
     def _say(self, one: WaitingLoop, pair: tuple[int, int], graph: FactorGraph,
              came: int) -> None:
@@ -195,33 +222,40 @@ class LoopFactors:
         loop = one.loop
         if loop.struck:
             self._struck.add(pair)
-            rows, stamps = self.rows[:came], self._stamps.view()[:came]
+            rows, stamps, robots = (
+                column[:came] for column in (self.rows, self._stamps.view(), self._robots.view()))
+            named = (stamps == loop.stamps).all(axis=1) & (robots == loop.robots).all(axis=1)
             factors = graph.between.pairs[rows]
             graph.say(rows[(factors == pair).all(axis=1) | (factors == pair[::-1]).all(axis=1)
-                           | (stamps == loop.stamps).all(axis=1)], trusted=False)
+                           | named], trusted=False)
         elif loop.trusted:
             self._struck.discard(pair)
             graph.say(np.array([self._row_of[one.key]]), trusted=True)
         elif pair in self._struck:
             graph.say(np.array([self._row_of[one.key]]), trusted=False)
 
-    def _can_be_factors(self, loops: list[WaitingLoop], pairs: Indices, first: int) -> Mask:
-        """Return which loops between keyframes (m, 2) can be factors, and note the rest."""
-        early = np.array([one.begin < first for one in loops])
+    def _can_be_factors(self, loops: list[WaitingLoop], pairs: Indices, first: Indices) -> Mask:
+        """
+        Return which loops between keyframes (m, 2) can be factors, and note the rest.
+
+        first : when the odometry of their robots begins, (m, 2) [ns]
+        """
+        early = np.logical_or(*(_times(loops)[0] < first).T)
         same = (pairs[:, 0] == pairs[:, 1]) & ~early & ~np.array(
             [one.loop.is_absolute for one in loops])
         for row in np.flatnonzero(early | same).tolist():
             if early[row]:
                 self._refuse('before_start', loops[row].loop, 'begins before the odometry; '
-                             f'expected times from {first} ns on')
+                             f'expected times from {first[row, 0]} ns on')
             else:
                 self._refuse('same_keyframe', loops[row].loop, 'begins and ends at one keyframe; '
                              'expected two')
         return ~(early | same)
 
-    def _note(self, rows: Indices, stamps: Indices) -> None:
+    def _note(self, rows: Indices, stamps: Indices, robots: Indices) -> None:
         self._rows.extend(rows)
         self._stamps.extend(stamps)
+        self._robots.extend(robots)
 
     def _refuse(self, cause: str, loop: LoopClosure, why: str) -> None:
         self.lost += not (loop.struck or loop.is_absolute or cause == 'repeated')
@@ -251,60 +285,10 @@ class LoopFactors:
             self._manifold, options.sigma_translation, options.sigma_rotation)
 
 
-def _carried(manifold: Manifold, used: list[WaitingLoop], to_reference: Array,
-             to_keyframe: Array, unseen: Array) -> tuple[Array, Array, Mask]:
-    """
-    Return what loops say between keyframes near their times.
-
-    Parameters
-    ----------
-    to_reference : (m, p) the robot at the reference, seen from the first keyframe; an absolute
-        pose has none
-    to_keyframe : (m, p) the second keyframe, seen from the robot at the end
-    unseen : (2, m, 2) the sigmas [m], [rad] of where the robot was at the reference and at the end
-
-    Returns
-    -------
-    measurement : (m, p); covariance : (m, d, d) in the axes of the keyframe. A loop that leaves
-        components unsaid keeps its own axes, the way being short; one without a heading goes that
-        way in a direction unknown, which is noise.
-    sound : (m,) bool, the covariance is one: a heading nearly unknown, at the end of a long lever,
-        leaves rounding where position was.
-
-    """
-    stated = np.concatenate([one.measurement for one in used])
-    covariance = np.concatenate([one.covariance for one in used])
-    absolute = np.array([one.loop.is_absolute for one in used])
-    silent = np.diagonal(covariance, axis1=1, axis2=2) == 0
-    if unseen.any():
-        covariance = covariance + noise.silenced(
-            _of_silences(manifold, stated, absolute, unseen), silent)
-    unturned = silent[:, manifold.ROTATION].any(axis=1)
-    measurement = np.where(absolute[:, None], stated, manifold.compose(to_reference, stated))
-    measurement = np.where(unturned[:, None], measurement,
-                           manifold.compose(measurement, to_keyframe))
-    # The error lives in the axes of the measured pose; see it from the keyframe instead.
-    Ad = manifold.adjoint(manifold.inverse(to_keyframe))
-    turned = Ad @ covariance @ Ad.transpose(0, 2, 1)
-    if not silent.any():
-        return measurement, turned, noise.usable(turned)
-    way = manifold.local(manifold.identity(len(used)), to_keyframe)
-    lost = np.zeros(silent.shape)
-    lost[:, manifold.TRANSLATION] = (way[:, manifold.TRANSLATION] ** 2).mean(axis=1)[:, None]
-    kept = covariance + (lost * (unturned[:, None] & ~silent))[:, :, None] * np.eye(lost.shape[1])
-    covariance = np.where(silent.any(axis=1)[:, None, None], kept, turned)
-    return measurement, covariance, noise.usable(noise.filled(covariance, silent))
-
-
-def _of_silences(manifold: Manifold, stated: Array, absolute: Mask, unseen: Array) -> Array:
-    """Return the covariances, (m, d, d), of loops whose ends nobody saw; see `_carried`."""
-    own = np.zeros((*unseen.shape[:2], manifold.TANGENT_SIZE))
-    own[:, :, manifold.TRANSLATION] = unseen[:, :, :1] ** 2
-    own[:, :, manifold.ROTATION] = unseen[:, :, 1:] ** 2
-    own[0, absolute] = 0.0  # the map has no time
-    first, second = own[..., None] * np.eye(manifold.TANGENT_SIZE)
-    Ad = manifold.adjoint(manifold.inverse(stated))
-    return Ad @ first @ Ad.transpose(0, 2, 1) + second
+def _times(loops: list[WaitingLoop]) -> tuple[Indices, Indices]:
+    """Return the times of loops, and on whose clocks these are, (m, 2) each."""
+    return (np.array([(one.begin, one.end) for one in loops]),
+            np.array([one.loop.robots for one in loops]))
 
 
 def _loop_covariance(stated: Array, model: Array | None,

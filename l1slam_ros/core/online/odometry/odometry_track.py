@@ -55,10 +55,15 @@ class OdometryTrack:
     ----------
     manifold : what the poses live on
 
+    Attributes
+    ----------
+    numbers : of its keyframes in the graph, as who adds them says
+
     """
 
     def __init__(self, manifold: Manifold):
         self._manifold = manifold
+        self.numbers = GrowingArray((), np.int64)
         self._times = GrowingArray((), np.int64)
         self._poses = GrowingArray((manifold.POSE_SIZE,))
         self._keyframes = GrowingArray((), np.int64)

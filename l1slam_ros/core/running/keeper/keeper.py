@@ -23,7 +23,7 @@ and whoever works with what was there before finds out when he comes to hand in 
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -39,6 +39,7 @@ from l1slam_ros.core.running.keeper.schedule import Size
 from l1slam_ros.core.running.map_state import Carried, MapState
 from l1slam_ros.core.running.map_to_odom import MapToOdom, Newest
 from l1slam_ros.core.running.optimised import Optimised
+from l1slam_ros.core.running.robot_maps import Seen, map_ends
 from l1slam_ros.core.running.snapshot import Robot, SavedMap, Snapshot
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
@@ -83,7 +84,9 @@ class Keeper:
         self._builder, self._solver, self._robust = builder, solver, robust
         self._front: Front | None = None
         nothing = Optimised.nothing(builder.graph.manifold.identity(0))
-        self._odom, self._revisions = MapToOdom(Newest.of(nothing.poses, None)), Revisions()
+        # By robot.
+        self._odom: dict[int, MapToOdom] = {}
+        self._revisions = Revisions()
         self._state = MapState.beginning(0, robust, nothing, Judgement.nothing(), 0)
 
     @property
@@ -103,13 +106,13 @@ class Keeper:
 
     # What comes in.
 
-    def add_odometry(self, sample: OdometrySample) -> bool:
+    def add_odometry(self, sample: OdometrySample, robot: int) -> bool:
         """See `Backend.add_odometry`."""
         with self._graph_lock:
             builder, graph = self._builder, self._builder.graph
             keyframes = graph.n_poses
             try:
-                return builder.add_odometry(sample)
+                return builder.add_odometry(sample, robot)
             finally:  # of two samples the second may be refused
                 if builder.graph is not graph:
                     self._begin()
@@ -157,7 +160,10 @@ class Keeper:
         optimised = optimised or Optimised.nothing(builder.graph.manifold.identity(0))
         judgement = judgement or Judgement.nothing()
         judged_loops = int((builder.loops.rows < len(judgement.accepted)).sum())
-        self._odom.begin(Newest.of(optimised.poses, None))
+        self._odom = {}
+        ends = map_ends(Seen.of(builder), optimised.poses, None, judgement.accepted)
+        for robot, end in ends.items():
+            self._odom[robot] = MapToOdom(end)
         self._state = MapState.beginning(
             self._revisions.now, self._robust, optimised, judgement, judged_loops)
 
@@ -182,13 +188,14 @@ class Keeper:
             views = front.views if front else ()
             with self._graph_lock:
                 self._add_due_loops()
-                track, loops = self._builder.track, self._builder.loops
+                builder, loops = self._builder, self._builder.loops
                 # A map that began meanwhile has no front.
                 views = views if front is self._front else ()
                 yield Snapshot(
-                    self._state, self._builder.graph.copy(), track.keyframe_stamps,
-                    track.keyframe_poses, self._odom.now(self._builder), loops.rows,
-                    loops.stamps, views, front.pattern if front and views else None)
+                    self._state, builder.graph.copy(), builder.keyframe_stamps,
+                    builder.keyframe_poses, self._odom_of(0).now(builder.robots[0]), loops.rows,
+                    loops.stamps, loops.robots, views,
+                    front.pattern if front and views else None)
 
     def saved(self) -> SavedMap | None:
         """See `Backend.saved`."""
@@ -203,17 +210,28 @@ class Keeper:
         with self._graph_lock:
             return self._state, self._builder.graph.between, Size.of(self._builder)
 
-    def robot(self) -> Robot | None:
+    def robot(self, robot: int) -> Robot | None:
         """See `Backend.robot`."""
         with self._graph_lock:
-            last = self._builder.stream.last
-            now = self._odom.now(self._builder)
-            return Robot(last.stamp, last.pose, now) if last else None
+            odometry = self._builder.robots.get(robot)
+            last = odometry.stream.last if odometry else None
+            if odometry is None or last is None:
+                return None
+            odom = self._odom_of(robot)
+            return Robot(last.stamp, last.pose, odom.now(odometry), odom.joined)
 
-    def moved(self) -> tuple[Array, Array]:
+    def moved(self, robot: int) -> tuple[Array, Array]:
         """See `Backend.moved`."""
         with self._graph_lock:
-            return self._odom.moved(self._builder)
+            return self._odom_of(robot).moved(self._builder.robots[robot])
+
+    def _odom_of(self, robot: int) -> MapToOdom:
+        """Return map -> odom of a robot; the graph is locked."""
+        if robot not in self._odom:
+            # Nothing can join what is not in the map.
+            none = self._builder.graph.manifold.identity(0)
+            self._odom[robot] = MapToOdom(Newest(-1, none, robot == 0))
+        return self._odom[robot]
 
     def covariance(self, keyframe: int) -> Array | None:
         """See `Backend.marginal_covariance`."""
@@ -238,10 +256,12 @@ class Keeper:
         if taken:
             with self._front_lock:
                 state = self._state
-                newest = Newest.of(state.optimised.poses, self._front)
+                with self._graph_lock:
+                    seen = Seen.of(self._builder)
+                ends = map_ends(seen, state.optimised.poses, self._front, state.table.accepted)
                 with self._graph_lock:
                     if self._state.began == state.began:
-                        self._move(newest)
+                        self._move(ends)
 
     def _add_due_loops(self) -> None:
         """Make factors of the loops whose times odometry has reached; the graph is locked."""
@@ -265,9 +285,10 @@ class Keeper:
                 self._state = state.taken(looks, Carried.by(front))
         return bool(looks)
 
-    def _move(self, newest: Newest) -> None:
-        """Note that the map is another, which ends here; the graph is locked."""
-        self._odom.move(self._builder, newest)
+    def _move(self, ends: Mapping[int, Newest]) -> None:
+        """Note that the map is another, which ends here for each robot; the graph is locked."""
+        for robot, end in ends.items():
+            self._odom_of(robot).move(self._builder.robots[robot], end)
         self._revisions = self._revisions.after(map=True)
 
     # What the workers make.
@@ -285,7 +306,9 @@ class Keeper:
         ArithmeticError : it is not finite; nothing is taken over.
 
         """
-        newest = Newest.of(improvement.poses, front)
+        with self._graph_lock:
+            seen = Seen.of(self._builder)
+        ends = map_ends(seen, improvement.poses, front, improvement.judgement.accepted)
         carried = Carried.by(front) if front else None
         former = self._front
         with self._front_lock, self._graph_lock:
@@ -296,8 +319,8 @@ class Keeper:
                 improvement, carried, looks, pending, self._builder.graph.between,
                 self._solver.outer_tolerance, time.monotonic())
             self._front = front
-            self._move(newest)
-        # To free its memory takes long, so an update must not hold the last reference.
+            self._move(ends)
+        # To give its memory back takes long: it shall not be an update that does so last.
         with self._front_lock:
             pass
         del former

@@ -24,6 +24,8 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.running.improve import Check, Improvement, front_of, optimise
 from l1slam_ros.core.running.keeper.keeper import Keeper
@@ -37,7 +39,7 @@ from l1slam_ros.core.running.keeper.workers import (
     Workers,
     until,
 )
-from l1slam_ros.core.running.problem import as_one
+from l1slam_ros.core.running.problem import as_one, by_robot
 
 # [s] The longest time an update takes in new factors, whatever the budget.
 _LEAST_TIME = 0.02
@@ -149,9 +151,14 @@ class Updates:
         whole = now.problem()
         if not len(whole.graph.between):
             return None
-        problem, check = as_one(whole), self.calm.kept(until(
+        turned, order = by_robot(whole)
+        check = self.calm.kept(until(
             lambda: bool(self._urgent) or stopped() or keeper.state.began != began))
-        improvement = optimise(problem, keeper.solver, check)
+        improvement = optimise(as_one(turned), keeper.solver, check)
+        improvement = replace(
+            improvement, poses=improvement.poses[np.argsort(order)],
+            judgement=improvement.judgement.renumbered(order))
+        problem = as_one(whole)
         check()
         front = front_of(replace(problem, judgement=improvement.judgement), improvement.poses,
                          len(whole.graph.between), check)

@@ -14,6 +14,7 @@ while it is computed.
 """
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from l1slam_ros.core.running.improve import Check, front_of, improve, one_round
 from l1slam_ros.core.running.keeper.keeper import Keeper
 from l1slam_ros.core.running.keeper.schedule import Moment, Work, is_late
 from l1slam_ros.core.running.keeper.workers import until
-from l1slam_ros.core.running.problem import as_one
+from l1slam_ros.core.running.problem import as_one, by_robot
 from l1slam_ros.core.running.snapshot import Snapshot
 
 # [s] So long a map is improved, whatever the budget; of the clock a round may take some times as
@@ -77,20 +78,24 @@ def judge_all(keeper: Keeper, anew: bool, idle: bool, check: Check) -> None:
     """Judge all loops; anew : from the graph alone; idle : only as long as nothing comes."""
     now, grown = keeper.begin_judgement()
     whole = now.problem()
-    problem = as_one(whole)
+    turned, order = by_robot(whole)
+    problem = as_one(turned)
     alone = until(lambda: keeper.revisions.grown != grown, check) if idle else check
     graph, known, poses = problem.graph, problem.judgement, problem.poses
     judgement, l2_poses = (robust_solve(graph, check=alone, known=(known, poses)) if anew
                            else judge(graph, poses, known, np.inf, check))
     check()
-    take_judgement(keeper, now, judgement.of_all(whole.graph), l2_poses, anew)
+    judgement = judgement.of_all(turned.graph).renumbered(order)
+    take_judgement(keeper, now, judgement, l2_poses[np.argsort(order)], anew)
 
 
 def compare_norms(keeper: Keeper, check: Check) -> None:
     """Doubt the map where another norm gives a different map."""
     now = keeper.snapshot()
-    problem = as_one(now.problem())
-    doubts = doubts_of_norm(problem.graph, problem.judgement, problem.poses, check)
+    turned, order = by_robot(now.problem())
+    problem = as_one(turned)
+    found = doubts_of_norm(problem.graph, problem.judgement, problem.poses, check)
+    doubts = replace(problem.judgement, doubts=found).renumbered(order).doubts
     keeper.change(now, lambda state, _: state.doubted(now.state, doubts))
 
 

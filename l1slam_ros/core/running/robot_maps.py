@@ -1,0 +1,140 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""
+In whose map each robot is: in that of the first one, or still in one of its own.
+
+In: a graph, what is accepted of it, and where keyframes are in it. Out: of each robot whether an
+accepted factor joins it to the first one, and what takes its keyframes to the map that it is
+published in. The graph has one frame for all; where a robot that nothing joins is in it, is a
+guess. Its own map begins with its first keyframe where its odometry has that, as the map of the
+only robot does.
+
+Parts of one robot, from before and after a gap, count as joined. Where absolute poses are
+accepted, the map of the first robot is that of the world, and who is not tied to it, the first
+robot too, is in a map of its own.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from l1slam_ros.core.bordered.front import Front
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import BetweenFactors, lowest_of_components
+from l1slam_ros.core.online.graph_builder import GraphBuilder
+from l1slam_ros.core.running.map_to_odom import Newest
+
+
+class RobotMap(NamedTuple):
+    """
+    The map that a robot is in.
+
+    joined : it is that of the first robot; turn : (1, p) from the frame of the graph to that of
+    the map, None: they are one
+    """
+
+    joined: bool
+    turn: Array | None
+
+
+def robot_maps(manifold: Manifold, robot: Indices, factors: BetweenFactors, accepted: Mask,
+               odometry: Callable[[Indices], Array],
+               pose: Callable[[Indices], Array]) -> dict[int, RobotMap]:
+    """
+    Return the map that each robot is in, by its number.
+
+    Parameters
+    ----------
+    robot : (n,) of each keyframe
+    factors, accepted : and which of the first ones are, (m,) bool
+    odometry, pose : return of some keyframes their odometry, and where they are, (k, p) each
+
+    """
+    numbers, firsts = np.unique(robot, return_index=True)
+    if len(numbers) < 2:
+        return {number: RobotMap(True, None) for number in numbers.tolist()}
+    joined, root = _joined(robot, numbers, factors, accepted)
+    turns = manifold.compose(odometry(firsts), manifold.inverse(pose(firsts)))
+    # The frame of the graph is that of the world, or of its first keyframe.
+    of_root = None if root is None or firsts[root] == 0 else turns[root:root + 1]
+    return {number: RobotMap(joins, of_root if joins else turns[row:row + 1])
+            for row, (number, joins) in enumerate(zip(
+                numbers.tolist(), joined.tolist(), strict=True))}
+
+
+class Seen(NamedTuple):
+    """
+    What is seen of a graph at a moment, to be read at leisure.
+
+    factors : of it; robot : (n,) of each keyframe; numbers : of each robot the keyframes, (k,);
+    firsts : (r, p) the odometry of their first ones, by robot
+    """
+
+    manifold: Manifold
+    factors: BetweenFactors
+    robot: Indices
+    numbers: dict[int, Indices]
+    firsts: dict[int, Array]
+
+    @staticmethod
+    def of(builder: GraphBuilder) -> 'Seen':
+        """Return what is seen of the graph of a builder."""
+        tracks = {robot: one.track for robot, one in builder.robots.items() if len(one.track)}
+        firsts = {robot: track.poses_of(slice(0, 1)) for robot, track in tracks.items()}
+        return Seen(builder.graph.manifold, builder.graph.between, builder.graph.robot,
+                    {robot: track.numbers.view() for robot, track in tracks.items()}, firsts)
+
+    def maps(self, known: int, accepted: Mask,
+             pose: Callable[[Indices], Array]) -> dict[int, RobotMap]:
+        """Return the maps of robots by the first keyframes, see `robot_maps`."""
+        if len(self.numbers) < 2:
+            return {}
+        factors = self.factors
+        inside = np.maximum(factors.i, factors.j)[:len(accepted)] < known
+
+        def odometry(keyframes: Indices) -> Array:
+            return np.concatenate([self.firsts[robot] for robot in self.robot[keyframes].tolist()])
+
+        return robot_maps(self.manifold, self.robot[:known], factors, accepted[:len(inside)] &
+                          inside, odometry, pose)
+
+
+def map_ends(seen: Seen, poses: Array, front: Front | None, accepted: Mask) -> dict[int, Newest]:
+    """
+    Return the last keyframe of each robot in a map, poses (n, p), or in its front if it has one.
+
+    accepted : which of the first factors are
+    """
+    known = front.keyframes if front else len(poses)
+    pose = front.poses_of if front else poses.__getitem__
+    maps, ends = seen.maps(known, accepted, pose), {}
+    for robot, numbers in seen.numbers.items():
+        last = int(np.searchsorted(numbers, known)) - 1
+        if last >= 0:
+            joined, turn = maps.get(robot, RobotMap(True, None))
+            at = pose(numbers[last:last + 1])
+            ends[robot] = Newest(
+                last, at if turn is None else seen.manifold.compose(turn, at), joined)
+    return ends
+
+
+def _joined(robot: Indices, numbers: Indices, factors: BetweenFactors,
+            accepted: Mask) -> tuple[Mask, int | None]:
+    """Return which robots are joined to the first one, (r,), or the world: then None, else it."""
+    rows = np.flatnonzero(accepted)
+    i, j, absolute = factors.i[rows], factors.j[rows], factors.is_absolute[rows]
+    ends = np.searchsorted(numbers, robot[j])
+    others = np.where(absolute, len(numbers), np.searchsorted(numbers, robot[i]))
+    between = np.flatnonzero(ends != others)
+    component = lowest_of_components(others[between], ends[between], len(numbers) + 1)
+    if absolute.any():
+        return component[:-1] == component[-1], None
+    return component[:-1] == component[0], 0

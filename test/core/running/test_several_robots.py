@@ -1,0 +1,153 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""Several robots in one back end: their maps, what joins them, and what is saved of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from problems import seconds
+from team import Team, believed_by
+
+from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.running.backend import Backend, BackendOptions
+from l1slam_ros.io.graphs.saved_map import load_map, save_map
+
+EVERY = BackendOptions.from_mapping({
+    'keyframe': {'translation': 0.0, 'rotation': 0.0}, 'on_time_jump': 'ignore',
+    'odometry': {'covariance_source': 'increment'}})
+
+@pytest.mark.parametrize('late', [0, 5])
+def test_the_loops_that_batch_believes_are_believed_interleaved(late):
+    team, backend = Team(), Backend(EVERY)
+    team.fill(backend, late)
+    backend.settle()
+    now = backend.snapshot()
+    assert now.graph.n_poses == 400 and len(now.graph.firsts) == 1
+    assert np.count_nonzero(np.diff(now.graph.robot)) > 300
+    expected, found = team.believed(), believed_by(now)
+    assert len(expected) > 200 and len(expected ^ found) <= 0.01 * len(expected)
+    assert all(one.joined for one in now.robot_maps.values())
+    for robot in (0, 1):
+        keyframes, poses = now.poses_in_map(robot)
+        truth = se2.between(np.tile(team.truth[:1], (200, 1)), team.truth[team.robot == robot])
+        assert np.abs(poses - truth)[:, :2].max() < 0.7
+
+
+def test_a_robot_that_nothing_joins_has_its_own_map_and_moves_whole_when_a_loop_is_believed():
+    team, backend = Team(lies=0, n=160, edges=500), Backend(EVERY)
+    joins = []
+    for robot, message in team.messages():
+        if isinstance(message, OdometrySample):
+            backend.add_odometry(message, robot)
+            if message.stamp == seconds(12):  # from its first second on
+                while backend.update(1.0) is not None:
+                    pass
+        elif message.robots == (0, 1):
+            joins.append(message)
+        else:
+            backend.add_loop(message)
+    backend.settle()
+    now, one = backend.snapshot(), backend.robot(1)
+    assert backend.robot(0).joined and not one.joined
+    keyframes, poses = now.poses_in_map(1)
+    assert_allclose(poses[0], [0.0, 0.0, 0.0], atol=1e-12)
+    assert_allclose(se2.compose(one.map_to_odom, one.odometry), poses[-1:], atol=1e-9)
+    shape = se2.between(np.tile(team.truth[80:81], (80, 1)), team.truth[80:])
+    assert np.abs(poses - shape)[:, :2].max() < 0.5
+    for loop in joins:
+        backend.add_loop(loop)
+    backend.settle()
+    now, one = backend.snapshot(), backend.robot(1)
+    assert one.joined and len(joins) > 5
+    poses = now.poses_in_map(1)[1]
+    truth = se2.between(np.tile(team.truth[:1], (80, 1)), team.truth[80:])
+    assert np.abs(poses - truth)[:, :2].max() < 0.7
+    assert_allclose(se2.compose(one.map_to_odom, one.odometry), poses[-1:], atol=1e-9)
+    assert_array_equal(keyframes, now.poses_in_map(1)[0])
+
+
+def test_a_map_of_two_robots_is_saved_and_goes_on(tmp_path):
+    team, backend = Team(n=120, edges=400, lies=40), Backend(EVERY)
+    messages = team.messages()
+    for some in (messages[:300], messages[300:]):
+        for robot, message in some:
+            if isinstance(message, LoopClosure):
+                backend.add_loop(message)
+            else:
+                backend.add_odometry(message, robot)
+        backend.settle()
+        save_map(tmp_path / 'map.g2o', backend.saved())
+        before, backend = backend, Backend(EVERY)
+        backend.restore(load_map(tmp_path / 'map.g2o')[0])
+        now, then = backend.snapshot(), before.snapshot()
+        assert_array_equal(now.graph.robot, then.graph.robot)
+        assert_array_equal(now.graph.predecessor, then.graph.predecessor)
+        assert_allclose(now.poses, then.poses, atol=1e-9)
+        for robot in (0, 1):
+            assert_allclose(now.poses_in_map(robot)[1], then.poses_in_map(robot)[1], atol=1e-9)
+        assert_array_equal(now.loop_robots[0], then.loop_robots[0])
+        assert_array_equal(now.loop_states().state, then.loop_states().state)
+    assert now.graph.n_poses == 120
+
+
+def test_a_robot_comes_late_and_may_be_any(tmp_path):
+    """The second one alone, too: what the map is of is said by its number."""
+    team, backend = Team(lies=0, n=80, edges=240), Backend(EVERY)
+    for k in range(40, 80):
+        backend.add_odometry(team.sample(k), 1)
+    backend.settle()
+    assert backend.robot() is None and backend.robot(1) is not None
+    save_map(tmp_path / 'map.g2o', backend.saved())
+    backend = Backend(EVERY)
+    backend.restore(load_map(tmp_path / 'map.g2o')[0])
+    assert (backend.snapshot().graph.robot == 1).all()
+    for k in range(40):
+        backend.add_odometry(team.sample(k), 0)
+    for _, _, loop in team.loops():
+        backend.add_loop(loop)
+    backend.settle()
+    now = backend.snapshot()
+    assert backend.robot(0).joined and now.robot_maps[1].joined
+    poses = now.poses_in_map(0)[1]
+    assert_allclose(poses[0], [0.0, 0.0, 0.0], atol=1e-12)
+    for robot in (0, 1):
+        truth = se2.between(np.tile(team.truth[:1], (40, 1)), team.truth[team.robot == robot])
+        assert np.abs(now.poses_in_map(robot)[1] - truth)[:, :2].max() < 0.7
+
+
+def test_a_reset_by_one_robot_is_one_for_all():
+    reset = BackendOptions.from_mapping({'on_time_jump': 'reset'})
+    team, backend = Team(n=40, edges=60, lies=0), Backend(reset)
+    for k in range(20):
+        backend.add_odometry(team.sample(k), 0)
+        backend.add_odometry(team.sample(20 + k), 1)
+    backend.settle()
+    for k in range(5):  # its clock was set back
+        backend.add_odometry(team.sample(k), 0)
+    now = backend.snapshot()
+    assert set(now.graph.robot.tolist()) == {0} and len(now.poses) == now.graph.n_poses < 10
+    for k in range(15, 20):
+        backend.add_odometry(replace(team.sample(20 + k), stamp=seconds(40 + k)), 1)
+    backend.settle()
+    now = backend.snapshot()
+    assert set(now.graph.robot.tolist()) == {0, 1}
+    # Its first keyframe is where its odometry has it.
+    keyframes, poses = now.poses_in_map(1)
+    assert_allclose(poses[0], now.odometry[keyframes[0]], atol=1e-12)
+
+
+@pytest.mark.parametrize('robot', [-1, 'r1', None, 0.5])
+def test_no_number_of_a_robot(robot):
+    team = Team(n=4, edges=4, lies=0)
+    with pytest.raises(OptionError, match='the robot is'):
+        Backend(EVERY).add_odometry(team.sample(0), robot)
