@@ -102,10 +102,6 @@ def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphReco
                           else value for name, value in report.items()}))
     elif not arguments.quiet:
         _print_report(report, record, _cost_name(asked), outcome)
-        for sentence in judgement_sentences(record, judgement) if judgement else ():
-            print(sentence)
-        for sentence in known_false_sentence(record, judgement):
-            print(sentence)
     return ending
 
 
@@ -236,18 +232,13 @@ def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
         'slips': record.ids[factors.pairs[slips]].tolist(),
         'parts': outcome.parts,
         'drift': judgement.drift if judgement else 0.0,
-        'confidence': _known(judgement.confidence) if judgement else None,
+        'confidence': judgement.confidence if judgement else None,
         'doubts': [
             {'kind': doubt.kind, 'text': text,
              'loops': record.ids[factors.pairs[doubted_rows(doubt, factors)]].tolist()}
             for doubt, text in zip(doubts, doubt_reasons(doubts, record.ids, record.stamps),
                                    strict=True)],
     }
-
-
-def _known(number: float) -> float | None:
-    """Return a number, None where it is none: JSON has no NaN."""
-    return None if math.isnan(number) else number
 
 
 def _print_report(report: dict[str, object], record: GraphRecord, cost_name: str,
@@ -267,3 +258,7 @@ def _print_report(report: dict[str, object], record: GraphRecord, cost_name: str
     if 'ate' in report:
         print(f'position error {report["ate"]:.4f} m over {report["ate_poses"]:,} of '
               f'{counted(len(solution.poses), "pose")} (RMSE after rigid alignment)')
+    for sentence in judgement_sentences(record, outcome.judgement) if outcome.judgement else ():
+        print(sentence)
+    for sentence in known_false_sentence(record, outcome.judgement):
+        print(sentence)

@@ -154,7 +154,10 @@ def test_the_help_of_backend_lists_all_and_starts_nothing(ask):
         of_type[name] = before = before if kind == 'the same' else kind
     for name, kind in {**INPUTS, **OUTPUTS, **SERVICES}.items():
         assert of_type.pop(name) == kind.replace('/msg/', '/').replace('/srv/', '/')
-    assert of_type.keys() == {'/map_graph', '/pose_graph', '/tf'}
+    assert of_type.keys() == {
+        '/map_graph', '/pose_graph', '/slam_toolbox/pose_graph', '/slam_toolbox/new_node_event',
+        '/cslam/keyframe_odom', '/cslam/intra_robot_loop_closure',
+        '/cslam/inter_robot_loop_closure', '/tf'}
     for name, (default, unit, _) in PARAMETERS.items():
         shown = str(default).lower() if isinstance(default, bool) else repr(default)
         assert f'\n  {name}: {shown}\n' in text and (f'[{unit}]' in text or not unit)

@@ -150,7 +150,8 @@ def solve(
 def _robust_map(graph: FactorGraph, asked: SolveOptions, minimiser: '_Minimiser',
                 on_round: OnRound, ids: Indices) -> tuple[RobustMap | None, str]:
     """Return the robust map; where nobody insists on one and there is none, None and why."""
-    unjudged, gaps = '', odometry_gaps(graph)
+    # No odometry leads to a robot's first keyframe, so that is no gap.
+    unjudged, gaps = '', np.setdiff1d(odometry_gaps(graph), graph.firsts - 1)
     if asked.robust is None and len(gaps) > _MOST_GAPS * (graph.n_poses - 1):
         unjudged = (f'no edge between the consecutive vertices {ids[gaps[0]]} and '
                     f'{ids[gaps[0] + 1]}, so no chain of odometry to judge loops by')

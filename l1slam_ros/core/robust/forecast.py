@@ -25,6 +25,8 @@ from l1slam_ros.core.geometry.noise import Mask
 _WEIGHTS = np.array([-5.44, 3.54, 1.01, 1.09, 0.70, 1.55])
 # [sigmas] A loop left out lies near below this; they are many above this share of the accepted.
 _NEAR, _MANY = 10.0, 0.1
+# From here on it is no reason to doubt a map that most of its loops are left out.
+CONFIDENT = 0.9
 
 
 def forecast(accepted: Mask, suspect: Mask, sigmas: Array, variance: float, slips: int) -> float:

@@ -23,7 +23,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, lowest_of_components
-from l1slam_ros.core.robust.forecast import forecast
+from l1slam_ros.core.robust.forecast import CONFIDENT, forecast
 from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.robust.odometry.slips import JOINING, SPANNING, SURE, common_steps, spanning
 from l1slam_ros.core.robust.pairwise_consistency import (
@@ -48,8 +48,6 @@ MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP, UNFINISHED, NORM, FAILED,
 
 # Of fewer loops most may well be refused, and be of one place; most are more than half by some.
 _HANDFUL, _MOST = 5, 0.55
-# From here on it is no doubt that most are refused.
-_CONFIDENT = 0.9
 # Refused loops that agree count if they are so many for each accepted one across.
 _AGAINST = 0.25
 
@@ -85,9 +83,8 @@ class Judgement:
     of each in a map, in the same units; slips : (k,) the odometry factors that slipped, not
     accepted; doubts : reasons not to rely on the map; settled : no more is to be found out from
     the factors that are there; drift : by how much more each metre of the odometry turns than it
-    says [rad/m]; confidence : how often maps that looked like this one were right, NaN where
-    nothing is recorded of such; is_refusal_doubted : the loops that it refused may well be true,
-    so they are to be judged again when there are more.
+    says [rad/m]; confidence : see `forecast`, NaN where nothing is recorded of such maps;
+    is_refusal_doubted : refused loops may be true.
     """
 
     accepted: Mask
@@ -208,12 +205,11 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
     size, slip = growth.size, growth.cut & ~growth.gap
     accepted, sigmas = (growth.accepted & ~slip)[:size], np.sqrt(square[:size])
     loops, slips = growth.is_loop[:size], np.flatnonzero(slip[:size])
-    confidence = forecast(accepted[loops], suspect[:size][loops], sigmas[loops],
+    confidence = forecast(*(of[:size][loops] for of in (accepted, suspect, sigmas)),
                           growth.variance[1], len(slips))
     doubted = any(doubt.kind in (MOSTLY_REFUSED, OTHER_MAP) for doubt in reasons)
-    # A count alone was no reason: of such maps, one in a hundred was wrong.
-    reasons = tuple(doubt for doubt in reasons
-                    if doubt.kind != MOSTLY_REFUSED or confidence < _CONFIDENT)
+    if confidence >= CONFIDENT:
+        reasons = tuple(doubt for doubt in reasons if doubt.kind != MOSTLY_REFUSED)
     return Judgement(accepted, suspect[:size], sigmas, growth.variance, _noise(growth)[:size],
                      slips, reasons, settled, confidence=confidence, is_refusal_doubted=doubted)
 
