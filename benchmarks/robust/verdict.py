@@ -64,7 +64,7 @@ _EDGES = (0.0, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
 
 @dataclass(frozen=True)
 class Row:
-    """One run: terms (6,) of the forecast, whether the map was wrong, whether it was doubted."""
+    """One run: terms (4,) of the forecast, whether the map was wrong, whether it was doubted."""
 
     graph: str
     terms: Array
@@ -160,8 +160,7 @@ def _run(name: str, found: Place, condition: int, seed: int) -> Row:
     judgement, poses = outcome.judgement, outcome.solution.poses[:, :2]
     assert judgement is not None
     rows = ~graph.between.is_odometry
-    terms = terms_of(judgement.accepted[rows], judgement.suspect[rows], judgement.sigmas[rows],
-                     judgement.variance[1], len(judgement.slips))
+    terms = terms_of(judgement.accepted[rows], judgement.suspect[rows], judgement.variance[1])
     return Row(name, terms, _is_wrong(found, poses, best), bool(judgement.doubts))
 
 
@@ -208,9 +207,12 @@ def main() -> int:
     for name in given.only:
         for seed in range(given.seeds if name in MADE else 1):
             found = MADE[name](seed) if name in MADE else place(given.datasets, name)
-            for condition, (change, amounts, _, _) in enumerate(CONDITIONS):
+            for condition, (change, amounts, _, share) in enumerate(CONDITIONS):
                 # Two steps less leave a lap in two parts.
                 if change == 'slip' and amounts[1] == 2 and name in ('ring', 'tails'):
+                    continue
+                # Takes minutes.
+                if share == 0.9 and name == 'bicocca25b':
                     continue
                 report_progress(f'{name} seed {seed}: {CONDITIONS[condition]}')
                 rows.append(_run(name, found, condition, seed))

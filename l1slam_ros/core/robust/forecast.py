@@ -9,9 +9,9 @@
 """
 How often maps that looked like this one were right: a forecast with a record.
 
-In: what is known at the end of a judgement. Out: a share of 1. It is a logistic regression of five
-terms on what became of made and of recorded graphs with lies; `benchmarks/robust/verdict.py` makes
-the graphs, fits the weights on half of them and counts on the other half how often it was right.
+In: what is known at the end of a judgement. Out: a share of 1. It is a logistic regression of
+three terms on what became of made and of recorded graphs with lies: `benchmarks/robust/verdict.py`
+makes the graphs, fits the weights on half of them and counts on the other half what was right.
 """
 
 import numpy as np
@@ -20,37 +20,28 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
 
 # Of a map with no loop left out; then for the share of loops that is left out, each power of ten
-# by which loops are noisier than stated, the share that is suspect, each slip, and where so many
-# of those left out lie near that they may be true.
-_WEIGHTS = np.array([-5.44, 3.54, 1.01, 1.09, 0.70, 1.55])
-# [sigmas] A loop left out lies near below this; they are many above this share of the accepted.
-_NEAR, _MANY = 10.0, 0.1
+# by which the variance of loops is larger than stated, and the share that is suspect.
+_WEIGHTS = np.array([-5.16, 3.75, 0.90, 1.67])
 # From here on it is no reason to doubt a map that most of its loops are left out.
 CONFIDENT = 0.9
 
 
-def forecast(accepted: Mask, suspect: Mask, sigmas: Array, variance: float, slips: int) -> float:
+def forecast(accepted: Mask, suspect: Mask, variance: float) -> float:
     """
     Return how often such maps were right; NaN without loops, of which nothing is recorded.
 
     Parameters
     ----------
-    accepted, suspect, sigmas : (k,) of each loop, as a judgement has them
+    accepted, suspect : (k,) of each loop, as a judgement has them
     variance : of loops as it was found, in units of what they state
-    slips : how many odometry factors were left out
 
     """
     if not len(accepted):
         return float('nan')
-    terms = terms_of(accepted, suspect, sigmas, variance, slips)
-    return float(1 / (1 + np.exp(_WEIGHTS @ terms)))
+    return float(1 / (1 + np.exp(_WEIGHTS @ terms_of(accepted, suspect, variance))))
 
 
-def terms_of(accepted: Mask, suspect: Mask, sigmas: Array, variance: float, slips: int) -> Array:
-    """Return what the weights are of, (6,); see `forecast`."""
-    left_out = ~accepted
-    near = np.count_nonzero(left_out & (sigmas < _NEAR))
-    are_many = near > _MANY * max(int(np.count_nonzero(accepted)), 1)
-    return np.array([
-        1.0, left_out.mean(), np.log10(max(variance, 1.0)), np.log1p(10 * suspect.mean()), slips,
-        are_many])
+def terms_of(accepted: Mask, suspect: Mask, variance: float) -> Array:
+    """Return what the weights are of, (4,); see `forecast`."""
+    return np.array([1.0, np.mean(~accepted), np.log10(max(variance, 1.0)),
+                     np.log1p(10 * np.mean(suspect))])

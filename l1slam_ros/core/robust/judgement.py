@@ -205,8 +205,7 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
     size, slip = growth.size, growth.cut & ~growth.gap
     accepted, sigmas = (growth.accepted & ~slip)[:size], np.sqrt(square[:size])
     loops, slips = growth.is_loop[:size], np.flatnonzero(slip[:size])
-    confidence = forecast(accepted[loops], suspect[:size][loops], sigmas[loops],
-                          growth.variance[1], len(slips))
+    confidence = forecast(accepted[loops], suspect[:size][loops], growth.variance[1])
     doubted = any(doubt.kind in (MOSTLY_REFUSED, OTHER_MAP) for doubt in reasons)
     if confidence >= CONFIDENT:
         reasons = tuple(doubt for doubt in reasons if doubt.kind != MOSTLY_REFUSED)
