@@ -101,4 +101,4 @@ def test_another_publisher_makes_a_small_jump_a_restart(bench, capfd, restarts):
         assert 'a new part of the map begins' in told[0]
         b.until(lambda: b.status()[2].get('odometry.new_part') == '1', 'diagnostics say so')
         level, sentence, _ = b.status()
-        assert level == DiagnosticStatus.WARN and sentence.endswith('last minute: 1 new_part')
+        assert level == DiagnosticStatus.WARN and 'last minute: 1 new_part' in sentence
