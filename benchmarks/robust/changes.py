@@ -141,6 +141,14 @@ def _odometry(place: Place, rng: np.random.Generator, times: float) -> Changed:
     return _true(_with(place.graph, measurement))
 
 
+def _drift(place: Place, rng: np.random.Generator, drift: float) -> Changed:
+    """Let the odometry turn by so much more on each metre [rad/m]; the map is that without."""
+    factors, measurement = place.graph.between, place.graph.between.measurement.copy()
+    rows = factors.is_odometry
+    measurement[rows, 2] += drift * np.linalg.norm(measurement[rows, :2], axis=1)
+    return Changed(_with(place.graph, measurement), place.graph)
+
+
 def _information(place: Place, rng: np.random.Generator, part: str, times: float) -> Changed:
     """State the noise of the odometry, or that of the loops, wrong."""
     is_odometry = place.graph.between.is_odometry
@@ -172,7 +180,7 @@ def _apart(place: Place, rng: np.random.Generator) -> Changed:
 
 CHANGES: dict[str, Callable[..., Changed]] = {
     'thinned': lambda place, rng, part: _true(_part_of_loops(place, part, rng)),
-    'heading': _heading, 'odometry': _odometry, 'slip': _slip,
+    'heading': _heading, 'odometry': _odometry, 'drift': _drift, 'slip': _slip,
     'aliased': _aliased,
     'aliased half': lambda place, rng, *amounts: _aliased(place, rng, *amounts, part=0.5),
     'half aliased': _half_aliased,

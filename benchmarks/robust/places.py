@@ -178,17 +178,23 @@ def _ring() -> Place:
     n, loops = 600, 20
     angle = 2 * np.pi * np.arange(n + loops) / n
     truth = np.stack((np.cos(angle), np.sin(angle), angle), axis=1) * [n / 6.3, n / 6.3, 1.0]
-    k, back = np.arange(n + loops - 1), np.arange(loops)
-    return place_of(RING, _measured(truth, np.concatenate((k, back)),
-                                    np.concatenate((k + 1, back + n))), None)
+    back, rng = np.arange(loops), np.random.default_rng(0)
+    sigma = np.broadcast_to([0.05, 0.05, 0.005], (n + 2 * loops - 1, 3))
+    return place_of(RING, measured(truth, back, back + n, sigma,
+                                   sigma * rng.standard_normal(sigma.shape)), None)
 
 
-def _measured(truth: Array, i: Indices, j: Indices) -> FactorGraph:
-    sigma, rng = np.array([0.05, 0.05, 0.005]), np.random.default_rng(0)
-    exact = se2.between(truth[i], truth[j])
+def measured(truth: Array, i: Indices, j: Indices, sigma: Array, noise: Array) -> FactorGraph:
+    """
+    Return the graph of a way, poses (n, 3), with loops from keyframes i to j, (l,).
+
+    sigma, noise : (n - 1 + l, 3) what each step, then each loop, states, and how far off it is
+    """
+    k = np.arange(len(truth) - 1)
+    i, j = np.concatenate((k, i)), np.concatenate((k + 1, j))
     graph = FactorGraph(se2, len(truth))
-    graph.add_between(i, j, se2.retract(exact, sigma * rng.standard_normal(exact.shape)),
-                      np.broadcast_to(np.diag(sigma**-2), (len(i), 3, 3)))
+    graph.add_between(i, j, se2.retract(se2.between(truth[i], truth[j]), noise),
+                      np.eye(3) / sigma[:, :, None]**2)
     return graph
 
 

@@ -29,14 +29,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from measuring import report_progress
-from robust.changes import changed, information_of
-from robust.places import Place, error_by_time, place, place_of
+from robust.changes import changed
+from robust.places import Place, error_by_time, measured, place, place_of
 from scipy.optimize import minimize
 
-from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
 from l1slam_ros.core.robust.forecast import terms_of
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
@@ -44,7 +42,7 @@ from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 FIT = ('world', 'sparse', 'intel', 'ring', 'tails')
 HELD = ('kitti_00', 'corridor', 'wide', 'fr079', 'manhattan3500', 'bicocca25b')
-# What is changed, by `changes.CHANGES` or 'drift', with its amounts; the lies, and their share.
+# What is changed, by `changes.CHANGES`, with its amounts; the lies, and their share.
 CONDITIONS: tuple[tuple[str, tuple[float | str, ...], str, float], ...] = (
     ('', (), '', 0.0), *(('', (), 'random', share) for share in (0.3, 0.5, 0.7, 0.9)),
     *(('', (), 'identity', share) for share in (0.5, 0.9)),
@@ -102,16 +100,12 @@ def _corridor(seed: int, tails: bool = False) -> Place:
 def _measured(truth: Array, i: Array, j: Array, step: tuple[float, ...], loop: tuple[float, ...],
               rng: np.random.Generator, tails: bool) -> Place:
     """Return what is measured of a truth (n, 3); tails: of loops with two degrees of freedom."""
-    n, k = len(truth), np.arange(len(truth) - 1)
-    sigma = np.concatenate((np.tile(step, (n - 1, 1)), np.tile(loop, (len(i), 1))))
-    i, j = np.concatenate((k, i)), np.concatenate((k + 1, j))
+    sigma = np.concatenate((np.tile(step, (len(truth) - 1, 1)), np.tile(loop, (len(i), 1))))
     noise = sigma * rng.standard_normal(sigma.shape)
     if tails:
-        noise[n - 1:] *= np.abs(rng.standard_t(2, (len(noise) - n + 1, 1)))
-    graph = FactorGraph(se2, n)
-    graph.add_between(i, j, se2.retract(se2.between(truth[i], truth[j]), noise),
-                      np.eye(3) / sigma[:, :, None]**2)
-    return place_of('made', graph, None, error_by_time(truth[:, :2]))
+        noise[len(truth) - 1:] *= np.abs(rng.standard_t(2, (len(i), 1)))
+    return place_of('made', measured(truth, i, j, sigma, noise), None,
+                    error_by_time(truth[:, :2]))
 
 
 def _world(poses: int, loops: int, options: WorldOptions, seed: int) -> Place:
@@ -130,29 +124,16 @@ MADE: dict[str, Callable[[int], Place]] = {
     'tails': lambda seed: (_ring if seed % 2 else _corridor)(50 + seed, True)}
 
 
-def _drifting(graph: FactorGraph, drift: float) -> FactorGraph:
-    """Return a graph whose odometry turns by so much more on each metre [rad/m]."""
-    factors, measurement = graph.between, graph.between.measurement.copy()
-    rows = factors.is_odometry
-    measurement[rows, 2] += drift * np.linalg.norm(measurement[rows, :2], axis=1)
-    new = FactorGraph(graph.manifold, graph.n_poses)
-    new.add_between(factors.i, factors.j, measurement, information_of(graph))
-    return new
-
-
 def _run(name: str, found: Place, condition: int, seed: int) -> Row:
     change, amounts, lies, share = CONDITIONS[condition]
     rng = np.random.default_rng((seed, condition, (FIT + HELD).index(name)))
-    if change == 'drift':
-        graph, clean, extra = _drifting(found.graph, float(amounts[0])), found.graph, None
-    else:
-        what = changed(found, change, amounts, rng)
-        graph, clean, extra = what.graph, what.clean, what.lies
+    what = changed(found, change, amounts, rng)
+    graph, clean = what.graph, what.clean
     if lies:
         count = np.count_nonzero(~graph.between.is_odometry) * share / (1 - share)
         graph = insert_loops(graph, FALSE_LOOPS[lies](graph, found.best, round(count), rng))
-    if extra is not None:
-        graph = insert_loops(graph, extra)
+    if what.lies is not None:
+        graph = insert_loops(graph, what.lies)
     if found.is_false.any():
         clean = found.graph.subset(~found.is_false)
     best = solve(clean, None, SolveOptions(robust=False)).solution.poses[:, :2]
@@ -218,8 +199,8 @@ def main() -> int:
                 rows.append(_run(name, found, condition, seed))
     weights = _fitted([row for row in rows if row.graph in FIT] or rows)
     print('weights:', ', '.join(f'{weight:.2f}' for weight in weights))
-    for half in ('FIT', 'HELD'):
-        if among := [row for row in rows if row.graph in globals()[half]]:
+    for half, graphs in {'FIT': FIT, 'HELD': HELD}.items():
+        if among := [row for row in rows if row.graph in graphs]:
             _tell(half, among, weights)
     return 0
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from l1slam_ros.core.errors import L1SlamError, OptionError, optional_libraries
-from l1slam_ros.fleet.isolated import Job, failed
+from l1slam_ros.fleet.isolated import TOOK_NOTHING, Job, failed
 from l1slam_ros.fleet.starter import Values
 
 if TYPE_CHECKING:
@@ -145,5 +145,5 @@ def _lost(job: Job, error: BaseException, attempts: int) -> Values:
     """Return the row of a job that no worker brought to an end."""
     # Dask's own sentence names places and times, which differ from run to run.
     row = failed(None, f'no worker could do it, {attempts} times: {type(error).__name__}')
-    return {'row': {'recording': job.name, **row}, 'attempts': attempts, 'seconds': 0.0,
-            'cpu_seconds': 0.0, 'peak_bytes': 0, 'worker': os.uname().nodename}
+    return {'row': {'recording': job.name, **row}, 'attempts': attempts, **TOOK_NOTHING,
+            'worker': os.uname().nodename}

@@ -31,6 +31,8 @@ _ENVIRONMENT = {**dict.fromkeys(
     'PYTHONHASHSEED': '0'}
 _TIME_IS_UP = -signal.SIGXCPU, -signal.SIGALRM
 _STARTERS = threading.local()
+# Of a job that was not brought to an end, nobody knows what it took.
+TOOK_NOTHING: Values = {'seconds': 0.0, 'cpu_seconds': 0.0, 'peak_bytes': 0}
 
 
 @dataclass(frozen=True)
@@ -143,8 +145,7 @@ def _attempt(begin: Callable[[], None], job: Job, limits: Limits) -> Values:
     except _DiedError:
         del _STARTERS.of[begin]
         starter.close()
-        return {'answer': None, 'status': -signal.SIGKILL, 'seconds': 0.0, 'cpu_seconds': 0.0,
-                'peak_bytes': 0}
+        return {'answer': None, 'status': -signal.SIGKILL, **TOOK_NOTHING}
 
 
 def _reason(status: int, limits: Limits, attempts: int) -> str:

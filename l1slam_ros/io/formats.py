@@ -50,7 +50,7 @@ from l1slam_ros.io.ours import refuse_others
 from l1slam_ros.io.trajectory import write_tum
 
 if TYPE_CHECKING:
-    from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
+    from l1slam_ros.core.online.options import GraphBuilderOptions
 
 # By the suffix of a file. A reader takes the path and what the rotation block of the information
 # is of, and raises FileError.

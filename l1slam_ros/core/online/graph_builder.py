@@ -25,7 +25,7 @@ from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.online.loops.loop_factors import LoopFactors
 from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame, OdometryStream
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
-from l1slam_ros.core.online.options import GraphBuilderOptions as GraphBuilderOptions
+from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.core.online.robot_odometry import GrowingGraph, RobotOdometry
 
 
@@ -117,7 +117,7 @@ class GraphBuilder:
         return self._shared.tracks.keyframe_poses
 
     def set_options(self, options: GraphBuilderOptions) -> None:
-        """Go on by other options; what is in the graph stays."""
+        """Use other options from now on; what is in the graph stays."""
         self._shared.options = options
 
     def add_odometry(self, sample: OdometrySample, robot: int = 0) -> bool:
@@ -156,7 +156,7 @@ class GraphBuilder:
             first.robot, tuple(others), *whose)
 
     def restore(self, state: BuilderState) -> None:
-        """Go on where a run ended; odometry that begins elsewhere begins a part there."""
+        """Continue where a run ended; odometry that does not continue there begins a new part."""
         self._shared.begin(state.graph)
         # In a file a loop across a gap looks like odometry.
         steps = self.graph.between.step_to

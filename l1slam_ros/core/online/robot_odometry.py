@@ -65,7 +65,7 @@ class GrowingGraph:
             begin()
 
     def forget(self) -> None:
-        """Begin anew; loops that came may yet find odometry of their times."""
+        """Begin anew; loops that wait are kept, since odometry of their times may still come."""
         self.begin(FactorGraph(self.graph.manifold))
         self.loops.forget()
 
@@ -125,7 +125,7 @@ class RobotOdometry:
             self._add(point)
             used = True
         track = self.track  # a new one, maybe
-        # Loops that are due become factors by the samples as they came.
+        # Loops that are due are carried by the samples as they came, so thinning waits for them.
         if track.may_be_thinned and not self._shared.loops.waiting.is_due(
                 self._robot, track.last):
             track.thin()
@@ -212,7 +212,7 @@ class RobotOdometry:
             unseen = point.unseen, turned
         if point.unsure:
             self._shared.notes.tell('unsure', f'{point.unsure}; it counts as uncertain by '
-                            f'{point.unseen:.3g} m and {turned:.2g} rad')
+                                    f'{point.unseen:.3g} m and {turned:.2g} rad')
         motion = self._motion.step(point.sample, pose, self._shared.options.keyframe,
                                    self._shared.options.odometry, self._shared.verbatim, unseen)
         self.track.append(point.stamp, pose, motion is not None, point.reach)

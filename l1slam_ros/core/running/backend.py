@@ -29,8 +29,9 @@ from l1slam_ros.core.graph.measurements import (
     require_sound,
 )
 from l1slam_ros.core.names import OF_THE_NODE
-from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.odometry.odometry_stream import BaseFrame
+from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.running.improve import Improvement
 from l1slam_ros.core.running.keeper.keeper import Keeper, Revisions
@@ -89,7 +90,7 @@ class Backend:
     options : as they are now
     base_frame, base_frame_of : of the first robot, and of one by its number, as far as they are
         known; no reset forgets them
-    calm : what goes on behind waits for its end, `with backend.calm:`
+    calm : background work pauses inside `with backend.calm:`
 
     Raises
     ------

@@ -120,6 +120,11 @@ def by_robot(problem: Problem) -> tuple[Problem, Indices]:
                    pattern=None), order
 
 
+def as_numbered(order: Indices, judgement: Judgement, poses: Array) -> tuple[Judgement, Array]:
+    """Return what was found of a problem `by_robot`, by the numbers that keyframes had before."""
+    return judgement.renumbered(order), poses[np.argsort(order)]
+
+
 def _tied(graph: FactorGraph, poses: Array, firsts: Indices) -> FactorGraph:
     """Return the graph with the first keyframes of parts tied to others; poses : (n, p)."""
     manifold, d = graph.manifold, graph.manifold.TANGENT_SIZE

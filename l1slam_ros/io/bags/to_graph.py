@@ -28,11 +28,12 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
 from l1slam_ros.core.graph.measurements import LoopClosure
-from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.keyframes import (
     KeyframeOptions,
     OdometryOptions,
 )
+from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.io.bags.damaged.walk import BagMessage
 from l1slam_ros.io.bags.foreign_topics import Foreign, foreign_graph
 from l1slam_ros.io.bags.from_graph import (

@@ -29,7 +29,7 @@ _LEAST = 1e-30
 
 def roots_of(nodes: list[Node], manifold: Manifold) -> tuple[Array, list[str]]:
     """
-    Return the roots of information (m, d, d) of covariances, and a sentence on what is mended.
+    Return the roots of information (m, d, d) of covariances, and a sentence on the indefinite.
 
     Raises
     ------

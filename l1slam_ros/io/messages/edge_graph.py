@@ -13,6 +13,7 @@ The transform of an edge is the pose of its second keyframe, seen from the first
 front end publishes are its own map: they are never read, for they would be taken for odometry.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -23,13 +24,13 @@ from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import root_of_inverse, usable
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, in_order
-from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
 from l1slam_ros.core.online.keyframes import (
     OdometryOptions,
     diagonal_covariance,
     reduced_covariance,
 )
-from l1slam_ros.io.graphs.robots import robots_of
+from l1slam_ros.core.online.options import GraphBuilderOptions
+from l1slam_ros.io.graphs.robots import keyframes_of, robots_of
 from l1slam_ros.io.messages.conversion import checked_pose3
 
 
@@ -54,7 +55,7 @@ class Told(NamedTuple):
     covariance: Array
 
 
-class EdgeGraph:
+class EdgeGraph(ABC):
     """A graph, message by message; each edge is taken once."""
 
     def __init__(self) -> None:
@@ -77,9 +78,9 @@ class EdgeGraph:
         except MessageError as error:
             yield error
 
+    @abstractmethod
     def _told(self, message: Any, topic: str) -> Iterator[Told]:
         """Yield the edges in a message, and note the times of keyframes."""
-        raise NotImplementedError
 
     def _taken(self, told: Told) -> Iterator[LoopClosure | MessageError]:
         key = (min(told.i, told.j), max(told.i, told.j), told.is_loop)
@@ -129,9 +130,7 @@ class EdgeGraph:
             manifold, options.loop.sigma_translation, options.loop.sigma_rotation),
             _of_motion(manifold, measured, options.odometry))
         covariance = np.where(usable(covariance)[:, None, None], covariance, model)
-        graph = FactorGraph(manifold)
-        for robot, count in enumerate(np.unique(robots_of(ids), return_counts=True)[1].tolist()):
-            graph.add_poses(count, robot)
+        graph = keyframes_of(ids, manifold)
         graph.append_between(ends[:, 0], ends[:, 1], measured, root_of_inverse(covariance))
         return graph, ids
 

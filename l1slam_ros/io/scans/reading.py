@@ -56,7 +56,7 @@ def read_log(path: Path, odom_topic: str, scan_topic: str | None) -> LaserLog:
     """
     if is_log(path):
         return read_carmen(path)
-    elif is_bag(path) and scan_topic:
+    if is_bag(path) and scan_topic:
         from l1slam_ros.io.bags.reader import bag_summary
         from l1slam_ros.io.scans.bag_scans import read_bag_scans
 

@@ -36,9 +36,10 @@ from scipy.spatial.transform import Rotation
 from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.graph.factor_graph import WORLD
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopOptions
+from l1slam_ros.core.online.options import GraphBuilderOptions
 
 EVERY = GraphBuilderOptions(keyframe=KeyframeOptions(0.0, 0.0, 0.0))
 DEFAULTS = GraphBuilderOptions()

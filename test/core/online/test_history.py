@@ -16,10 +16,11 @@ from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.geometry.noise import LEAST_VARIANCE
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.online import keyframes
-from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
 from l1slam_ros.core.online.loops.loop_factors import LoopOptions
 from l1slam_ros.core.online.odometry.odometry_track import OdometryTrack
+from l1slam_ros.core.online.options import GraphBuilderOptions
 
 N = 6000
 MISSED = LEAST_VARIANCE**0.5

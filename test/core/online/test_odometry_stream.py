@@ -30,8 +30,9 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import FASTEST, LONGEST_PAUSE
 from l1slam_ros.core.graph.parts import bridged
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.io.bags.from_graph import write_graph_bag
 from l1slam_ros.io.bags.to_graph import DEFAULT_TOPICS, graph_from_bag
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file

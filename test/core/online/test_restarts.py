@@ -21,8 +21,9 @@ from problems import EVERY, hear, odometry, straight
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.noise import covariance_of
-from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.keyframes import OdometryOptions
+from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.core.running.backend import Backend, BackendOptions
 from l1slam_ros.core.running.snapshot import ACCEPTED, REJECTED
 

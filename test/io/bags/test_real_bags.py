@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bags import KINDS, TYPES, mcap_file, recording_of, rosbag2_directory, write_world
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.core.online.graph_builder import GraphBuilderOptions
+from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.io.bags.reader import read_messages, read_raw
 from l1slam_ros.io.bags.to_graph import Topics
 from l1slam_ros.io.formats import read_input

@@ -19,7 +19,8 @@ from bags import TYPES
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import LoopClosure
-from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilder
+from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.io.bags.to_graph import DEFAULT_TOPICS, graph_from_bag
 from l1slam_ros.io.messages.conversion import reference_frame_id
 

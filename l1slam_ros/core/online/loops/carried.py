@@ -17,7 +17,7 @@ from l1slam_ros.core.online.loops.waiting_loops import WaitingLoop
 
 
 def carried(manifold: Manifold, used: list[WaitingLoop], to_reference: Array,
-             to_keyframe: Array, unseen: Array) -> tuple[Array, Array, Mask]:
+            to_keyframe: Array, unseen: Array) -> tuple[Array, Array, Mask]:
     """
     Return what loops say between keyframes near their times.
 

@@ -73,7 +73,7 @@ class LoopFactors:
 
     def forget(self) -> None:
         """Begin with an empty graph; loops that wait may yet find odometry of their times."""
-        # The clock that they came by was none, or goes otherwise now.
+        # Their times of arrival are of another clock.
         self.waiting.forget_clocks()
         # The loops that came, by their identities; and their rows once they are factors.
         self._seen = {one.key for one in self.waiting.all() if not one.loop.struck}

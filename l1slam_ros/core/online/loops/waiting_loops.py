@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Loop closures that wait for odometry to reach their times, or for their time to be over.
+Loop closures that wait for odometry to reach their times, until they expire.
 
 A loop between two robots waits first for the odometry of the one that it is a pose of, then for
 that of the other, on the clock of each.
@@ -149,7 +149,7 @@ class WaitingLoops:
         return early
 
     def begin_anew(self, time: Callable[[int], int], robot: int) -> None:
-        """Look anew what stamps of a robot mean, `time` of a stamp: its odometry went back."""
+        """Interpret the stamps of a robot again by `time`, after its odometry went back."""
         def how(one: WaitingLoop) -> WaitingLoop:
             (begins, ends), (first, last) = one.loop.robots, one.loop.stamps
             return replace(one, begin=time(first) if begins == robot else one.begin,

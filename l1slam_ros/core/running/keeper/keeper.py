@@ -32,7 +32,8 @@ from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import BetweenFactors
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
-from l1slam_ros.core.online.graph_builder import GraphBuilder, GraphBuilderOptions
+from l1slam_ros.core.online.graph_builder import GraphBuilder
+from l1slam_ros.core.online.options import GraphBuilderOptions
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.improve import Improvement
 from l1slam_ros.core.running.keeper.schedule import Size
@@ -320,7 +321,7 @@ class Keeper:
                 self._solver.outer_tolerance, time.monotonic())
             self._front = front
             self._move(ends)
-        # To give its memory back takes long: it shall not be an update that does so last.
+        # To free its memory takes long, so an update must not hold the last reference.
         with self._front_lock:
             pass
         del former

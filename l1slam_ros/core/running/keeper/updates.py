@@ -24,8 +24,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
-
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.running.improve import Check, Improvement, front_of, optimise
 from l1slam_ros.core.running.keeper.keeper import Keeper
@@ -39,7 +37,7 @@ from l1slam_ros.core.running.keeper.workers import (
     Workers,
     until,
 )
-from l1slam_ros.core.running.problem import as_one, by_robot
+from l1slam_ros.core.running.problem import as_numbered, as_one, by_robot
 
 # [s] The longest time an update takes in new factors, whatever the budget.
 _LEAST_TIME = 0.02
@@ -155,12 +153,11 @@ class Updates:
         check = self.calm.kept(until(
             lambda: bool(self._urgent) or stopped() or keeper.state.began != began))
         improvement = optimise(as_one(turned), keeper.solver, check)
-        improvement = replace(
-            improvement, poses=improvement.poses[np.argsort(order)],
-            judgement=improvement.judgement.renumbered(order))
+        judgement, poses = as_numbered(order, improvement.judgement, improvement.poses)
+        improvement = replace(improvement, poses=poses, judgement=judgement)
         problem = as_one(whole)
         check()
-        front = front_of(replace(problem, judgement=improvement.judgement), improvement.poses,
+        front = front_of(replace(problem, judgement=judgement), poses,
                          len(whole.graph.between), check)
         improvement = improvement.of_all(whole)
         take_judgement(keeper, now, improvement.judgement, improvement.poses, True)

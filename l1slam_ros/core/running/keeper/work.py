@@ -26,7 +26,7 @@ from l1slam_ros.core.running.improve import Check, front_of, improve, one_round
 from l1slam_ros.core.running.keeper.keeper import Keeper
 from l1slam_ros.core.running.keeper.schedule import Moment, Work, is_late
 from l1slam_ros.core.running.keeper.workers import until
-from l1slam_ros.core.running.problem import as_one, by_robot
+from l1slam_ros.core.running.problem import as_numbered, as_one, by_robot
 from l1slam_ros.core.running.snapshot import Snapshot
 
 # [s] So long a map is improved, whatever the budget; of the clock a round may take some times as
@@ -85,8 +85,8 @@ def judge_all(keeper: Keeper, anew: bool, idle: bool, check: Check) -> None:
     judgement, l2_poses = (robust_solve(graph, check=alone, known=(known, poses)) if anew
                            else judge(graph, poses, known, np.inf, check))
     check()
-    judgement = judgement.of_all(turned.graph).renumbered(order)
-    take_judgement(keeper, now, judgement, l2_poses[np.argsort(order)], anew)
+    take_judgement(keeper, now, *as_numbered(
+        order, judgement.of_all(turned.graph), l2_poses), anew)
 
 
 def compare_norms(keeper: Keeper, check: Check) -> None:
