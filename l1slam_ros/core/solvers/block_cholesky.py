@@ -249,8 +249,8 @@ class BlockCholesky:
         """
         layout = self._last
         return kernels.border.climb(
-            layout.panels, *layout.shape, self.pattern.owner, self.pattern.position[keyframe],
-            len(layout.size))
+            layout.panels, *layout.shape, self.pattern.owner,
+            int(self.pattern.position[keyframe]), len(layout.size))
 
 
 def _at_once(share: Callable[[int], Result]) -> tuple[Result, Result]:
