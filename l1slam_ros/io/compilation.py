@@ -30,7 +30,6 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from pathlib import Path
 
 from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Manifold

@@ -62,6 +62,7 @@ class Loop:
         self._dispatcher: Any = None
 
     def __call__(self, *arguments: Any) -> Any:
+        """Call what was compiled for arguments of these types."""
         tried = self.linked
         for wanted, function in tried:
             if len(wanted) != len(arguments):
@@ -92,7 +93,8 @@ class Loop:
         with link.lock:
             if space not in self._sought:
                 takes = self.takes_in_space if space else self.takes
-                found = link.link(self.py_func.__module__, self.__name__, space) if takes else []
+                of = self.py_func
+                found = link.link(of.__module__, of.__name__, space) if takes else []
                 self.linked = (*self.linked, *found) if found else self.linked
                 self._sought[space] = len(found) == len(takes)
         return self._sought[space]
@@ -154,7 +156,7 @@ def keep(step: str) -> list[str]:
             dispatcher._cache.load_overload = lambda *_: None
             versions = [_compile(dispatcher, one) for one in takes]
             folders.add(dispatcher.stats.cache_path)
-            kept[kernel.__name__] = versions
+            kept[kernel.py_func.__name__] = versions
     beside = sorted(str(file) for folder in folders - {None}
                     for file in Path(folder).glob(f'{name}.*.nbi'))
     if not beside:

@@ -73,19 +73,21 @@ def write(step: str, loops: dict[str, list[Kept]], beside: list[str]) -> str:
     folder = next(filter(is_writable, folders()))
     with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
         file.write(hashlib.sha256(rest).hexdigest().encode() + rest)
+    os.chmod(file.name, 0o644)  # others may read what root has compiled
     path = folder / file_name(step)
     os.replace(file.name, path)
     return str(path)
 
 
 def read(step: str) -> dict[str, list[Kept]]:
-    """Return the loops that are kept of a step, by their names; of a file that is not sound: {}."""
+    """Return the loops that are kept of a step, by their names; none of a file not sound."""
     _, head, codes = _sound(step)
-    loops, begin = {}, 0
+    loops: dict[str, list[Kept]] = {}
+    begin = 0
     for name, versions in head['loops'].items():
-        loops[name] = []
         for *facts, size in versions:
-            loops[name].append(Kept(*facts, codes[begin:begin + size]))
+            kept = Kept._make([*facts, codes[begin:begin + size]])
+            loops.setdefault(name, []).append(kept)
             begin += size
     return loops
 
@@ -147,19 +149,22 @@ def key(step: str) -> str:
     return hashlib.sha256(repr(facts).encode()).hexdigest()
 
 
-@functools.cache
 def surroundings() -> str:
     """Return all but the sources that compiled loops depend on; imports neither numba nor LLVM."""
+    settings = sorted(pair for pair in os.environ.items() if pair[0].startswith('NUMBA_'))
+    own = Path('.numba_config.yaml')
+    return repr((settings, own.read_bytes() if own.exists() else b'', _machine_and_libraries()))
+
+
+@functools.cache
+def _machine_and_libraries() -> str:
     parts = [folder / part for name in ('numba', 'llvmlite', 'numpy')
              if (folder := folder_of(name)) for part in ('__init__.py', '_version.py')]
     parts += [path for path in helpers().values() if path]
     parts += sorted((folder_of('llvmlite') or KERNELS).glob('binding/libllvmlite*'))
     stats = [(str(path), stat.st_mtime_ns, stat.st_size)
              for path in parts if path.exists() for stat in [path.stat()]]
-    settings = sorted(pair for pair in os.environ.items() if pair[0].startswith('NUMBA_'))
-    own = Path('.numba_config.yaml')
-    return repr((sys.version, platform.machine(), np.__version__, _processor(), settings, stats,
-                 own.read_bytes() if own.exists() else b''))
+    return repr((sys.version, platform.machine(), np.__version__, _processor(), stats))
 
 
 def helpers() -> dict[str, Path | None]:
