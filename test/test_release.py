@@ -24,7 +24,7 @@ from headers import HEADER, files_of_python
 from l1slam_ros.core.errors import MissingError, optional_libraries
 
 ROOT = Path(__file__).parents[1]
-PATIENCE = 120.0  # [s] the solver can have to be compiled first
+PATIENCE = 300  # [s] where nothing can be kept, all is compiled first
 # Where each key of package.xml was looked up: ros/rosdistro, `rosdep/python.yaml`, a stored copy
 # (commit 000730d), and which package of Ubuntu it names for each release that has no line of its
 # own. A key that ends with -pip has a rule for pip alone, which bloom refuses.

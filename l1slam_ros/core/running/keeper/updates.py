@@ -111,7 +111,9 @@ class Updates:
         return state.account(size.loops, time.monotonic() - start)
 
     def _begin_due(self, idle: bool, budget: float, check: Check) -> bool:
-        """Start the work that is due; return whether any worker is busy."""
+        """Start the work that is due; return whether there is any, or was just now."""
+        # Asked before the state is read: work that ends in between makes other work due.
+        busy = self._workers.busy
         moment = Moment(time.monotonic(), idle, budget)
         state, _, size = self._keeper.look()
         make, judge = due(state, size, moment)
@@ -119,7 +121,7 @@ class Updates:
             if piece is not None:
                 worker.start(partial(
                     carry_out, self._keeper, piece, moment, self.calm.kept(check)))
-        return self._workers.busy
+        return busy or make is not None or judge is not None
 
     def _check(self, began: int, stopped: Stopped) -> Check:
         """Return a check that raises `Interrupted` where work for a map is not wanted any more."""
