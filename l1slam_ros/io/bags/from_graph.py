@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A graph as the messages of a bag, such that it can be had back exactly.
+A graph as the messages of a bag, from which exactly the same graph is read again.
 
     /odom            one nav_msgs/Odometry per keyframe: the odometry factors, chained
     /loop_closures   one geometry_msgs/PoseWithCovarianceStamped per other factor;
@@ -128,7 +128,7 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
 
 def _note(graph: FactorGraph, stamps: list[int]) -> dict[str, str]:
     """
-    Return what is noted of a graph in its bag.
+    Return the note on a graph that goes into the metadata of its bag.
 
     A graph may have loops that are equal in all, steps longer than a robot's, years between its
     keyframes, and variances of no measurement: each message is meant then, and the note says so.
