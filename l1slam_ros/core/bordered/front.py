@@ -51,8 +51,7 @@ _SURE = 1000.0
 # Rows of a border, and keyframes it touches, that one more update has the time and the memory for.
 # What comes then waits for the next map.
 _MOST_ROWS, _MOST_POINTS = 1800, 1400
-# What to do with a factor: accept it; skip it, for the map has it already or is to stay without
-# it; or gate it.
+# What to do with a factor: accept it; skip it, since the map has it or shall not have it; gate it.
 BELIEVE, SKIP, GATE = 1, 0, -1
 
 
@@ -185,7 +184,7 @@ class Front:
         return self._manifold.retract(self._first.view()[keyframes, L1], steps)
 
     def covariance(self, keyframe: int) -> Array:
-        """Return the covariance of a keyframe's step from the L2 map, (k, k)."""
+        """Return the covariance of a keyframe in the L2 map, (k, k)."""
         return self._systems[L2].covariance(max(keyframe - self._fixed, FIXED))
 
     def take(self, factors: BetweenFactors, what: Indices) -> list[Look]:

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What a graph builder has made of messages, as it is saved."""
+"""The state of a graph builder, as it is saved."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ from l1slam_ros.core.graph.parts import give_to
 @dataclass(frozen=True)
 class TrackEnd:
     """
-    Where the odometry of a robot has come to.
+    The end of the odometry of a robot.
 
     robot : its number; offset (1, p) : see `GraphBuilder`; end : stamp [ns] of the last sample,
     end_pose (1, p) and end_covariance (d, d) of the motion to it from the last keyframe
@@ -38,7 +38,7 @@ class TrackEnd:
 @dataclass(frozen=True)
 class BuilderState:
     """
-    What a graph builder has made of messages, for another to go on from.
+    The state of a graph builder, from which another one continues.
 
     graph : the factors; stamps (n,) [ns] and odometry (n, p) of the keyframes; offset, end,
     end_pose, end_covariance : of the first robot, see `TrackEnd`; loop_rows (k,),

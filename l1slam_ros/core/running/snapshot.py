@@ -53,7 +53,7 @@ class LoopStates:
 @dataclass(frozen=True)
 class SavedMap:
     """
-    All that another back end goes on from.
+    The map of a back end and its graph, from which another back end continues.
 
     judgement : of all factors; robust : loops were doubted; graph_began : names the graph in its
     back end, see `Revisions`; robots : their names by their numbers, as far as they have any
@@ -97,7 +97,7 @@ class Counts(NamedTuple):
 @dataclass(frozen=True)
 class Behind:
     """
-    What goes on behind updates.
+    The state of the background work.
 
     age : [s] of the map that was factored, NaN: there is none; rows : of loops that came since;
     loops : not judged yet; bound : a lower bound on the L1 cost of all maps of the accepted
@@ -125,7 +125,7 @@ class Behind:
 @dataclass(frozen=True)
 class Snapshot:
     """
-    What a back end knows.
+    A back end at one moment.
 
     state : of its map; graph : the factors so far; stamps (n,) [ns] and odometry (n, p) of the
     keyframes; map_to_odom : (1, p) of the first robot; loop_rows, loop_stamps, loop_robots : see

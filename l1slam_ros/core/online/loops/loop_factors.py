@@ -218,7 +218,7 @@ class LoopFactors:
 
     def _say(self, one: WaitingLoop, pair: tuple[int, int], graph: FactorGraph,
              came: int) -> None:
-        """Let what a person says of a loop count; came : how many loops have, with this one."""
+        """Apply a person's word, `trusted` or `struck`; came : how many loops came, with this."""
         loop = one.loop
         if loop.struck:
             self._struck.add(pair)
@@ -265,7 +265,7 @@ class LoopFactors:
 
     def _covariance(self, loop: LoopClosure, options: LoopOptions) -> Array | None:
         """
-        Return what a loop states, zeros for what it leaves unsaid, (1, d, d).
+        Return the covariance that a loop states, zeros for components it leaves unsaid, (1, d, d).
 
         Where that is no covariance, the model; there is none of absolute poses: None, refused.
         """

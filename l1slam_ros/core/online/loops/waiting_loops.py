@@ -27,7 +27,7 @@ from l1slam_ros.core.graph.measurements import LoopClosure
 @dataclass(frozen=True)
 class WaitingLoop:
     """
-    A loop, and what it says on the manifold.
+    A loop that waits, and its measurement on the manifold.
 
     begin, end : times [ns], what its stamps mean; arrivals : when it came, by the clocks of the
     robots of these; measurement : (1, p); covariance : (1, d, d), sound, zeros where it says
@@ -48,7 +48,7 @@ class WaitingLoop:
         return self.arrivals[1]
 
     def awaits(self, clocks: Mapping[int, int]) -> int | None:
-        """Return whose odometry has not come to its time; None: that of both has."""
+        """Return the robot whose odometry has not reached the loop's time; None: both have."""
         one, other = self.loop.robots
         if other not in clocks or clocks[other] < self.end:
             return other

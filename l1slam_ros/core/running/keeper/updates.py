@@ -7,14 +7,14 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Updates of a map: what has come is taken in at once, and workers are let begin what is due.
+Updates of a map: new factors are taken in at once, and workers begin the work that is due.
 
 In: a keeper, and calls of any threads. Out: the account of what an update did. The order of all
 that happens to a message is told in doc/how_a_message_becomes_a_map.md, step by step.
 
-One lock lets one thread at a time update the map, or solve it to the end. Who waits to have the
-map for itself is counted, and work that is under way makes way; a settle is work that somebody
-waits for, and makes way for what cannot wait alone: a process that is about to fork, or to end.
+One lock admits one thread at a time to update the map or to settle it. Threads that wait for the
+lock are counted, and background work ends early for them. A settle, for which a caller waits, ends
+early only for a process that is about to fork or to end.
 """
 
 import threading
