@@ -22,6 +22,7 @@ import numpy as np
 from l1slam_ros.core.bordered.front import View
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.parts import ends_before
 from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.map_state import MapState
@@ -181,13 +182,16 @@ class Snapshot:
         """
         Return poses (k, p), and behind them the other keyframes as they follow in others (n, p).
 
-        Each follows the last of its predecessors that is known, the first of a part the last
-        keyframe that is.
+        Each follows the last of its predecessors that is known; the first of a part the end of
+        the one of its robot before, or of none of its robot the last keyframe that is known.
         """
         manifold, known = self.graph.manifold, len(poses)
         if not known or known == len(others):
             return np.concatenate((poses, others[known:]))
-        before = np.where(self.graph.parent < np.arange(len(others)), self.graph.parent, known - 1)
+        before, firsts = self.graph.parent, self.graph.firsts
+        ends = ends_before(self.graph)
+        before[firsts] = np.where(
+            self.graph.robot[ends] == self.graph.robot[firsts], ends, known - 1)
         while (before[known:] >= known).any():
             before = np.where(before >= known, before[before], before)
         before = before[known:]
