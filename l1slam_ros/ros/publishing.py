@@ -94,7 +94,7 @@ class MapPublisher:
             before, after = (manifold.compose(transform, robot.odometry)
                              for transform in self._backend.moved(one.number))
             self._diagnostics.note_jump(manifold, before, after, one.prefix)
-        keyframes, poses, frame = np.arange(len(now.poses)), now.poses, self._frame
+        keyframes, poses, frame = np.arange(len(now.poses)), now.drawn, self._frame
         if one.name:
             keyframes, poses = now.poses_in_map(one.number)
             maps = now.robot_maps

@@ -152,7 +152,11 @@ class Snapshot:
 
     @cached_property
     def poses(self) -> Array:
-        """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
+        """
+        Return all keyframes in the frame of the graph, (n, p).
+
+        The optimised ones, then odometry from there.
+        """
         return self._followed(
             self.views[0].poses if self.views else self.state.optimised.poses, self.odometry)
 
@@ -172,7 +176,7 @@ class Snapshot:
 
     @property
     def drawn(self) -> Array:
-        """All keyframes as seen from the map of the first robot, (n, p)."""
+        """All keyframes as seen from the map of the first robot, (n, p), joined to it or not."""
         first = self.robot_maps.get(0)
         if first is None or first.turn is None or not first.joined:
             return self.poses
