@@ -57,7 +57,8 @@ class MapPublisher:
         self.covariances = [node.create_publisher(
             PoseWithCovarianceStamped, f'{robot.prefix}pose_with_covariance', 10)
             for robot in robots]
-        self._markers, self._loop_status = GraphMarkers(node), LoopStatus(node)
+        self._markers = GraphMarkers(node)
+        self._loop_status = LoopStatus(node, parameters.options.names)
         # The revision that was published last.
         self._published = 0
 

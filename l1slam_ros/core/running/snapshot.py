@@ -42,13 +42,15 @@ class LoopStates:
     What has become of the loops.
 
     rows : (k,) the between factors of the first k of them; stamps : (l, 2) [ns] reference and end;
-    state : (l,) of `LOOP_STATES`; sigmas : (l,), NaN where a loop was not looked at.
+    state : (l,) of `LOOP_STATES`; sigmas : (l,), NaN where a loop was not looked at; robots :
+    (l, 2) whose times the stamps are.
     """
 
     rows: Indices
     stamps: Indices
     state: Indices
     sigmas: Array
+    robots: Indices
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ class Snapshot:
     map_to_odom: Array
     loop_rows: Indices
     loop_stamps: tuple[Indices, Indices, Indices]
-    loop_robots: tuple[Indices, Indices]
+    loop_robots: tuple[Indices, Indices, Indices]
     views: tuple[View, ...]
     pattern: Pattern | None
 
@@ -256,7 +258,8 @@ class Snapshot:
         others = np.repeat([WAITING, EXPIRED], [len(waiting), len(expired)])
         sigmas = np.concatenate((judgement.sigmas[rows], np.full(len(others), np.nan)))
         return LoopStates(rows, np.concatenate((in_graph, waiting, expired)),
-                          np.concatenate((state, others)), sigmas)
+                          np.concatenate((state, others)), sigmas,
+                          np.concatenate(self.loop_robots))
 
     def sizes(self) -> dict[str, int]:
         """Return how many keyframes, factors and loops of each state there are, by name."""

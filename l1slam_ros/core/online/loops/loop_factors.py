@@ -95,9 +95,9 @@ class LoopFactors:
         return self._stamps.view(), self.waiting.stamps(), self._expired.view()
 
     @property
-    def robots(self) -> tuple[Indices, Indices]:
-        """Whose times the stamps of the loops in the graph and expired are, (k, 2) each."""
-        return self._robots.view(), self._expired_robots.view()
+    def robots(self) -> tuple[Indices, Indices, Indices]:
+        """Whose times the `stamps` are."""
+        return self._robots.view(), self.waiting.robots(), self._expired_robots.view()
 
     @property
     def rows(self) -> Indices:
