@@ -57,7 +57,8 @@ class MapPublisher:
         self.covariances = [node.create_publisher(
             PoseWithCovarianceStamped, f'{robot.prefix}pose_with_covariance', 10)
             for robot in robots]
-        self._markers, self._loop_status = GraphMarkers(node), LoopStatus(node)
+        self._markers = GraphMarkers(node)
+        self._loop_status = LoopStatus(node, parameters.options.names)
         # The revision that was published last.
         self._published = 0
 
@@ -94,7 +95,7 @@ class MapPublisher:
             before, after = (manifold.compose(transform, robot.odometry)
                              for transform in self._backend.moved(one.number))
             self._diagnostics.note_jump(manifold, before, after, one.prefix)
-        keyframes, poses, frame = np.arange(len(now.poses)), now.poses, self._frame
+        keyframes, poses, frame = np.arange(len(now.poses)), now.drawn, self._frame
         if one.name:
             keyframes, poses = now.poses_in_map(one.number)
             maps = now.robot_maps

@@ -144,11 +144,11 @@ class GraphBuilder:
         """Return the state from which another builder continues; there is a keyframe at least."""
         shared, loops = self._shared, self.loops
         tracks = shared.tracks
-        in_graph, _, expired = loops.stamps
+        (in_graph, _, expired), (own, _, of_expired) = loops.stamps, loops.robots
         ends = [self.robots[robot].end() for robot in tracks.begun]
         first, *others = ends
         # With the first robot alone all is its own.
-        whose = loops.robots if others or first.robot else (None, None)
+        whose = (own, of_expired) if others or first.robot else (None, None)
         return BuilderState(
             self.graph.copy(), self.keyframe_stamps, self.keyframe_poses, first.offset,
             first.end, first.end_pose, first.end_covariance, loops.rows, in_graph, expired,

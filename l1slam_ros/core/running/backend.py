@@ -253,8 +253,8 @@ class Backend:
 
     @property
     def poses(self) -> Array:
-        """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
-        return self.snapshot().poses
+        """All keyframes in the map of the first robot, (n, p), see `Snapshot.drawn`."""
+        return self.snapshot().drawn
 
     def snapshot(self) -> Snapshot:
         """Return the back end as it is now, the due loops in its graph, to be read at leisure."""

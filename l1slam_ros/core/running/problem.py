@@ -22,7 +22,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import sigmas
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.parts import give_to
+from l1slam_ros.core.graph.parts import ends_before, give_to
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.block_cholesky import Pattern
 from l1slam_ros.core.solvers.solve import AUTO, PRIMAL_DUAL, Method, choose
@@ -78,8 +78,8 @@ def as_one(problem: Problem) -> Problem:
     """
     Return the problem with a connected graph, without the loops that a person struck out.
 
-    Each part of the map is tied to the keyframe before its first one, where both stand: so weakly
-    that whatever else joins them decides.
+    Each part of the map is tied to the end of the one of its robot before, the first one of a
+    robot to any keyframe, where both stand: so weakly that whatever else joins them decides.
     """
     graph, judgement = problem.graph, problem.judgement
     rows, d = graph.not_struck, graph.manifold.TANGENT_SIZE
@@ -130,8 +130,7 @@ def _tied(graph: FactorGraph, poses: Array, firsts: Indices) -> FactorGraph:
     manifold, d = graph.manifold, graph.manifold.TANGENT_SIZE
     extent = float(np.ptp(manifold.positions(poses), axis=0).max()) if len(poses) else 0.0
     sigma = sigmas(manifold, 1.0 + extent, _HEADING)
-    # Any keyframe of a part that came earlier will do.
-    others = firsts - 1
+    others = ends_before(graph)
     graph.follow(firsts, others)
     graph.append_between(
         others, firsts, manifold.between(poses[others], poses[firsts]),

@@ -22,6 +22,7 @@ import numpy as np
 from l1slam_ros.core.bordered.front import View
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.parts import ends_before
 from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.map_state import MapState
@@ -41,13 +42,15 @@ class LoopStates:
     What has become of the loops.
 
     rows : (k,) the between factors of the first k of them; stamps : (l, 2) [ns] reference and end;
-    state : (l,) of `LOOP_STATES`; sigmas : (l,), NaN where a loop was not looked at.
+    state : (l,) of `LOOP_STATES`; sigmas : (l,), NaN where a loop was not looked at; robots :
+    (l, 2) whose times the stamps are.
     """
 
     rows: Indices
     stamps: Indices
     state: Indices
     sigmas: Array
+    robots: Indices
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,7 @@ class Snapshot:
     map_to_odom: Array
     loop_rows: Indices
     loop_stamps: tuple[Indices, Indices, Indices]
-    loop_robots: tuple[Indices, Indices]
+    loop_robots: tuple[Indices, Indices, Indices]
     views: tuple[View, ...]
     pattern: Pattern | None
 
@@ -151,7 +154,11 @@ class Snapshot:
 
     @cached_property
     def poses(self) -> Array:
-        """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
+        """
+        Return all keyframes in the frame of the graph, (n, p).
+
+        The optimised ones, then odometry from there.
+        """
         return self._followed(
             self.views[0].poses if self.views else self.state.optimised.poses, self.odometry)
 
@@ -171,7 +178,7 @@ class Snapshot:
 
     @property
     def drawn(self) -> Array:
-        """All keyframes as seen from the map of the first robot, (n, p)."""
+        """All keyframes as seen from the map of the first robot, (n, p), joined to it or not."""
         first = self.robot_maps.get(0)
         if first is None or first.turn is None or not first.joined:
             return self.poses
@@ -181,13 +188,16 @@ class Snapshot:
         """
         Return poses (k, p), and behind them the other keyframes as they follow in others (n, p).
 
-        Each follows the last of its predecessors that is known, the first of a part the last
-        keyframe that is.
+        Each follows the last of its predecessors that is known; the first of a part the end of
+        the one of its robot before, or of none of its robot the last keyframe that is known.
         """
         manifold, known = self.graph.manifold, len(poses)
         if not known or known == len(others):
             return np.concatenate((poses, others[known:]))
-        before = np.where(self.graph.parent < np.arange(len(others)), self.graph.parent, known - 1)
+        before, firsts = self.graph.parent, self.graph.firsts
+        ends = ends_before(self.graph)
+        before[firsts] = np.where(
+            self.graph.robot[ends] == self.graph.robot[firsts], ends, known - 1)
         while (before[known:] >= known).any():
             before = np.where(before >= known, before[before], before)
         before = before[known:]
@@ -248,7 +258,8 @@ class Snapshot:
         others = np.repeat([WAITING, EXPIRED], [len(waiting), len(expired)])
         sigmas = np.concatenate((judgement.sigmas[rows], np.full(len(others), np.nan)))
         return LoopStates(rows, np.concatenate((in_graph, waiting, expired)),
-                          np.concatenate((state, others)), sigmas)
+                          np.concatenate((state, others)), sigmas,
+                          np.concatenate(self.loop_robots))
 
     def sizes(self) -> dict[str, int]:
         """Return how many keyframes, factors and loops of each state there are, by name."""

@@ -144,15 +144,16 @@ class MapFile:
 
     def _by_name(self, saved: SavedMap) -> SavedMap:
         """Return a loaded map; its robots get the numbers that their names have in this node."""
-        own = self._options().names
-        self._robots = own + tuple(name for name in saved.robots if name not in own)
-        number = {was: self._robots.index(name) for was, name in enumerate(saved.robots)}
-        if not own or all(was == now for was, now in number.items()):
+        own, named = self._options().names, len(saved.robots)
+        names = self._robots = own + tuple(name for name in saved.robots if name not in own)
+
+        def number(was: int) -> int:
+            return names.index(saved.robots[was]) if was < named else was - named + len(names)
+
+        # What a node without names has saved, is of the first robot.
+        if not own or not named:
             return saved
-        builder = saved.builder
-        for end in builder.ends:  # of no name
-            number.setdefault(end.robot, len(number) + len(self._robots))
-        return replace(saved, builder=builder.renumbered(number))
+        return replace(saved, builder=saved.builder.renumbered(number))
 
     def load_at_start(self, tell: Callable[[str], object]) -> None:
         """Load the map if there is one; tell so, or warn where there is a damaged one."""
