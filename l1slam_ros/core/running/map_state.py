@@ -188,8 +188,7 @@ class MapState:
         Return the state after a judgement of so many loops, of which poses (n, p) is the L2 map.
 
         Where it accepts other factors than the map is of, or corrects them otherwise, it waits for
-        a map; anew : from the
-        graph alone
+        a map; anew : from the graph alone
         """
         after = replace(self, judged=self.judged.after(judgement, poses, loops, anew, now))
         accepted = self.table.accepted[:len(judgement.accepted)]
