@@ -386,9 +386,13 @@ def test_a_launch_file_starts_what_there_is(block):
     assert launch.tag == 'launch' and ours
     topics = (ROOT / 'doc' / 'topics_and_parameters.md').read_text()
     for node in ours:
-        assert node.get('exec') in {'backend', 'replay'} and node.get('name')
+        assert node.get('exec') in {'backend', 'scan_loops'} and node.get('name')
         for remap in node.iter('remap'):
             assert f'`{remap.get("from")}`' in topics
+        for param in node.iter('param'):
+            folder, shipped, name = param.get('from').rpartition('/config/')
+            assert not shipped or ((ROOT / 'config' / name).exists()
+                                   and folder == '$(find-pkg-share l1slam_ros)')
     beside = {block.heading for block in blocks(OTHERS) if block.language == 'yaml'}
     assert block.heading in beside
 

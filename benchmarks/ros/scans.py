@@ -13,8 +13,8 @@ A laser log over DDS, faster than it was driven: the map of `scan_loops` and `ba
 
 LOG is a CARMEN log, TRUTH a table of `stamp,x,y,theta`. Both nodes run as shipped, each a process
 of its own; the log is sent as LaserScan and Odometry, so many scans a second. Said is how many
-scans were used and left out, what each process took of a core for a scan, its memory, and the
-error of the Path to the truth at the truth's stamps.
+scans were used and left out, what each process took of a core for a scan, its memory, how long
+updates of the map took, and the error of the Path to the truth at the truth's stamps.
 """
 
 import csv
@@ -25,9 +25,10 @@ from pathlib import Path
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
-from peer import arguments, cpu_seconds
+from peer import UpdateTimes, arguments, cpu_seconds
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import LaserScan
 
@@ -53,6 +54,9 @@ def main() -> None:
     maps: list[PathMessage] = []
     node.create_subscription(PathMessage, 'path', maps.append, QoSProfile(
         depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    updates = UpdateTimes()
+    node.create_subscription(DiagnosticArray, '/diagnostics', lambda message: updates.note(
+        {value.key: value.value for value in message.status[0].values}), 10)
     scans = node.create_publisher(LaserScan, 'scan', qos_profile_sensor_data)
     wheels = node.create_publisher(Odometry, 'odom', QoSProfile(depth=1000))
     files = ['--ros-args', '--params-file', str(_SHIPPED), '--log-level', 'error']
@@ -74,6 +78,7 @@ def main() -> None:
         for name, seconds, process in zip(('scan_loops', 'backend'), spent, nodes, strict=True):
             print(f'{name}: {1e3 * seconds / len(log.scans):.2f} ms of a core for a scan, '
                   f'{_memory(process.pid):.0f} MB')
+        print(f'backend: {updates.sentence}')
         print(f'{len(log.scans)} scans, {len(maps[-1].poses)} keyframes, '
               f'{_error(maps[-1], given.truth):.3f} m from the truth')
     finally:

@@ -14,6 +14,7 @@ It has a keeper, which owns the graph and its map, and updates of that; see `kee
 
 import os
 import time
+from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import cache
@@ -197,13 +198,14 @@ class Backend:
 
     # What is done.
 
-    def update(self, budget: float = 0.1,
-               stopped: Stopped = lambda: False) -> Improvement | None:
+    def update(self, budget: float = 0.1, stopped: Stopped = lambda: False,
+               taken: Callable[[], None] = lambda: None) -> Improvement | None:
         """
         Take new factors into the map and start background work; None: there was nothing to do.
 
-        What has come, up to some twenty milliseconds of work, is in the map when this returns. It
-        waits up to `budget` seconds for the background work, which then goes on by itself; with
+        What has come, up to some twenty milliseconds of work, is in the map when `taken` is
+        called; up to there the `seconds` of what is returned count. Then it waits up to `budget`
+        seconds for the background work, which goes on by itself after that; with
         `background=True` it does not wait.
 
         Raises
@@ -213,7 +215,7 @@ class Backend:
         """
         self._called = time.monotonic()
         behind = self._background is not None and self._background.is_alive
-        return self._updates.update(budget, stopped, waits=not behind)
+        return self._updates.update(budget, stopped, waits=not behind, taken=taken)
 
     def settle(self, stopped: Stopped = lambda: False) -> Improvement | None:
         """

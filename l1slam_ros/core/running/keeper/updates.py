@@ -71,7 +71,7 @@ class Updates:
         return self._workers.failing
 
     def update(self, budget: float, stopped: Stopped, idle: bool | None = None,
-               waits: bool = True) -> Improvement | None:
+               waits: bool = True, taken: Callable[[], None] = lambda: None) -> Improvement | None:
         """
         See `Backend.update`.
 
@@ -89,6 +89,9 @@ class Updates:
             came = seen.grown > max(self._updated, keeper.state.began)
             self._updated = seen.now
             idle = not came if idle is None else idle
+            # Before workers begin: on one core they would share it with whoever publishes.
+            taken()
+            took = time.monotonic() - start
             check = self._check(before.began, stopped)
             end = start + budget if waits else start
             while self._begin_due(idle, budget, check):
@@ -96,19 +99,19 @@ class Updates:
                 self._workers.check()
                 check()
                 if time.monotonic() >= end:
-                    return self._account(before.began, start)
+                    return self._account(before.began, took)
             if came or not idle or keeper.state.last is not before.last:
-                return self._account(before.began, start)
+                return self._account(before.began, took)
             # Work that failed since the check is still to do.
             self._workers.check()
             self._rested = seen.now
         return None
 
-    def _account(self, began: int, start: float) -> Improvement:
+    def _account(self, began: int, took: float) -> Improvement:
         state, _, size = self._keeper.look()
         if state.began != began:
             raise Interrupted
-        return state.account(size.loops, time.monotonic() - start)
+        return state.account(size.loops, took)
 
     def _begin_due(self, idle: bool, budget: float, check: Check) -> bool:
         """Start the work that is due; return whether there is any, or was just now."""
