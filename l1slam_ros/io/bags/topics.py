@@ -19,9 +19,11 @@ FALSE_LOOP_TOPIC = '/false_loop_closures'
 REJECTED_LOOP_TOPIC = '/rejected_loop_closures'
 ABSOLUTE_TOPIC = '/absolute_poses'
 TRUTH_TOPIC = '/ground_truth'
+SCAN_TOPIC = '/scan'
 
 ODOMETRY_TYPE = 'nav_msgs/msg/Odometry'
 POSE_TYPE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+SCAN_TYPE = 'sensor_msgs/msg/LaserScan'
 
 
 @dataclass(frozen=True)
