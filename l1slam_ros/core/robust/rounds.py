@@ -81,6 +81,8 @@ class Growth:
     loops; part : (n,) number of the part of each keyframe; poses : (n, p) the L2 map of the
     accepted; posterior : of these; variance : (2,) of odometry and loops in units of what they
     state; slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
+    ventured : (m,) bool, loops of runs that noisier odometry explained; first_variance : (2,)
+    before any loop was accepted;
     drops : (m,) how often each was accepted and did not fit; at_their_word : whether factors may
     be as noisy as they say; in_tail : (m,) bool, not the loops that are too far off for that;
     check : called before long steps, raises where the work shall stop.
@@ -110,9 +112,10 @@ class Growth:
         self._stated = stated_variance(self.factors)
         self.variance = within_ratio(np.ones(2), self._stated)
         self._learnt_of = np.zeros(0, bool)
-        self._floor, self.at_their_word = np.full(2, _LEAST_VARIANCE), False
+        self.first_variance, self.at_their_word = np.ones(2), False
         self.posterior: Posterior
         self.slip_odds: dict[int, float] = {}
+        self.ventured = np.zeros(len(self.factors), bool)
         self.drops = np.zeros(len(self.factors), np.int64)
         self.in_tail = np.ones(len(self.factors), bool)
 
@@ -127,13 +130,13 @@ class Growth:
         if not self.may_err_as_one(rows):
             found = self.variance * noise_variance(self.innovations(rows))
             self.variance = within_ratio(found, self._stated)
-            self._floor = _LEAST_VARIANCE * self.variance
+            self.first_variance = self.variance
             self.solve()
 
     def resume(self, poses: Array, accepted: Mask, variance: Array) -> None:
         """Go on from an earlier state: poses (n, p), accepted (m,), variance (2,)."""
         self.poses, self.variance = poses, within_ratio(variance, self._stated)
-        self._floor = np.full(2, LEAST_RATIO**2)  # what was found first is not known any more
+        self.first_variance = np.full(2, LEAST_RATIO)  # it is not known any more, hence no limit
         self.accepted[: self.size] = accepted | self.trusted[: self.size]
         self.cut |= ~self.accepted & ~self.is_loop
         self.accepted |= self.cut
@@ -189,7 +192,7 @@ class Growth:
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
         clone = copy.copy(self)
-        for name in ('accepted', 'drops', 'cut', 'in_tail', 'variance', 'slip_odds'):
+        for name in ('accepted', 'drops', 'cut', 'in_tail', 'variance', 'slip_odds', 'ventured'):
             setattr(clone, name, getattr(self, name).copy())
         return clone
 
@@ -281,6 +284,11 @@ class Growth:
             self._learn_variance(rows)
             self._learnt_of = self.accepted.copy()
 
+    def learn_anew(self) -> None:
+        """Solve, and learn the noise of what is accepted, though it was learnt of it before."""
+        self._learnt_of = self._learnt_of[:0]
+        self.solve()
+
     @property
     def _knows_noise(self) -> bool:
         """Whether there is nothing new to learn it of: what was learnt of, says always more."""
@@ -323,7 +331,8 @@ class Growth:
         found = np.bincount(kind, own * (self.posterior.residual**2).sum(axis=1), 2)
         stated = np.bincount(kind, own * np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
         scale = (found + known) / (stated + known)
-        self.variance = within_ratio(np.maximum(self.variance * scale, self._floor), self._stated)
+        self.variance = within_ratio(np.maximum(
+            self.variance * scale, _LEAST_VARIANCE * self.first_variance), self._stated)
 
     def innovations(self, rows: Indices) -> Innovations:
         """Return how factors that are not accepted fit the map."""
