@@ -81,10 +81,10 @@ class Growth:
     loops; part : (n,) number of the part of each keyframe; poses : (n, p) the L2 map of the
     accepted; posterior : of these; variance : (2,) of odometry and loops in units of what they
     state; slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
-    ventured : (m,) bool, loops of runs that noisier odometry explained; first_variance : (2,)
-    before any loop was accepted;
-    drops : (m,) how often each was accepted and did not fit; at_their_word : whether factors may
-    be as noisy as they say; in_tail : (m,) bool, not the loops that are too far off for that;
+    ventured : (m,) bool, loops of runs that noisier odometry explained; first_variance : (2,) of
+    no loop yet, learnt_of : (m,) bool, of what it was learnt last; drops : (m,) how often each was
+    accepted and did not fit; at_their_word : whether factors may be as noisy as they say;
+    in_tail : (m,) bool, not the loops that are too far off for that;
     check : called before long steps, raises where the work shall stop.
     """
 
@@ -111,13 +111,12 @@ class Growth:
         self.part = np.zeros(graph.n_poses, np.int64)
         self._stated = stated_variance(self.factors)
         self.variance = within_ratio(np.ones(2), self._stated)
-        self._learnt_of = np.zeros(0, bool)
+        self.learnt_of = np.zeros(0, bool)
         self.first_variance, self.at_their_word = np.ones(2), False
         self.posterior: Posterior
         self.slip_odds: dict[int, float] = {}
-        self.ventured = np.zeros(len(self.factors), bool)
-        self.drops = np.zeros(len(self.factors), np.int64)
-        self.in_tail = np.ones(len(self.factors), bool)
+        none = np.zeros(len(self.factors), bool)
+        self.ventured, self.in_tail, self.drops = none, ~none, none.astype(np.int64)
 
     def begin(self) -> None:
         """Solve for what is accepted, and learn from the loops how large the noise is."""
@@ -142,7 +141,7 @@ class Growth:
         self.accepted |= self.cut
         self._tie_to_world(_LATEST)
         # What the noise of these is, is known.
-        self._learnt_of = self.accepted.copy()
+        self.learnt_of = self.accepted.copy()
         if (self.accepted & self.is_loop).any():
             self.solve()
         else:
@@ -282,17 +281,12 @@ class Growth:
             self.drops[misfits] += 1
         if not self._knows_noise:
             self._learn_variance(rows)
-            self._learnt_of = self.accepted.copy()
-
-    def learn_anew(self) -> None:
-        """Solve, and learn the noise of what is accepted, though it was learnt of it before."""
-        self._learnt_of = self._learnt_of[:0]
-        self.solve()
+            self.learnt_of = self.accepted.copy()
 
     @property
     def _knows_noise(self) -> bool:
         """Whether there is nothing new to learn it of: what was learnt of, says always more."""
-        return self.at_their_word or np.array_equal(self.accepted, self._learnt_of)
+        return self.at_their_word or np.array_equal(self.accepted, self.learnt_of)
 
     def _is_noisier(self, rows: Indices) -> bool:
         """Raise the variance where half of the factors say that it is far too small."""
@@ -330,9 +324,8 @@ class Growth:
         own = np.where(self.factors.is_absolute[rows], 0.0, 1.0)
         found = np.bincount(kind, own * (self.posterior.residual**2).sum(axis=1), 2)
         stated = np.bincount(kind, own * np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
-        scale = (found + known) / (stated + known)
-        self.variance = within_ratio(np.maximum(
-            self.variance * scale, _LEAST_VARIANCE * self.first_variance), self._stated)
+        least, scale = _LEAST_VARIANCE * self.first_variance, (found + known) / (stated + known)
+        self.variance = within_ratio(np.maximum(self.variance * scale, least), self._stated)
 
     def innovations(self, rows: Indices) -> Innovations:
         """Return how factors that are not accepted fit the map."""

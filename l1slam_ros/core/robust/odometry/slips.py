@@ -155,8 +155,9 @@ def _with_runs(growth: Growth) -> Growth | None:
         state.accepted[group.rows] = state.ventured[group.rows] = True
     state.variance, state.drops[:] = noisier.variance, 0
     # Once from noise that is far too large, and once from what was left of that.
-    state.learn_anew()
-    state.learn_anew()
+    for _ in range(2):
+        state.learnt_of = state.learnt_of[:0]
+        state.solve()
     _accept_more(state)
     is_noisier = state.variance[0] > _MOST * min(growth.first_variance[0], 1.0)
     return None if is_noisier or _gain(growth, growth, state) <= 0 else state
