@@ -34,8 +34,8 @@ Ends = tuple[Indices, Indices, Array]
 ASKED = 250
 # Of each one so many pairs are looked at closely, those that differ least.
 _NEAREST = 20
-# A run has so many loops, and it is so long [m].
-RUN, _RUN_WAY = 6, 2.5
+# A run has so many loops, each agrees with so many others of it, and it is so long [m].
+RUN, _MATES, _RUN_WAY = 6, 3, 2.5
 # So many times vaguer than the surest one, a loop says little.
 _VAGUE, _TINY = 10.0, 1e-300
 
@@ -89,9 +89,9 @@ def runs(growth: Growth, rows: Indices) -> list[Group]:
     """
     Return of some loops those of one place that are no one mistake.
 
-    A robot that goes the same way twice sees one place all along it. So many loops, each of which
-    agrees with half of the others, along a way so long at either end, are hardly all false: of
-    recorded runs of ten or more five in six are true.
+    A robot that goes the same way twice sees one place all along it. So many loops that agree in
+    pairs, along a way so long at either end, are hardly all false: of recorded runs of ten or more
+    five in six are true.
     """
     rows = asked(growth, rows)
     one, other, _ = agreement(growth, rows)
@@ -100,7 +100,7 @@ def runs(growth: Growth, rows: Indices) -> list[Group]:
     found = []
     for number in np.unique(place):
         own = np.flatnonzero(place == number)
-        own = own[count[own] >= (len(own) - 1) / 2]
+        own = own[count[own] >= _MATES]
         ways = [np.ptp(poses[ends[rows[own]]], axis=0).max(initial=0.0)
                 for ends in (growth.low, growth.high)] if len(own) >= RUN else [0.0]
         if min(ways) > _RUN_WAY:
