@@ -183,9 +183,18 @@ class Front:
         steps = self._systems[L1].step(np.maximum(keyframes - self._fixed, FIXED).tolist())
         return self._manifold.retract(self._first.view()[keyframes, L1], steps)
 
-    def covariance(self, keyframe: int) -> Array:
-        """Return the covariance of a keyframe in the L2 map, (k, k)."""
-        return self._systems[L2].covariance(max(keyframe - self._fixed, FIXED))
+    def covariance(self, keyframe: int, seen_from: int | None = None) -> Array:
+        """
+        Return the covariance of a keyframe in its own axes, in the L2 map, (k, k).
+
+        seen_from : relative to this keyframe, None: to what the map is held by
+        """
+        turn, other = np.zeros((len(self._usual),) * 2), FIXED
+        if seen_from is not None:
+            here, there = self.poses_of(np.array([keyframe, seen_from]))[:, None]
+            turn = self._manifold.adjoint(self._manifold.between(here, there))[0]
+            other = max(seen_from - self._fixed, FIXED)
+        return self._systems[L2].covariance(max(keyframe - self._fixed, FIXED), other, turn)
 
     def take(self, factors: BetweenFactors, what: Indices) -> list[Look]:
         """

@@ -293,15 +293,16 @@ class Backend:
         with self._keeper.reading() as builder:
             return builder.notes.news()
 
-    def marginal_covariance(self, keyframe: int) -> Array | None:
+    def marginal_covariance(self, keyframe: int, seen_from: int | None = None) -> Array | None:
         """
         Return the covariance of a keyframe in its own axes, (d, d).
 
         Of the least squares map of the accepted factors, with the noise that was found in them:
-        relative to the first keyframe, or to the world where absolute poses are accepted. None:
-        the map does not have the keyframe, or its graph is too dense to be factored.
+        relative to the keyframe `seen_from`, if any, else to the first one, or to the world where
+        absolute poses are accepted. None: the map does not have one of them, or its graph is too
+        dense to be factored.
         """
-        return self._keeper.covariance(keyframe)
+        return self._keeper.covariance(keyframe, seen_from)
 
 
 def _require_options(options: object) -> None:

@@ -235,12 +235,13 @@ class Keeper:
             self._odom[robot] = MapToOdom(Newest(-1, none, robot == 0))
         return self._odom[robot]
 
-    def covariance(self, keyframe: int) -> Array | None:
+    def covariance(self, keyframe: int, seen_from: int | None) -> Array | None:
         """See `Backend.marginal_covariance`."""
         with self._front_lock:
             front = self._front
-            known = front is not None and 0 <= keyframe < front.keyframes
-            return front.covariance(keyframe) if front and known else None
+            known = front is not None and all(
+                0 <= one < front.keyframes for one in (keyframe, seen_from or 0))
+            return front.covariance(keyframe, seen_from) if front and known else None
 
     # What the front takes.
 
