@@ -38,7 +38,12 @@ from l1slam_ros.core.geometry import noise, se3
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
-from l1slam_ros.core.graph.measurements import FASTEST, LONGEST_PAUSE, SHORTEST_STEP
+from l1slam_ros.core.graph.measurements import (
+    FASTEST,
+    LONGEST_PAUSE,
+    SHORTEST_STEP,
+    LoopClosure,
+)
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.graph.recording import loops_of, recorded, steps_of
 from l1slam_ros.io.bags.topics import (
@@ -132,11 +137,15 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
                 # Of one that is struck out the message before told what it is.
                 word = '' if loop.struck else next(in_order)
                 if loop.reference_stamp is not None:
-                    topic = (FALSE_LOOP_TOPIC if loop.struck else
-                             REJECTED_LOOP_TOPIC if word in _REFUSED else
-                             TRUSTED_LOOP_TOPIC if loop.trusted else LOOP_TOPIC)
+                    topic = _topic(loop, word)
                     frame = reference_frame_id(_BASE_FRAME, loop.reference_stamp)
                 writer.write(topic, stamp, pose_bytes(frame, stamp, loop.pose3, loop.covariance))
+
+
+def _topic(loop: LoopClosure, word: str) -> str:
+    """Return the topic of a loop; word : what it was left out as, empty: it was not."""
+    return (FALSE_LOOP_TOPIC if loop.struck else REJECTED_LOOP_TOPIC if word in _REFUSED else
+            TRUSTED_LOOP_TOPIC if loop.trusted else LOOP_TOPIC)
 
 
 def _note(graph: FactorGraph, stamps: list[int]) -> dict[str, str]:
