@@ -44,9 +44,9 @@ _NO_COLUMNS = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32
 
 # Numbers that one gigabyte holds.
 MOST_ENTRIES = 135_000_000
-# Multiplications for each block of the factor from which a factorisation takes longer than to find
-# another order.
-_LONG = 1500
+# Multiplications for each keyframe from which a factorisation is long: what another order spares of
+# a few of them is then more than it takes to find.
+_LONG = 8000
 # A graph that has grown by more is ordered anew, which is seldom enough to cost nothing. Had it
 # never been, City's last factorisation, six thousand keyframes on, would do a quarter more work.
 _GROWN = 1.1
@@ -107,8 +107,8 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
     """
     Return a pattern of little fill.
 
-    By minimum degree; where a factorisation takes longer than that, by dissection too, and the
-    better of the two.
+    By minimum degree; where a factorisation is long, by dissection too, of separators and of
+    levels, and the best of the three.
 
     Parameters
     ----------
@@ -130,14 +130,14 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
         if pattern is not None:
             return pattern
     pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), _NO_COLUMNS, size)
+    if pattern is None or pattern.work * k**3 > _LONG * size:
+        for dissect in kernels.dissection.dissect, kernels.ordering.dissect:
+            dissected = _laid_out(graph, most_blocks, dissect(*graph), _NO_COLUMNS, size)
+            if dissected and not (pattern and pattern.work <= dissected.work):
+                pattern = dissected
     if pattern is None:
         raise FillError(f'the factor of {size} keyframes and {len(keyframe)} factors would have '
                         f'more than {most_blocks} blocks: too many far places are joined')
-    if pattern.work * k**3 > _LONG * len(pattern.columns[-1]):
-        stage = kernels.ordering.dissect(*graph)
-        dissected = _laid_out(graph, most_blocks, stage, _NO_COLUMNS, size)
-        if dissected is not None and dissected.work < pattern.work:
-            return dissected
     return pattern
 
 
