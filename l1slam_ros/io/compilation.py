@@ -39,8 +39,8 @@ from l1slam_ros.core.geometry.manifold import Manifold
 from l1slam_ros.io.progress import Progress
 
 # What a sparse graph is solved by, what false loops are told by, what a dense graph is solved by,
-# what keeps up with a graph that grows, what orders a large graph: modules of `kernels`, those first that take long to
-# compile.
+# what keeps up with a graph that grows, what orders a large graph: modules of `kernels`, those
+# first that take long to compile.
 SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interior_point', 'se2')
 JUDGEMENT = ('prediction',)
 DENSE = ('halpern',)

@@ -44,8 +44,8 @@ _NO_COLUMNS = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32
 
 # Numbers that one gigabyte holds.
 MOST_ENTRIES = 135_000_000
-# Multiplications for each keyframe from which a factorisation is long: what another order spares of
-# a few of them is then more than it takes to find.
+# Multiplications for each keyframe from which a factorisation is long: what another order spares
+# of a few of them is then more than it takes to find.
 _LONG = 8000
 # A graph that has grown by more is ordered anew, which is seldom enough to cost nothing. Had it
 # never been, City's last factorisation, six thousand keyframes on, would do a quarter more work.
