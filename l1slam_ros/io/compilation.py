@@ -39,14 +39,13 @@ from l1slam_ros.core.geometry.manifold import Manifold
 from l1slam_ros.io.progress import Progress
 
 # What a sparse graph is solved by, what false loops are told by, what a dense graph is solved by,
-# what keeps up with a graph that grows, what orders a large graph: modules of `kernels`, those
-# first that take long to compile.
+# what keeps up with a graph that grows: modules of `kernels`, those first that take long to
+# compile.
 SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interior_point', 'se2')
 JUDGEMENT = ('prediction',)
 DENSE = ('halpern',)
 ONLINE = ('border',)
-LARGE = ('dissection',)
-STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *LARGE, *SPARSE[2:])
+STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
 # What poses in space need besides; after the colon: the versions for them of that module's loops.
 _SPACE = ':space'
 IN_SPACE = {'halpern': f'halpern{_SPACE}', 'cholesky': f'cholesky{_SPACE}',

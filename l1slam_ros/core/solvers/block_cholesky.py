@@ -35,6 +35,7 @@ from l1slam_ros.core.graph.linear_system import (
     loose_keyframes,
     size_of_blocks,
 )
+from l1slam_ros.core.solvers import nested_dissection
 
 Result = TypeVar('Result')
 Places = NDArray[np.int32]
@@ -47,6 +48,9 @@ MOST_ENTRIES = 135_000_000
 # Multiplications for each keyframe from which a factorisation is long: what another order spares
 # of a few of them is then more than it takes to find.
 _LONG = 8000
+# Multiplications of numbers, some 50 ms, from which separators may pay for the loops that find
+# them: those are compiled at their first use on a machine, for 5 s.
+_VAST = 1.5e8
 # A graph that has grown by more is ordered anew, which is seldom enough to cost nothing. Had it
 # never been, City's last factorisation, six thousand keyframes on, would do a quarter more work.
 _GROWN = 1.1
@@ -107,8 +111,8 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
     """
     Return a pattern of little fill.
 
-    By minimum degree; where a factorisation is long, by dissection too, of separators and of
-    levels, and the best of the three.
+    By minimum degree; where a factorisation is long, by dissection of levels too, where it still
+    is very long, of separators; the best of them.
 
     Parameters
     ----------
@@ -130,8 +134,8 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
         if pattern is not None:
             return pattern
     pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), _NO_COLUMNS, size)
-    if pattern is None or pattern.work * k**3 > _LONG * size:
-        for dissect in kernels.dissection.dissect, kernels.ordering.dissect:
+    for dissect, least in (kernels.ordering.dissect, 0.0), (nested_dissection.dissect, _VAST):
+        if pattern is None or pattern.work * k**3 > max(_LONG * size, least):
             dissected = _laid_out(graph, most_blocks, dissect(*graph), _NO_COLUMNS, size)
             if dissected and not (pattern and pattern.work <= dissected.work):
                 pattern = dissected

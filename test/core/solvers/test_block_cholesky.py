@@ -331,6 +331,19 @@ def test_large_blocks_are_worth_the_search_for_a_better_order():
     assert_array_equal(np.sort(better.position), np.arange(2500))
 
 
+def test_only_what_takes_very_long_is_ordered_by_separators(monkeypatch):
+    """Their loops are not compiled before: of a small graph levels alone are the better order."""
+    asked = []
+    monkeypatch.setattr(block_cholesky.nested_dissection, 'dissect', lambda start, adjacent: (
+        asked.append(len(start) - 1) or np.zeros(len(start) - 1, np.int32)))
+    for side in (40, 100):
+        k = np.arange(side**2).reshape(side, side)
+        pairs = np.concatenate([np.stack((k.ravel(), np.roll(k, 1, axis).ravel()), axis=1)
+                                for axis in range(2)])
+        assert len(find_pattern(pairs, side**2, PLENTY, 6).position) == side**2
+    assert asked == [10_000]
+
+
 def test_a_graph_that_grows_keeps_its_order_for_a_while(rng):
     """Until it has a tenth more keyframes, or if all that is kept would be too much."""
     pairs = np.array(random_loops(N))
