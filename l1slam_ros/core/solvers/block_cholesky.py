@@ -35,7 +35,6 @@ from l1slam_ros.core.graph.linear_system import (
     loose_keyframes,
     size_of_blocks,
 )
-from l1slam_ros.core.solvers import nested_dissection
 
 Result = TypeVar('Result')
 Places = NDArray[np.int32]
@@ -134,7 +133,7 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
         if pattern is not None:
             return pattern
     pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), _NO_COLUMNS, size)
-    for dissect, least in (kernels.ordering.dissect, 0.0), (nested_dissection.dissect, _VAST):
+    for dissect, least in (kernels.ordering.dissect, 0.0), (kernels.dissection.dissect, _VAST):
         if pattern is None or pattern.work * k**3 > max(_LONG * size, least):
             dissected = _laid_out(graph, most_blocks, dissect(*graph), _NO_COLUMNS, size)
             if dissected and not (pattern and pattern.work <= dissected.work):

@@ -18,10 +18,9 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import Delaunay
 from systems import PLENTY, SHAPES
 
-from l1slam_ros.core import kernels
-from l1slam_ros.core.kernels import ordering
+from l1slam_ros.core.kernels import dissection, ordering
+from l1slam_ros.core.kernels.dissection import coarsening, separators
 from l1slam_ros.core.kernels.symbolic import postorder, untouched
-from l1slam_ros.core.solvers import nested_dissection
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 NOTHING = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32)
@@ -155,7 +154,7 @@ def torus(side):
             for pair in zip(k.ravel().tolist(), np.roll(k, 1, axis).ravel().tolist(), strict=True)]
 
 
-BOTH = pytest.mark.parametrize('dissect', [nested_dissection.dissect, ordering.dissect],
+BOTH = pytest.mark.parametrize('dissect', [dissection.dissect, ordering.dissect],
                                ids=['separators', 'levels'])
 
 
@@ -223,13 +222,13 @@ def test_of_a_large_grid_separators_spare_work_however_nodes_are_called(rng):
     pairs = [pair for one, other in ((k[1:], k[:-1]), (k[:, 1:], k[:, :-1]))
              for pair in zip(one.ravel().tolist(), other.ravel().tolist(), strict=True)]
     graph = adjacency_of(pairs, side**2)
-    own = work(graph, nested_dissection.dissect(*graph))
+    own = work(graph, dissection.dissect(*graph))
     assert 1.5 * own < work(graph, np.zeros(side**2, np.int32))
 
 
 def test_the_loops_of_dissection_are_called_with_the_types_that_they_say():
-    nested_dissection.dissect(*adjacency_of(torus(30), 900))
-    for module in kernels.dissection.coarsening, kernels.dissection.separators:
+    dissection.dissect(*adjacency_of(torus(30), 900))
+    for module in coarsening, separators:
         loops = [value for value in vars(module).values() if hasattr(value, 'takes')]
         assert len(loops) == 2
         for loop in loops:
@@ -242,7 +241,7 @@ def test_of_many_streets_separators_spare_a_third_of_the_work(rng):
     n = 16_000
     factors = simulate_world(n, 2 * n, WorldOptions(), rng).graph.between
     graph = adjacency_of(np.stack((factors.i, factors.j), axis=1).tolist(), n)
-    own = work(graph, nested_dissection.dissect(*graph))
+    own = work(graph, dissection.dissect(*graph))
     assert 1.4 * own < work(graph, np.zeros(n, np.int32))
     assert 1.5 * own < work(graph, ordering.dissect(*graph))
 

@@ -25,6 +25,7 @@ from systems import (
     star,
 )
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -334,7 +335,7 @@ def test_large_blocks_are_worth_the_search_for_a_better_order():
 def test_only_what_takes_very_long_is_ordered_by_separators(monkeypatch):
     """Their loops are not compiled before: of a small graph levels alone are the better order."""
     asked = []
-    monkeypatch.setattr(block_cholesky.nested_dissection, 'dissect', lambda start, adjacent: (
+    monkeypatch.setattr(kernels.dissection, 'dissect', lambda start, adjacent: (
         asked.append(len(start) - 1) or np.zeros(len(start) - 1, np.int32)))
     for side in (40, 100):
         k = np.arange(side**2).reshape(side, side)

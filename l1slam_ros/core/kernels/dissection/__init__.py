@@ -7,11 +7,11 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Loops that only large graphs need: their separators, see `core.solvers.nested_dissection`.
+What only large graphs need: the separators that hold them together.
 
-They are compiled when a graph is first that large, and are no step of a start.
+These loops are compiled when a graph is first that large, and are no step of a start.
 """
 
-from l1slam_ros.core.kernels.dissection import coarsening, separators
+from l1slam_ros.core.kernels.dissection.parts import dissect
 
-__all__ = ['coarsening', 'separators']
+__all__ = ['dissect']

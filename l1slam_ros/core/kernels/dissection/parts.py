@@ -12,7 +12,8 @@ Nested dissection: which keyframes hold two halves of a graph together, and so o
 Eliminated last, these separators keep large graphs, and those that are alike everywhere (a sphere,
 a torus), from filling in. A good one is found on a small graph that is like the large one: nodes
 are merged in pairs, over and over; the smallest graph is cut; and on the way back each graph gets
-the cut of the one below it, made better.
+the cut of the one below it, made better. The loops of both are compiled, what goes through the
+parts is not.
 
 Source: Karypis and Kumar, "A fast and high quality multilevel scheme for partitioning irregular
 graphs" (1998).
@@ -21,7 +22,7 @@ graphs" (1998).
 import numpy as np
 from numpy.typing import NDArray
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core.kernels.dissection import coarsening, separators
 
 Places = NDArray[np.int32]
 
@@ -40,7 +41,7 @@ def dissect(start: Places, adjacent: Places) -> Places:
     """
     Return the stage of each node, (n,): the higher, the later it is to be eliminated.
 
-    start, adjacent : as of `kernels.ordering.minimum_degree`
+    start, adjacent : as of `ordering.minimum_degree`
     """
     n = len(start) - 1
     depth, part = np.zeros(n, np.int32), np.zeros(n, np.int32)
@@ -53,8 +54,7 @@ def dissect(start: Places, adjacent: Places) -> Places:
             continue
         number += 1
         own = nodes[low:high]
-        kernels.dissection.coarsening.take_part(
-            own, number, start, adjacent, part, local, memory.pool)
+        coarsening.take_part(own, number, start, adjacent, part, local, memory.pool)
         side = memory.cut(len(own))
         left, right, between = np.bincount(side, minlength=3).tolist()
         if between > _CUT * len(own) or not left or not right:
@@ -70,8 +70,7 @@ class _Memory:
     """
     What all parts share.
 
-    pool, lists : see `kernels.dissection.coarsening`; sides, space : see
-    `kernels.dissection.separators.cut`.
+    pool, lists : see `coarsening`; sides, space : see `separators.cut`.
     """
 
     def __init__(self, n: int, edges: int):
@@ -85,10 +84,10 @@ class _Memory:
 
     def cut(self, size: int) -> Places:
         """Return the side of each node of the pool's first graph: left 0, right 1, between 2."""
-        merge, cuts = kernels.dissection.coarsening.coarsen, kernels.dissection.separators
-        top, least = merge(self.pool, self._lists, 0, size // _SMALLER, 0), np.inf
+        top = coarsening.coarsen(self.pool, self._lists, 0, size // _SMALLER, 0)
+        least = np.inf
         for attempt in range(_CUTS):
-            bottom = merge(self.pool, self._lists, top, 0, attempt)
-            least = cuts.cut(self.pool, bottom, top, least, self._sides, self._space)
-        side: Places = cuts.separate(self.pool, top, self._sides, self._space)
+            bottom = coarsening.coarsen(self.pool, self._lists, top, 0, attempt)
+            least = separators.cut(self.pool, bottom, top, least, self._sides, self._space)
+        side: Places = separators.separate(self.pool, top, self._sides, self._space)
         return side
