@@ -6,12 +6,11 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""A world that two robots drive, each with odometry of its own, and messages of theirs."""
+"""A world that several robots drive, each with odometry of its own, and messages of theirs."""
 
 import numpy as np
-from problems import covariance6, seconds
+from problems import seconds
 
-from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.graph.parts import give_to
@@ -25,33 +24,33 @@ UNKNOWN = np.zeros((6, 6))
 
 class Team:
     """
-    A world driven by two robots, each a half of it, with odometry of its own, and lies.
+    A world driven by robots, each a share of it, with odometry of its own, and lies.
 
     graph : as one file has it, one robot behind the other
     """
 
-    def __init__(self, n=400, edges=1400, lies=300, seed=3):
+    def __init__(self, n=400, edges=1400, lies=300, seed=3, robots=2, world='streets'):
         options = WorldOptions(odometry_sigma_rotation=0.005)
         rng = np.random.default_rng(seed)
-        world = simulate_world(n, edges, options, rng)
+        world = simulate_world(n, edges, options, rng, world)
         if lies:
             world = with_false_loops(world, random_false_loops(
                 world.graph, world.truth, lies, rng))
-        self.half, whole = n // 2, world.graph.between
-        self.robot = (np.arange(n) >= self.half).astype(int)
-        seam = (whole.i == self.half - 1) & (whole.j == self.half)
-        graph = world.graph.subset(~seam)
-        self.graph = FactorGraph(se2, 0)
+        self.half, whole = n // robots, world.graph.between
+        self.robot = np.minimum(np.arange(n) // self.half, robots - 1)
+        seam = (whole.j == whole.i + 1) & (np.diff(self.robot)[whole.i.clip(0, n - 2)] > 0)
+        graph, self.manifold = world.graph.subset(~seam), world.graph.manifold
+        self.graph = FactorGraph(self.manifold, 0)
         self.graph.add_poses(n)
         give_to(self.graph, self.robot)
         f = graph.between
         self.graph.append_between(f.i, f.j, f.measurement, f.sqrt_information)
         self.truth, self.factors = world.truth, self.graph.between
-        self.odometry = np.zeros((n, 3))
+        self.odometry = self.manifold.identity(n)
         steps = self.factors.step_to
         for k in range(n):
             if steps[k] >= 0:
-                self.odometry[k] = se2.compose(
+                self.odometry[k] = self.manifold.compose(
                     self.odometry[k - 1:k], self.factors.measurement[steps[k]][None])[0]
 
     def stamp(self, k):
@@ -60,20 +59,25 @@ class Team:
     def sample(self, k):
         step, cov = self.factors.step_to[k], UNKNOWN
         if step >= 0:
-            root = self.factors.sqrt_information[step]
-            cov = covariance6(np.linalg.inv(root.T @ root))
-        pose3 = se2.to_pose3(self.odometry[k:k + 1])[0]
+            cov = self.covariance(step)
+        pose3 = self.manifold.to_pose3(self.odometry[k:k + 1])[0]
         return OdometrySample(self.stamp(k), pose3, cov, UNKNOWN)
+
+    def covariance(self, row):
+        """Return that of a factor, as a message states it."""
+        root, rows = self.factors.sqrt_information[row], np.array(self.manifold.COVARIANCE_ROWS)
+        whole = np.zeros((6, 6))
+        whole[rows[:, None], rows] = np.linalg.inv(root.T @ root)
+        return whole
 
     def loops(self):
         """Yield rows of loops, and them."""
         for row in np.flatnonzero(~self.factors.is_odometry):
-            i, j, root = self.factors.i[row], self.factors.j[row], self.factors.sqrt_information[
-                row]
+            i, j = self.factors.i[row], self.factors.j[row]
             yield i, j, LoopClosure(
                 self.stamp(i), self.stamp(j),
-                se2.to_pose3(self.factors.measurement[row:row + 1])[0],
-                covariance6(np.linalg.inv(root.T @ root)), robot=int(self.robot[j]),
+                self.manifold.to_pose3(self.factors.measurement[row:row + 1])[0],
+                self.covariance(row), robot=int(self.robot[j]),
                 reference_robot=int(self.robot[i]))
 
     def messages(self, late=0):

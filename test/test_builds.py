@@ -224,6 +224,15 @@ def workspace(request, source, tmp_path_factory):
     return folder
 
 
+def test_colcon_tests_a_workspace(workspace, tmp_path):
+    """By a part of the suite, with what the running Python has."""
+    colcon = environment(*COLCON).prefix / 'bin' / 'colcon'
+    lent = lent_variables(HOME=str(tmp_path))
+    run(colcon, 'test', '--pytest-args', 'test/core/test_options.py', cwd=workspace, env=lent)
+    found = run(colcon, 'test-result', '--all', cwd=workspace, env=lent)
+    assert re.search(r'Summary: [1-9]\d* tests, 0 errors, 0 failures', found), found
+
+
 def sourced(workspace, *command):
     """Return a command that sources the workspace, and then is `command`."""
     return ['bash', '-c', '. "$0/install/setup.bash" && exec "$@"', workspace, *command]

@@ -10,25 +10,36 @@
 One graph cut into robots: whether the same loops are believed as in one piece.
 
     python benchmarks/fleet/cut.py --datasets DIR [--graphs manhattan3500,city10000,building]
-        [--robots 2,5,20] [--lies 0.3]
+        [--robots 2,5,20] [--lies 0.3] [--late 5]
 
 To the graph false loops of the kind `random` are added, so many for each loop. Its keyframes then
 go in equal pieces to so many robots, each with a letter in its vertex ids, as a g2o file: the
 edges are the same, but at a cut there is no odometry. Printed is for how many loops the verdict is
 another one, and how far the L1 optimum of the loops that the cut graph accepts is from that of the
 same loops in the graph in one piece.
+
+With `--late` the pieces are driven as well, as messages to a running back end, a keyframe of each
+robot a second, each robot late by a number of seconds up to this; the last column is for how many
+loops the verdict is another one than in one piece, once nothing is left to do.
 """
 
 import argparse
 import string
 import tempfile
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
+from l1slam_ros.core.graph.recording import recorded
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions, solve
+from l1slam_ros.core.running.backend import Backend, BackendOptions
+from l1slam_ros.core.running.snapshot import ACCEPTED
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
@@ -36,6 +47,10 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_
 BUILDING = 'building'
 _POSES, _EDGES = 4000, 8000
 _BELIEVING = SolveOptions(robust=False)
+_SECOND = 10**9
+_EVERY = BackendOptions.from_mapping({
+    'keyframe': {'translation': 0.0, 'rotation': 0.0}, 'on_time_jump': 'ignore',
+    'odometry': {'covariance_source': 'increment'}, 'loop': {'wait': 1e6}})
 
 
 def with_lies(record: GraphRecord, lies: float, seed: int = 0) -> GraphRecord:
@@ -69,7 +84,48 @@ def accepted(outcome: Outcome, graph: FactorGraph) -> np.ndarray:
     return np.asarray(outcome.judgement.accepted)
 
 
-def row(name: str, whole: GraphRecord, outcome: Outcome, robots: int) -> str:
+def stamped(pieces: FactorGraph) -> tuple[np.ndarray, np.ndarray]:
+    """Return the robot of each keyframe, from 0, and its stamp; no two have the same."""
+    _, robot = np.unique(pieces.robot, return_inverse=True)
+    second = np.arange(len(robot)) - np.searchsorted(robot, np.arange(robot[-1] + 1))[robot] + 1
+    return robot, second * _SECOND + robot
+
+
+def messages(pieces: FactorGraph, late: float
+             ) -> Iterator[tuple[int, OdometrySample | LoopClosure]]:
+    """Yield robot and message as they come, each robot late by up to so much [s]."""
+    robot, stamps = stamped(pieces)
+    delay = np.random.default_rng(0).uniform(0, late, robot[-1] + 1)
+    events: list[tuple[float, int, OdometrySample | LoopClosure]] = []
+    for k, (sample, loops) in enumerate(recorded(pieces, stamps.tolist())):
+        own = int(robot[k])
+        events.append((sample.stamp / _SECOND + delay[own], own, sample))
+        for loop in loops:
+            one, other = ((stamp, stamp % _SECOND) for stamp in loop.stamps)
+            comes = max(stamp / _SECOND + delay[whose] for stamp, whose in (one, other))
+            events.append((comes, own, replace(loop, robot=own, reference_robot=one[1])))
+    yield from (event[1:] for event in sorted(events, key=lambda event: event[0]))
+
+
+def other_verdicts(pieces: FactorGraph, believed: np.ndarray, late: float) -> int:
+    """Return for how many loops a running back end has another verdict, believed : (m,) bool."""
+    with Backend(_EVERY, 2 if pieces.manifold is se2 else 3) as backend:
+        for robot, message in messages(pieces, late):
+            if isinstance(message, LoopClosure):
+                backend.add_loop(message)
+            else:
+                backend.add_odometry(message, robot)
+                backend.update(0.0)
+        backend.settle()
+        states = backend.loop_states()
+    rows = believed & ~pieces.between.is_odometry
+    here, there = (Counter(map(tuple, np.sort(pairs, axis=1).tolist())) for pairs in (
+        states.stamps[states.state == ACCEPTED], stamped(pieces)[1][pieces.between.pairs[rows]]))
+    return ((here - there) + (there - here)).total()
+
+
+def row(name: str, whole: GraphRecord, outcome: Outcome, robots: int,
+        late: float | None = None) -> str:
     """Return the line of the table of one graph and number of robots."""
     pieces = cut(whole, robots)
     of_pieces = solve(pieces.graph, None, SolveOptions())
@@ -77,10 +133,14 @@ def row(name: str, whole: GraphRecord, outcome: Outcome, robots: int) -> str:
     loops = ~whole.graph.between.is_odometry
     there = solve(whole.graph.subset(mine), None, _BELIEVING).solution.cost
     here = solve(pieces.graph.subset(mine), None, _BELIEVING).solution.cost
-    others = int((mine != theirs).sum())
+    others, live = int((mine != theirs).sum()), ''
+    if late is not None:
+        driven = other_verdicts(pieces.graph, theirs, late)
+        live = f' {driven:,} ({driven / loops.sum():.2%}) |'
     return (f'| {name} | {robots} | {int(loops.sum()):,} | {int((~theirs).sum()):,} | '
             f'{int((~mine).sum()):,} | {others:,} ({others / loops.sum():.2%}) | '
-            f'{abs(here / there - 1):.1e} | {of_pieces.parts} | {of_pieces.unjudged or "yes"} |')
+            f'{abs(here / there - 1):.1e} | {of_pieces.parts} | {of_pieces.unjudged or "yes"} |'
+            f'{live}')
 
 
 def main() -> None:
@@ -90,9 +150,11 @@ def main() -> None:
     parser.add_argument('--graphs', default=f'manhattan3500,city10000,{BUILDING}')
     parser.add_argument('--robots', default='2,5,20')
     parser.add_argument('--lies', type=float, default=0.3)
+    parser.add_argument('--late', type=float, help='drive them, so late at most [s]')
     arguments = parser.parse_args()
-    print('| graph | robots | loops | refused in one piece | refused | other verdict | cost off | '
-          'parts | judged |\n|---|---|---|---|---|---|---|---|---|', flush=True)
+    names = ['graph', 'robots', 'loops', 'refused in one piece', 'refused', 'other verdict',
+             'cost off', 'parts', 'judged', *(['driven'] if arguments.late is not None else [])]
+    print(f'| {" | ".join(names)} |\n{"|---" * len(names)}|', flush=True)
     for name in arguments.graphs.split(','):
         if name == BUILDING:
             world = simulate_world(_POSES, _EDGES, WorldOptions(), np.random.default_rng(0), name)
@@ -102,7 +164,7 @@ def main() -> None:
         whole = with_lies(record, arguments.lies)
         outcome = solve(whole.graph, None, SolveOptions())
         for robots in map(int, arguments.robots.split(',')):
-            print(row(name, whole, outcome, robots), flush=True)
+            print(row(name, whole, outcome, robots, arguments.late), flush=True)
 
 
 if __name__ == '__main__':

@@ -124,7 +124,8 @@ MADE: dict[str, Callable[[int], Place]] = {
     'tails': lambda seed: (_ring if seed % 2 else _corridor)(50 + seed, True)}
 
 
-def _run(name: str, found: Place, condition: int, seed: int) -> Row:
+def run(name: str, found: Place, condition: int, seed: int) -> Row:
+    """Return what became of the map of a graph in one of `CONDITIONS`."""
     change, amounts, lies, share = CONDITIONS[condition]
     rng = np.random.default_rng((seed, condition, (FIT + HELD).index(name)))
     what = changed(found, change, amounts, rng)
@@ -196,7 +197,7 @@ def main() -> int:
                 if share == 0.9 and name == 'bicocca25b':
                     continue
                 report_progress(f'{name} seed {seed}: {CONDITIONS[condition]}')
-                rows.append(_run(name, found, condition, seed))
+                rows.append(run(name, found, condition, seed))
     weights = _fitted([row for row in rows if row.graph in FIT] or rows)
     print('weights:', ', '.join(f'{weight:.2f}' for weight in weights))
     for half, graphs in {'FIT': FIT, 'HELD': HELD}.items():

@@ -245,8 +245,8 @@ def main() -> None:
     seen = Seen(listener.node)
     with running(BACKEND) as backend:
         with running('replay', str(BAG), '--rate', RATE) as replay:
-            listener.wait(backend, lambda: replay.poll() is not None)
-        listener.wait(backend, listener.is_final)
+            listener.wait({BACKEND: backend}, lambda: replay.poll() is not None)
+        listener.wait({BACKEND: backend}, listener.is_final)
     rclpy.shutdown()
     mpl.rcParams['figure.constrained_layout.use'] = True
     figure = Figure(figsize=(_WIDE / _DOTS, 2 * _HIGH / _DOTS))

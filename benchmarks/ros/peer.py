@@ -17,6 +17,8 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, TypeVar
 
+import numpy as np
+
 from l1slam_ros.ros.shell.domain import go_where_nobody_is
 
 # Its children share it: nobody else's messages are counted.
@@ -40,6 +42,28 @@ from l1slam_ros.ros.demo import executable
 KINDS = {ODOMETRY_TOPIC: Odometry, LOOP_TOPIC: PoseWithCovarianceStamped}
 PATIENCE = 900.0  # [s] the solver may have to be compiled
 AnyPeer = TypeVar('AnyPeer', bound='Peer')
+
+
+class UpdateTimes:
+    """How long updates took, as the diagnostics of the node say it once a second."""
+
+    def __init__(self) -> None:
+        self._seconds: list[float] = []
+        self._updates = '0'
+
+    def note(self, said: Mapping[str, str]) -> None:
+        """Note what the diagnostics say, by name, if there was an update since the last ones."""
+        updates = said.get('updates', '0')
+        if updates not in ('0', self._updates):
+            self._updates = updates
+            self._seconds.append(float(said['update_seconds']))
+
+    @property
+    def sentence(self) -> str:
+        """What is to be said of them."""
+        took = 1e3 * np.array(self._seconds)
+        return (f'{len(took)} updates looked at: median {np.median(took):.1f} ms, p99 '
+                f'{np.percentile(took, 99):.1f}, worst {took.max():.1f}')
 
 
 class Peer:

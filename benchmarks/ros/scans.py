@@ -12,35 +12,40 @@ A laser log over DDS, faster than it was driven: the map of `scan_loops` and `ba
     python benchmarks/ros/scans.py LOG TRUTH [RATE]
 
 LOG is a CARMEN log, TRUTH a table of `stamp,x,y,theta`. Both nodes run as shipped, each a process
-of its own; the log is sent as LaserScan and Odometry, so many scans a second. Said is how many
-scans were used and left out, what each process took of a core for a scan, its memory, and the
-error of the Path to the truth at the truth's stamps.
+of its own; the log is sent as LaserScan and Odometry, so many scans a second. Said is what each
+process took of a core for a scan, its memory, how long updates of the map took, what the front end
+says of itself, and the error of the map at the truth's stamps: where the Path has the keyframe
+before, and `scan_odom` from there. A straight line between keyframes would not do: a robot that
+stands, and goes on, is not on it.
 """
 
-import csv
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
-from peer import arguments, cpu_seconds
+from peer import UpdateTimes, arguments, cpu_seconds
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import LaserScan
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, poses_at
 from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.io.scans.carmen import read_carmen
+from l1slam_ros.io.trajectory import read_reference
 from l1slam_ros.ros.demo import executable
 from l1slam_ros.ros.publishing import header
 
 RATE = 40.0
 # Both nodes' parameters.
 _SHIPPED = Path(__file__).parents[2] / 'config' / 'scan_loops.yaml'
+_LONGEST, _FARTHEST = 10 * 10**9, 10.0  # [ns], [m] of odometry from a keyframe
 _COMPILING, _END = 60.0, 30.0  # [s] nothing is sent before; the map may change after the last
 
 
@@ -51,8 +56,21 @@ def main() -> None:
     rclpy.init()
     node = rclpy.create_node('laser')
     maps: list[PathMessage] = []
+    way: list[Odometry] = []
+    said: dict[str, str] = {}
+    updates = UpdateTimes()
+
+    def hear(message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            updates.note(values)
+            if status.name.endswith('scans'):
+                said.update(values)
+
     node.create_subscription(PathMessage, 'path', maps.append, QoSProfile(
         depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    node.create_subscription(Odometry, 'scan_odom', way.append, QoSProfile(depth=1000))
+    node.create_subscription(DiagnosticArray, '/diagnostics', hear, 10)
     scans = node.create_publisher(LaserScan, 'scan', qos_profile_sensor_data)
     wheels = node.create_publisher(Odometry, 'odom', QoSProfile(depth=1000))
     files = ['--ros-args', '--params-file', str(_SHIPPED), '--log-level', 'error']
@@ -74,8 +92,11 @@ def main() -> None:
         for name, seconds, process in zip(('scan_loops', 'backend'), spent, nodes, strict=True):
             print(f'{name}: {1e3 * seconds / len(log.scans):.2f} ms of a core for a scan, '
                   f'{_memory(process.pid):.0f} MB')
+        print(f'backend: {updates.sentence}')
+        print(', '.join(f'{name} {said[name]}' for name in said
+                        if name.startswith(('refused', 'scan', 'loops', 'parts'))))
         print(f'{len(log.scans)} scans, {len(maps[-1].poses)} keyframes, '
-              f'{_error(maps[-1], given.truth):.3f} m from the truth')
+              f'{_error(maps[-1], way, given.truth):.3f} m from the truth')
     finally:
         for process in nodes:
             process.terminate()
@@ -110,16 +131,27 @@ def _memory(process: int) -> float:
     return int(line.split()[1]) / 1024
 
 
-def _error(path: PathMessage, truth: Path) -> float:
-    """Return the RMSE of positions [m] at the truth's stamps, between keyframes by the line."""
-    with truth.open() as file:
-        rows = [[float(value) for value in row.values()] for row in csv.DictReader(file)]
-    known = np.array(rows)
-    stamps = np.array([stamp_of(pose.header) for pose in path.poses]) / 1e9
-    places = np.array([(p.pose.position.x, p.pose.position.y) for p in path.poses])
-    known = known[(known[:, 0] >= stamps[0]) & (known[:, 0] <= stamps[-1])]
-    found = np.stack([np.interp(known[:, 0], stamps, values) for values in places.T], axis=1)
-    return absolute_trajectory_error(found, known[:, 1:3])
+def _error(path: PathMessage, way: list[Odometry], truth: Path) -> float:
+    """Return the RMSE of positions [m] at the truth's stamps."""
+    true = read_reference(truth, se2, by_stamps=True)
+    keyframes, poses = _stamped([(p.header, p.pose) for p in path.poses])
+    stamps, odometry = _stamped([(m.header, m.pose.pose) for m in way])
+    rows, there = poses_at(se2, stamps, odometry, true.keys, _LONGEST, 0)
+    rows, there = rows[true.keys[rows] >= keyframes[0]], there[true.keys[rows] >= keyframes[0]]
+    before = np.searchsorted(keyframes, true.keys[rows], side='right') - 1
+    _, from_there = poses_at(se2, stamps, odometry, keyframes[before], _LONGEST, 0)
+    step = se2.between(from_there, there)
+    found = se2.compose(poses[before], step)
+    # Between the last scan of a part and the first of the next there is no odometry.
+    known = np.hypot(step[:, 0], step[:, 1]) < _FARTHEST
+    return absolute_trajectory_error(found[known, :2], true.poses[rows[known], :2])
+
+
+def _stamped(messages: list[tuple[Any, Any]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the stamps (n,) [ns] and poses (n, 3) of headers and poses."""
+    poses = np.array([[p.position.x, p.position.y, p.position.z, p.orientation.x, p.orientation.y,
+                       p.orientation.z, p.orientation.w] for _, p in messages])
+    return np.array([stamp_of(head) for head, _ in messages]), se2.from_pose3(poses)
 
 
 if __name__ == '__main__':

@@ -9,14 +9,18 @@
 """
 The node on a small computer: one core, and as much memory as a control group allows.
 
-    python benchmarks/ros/small.py GRAPH GROUP [RATE [PARAMS]]
+    python benchmarks/ros/small.py GRAPH GROUPS [RATE [PARAMS]]
+    python benchmarks/ros/small.py within GROUPS COMMAND ...
 
-The node runs as shipped on the first core, in the control group of the folder GROUP, which has a
-limit and is made beforehand; all others run elsewhere. GRAPH is played to it at so many keyframes
-a second; PARAMS is a params file. Said is how long the start took, which compiles the solver
-unless that was done before, how long updates took, as the diagnostics say it once a second, how
-late poses were, the processor's time, and the most memory that the node had, and the group with
-whatever compiled. It ends with 1 where the node was killed.
+The node runs as shipped on the first core, in the control groups of the folders GROUPS, joined by
+colons, which have limits and are made beforehand; all others run elsewhere. GRAPH is played to it
+at so many keyframes a second; PARAMS is a params file. Said is how long the start took, which
+compiles the solver unless that was done before, how long updates took until the map that they
+made was published, how late poses were, the processor's time, and the most memory that
+the node had, and the groups with whatever compiled. It ends with 1 where the node was killed.
+
+The second form runs any command, with all that it starts, on the first core in these groups, and
+says at the end the most memory that they had.
 """
 
 import os
@@ -30,7 +34,7 @@ import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from peer import Peer, arguments, cpu_seconds, heard
+from peer import Peer, UpdateTimes, arguments, cpu_seconds, heard
 
 from l1slam_ros.io.bags.from_graph import write_graph_bag
 from l1slam_ros.io.graphs.graph_file import read_graph_file
@@ -46,31 +50,30 @@ _EVERY = {'keyframe.translation': 0.0, 'keyframe.rotation': 0.0,
 class Played(Peer):
     """A peer that notes how long updates took."""
 
-    def __init__(self, parameters: dict[str, object], group: Path, params: str):
-        self.seconds: list[float] = []
-        self._updates = ''
-        super().__init__(parameters, [sys.executable, __file__, 'within', str(group)],
+    def __init__(self, parameters: dict[str, object], groups: str, params: str):
+        self.updates = UpdateTimes()
+        super().__init__(parameters, [sys.executable, __file__, 'join', groups],
                          ['--params-file', params])
 
     def _hear(self, message: object) -> None:
         super()._hear(message)
-        if self.said.get('updates', '0') not in ('0', self._updates):
-            self._updates = self.said['updates']
-            self.seconds.append(float(self.said['update_seconds']))
+        self.updates.note(self.said)
 
 
 def main() -> int:
     """Measure and print."""
+    if sys.argv[1:2] == ['join']:
+        return _join(sys.argv[2], sys.argv[3:])
     if sys.argv[1:2] == ['within']:
-        return _within(Path(sys.argv[2]), sys.argv[3:])
-    given = arguments(__doc__, graph=Path, group=Path, rate=RATE, params=str(DEFAULTS))
+        return _within(sys.argv[2], sys.argv[3:])
+    given = arguments(__doc__, graph=Path, groups=str, rate=RATE, params=str(DEFAULTS))
     record = read_graph_file(given.graph)
     os.sched_setaffinity(0, set(range(1, os.cpu_count() or 2)))
     rclpy.init()
     with tempfile.TemporaryDirectory() as folder:
         write_graph_bag(Path(folder) / 'bag', record)
         began = time.monotonic()
-        with Played({'save_path': Path(folder) / 'map.g2o', **_EVERY}, given.group,
+        with Played({'save_path': Path(folder) / 'map.g2o', **_EVERY}, given.groups,
                     given.params) as peer:
             print(f'ready after {time.monotonic() - began:.1f} s', flush=True)
             sent = heard(peer.node, Odometry, 'odom')
@@ -85,28 +88,33 @@ def main() -> int:
             _tell(peer, sent, poses, cpu / seconds)
             most = _most(peer.process.pid)
             code = peer.end()
-    print(f'the node had at most {most:.0f} MiB, the group {_group_most(given.group):.0f} MiB; '
+    print(f'the node had at most {most:.0f} MiB, the groups {_groups_most(given.groups):.0f} MiB; '
           f'ended with {code}')
     return int(code != 0)
 
 
-def _within(group: Path, command: list[str]) -> int:
-    """Become a command on the first core, in a control group."""
-    (group / 'cgroup.procs').write_text(str(os.getpid()))
+def _join(groups: str, command: list[str]) -> int:
+    """Become a command on the first core, in control groups."""
+    for group in groups.split(':'):
+        (Path(group) / 'cgroup.procs').write_text(str(os.getpid()))
     os.sched_setaffinity(0, {0})
-    os.execv(command[0], command)
+    os.execvp(command[0], command)
+
+
+def _within(groups: str, command: list[str]) -> int:
+    """Run a command on the first core, in control groups; say the most memory they had."""
+    code = subprocess.call([sys.executable, __file__, 'join', groups, *command])
+    print(f'the groups had at most {_groups_most(groups):.0f} MiB; ended with {code}')
+    return code
 
 
 def _tell(peer: Played, sent: list[tuple[int, int]], poses: list[tuple[int, int]],
           share: float) -> None:
     when = dict(sent)
     late = [1e-6 * (at - when[stamp]) for stamp, at in poses if stamp in when]
-    took = 1e3 * np.array(peer.seconds)
     print(f'{peer.said["keyframes"]} keyframes, {peer.said["factors"]} factors, '
-          f'{share:.0%} of the core; {len(took)} updates looked at: median '
-          f'{np.median(took):.1f} ms, p99 {np.percentile(took, 99):.1f}, worst {took.max():.1f}; '
-          f'pose after odometry: median {np.median(late):.1f} ms, p99 '
-          f'{np.percentile(late, 99):.1f}')
+          f'{share:.0%} of the core; {peer.updates.sentence}; pose after odometry: median '
+          f'{np.median(late):.1f} ms, p99 {np.percentile(late, 99):.1f}')
     print(f'the node says: {peer.said["message"]}')
 
 
@@ -117,9 +125,10 @@ def _most(process: int) -> float:
     return int(line.split()[1]) / 1024
 
 
-def _group_most(group: Path) -> float:
-    """Return the most memory that a control group had [MiB], in either version of them."""
-    (file,) = (file for file in (group / 'memory.max_usage_in_bytes', group / 'memory.peak')
+def _groups_most(groups: str) -> float:
+    """Return the most memory that control groups had [MiB], in either version of them."""
+    (file,) = (file for group in groups.split(':')
+               for file in (Path(group) / 'memory.max_usage_in_bytes', Path(group) / 'memory.peak')
                if file.exists())
     return int(file.read_text()) / 2**20
 

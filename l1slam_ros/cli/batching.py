@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""The command of `l1slam` that solves a folder of recordings, and what solves one of them."""
+"""The command of `l1slam` that solves a folder of recordings, each in a process of its own."""
 
 import argparse
 import io

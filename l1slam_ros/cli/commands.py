@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 class Ending(NamedTuple):
     """
-    What is still to be said when a command has done its work: sentences, empty if there is none.
+    The last words of a command, a sentence each, or empty.
 
     damage : what could not be read; doubt : why the map is not to be relied on.
     """

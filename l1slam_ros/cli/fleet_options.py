@@ -15,7 +15,7 @@ from l1slam_ros.core import names
 
 
 def add_batch(parser: argparse.ArgumentParser) -> None:
-    """Add what `batch` takes, but for how a recording is read."""
+    """Add the options of `batch`, without those on how a recording is read."""
     add = parser.add_argument
     add('folder', type=Path, metavar='FOLDER',
         help='each file and rosbag2 directory in it that `solve` takes, however deep, is one '
@@ -42,7 +42,7 @@ def add_batch(parser: argparse.ArgumentParser) -> None:
 
 
 def add_merge(parser: argparse.ArgumentParser) -> None:
-    """Add what `merge` takes, but for how an input is read."""
+    """Add the options of `merge`, without those on how an input is read."""
     add = parser.add_argument
     add('input', type=Path, nargs='+', metavar='INPUT',
         help='two or more of what `solve` takes; an edge of a graph file may lead to a vertex of '

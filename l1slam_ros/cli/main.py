@@ -222,6 +222,8 @@ def _add_simulate(parser: argparse.ArgumentParser) -> None:
     add('--edges', type=int, required=True, metavar='M', help='true ones, odometry included')
     add('--false-loops', type=int, default=0, metavar='K',
         help='on top of the edges (default: %(default)s)')
+    add('--scans', action='store_true',
+        help='houses along the streets, and what a laser sees of them on /scan; OUTPUT is a bag')
     _add_randomness(parser)
 
 

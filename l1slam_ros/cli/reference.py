@@ -47,7 +47,7 @@ class Truth:
     steps: Array | None = None
 
     def estimate(self, record: GraphRecord, poses: Array) -> Array:
-        """Return where a map (n, p) has what `poses` tells of, (k, p)."""
+        """Return the estimates of a map (n, p) for the true `poses`, (k, p)."""
         own: Array = poses[self.rows]
         return own if self.steps is None else record.graph.manifold.compose(own, self.steps)
 

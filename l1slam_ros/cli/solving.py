@@ -66,7 +66,8 @@ def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphReco
     """
     Optimise a graph that was read; print, write and draw what came out.
 
-    made : what scans made besides; settled : what is still to be done with the outcome, and said
+    made : what the scans gave besides the graph; settled : changes the outcome before it is
+    written, and returns sentences on that
     """
     truth = read_truth(
         arguments.reference, record, arguments.input, made.path if made else None) if (
@@ -114,7 +115,7 @@ def _read(arguments: argparse.Namespace) -> tuple[GraphRecord, 'ScanMap | None']
 
 
 def _remarks(outcome: Outcome) -> Iterator[str]:
-    """Yield what a map is not."""
+    """Yield a sentence on each limit of a map: loops not judged, parts not joined."""
     if outcome.unjudged:
         yield f'no loop was doubted: {outcome.unjudged}'
     if outcome.parts > 1:

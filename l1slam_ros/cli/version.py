@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Which l1slam this is, for a report of a fault: version, commit and numba; nothing is solved."""
+"""The version of l1slam, its commit and its numba, for reports of faults."""
 
 import json
 import os

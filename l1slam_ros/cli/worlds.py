@@ -12,18 +12,20 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from l1slam_ros.cli.commands import Ending, inputs, read
 from l1slam_ros.cli.reference import known_false
-from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.errors import FileError, OptionError
 from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.names import WORLDS
 from l1slam_ros.core.robust.batch_map import SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
-from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
+from l1slam_ros.core.worlds.simulate import World, WorldOptions, simulate_world, with_false_loops
 from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import SPARSE, compile_now, with_space
 from l1slam_ros.io.files import put_lines, replacing
@@ -33,10 +35,14 @@ from l1slam_ros.io.ours import marked
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.trajectory import truth_lines
 
+if TYPE_CHECKING:
+    from l1slam_ros.core.scans.points import Scan
+
 
 def simulate(arguments: argparse.Namespace) -> Ending:
     """Make a world and write its graph, its truth and which of its loops are false."""
     _check(arguments, (), ('truth', 'false'))
+    _check_scans(arguments)
     output, rng = arguments.output, np.random.default_rng(arguments.seed)
     world = simulate_world(arguments.poses, arguments.edges, WorldOptions(), rng, arguments.world)
     if arguments.false_loops:
@@ -44,11 +50,28 @@ def simulate(arguments: argparse.Namespace) -> Ending:
         world = with_false_loops(world, make(world.graph, world.truth, arguments.false_loops, rng))
     ids = np.arange(world.graph.n_poses)
     record = GraphRecord(world.graph, world.odometry, ids)
+    # Drawn after all that the world itself is drawn of: it is the same world without.
+    seen = _scans(world, record, rng) if arguments.scans else []
     with replacing(beside(output, 'truth')) as temporary:
         put_lines(temporary, marked(truth_lines(ids, world.truth)))
-        _write(output, world.false_loops,
-               lambda: formats.write_output(output, record, world.truth, arguments.force))
+        _write(output, world.false_loops, lambda: formats.write_output(
+            output, record, world.truth, arguments.force, seen))
     return Ending()
+
+
+def _scans(world: World, record: GraphRecord, rng: np.random.Generator) -> 'list[Scan]':
+    # It takes numba along, which nothing else here needs.
+    from l1slam_ros.core.worlds.houses import scans_of_streets
+
+    return scans_of_streets(world.truth, record.times, WorldOptions(), rng)
+
+
+def _check_scans(arguments: argparse.Namespace) -> None:
+    """Refuse scans where no laser can be simulated, or no file has a place for them."""
+    if arguments.scans and arguments.world != WORLDS[0]:
+        raise OptionError(f'--scans in the world {arguments.world}, expected {WORLDS[0]}')
+    if arguments.scans and arguments.output.suffix:
+        raise FileError(arguments.output, 'holds no scans; expected no suffix, for a bag')
 
 
 def corrupt(arguments: argparse.Namespace) -> Ending:

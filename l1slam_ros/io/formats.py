@@ -14,7 +14,7 @@ In the end `l1slam_ros.read_graph` and `write_graph`.
 
 import os
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -51,6 +51,7 @@ from l1slam_ros.io.trajectory import write_tum
 
 if TYPE_CHECKING:
     from l1slam_ros.core.online.options import GraphBuilderOptions
+    from l1slam_ros.core.scans.points import Scan
 
 # By the suffix of a file. A reader takes the path and what the rotation block of the information
 # is of, and raises FileError.
@@ -196,12 +197,12 @@ def check_graph_output(path: Path, inputs: Iterable[Path] = (), force: bool = Fa
 
 
 def write_output(path: Path, record: GraphRecord, truth: Array | None = None,
-                 force: bool = False) -> None:
+                 force: bool = False, scans: 'Sequence[Scan]' = ()) -> None:
     """
     Write a graph with its poses, in the format that the suffix names; none: a bag.
 
     truth : (n, p) poses, which bags and JRL files have a place for; force : whether to replace
-    what others wrote
+    what others wrote; scans : see `write_graph_bag`; only a bag has a place for them
 
     Raises
     ------
@@ -219,7 +220,7 @@ def write_output(path: Path, record: GraphRecord, truth: Array | None = None,
     else:
         from l1slam_ros.io.bags.from_graph import write_graph_bag
 
-        write_graph_bag(path, record, truth)
+        write_graph_bag(path, record, truth, scans)
 
 
 def read_graph(path: str | os.PathLike[str], *, odom_topic: str = DEFAULT_TOPICS.odometry,

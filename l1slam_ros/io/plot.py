@@ -25,6 +25,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from matplotlib.transforms import ScaledTranslation
+from numpy.typing import NDArray
 
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry.manifold import Array, Indices
@@ -49,6 +50,8 @@ _PANEL = 5.6  # [inch]
 _ASPECTS = 0.6, 1.4
 _DOTS_PER_INCH = 150
 _POINT = 1 / 72  # [inch]
+# Of black: cells of a grid of which nothing is known, and those that are occupied.
+_UNKNOWN, _WALL = 0.12, 0.75
 # [inch] From the x axis down to the legend of a map: ticks, their numbers and the name of the axis
 # are in between, and as high in every map, however flat that is.
 _LEGEND_BELOW = 38 * _POINT
@@ -59,6 +62,20 @@ def _no_pairs() -> Indices:
 
 
 @dataclass(frozen=True)
+class Ground:
+    """
+    An occupancy grid under a map.
+
+    occupancy : (a, b) int8, column of x and row of y: 100 occupied, 0 free, -1 unknown; origin :
+    (2,) the corner of cell (0, 0) [m]; resolution : [m]
+    """
+
+    occupancy: NDArray[np.int8]
+    origin: Array
+    resolution: float
+
+
+@dataclass(frozen=True)
 class MapDrawing:
     """
     What one map shows, seen from above where it is not said otherwise.
@@ -66,7 +83,8 @@ class MapDrawing:
     positions, odometry : (n, 2 or 3) [m]; truth : (l, 2 or 3) [m] a path, rows of NaN part it;
     loops, suspect, rejected, false : (m, 2) pairs of rows of `positions`, each loop in one of
     them: `false` those known to be which were not rejected; name : what the positions are; note :
-    more for the line under the title, e.g. costs; upwards : the axis that is.
+    more for the line under the title, e.g. costs; upwards : the axis that is; ground : what lies
+    under all of it.
     """
 
     title: str
@@ -80,6 +98,7 @@ class MapDrawing:
     name: str = 'optimised'
     note: str = ''
     upwards: str = 'y'
+    ground: Ground | None = None
 
     def views(self) -> 'list[MapDrawing]':
         """Return what is drawn: the map from above, and where it has heights, from the side."""
@@ -207,6 +226,8 @@ def _write_title(axes: Axes, title: str, small_print: str) -> None:
 
 def _draw_map(axes: Axes, drawing: MapDrawing) -> None:
     """Draw from the ground up: what was believed, what is true, what is refused, what came out."""
+    if drawing.ground is not None:
+        _draw_ground(axes, drawing.ground)
     if drawing.odometry is not None:
         _draw_path(axes, drawing.odometry, _ODOMETRY, _GREY, 0.7, zorder=1,
                    opacity=_opacity(len(drawing.odometry)))
@@ -228,6 +249,14 @@ def _draw_map(axes: Axes, drawing: MapDrawing) -> None:
     axes.set_ylabel(f'{drawing.upwards} [m]')
     _tidy(axes)
     _draw_legend(axes)
+
+
+def _draw_ground(axes: Axes, ground: Ground) -> None:
+    """Draw what is occupied dark, what is free white, and what is unknown light grey."""
+    shade = np.where(ground.occupancy < 0, _UNKNOWN, np.where(ground.occupancy > 0, _WALL, 0.0))
+    (x, y), (a, b) = ground.origin, ground.resolution * np.array(ground.occupancy.shape)
+    axes.imshow(shade.T, 'Greys', origin='lower', extent=(x, x + a, y, y + b), vmin=0, vmax=1,
+                zorder=0)
 
 
 def _draw_legend(axes: Axes) -> None:
@@ -292,6 +321,9 @@ def _set_view(axes: Axes, drawing: MapDrawing) -> None:
     points = np.concatenate([positions[:, :2] for positions in seen])
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     size = max(float((high - low).max()), 1.0)
+    if (ground := drawing.ground) is not None:
+        end = ground.origin + ground.resolution * np.array(ground.occupancy.shape)
+        low, high = np.minimum(low, ground.origin), np.maximum(high, end)
     if drawing.odometry is not None:
         strayed = drawing.odometry[:, :2].clip(low - _ASTRAY * size, high + _ASTRAY * size)
         low, high = np.minimum(low, strayed.min(axis=0)), np.maximum(high, strayed.max(axis=0))

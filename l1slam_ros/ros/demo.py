@@ -7,12 +7,14 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-`make demo`: plays the demo bag into the real node, draws its map, and compares with the truth.
+`make demo`: plays the demo bag into the real nodes, draws their map, and compares with the truth.
 
-`backend` and `replay` run as processes of their own, with the parameters as shipped; this one
-only listens, as any other ROS program would. It counts no seconds, so it works on a busy machine
-and while the solver is compiled: it waits for the whole recording to be in the map and for the
-node to say that nothing changes any more.
+`scan_loops` finds loops in the recorded scans and draws the grid; `backend` makes the map of these
+loops, of those that the recording holds, ten false ones among them, and of the wheels. These and
+`replay` run as processes of their own, with the parameters as shipped, but that the scans of a
+recording that is played fast may wait; this one only listens, as any other ROS program would. It
+counts no seconds, so it works on a busy machine and while loops are compiled: it waits for the
+whole recording to be in the map and for the node to say that nothing changes any more.
 """
 
 import os
@@ -21,7 +23,7 @@ import subprocess
 import sys
 import sysconfig
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,6 +31,7 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
@@ -38,21 +41,26 @@ from l1slam_ros.core.errors import L1SlamError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, aligned_positions
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.io.bags.reader import bag_summary
 from l1slam_ros.io.bags.to_graph import read_truth_topic
-from l1slam_ros.io.bags.topics import TRUTH_TOPIC
+from l1slam_ros.io.bags.topics import SCAN_TOPIC, TRUTH_TOPIC
 from l1slam_ros.io.files import stamp_from_text
 from l1slam_ros.io.formats import read_input
 from l1slam_ros.io.graphs.side_files import read_pairs
 from l1slam_ros.io.messages.conversion import stamp_of
-from l1slam_ros.io.plot import MapDrawing, plot_maps
+from l1slam_ros.io.plot import Ground, MapDrawing, plot_maps
 from l1slam_ros.ros.shell.domain import go_where_nobody_is
 
 Process = subprocess.Popen[bytes]
 
 BAG = Path('bags/demo')
-BACKEND = 'backend'  # the executable, and the node
+BACKEND, FRONT_END = 'backend', 'scan_loops'  # the executables, and the nodes
 PICTURE = Path('demo/map.png')
 RATE = 10.0
+# Played faster than recorded, no scan is to be left out, nor lost on the way.
+_OF_SCANS = 'qos_overrides./scan.subscription'
+IN_TURN = ('--ros-args', '-p', 'backlog:=1000', '-p', f'{_OF_SCANS}.reliability:=reliable',
+           '-p', f'{_OF_SCANS}.depth:=1000')
 # The map is final when the node has said so often [diagnostics, one a second] the same of it.
 CALM = 3
 OF_THE_MAP = ('keyframes', 'factors', 'updates', 'l1_cost')
@@ -73,7 +81,7 @@ class Recording:
     What the bag holds.
 
     stamps : (n,) [ns]; odometry, truth : (n, 2) positions [m]; loops : (m, 2) rows of these;
-    is_false : (m,) bool, the loops that the file beside the bag calls false.
+    is_false : (m,) bool, the loops that the file beside the bag calls false; scans : how many.
     """
 
     stamps: Indices
@@ -81,6 +89,7 @@ class Recording:
     truth: Array
     loops: Indices
     is_false: np.ndarray
+    scans: int
 
     @property
     def loop_stamps(self) -> list[tuple[int, int]]:
@@ -95,21 +104,24 @@ def read_recording(path: Path) -> Recording:
     positions, loops = graph.manifold.positions, graph.between.pairs[~graph.between.is_odometry]
     false, _ = read_pairs(path, 'false')
     is_false = (loops[:, None] == false).all(axis=2).any(axis=1)
+    scans = sum(topic.count for topic in bag_summary(path).topics if topic.name == SCAN_TOPIC)
     return Recording(record.times, positions(odometry_poses(graph)), positions(truth.poses),
-                     loops, is_false)
+                     loops, is_false, scans)
 
 
 @dataclass
 class Heard:
     """
-    What the back end published.
+    What the back end and the front end published.
 
     path : the last one; states : loop (reference, end) [ns] -> what has become of it; sentence :
     of its diagnostics; calm : how many of these in a row said the same of the map, with no other
-    news in between.
+    news in between; ground : the last grid of the front end; scans : how many it has used.
     """
 
     path: PathMessage | None = None
+    ground: OccupancyGrid | None = None
+    scans: int = 0
     states: dict[tuple[int, int], str] = field(default_factory=dict)
     sentence: str = 'nothing yet'
     calm: int = 0
@@ -122,6 +134,11 @@ class Heard:
     def count_judged(self, loops: list[tuple[int, int]]) -> int:
         """Return how many of some loops are in the map or refused."""
         return sum(self.states.get(loop, 'waiting') != 'waiting' for loop in loops)
+
+    def found(self, loops: list[tuple[int, int]]) -> list[str]:
+        """Return what has become of all loops but these."""
+        known = set(loops)
+        return [state for ends, state in self.states.items() if ends not in known]
 
     def refused(self, loops: list[tuple[int, int]]) -> np.ndarray:
         """Return which of some loops are not in the map, bool."""
@@ -140,10 +157,14 @@ class Listener:
         every = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         node.create_subscription(DiagnosticArray, 'loop_status', self._hear_of_loops, every)
         node.create_subscription(DiagnosticArray, '/diagnostics', self._hear_of_the_map, 10)
+        node.create_subscription(OccupancyGrid, 'map', self._hear_ground, latched)
 
     def _hear(self, message: PathMessage) -> None:
         self.heard.path = message
         self._move()
+
+    def _hear_ground(self, message: OccupancyGrid) -> None:
+        self.heard.ground = message
 
     def _hear_of_loops(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -155,6 +176,11 @@ class Listener:
     def _hear_of_the_map(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
+            if 'scans' in values:  # the front end's
+                if int(values['scans']) != self.heard.scans:
+                    self.heard.scans = int(values['scans'])
+                    self._move()
+                continue
             said = {key: values[key] for key in OF_THE_MAP if key in values}
             if not said:
                 continue
@@ -172,23 +198,26 @@ class Listener:
     def is_final(self) -> bool:
         """Return whether all of the recording is in the map, and the map at rest."""
         heard, loops = self.heard, self.recording.loop_stamps
-        return (heard.calm >= CALM and heard.stamps[-1:] == [self.recording.stamps[-1]]
+        # As long as it uses scans, the front end is not calm.
+        return (heard.calm >= CALM and heard.scans > 0
+                and heard.stamps[-1:] == [self.recording.stamps[-1]]
                 and heard.count_judged(loops) == len(loops))
 
     def how_far(self) -> str:
         """Return how much of the recording is in the map, and what the node says."""
         heard, loops = self.heard, self.recording.loop_stamps
-        return (f'{len(heard.stamps)} of {len(self.recording.stamps)} keyframes mapped, '
+        return (f'{heard.scans} of {self.recording.scans} scans used, '
+                f'{len(heard.stamps)} of {len(self.recording.stamps)} keyframes mapped, '
                 f'{heard.count_judged(loops)} of {len(loops)} loops judged; the node says: '
                 f'{heard.sentence}')
 
-    def wait(self, backend: Process, ready: Callable[[], bool]) -> None:
+    def wait(self, nodes: Mapping[str, Process], ready: Callable[[], bool]) -> None:
         """
         Listen until it is ready, saying now and then how far things are.
 
         Raises
         ------
-        DemoError : the node has ended, or nothing has moved for `PATIENCE` seconds.
+        DemoError : a node has ended, or nothing has moved for `PATIENCE` seconds.
 
         """
         self.moved = time.monotonic()
@@ -196,9 +225,10 @@ class Listener:
         while not ready():
             rclpy.spin_once(self.node, timeout_sec=0.1)
             now = time.monotonic()
-            if backend.poll() is not None:
-                raise DemoError(f'{BACKEND} ended with exit code {backend.returncode}; '
-                                f'{self.how_far()}')
+            for name, process in nodes.items():
+                if process.poll() is not None:
+                    raise DemoError(f'{name} ended with exit code {process.returncode}; '
+                                    f'{self.how_far()}')
             if now > self.moved + PATIENCE:
                 raise DemoError(f'nothing has moved for {PATIENCE:.0f} s; {self.how_far()}')
             if now > tell:
@@ -233,16 +263,17 @@ def executable(name: str) -> str:
 
 
 def record_map(bag: Path, recording: Recording) -> Heard:
-    """Play the bag into `backend`; return what it published."""
+    """Play the bag into both nodes; return what they published."""
     rclpy.init()
     try:
         listener = Listener(rclpy.create_node('demo'), recording)
-        with running(BACKEND) as backend:
+        with running(BACKEND) as backend, running(FRONT_END, *IN_TURN) as front_end:
+            nodes = {BACKEND: backend, FRONT_END: front_end}
             print(f'demo: playing {bag}, {RATE:g} times as fast as recorded', flush=True)
             with running('replay', str(bag), '--rate', str(RATE)) as replay:
-                listener.wait(backend, lambda: replay.poll() is not None)
+                listener.wait(nodes, lambda: replay.poll() is not None)
             print('demo: waiting until nothing changes in the map any more', flush=True)
-            listener.wait(backend, listener.is_final)
+            listener.wait(nodes, listener.is_final)
         return listener.heard
     finally:
         rclpy.try_shutdown()
@@ -260,18 +291,30 @@ def summarise(recording: Recording, heard: Heard, picture: Path) -> str:
     note = f'position error {errors[0]:.2f} m by odometry, {errors[1]:.2f} m optimised'
     refused, false = heard.refused(recording.loop_stamps), recording.is_false
     loops = np.searchsorted(stamps, recording.stamps[recording.loops])
+    found = heard.found(recording.loop_stamps)
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot_maps(picture, [MapDrawing('l1slam_ros demo', positions, odometry,
                                    aligned_positions(truth, positions), loops[~refused & ~false],
                                    rejected=loops[refused], false=loops[~refused & false],
-                                   note=note)])
+                                   note=note, ground=_ground(heard.ground))])
     return '\n'.join((
         f'position error  {errors[0]:.3f} m by odometry, {errors[1]:.3f} m in the map (RMSE)',
         f'graph           {len(stamps)} keyframes, {len(loops)} loops, {false.sum()} of them '
         'false',
         f'refused         {(refused & false).sum()} false loops, {(refused & ~false).sum()} true '
         'ones',
+        f'from the scans  {len(found)} more loops, {sum(state != "accepted" for state in found)} '
+        'of them not in the map',
         f'picture         {picture}'))
+
+
+def _ground(message: OccupancyGrid | None) -> Ground | None:
+    if message is None:
+        return None
+    meta = message.info
+    origin = np.array([meta.origin.position.x, meta.origin.position.y])
+    return Ground(np.array(message.data, np.int8).reshape(meta.height, meta.width).T, origin,
+                  meta.resolution)
 
 
 def require_the_truth(recording: Recording, heard: Heard) -> None:

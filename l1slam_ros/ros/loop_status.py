@@ -9,6 +9,7 @@
 """What has become of each loop, on `loop_status`: a status when one comes, and on each change."""
 
 import struct
+from collections.abc import Sequence
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -31,17 +32,19 @@ class LoopStatus:
     Parameters
     ----------
     node : whose name and clock it speaks with
+    robots : their names by their numbers, none: there is one without a name
 
     """
 
-    def __init__(self, node: Node):
-        self._node = node
+    def __init__(self, node: Node, robots: Sequence[str] = ()):
+        self._node, self._robots = node, robots
         latched = QoSProfile(depth=_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._publisher = node.create_publisher(DiagnosticArray, 'loop_status', latched)
-        # States of those in the graph, and stamps of those that have expired: many, in order.
+        # States of those in the graph; robots and stamps of those that have expired, many, in
+        # order, and of those that wait.
         self._in_graph: Indices = np.zeros(0, np.int64)
-        self._expired: Indices = np.zeros((0, 2), np.int64)
-        self._waiting: set[tuple[int, int]] = set()
+        self._expired: Indices = np.zeros((0, 4), np.int64)
+        self._waiting: set[tuple[int, ...]] = set()
 
     def publish(self, states: LoopStates) -> None:
         """Publish the loops whose state has changed since the last call; called by the worker."""
@@ -52,31 +55,41 @@ class LoopStatus:
         changed = np.ones(len(states.state), bool)
         changed[:known] = now[:known] != self._in_graph[:known]
         (expired,) = np.nonzero(states.state == EXPIRED)
-        gone, before = states.stamps[expired], len(self._expired)
+        named = np.hstack((states.robots, states.stamps))
+        gone, before = named[expired], len(self._expired)
         changed[expired[:before]] = not np.array_equal(gone[:before], self._expired)
         (waits,) = np.nonzero(states.state == WAITING)
-        waiting = [(int(i), int(j)) for i, j in states.stamps[waits]]
-        changed[waits] = [stamps not in self._waiting for stamps in waiting]
+        waiting = [tuple(one) for one in named[waits].tolist()]
+        changed[waits] = [one not in self._waiting for one in waiting]
         rows = np.flatnonzero(changed).tolist()
         self._in_graph, self._expired, self._waiting = now.copy(), gone, set(waiting)
         if rows:
             name, clock = self._node.get_fully_qualified_name(), self._node.get_clock()
-            self._publisher.publish(states_bytes(name, clock.now().nanoseconds, states, rows))
+            self._publisher.publish(states_bytes(
+                name, clock.now().nanoseconds, states, rows, self._robots))
 
 
-def states_bytes(name: str, stamp: int, states: LoopStates, rows: list[int]) -> bytes:
+def states_bytes(name: str, stamp: int, states: LoopStates, rows: list[int],
+                 robots: Sequence[str] = ()) -> bytes:
     """
     Return a serialised diagnostic_msgs/DiagnosticArray: loops come and change by the hundred.
 
-    name : of the node; stamp : of the message [ns]; rows : of the states
+    name : of the node; stamp : of the message [ns]; rows : of the states; robots : see
+    `LoopStatus`
     """
     parts = [(4, header_bytes('', stamp)), (4, struct.pack('<I', len(rows)))]
     for row in rows:
         reference, end = (stamp_text(int(value)) for value in states.stamps[row])
         state, sigmas = int(states.state[row]), float(states.sigmas[row])
         level = DiagnosticStatus.OK if state in (ACCEPTED, WAITING) else DiagnosticStatus.WARN
-        values = ('reference_stamp', reference, 'stamp', end, 'state', LOOP_STATES[state],
-                  'sigmas', '' if np.isnan(sigmas) else f'{sigmas:.2f}')
+        values = ['reference_stamp', reference, 'stamp', end, 'state', LOOP_STATES[state],
+                  'sigmas', '' if np.isnan(sigmas) else f'{sigmas:.2f}']
+        if robots:
+            # Of a loaded map there may be robots that the node has no name for.
+            one, other = (robots[number] if number < len(robots) else str(number)
+                          for number in states.robots[row].tolist())
+            values += 'reference_robot', one, 'robot', other
+            reference, end = f'{one} {reference}', f'{other} {end}'
         texts = f'{name}: loop {reference} - {end}', LOOP_STATES[state], name
         parts += ((1, level), *((4, string_bytes(text)) for text in texts),
                   (4, struct.pack('<I', len(values) // 2)),

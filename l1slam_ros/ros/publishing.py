@@ -57,7 +57,8 @@ class MapPublisher:
         self.covariances = [node.create_publisher(
             PoseWithCovarianceStamped, f'{robot.prefix}pose_with_covariance', 10)
             for robot in robots]
-        self._markers, self._loop_status = GraphMarkers(node), LoopStatus(node)
+        self._markers = GraphMarkers(node)
+        self._loop_status = LoopStatus(node, parameters.options.names)
         # The revision that was published last.
         self._published = 0
 
@@ -94,18 +95,19 @@ class MapPublisher:
             before, after = (manifold.compose(transform, robot.odometry)
                              for transform in self._backend.moved(one.number))
             self._diagnostics.note_jump(manifold, before, after, one.prefix)
-        keyframes, poses, frame = np.arange(len(now.poses)), now.poses, self._frame
+        keyframes, poses, joined = np.arange(len(now.poses)), now.drawn, True
         if one.name:
             keyframes, poses = now.poses_in_map(one.number)
-            maps = now.robot_maps
-            frame = one.map_frame(maps[one.number].joined if one.number in maps else False)
+            joined = len(keyframes) > 0 and now.robot_maps[one.number].joined
             if not len(keyframes) and not path.get_subscription_count():
                 return
-        stamps = now.stamps[keyframes]
+        stamps, frame = now.stamps[keyframes], one.map_frame(joined)
         stamp = robot.stamp if robot is not None else 0
         path.publish(path_bytes(frame, stamp, stamps, manifold.to_pose3(poses)))
         if covariance.get_subscription_count() and len(poses):
-            known = self._backend.marginal_covariance(int(keyframes[-1]))
+            # A map of its own is held by the first keyframe of the robot.
+            known = self._backend.marginal_covariance(
+                int(keyframes[-1]), None if joined else int(keyframes[0]))
             # None: a later map knows it, if any.
             if known is not None:
                 covariance.publish(pose_with_covariance(

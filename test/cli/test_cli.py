@@ -664,6 +664,9 @@ def test_a_parameter_file_speaks_to_both_growth_and_solver(capsys, world, tmp_pa
     (['solve', 'missing.g2o', '--plot', '/proc/out.png'], '/proc/out.png: cannot be written'),
     (['simulate', '/proc/a.g2o', '--poses', '1', '--edges', '5'], '/proc/a.g2o: cannot be wri'),
     (['simulate', 'out.g2o', '--poses', '10', '--edges', '5'], '9 to 45'),
+    (['simulate', 'out.g2o', '--poses', '10', '--edges', '12', '--scans'], 'holds no scans'),
+    (['simulate', 'out', '--poses', '10', '--edges', '12', '--scans', '--world', 'torus'],
+     '--scans in the world torus'),
     (['simulate', 'out.g2o', '--poses', '10', '--edges', '20', '--seed', '-1'], 'seed'),
 ])
 def test_bad_arguments_are_one_line_and_exit_code_2(

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from l1slam_ros.core.errors import FileError
-from l1slam_ros.io.plot import Curve, MapDrawing, plot_curves, plot_maps, plot_solution
+from l1slam_ros.io.plot import Curve, Ground, MapDrawing, plot_curves, plot_maps, plot_solution
 
 SQUARE = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0], [0.0, 1.0]])
 
@@ -96,6 +96,24 @@ def test_the_truth_is_a_path_with_its_gaps(tmp_path):
         r, g, b = np.moveaxis(pixels(tmp_path / 'map.png'), -1, 0)
         orange.append(((r > 200) & (g > 130) & (g < 190) & (b < 90)).sum())
     assert 0 < 1.3 * orange[0] < orange[1]
+
+
+def test_a_grid_lies_under_the_map_dark_where_something_is_and_grey_where_nothing_is_known(
+        tmp_path):
+    occupancy = np.zeros((40, 20), np.int8)
+    occupancy[:, :10] = -1
+    occupancy[:10] = 100
+    plot_maps(tmp_path / 'without.png', [MapDrawing('square', SQUARE)])
+    plot_maps(tmp_path / 'with.png', [MapDrawing(
+        'square', SQUARE, ground=Ground(occupancy, np.array([2.0, 2.0]), 0.2))])
+    plain, drawn = (pixels(tmp_path / f'{name}.png') for name in ('without', 'with'))
+    assert plain.shape == drawn.shape
+    new = (plain == 255).all(axis=2) & (drawn != 255).any(axis=2)
+    shades, counts = np.unique(drawn[new][:, 0], return_counts=True)
+    most = shades[np.argsort(-counts)[:2]]
+    assert most.min() < 110 and 210 < most.max() < 250
+    # Ten of forty columns are dark; of the others the lower half is grey.
+    assert counts.max() / np.sort(counts)[-2] == pytest.approx(1.5, rel=0.1)
 
 
 def test_axes_are_equal(tmp_path):

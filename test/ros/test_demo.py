@@ -20,11 +20,13 @@ rclpy = pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, Pose, PoseStamped
+from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from l1slam_ros.cli.main import main
 from l1slam_ros.io.bags.reader import read_messages
+from l1slam_ros.io.bags.topics import SCAN_TOPIC
 from l1slam_ros.ros import demo
 from l1slam_ros.ros.demo import (
     BAG,
@@ -45,7 +47,12 @@ DEADLINE = 60.0
 def numbers(bag):
     """Return all numbers of all messages of a bag, (k,)."""
     values = []
-    for _, _, stamp, message in read_messages(bag):
+    for topic, _, stamp, message in read_messages(bag):
+        if topic == SCAN_TOPIC:
+            values += [stamp, message.angle_min, message.angle_max, message.angle_increment,
+                       message.range_max, len(message.ranges),
+                       *np.nan_to_num(message.ranges, posinf=-1.0)]
+            continue
         pose = message.pose
         stamped = pose.pose if hasattr(pose, 'covariance') else pose
         p, q = stamped.position, stamped.orientation
@@ -70,7 +77,10 @@ def test_the_summary_of_a_perfect_map_is_an_error_of_zero(tmp_path):
     path = PathMessage(poses=[
         PoseStamped(header=header('map', int(stamp)), pose=Pose(position=Point(x=x, y=y)))
         for stamp, (x, y) in zip(recording.stamps, turned, strict=True)])
-    heard = Heard(path, states_of(recording))
+    grid = OccupancyGrid(data=[-1, 0, 100, 0, 0, 100])
+    grid.info.resolution, grid.info.width, grid.info.height = 2.0, 3, 2
+    states = {**states_of(recording), (1, 2): 'accepted', (1, 3): 'suspect'}
+    heard = Heard(path, grid, 1000, states)
     for is_false in True, False:  # one of each is told apart wrongly
         ends = recording.loop_stamps[np.argmax(recording.is_false == is_false)]
         heard.states[ends] = 'accepted' if is_false else 'rejected'
@@ -78,6 +88,7 @@ def test_the_summary_of_a_perfect_map_is_an_error_of_zero(tmp_path):
     assert '0.000 m in the map' in text and '2.880 m by odometry' in text
     assert '1000 keyframes, 611 loops, 10 of them false' in text
     assert '9 false loops, 1 true ones' in text
+    assert 'from the scans  2 more loops, 1 of them not in the map' in text
     assert (tmp_path / 'demo' / 'map.png').read_bytes().startswith(b'\x89PNG')
 
 
@@ -120,6 +131,13 @@ def diagnostics(updates):
         DiagnosticStatus(message='odom', values=[rate])])
 
 
+def scans_used(count):
+    """Return what the front end says of the scans it has used."""
+    return DiagnosticArray(status=[DiagnosticStatus(
+        message='ok', values=[KeyValue(key='scans', value=str(count)),
+                              KeyValue(key='keyframes', value='1')])])
+
+
 def say(listener, publisher, *messages):
     """Publish messages; wait until the listener has heard of each."""
     deadline = time.monotonic() + DEADLINE
@@ -145,10 +163,16 @@ def test_the_map_is_final_when_it_is_whole_and_the_node_says_the_same_of_it(list
     say(listener, publisher, *[diagnostics(8)] * 5)
     assert not listener.is_final()  # no loop is yet
     heard.states |= states_of(listener.recording)
+    assert not listener.is_final()  # nor has the front end used a scan
+    say(listener, publisher, scans_used(999), *[diagnostics(8)] * 5)
     assert listener.is_final()
     heard.states[listener.recording.loop_stamps[5]] = 'waiting'
     assert not listener.is_final()
     heard.states[listener.recording.loop_stamps[5]] = 'suspect'
+    assert listener.is_final()
+    say(listener, publisher, scans_used(1000))
+    assert not listener.is_final()  # another scan was used
+    say(listener, publisher, *[diagnostics(8)] * 5)
     assert listener.is_final()
     say(listener, publisher, diagnostics(9))
     assert not listener.is_final()  # another update
@@ -156,12 +180,12 @@ def test_the_map_is_final_when_it_is_whole_and_the_node_says_the_same_of_it(list
 
 def test_the_demo_ends_with_a_sentence_when_the_node_has_died(listener):
     process = subprocess.Popen([sys.executable, '-c', 'raise SystemExit(7)'])
-    with pytest.raises(DemoError, match='^backend ended with exit code 7; 0 of 1000 keyframes'):
-        listener.wait(process, lambda: False)
+    with pytest.raises(DemoError, match='^backend ended with exit code 7; 0 of 1000 scans'):
+        listener.wait({'backend': process}, lambda: False)
 
 
 def test_the_demo_ends_with_a_sentence_when_nothing_moves(listener, monkeypatch):
     monkeypatch.setattr(demo, 'PATIENCE', 0.2)
     waiting = subprocess.Popen([sys.executable, '-c', 'input()'], stdin=subprocess.PIPE)
-    with waiting, pytest.raises(DemoError, match='^nothing has moved for .*; 0 of 1000 keyfr'):
-        listener.wait(waiting, lambda: False)
+    with waiting, pytest.raises(DemoError, match='^nothing has moved for .*; 0 of 1000 scans'):
+        listener.wait({'backend': waiting}, lambda: False)

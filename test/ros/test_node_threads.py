@@ -135,6 +135,16 @@ def test_services_do_not_wait_for_an_update(bench, monkeypatch, tmp_path):
     b.until(lambda: len(b.path().poses) == 8, 'updates go on')
 
 
+def test_the_path_does_not_wait_for_the_work_behind_an_update(bench, monkeypatch):
+    b, began = bench(**{'update.budget': 600.0}), threading.Event()
+    b.drive(0, 3)
+    b.until(lambda: len(b.path().poses) == 3, 'a map')
+    monkeypatch.setattr(work, 'improve', lambda *a: began.set() or patient(*a))
+    b.drive(3, 40)
+    b.until(began.is_set, 'an update that takes for ever')
+    b.until(lambda: len(b.path().poses) > 3, 'the Path of what had come')
+
+
 def test_a_backlog_is_taken_over_from_dds_and_answered_at_its_end(bench, monkeypatch):
     """More than the thousand messages that DDS queues up come while the first are in work."""
     b = bench()

@@ -102,7 +102,7 @@ def test_markers_are_what_their_bytes_say(frame, rng):
 def test_ros_reads_the_states_of_loops_that_were_meant(name):
     stamps = np.array([[1, 2], [10**9 + 5, 7 * 10**9], [3, 4 * 10**9 + 1]])
     states = LoopStates(np.arange(2), stamps, np.array([ACCEPTED, REJECTED, WAITING]),
-                        np.array([0.5, 12.346, np.nan]))
+                        np.array([0.5, 12.346, np.nan]), np.array([[0, 0], [0, 1], [2, 0]]))
     data = states_bytes(name, 5_000_000_007, states, [1, 2])
     read = deserialize_message(data, DiagnosticArray)
     assert (read.header.stamp.sec, read.header.stamp.nanosec) == (5, 7)
@@ -114,6 +114,12 @@ def test_ros_reads_the_states_of_loops_that_were_meant(name):
         'reference_stamp': '1.000000005', 'stamp': '7.000000000', 'state': 'rejected',
         'sigmas': '12.35'}
     assert waiting.level == DiagnosticStatus.OK and waiting.values[3].value == ''
+    named = deserialize_message(
+        states_bytes(name, 0, states, [1, 2], ('r1', 'r2')), DiagnosticArray).status
+    assert [one.name.partition(': ')[2] for one in named] == [
+        'loop r1 1.000000005 - r2 7.000000000', 'loop 2 0.000000003 - r1 4.000000001']
+    assert [{value.key: value.value for value in one.values}['robot'] for one in named] == [
+        'r2', 'r1']
 
 
 def test_each_loop_is_told_of_when_it_comes_and_when_it_changes(bench):
@@ -129,7 +135,8 @@ def test_each_loop_is_told_of_when_it_comes_and_when_it_changes(bench):
             [{7: WAITING}]):
         stamps = [(1, 5) for _ in in_graph] + [(1, end) for end in outside]
         status.publish(LoopStates(np.arange(len(in_graph)), np.array(stamps), np.array(
-            [*in_graph, *outside.values()]), np.zeros(len(stamps))))
+            [*in_graph, *outside.values()]), np.zeros(len(stamps)),
+            np.zeros((len(stamps), 2), np.int64)))
     b.until(lambda: len(told) == 5, 'all is told')
     assert told == [[('5', 'waiting'), ('6', 'waiting')], [('5', 'accepted'), ('6', 'expired')],
                     [('7', 'waiting')], [('5', 'rejected'), ('7', 'expired')],

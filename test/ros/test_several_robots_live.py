@@ -114,6 +114,7 @@ def test_a_map_of_two_robots_is_loaded_by_their_names(bench, tmp_path):
     play(b, team)
     settled(b, True)
     b.until(lambda: len(b.received['r2/path'][-1].poses) == 60, 'all of it')
+    b.until(lambda: b.backend._backend.update(0.0) is None, 'the map stands still')
     assert call(b, 'save').success
     second = poses_of(b.received['r2/path'][-1])
     b.close()

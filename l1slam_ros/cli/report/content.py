@@ -38,8 +38,8 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.side_files import beside
 from l1slam_ros.io.sentences import DOUBTFUL, doubt_reasons, doubted, doubted_rows
 
-# What became of a loop, or a step of the odometry: the word; where it is so many sigmas off; where
-# nobody knows how many.
+# The fate of a loop or an odometry step: the word, the sentence where its sigmas are known, the
+# sentence where they are not.
 _FATES = (
     ('accepted', 'agrees with the map, {} sigmas off it', 'is in the map, and was not judged'),
     ('rejected', 'contradicts what is accepted: {} sigmas off the map without it',
@@ -70,7 +70,7 @@ _ADVICE = {
     NORM: 'No single loop settles this. Switch to the least squares map: if that is the place as '
           'you know it, solve with `--norm l2`.',
     FAILED: 'Please report the sentence.', UNSOLVED: 'Please report the sentence.'}
-# By no word about loops.
+# Doubts that no decision about loops settles.
 _UNSETTLED = NORM, FAILED, UNSOLVED
 
 
@@ -105,7 +105,7 @@ def content(path: Path, norm: str | None, record: GraphRecord, outcome: Outcome,
             for doubt, text in zip(doubts, doubt_reasons(doubts, record.ids, record.stamps),
                                    strict=True)],
         'remarks': list(remarks),
-        # Of 64 bits, which JavaScript's numbers have not.
+        # As text: JavaScript's numbers do not hold 64 bits.
         'ids': [str(name) for name in record.ids.tolist()],
         'path': _path(record.graph),
         'i': factors.pairs[rows, 0].tolist(), 'j': factors.pairs[rows, 1].tolist(),

@@ -48,7 +48,7 @@ def check_report(path: Path, read: Sequence[Path], force: bool) -> None:
         raise FileError(path, 'is no name of a page; expected one that ends in '
                         f'{" or ".join(_SUFFIXES)}')
     if find_spec('plotly') is None:
-        raise OptionError("--report draws with plotly, which is not installed; expected it: `pip "
+        raise OptionError('--report draws with plotly, which is not installed; expected it: `pip '
                           "install 'l1slam_ros[report]'`, or the package python3-plotly")
     refuse_others([path], read, force)
 

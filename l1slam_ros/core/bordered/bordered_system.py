@@ -168,13 +168,16 @@ class BorderedSystem:
         self._blocks.extend(predicted.blocks[None])
         self._pulled = self._pulled[:0]
 
-    def covariance(self, keyframe: int) -> Array:
-        """Return the covariance of the step of a keyframe, `FIXED` for none, (k, k)."""
-        before = self.points
-        blocks = np.stack((np.eye(self._k), np.zeros((self._k, self._k))))
-        covariance = self.predict((keyframe, FIXED), blocks, np.zeros(self._k)).covariance
-        if self.points > before:
-            self._points.forget_last(keyframe)
+    def covariance(self, keyframe: int, other: int, turn: Array) -> Array:
+        """
+        Return the covariance of the step of a keyframe less that of another, turned, (k, k).
+
+        keyframe, other : `FIXED` for none; turn : (k, k)
+        """
+        before, blocks = self.points, np.stack((np.eye(self._k), -turn))
+        covariance = self.predict((keyframe, other), blocks, np.zeros(self._k)).covariance
+        while self.points > before:
+            self._points.forget_last()
         return covariance
 
     def step(self, keyframes: list[int]) -> Array:

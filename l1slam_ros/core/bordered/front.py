@@ -51,8 +51,7 @@ _SURE = 1000.0
 # Rows of a border, and keyframes it touches, that one more update has the time and the memory for.
 # What comes then waits for the next map.
 _MOST_ROWS, _MOST_POINTS = 1800, 1400
-# What to do with a factor: accept it; skip it, for the map has it already or is to stay without
-# it; or gate it.
+# What to do with a factor: accept it; skip it, since the map has it or shall not have it; gate it.
 BELIEVE, SKIP, GATE = 1, 0, -1
 
 
@@ -184,9 +183,18 @@ class Front:
         steps = self._systems[L1].step(np.maximum(keyframes - self._fixed, FIXED).tolist())
         return self._manifold.retract(self._first.view()[keyframes, L1], steps)
 
-    def covariance(self, keyframe: int) -> Array:
-        """Return the covariance of a keyframe's step from the L2 map, (k, k)."""
-        return self._systems[L2].covariance(max(keyframe - self._fixed, FIXED))
+    def covariance(self, keyframe: int, seen_from: int | None = None) -> Array:
+        """
+        Return the covariance of a keyframe in its own axes, in the L2 map, (k, k).
+
+        seen_from : relative to this keyframe, None: to what the map is held by
+        """
+        turn, other = np.zeros((len(self._usual),) * 2), FIXED
+        if seen_from is not None:
+            here, there = self.poses_of(np.array([keyframe, seen_from]))[:, None]
+            turn = self._manifold.adjoint(self._manifold.between(here, there))[0]
+            other = max(seen_from - self._fixed, FIXED)
+        return self._systems[L2].covariance(max(keyframe - self._fixed, FIXED), other, turn)
 
     def take(self, factors: BetweenFactors, what: Indices) -> list[Look]:
         """

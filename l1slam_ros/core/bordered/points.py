@@ -141,10 +141,10 @@ class Points:
         kernels.border.follow(self.covariance, parent, turn, noise, product)
         self._of_new.append(self._append(product, mean, parent, turn, noise))
 
-    def forget_last(self, keyframe: int) -> None:
+    def forget_last(self) -> None:
         """Take back the last point, an old keyframe: each makes the next one cost more."""
         last, climb = len(self) - 1, int(self._begin.view()[-2])
-        del self._of_old[keyframe]
+        self._of_old.popitem()
         ends = ((self._begin, last + 1), (self._places, climb),
                 (self._values, climb * self._k**2), (self._covariance, triangle(last)),
                 (self._mean, last), (self._parent, last), (self._turn, last), (self._noise, last))

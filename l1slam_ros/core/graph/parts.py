@@ -30,6 +30,19 @@ def give_to(graph: FactorGraph, robot: Indices) -> None:
     graph.follow(np.arange(len(robot)), before, robot)
 
 
+def ends_before(graph: FactorGraph) -> Indices:
+    """
+    Return behind which keyframe each of `FactorGraph.firsts` is put by a guess, (g,).
+
+    The last one before it of its own robot; of the first one of a robot, the one before it.
+    """
+    firsts, robot = graph.firsts, graph.robot
+    order = np.argsort(robot, kind='stable')
+    at = np.argsort(order)[firsts]
+    own = order[np.maximum(at - 1, 0)]
+    return np.where((at > 0) & (robot[own] == robot[firsts]), own, firsts - 1)
+
+
 def odometry_gaps(graph: FactorGraph) -> Indices:
     """Return the keyframes k where no odometry leads from any keyframe to k + 1, (g,)."""
     return np.flatnonzero(graph.between.step_to[1:] < 0)

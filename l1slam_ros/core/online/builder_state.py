@@ -6,9 +6,9 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What a graph builder has made of messages, as it is saved."""
+"""The state of a graph builder, as it is saved."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,11 +18,19 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.graph.parts import give_to
 
+# [bytes] Of an identity, see `noise.loop_identity`.
+_IDENTITY = 16
+
+
+def key_of(identity: bytes, robots: tuple[int, int]) -> bytes:
+    """Return what equal loops have in common; robots : whose times they name."""
+    return identity + np.array(robots).tobytes() if any(robots) else identity
+
 
 @dataclass(frozen=True)
 class TrackEnd:
     """
-    Where the odometry of a robot has come to.
+    The end of the odometry of a robot.
 
     robot : its number; offset (1, p) : see `GraphBuilder`; end : stamp [ns] of the last sample,
     end_pose (1, p) and end_covariance (d, d) of the motion to it from the last keyframe
@@ -38,7 +46,7 @@ class TrackEnd:
 @dataclass(frozen=True)
 class BuilderState:
     """
-    What a graph builder has made of messages, for another to go on from.
+    The state of a graph builder, from which another one continues.
 
     graph : the factors; stamps (n,) [ns] and odometry (n, p) of the keyframes; offset, end,
     end_pose, end_covariance : of the first robot, see `TrackEnd`; loop_rows (k,),
@@ -73,27 +81,31 @@ class BuilderState:
         return TrackEnd(self.robot, self.offset, self.end, self.end_pose,
                         self.end_covariance), *self.others
 
-    def renumbered(self, number: Mapping[int, int]) -> 'BuilderState':
+    def renumbered(self, number: Callable[[int], int]) -> 'BuilderState':
         """Return the state where robots have other numbers."""
         def turned(robots: Indices) -> Indices:
-            return np.array([number[one] for one in robots.ravel().tolist()], np.int64).reshape(
+            return np.array([number(one) for one in robots.ravel().tolist()], np.int64).reshape(
                 robots.shape)
 
         graph = self.graph.copy()
         give_to(graph, turned(graph.robot))
-        first, *others = sorted((replace(end, robot=number[end.robot]) for end in self.ends),
+        first, *others = sorted((replace(end, robot=number(end.robot)) for end in self.ends),
                                 key=lambda end: end.robot)
         loops, expired = (
             turned(np.full((k, 2), self.robot) if robots is None else robots) for robots, k in (
                 (self.loop_robots, len(self.loop_rows)),
                 (self.expired_robots, len(self.expired))))
-        waiting = tuple((replace(loop, robot=number[loop.robot],
-                                 reference_robot=number[loop.robots[0]]), age)
+        waiting = tuple((replace(loop, robot=number(loop.robot),
+                                 reference_robot=number(loop.robots[0])), age)
                         for loop, age in self.waiting)
+        seen = {}
+        for key, row in self.seen.items():
+            one, other = np.frombuffer(key[_IDENTITY:], np.int64).tolist() or (0, 0)
+            seen[key_of(key[:_IDENTITY], (number(one), number(other)))] = row
         return replace(
             self, graph=graph, robot=first.robot, offset=first.offset, end=first.end,
             end_pose=first.end_pose, end_covariance=first.end_covariance, others=tuple(others),
-            loop_robots=loops, expired_robots=expired, waiting=waiting)
+            loop_robots=loops, expired_robots=expired, waiting=waiting, seen=seen)
 
     @staticmethod
     def of_graph(graph: FactorGraph, poses: Array, stamps: Indices) -> 'BuilderState':

@@ -78,7 +78,7 @@ class GraphBuilder:
 
     @property
     def notes(self) -> Notes:
-        """Of messages that were not used, or otherwise than they say."""
+        """Notes on messages that were refused, or used with a correction."""
         return self._shared.notes
 
     @property
@@ -88,7 +88,7 @@ class GraphBuilder:
 
     @property
     def stream(self) -> OdometryStream:
-        """That of the first robot: passes on what is its motion, and holds what may not be."""
+        """The odometry of the first robot as it comes; a sample that is in doubt is held."""
         return self.robots[0].stream
 
     @property
@@ -136,19 +136,19 @@ class GraphBuilder:
         return self._odometry_of(robot).add(sample)
 
     def finish(self) -> None:
-        """Use the last sample of each robot, if it is held for a pause alone; see `held`."""
+        """Use the last sample of each robot, if only a pause before it is why it is held."""
         for one in self.robots.values():
             one.finish()
 
     def grown(self) -> BuilderState:
-        """Return what another builder goes on from; there are keyframes."""
+        """Return the state from which another builder continues; there is a keyframe at least."""
         shared, loops = self._shared, self.loops
         tracks = shared.tracks
-        in_graph, _, expired = loops.stamps
+        (in_graph, _, expired), (own, _, of_expired) = loops.stamps, loops.robots
         ends = [self.robots[robot].end() for robot in tracks.begun]
         first, *others = ends
         # With the first robot alone all is its own.
-        whose = loops.robots if others or first.robot else (None, None)
+        whose = (own, of_expired) if others or first.robot else (None, None)
         return BuilderState(
             self.graph.copy(), self.keyframe_stamps, self.keyframe_poses, first.offset,
             first.end, first.end_pose, first.end_covariance, loops.rows, in_graph, expired,

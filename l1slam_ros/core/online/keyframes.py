@@ -68,7 +68,7 @@ def reduced_covariance(manifold: Manifold, covariance: Array) -> Array:
 
 
 class Level:
-    """The components of odometry poses that poses of the map lack: in the plane z and tilt."""
+    """Height and tilt of odometry poses, which poses in the plane lack."""
 
     def __init__(self, manifold: Manifold):
         self._manifold = manifold

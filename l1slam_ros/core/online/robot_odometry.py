@@ -138,7 +138,7 @@ class RobotOdometry:
 
     def _put_in_place(self, point: Point) -> bool:
         """
-        Take a sample in that came late; return False: that is more than `odometry.reorder`.
+        Put a late sample in its place; return False where it is later than `odometry.reorder`.
 
         What is known from one keyframe to the next, stays: a message before the last one is
         dropped, and so is one of a place that the robot did not go by.

@@ -335,5 +335,3 @@ def student_quantile(probability: float, freedom: Indices, k: int) -> Array:
         return q * x / (1 - x)
 
     return by_freedom(quantile, freedom)
-
-

@@ -35,7 +35,7 @@ ASKED = 250
 # Of each one so many pairs are looked at closely, those that differ least.
 _NEAREST = 20
 # A run has so many loops, each agrees with so many others of it, and it is so long [m].
-_RUN, _MATES, _RUN_WAY = 10, 3, 3.0
+RUN, _MATES, _RUN_WAY = 6, 3, 2.5
 # So many times vaguer than the surest one, a loop says little.
 _VAGUE, _TINY = 10.0, 1e-300
 
@@ -74,30 +74,39 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
 
 def longest_run(growth: Growth, rows: Indices) -> Group:
     """
-    Return of some loops those of one place that is no one mistake, empty where there is none.
+    Return of some loops the run that most of them are of, empty where there is none.
 
-    A robot that goes the same way twice sees one place all along it. So many loops that agree in
-    pairs, along a way so long at either end, which are most of all, are hardly all false: of
-    recorded runs of ten or more five in six are true. Of loops that say little, as of times when
-    no odometry came, none is asked.
+    Of loops that say little, as of times when no odometry came, none is asked.
     """
     diagonal = np.diagonal(growth.factors.sqrt_information[rows], axis1=1, axis2=2)
     size = np.log(np.maximum(np.abs(diagonal), _TINY)).mean(axis=1)
     rows = asked(growth, rows[size > size.max(initial=-np.inf) - np.log(_VAGUE)])
-    if len(rows) < _RUN:
-        return NO_GROUP
+    longest = max(runs(growth, rows), key=lambda group: len(group.rows), default=NO_GROUP)
+    return longest if len(longest.rows) > len(rows) / 2 else NO_GROUP
+
+
+def runs(growth: Growth, rows: Indices) -> list[Group]:
+    """
+    Return of some loops those of one place that are no one mistake.
+
+    A robot that goes the same way twice sees one place all along it. So many loops that agree in
+    pairs, along a way so long at either end, are hardly all false: of recorded runs of ten or more
+    five in six are true.
+    """
+    rows = asked(growth, rows)
     one, other, _ = agreement(growth, rows)
-    number = growth.place[rows]
-    count = np.bincount(one[number[one] == number[other]], minlength=len(rows))
-    count[number != np.bincount(number[count >= _MATES], minlength=1).argmax()] = 0
-    run = np.argsort(-count, kind='stable')[:np.count_nonzero(count >= _MATES)]
-    if len(run) < max(_RUN, len(rows) / 2 + 1):
-        return NO_GROUP
-    poses = growth.graph.manifold.positions(growth.poses)
-    ways = [np.ptp(poses[ends[rows[run]]], axis=0) for ends in (growth.low, growth.high)]
-    if min(way.max() for way in ways) < _RUN_WAY:
-        return NO_GROUP
-    return Group(rows[run], number[run[:1]])
+    place, poses = growth.place[rows], growth.graph.manifold.positions(growth.poses)
+    count = np.bincount(one[place[one] == place[other]], minlength=len(rows))
+    found = []
+    for number in np.unique(place):
+        own = np.flatnonzero(place == number)
+        own = own[count[own] >= _MATES]
+        ways = [np.ptp(poses[ends[rows[own]]], axis=0).max(initial=0.0)
+                for ends in (growth.low, growth.high)] if len(own) >= RUN else [0.0]
+        if min(ways) > _RUN_WAY:
+            order = np.argsort(-count[own], kind='stable')
+            found.append(Group(rows[own[order]], np.array([number])))
+    return found
 
 
 def asked(growth: Growth, rows: Indices) -> Indices:

@@ -81,8 +81,10 @@ class Growth:
     loops; part : (n,) number of the part of each keyframe; poses : (n, p) the L2 map of the
     accepted; posterior : of these; variance : (2,) of odometry and loops in units of what they
     state; slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
-    drops : (m,) how often each was accepted and did not fit; at_their_word : whether factors may
-    be as noisy as they say; in_tail : (m,) bool, not the loops that are too far off for that;
+    ventured : (m,) bool, loops of runs that noisier odometry explained; first_variance : (2,) of
+    no loop yet, learnt_of : (m,) bool, of what it was learnt last; drops : (m,) how often each was
+    accepted and did not fit; at_their_word : whether factors may be as noisy as they say;
+    in_tail : (m,) bool, not the loops that are too far off for that;
     check : called before long steps, raises where the work shall stop.
     """
 
@@ -109,12 +111,12 @@ class Growth:
         self.part = np.zeros(graph.n_poses, np.int64)
         self._stated = stated_variance(self.factors)
         self.variance = within_ratio(np.ones(2), self._stated)
-        self._learnt_of = np.zeros(0, bool)
-        self._floor, self.at_their_word = np.full(2, _LEAST_VARIANCE), False
+        self.learnt_of = np.zeros(0, bool)
+        self.first_variance, self.at_their_word = np.ones(2), False
         self.posterior: Posterior
         self.slip_odds: dict[int, float] = {}
-        self.drops = np.zeros(len(self.factors), np.int64)
-        self.in_tail = np.ones(len(self.factors), bool)
+        none = np.zeros(len(self.factors), bool)
+        self.ventured, self.in_tail, self.drops = none, ~none, none.astype(np.int64)
 
     def begin(self) -> None:
         """Solve for what is accepted, and learn from the loops how large the noise is."""
@@ -127,19 +129,19 @@ class Growth:
         if not self.may_err_as_one(rows):
             found = self.variance * noise_variance(self.innovations(rows))
             self.variance = within_ratio(found, self._stated)
-            self._floor = _LEAST_VARIANCE * self.variance
+            self.first_variance = self.variance
             self.solve()
 
     def resume(self, poses: Array, accepted: Mask, variance: Array) -> None:
         """Go on from an earlier state: poses (n, p), accepted (m,), variance (2,)."""
         self.poses, self.variance = poses, within_ratio(variance, self._stated)
-        self._floor = np.full(2, LEAST_RATIO**2)  # what was found first is not known any more
+        self.first_variance = np.full(2, LEAST_RATIO)  # it is not known any more, hence no limit
         self.accepted[: self.size] = accepted | self.trusted[: self.size]
         self.cut |= ~self.accepted & ~self.is_loop
         self.accepted |= self.cut
         self._tie_to_world(_LATEST)
         # What the noise of these is, is known.
-        self._learnt_of = self.accepted.copy()
+        self.learnt_of = self.accepted.copy()
         if (self.accepted & self.is_loop).any():
             self.solve()
         else:
@@ -189,7 +191,7 @@ class Growth:
     def copy(self) -> 'Growth':
         """Return a state to try something in."""
         clone = copy.copy(self)
-        for name in ('accepted', 'drops', 'cut', 'in_tail', 'variance', 'slip_odds'):
+        for name in ('accepted', 'drops', 'cut', 'in_tail', 'variance', 'slip_odds', 'ventured'):
             setattr(clone, name, getattr(self, name).copy())
         return clone
 
@@ -279,12 +281,12 @@ class Growth:
             self.drops[misfits] += 1
         if not self._knows_noise:
             self._learn_variance(rows)
-            self._learnt_of = self.accepted.copy()
+            self.learnt_of = self.accepted.copy()
 
     @property
     def _knows_noise(self) -> bool:
         """Whether there is nothing new to learn it of: what was learnt of, says always more."""
-        return self.at_their_word or np.array_equal(self.accepted, self._learnt_of)
+        return self.at_their_word or np.array_equal(self.accepted, self.learnt_of)
 
     def _is_noisier(self, rows: Indices) -> bool:
         """Raise the variance where half of the factors say that it is far too small."""
@@ -322,8 +324,8 @@ class Growth:
         own = np.where(self.factors.is_absolute[rows], 0.0, 1.0)
         found = np.bincount(kind, own * (self.posterior.residual**2).sum(axis=1), 2)
         stated = np.bincount(kind, own * np.trace(self.posterior.moment, axis1=1, axis2=2), 2)
-        scale = (found + known) / (stated + known)
-        self.variance = within_ratio(np.maximum(self.variance * scale, self._floor), self._stated)
+        least, scale = _LEAST_VARIANCE * self.first_variance, (found + known) / (stated + known)
+        self.variance = within_ratio(np.maximum(self.variance * scale, least), self._stated)
 
     def innovations(self, rows: Indices) -> Innovations:
         """Return how factors that are not accepted fit the map."""

@@ -14,6 +14,7 @@ It has a keeper, which owns the graph and its map, and updates of that; see `kee
 
 import os
 import time
+from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from functools import cache
@@ -197,13 +198,14 @@ class Backend:
 
     # What is done.
 
-    def update(self, budget: float = 0.1,
-               stopped: Stopped = lambda: False) -> Improvement | None:
+    def update(self, budget: float = 0.1, stopped: Stopped = lambda: False,
+               taken: Callable[[], None] = lambda: None) -> Improvement | None:
         """
         Take new factors into the map and start background work; None: there was nothing to do.
 
-        What has come, up to some twenty milliseconds of work, is in the map when this returns. It
-        waits up to `budget` seconds for the background work, which then goes on by itself; with
+        What has come, up to some twenty milliseconds of work, is in the map when `taken` is
+        called; up to there the `seconds` of what is returned count. Then it waits up to `budget`
+        seconds for the background work, which goes on by itself after that; with
         `background=True` it does not wait.
 
         Raises
@@ -213,7 +215,7 @@ class Backend:
         """
         self._called = time.monotonic()
         behind = self._background is not None and self._background.is_alive
-        return self._updates.update(budget, stopped, waits=not behind)
+        return self._updates.update(budget, stopped, waits=not behind, taken=taken)
 
     def settle(self, stopped: Stopped = lambda: False) -> Improvement | None:
         """
@@ -253,8 +255,8 @@ class Backend:
 
     @property
     def poses(self) -> Array:
-        """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
-        return self.snapshot().poses
+        """All keyframes in the map of the first robot, (n, p), see `Snapshot.drawn`."""
+        return self.snapshot().drawn
 
     def snapshot(self) -> Snapshot:
         """Return the back end as it is now, the due loops in its graph, to be read at leisure."""
@@ -291,15 +293,16 @@ class Backend:
         with self._keeper.reading() as builder:
             return builder.notes.news()
 
-    def marginal_covariance(self, keyframe: int) -> Array | None:
+    def marginal_covariance(self, keyframe: int, seen_from: int | None = None) -> Array | None:
         """
         Return the covariance of a keyframe in its own axes, (d, d).
 
         Of the least squares map of the accepted factors, with the noise that was found in them:
-        relative to the first keyframe, or to the world where absolute poses are accepted. None:
-        the map does not have the keyframe, or its graph is too dense to be factored.
+        relative to the keyframe `seen_from`, if any, else to the first one, or to the world where
+        absolute poses are accepted. None: the map does not have one of them, or its graph is too
+        dense to be factored.
         """
-        return self._keeper.covariance(keyframe)
+        return self._keeper.covariance(keyframe, seen_from)
 
 
 def _require_options(options: object) -> None:

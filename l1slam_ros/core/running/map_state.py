@@ -39,7 +39,7 @@ _TOLD_SINCE = -1
 
 class Carried(NamedTuple):
     """
-    What a front carries beside the map that it was made of.
+    The size of a front: what it has taken since the map that it was made of.
 
     rows, taken, closed, keyframes, border, variance : see `Front`
     """
@@ -53,7 +53,7 @@ class Carried(NamedTuple):
 
     @staticmethod
     def by(front: Front) -> 'Carried':
-        """Return what a front carries now."""
+        """Return the size of a front as it is now."""
         return Carried(front.rows, front.taken, front.closed, front.keyframes, front.border,
                        front.variance)
 
@@ -187,9 +187,8 @@ class MapState:
         """
         Return the state after a judgement of so many loops, of which poses (n, p) is the L2 map.
 
-        Where it accepts other factors than the map is of, or corrects them otherwise, it waits for
-        a map; anew : from the
-        graph alone
+        A judgement that accepts other factors than the map uses, or corrects them otherwise, is
+        pending until a map is made of it; anew : it is from the graph alone
         """
         after = replace(self, judged=self.judged.after(judgement, poses, loops, anew, now))
         accepted = self.table.accepted[:len(judgement.accepted)]
@@ -237,14 +236,14 @@ class MapState:
             made=now, bound=bound[0], bound_at=bound[1])
 
     def doubted(self, earlier: 'MapState', doubts: tuple[Doubt, ...]) -> 'MapState':
-        """Return the state with what was found of an earlier one, if its map is the same."""
+        """Return the state with doubts found for an earlier state, if its map is the same."""
         if self.optimised is not earlier.optimised or self.of_all is not earlier.of_all:
             return self
         of_all = replace(self.of_all, doubts=tuple(dict.fromkeys(self.of_all.doubts + doubts)))
         return replace(self, of_all=of_all, judged=replace(self.judged, compared=self.optimised))
 
     def account(self, loops: int, seconds: float) -> Improvement:
-        """Return what the last map says of itself, after an update that took so long."""
+        """Return the account of the last map for an update that took so many seconds."""
         settled, last = self.all_judged(loops), self.last
         if last is None:
             judgement = replace(self.table.judgement(self.of_all), settled=settled)

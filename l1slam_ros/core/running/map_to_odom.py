@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Where the odometry frame of a robot is in its map: what the last keyframe of the map says."""
+"""The transform map -> odom of a robot, by the last of its keyframes in the map."""
 
 from typing import NamedTuple
 

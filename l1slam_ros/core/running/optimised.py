@@ -23,7 +23,7 @@ _QUIET_UPDATES = 5
 @dataclass(frozen=True)
 class Optimised:
     """
-    What has been made so far, of the first keyframes and factors.
+    The last solution: of the keyframes and factors that there were when it began.
 
     poses : (k, p); dual : (rows,); cost, status : as the last map left them; quiet_updates : how
     many in a row hardly lowered the cost.
@@ -37,7 +37,7 @@ class Optimised:
 
     @staticmethod
     def nothing(poses: Array) -> 'Optimised':
-        """Return what stands before the first update: poses at most."""
+        """Return the solution before the first update: poses at most."""
         return Optimised(poses, np.zeros(0), 0.0, Status.OUT_OF_TIME, 0)
 
     @property

@@ -9,9 +9,9 @@
 """
 The problem to minimise: a graph, the judgement of its factors, and a warm start.
 
-In: what a back end has at one moment. Out: the same as judge and solvers want it, see `as_one`: of
-one piece, without what a person struck out. What was made of that, `Improvement.of_all` gives back
-for the factors of the back end's graph.
+In: the graph of a back end at one moment. Out: a connected graph without the loops that a person
+struck out, as judge and solvers need it, see `as_one`. `Improvement.of_all` turns a result for
+that graph into one for all factors of the back end.
 """
 
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import sigmas
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.graph.parts import give_to
+from l1slam_ros.core.graph.parts import ends_before, give_to
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.solvers.block_cholesky import Pattern
 from l1slam_ros.core.solvers.solve import AUTO, PRIMAL_DUAL, Method, choose
@@ -34,7 +34,7 @@ _HEADING = 1.0
 @dataclass(frozen=True)
 class Problem:
     """
-    What there is to minimise.
+    A graph to optimise, and where to start.
 
     map : names the map that it is of, another after `Backend.reset` and `Backend.restore`; graph :
     all factors; starts : poses (n, p) to start from, `poses` the first; dual : (rows,) to start
@@ -76,10 +76,10 @@ class Problem:
 
 def as_one(problem: Problem) -> Problem:
     """
-    Return the problem whose graph is of one piece, without what a person struck out.
+    Return the problem with a connected graph, without the loops that a person struck out.
 
-    Each part of the map is tied to the keyframe before its first one, where both stand: so weakly
-    that whatever else joins them decides.
+    Each part of the map is tied to the end of the one of its robot before, the first one of a
+    robot to any keyframe, where both stand: so weakly that whatever else joins them decides.
     """
     graph, judgement = problem.graph, problem.judgement
     rows, d = graph.not_struck, graph.manifold.TANGENT_SIZE
@@ -99,10 +99,10 @@ def as_one(problem: Problem) -> Problem:
 
 def by_robot(problem: Problem) -> tuple[Problem, Indices]:
     """
-    Return the problem with the keyframes of one robot behind those of another, and its order.
+    Return the problem with its keyframes sorted by robot, and the order (n,) of that.
 
-    What is near along the way has numbers near each other then, as the judge wants it. The order
-    (n,) has the number that each keyframe had.
+    Then keyframes that are near along the way have near numbers, as the judge expects. The order
+    has the number that each keyframe had before.
     """
     graph = problem.graph
     order = np.argsort(graph.robot, kind='stable')
@@ -121,7 +121,7 @@ def by_robot(problem: Problem) -> tuple[Problem, Indices]:
 
 
 def as_numbered(order: Indices, judgement: Judgement, poses: Array) -> tuple[Judgement, Array]:
-    """Return what was found of a problem `by_robot`, by the numbers that keyframes had before."""
+    """Return judgement and poses of a problem `by_robot`, by the keyframes' former numbers."""
     return judgement.renumbered(order), poses[np.argsort(order)]
 
 
@@ -130,8 +130,7 @@ def _tied(graph: FactorGraph, poses: Array, firsts: Indices) -> FactorGraph:
     manifold, d = graph.manifold, graph.manifold.TANGENT_SIZE
     extent = float(np.ptp(manifold.positions(poses), axis=0).max()) if len(poses) else 0.0
     sigma = sigmas(manifold, 1.0 + extent, _HEADING)
-    # Any keyframe of a part that came earlier will do.
-    others = firsts - 1
+    others = ends_before(graph)
     graph.follow(firsts, others)
     graph.append_between(
         others, firsts, manifold.between(poses[others], poses[firsts]),

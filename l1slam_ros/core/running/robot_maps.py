@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-In whose map each robot is: in that of the first one, or still in one of its own.
+The map that each robot is in: the map of the first robot, or still a map of its own.
 
 In: a graph, what is accepted of it, and where keyframes are in it. Out: of each robot whether an
 accepted factor joins it to the first one, and what takes its keyframes to the map that it is
@@ -72,7 +72,7 @@ def robot_maps(manifold: Manifold, robot: Indices, factors: BetweenFactors, acce
 
 class Seen(NamedTuple):
     """
-    What is seen of a graph at a moment, to be read at leisure.
+    What a graph was at a moment; it is read without a lock.
 
     factors : of it; robot : (n,) of each keyframe; numbers : of each robot the keyframes, (k,);
     firsts : (r, p) the odometry of their first ones, by robot

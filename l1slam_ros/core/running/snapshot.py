@@ -22,6 +22,7 @@ import numpy as np
 from l1slam_ros.core.bordered.front import View
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.parts import ends_before
 from l1slam_ros.core.online.builder_state import BuilderState
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.map_state import MapState
@@ -41,19 +42,21 @@ class LoopStates:
     What has become of the loops.
 
     rows : (k,) the between factors of the first k of them; stamps : (l, 2) [ns] reference and end;
-    state : (l,) of `LOOP_STATES`; sigmas : (l,), NaN where a loop was not looked at.
+    state : (l,) of `LOOP_STATES`; sigmas : (l,), NaN where a loop was not looked at; robots :
+    (l, 2) whose times the stamps are.
     """
 
     rows: Indices
     stamps: Indices
     state: Indices
     sigmas: Array
+    robots: Indices
 
 
 @dataclass(frozen=True)
 class SavedMap:
     """
-    All that another back end goes on from.
+    The map of a back end and its graph, from which another back end continues.
 
     judgement : of all factors; robust : loops were doubted; graph_began : names the graph in its
     back end, see `Revisions`; robots : their names by their numbers, as far as they have any
@@ -97,7 +100,7 @@ class Counts(NamedTuple):
 @dataclass(frozen=True)
 class Behind:
     """
-    What goes on behind updates.
+    The state of the background work.
 
     age : [s] of the map that was factored, NaN: there is none; rows : of loops that came since;
     loops : not judged yet; bound : a lower bound on the L1 cost of all maps of the accepted
@@ -125,7 +128,7 @@ class Behind:
 @dataclass(frozen=True)
 class Snapshot:
     """
-    What a back end knows.
+    A back end at one moment.
 
     state : of its map; graph : the factors so far; stamps (n,) [ns] and odometry (n, p) of the
     keyframes; map_to_odom : (1, p) of the first robot; loop_rows, loop_stamps, loop_robots : see
@@ -140,7 +143,7 @@ class Snapshot:
     map_to_odom: Array
     loop_rows: Indices
     loop_stamps: tuple[Indices, Indices, Indices]
-    loop_robots: tuple[Indices, Indices]
+    loop_robots: tuple[Indices, Indices, Indices]
     views: tuple[View, ...]
     pattern: Pattern | None
 
@@ -151,7 +154,11 @@ class Snapshot:
 
     @cached_property
     def poses(self) -> Array:
-        """All keyframes in the map frame, (n, p): the optimised ones, then odometry from there."""
+        """
+        Return all keyframes in the frame of the graph, (n, p).
+
+        The optimised ones, then odometry from there.
+        """
         return self._followed(
             self.views[0].poses if self.views else self.state.optimised.poses, self.odometry)
 
@@ -171,7 +178,7 @@ class Snapshot:
 
     @property
     def drawn(self) -> Array:
-        """All keyframes as seen from the map of the first robot, (n, p)."""
+        """All keyframes as seen from the map of the first robot, (n, p), joined to it or not."""
         first = self.robot_maps.get(0)
         if first is None or first.turn is None or not first.joined:
             return self.poses
@@ -181,13 +188,16 @@ class Snapshot:
         """
         Return poses (k, p), and behind them the other keyframes as they follow in others (n, p).
 
-        Each follows the last of its predecessors that is known, the first of a part the last
-        keyframe that is.
+        Each follows the last of its predecessors that is known; the first of a part the end of
+        the one of its robot before, or of none of its robot the last keyframe that is known.
         """
         manifold, known = self.graph.manifold, len(poses)
         if not known or known == len(others):
             return np.concatenate((poses, others[known:]))
-        before = np.where(self.graph.parent < np.arange(len(others)), self.graph.parent, known - 1)
+        before, firsts = self.graph.parent, self.graph.firsts
+        ends = ends_before(self.graph)
+        before[firsts] = np.where(
+            self.graph.robot[ends] == self.graph.robot[firsts], ends, known - 1)
         while (before[known:] >= known).any():
             before = np.where(before >= known, before[before], before)
         before = before[known:]
@@ -248,7 +258,8 @@ class Snapshot:
         others = np.repeat([WAITING, EXPIRED], [len(waiting), len(expired)])
         sigmas = np.concatenate((judgement.sigmas[rows], np.full(len(others), np.nan)))
         return LoopStates(rows, np.concatenate((in_graph, waiting, expired)),
-                          np.concatenate((state, others)), sigmas)
+                          np.concatenate((state, others)), sigmas,
+                          np.concatenate(self.loop_robots))
 
     def sizes(self) -> dict[str, int]:
         """Return how many keyframes, factors and loops of each state there are, by name."""

@@ -84,17 +84,17 @@ def submap_of(keyframes: Sequence[Keyframe], at: int, before: int = AROUND, afte
     near = [keyframe for keyframe in keyframes[max(at - before, 0) : at + after + 1]
             if keyframe.part == own.part]
     poses = se2.between(np.tile(own.pose, (len(near), 1)), np.array([k.pose for k in near]))
-    # The own scan first: of the points of a cell the first is kept.
-    order = np.arange(len(near))
+    # Of the points of a cell the first is kept, which is of the oldest scan.
     xy, normals = [], []
-    for k in order:
-        points, normal = near[k].points.surface
-        xy.append(transformed(poses[k], points))
-        normals.append(rotated(poses[k], normal))
+    for keyframe, pose in zip(near, poses, strict=True):
+        points, normal = keyframe.points.surface
+        xy.append(transformed(pose, points))
+        normals.append(rotated(pose, normal))
     points, normal = np.concatenate(xy), np.concatenate(normals)
     side = np.round(np.arctan2(normal[:, 1], normal[:, 0]) / (np.pi / 2)).astype(np.int64) % 4
     cell = np.floor(points / _CELL).astype(np.int64)
-    _, first = np.unique(np.column_stack((cell, side)), axis=0, return_index=True)
+    # One number for each cell and side; no map is 2^29 cells wide.
+    _, first = np.unique((cell[:, 0] * 2**31 + cell[:, 1]) * 4 + side, return_index=True)
     kept = np.sort(first)
     centres = poses.copy()
     for row, keyframe in zip(centres, near, strict=True):

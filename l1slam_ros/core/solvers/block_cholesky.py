@@ -44,9 +44,12 @@ _NO_COLUMNS = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32
 
 # Numbers that one gigabyte holds.
 MOST_ENTRIES = 135_000_000
-# Multiplications for each block of the factor from which a factorisation takes longer than to find
-# another order.
-_LONG = 1500
+# Multiplications for each keyframe from which a factorisation is long: what another order spares
+# of a few of them is then more than it takes to find.
+_LONG = 8000
+# Multiplications of numbers, some 50 ms, from which separators may pay for the loops that find
+# them: those are compiled at their first use on a machine, for 5 s.
+_VAST = 1.5e8
 # A graph that has grown by more is ordered anew, which is seldom enough to cost nothing. Had it
 # never been, City's last factorisation, six thousand keyframes on, would do a quarter more work.
 _GROWN = 1.1
@@ -107,8 +110,8 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
     """
     Return a pattern of little fill.
 
-    By minimum degree; where a factorisation takes longer than that, by dissection too, and the
-    better of the two.
+    By minimum degree; where a factorisation is long, by dissection of levels too, where it still
+    is very long, of separators; the best of them.
 
     Parameters
     ----------
@@ -130,14 +133,14 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
         if pattern is not None:
             return pattern
     pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), _NO_COLUMNS, size)
+    for dissect, least in (kernels.ordering.dissect, 0.0), (kernels.dissection.dissect, _VAST):
+        if pattern is None or pattern.work * k**3 > max(_LONG * size, least):
+            dissected = _laid_out(graph, most_blocks, dissect(*graph), _NO_COLUMNS, size)
+            if dissected and not (pattern and pattern.work <= dissected.work):
+                pattern = dissected
     if pattern is None:
         raise FillError(f'the factor of {size} keyframes and {len(keyframe)} factors would have '
                         f'more than {most_blocks} blocks: too many far places are joined')
-    if pattern.work * k**3 > _LONG * len(pattern.columns[-1]):
-        stage = kernels.ordering.dissect(*graph)
-        dissected = _laid_out(graph, most_blocks, stage, _NO_COLUMNS, size)
-        if dissected is not None and dissected.work < pattern.work:
-            return dissected
     return pattern
 
 

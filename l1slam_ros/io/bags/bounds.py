@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What a bag may ask for before it is refused: memory by what is packed in it, time by its queries.
+Limits on a bag: the memory that its compressed parts unpack to, and the time its queries take.
 
 A few kilobytes can unpack to gigabytes, a table of a database can be a query without an end, and
 nested YAML costs a parser the square of its length. So each is bounded before it is read.
@@ -50,7 +50,7 @@ def require_small(size: int, what: str) -> None:
 
 def unpacked(compression: str, data: bytes) -> bytes:
     """
-    Return what is packed, as far as it goes where it is cut; compression : zstd, lz4 or bz2.
+    Return the unpacked data, where it is cut up to the cut; compression : zstd, lz4 or bz2.
 
     Raises
     ------

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Which topics of a bag have the graph of another front end."""
+"""Which topics of a bag hold the pose graph of another front end, as slam_toolbox."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +33,7 @@ class Foreign:
 
 def foreign_graph(path: Path, topics: Topics) -> tuple[Topics, Foreign | None]:
     """
-    Return where to look, and what of it is the graph of another front end, if any is.
+    Return the topics to read, and which of them hold another front end's graph, if any do.
 
     A bag that has nothing on the default topic of the odometry, and the messages of one front
     end that tells its odometry, is taken for one of that: of all robots in it.

@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A graph as the messages of a bag, such that it can be had back exactly.
+A graph as the messages of a bag, from which exactly the same graph is read again.
 
     /odom            one nav_msgs/Odometry per keyframe: the odometry factors, chained
     /loop_closures   one geometry_msgs/PoseWithCovarianceStamped per other factor;
@@ -16,6 +16,7 @@ A graph as the messages of a bag, such that it can be had back exactly.
                      /rejected_loop_closures for those that were left out of the map
     /absolute_poses  the same per absolute factor
     /ground_truth    geometry_msgs/PoseStamped, where the truth is known
+    /scan            sensor_msgs/LaserScan, where a laser was simulated
 
 Covariances are those of the factors, in the axes of the measured pose: of an odometry message
 that of the motion since the message before. What is left unsaid has an infinite variance. In a bag
@@ -27,6 +28,8 @@ bag needs that of every keyframe; and so is an absolute pose.
 """
 
 import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,7 +38,12 @@ from l1slam_ros.core.geometry import noise, se3
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, turned
-from l1slam_ros.core.graph.measurements import FASTEST, LONGEST_PAUSE, SHORTEST_STEP
+from l1slam_ros.core.graph.measurements import (
+    FASTEST,
+    LONGEST_PAUSE,
+    SHORTEST_STEP,
+    LoopClosure,
+)
 from l1slam_ros.core.graph.parts import odometry_gaps
 from l1slam_ros.core.graph.recording import loops_of, recorded, steps_of
 from l1slam_ros.io.bags.topics import (
@@ -44,6 +52,8 @@ from l1slam_ros.io.bags.topics import (
     LOOP_TOPIC,
     ODOMETRY_TOPIC,
     REJECTED_LOOP_TOPIC,
+    SCAN_TOPIC,
+    SCAN_TYPE,
     TRUSTED_LOOP_TOPIC,
     TRUTH_TOPIC,
 )
@@ -52,7 +62,10 @@ from l1slam_ros.io.files import LAST_STAMP
 from l1slam_ros.io.graphs.graph_file import GraphRecord, left_out_words
 from l1slam_ros.io.graphs.left_out import REJECTED, SLIP, SUSPECT
 from l1slam_ros.io.messages.conversion import reference_frame_id
-from l1slam_ros.io.messages.serialisation import odometry_bytes, pose_bytes
+from l1slam_ros.io.messages.serialisation import odometry_bytes, pose_bytes, scan_bytes
+
+if TYPE_CHECKING:  # it takes numba along
+    from l1slam_ros.core.scans.points import Scan
 
 # What `reader.read_note` returns for a graph.
 GRAPH_NOTE = {'keyframes': 'every', 'covariance': 'increment'}
@@ -72,7 +85,7 @@ _LOOP = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
 
 def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
-                    truth: Array | None = None) -> None:
+                    truth: Array | None = None, scans: 'Sequence[Scan]' = ()) -> None:
     """
     Write a graph as the messages a robot would have sent.
 
@@ -81,6 +94,7 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
     path : the bag's directory; a bag already there is replaced once the new one is complete
     record : its stamps, or invented ones; its stored poses and vertex ids have no place in a bag
     truth : (n, p) poses in the map frame, or None
+    scans : of a laser that is where the robot is, one for each keyframe and at its stamp, or none
 
     Raises
     ------
@@ -108,27 +122,35 @@ def write_graph_bag(path: str | os.PathLike[str], record: GraphRecord,
         if truth is not None:
             writer.add_topic(TRUTH_TOPIC, _TRUTH)
             true = to_pose3(truth)
+        if scans:
+            writer.add_topic(SCAN_TOPIC, SCAN_TYPE)
         for k, (sample, loops) in enumerate(recorded(graph, stamps)):
             stamp = sample.stamp
             writer.write(ODOMETRY_TOPIC, stamp, odometry_bytes(
                 'odom', _BASE_FRAME, stamp, sample.pose3, sample.covariance))
             if truth is not None:
                 writer.write(TRUTH_TOPIC, stamp, pose_bytes('map', stamp, true[k]))
+            if scans:
+                writer.write(SCAN_TOPIC, stamp, scan_bytes(_BASE_FRAME, scans[k]))
             for loop in loops:
                 topic, frame = ABSOLUTE_TOPIC, 'map'
                 # Of one that is struck out the message before told what it is.
                 word = '' if loop.struck else next(in_order)
                 if loop.reference_stamp is not None:
-                    topic = (FALSE_LOOP_TOPIC if loop.struck else
-                             REJECTED_LOOP_TOPIC if word in _REFUSED else
-                             TRUSTED_LOOP_TOPIC if loop.trusted else LOOP_TOPIC)
+                    topic = _topic(loop, word)
                     frame = reference_frame_id(_BASE_FRAME, loop.reference_stamp)
                 writer.write(topic, stamp, pose_bytes(frame, stamp, loop.pose3, loop.covariance))
 
 
+def _topic(loop: LoopClosure, word: str) -> str:
+    """Return the topic of a loop; word : what it was left out as, empty: it was not."""
+    return (FALSE_LOOP_TOPIC if loop.struck else REJECTED_LOOP_TOPIC if word in _REFUSED else
+            TRUSTED_LOOP_TOPIC if loop.trusted else LOOP_TOPIC)
+
+
 def _note(graph: FactorGraph, stamps: list[int]) -> dict[str, str]:
     """
-    Return what is noted of a graph in its bag.
+    Return the note on a graph that goes into the metadata of its bag.
 
     A graph may have loops that are equal in all, steps longer than a robot's, years between its
     keyframes, and variances of no measurement: each message is meant then, and the note says so.

@@ -244,7 +244,7 @@ def _ros1_types(fields: Mapping[str, Any]) -> Any:
 
 @contextmanager
 def _reader(bag: Path) -> Iterator[Any]:
-    """Yield the library's reader of a bag that it can be trusted with."""
+    """Yield the library's reader of a bag, after checks that the library does not make."""
     if bag.is_dir():
         require_shallow(bag / METADATA)
         if str(directory_metadata(bag).get('compression_mode') or 'none').lower() != 'none':
@@ -264,7 +264,7 @@ def _reader(bag: Path) -> Iterator[Any]:
 
 
 def _salvage(bag: Path, error: Exception) -> Salvage:
-    """Return what can be had of a bag that the library gave up on."""
+    """Return the messages before the damage of a bag that the library cannot read."""
     if isinstance(error, BombError):
         raise FileError(bag, str(error)) from error
     if bag.suffix.lower() == '.bag':

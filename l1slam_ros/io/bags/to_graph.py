@@ -262,13 +262,13 @@ def _noted_left_out(graph: FactorGraph, note: dict[str, str]) -> np.ndarray:
 
 
 def _noted_rows(rows: Indices, note: dict[str, str], name: str) -> Indices:
-    """Return those of the rows whose numbers a note has; a damaged bag may lack the last."""
+    """Return the rows whose numbers are in a note; a damaged bag may lack the last ones."""
     numbers = [int(word) for word in note.get(name, '').split() if word.isdecimal()]
     return rows[[number for number in numbers if number < len(rows)]]
 
 
 def _alternatives(path: Path, topic: str, *msgtypes: str) -> list[str]:
-    """Say on which other topics a bag has messages of some types; nothing where on none."""
+    """Name the other topics of a bag with messages of some types; empty where there are none."""
     others = [(t.msgtype, t.name) for t in bag_summary(path).topics if t.name != topic]
     return [f'{msgtype} is on {", ".join(name for found, name in others if found == msgtype)}'
             for msgtype in msgtypes if msgtype in dict(others)]

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""How bags are called, and where one has what; imports nothing that takes time."""
+"""The suffixes of bags and their default topics; this module is quick to import."""
 
 from dataclasses import dataclass
 
@@ -19,14 +19,16 @@ FALSE_LOOP_TOPIC = '/false_loop_closures'
 REJECTED_LOOP_TOPIC = '/rejected_loop_closures'
 ABSOLUTE_TOPIC = '/absolute_poses'
 TRUTH_TOPIC = '/ground_truth'
+SCAN_TOPIC = '/scan'
 
 ODOMETRY_TYPE = 'nav_msgs/msg/Odometry'
 POSE_TYPE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+SCAN_TYPE = 'sensor_msgs/msg/LaserScan'
 
 
 @dataclass(frozen=True)
 class Topics:
-    """Where a bag has its odometry and loop closures; the other topics have no other names."""
+    """The topics of a bag's odometry and loop closures; its other topics have fixed names."""
 
     odometry: str = ODOMETRY_TOPIC
     loops: str = LOOP_TOPIC

@@ -96,7 +96,7 @@ class BagWriter:
 @contextmanager
 def new_bag(path: str | os.PathLike[str], note: dict[str, str]) -> Iterator[BagWriter]:
     """
-    Yield the writer of a bag (a rosbag2 directory, mcap), in its place when the block succeeds.
+    Yield the writer of a bag, which takes its place when the block succeeds.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def refuse_other_than_bag(target: Path) -> None:
 
 @contextmanager
 def _replacing_directory(target: Path) -> Iterator[Path]:
-    """Yield the name of a directory to make, which takes the place of `target` in the end."""
+    """Yield the name of a directory that replaces `target` when the block succeeds."""
     with reported(target):
         refuse_other_than_bag(target)
         with new_folder_beside(target) as scratch:

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Vertices of a graph file that hold it in place and are none of the robot's."""
+"""Vertices of a graph file that only fix it in the world: they are no poses of the robot."""
 
 import numpy as np
 
@@ -22,10 +22,11 @@ def fixed_in(groups: dict[str, TextLines]) -> list[str]:
 
 def anchors_of(groups: dict[str, TextLines], ids: Indices, edges: Rows) -> Indices:
     """
-    Return the vertices that hold a graph in place and are none of the robot's, (k,).
+    Return the vertices that only fix a graph in the world, no poses of the robot, (k,).
 
-    As of hdl_graph_slam: fixed, on a single edge, and another leads from the vertex before to the
-    one behind. The map is the same without them; with them the odometry would have a gap.
+    hdl_graph_slam writes them. Such a vertex is fixed and has a single edge, and another edge
+    joins the vertices with the ids just below and above. The map is the same without them; with
+    them the odometry would have a gap.
     """
     fixed = fixed_in(groups)
     if not fixed:  # as in most files; else each vertex gets a name to compare

@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Factors that a map was made without: comments for other programs, factors again for this one.
+Factors that a map was made without: comments in its file, which this program reads as factors.
 
     # rejected EDGE_SE2 ...   a loop or an absolute pose that was not believed
     # suspect EDGE_SE2 ...    one that fits, but could as well be chance
@@ -38,7 +38,7 @@ _COMMENT = re.compile(f'# ({REJECTED}|{SUSPECT}|{SLIP}|{STRUCK}|{MEASURED}) '
 
 
 def nothing_left_out(count: int) -> np.ndarray:
-    """Return for each of some factors that a map is made with it: an empty word, (count,)."""
+    """Return an empty word for each of `count` factors: none of them is left out."""
     return np.full(count, '', object)
 
 
@@ -55,7 +55,7 @@ def left_out_by(judgement: Judgement | None, factors: BetweenFactors) -> np.ndar
 
 
 def left_out_of(inliers: Mask, factors: BetweenFactors) -> np.ndarray:
-    """Return the same where all that is known is which factors (m,) bool were believed."""
+    """Return these words where only (m,) bool is known, which factors were believed."""
     words = np.where(inliers, '', np.where(factors.is_odometry, SLIP, REJECTED)).astype(object)
     words[factors.struck] = STRUCK
     return words
@@ -68,7 +68,7 @@ def commented(lines: list[str], words: np.ndarray) -> list[str]:
 
 def restored(lines: TextLines) -> tuple[TextLines, dict[int, tuple[str, int]]]:
     """
-    Return the lines of a file with those that were left out, and their words and places.
+    Return the lines of a file with the left-out ones as factors again, and their words and places.
 
     Those by the numbers of their lines; a place is the number among the factors.
 
@@ -92,7 +92,7 @@ def restored(lines: TextLines) -> tuple[TextLines, dict[int, tuple[str, int]]]:
 def in_place(numbers: Indices, words: dict[int, tuple[str, int]]
              ) -> tuple[Indices, np.ndarray, Indices]:
     """
-    Return the order (m,) in which factors stood, by their lines, and their words in it.
+    Return the order (m,) of the factors before some were left out, and their words in that order.
 
     And the order (m,) of their measurements: of what was corrected, as it was measured.
     """

@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Where a running back end keeps its map: when it is saved, and never over that of another."""
+"""The file of a running map: when it is saved, and never over a file of somebody else."""
 
 import filecmp
 import os
@@ -34,7 +34,7 @@ _END = 128
 
 class MapFile:
     """
-    Saves and loads the map of a back end; of several threads one after the other does.
+    Saves and loads the map of a back end; several threads may call, one at a time is served.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class MapFile:
         self._ours_before: tuple[object, ...] = ()
 
     def save(self) -> str:
-        """Save the map; return a sentence that says where, and what of others was kept."""
+        """Save the map; return a sentence that says where, and which foreign file was kept."""
         with self._at_work(), self._backend.calm:
             revision, path = self._backend.revisions.now, self._path()
             saved = self._backend.saved()
@@ -73,7 +73,7 @@ class MapFile:
 
     def autosave(self, taken: Callable[[], None] = lambda: None) -> None:
         """
-        Save the map if it has changed; what stood in its place, if not its own, is kept.
+        Save the map if it has changed; a file in its place that this node did not write is kept.
 
         taken : called before it is written: what becomes of the map from then on does not matter
         """
@@ -89,7 +89,7 @@ class MapFile:
             self._write(path, saved, revision)
 
     def _keep_others(self, path: Path, saved: SavedMap | None) -> list[str]:
-        """Keep what stands in the places of a map and is none of it; return what to say of it."""
+        """Keep foreign files in the places of a map under other names; return a sentence on it."""
         if saved is None:
             return []
         sentences, before, end = [], before_of(path), _end_of(path)
@@ -143,16 +143,17 @@ class MapFile:
         return sentence, whole
 
     def _by_name(self, saved: SavedMap) -> SavedMap:
-        """Return a map whose robots have the numbers that those of their names have here."""
-        own = self._options().names
-        self._robots = own + tuple(name for name in saved.robots if name not in own)
-        number = {was: self._robots.index(name) for was, name in enumerate(saved.robots)}
-        if not own or all(was == now for was, now in number.items()):
+        """Return a loaded map; its robots get the numbers that their names have in this node."""
+        own, named = self._options().names, len(saved.robots)
+        names = self._robots = own + tuple(name for name in saved.robots if name not in own)
+
+        def number(was: int) -> int:
+            return names.index(saved.robots[was]) if was < named else was - named + len(names)
+
+        # What a node without names has saved, is of the first robot.
+        if not own or not named:
             return saved
-        builder = saved.builder
-        for end in builder.ends:  # of no name
-            number.setdefault(end.robot, len(number) + len(self._robots))
-        return replace(saved, builder=builder.renumbered(number))
+        return replace(saved, builder=saved.builder.renumbered(number))
 
     def load_at_start(self, tell: Callable[[str], object]) -> None:
         """Load the map if there is one; tell so, or warn where there is a damaged one."""
@@ -166,9 +167,9 @@ class MapFile:
         """
         Return whether to autosave now.
 
-        The first save is due as soon as there is a map: who restarts a node again and again must
-        not lose all of it again and again. But what stands in its place and was not loaded has
-        time to be.
+        The first save is due as soon as there is a map: a node that is restarted again and again
+        would otherwise lose its map each time. Where a file that was not loaded stands at the
+        path, the first save waits a period, so that a person can still load it.
         """
         due = self._began + _PART * self._options().autosave_period
         return self._is_to_be_saved() and (time.monotonic() >= due or (
@@ -203,7 +204,7 @@ def _absolute(path: str) -> Path:
 
 
 def _end_of(path: Path) -> bytes:
-    """Return the last bytes of a file, of a saved map its checksum; none: there is no file."""
+    """Return the last bytes of a file, empty: there is none. A saved map ends in its checksum."""
     if not os.path.isfile(path):
         return b''
     with path.open('rb') as file:

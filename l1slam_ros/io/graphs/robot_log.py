@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What a log of several robots says besides its graph, to be written again as it came."""
+"""What a log of several robots holds besides its graph; it is written back unchanged."""
 
 from dataclasses import dataclass
 

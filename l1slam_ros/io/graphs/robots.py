@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Which robot a vertex is of, by its id, as the symbols of GTSAM have it."""
+"""Which robot a vertex belongs to, by its id: a symbol of GTSAM has the robot's letter in it."""
 
 import numpy as np
 

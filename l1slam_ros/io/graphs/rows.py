@@ -109,7 +109,7 @@ def expected_tags(kind: str) -> str:
 
 
 def manifold_of(path: object, groups: dict[str, TextLines]) -> Manifold:
-    """Return what the poses of a file are of; there must be but one."""
+    """Return the manifold of the poses of a file; all of them must be on one."""
     found = sorted((lines.numbers[0], name) for name, lines in groups.items() if name in TAGS)
     for line, name in found[1:]:
         if TAGS[name].manifold is not TAGS[found[0][1]].manifold:
@@ -121,7 +121,7 @@ def manifold_of(path: object, groups: dict[str, TextLines]) -> Manifold:
 
 def rows_of(path: object, groups: dict[str, TextLines], manifold: Manifold, kinds: tuple[str, ...],
           rotation_information: str = QUATERNION) -> Rows:
-    """Return the lines of some kinds, whatever their tags."""
+    """Return the lines of some kinds (vertex, edge, ...), whichever tags they have."""
     offsets = _offsets(path, groups)
     parts = [_parse(path, name, groups.get(name, TextLines([], [])), rotation_information, offsets)
              for name, tag in TAGS.items() if tag.kind in kinds and tag.manifold is manifold]

@@ -33,7 +33,7 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord, graph_lines, read_graph
 from l1slam_ros.io.graphs.left_out import SUSPECT, left_out_by
 from l1slam_ros.io.remarks import is_proven, with_remarks
 
-# What the state of a builder has beside that of one robot.
+# What a builder's state holds beside the state of a single robot.
 _OF_ROBOTS = ('robot', 'others', 'loop_robots', 'expired_robots')
 
 _Record = TypeVar('_Record', BuilderState, Optimised, Judgement)
@@ -61,9 +61,9 @@ def save_map(path: Path, saved: SavedMap | None) -> str:
 
 def load_map(path: Path) -> tuple[SavedMap, str, bool]:
     """
-    Return the map in a file, or that before it where this one is damaged or missing.
+    Return the map in a file, or the one saved before where the file is damaged or missing.
 
-    And a sentence that says which, and whether it is the newer one.
+    Besides: a sentence that says which of the two it is, and whether it is the newer one.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def load_map(path: Path) -> tuple[SavedMap, str, bool]:
 
 def keep_as(path: Path, another: Path) -> None:
     """
-    Let a file have another name, too, in the place of what has that.
+    Give a file a second name, in place of the file that has this name now.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def is_map(path: Path) -> bool:
 
 
 def before_of(path: Path) -> Path:
-    """Return the name of the map before the one of a name."""
+    """Return the name under which the map saved before the one at `path` is kept."""
     return path.with_name(f'{path.name}.1')
 
 
@@ -117,21 +117,21 @@ def _count(saved: SavedMap) -> int:
 
 
 def _keep(path: Path) -> None:
-    """Let a file be that before it, too, unless it is damaged and that is not."""
+    """Keep a file as the map before, unless it is damaged and the map before is whole."""
     before = before_of(path)
     if os.path.exists(path) and (is_map(path) or not is_map(before)):
         keep_as(path, before)
 
 
 def _remove_leftovers(path: Path) -> None:
-    """Remove what is left of writers of this file that were killed."""
+    """Remove temporary files of earlier writers of this file that were killed."""
     path = Path(os.path.realpath(path))
     for leftover in path.parent.glob(f'.{glob.escape(path.name)}*.tmp'):
         leftover.unlink(missing_ok=True)
 
 
 def _left_out(saved: SavedMap) -> np.ndarray:
-    """Return why each factor is left out; loops that came after the judgement wait for it."""
+    """Return why each factor is left out; loops newer than the judgement are not judged yet."""
     factors, judgement = saved.builder.graph.between, saved.judgement
     if not saved.robust or not len(judgement.accepted):
         return left_out_by(None, factors)
@@ -142,7 +142,7 @@ def _left_out(saved: SavedMap) -> np.ndarray:
 
 
 def _remarks(saved: SavedMap) -> dict[str, Any]:
-    """Return by name what g2o has no tag for."""
+    """Return, by name, the values of the state for which g2o has no tag."""
     state, judgement = saved.builder, saved.judgement
     values = {f.name: getattr(record, f.name)
               for record in (state, saved.optimised, judgement) for f in fields(record)}
@@ -160,7 +160,7 @@ def _remarks(saved: SavedMap) -> dict[str, Any]:
 
 
 def _of_robots(state: BuilderState) -> dict[str, Any]:
-    """Return by name what is whose; a map of the first robot alone has nothing of it."""
+    """Return, by name, which robot owns what; nothing for a map of the first robot alone."""
     if not (state.others or state.robot):
         return {}
     return {'keyframe_robots': state.graph.robot, 'robot': state.robot,
@@ -170,7 +170,7 @@ def _of_robots(state: BuilderState) -> dict[str, Any]:
 
 
 def _with_robots(state: BuilderState, values: dict[str, Any]) -> BuilderState:
-    """Return a state with what was saved of whose is what."""
+    """Return a state with the saved ownership of its keyframes and loops by robot."""
     give_to(state.graph, np.array(values['keyframe_robots']))
     others = tuple(
         TrackEnd(robot, np.array(offset), end, np.array(pose), np.array(covariance))
@@ -210,7 +210,7 @@ def _read(path: Path) -> SavedMap:
 
 
 def _restored(record: _Record, values: dict[str, Any]) -> _Record:
-    """Return a record with the values that were saved, each of the kind that stands in it."""
+    """Return a record with the values that were saved, each converted to the type of its field."""
     return replace(record, **{f.name: _like(getattr(record, f.name), values[f.name])
                               for f in fields(record) if f.name in values})
 

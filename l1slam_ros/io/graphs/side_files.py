@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What lies beside a graph because no graph format has a place for it.
+The files beside a graph file, for what no graph format has a place for.
 
     <path>.stamps.txt    `id seconds`, one line for each vertex; or `seconds` alone, in their order
     <path>.trusted.txt   `i j`, the vertex ids of each loop that is never doubted
@@ -76,7 +76,7 @@ def write_beside(path: str | os.PathLike[str], ids: Indices, stamps: Indices | N
 
 @contextmanager
 def _replaced(path: Path, lines: list[str]) -> Iterator[None]:
-    """Let a file of these lines take its place when the block succeeds; no lines, no file."""
+    """Replace a file by these lines once the block succeeds; without lines remove it."""
     if lines:
         with replacing(path) as temporary:
             put_lines(temporary, marked(lines))

@@ -51,7 +51,7 @@ _REFERENCE_FRAME = re.compile(
 
 def odometry_sample(message: Any) -> OdometrySample:
     """
-    Return what a nav_msgs/Odometry says.
+    Return a nav_msgs/Odometry message as a sample of odometry.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def odometry_sample(message: Any) -> OdometrySample:
 
 def odometry_in(data: bytes) -> tuple[str, OdometrySample]:
     """
-    Return the frame of a serialised odometry message, and what it says.
+    Return the child frame of a serialised odometry message, and its sample.
 
     By its layout, in a quarter of the time that rclpy takes to make the objects of a message.
 
@@ -121,7 +121,7 @@ def _text(data: bytes, place: int, length: int) -> tuple[str, int]:
 def loop_closure(message: Any, base_frame: str, trusted: bool,
                  ordered: bool = True) -> LoopClosure:
     """
-    Return what a geometry_msgs/PoseWithCovarianceStamped says about two times.
+    Return the loop closure in a geometry_msgs/PoseWithCovarianceStamped.
 
     Parameters
     ----------
@@ -141,9 +141,9 @@ def loop_closure(message: Any, base_frame: str, trusted: bool,
 
 def false_loop(message: Any, base_frame: str, ordered: bool = True) -> LoopClosure:
     """
-    Return the word that the loop of two times is false, named as in `loop_closure`.
+    Return a loop closure that strikes out the loop of its two times, named as in `loop_closure`.
 
-    What the message measures says nothing, and may be left empty.
+    The pose of the message is not read and may be left empty.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def false_loop(message: Any, base_frame: str, ordered: bool = True) -> LoopClosu
 
 def absolute_pose(message: Any, map_frame: str) -> LoopClosure:
     """
-    Return what a geometry_msgs/PoseWithCovarianceStamped says about the robot in the map frame.
+    Return the absolute pose of the robot in a geometry_msgs/PoseWithCovarianceStamped.
 
     Where it says nothing of the rotation, the quaternion may be any, also none.
 

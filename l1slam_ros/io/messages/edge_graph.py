@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-A graph of edges between numbered keyframes, as the messages of a front end tell it bit by bit.
+A graph of edges between numbered keyframes, collected from the messages of a front end.
 
 The transform of an edge is the pose of its second keyframe, seen from the first. The poses that a
 front end publishes are its own map: they are never read, for they would be taken for odometry.
@@ -135,7 +135,7 @@ class EdgeGraph(ABC):
         return graph, ids
 
     def sentences(self) -> list[str]:
-        """Return what is to be said of edges that are not in the graph."""
+        """Return a sentence on each kind of edge that was not put into the graph."""
         return []
 
 

@@ -14,11 +14,15 @@ too long.
 """
 
 import struct
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.io.files import NANOSECONDS
+
+if TYPE_CHECKING:  # it takes numba along
+    from l1slam_ros.core.scans.points import Scan
 
 _ENCAPSULATION = b'\x00\x01\x00\x00'
 
@@ -93,6 +97,16 @@ def odometry_bytes(frame: str, child: str, stamp: int, pose3: Array, covariance:
     # It begins like a TransformStamped.
     return transform_bytes(frame, child, stamp, np.concatenate(
         (pose3, covariance.ravel(), np.zeros(6 + 36))))
+
+
+def scan_bytes(frame: str, scan: 'Scan') -> bytes:
+    """Return a serialised sensor_msgs/LaserScan without intensities, its rays of one moment."""
+    last = scan.angle_min + scan.angle_increment * (len(scan.ranges) - 1)
+    numbers = (scan.angle_min, last, scan.angle_increment, scan.time_increment, 0.0,
+               scan.range_min, scan.range_max)
+    return cdr((4, header_bytes(frame, scan.stamp)), (4, struct.pack('<7f', *numbers)),
+               (4, struct.pack('<I', len(scan.ranges))),
+               (4, scan.ranges.astype('<f4').tobytes()), (4, struct.pack('<I', 0)))
 
 
 def transform_bytes(parent: str, child: str, stamp: int, pose3: Array,

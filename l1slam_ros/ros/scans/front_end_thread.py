@@ -25,7 +25,7 @@ from l1slam_ros.core.errors import L1SlamError, MessageError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.kernels.compiled import make_ready
-from l1slam_ros.core.scans import kernels
+from l1slam_ros.core.scans import kernels, search_kernels
 from l1slam_ros.core.scans.front_end import ScanFrontEnd
 from l1slam_ros.core.scans.odometry import Step
 from l1slam_ros.core.scans.points import Mount, Scan
@@ -42,8 +42,9 @@ from l1slam_ros.ros.threads.failures import Failures
 
 # So many messages are kept until there is time for them.
 _BACKLOG = 20_000
-# [s] So often, at most, the path is read while there is nothing else to do; and the map looked at.
-_READ, _LOOK = 1.0, 0.1
+# [s] So often, at most, the path is read while there is nothing else to do, and where there is a
+# new keyframe; and the map looked at. To read it takes as long as some scans do.
+_READ, _FRESH, _LOOK = 1.0, 0.2, 0.1
 _REPEAT_WARNING = 5.0  # [s]
 # [s] Pause after an error, so that one which recurs does not keep a core busy.
 _BREATH = 0.05
@@ -108,7 +109,7 @@ class RunOfScans:
         self._placing.add_odometry(scan.stamp, step.pose)
         self._warn(step, begins)
         if step.keyframe is not None:
-            self._place()
+            self.place_if_due(_FRESH)
         # Comparisons of keyframes wait for each other: a few are made with each scan.
         for loop in self._front_end.loops():
             self._publisher.loop(self._frames.base, self._front_end.keyframes, loop)
@@ -117,9 +118,9 @@ class RunOfScans:
         self.costs.append(time.thread_time() - began)
         self._count()
 
-    def place_if_due(self) -> None:
-        """Read a path that has come, if the last one was read a while ago."""
-        if self._path and time.monotonic() - self._read > _READ:
+    def place_if_due(self, seconds: float = _READ) -> None:
+        """Read a path that has come, if the last one was read some seconds ago."""
+        if self._path and time.monotonic() - self._read > seconds:
             self._place()
 
     def cost(self) -> tuple[float, float]:
@@ -140,9 +141,8 @@ class RunOfScans:
 
     def _place(self) -> None:
         """Let front end and map know where the path has the keyframes."""
-        if self._path:
-            self._placing.set_path(*path_in(deserialize_message(self._path, Path)))
-            self._path, self._read = b'', time.monotonic()
+        self._placing.set_path(*path_in(deserialize_message(self._path, Path)))
+        self._path, self._read = b'', time.monotonic()
         keyframes = self._front_end.keyframes
         poses = self._placing.place(keyframes)
         if not len(poses):
@@ -184,7 +184,7 @@ class FrontEndThread:
         self._drawer, self._failures = drawer, failures
         self._frames = RobotFrames(options, self._logger, static)
         self.refused = Counter[str]()
-        self.queue, self.ready = ScanQueue(), False
+        self.queue, self.ready = ScanQueue(lambda: options().backlog), False
         self._restarts = self.queue.restarts
         self.run = RunOfScans(options, self._frames, publisher, drawer, self._logger)
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=_BACKLOG)
@@ -211,7 +211,7 @@ class FrontEndThread:
 
     def _work(self) -> None:
         try:
-            for loop in vars(kernels).values():
+            for loop in (*vars(kernels).values(), *vars(search_kernels).values()):
                 if hasattr(loop, 'takes') and not self._closing:
                     make_ready(loop, False)
         except Exception as error:  # what is missing is compiled when it is first called

@@ -127,6 +127,8 @@ class RobotFrames:
         now = time.monotonic()
         self._asked = self._asked or now
         mount, how = self._options().mount(), 'as laser_pose says'
+        if mount is None and self.laser == self.base:
+            mount, how = Mount(), 'for that is the frame of the scans'
         if mount is None and self._transforms is not None:
             mount, how = self._transforms.mount(self.base, self.laser), 'as /tf_static says'
             if mount is None and now - self._asked < _MOUNTING:

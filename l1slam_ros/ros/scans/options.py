@@ -36,6 +36,9 @@ class ScanLoopsOptions(FrontEndOptions):
     scan_wait: float = option(
         2.0, 'how long a scan waits for odometry on both sides of its stamp, by the stamps of '
         'later scans', 's', 0.01, 60)
+    backlog: int = option(
+        30, 'so many scans may wait for their turn; of more, every other one is left out', '',
+        1, 100_000)
     base_frame: str = option(
         '', "the robot's frame; empty: the first child_frame_id of odom", fixed=True)
     odom_frame: str = option(

@@ -10,10 +10,11 @@
 Scans that wait for odometry on both sides of their stamps, and for their turn.
 
 In: scans and the wheels' poses, each in the order of its stamps. Out: a scan with the wheels' pose
-at its stamp. Who takes them too slowly gets the newest one, and the others are counted.
+at its stamp. Who takes them too slowly gets every other one, and those left out are counted.
 """
 
 from collections import Counter, deque
+from collections.abc import Callable
 
 import numpy as np
 
@@ -21,9 +22,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans.points import Scan
 
-# So many scans may be ready and wait; of more, only the newest is used.
-_BEHIND = 3
-# So much is kept, scans and poses: seconds of a fast laser, of fast wheels.
+# So many scans and poses may wait for each other: seconds of a fast laser, of fast wheels.
 _MOST_SCANS, _MOST_POSES = 100, 5000
 # [ns] Stamps that go back so far are of another time; nearer, one message came late.
 _BACK = 500_000_000
@@ -33,6 +32,10 @@ class ScanQueue:
     """
     Pairs scans with the wheels; one thread uses it.
 
+    Parameters
+    ----------
+    backlog : returns how many scans may wait for their turn; of more, every other one is left out
+
     Attributes
     ----------
     counts : `left_out`: there was no time for them, `expired`: no odometry surrounded them,
@@ -41,7 +44,8 @@ class ScanQueue:
 
     """
 
-    def __init__(self) -> None:
+    def __init__(self, backlog: Callable[[], int]) -> None:
+        self._backlog = backlog
         self.counts: Counter[str] = Counter()
         self.restarts = 0
         self._scans: deque[Scan] = deque()
@@ -82,7 +86,8 @@ class ScanQueue:
             self._scans.clear()
         self._newest = scan.stamp
         self._scans.append(scan)
-        if len(self._scans) > _MOST_SCANS:
+        # Where wheels have come, scans wait for their turn alone.
+        if len(self._scans) > max(_MOST_SCANS, self._backlog()):
             self._scans.popleft()
             self.counts['expired'] += 1
 
@@ -103,9 +108,10 @@ class ScanQueue:
                 self.counts['expired'] += 1
             else:
                 self._ready.append((scan, found))
-        if len(self._ready) > _BEHIND:
-            self.counts['left_out'] += len(self._ready) - 1
-            self._ready = deque([self._ready[-1]])
+        if (waiting := len(self._ready)) > self._backlog():
+            # The newest stays; scans that lie evenly along the way are followed more surely.
+            self._ready = deque([*self._ready][(waiting - 1) % 2 :: 2])
+            self.counts['left_out'] += waiting - len(self._ready)
         return self._ready.popleft() if self._ready else None
 
     def _at(self, stamp: int, longest: int) -> Array | None:

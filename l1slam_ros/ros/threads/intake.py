@@ -23,6 +23,7 @@ import time
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -217,7 +218,11 @@ class Intake:
 
     def _work(self) -> None:
         context = self._node.context
-        with context.handle, self._guard.handle:
+        with context.handle, self._guard.handle, ExitStack() as held:
+            # From Kilted on a signal destroys the node in its own thread, and what is waited for
+            # must be there until the wait is over.
+            for one in self._topics:
+                held.enter_context(one.subscription.handle)
             waiting, seconds = None, math.inf
             while not self._closing and context.ok():
                 try:

@@ -55,7 +55,8 @@ class SolverThread:
         """
         Begin; before the first update, what is not in the cache is compiled.
 
-        tell : called before and after each update, with what it did, None: nothing; may publish
+        tell : publishes what is new; called when an update has taken in what has come, and at its
+            end, with what it did, None: nothing
         """
         self._thread = background('solver', lambda: self._work(tell))
         self._thread.start()
@@ -99,9 +100,7 @@ class SolverThread:
             if time.monotonic() < self._not_before:
                 continue
             try:
-                # First what services have made of the map: an update may take long.
-                tell(None)
-                improvement = self._update()
+                improvement = self._update(lambda: tell(None))
                 tell(improvement)
             except Interrupted:
                 continue
@@ -116,12 +115,12 @@ class SolverThread:
                     self._failures.over('update')
                     self._pause = _FIRST_PAUSE
 
-    def _update(self) -> Improvement | None:
+    def _update(self, taken: Callable[[], None]) -> Improvement | None:
         if self._paused:
             return None
         self._behind_since = self._behind_since or time.monotonic()
         improvement = self._backend.update(
-            self._parameters.options.update.budget, lambda: self._paused or self._closing)
+            self._parameters.options.update.budget, lambda: self._paused or self._closing, taken)
         if improvement is None or improvement.judgement.settled:
             self._behind_since = 0.0
         return improvement

@@ -127,8 +127,13 @@ def test_a_border_is_the_whole_problem(k, shape, rng):
                         [*steps[some], *np.zeros((2, k))], rtol=1e-6, atol=1e-8)
     points = border.points
     for v in range(OLD + NEW):
-        assert_allclose(border.covariance(v), whole.covariance((v, FIXED), np.stack(
-            (np.eye(k), np.zeros((k, k)))), OLD + NEW), rtol=1e-7, atol=1e-9)
+        for other, turn in (FIXED, np.zeros((k, k))), (int(rng.integers(OLD)), rng.normal(
+                size=(k, k))):
+            if v != other:
+                assert_allclose(
+                    border.covariance(v, other, turn), whole.covariance(
+                        (v, other), np.stack((np.eye(k), -turn)), OLD + NEW),
+                    rtol=1e-7, atol=1e-9)
     assert border.points == points
     assert_allclose(border.steps().all(), steps, rtol=1e-6, atol=1e-8)
     taken = border.steps()

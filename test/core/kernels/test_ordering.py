@@ -10,6 +10,7 @@
 
 import numpy as np
 import pytest
+from numba.core.sigutils import normalize_signature
 from numpy.testing import assert_array_equal
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -17,8 +18,10 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import Delaunay
 from systems import PLENTY, SHAPES
 
-from l1slam_ros.core.kernels import ordering
+from l1slam_ros.core.kernels import dissection, ordering
+from l1slam_ros.core.kernels.dissection import coarsening, separators
 from l1slam_ros.core.kernels.symbolic import postorder, untouched
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 NOTHING = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32)
 
@@ -151,11 +154,16 @@ def torus(side):
             for pair in zip(k.ravel().tolist(), np.roll(k, 1, axis).ravel().tolist(), strict=True)]
 
 
-def test_what_is_cut_leaves_small_parts_that_come_first(rng):
+BOTH = pytest.mark.parametrize('dissect', [dissection.dissect, ordering.dissect],
+                               ids=['separators', 'levels'])
+
+
+@BOTH
+def test_what_is_cut_leaves_small_parts_that_come_first(dissect):
     """Also of two tori that nothing joins; the cuts of a part come after those within it."""
     pairs = torus(30)
     graph = adjacency_of(pairs + [(a + 900, b + 900) for a, b in pairs], 1800)
-    stage = ordering.dissect(*graph)
+    stage = dissect(*graph)
     whole = [(a, b) for a, b in [*pairs] if not stage[a] and not stage[b]]
     labels = connected_components(coo_array((np.ones(len(whole)), np.transpose(whole)),
                                             shape=(900, 900)))[1]
@@ -166,10 +174,76 @@ def test_what_is_cut_leaves_small_parts_that_come_first(rng):
     assert len(rows) == sum(map(len, eliminate(*graph, order)))
 
 
-def test_what_is_small_or_joined_throughout_is_not_cut():
+@BOTH
+def test_what_is_small_or_joined_throughout_is_not_cut(dissect):
     for n, pairs in ((100, torus(10)), (150, [(i, j) for i in range(150) for j in range(i)]),
                      (0, [])):
-        assert not ordering.dissect(*adjacency_of(pairs, n)).any()
+        assert not dissect(*adjacency_of(pairs, n)).any()
+
+
+def path(n, rng):
+    return [(k, k + 1) for k in range(n - 1)]
+
+
+def star(n, rng):
+    return [(0, k) for k in range(1, n)]
+
+
+def anywhere(n, rng):
+    return rng.integers(n, size=(2 * n, 2)).tolist()
+
+
+def scattered(n, rng):
+    """Return the pairs of ten paths that nothing joins, and of nodes without any."""
+    return [(k, k + 1) for k in range(n - 1) if k % (n // 10) and k % 7]
+
+
+@BOTH
+@pytest.mark.parametrize('shape', [path, star, tree, planar, anywhere, scattered])
+def test_every_graph_is_ordered_whole_and_its_parts_are_apart(dissect, shape, rng):
+    n = 700
+    pairs = [(i, j) for i, j in shape(n, rng) if i != j]
+    graph = adjacency_of(pairs, n)
+    stage = dissect(*graph)
+    order, _, rows = ordering.minimum_degree(*graph, 10**6, stage, *NOTHING)
+    assert_array_equal(np.sort(order), np.arange(n))
+    assert len(rows) == sum(map(len, eliminate(*graph, order)))
+    assert_array_equal(stage, dissect(*graph))
+
+
+def work(graph, stage):
+    _, column, _ = ordering.minimum_degree(*graph, 10**7, stage, *NOTHING)
+    return float(((np.diff(column) + 1.0)**2).sum() / 2)
+
+
+def test_of_a_large_grid_separators_spare_work_however_nodes_are_called(rng):
+    side = 120
+    k = rng.permutation(side**2).reshape(side, side)
+    pairs = [pair for one, other in ((k[1:], k[:-1]), (k[:, 1:], k[:, :-1]))
+             for pair in zip(one.ravel().tolist(), other.ravel().tolist(), strict=True)]
+    graph = adjacency_of(pairs, side**2)
+    own = work(graph, dissection.dissect(*graph))
+    assert 1.5 * own < work(graph, np.zeros(side**2, np.int32))
+
+
+def test_the_loops_of_dissection_are_called_with_the_types_that_they_say():
+    dissection.dissect(*adjacency_of(torus(30), 900))
+    for module in coarsening, separators:
+        loops = [value for value in vars(module).values() if hasattr(value, 'takes')]
+        assert len(loops) == 2
+        for loop in loops:
+            takes, = loop.takes
+            assert loop.signatures == [tuple(normalize_signature(takes)[0])]
+
+
+def test_of_many_streets_separators_spare_a_third_of_the_work(rng):
+    """Minimum degree and levels do 1.5 and 1.7 times as much."""
+    n = 16_000
+    factors = simulate_world(n, 2 * n, WorldOptions(), rng).graph.between
+    graph = adjacency_of(np.stack((factors.i, factors.j), axis=1).tolist(), n)
+    own = work(graph, dissection.dissect(*graph))
+    assert 1.4 * own < work(graph, np.zeros(n, np.int32))
+    assert 1.5 * own < work(graph, ordering.dissect(*graph))
 
 
 # What follows from an order

@@ -8,6 +8,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The incremental back end: as good as a batch solve, in time, and consistent on the way."""
 
+import threading
 import time
 from dataclasses import replace
 
@@ -40,6 +41,8 @@ from l1slam_ros.core.robust.judgement import NORM, Judgement
 from l1slam_ros.core.running.backend import Backend, BackendOptions, RobustOptions
 from l1slam_ros.core.running.improve import improve, one_round, optimise
 from l1slam_ros.core.running.keeper import work
+from l1slam_ros.core.running.keeper.schedule import Work
+from l1slam_ros.core.running.keeper.workers import Worker
 from l1slam_ros.core.running.problem import Problem
 from l1slam_ros.core.running.snapshot import (
     ACCEPTED,
@@ -201,6 +204,33 @@ def test_small_budgets_judge_to_the_end(world):
     play(backend, world)
     while backend.update(0.0) is not None:
         assert time.monotonic() < end
+    assert (backend.loop_states().state == ACCEPTED).all()
+    assert backend.snapshot().problem().judgement.settled
+
+
+def test_a_judgement_that_ends_within_an_update_is_followed_up(world, monkeypatch):
+    """It ends after the update has read the state, and before it has asked who is at work."""
+    begin, made, at_rest = Worker.start, threading.Event(), threading.Event()
+
+    def start(worker, task):
+        if task.args[1] in (Work.ROUND, Work.EXACT):
+            begin(worker, task)
+            worker.join()
+            made.set()
+        elif not worker.busy:
+            begin(worker, lambda: (at_rest.wait(PLENTY), task()))
+        elif made.is_set():
+            made.clear()
+        else:  # there is no better map without a judgement
+            at_rest.set()
+            worker.join()
+
+    monkeypatch.setattr(Worker, 'start', start)
+    backend, end = Backend(EVERY), time.monotonic() + PLENTY
+    play(backend, world)
+    while backend.update(0.0) is not None:
+        assert time.monotonic() < end
+    assert at_rest.is_set()
     assert (backend.loop_states().state == ACCEPTED).all()
     assert backend.snapshot().problem().judgement.settled
 

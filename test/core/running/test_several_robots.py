@@ -64,6 +64,12 @@ def test_a_robot_that_nothing_joins_has_its_own_map_and_moves_whole_when_a_loop_
     assert_allclose(se2.compose(one.map_to_odom, one.odometry), poses[-1:], atol=1e-9)
     shape = se2.between(np.tile(team.truth[80:81], (80, 1)), team.truth[80:])
     assert np.abs(poses - shape)[:, :2].max() < 0.5
+    # In its own map a pose is known as that of another robot from where it began.
+    known = [backend.marginal_covariance(int(own[-1]), int(own[0])) for own in (
+        now.poses_in_map(0)[0], keyframes)]
+    assert_allclose(known[0], backend.marginal_covariance(now.poses_in_map(0)[0][-1]))
+    metres = [np.sqrt(np.trace(one[:2, :2])) for one in known]
+    assert metres[0] / 4 < metres[1] < 4 * metres[0] < 1.0
     for loop in joins:
         backend.add_loop(loop)
     backend.settle()

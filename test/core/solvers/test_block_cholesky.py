@@ -25,6 +25,7 @@ from systems import (
     star,
 )
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -329,6 +330,19 @@ def test_large_blocks_are_worth_the_search_for_a_better_order():
     by_degree, better = (find_pattern(pairs, 2500, PLENTY, size) for size in (1, 6))
     assert better.work < 0.8 * by_degree.work
     assert_array_equal(np.sort(better.position), np.arange(2500))
+
+
+def test_only_what_takes_very_long_is_ordered_by_separators(monkeypatch):
+    """Their loops are not compiled before: of a small graph levels alone are the better order."""
+    asked = []
+    monkeypatch.setattr(kernels.dissection, 'dissect', lambda start, adjacent: (
+        asked.append(len(start) - 1) or np.zeros(len(start) - 1, np.int32)))
+    for side in (40, 100):
+        k = np.arange(side**2).reshape(side, side)
+        pairs = np.concatenate([np.stack((k.ravel(), np.roll(k, 1, axis).ravel()), axis=1)
+                                for axis in range(2)])
+        assert len(find_pattern(pairs, side**2, PLENTY, 6).position) == side**2
+    assert asked == [10_000]
 
 
 def test_a_graph_that_grows_keeps_its_order_for_a_while(rng):

@@ -13,10 +13,15 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from problems import odometry
+from team import Team
 
 from l1slam_ros.core.errors import FileError, OptionError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.io.graphs.map_file import MapFile, unusable_path
 from l1slam_ros.io.graphs.saved_map import is_map, load_map
@@ -261,3 +266,78 @@ def test_where_no_file_can_be_is_said(tmp_path):
 def test_without_a_name_nothing_is_loaded(tmp_path):
     with pytest.raises(OptionError, match='save_path is empty, expected the name of a .g2o file'):
         Robot('').load_at_start()
+
+
+class Fleet:
+    """A back end with a map file, whose robots have names; a, b and c drive."""
+
+    team = Team(n=90, edges=270, lies=0, robots=3)
+
+    def __init__(self, path, names=''):
+        self.options = NodeOptions.from_mapping({
+            'save_path': str(path), 'robots': [*names], 'keyframe': {
+                'translation': 0.0, 'rotation': 0.0}, 'odometry': {
+                    'covariance_source': 'increment'}})
+        self.backend = Backend(self.options)
+        self.map_file = MapFile(self.backend, lambda: self.options, lambda _: None)
+        self.number = [names.find(name) for name in 'abc']
+
+    def drive(self):
+        """Let c come first."""
+        samples = [come for come in self.team.messages() if not isinstance(come[1], LoopClosure)]
+        for robot, sample in sorted(samples, key=lambda come: (come[1].stamp, -come[0])):
+            self.backend.add_odometry(sample, self.number[robot])
+
+    def send_loops(self, of='abc'):
+        """Send the loops between some; return how many."""
+        sent = 0
+        for _, _, loop in self.team.loops():
+            if {'abc'[robot] for robot in loop.robots} <= {*of}:
+                one, other = (self.number[robot] for robot in loop.robots)
+                self.backend.add_loop(replace(loop, robot=other, reference_robot=one))
+                sent += 1
+        return sent
+
+    def poses(self):
+        """Return the poses of a, b and c as a sees them."""
+        now = self.backend.snapshot()
+        poses = [now.poses[now.graph.robot == number] for number in self.number]
+        first = np.tile(poses[0][:1], (30, 1))
+        return np.concatenate([se2.between(first, some) for some in poses])
+
+
+def test_a_map_of_three_robots_is_loaded_by_their_names_in_any_order_and_by_fewer(tmp_path):
+    path, fleet = tmp_path / 'map.g2o', Fleet(tmp_path / 'map.g2o', 'abc')
+    fleet.drive()
+    assert fleet.send_loops() == 181
+    fleet.backend.settle()
+    fleet.map_file.save()
+    poses = fleet.poses()
+    # Those that are not named here keep their names, and come behind.
+    for names, then in ('cb', 'cba'), ('xcab', 'xcab'), ('abc', 'abcx'):
+        fleet = Fleet(path, names)
+        fleet.map_file.load()
+        fleet.number = [then.index(name) for name in 'abc']
+        assert_allclose(fleet.poses(), poses, atol=1e-9)
+        sent, counts = fleet.send_loops([*{*names} - {'x'}]), fleet.backend.counts()
+        assert counts.refused == {'repeated': sent} and counts.sizes['accepted_loops'] == 181
+        fleet.backend.settle()
+        fleet.map_file.save()
+        poses = fleet.poses()
+
+
+def test_a_robot_without_a_name_goes_on_in_the_map_of_several(tmp_path):
+    """The graph begins with another one, and yet path and pose are of its own map."""
+    fleet = Fleet(tmp_path / 'map.g2o', 'abc')
+    fleet.drive()
+    fleet.send_loops()
+    while fleet.backend.update(1.0) is not None:
+        pass
+    fleet.map_file.save()
+    assert fleet.backend.snapshot().graph.robot[0] == 2
+    nameless = Fleet(tmp_path / 'map.g2o')
+    nameless.map_file.load()
+    backend, sample = nameless.backend, fleet.team.sample(29)
+    backend.add_odometry(replace(sample, stamp=sample.stamp + 1))
+    robot, last = backend.robot(), np.flatnonzero(backend.snapshot().graph.robot == 0)[-1:]
+    assert_allclose(se2.compose(robot.map_to_odom, robot.odometry), backend.poses[last], atol=1e-6)

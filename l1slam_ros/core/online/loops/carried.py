@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What loops say between the keyframes that are nearest to their times."""
+"""Loop measurements, carried from the times that they name to the nearest keyframes."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from l1slam_ros.core.online.loops.waiting_loops import WaitingLoop
 def carried(manifold: Manifold, used: list[WaitingLoop], to_reference: Array,
             to_keyframe: Array, unseen: Array) -> tuple[Array, Array, Mask]:
     """
-    Return what loops say between keyframes near their times.
+    Return the measurements of loops between the keyframes nearest to their times.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.graph.measurements import LoopClosure, Notes
-from l1slam_ros.core.online.builder_state import BuilderState
+from l1slam_ros.core.online.builder_state import BuilderState, key_of
 from l1slam_ros.core.online.keyframes import diagonal_covariance, reduced_covariance
 from l1slam_ros.core.online.loops.carried import carried
 from l1slam_ros.core.online.loops.waiting_loops import WaitingLoop, WaitingLoops
@@ -95,9 +95,9 @@ class LoopFactors:
         return self._stamps.view(), self.waiting.stamps(), self._expired.view()
 
     @property
-    def robots(self) -> tuple[Indices, Indices]:
-        """Whose times the stamps of the loops in the graph and expired are, (k, 2) each."""
-        return self._robots.view(), self._expired_robots.view()
+    def robots(self) -> tuple[Indices, Indices, Indices]:
+        """Whose times the `stamps` are."""
+        return self._robots.view(), self.waiting.robots(), self._expired_robots.view()
 
     @property
     def rows(self) -> Indices:
@@ -135,9 +135,8 @@ class LoopFactors:
         if covariance is None:
             return
         measurement = _said(self._manifold, loop, covariance)
-        key, robots = noise.loop_identity(*loop.stamps, measurement, covariance), loop.robots
-        if any(robots):
-            key += np.array(robots).tobytes()
+        robots = loop.robots
+        key = key_of(noise.loop_identity(*loop.stamps, measurement, covariance), robots)
         # Of what a person says the last word counts, though it was said before.
         if not loop.struck:
             if key in self._seen and not (loop.trusted or self._verbatim):
@@ -218,7 +217,7 @@ class LoopFactors:
 
     def _say(self, one: WaitingLoop, pair: tuple[int, int], graph: FactorGraph,
              came: int) -> None:
-        """Let what a person says of a loop count; came : how many loops have, with this one."""
+        """Apply a person's word, `trusted` or `struck`; came : how many loops came, with this."""
         loop = one.loop
         if loop.struck:
             self._struck.add(pair)
@@ -265,7 +264,7 @@ class LoopFactors:
 
     def _covariance(self, loop: LoopClosure, options: LoopOptions) -> Array | None:
         """
-        Return what a loop states, zeros for what it leaves unsaid, (1, d, d).
+        Return the covariance that a loop states, zeros for components it leaves unsaid, (1, d, d).
 
         Where that is no covariance, the model; there is none of absolute poses: None, refused.
         """

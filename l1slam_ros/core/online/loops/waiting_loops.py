@@ -27,7 +27,7 @@ from l1slam_ros.core.graph.measurements import LoopClosure
 @dataclass(frozen=True)
 class WaitingLoop:
     """
-    A loop, and what it says on the manifold.
+    A loop that waits, and its measurement on the manifold.
 
     begin, end : times [ns], what its stamps mean; arrivals : when it came, by the clocks of the
     robots of these; measurement : (1, p); covariance : (1, d, d), sound, zeros where it says
@@ -48,7 +48,7 @@ class WaitingLoop:
         return self.arrivals[1]
 
     def awaits(self, clocks: Mapping[int, int]) -> int | None:
-        """Return whose odometry has not come to its time; None: that of both has."""
+        """Return the robot whose odometry has not reached the loop's time; None: both have."""
         one, other = self.loop.robots
         if other not in clocks or clocks[other] < self.end:
             return other
@@ -104,7 +104,7 @@ class WaitingLoops:
     def __init__(self) -> None:
         self._queues: dict[int, _Queue] = {}
         self._count = 0
-        self._stamps: Indices | None = None
+        self._told: tuple[Indices, Indices] | None = None
 
     def __len__(self) -> int:
         return sum(len(queue.loops) for queue in self._queues.values())
@@ -139,13 +139,13 @@ class WaitingLoops:
                 due[number] = one
             else:  # the other one's odometry is behind
                 self._put(other, number, one, clocks.get(other, 0))
-        self._stamps = None if due else self._stamps
+        self._told = None if due else self._told
         return list(due.values())
 
     def expired(self, robot: int, since: int) -> list[WaitingLoop]:
         """Take out those that wait for a robot since before `since`, in the order they came."""
         early = self._queues[robot].expired(since) if robot in self._queues else []
-        self._stamps = None if early else self._stamps
+        self._told = None if early else self._told
         return early
 
     def begin_anew(self, time: Callable[[int], int], robot: int) -> None:
@@ -171,13 +171,22 @@ class WaitingLoops:
 
     def stamps(self) -> Indices:
         """Return reference and end [ns] of each that is no strike of one, (k, 2)."""
-        if self._stamps is None:
-            self._stamps = np.array([one.loop.stamps for one in self.all()
-                                     if not one.loop.struck], np.int64).reshape(-1, 2)
-        return self._stamps
+        return self._of_loops()[0]
+
+    def robots(self) -> Indices:
+        """Return whose times these are, (k, 2)."""
+        return self._of_loops()[1]
+
+    def _of_loops(self) -> tuple[Indices, Indices]:
+        if self._told is None:
+            loops = [one.loop for one in self.all() if not one.loop.struck]
+            stamps, robots = (np.array(pairs, np.int64).reshape(-1, 2) for pairs in (
+                [loop.stamps for loop in loops], [loop.robots for loop in loops]))
+            self._told = stamps, robots
+        return self._told
 
     def _put(self, robot: int, number: int, waiting: WaitingLoop, since: int) -> None:
-        self._stamps = None
+        self._told = None
         if robot not in self._queues:
             self._queues[robot] = _Queue(robot)
         self._queues[robot].add(number, waiting, since)

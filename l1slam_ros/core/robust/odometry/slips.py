@@ -36,8 +36,10 @@ from l1slam_ros.core.robust.odometry.motion import (
     usual_motion,
 )
 from l1slam_ros.core.robust.pairwise_consistency import (
+    RUN,
     Group,
     longest_run,
+    runs,
     spanned,
     strongest_group,
 )
@@ -49,8 +51,9 @@ JOINING, SPANNING = 2, 3
 _TRIED = 2
 # What is nearly sure: ln of the odds.
 SURE = float(np.log(1 / DOUBT - 1))
-# By so much more the odometry may vary than its good steps say.
-_NOISIER = (10.0, 100.0)
+# By so much more the odometry may vary than its good steps say, for a run to be looked at; and
+# with it, than was found first, and than it states.
+_NOISIER, _MOST = 30.0, 10.0
 # Of fewer steps there is no habit.
 _FEWEST_STEPS = 20
 
@@ -108,7 +111,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     if np.count_nonzero(~growth.is_loop & ~growth.cut) < _FEWEST_STEPS:
         return None
     motion = usual_motion(growth)
-    found, most = _noisier(growth, as_stated)
+    found, most = None, 0.0
     for steps, odds, state, usual in _tried(growth, as_stated, motion):
         back = _put_back(state, steps, motion) if state else None
         state, odds = back or (state, odds)
@@ -120,6 +123,7 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
         if state and evidence > most and (usual or (odds > 0 and len(steps) == 1)):
             found, most = state, evidence
             state.slip_odds.update(dict.fromkeys(steps, evidence))
+    found = found or _with_runs(growth)
     if not found and growth.cut.any():
         # In the end more is known than when it was cut.
         now = log_odds_of_slips(growth, motion)
@@ -128,32 +132,35 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     return found
 
 
-def _noisier(growth: Growth, as_stated: Growth) -> tuple[Growth | None, float]:
+def _with_runs(growth: Growth) -> Growth | None:
     """
-    Return a state whose odometry is noisier than its good steps say, None: it is not; its odds.
+    Return a state with the runs that are left out and noisier odometry explains, None: without.
 
-    Asked only where most loops are left out, and believed only where most come in by it. The odds
-    are those of f residuals, as many as others check, of K times the variance: what was learnt
-    then over what was learnt of them alone, f / 2 (1 - 1 / K - ln K).
+    The noise is learnt of the loops that came in, which are those that it is small for: a robot
+    that backs up, or slides on one floor, errs by more where nothing else looks. A run that is off
+    by no more than that, of whose place nothing is accepted, is rather true than a lie.
     """
-    half = np.count_nonzero(growth.is_loop) / 2
-    if len(as_stated.undecided()) <= half:
-        return None, 0.0
-    odometry = ~growth.is_loop[growth.accepted] & ~growth.cut[growth.accepted]
-    freedom = np.trace(growth.posterior.moment[odometry], axis1=1, axis2=2).sum()
-    found, most = None, 0.0
-    for times in _NOISIER:
-        state = growth.copy()
-        state.variance = growth.variance * (times, 1.0)
-        state.drops[:] = 0
+    rows, noisier, loops = growth.undecided(), growth.copy(), growth.accepted & growth.is_loop
+    rows = rows[~np.isin(growth.place[rows], growth.place[loops])]
+    if len(rows) < RUN or growth.ventured.any() or growth.may_err_as_one(np.flatnonzero(loops)):
+        return None
+    noisier.variance = growth.variance * (_NOISIER, 1.0)
+    noisier.solve()
+    found = noisier.innovations(rows)
+    groups = runs(growth, rows[found.square < noisier.gate(found.freedom)])
+    if not groups:
+        return None
+    state = growth.copy()
+    for group in groups:
+        state.accepted[group.rows] = state.ventured[group.rows] = True
+    state.variance, state.drops[:] = noisier.variance, 0
+    # Once from noise that is far too large, and once from what was left of that.
+    for _ in range(2):
+        state.learnt_of = state.learnt_of[:0]
         state.solve()
-        _accept_more(state)
-        ratio = state.variance[0] / growth.variance[0]
-        evidence = _gain(growth, as_stated, state) + freedom / 2 * (
-            1 - 1 / ratio - np.log(ratio))
-        if len(state.undecided()) < half and evidence > most:
-            found, most = state, evidence
-    return found, most
+    _accept_more(state)
+    is_noisier = state.variance[0] > _MOST * min(growth.first_variance[0], 1.0)
+    return None if is_noisier or _gain(growth, growth, state) <= 0 else state
 
 
 def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True

@@ -16,9 +16,10 @@ keep something know whether it is stale.
     _graph_lock     graph, odometry, loops, state and revision: held for moments, so that messages
                     never wait
 
-Who needs both takes them in this order; neither is held while solving, or reading or writing a
-file. The state changes under both, but for a map that begins anew: that needs the second alone,
-and whoever works with what was there before finds out when he comes to hand in what he made.
+A thread that needs both takes them in this order; neither is held while solving, or while a file
+is read or written. The state changes under both locks. A map that begins anew is the exception: it
+needs the graph lock alone, and a result that was computed for the map before is refused
+(`Interrupted`) when it is handed in.
 """
 
 import threading
@@ -133,10 +134,10 @@ class Keeper:
     def begin(self, builder: GraphBuilder, optimised: Optimised | None = None,
               judgement: Judgement | None = None) -> int:
         """
-        Begin a map with the graph of a builder; what is made for the one before is left.
+        Begin a map with the graph of a builder; results for the map before are no longer taken.
 
-        optimised, judgement : of the graph, as far as they are known; None: nothing is. Return
-        what names the graph, see `Revisions`.
+        optimised, judgement : of the graph, None: nothing is known of it yet. Return the revision
+        that names the graph, see `Revisions`.
         """
         with self._graph_lock:
             self._builder = builder
@@ -177,13 +178,13 @@ class Keeper:
             yield self._builder
 
     def snapshot(self) -> Snapshot:
-        """Return all as it is now, the due loops in its graph, to be read at leisure."""
+        """Return a copy of the present state, with the loops that are due as factors."""
         with self.standing() as now:
             return now
 
     @contextmanager
     def standing(self) -> Iterator[Snapshot]:
-        """Give a snapshot, see `snapshot`; nothing changes within the block."""
+        """Give a snapshot; graph, front and state do not change within the block."""
         with self._front_lock:
             front = self._front
             views = front.views if front else ()
@@ -234,17 +235,18 @@ class Keeper:
             self._odom[robot] = MapToOdom(Newest(-1, none, robot == 0))
         return self._odom[robot]
 
-    def covariance(self, keyframe: int) -> Array | None:
+    def covariance(self, keyframe: int, seen_from: int | None) -> Array | None:
         """See `Backend.marginal_covariance`."""
         with self._front_lock:
             front = self._front
-            known = front is not None and 0 <= keyframe < front.keyframes
-            return front.covariance(keyframe) if front and known else None
+            known = front is not None and all(
+                0 <= one < front.keyframes for one in (keyframe, seen_from or 0))
+            return front.covariance(keyframe, seen_from) if front and known else None
 
     # What the front takes.
 
     def take_what_has_come(self, deadline: float) -> None:
-        """Make factors of the due loops; let the front take what is new to it until a time [s]."""
+        """Make factors of the due loops; let the front take new factors until the deadline [s]."""
         with self._front_lock, self._graph_lock:
             self._add_due_loops()
         taken = False
@@ -287,7 +289,7 @@ class Keeper:
         return bool(looks)
 
     def _move(self, ends: Mapping[int, Newest]) -> None:
-        """Note that the map is another, which ends here for each robot; the graph is locked."""
+        """Note a changed map; ends : its last keyframe of each robot; the graph is locked."""
         for robot, end in ends.items():
             self._odom_of(robot).move(self._builder.robots[robot], end)
         self._revisions = self._revisions.after(map=True)
@@ -297,14 +299,15 @@ class Keeper:
     def adopt(self, improvement: Improvement, front: Front | None = None,
               pending: Judgement | None = None, looks: Sequence[Look] = ()) -> None:
         """
-        Take over a map that was made of a snapshot; keyframes since then follow along.
+        Publish a map that was made of a snapshot; keyframes since then move along with it.
 
-        front : made of it, None: it cannot be factored; pending, looks : see `MapState.adopted`
+        front : of this map, None: the map cannot be factored; pending, looks : see
+        `MapState.adopted`
 
         Raises
         ------
-        Interrupted : it was made for a map that is there no more.
-        ArithmeticError : it is not finite; nothing is taken over.
+        Interrupted : another map has begun since the snapshot.
+        ArithmeticError : a pose is not finite; the map before stays.
 
         """
         with self._graph_lock:
@@ -327,7 +330,7 @@ class Keeper:
         del former
 
     def begin_judgement(self) -> tuple[Snapshot, int]:
-        """Return all as it is now, to be judged, and since when the graph has its size."""
+        """Return a snapshot to judge, and the revision since which its graph has not grown."""
         with self.standing() as now:
             self._state = self._state.being_judged(time.monotonic())
             return now, self._revisions.grown
@@ -335,11 +338,11 @@ class Keeper:
     def change(self, made_for: Snapshot,
                transition: Callable[[MapState, BetweenFactors], MapState]) -> None:
         """
-        Let another state follow, by what was found of a snapshot.
+        Replace the state by `transition` of it; made_for : the snapshot that the result is of.
 
         Raises
         ------
-        Interrupted : the map is there no more.
+        Interrupted : another map has begun since the snapshot.
 
         """
         with self._front_lock, self._graph_lock:

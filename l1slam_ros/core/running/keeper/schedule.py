@@ -10,7 +10,7 @@
 What is due: which map to make, and what to judge.
 
 In: the state of the map, how large the graph is by now, and the moment. Out: pieces of work, one
-for each worker at most. Pure: who carries them out is no concern of it.
+for each worker at most. These functions are pure: `updates` has the threads that carry them out.
 """
 
 from enum import Enum
@@ -53,7 +53,7 @@ class Size(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """The time [s] of any clock; nothing has come for a while; there is so much time now [s]."""
+    """Now [s] by any clock; idle : no message came for a while; budget [s] of the update."""
 
     now: float
     idle: bool
@@ -61,7 +61,7 @@ class Moment(NamedTuple):
 
 
 def due(state: MapState, size: Size, moment: Moment) -> tuple[Work | None, Work | None]:
-    """Return the work that is due for the worker that makes maps, and for the one that judges."""
+    """Return the work that is due for the mapper and for the judge, each None where nothing is."""
     make = is_map_due(state, size, moment.idle)
     return (_map(state, moment.idle) if make else None,
             _judgement(state, size, moment, make))
@@ -87,7 +87,7 @@ def _judgement(state: MapState, size: Size, moment: Moment, make: bool) -> Work 
 
 
 def is_map_due(state: MapState, size: Size, idle: bool) -> bool:
-    """Return whether to make the map anew; idle : nothing has come for a while."""
+    """Return whether a new map is to be made; idle : no message came for a while."""
     optimised, carried = state.optimised, state.carried
     behind = (len(optimised.poses) < size.keyframes or len(optimised.dual) < size.rows
               or not optimised.at_rest)
@@ -99,7 +99,7 @@ def is_map_due(state: MapState, size: Size, idle: bool) -> bool:
 
 
 def is_late(state: MapState) -> bool:
-    """Return whether the front has more to carry than it should."""
+    """Return whether the front has taken so many factors that the map is to be factored anew."""
     carried = state.carried
     return carried is None or carried.closed or carried.taken >= max(
         _FEWEST, carried.keyframes // _KEYFRAMES_EACH)
@@ -109,9 +109,9 @@ def is_judge_due(state: MapState, size: Size, moment: Moment) -> bool:
     """
     Return whether to judge all loops.
 
-    At rest it is due until all loops are judged from the graph alone. Otherwise it is due where
-    there is enough time for it, or where the last judgement is long ago. That is sooner where the
-    front left a loop that fits, or there is no front that gates them.
+    At rest it is due until all loops are judged from the graph alone. While messages come it is
+    due where the budget is longer than a judgement takes, or where the last judgement is long ago;
+    a shorter wait is enough where the front has left a loop that fits, or no front gates loops.
     """
     if moment.idle:
         return not state.all_judged_anew(size.loops)
@@ -127,9 +127,10 @@ def is_anew_due(state: MapState, size: Size, moment: Moment) -> bool:
     """
     Return whether the next judgement is to be from the graph alone.
 
-    At rest what the last one went on from is asked, too; and before, where loops that it refused
-    make it doubtful: a lie that came first may keep out true ones. What lays the doubt may be lies
-    that agree: it is asked until there are twice as many loops.
+    A judgement starts from the loops believed so far, so a false loop that came first may keep
+    out true ones. Hence one from the graph alone follows at rest. While messages come it is due
+    where the refused loops put the map in doubt, until there are twice as many loops: they may as
+    well be false loops that agree.
     """
     if moment.idle:
         return state.all_judged(size.loops)

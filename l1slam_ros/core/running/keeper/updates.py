@@ -7,14 +7,14 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-Updates of a map: what has come is taken in at once, and workers are let begin what is due.
+Updates of a map: new factors are taken in at once, and workers begin the work that is due.
 
 In: a keeper, and calls of any threads. Out: the account of what an update did. The order of all
 that happens to a message is told in doc/how_a_message_becomes_a_map.md, step by step.
 
-One lock lets one thread at a time update the map, or solve it to the end. Who waits to have the
-map for itself is counted, and work that is under way makes way; a settle is work that somebody
-waits for, and makes way for what cannot wait alone: a process that is about to fork, or to end.
+One lock admits one thread at a time to update the map or to settle it. Threads that wait for the
+lock are counted, and background work ends early for them. A settle, for which a caller waits, ends
+early only for a process that is about to fork or to end.
 """
 
 import threading
@@ -71,7 +71,7 @@ class Updates:
         return self._workers.failing
 
     def update(self, budget: float, stopped: Stopped, idle: bool | None = None,
-               waits: bool = True) -> Improvement | None:
+               waits: bool = True, taken: Callable[[], None] = lambda: None) -> Improvement | None:
         """
         See `Backend.update`.
 
@@ -89,6 +89,9 @@ class Updates:
             came = seen.grown > max(self._updated, keeper.state.began)
             self._updated = seen.now
             idle = not came if idle is None else idle
+            # Before workers begin: on one core they would share it with whoever publishes.
+            taken()
+            took = time.monotonic() - start
             check = self._check(before.began, stopped)
             end = start + budget if waits else start
             while self._begin_due(idle, budget, check):
@@ -96,22 +99,24 @@ class Updates:
                 self._workers.check()
                 check()
                 if time.monotonic() >= end:
-                    return self._account(before.began, start)
+                    return self._account(before.began, took)
             if came or not idle or keeper.state.last is not before.last:
-                return self._account(before.began, start)
+                return self._account(before.began, took)
             # Work that failed since the check is still to do.
             self._workers.check()
             self._rested = seen.now
         return None
 
-    def _account(self, began: int, start: float) -> Improvement:
+    def _account(self, began: int, took: float) -> Improvement:
         state, _, size = self._keeper.look()
         if state.began != began:
             raise Interrupted
-        return state.account(size.loops, time.monotonic() - start)
+        return state.account(size.loops, took)
 
     def _begin_due(self, idle: bool, budget: float, check: Check) -> bool:
-        """Start the work that is due; return whether any worker is busy."""
+        """Start the work that is due; return whether there is any, or was just now."""
+        # Asked before the state is read: work that ends in between makes other work due.
+        busy = self._workers.busy
         moment = Moment(time.monotonic(), idle, budget)
         state, _, size = self._keeper.look()
         make, judge = due(state, size, moment)
@@ -119,7 +124,7 @@ class Updates:
             if piece is not None:
                 worker.start(partial(
                     carry_out, self._keeper, piece, moment, self.calm.kept(check)))
-        return self._workers.busy
+        return busy or make is not None or judge is not None
 
     def _check(self, began: int, stopped: Stopped) -> Check:
         """Return a check that raises `Interrupted` where work for a map is not wanted any more."""

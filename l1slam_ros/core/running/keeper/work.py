@@ -47,7 +47,7 @@ def carry_out(keeper: Keeper, piece: Work, moment: Moment, check: Check) -> None
 
 
 def make_map(keeper: Keeper, exact: bool, budget: float, check: Check) -> None:
-    """Lower the cost of the map, exact : to the end; factor it, and let a front carry the rest."""
+    """Lower the cost of the map (exact : to the optimum), factor it, let its front catch up."""
     now, solver = keeper.snapshot(), keeper.solver
     whole, pending, looked = now.problem(), now.state.pending, now.looked
     del now  # holds the factors of a front that may be replaced meanwhile
@@ -75,7 +75,7 @@ def make_map(keeper: Keeper, exact: bool, budget: float, check: Check) -> None:
 
 
 def judge_all(keeper: Keeper, anew: bool, idle: bool, check: Check) -> None:
-    """Judge all loops; anew : from the graph alone; idle : only as long as nothing comes."""
+    """Judge all loops; anew : from the graph alone; idle : stop as soon as the graph grows."""
     now, grown = keeper.begin_judgement()
     whole = now.problem()
     turned, order = by_robot(whole)
@@ -90,7 +90,7 @@ def judge_all(keeper: Keeper, anew: bool, idle: bool, check: Check) -> None:
 
 
 def compare_norms(keeper: Keeper, check: Check) -> None:
-    """Doubt the map where another norm gives a different map."""
+    """Note a doubt where another norm gives a clearly different map."""
     now = keeper.snapshot()
     turned, order = by_robot(now.problem())
     problem = as_one(turned)
@@ -101,6 +101,6 @@ def compare_norms(keeper: Keeper, check: Check) -> None:
 
 def take_judgement(keeper: Keeper, of: Snapshot, judgement: Judgement, poses: Array,
                    anew: bool) -> None:
-    """Hand in what was found of a snapshot, and its L2 map (n, p); anew : from it alone."""
+    """Hand in the judgement of a snapshot and its L2 map (n, p); anew : from the graph alone."""
     keeper.change(of, lambda state, factors: state.judged_by(
         judgement, poses, len(of.loop_rows), anew, factors, time.monotonic()))

@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What can still be had of a bag that the bag library gives up on.
+The messages before the first damage of a bag that the bag library refuses.
 
 The files of a bag are walked in the order in which they were written, up to the first damage.
 What lies behind is not used: odometry that ends early gives a smaller map, odometry with a piece
@@ -55,7 +55,7 @@ class DamageError(Exception):
         self.where, self.used = where, used
 
     def sentence(self, count: int) -> str:
-        """Say it all, when `count` messages were used."""
+        """Return the damage as one sentence; count : how many messages were used."""
         return f'{self}; {count:,} messages {self.used} were used'
 
 

@@ -1,0 +1,151 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the scan front end makes of a laser log, by truth: error, loops, places, cost, memory.
+
+    python benchmarks/scans.py --datasets DIR [--logs fr079,intel]
+
+DIR/lidar holds the logs and their corrected poses. Where a keyframe was in truth is the nearest
+corrected pose, and scan-matched odometry from there. A loop is false where it is off by more than
+FAR or TURNED: where a robot turns, corrected poses are up to half a radian off, for all loops of a
+keyframe alike. A place is a square of SIDE; it is seen again each time that the robot comes into
+it, if it had been within NEAR of where it is then, and has gone APART since. It is closed where a
+true loop leads back from there, or from within NEAR of way. Seconds are the processor's, on one
+thread, and of the front end alone: what a scan costs `scan_loops`.
+"""
+
+import argparse
+import resource
+import time
+from pathlib import Path
+
+import numpy as np
+
+from l1slam_ros.cli.reference import position_error, read_truth
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.robust.batch_map import SolveOptions, solve
+from l1slam_ros.core.scans.front_end import ScanFrontEnd
+from l1slam_ros.io.scans.carmen import read_carmen
+from l1slam_ros.io.scans.to_graph import ScanMap, map_scans
+from l1slam_ros.io.trajectory import read_reference
+
+# [m], [rad]
+FAR, TURNED = 0.5, 0.6
+# [m]
+SIDE, NEAR, APART = 2.0, 2.0, 10.0
+
+
+class Timed:
+    """A front end's calls, and what each scan took of the processor [s]."""
+
+    def __init__(self) -> None:
+        self.seconds: list[float] = []
+
+    def __enter__(self) -> 'Timed':
+        """Measure every front end."""
+        self._add, self._loops = ScanFrontEnd.add, ScanFrontEnd.loops
+        add, loops, seconds = self._add, self._loops, self.seconds
+
+        def timed_add(front_end: ScanFrontEnd, *arguments: object) -> object:
+            began = time.thread_time()
+            step = add(front_end, *arguments)
+            seconds.append(time.thread_time() - began)
+            return step
+
+        def timed_loops(front_end: ScanFrontEnd) -> object:
+            began = time.thread_time()
+            found = loops(front_end)
+            seconds[-1] += time.thread_time() - began
+            return found
+
+        ScanFrontEnd.add, ScanFrontEnd.loops = timed_add, timed_loops
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Measure no more."""
+        ScanFrontEnd.add, ScanFrontEnd.loops = self._add, self._loops
+
+
+def true_poses(made: ScanMap, stamps: Indices, truth: Array) -> Array:
+    """Return where the keyframes were, (n, 3), by true poses (m, 3) at stamps [ns]."""
+    rows, keyframes, steps = made.path.steps_at(stamps, 10**10, 10**6)
+    own = made.record.times
+    found = np.full((len(own), 3), np.nan)
+    nearest = np.full(len(own), np.inf)
+    for row, keyframe, step in zip(rows, keyframes, steps, strict=True):
+        if (off := abs(stamps[row] - own[keyframe])) < nearest[keyframe]:
+            nearest[keyframe] = off
+            found[keyframe] = se2.compose(truth[row][None], se2.inverse(step[None]))[0]
+    # Keyframes without a corrected pose of their own: by odometry from those beside.
+    graph = made.record.graph.between
+    steps = list(zip(graph.pairs[graph.is_odometry].tolist(),
+                     graph.measurement[graph.is_odometry][:, None], strict=True))
+    for (i, j), step in steps:
+        if np.isnan(found[j, 0]):
+            found[j] = se2.compose(found[i][None], step)[0]
+    for (i, j), step in reversed(steps):
+        if np.isnan(found[i, 0]):
+            found[i] = se2.compose(found[j][None], se2.inverse(step))[0]
+    return found
+
+
+def false_loops(made: ScanMap, truth: Array) -> tuple[Indices, np.ndarray]:
+    """Return the pairs of all loops (l, 2), and which are false."""
+    factors = made.record.graph.between
+    pairs = factors.pairs[~factors.is_odometry]
+    true = se2.between(truth[pairs[:, 0]], truth[pairs[:, 1]])
+    off = se2.between(true, factors.measurement[~factors.is_odometry])
+    return pairs, (np.hypot(off[:, 0], off[:, 1]) > FAR) | (abs(off[:, 2]) > TURNED)
+
+
+def places(pairs: Indices, truth: Array) -> tuple[int, int]:
+    """Return how many times a place was seen again, and how many of these are closed."""
+    way = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))))
+    square = np.floor(truth[:, :2] / SIDE).astype(int)
+    comes = np.concatenate(([0], np.cumsum((np.diff(square, axis=0) != 0).any(axis=1))))
+    again = np.array([
+        (np.hypot(*(truth[:k, :2] - truth[k, :2]).T)[way[:k] < way[k] - APART] < NEAR).any()
+        for k in range(len(truth))])
+    from_loop = abs(way - way[pairs.max(axis=1)][:, None]).min(axis=0, initial=np.inf)
+    return len(set(comes[again])), len(set(comes[again & (from_loop < NEAR)]))
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description='the scan front end on laser logs, by truth')
+    parser.add_argument('--datasets', type=Path, required=True, metavar='DIR')
+    parser.add_argument('--logs', default='fr079,intel')
+    given = parser.parse_args()
+    for name in given.logs.split(','):
+        folder = given.datasets / 'lidar'
+        log = read_carmen(folder / f'{name}.clf.bz2')
+        with Timed() as timed:
+            made = map_scans(zip(log.scans, log.wheels, strict=True), log.mount)
+        table = folder / f'{name}.truth.csv'
+        reference = read_reference(table, se2, by_stamps=True)
+        truth = true_poses(made, reference.keys, reference.poses)
+        pairs, false = false_loops(made, truth)
+        again, closed = places(pairs[~false], truth)
+        outcome = solve(made.record.graph, None, SolveOptions())
+        error = position_error(made.record, outcome.solution.poses, read_truth(
+            str(table), made.record, folder / f'{name}.clf.bz2', made.path))
+        milliseconds = 1e3 * np.array(timed.seconds)
+        print(f'{name}: {len(log.scans):,} scans, {len(truth):,} keyframes, error {error:.3f} m, '
+              f'{outcome.solution.status}')
+        print(f'  {len(pairs)} loops, {false.sum()} false; {closed} of {again} places closed '
+              f'({closed / max(again, 1):.0%})')
+        print(f'  a scan takes {np.median(milliseconds):.2f} ms in the median, p99 '
+              f'{np.quantile(milliseconds, 0.99):.1f} ms; '
+              f'{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB so far',
+              flush=True)
+
+
+if __name__ == '__main__':
+    main()
