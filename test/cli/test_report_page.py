@@ -194,14 +194,11 @@ def test_a_slip_and_most_loops_refused_have_rivals(capsys, tmp_path):
     (tmp_path / 'torn.g2o.trusted.txt').write_text(''.join(
         f'{i} {j}\n' for i, j in report['doubts'][0]['loops']))
     page, report = reported(capsys, path)
-    kinds = [doubt['kind'] for doubt in report['doubts']]
-    assert kinds == ['a slip suspected', 'a slip suspected', 'another norm']
-    names = [rival['name'] for rival in shown(page)['maps'][1:]]
-    steps = [doubt['text'].split(' between ')[1].split(',')[0].split(' and ')
-             for doubt in report['doubts'][:2]]
-    assert [name.split(' the step ')[1] for name in names[:2]] == [' - '.join(s) for s in steps]
-    assert names[2] == 'rival: least squares'
-    assert shown(page)['files']['settled'] == 'l1slam solve torn.g2o --norm l2'
+    doubt, = report['doubts']
+    assert doubt['kind'] == 'a slip suspected'
+    rival, = shown(page)['maps'][1:]
+    step = doubt['text'].split(' between ')[1].split(',')[0].split(' and ')
+    assert rival['name'].split(' the step ')[1] == ' - '.join(step)
 
 
 def test_a_page_of_what_nobody_judged(capsys, tmp_path):
@@ -252,6 +249,7 @@ def test_least_squares_settles_what_no_loop_does(capsys, datasets, tmp_path):
     page, report = reported(capsys, tmp_path / 'bovisa06.g2o')
     assert [doubt['kind'] for doubt in report['doubts']] == ['another norm']
     assert not shown(page)['doubts'][0]['settled']
+    assert shown(page)['maps'][1]['name'] == 'rival: least squares'
     command = shown(page)['files']['settled'].split()
     assert command == ['l1slam', 'solve', 'bovisa06.g2o', '--norm', 'l2']
     again = solve_json(capsys, tmp_path / 'bovisa06.g2o', *command[3:])

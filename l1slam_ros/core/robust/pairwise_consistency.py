@@ -36,6 +36,8 @@ ASKED = 250
 _NEAREST = 20
 # A run has so many loops, each agrees with so many others of it, and it is so long [m].
 RUN, _MATES, _RUN_WAY = 6, 3, 2.5
+# One that is to outweigh the odometry has so many: of recorded ones five in six are true then.
+_LONG_RUN = 10
 # So many times vaguer than the surest one, a loop says little.
 _VAGUE, _TINY = 10.0, 1e-300
 
@@ -82,7 +84,7 @@ def longest_run(growth: Growth, rows: Indices) -> Group:
     size = np.log(np.maximum(np.abs(diagonal), _TINY)).mean(axis=1)
     rows = asked(growth, rows[size > size.max(initial=-np.inf) - np.log(_VAGUE)])
     longest = max(runs(growth, rows), key=lambda group: len(group.rows), default=NO_GROUP)
-    return longest if len(longest.rows) > len(rows) / 2 else NO_GROUP
+    return longest if len(longest.rows) >= max(_LONG_RUN, len(rows) / 2 + 1) else NO_GROUP
 
 
 def runs(growth: Growth, rows: Indices) -> list[Group]:
@@ -90,8 +92,7 @@ def runs(growth: Growth, rows: Indices) -> list[Group]:
     Return of some loops those of one place that are no one mistake.
 
     A robot that goes the same way twice sees one place all along it. So many loops that agree in
-    pairs, along a way so long at either end, are hardly all false: of recorded runs of ten or more
-    five in six are true.
+    pairs, along a way so long at either end, are hardly all false.
     """
     rows = asked(growth, rows)
     one, other, _ = agreement(growth, rows)
