@@ -81,10 +81,10 @@ class Growth:
     loops; part : (n,) number of the part of each keyframe; poses : (n, p) the L2 map of the
     accepted; posterior : of these; variance : (2,) of odometry and loops in units of what they
     state; slip_odds : ln P(slipped) / P(measured) of the odometry factors that were suspected;
-    ventured : (m,) bool, loops of runs that noisier odometry explained; first_variance : (2,) of
-    no loop yet, learnt_of : (m,) bool, of what it was learnt last; drops : (m,) how often each was
-    accepted and did not fit; at_their_word : whether factors may be as noisy as they say;
-    in_tail : (m,) bool, not the loops that are too far off for that;
+    ventured : (m,) bool, loops of runs that noisier odometry explained; first_variance : (2,) as
+    found before any loop came in; learnt_of : (m,) bool, what it was learnt of last; drops :
+    (m,) how often each was accepted and did not fit; at_their_word : whether factors may be as
+    noisy as they say; in_tail : (m,) bool, not the loops that are too far off for that;
     check : called before long steps, raises where the work shall stop.
     """
 
