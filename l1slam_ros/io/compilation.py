@@ -26,7 +26,6 @@ import select
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -192,15 +191,10 @@ def _noted() -> dict[str, list[str]]:
 
 def _note(steps: dict[str, list[str]]) -> None:
     """Write down what is in the cache; a reader finds all of the note or none."""
-    folder = next(filter(objects.is_writable, objects.folders()))
-    with tempfile.NamedTemporaryFile('w', dir=folder, delete=False) as file:
-        json.dump({'key': _key(), 'steps': steps}, file)
-    os.replace(file.name, folder / objects.file_name('json'))
+    note = {'key': _key(), 'steps': steps}
+    objects.put(objects.file_name('json'), json.dumps(note).encode())
 
 
 def _key() -> str:
-    """Return what changes with all that a compiled loop depends on."""
-    stats = [(path.name, path.stat()) for path in sorted(objects.KERNELS.rglob('*.py'))]
-    facts = (objects.surroundings(),
-             [(name, stat.st_mtime_ns, stat.st_size) for name, stat in stats])
-    return hashlib.sha256(repr(facts).encode()).hexdigest()
+    """Return what changes with the sources; on the rest depends how the note is called."""
+    return hashlib.sha256(repr(objects.sources()).encode()).hexdigest()

@@ -56,6 +56,7 @@ class Loop:
     def __init__(self, py_func: Kernel, takes: tuple[str, ...] = (),
                  takes_in_space: tuple[str, ...] = ()) -> None:
         update_wrapper(self, py_func)
+        objects.note_import(_source(py_func))
         self.py_func, self.takes, self.takes_in_space = py_func, takes, takes_in_space
         self.linked: tuple[link.Linked, ...] = ()
         self._sought: dict[bool, bool] = {}
@@ -142,8 +143,12 @@ def make_ready(kernel: Loop, space: bool) -> None:
 
 def keep(step: str) -> list[str]:
     """Have what is not kept yet of a step compiled, and kept; return the files that keep it."""
-    if files := objects.files(step):
-        return files
+    with objects.alone(step):
+        return objects.files(step) or _made(step)
+
+
+def _made(step: str) -> list[str]:
+    """Compile the loops of a step, and keep them; return the files that keep it."""
     from l1slam_ros.core.kernels.kept import make
 
     name = step.removesuffix(objects.SPACE)
@@ -183,12 +188,18 @@ def _dispatcher(function: Kernel) -> Any:
 
     _spare_blas()
     own = function.__name__.startswith('_')
+    # After an upgrade numba would keep what this process has under the source that is there now.
+    as_imported = objects.is_as_imported(_source(function))
     options = {'nogil': True, 'error_model': 'numpy', 'fastmath': {'contract', 'reassoc', 'nsz'},
                'no_cfunc_wrapper': True, 'no_cpython_wrapper': own}
     try:
-        return numba.njit(cache=not own, **options)(function)
+        return numba.njit(cache=as_imported and not own, **options)(function)
     except RuntimeError:
         return numba.njit(**options)(function)
+
+
+def _source(function: Kernel) -> Path:
+    return Path(function.__code__.co_filename)
 
 
 def _spare_blas() -> None:

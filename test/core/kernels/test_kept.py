@@ -179,6 +179,24 @@ def test_code_made_otherwise_is_not_used(copy_of_cache, monkeypatch, name, setti
     assert not objects.read('blocks')
 
 
+@pytest.mark.parametrize('name, setting', [
+    ('NUMBA_NUM_THREADS', '1'), ('NUMBA_THREADING_LAYER', 'omp'), ('NUMBA_CACHE_DIR', '/nowhere')])
+def test_settings_that_code_does_not_depend_on_ask_for_no_other(copy_of_cache, monkeypatch, name,
+                                                                setting):
+    monkeypatch.setenv(name, setting)
+    assert objects.read('blocks')
+
+
+def test_who_shares_a_folder_but_not_the_settings_replaces_nothing(copy_of_cache, monkeypatch):
+    kept = objects.read('blocks')
+    with monkeypatch.context() as patched:
+        patched.setenv('NUMBA_OPT', '1')
+        other = Path(objects.write('blocks', {'whiten': kept['whiten']}, []))
+        assert objects.read('blocks') == {'whiten': kept['whiten']}
+    assert objects.read('blocks') == kept
+    assert {copy_of_cache, other} == set(copy_of_cache.parent.glob('*.blocks'))
+
+
 @pytest.mark.parametrize('of, what, found', [
     (binding, 'get_host_cpu_name', lambda: 'another'), (binding, 'get_host_cpu_features', dict),
     (objects, '_machine_and_libraries', str)])
@@ -188,11 +206,53 @@ def test_code_of_another_processor_library_or_source_is_not_used(copy_of_cache, 
     assert not objects.read('blocks')
 
 
+def test_code_of_an_upgrade_is_not_used_by_a_process_that_began_before(copy_of_cache, monkeypatch):
+    """It has the older functions that call these loops."""
+    source = objects.KERNELS / 'blocks.py'
+    monkeypatch.setitem(objects._imported, source, (1, 1))
+    assert not objects.read('blocks') and not objects.is_as_imported(source)
+
+
 def test_code_of_another_source_is_not_used(copy_of_cache, monkeypatch):
     read = Path.read_bytes
     monkeypatch.setattr(Path, 'read_bytes', lambda path: read(path) + (
         b'# A change.' if path.name == 'blocks.py' else b''))
     assert not objects.read('blocks')
+
+
+# Makes a step, once all who shall are ready.
+MAKE = """
+import sys, time
+from pathlib import Path
+from l1slam_ros.core.kernels import compiled
+
+print('ready', flush=True)
+sys.stdin.read()
+before = time.process_time()
+print(*compiled.keep('interior_point'), time.process_time() - before)
+"""
+
+
+def test_two_who_make_the_same_at_once_make_it_once(tmp_path):
+    both = [subprocess.Popen([sys.executable, '-c', MAKE], stdin=subprocess.PIPE, text=True,
+                             stdout=subprocess.PIPE, env={**os.environ, 'NUMBA_CACHE_DIR':
+                                                          str(tmp_path)}) for _ in range(2)]
+    for one in both:
+        assert one.stdout.readline() == 'ready\n'
+    for one in both:
+        one.stdin.close()
+    (*files, first), (*others, last) = sorted((one.stdout.read().split() for one in both),
+                                              key=lambda said: float(said[-1]))
+    assert files == others and all(map(os.path.exists, files)) and len(files) > 1
+    assert float(first) < float(last) / 4
+    assert [one.wait() for one in both] == [0, 0]
+
+
+def test_nobody_waits_for_ever_for_one_who_is_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr(objects, 'folders', lambda: [tmp_path])
+    monkeypatch.setattr(objects, '_PATIENCE', 0.2)
+    with objects.alone('blocks'), objects.alone('se2'), objects.alone('blocks'):
+        pass
 
 
 # Calls a loop; prints whether numba was imported for it.

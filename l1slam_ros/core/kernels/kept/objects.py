@@ -10,9 +10,11 @@
 The file that keeps the machine code of a step: of the loops of one module, or those for space.
 
 A file is the digest of all that follows, a line of JSON, and one object file after the other. It
-is read as a whole or not at all: with another digest, or if it was made of other sources, by
-another Python, numba, llvmlite or NumPy, with other settings of numba's, or for another processor,
-it is as if it were not there.
+is read as a whole or not at all: with another digest, or if it was made of other sources, it is as
+if it were not there, and so it is to a process that has imported older sources than are there now.
+
+Its name has what else its code depends on: Python, numba, llvmlite, NumPy, settings of numba's,
+and the processor. So whoever shares a folder but none of these does not replace what others need.
 """
 
 import functools
@@ -24,6 +26,9 @@ import os
 import platform
 import sys
 import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,6 +40,11 @@ SPACE = ':space'
 # Extension modules of numba's that hold what its machine code calls: where they are in it.
 HELPERS = ('_helperlib', '_dynfunc', 'core/runtime/_nrt_python')
 _DIGEST = 64  # [characters]
+# Settings of numba's that the code of loops does not depend on: where it is kept, and the threads
+# of loops that have more than one, as none of ours has.
+_WITHOUT_EFFECT = ('NUMBA_CACHE_DIR', 'NUMBA_NUM_THREADS', 'NUMBA_THREADING_LAYER')
+# [s] How long a process waits for another one that makes the same step, and how often it looks.
+_PATIENCE, _LOOK = 60.0, 0.05
 # What a processor is known by, of all that the kernel of Linux says of it.
 _PROCESSOR = ('model name', 'flags', 'Features', 'CPU implementer', 'CPU part')
 
@@ -70,13 +80,36 @@ def write(step: str, loops: dict[str, list[Kept]], beside: list[str]) -> str:
     codes = [one.code for versions in loops.values() for one in versions]
     head = json.dumps({'key': key(step), 'beside': beside, 'loops': index}).encode()
     rest = b''.join([head, b'\n', *codes])
-    folder = next(filter(is_writable, folders()))
-    with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
-        file.write(hashlib.sha256(rest).hexdigest().encode() + rest)
+    return put(file_name(step), hashlib.sha256(rest).hexdigest().encode() + rest)
+
+
+def put(name: str, content: bytes) -> str:
+    """Write a file where it can be; a reader finds the whole or none. Returns where it is."""
+    path = next(filter(is_writable, folders())) / name
+    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+        file.write(content)
     os.chmod(file.name, 0o644)  # others may read what root has compiled
-    path = folder / file_name(step)
     os.replace(file.name, path)
     return str(path)
+
+
+@contextmanager
+def alone(step: str) -> Iterator[None]:
+    """Keep other processes from making a step for the same folder; wait until none does."""
+    with ExitStack() as held:
+        with suppress(ImportError, OSError, StopIteration):  # nowhere to lock
+            import fcntl
+
+            folder = next(filter(is_writable, folders()))
+            file = held.enter_context((folder / file_name(f'{step}.lock')).open('w'))
+            # Whoever holds it may be stopped, by Ctrl-Z: then both make it.
+            end = time.monotonic() + _PATIENCE
+            while time.monotonic() < end:
+                with suppress(BlockingIOError):
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                time.sleep(_LOOK)
+        yield
 
 
 def read(step: str) -> dict[str, list[Kept]]:
@@ -100,7 +133,7 @@ def files(step: str) -> list[str]:
 
 def _sound(step: str) -> tuple[str, dict, bytes]:
     """Return a sound file of a step, the first line of it, and what follows."""
-    for folder in folders():
+    for folder in folders() if all(map(is_as_imported, _sources(step))) else ():
         path = folder / file_name(step)
         try:
             whole = path.read_bytes()
@@ -132,26 +165,53 @@ def is_writable(folder: Path) -> bool:
 
 
 def file_name(end: str) -> str:
-    """Return the name of a file: one for each place of the package, and Python, in a folder."""
-    place = hashlib.sha256(os.fsencode(KERNELS)).hexdigest()[:12]
-    return f'l1slam-{sys.implementation.cache_tag}-{place}.{end.replace(":", ".")}'
+    """Return the name of a file: one for each place of the package, and its surroundings."""
+    facts = os.fsencode(KERNELS) + surroundings().encode()
+    return (f'l1slam-{sys.implementation.cache_tag}-{hashlib.sha256(facts).hexdigest()[:16]}.'
+            f'{end.replace(":", ".")}')
 
 
 def key(step: str) -> str:
-    """Return what changes with all that the machine code of a step depends on."""
+    """Return what changes with the sources of a step, and with what LLVM says of the processor."""
     from llvmlite import binding
 
-    own = KERNELS / f'{step.removesuffix(SPACE)}.py'
-    sources = [path.read_bytes() for path in (own, KERNELS / 'compiled.py',
-                                              *sorted(Path(__file__).parent.glob('*.py')))]
     processor = binding.get_host_cpu_name(), sorted(binding.get_host_cpu_features().items())
-    facts = surroundings(), processor, step, sources
+    facts = processor, step, [path.read_bytes() for path in _sources(step)]
     return hashlib.sha256(repr(facts).encode()).hexdigest()
+
+
+def sources() -> dict[str, tuple[int, int]]:
+    """Return time of change [ns] and size of all sources of loops, and of what keeps them."""
+    return {str(path): _state(path) for path in sorted(KERNELS.rglob('*.py'))}
+
+
+def note_import(source: Path) -> None:
+    """Note the state of a source as this process imports it."""
+    if source not in _imported:
+        _imported[source] = _state(source)
+
+
+def is_as_imported(source: Path) -> bool:
+    """Tell whether a source is what this process runs, or would; it is not after an upgrade."""
+    now = _state(source)
+    return _imported.get(source, now) == now
+
+
+def _state(path: Path) -> tuple[int, int]:
+    with suppress(OSError):
+        stat = path.stat()
+        return stat.st_mtime_ns, stat.st_size
+    return 0, 0
+
+
+def _sources(step: str) -> list[Path]:
+    return [KERNELS / f'{step.removesuffix(SPACE)}.py', *_SHARED]
 
 
 def surroundings() -> str:
     """Return all but the sources that compiled loops depend on; imports neither numba nor LLVM."""
-    settings = sorted(pair for pair in os.environ.items() if pair[0].startswith('NUMBA_'))
+    settings = sorted(pair for pair in os.environ.items()
+                      if pair[0].startswith('NUMBA_') and not pair[0].startswith(_WITHOUT_EFFECT))
     own = Path('.numba_config.yaml')
     return repr((settings, own.read_bytes() if own.exists() else b'', _machine_and_libraries()))
 
@@ -187,3 +247,9 @@ def _processor() -> list[str]:
     except OSError:
         return [platform.processor()]
     return [line for line in first.splitlines() if line.startswith(_PROCESSOR)]
+
+
+_SHARED = [KERNELS / 'compiled.py', *sorted(Path(__file__).parent.glob('*.py'))]
+_imported: dict[Path, tuple[int, int]] = {}
+for _source in _SHARED:
+    note_import(_source)
