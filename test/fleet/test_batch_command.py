@@ -253,12 +253,17 @@ def test_what_crashes_once_is_tried_again(tmp_path, what):
     assert ended['row'] == {'recording': 'name', 'status': 'converged'} and ended['attempts'] == 2
 
 
+def states(folders):
+    return {path: path.stat().st_mtime_ns for folder in folders
+            for path in folder.rglob('l1slam-*')}
+
+
 @pytest.mark.parametrize('threads', [None, '1', '2'])
 def test_a_job_compiles_nothing_once_the_cache_is_full(recordings, tmp_path, monkeypatch, threads):
     """Whatever a worker's environment says of the threads of loops, of which none has many."""
     assert fill_cache(lambda done, total: None, lambda: False, (*SPARSE, *JUDGEMENT))
     folders = {Path(path).parent for step in SPARSE for path in objects.files(step)}
-    before = {folder: sorted(folder.iterdir()) for folder in folders}
+    before = states(folders)
     monkeypatch.setattr(isolated, '_STARTERS', threading.local())  # no process that is there
     if threads:
         monkeypatch.setenv('NUMBA_NUM_THREADS', threads)
@@ -266,7 +271,7 @@ def test_a_job_compiles_nothing_once_the_cache_is_full(recordings, tmp_path, mon
     row = run_job(begin_prepared, job, Limits(SECONDS, 10**10), 0)['row']
     isolated._STARTERS.of[begin_prepared].close()
     assert row['status'] != 'failed' and not row['numba']
-    assert {folder: sorted(folder.iterdir()) for folder in folders} == before
+    assert states(folders) == before
 
 
 def test_recordings_are_found_however_deep_and_bags_as_a_whole(tmp_path):
