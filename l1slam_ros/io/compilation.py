@@ -27,8 +27,9 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 
 from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Manifold
@@ -48,8 +49,10 @@ STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
 IN_SPACE = {'halpern': f'halpern{objects.SPACE}', 'cholesky': f'cholesky{objects.SPACE}',
              'blocks': f'blocks{objects.SPACE}', 'se2': 'se3'}
 
-# [s] How often the caller is asked whether to stop.
+# [s] How often the caller is asked whether to stop, and whether another process is done.
 _LOOK = 0.1
+# [s] How long a process waits for another one that makes the same step.
+_PATIENCE = 60.0
 # Of glibc's `mallopt`: from which size on an array has pages of its own, and how much may lie free
 # at the end of a heap. Left alone it raises both, to tens of megabytes for each thread.
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
@@ -146,7 +149,33 @@ def work(steps: list[str]) -> None:
     # What numba makes it holds on to: to look for garbage takes a tenth of the time, in vain.
     gc.disable()
     for step in steps:
-        print(json.dumps([step, compiled.keep(step)]), flush=True)
+        print(json.dumps([step, make(step)]), flush=True)
+
+
+def make(step: str) -> list[str]:
+    """Compile a step if no other process does; return the files that keep it."""
+    with alone(step):
+        return compiled.keep(step)
+
+
+@contextmanager
+def alone(step: str) -> Iterator[None]:
+    """Keep other processes from making a step for the same folder; wait until none does."""
+    with ExitStack() as held:
+        with suppress(ImportError, OSError, StopIteration):  # nowhere to lock
+            import fcntl
+
+            folder = next(filter(objects.is_writable, objects.folders()))
+            path = folder / objects.file_name(f'{step}.lock')
+            file = held.enter_context(path.open('w'))
+            # Whoever holds it may be stopped, by Ctrl-Z: then both make it.
+            end = time.monotonic() + _PATIENCE
+            while time.monotonic() < end:
+                with suppress(BlockingIOError):
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                time.sleep(_LOOK)
+        yield
 
 
 def load(steps: Sequence[str] = STEPS) -> None:

@@ -143,12 +143,8 @@ def make_ready(kernel: Loop, space: bool) -> None:
 
 def keep(step: str) -> list[str]:
     """Have what is not kept yet of a step compiled, and kept; return the files that keep it."""
-    with objects.alone(step):
-        return objects.files(step) or _made(step)
-
-
-def _made(step: str) -> list[str]:
-    """Compile the loops of a step, and keep them; return the files that keep it."""
+    if files := objects.files(step):
+        return files
     from l1slam_ros.core.kernels.kept import make
 
     name = step.removesuffix(objects.SPACE)

@@ -22,6 +22,7 @@ from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.kernels.compiled import Loop
 from l1slam_ros.core.kernels.kept import objects
+from l1slam_ros.io import compilation
 from l1slam_ros.io.compilation import STEPS, fill_cache, with_space
 
 TESTS = Path(__file__).parents[2]
@@ -224,12 +225,12 @@ def test_code_of_another_source_is_not_used(copy_of_cache, monkeypatch):
 MAKE = """
 import sys, time
 from pathlib import Path
-from l1slam_ros.core.kernels import compiled
+from l1slam_ros.io import compilation
 
 print('ready', flush=True)
 sys.stdin.read()
 before = time.process_time()
-print(*compiled.keep('interior_point'), time.process_time() - before)
+print(*compilation.make('interior_point'), time.process_time() - before)
 """
 
 
@@ -250,8 +251,8 @@ def test_two_who_make_the_same_at_once_make_it_once(tmp_path):
 
 def test_nobody_waits_for_ever_for_one_who_is_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr(objects, 'folders', lambda: [tmp_path])
-    monkeypatch.setattr(objects, '_PATIENCE', 0.2)
-    with objects.alone('blocks'), objects.alone('se2'), objects.alone('blocks'):
+    monkeypatch.setattr(compilation, '_PATIENCE', 0.2)
+    with compilation.alone('blocks'), compilation.alone('se2'), compilation.alone('blocks'):
         pass
 
 

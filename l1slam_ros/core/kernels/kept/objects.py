@@ -26,9 +26,7 @@ import os
 import platform
 import sys
 import tempfile
-import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,8 +41,6 @@ _DIGEST = 64  # [characters]
 # Settings of numba's that the code of loops does not depend on: where it is kept, and the threads
 # of loops that have more than one, as none of ours has.
 _WITHOUT_EFFECT = ('NUMBA_CACHE_DIR', 'NUMBA_NUM_THREADS', 'NUMBA_THREADING_LAYER')
-# [s] How long a process waits for another one that makes the same step, and how often it looks.
-_PATIENCE, _LOOK = 60.0, 0.05
 # What a processor is known by, of all that the kernel of Linux says of it.
 _PROCESSOR = ('model name', 'flags', 'Features', 'CPU implementer', 'CPU part')
 
@@ -91,25 +87,6 @@ def put(name: str, content: bytes) -> str:
     os.chmod(file.name, 0o644)  # others may read what root has compiled
     os.replace(file.name, path)
     return str(path)
-
-
-@contextmanager
-def alone(step: str) -> Iterator[None]:
-    """Keep other processes from making a step for the same folder; wait until none does."""
-    with ExitStack() as held:
-        with suppress(ImportError, OSError, StopIteration):  # nowhere to lock
-            import fcntl
-
-            folder = next(filter(is_writable, folders()))
-            file = held.enter_context((folder / file_name(f'{step}.lock')).open('w'))
-            # Whoever holds it may be stopped, by Ctrl-Z: then both make it.
-            end = time.monotonic() + _PATIENCE
-            while time.monotonic() < end:
-                with suppress(BlockingIOError):
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    break
-                time.sleep(_LOOK)
-        yield
 
 
 def read(step: str) -> dict[str, list[Kept]]:
