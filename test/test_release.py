@@ -11,6 +11,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -19,7 +20,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from environments import environment
+from environments import environment, own_variables
 from headers import HEADER, files_of_python
 
 from l1slam_ros.core.errors import MissingError, optional_libraries
@@ -137,7 +138,7 @@ def test_the_header_is_what_ament_copyright_looks_for():
 # no command (D401), and says of those arguments alone something that need it (D417).
 OURS = ('l1slam_ros', 'config', 'setup.py')
 LINTERS = {
-    'ament_copyright': ('l1slam_ros', 'test', 'config', 'benchmarks', 'setup.py'),
+    'ament_copyright': ('l1slam_ros', 'test', 'config', 'benchmarks', 'doc', 'setup.py'),
     'ament_xmllint': ('package.xml',),
     'ament_flake8': ('--config', 'test/ament_flake8.ini', *OURS),
     'ament_pep257': ('--add-ignore', 'D401', 'D417', '--', *OURS),
@@ -145,10 +146,13 @@ LINTERS = {
 
 
 @pytest.mark.parametrize('linter', LINTERS)
-def test_a_linter_of_ros_finds_nothing(linter, monkeypatch):
-    run = pytest.importorskip(f'{linter}.main').main
-    monkeypatch.chdir(ROOT)
-    assert run(argv=list(LINTERS[linter])) == 0
+def test_a_linter_of_ros_finds_nothing(linter):
+    """That of the system: Debian and Ubuntu have all four."""
+    if shutil.which(linter) is None:
+        pytest.skip(f'{linter} is not installed: apt install python3-{linter.replace("_", "-")}')
+    done = subprocess.run([linter, *LINTERS[linter]], cwd=ROOT, capture_output=True, text=True,
+                          env=own_variables(), timeout=PATIENCE)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 @pytest.mark.parametrize('linter', ['ament_flake8', 'ament_pep257'])
