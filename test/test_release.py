@@ -22,38 +22,12 @@ from xml.etree import ElementTree
 import pytest
 from environments import environment, own_variables
 from headers import HEADER, files_of_python
+from rosdep_keys import OF_JAZZY, OF_ROSDEP
 
 from l1slam_ros.core.errors import MissingError, optional_libraries
 
 ROOT = Path(__file__).parents[1]
 PATIENCE = 300  # [s] where nothing can be kept, all is compiled first
-# Where each key of package.xml was looked up: `rosdep/python.yaml` of ros/rosdistro, in a stored
-# copy (commit 000730d) and, argcomplete excepted, in one of 2025 that knows Noble (commit 30d139d
-# of a fork). The package is the one for each release of Ubuntu: no key has an exception for Noble.
-# A key that ends with -pip has a rule for pip alone, which bloom refuses.
-OF_ROSDEP = {
-    'python3-argcomplete': 'python3-argcomplete',
-    'python3-hypothesis': 'python3-hypothesis',
-    'python3-matplotlib': 'python3-matplotlib',
-    # The older copy names Bionic and Focal alone; the newer one, all releases.
-    'python3-numba': 'python3-numba',
-    'python3-numpy': 'python3-numpy',
-    'python3-packaging': 'python3-packaging',
-    'python3-pytest': 'python3-pytest',
-    'python3-scipy': 'python3-scipy',
-    'python3-tqdm': 'python3-tqdm',
-    'python3-yaml': 'python3-yaml',
-}
-# Packages of ROS itself: ros/rosdistro, `jazzy/distribution.yaml`, a stored copy (commit 0006cda),
-# by the repository that holds them; each is released as ros-jazzy-<name>.
-OF_JAZZY = {
-    'builtin_interfaces': 'rcl_interfaces', 'diagnostic_msgs': 'common_interfaces',
-    'geometry_msgs': 'common_interfaces', 'lifecycle_msgs': 'rcl_interfaces',
-    'nav_msgs': 'common_interfaces', 'rcl_interfaces': 'rcl_interfaces', 'rclpy': 'rclpy',
-    'rosgraph_msgs': 'rcl_interfaces', 'sensor_msgs': 'common_interfaces',
-    'std_msgs': 'common_interfaces', 'std_srvs': 'common_interfaces', 'tf2_msgs': 'geometry2',
-    'visualization_msgs': 'common_interfaces',
-}
 # What no package of Ubuntu brings, or what not every command needs.
 OPTIONAL = ('rosbags', 'mcap', 'lz4', 'zstandard', 'matplotlib', 'tqdm', 'argcomplete')
 
