@@ -36,7 +36,6 @@ from scipy.optimize import minimize
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
-from l1slam_ros.core.robust.forecast import terms_of
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
@@ -62,7 +61,7 @@ _EDGES = (0.0, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
 
 @dataclass(frozen=True)
 class Row:
-    """One run: terms (4,) of the forecast, whether the map was wrong, whether it was doubted."""
+    """One run: terms (6,) of the forecast, whether the map was wrong, whether it was doubted."""
 
     graph: str
     terms: Array
@@ -141,9 +140,7 @@ def run(name: str, found: Place, condition: int, seed: int) -> Row:
     outcome = solve(graph, None, SolveOptions(robust=True))
     judgement, poses = outcome.judgement, outcome.solution.poses[:, :2]
     assert judgement is not None
-    rows = ~graph.between.is_odometry
-    terms = terms_of(judgement.accepted[rows], judgement.suspect[rows], judgement.variance[1])
-    return Row(name, terms, _is_wrong(found, poses, best), bool(judgement.doubts))
+    return Row(name, judgement.terms, _is_wrong(found, poses, best), bool(judgement.doubts))
 
 
 def _is_wrong(found: Place, positions: Array, best: Array) -> bool:

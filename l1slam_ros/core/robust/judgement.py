@@ -23,11 +23,16 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, lowest_of_components
-from l1slam_ros.core.robust.forecast import CONFIDENT, forecast
+from l1slam_ros.core.robust.forecast import (
+    CONFIDENT,
+    forecast,
+    left_drift,
+    terms_of,
+    unsureness,
+)
 from l1slam_ros.core.robust.odometry.drift import straightened
-from l1slam_ros.core.robust.odometry.slips import JOINING, SPANNING, SURE, common_steps, spanning
+from l1slam_ros.core.robust.odometry.slips import JOINING, SURE, common_steps, spanning
 from l1slam_ros.core.robust.pairwise_consistency import (
-    ASKED,
     Group,
     agreement,
     asked,
@@ -39,17 +44,19 @@ from l1slam_ros.core.robust.rounds import Growth
 
 # Most loops are refused; all that are accepted are of one place; loops of one place alone say how
 # two parts lie to each other; refused loops of several places agree on another map; an odometry
-# factor may have slipped, and it was not believed; there were more rounds to come; another norm of
-# the same factors has another map; judging the loops failed, and what is believed is what was by
-# then; so did solving for what is believed.
-MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP, UNFINISHED, NORM, FAILED, UNSOLVED = (
+# factor may have slipped, and it was not believed; the odometry drifts, which was taken for noise;
+# there were more rounds to come; another norm of the same factors has another map; judging the
+# loops failed, and what is believed is what was by then; so did solving for what is believed.
+(MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP, DRIFTS, UNFINISHED, NORM, FAILED,
+ UNSOLVED) = (
     'mostly refused', 'one place', 'one place joins', 'another map', 'a slip suspected',
-    'not at an end', 'another norm', 'judging failed', 'solving failed')
+    'a drift suspected', 'not at an end', 'another norm', 'judging failed', 'solving failed')
 
 # Of fewer loops most may well be refused, and be of one place; most are more than half by some.
 _HANDFUL, _MOST = 5, 0.55
-# Refused loops that agree count if they are so many for each accepted one across.
-_AGAINST = 0.25
+# [sigmas] A drift counts from here on, where the map is less sure of itself than a right one is
+# exact.
+_DRIFTS = 3.5
 
 
 @dataclass(frozen=True)
@@ -83,7 +90,8 @@ class Judgement:
     of each in a map, in the same units; slips : (k,) the odometry factors that slipped, not
     accepted; doubts : reasons not to rely on the map; settled : no more is to be found out from
     the factors that are there; drift : by how much more each metre of the odometry turns than it
-    says [rad/m]; confidence : see `forecast`, NaN where nothing is recorded of such maps;
+    says [rad/m]; confidence : see `forecast`, NaN where nothing is recorded of such maps; terms :
+    what that was made of, see `forecast`;
     is_refusal_doubted : refused loops may be true.
     """
 
@@ -97,6 +105,7 @@ class Judgement:
     settled: bool = True
     drift: float = 0.0
     confidence: float = float('nan')
+    terms: Array = field(default_factory=lambda: np.zeros(0), compare=False, repr=False)
     is_refusal_doubted: bool = False
 
     @property
@@ -205,12 +214,21 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
     size, slip = growth.size, growth.cut & ~growth.gap
     accepted, sigmas = (growth.accepted & ~slip)[:size], np.sqrt(square[:size])
     loops, slips = growth.is_loop[:size], np.flatnonzero(slip[:size])
-    confidence = forecast(accepted[loops], suspect[:size][loops], growth.variance[1])
+    terms = _terms(growth, reasons)
+    confidence = forecast(terms) if loops.any() else float('nan')
     doubted = any(doubt.kind in (MOSTLY_REFUSED, OTHER_MAP) for doubt in reasons)
     if confidence >= CONFIDENT:
         reasons = tuple(doubt for doubt in reasons if doubt.kind != MOSTLY_REFUSED)
     return Judgement(accepted, suspect[:size], sigmas, growth.variance, _noise(growth)[:size],
-                     slips, reasons, settled, confidence=confidence, is_refusal_doubted=doubted)
+                     slips, reasons, settled, confidence=confidence, terms=terms,
+                     is_refusal_doubted=doubted)
+
+
+def _terms(growth: Growth, reasons: tuple[Doubt, ...]) -> Array:
+    """Return what a forecast is made of."""
+    kinds = {doubt.kind for doubt in reasons}
+    return terms_of(bool((growth.is_loop & growth.accepted).any()), unsureness(growth),
+                    *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
 
 
 def _noise(growth: Growth) -> Array:
@@ -269,6 +287,7 @@ def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
         _slip_doubt(growth, step)
         for step, odds in growth.slip_odds.items()
         if (odds < SURE if growth.cut[step] else odds > -SURE)]
+    reasons += _drift_doubt(growth, accepted)
     return tuple(dict.fromkeys(reasons))
 
 
@@ -313,18 +332,13 @@ def _agree_at_a_place(growth: Growth) -> Indices:
 
 
 def _other_map(growth: Growth) -> list[Doubt]:
-    """Return a doubt where refused loops of several places agree: they may be right."""
-    outside = growth.undecided()
-    group = strongest_group(growth, outside)
-    if len(group.places) < JOINING:
-        return []
-    accepted, size = growth.accepted & growth.is_loop, len(group.rows) * max(
-        len(outside) / ASKED, 1.0)
-    trusted, against = (_against(growth, group, rows)
-                        for rows in (accepted & growth.trusted, accepted))
-    # What is trusted is right, whatever else speaks against it.
-    few = len(group.places) < SPANNING and against
-    if trusted or few or size < _AGAINST * against:
+    """
+    Return a doubt where refused loops of several places agree, and no accepted one speaks against.
+
+    They may be right then: the odometry slipped, and nothing else knows of it.
+    """
+    group = strongest_group(growth, growth.undecided())
+    if len(group.places) < JOINING or _against(growth, group, growth.accepted & growth.is_loop):
         return []
     return [_doubt(growth, OTHER_MAP, group.rows)]
 
@@ -349,6 +363,13 @@ def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
     low, high = np.maximum(growth.low[rows], 0), growth.high[rows]
     return Doubt(kind, len(rows), int(low.min()), int(high.max()),
                  pairs=listed(growth.factors.pairs[rows]))
+
+
+def _drift_doubt(growth: Growth, accepted: Indices) -> list[Doubt]:
+    drift, sigmas = left_drift(growth)
+    if abs(sigmas) < _DRIFTS or unsureness(growth) < 1:
+        return []
+    return [replace(_doubt(growth, DRIFTS, accepted), detail=f'{-drift:+.2g}')]
 
 
 def _slip_doubt(growth: Growth, step: int) -> Doubt:
