@@ -45,7 +45,7 @@ A drift
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
-    is a rival explanation nearly as good as the one that won: `judgement` names it.
+    is a rival explanation nearly as good as the one that won: `reasons` names it.
 
 No loop is factored before it is accepted, so none bends what it is judged by. Read on in `rounds`,
 `gating`, `innovation`, `places`, `pairwise_consistency`, `motion`, `slips`, `judgement`.
@@ -73,13 +73,13 @@ from l1slam_ros.core.robust.judgement import (
     Doubt,
     Judgement,
     doubt_of,
-    doubts,
     judgement_of,
     listed,
 )
 from l1slam_ros.core.robust.odometry.drift import straightened, vote
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.places import places
+from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds import REFUSED, Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
