@@ -219,7 +219,7 @@ def main() -> int:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--datasets', type=Path, required=True)
     parser.add_argument('--seeds', type=int, default=3, help='of graphs that are made')
-    parser.add_argument('--drawn', type=int, default=60, help='worlds of each kind')
+    parser.add_argument('--drawn', type=int, default=30, help='worlds of each kind')
     parser.add_argument('--only', nargs='+', choices=FIT + HELD, default=FIT + HELD)
     given = parser.parse_args()
     rows = [row for base in (1, 2) for row in runs_drawn(base, given.drawn)]
