@@ -8,6 +8,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A graph whose map is not to be relied on: refused loops of many places agree on another."""
 
+from dataclasses import replace
+
 import numpy as np
 from lies import careful_world
 
@@ -26,8 +28,15 @@ def shifted_runs(world, starts, length):
     return graph
 
 
-def torn_graph():
-    """Return a graph with 72 such loops beside 210 true ones, and where these end, (2,)."""
-    starts = [(5 + 20 * run, 210 + 20 * run) for run in range(9)]
-    graph = shifted_runs(careful_world(400, 399 + 210), starts, _RUN)
+def torn_graph(contradicted=False):
+    """
+    Return a graph with 72 such loops, and where these end, (2,).
+
+    contradicted : by true loops that join its halves; else none does
+    """
+    starts, half = [(5 + 20 * run, 210 + 20 * run) for run in range(9)], 200
+    world = careful_world(400, 399 + 210)
+    factors = world.graph.between
+    within = contradicted | factors.is_odometry | ((factors.i < half) == (factors.j < half))
+    graph = shifted_runs(replace(world, graph=world.graph.subset(within)), starts, _RUN)
     return graph, np.array([starts[0][0], starts[-1][1] + _RUN])

@@ -146,7 +146,7 @@ def _others() -> list[Kind]:
         Kind('sessions', 'apart', (INTEL, CITY), 'apart', bar=Bar(error=0.1, doubt=FREE)),
         Kind('doubtful', 'ring', (RING,), bar=Bar(doubt=MUST)),
         Kind('doubtful', 'ring-random', (RING,), '', (), 'random', (0.5,), Bar(doubt=MUST)),
-        Kind('doubtful', 'half', (WORLD,), 'half aliased', (54,), bar=Bar(doubt=MUST)),
+        Kind('doubtful', 'half', (WORLD,), 'half aliased', (54,)),
     ]
 
 

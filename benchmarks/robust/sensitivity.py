@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from measuring import report_progress
 from robust.places import Place, place
-from robust.verdict import CONDITIONS, FIT, MADE, Row, run
+from robust.verdict import CONDITIONS, FIT, MADE, Row, run_one
 
 from l1slam_ros.core import robust
 
@@ -98,7 +98,7 @@ def _outcomes(places: dict[str, Place]) -> list[int]:
             if change not in _TOLD or two or share > 0.7:
                 continue
             try:
-                outcomes.append(_outcome(run(name, found, condition, 0)))
+                outcomes.append(_outcome(run_one(name, found, condition, 0)))
             except ArithmeticError:
                 outcomes.append(4)
     return outcomes

@@ -9,17 +9,19 @@
 """
 How often a map was right, beside the forecast that was made of it: fits it, and counts its record.
 
-    python benchmarks/robust/verdict.py --datasets DIR [--seeds N] [--only GRAPH...]
+    python benchmarks/robust/verdict.py --datasets DIR [--seeds N] [--drawn N] [--only GRAPH...]
 
 Graphs, made and recorded, get lies, slips, drift and misstated noise. A map is wrong where it is
 further from the truth than 1.5 times the map of the true loops alone, and 5 cm; where no truth is
 known, more than .25 m and .5% of the map's diagonal from that map. The weights are fitted on the
-graphs of `FIT`; the table counts those of `HELD`, of which nothing was used.
+graphs of `FIT` and on worlds that `drawn` draws. The tables count those of `HELD`, of which
+nothing was used, and fresh worlds, of other seeds and one kind more.
 """
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,21 +31,23 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from measuring import report_progress
+from robust import drawn
 from robust.changes import changed
 from robust.places import Place, error_by_time, measured, place, place_of
 from scipy.optimize import minimize
 
+from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
-from l1slam_ros.core.robust.forecast import terms_of
+from l1slam_ros.core.robust.judgement import ONE_PLACE
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 FIT = ('world', 'sparse', 'intel', 'ring', 'tails')
 HELD = ('kitti_00', 'corridor', 'wide', 'fr079', 'manhattan3500', 'bicocca25b')
 # What is changed, by `changes.CHANGES`, with its amounts; the lies, and their share.
-CONDITIONS: tuple[tuple[str, tuple[float | str, ...], str, float], ...] = (
+CONDITIONS: tuple[drawn.Condition, ...] = (
     ('', (), '', 0.0), *(('', (), 'random', share) for share in (0.3, 0.5, 0.7, 0.9)),
     *(('', (), 'identity', share) for share in (0.5, 0.9)),
     *(('', (), 'grouped', share) for share in (0.3, 0.5, 0.7)),
@@ -62,12 +66,17 @@ _EDGES = (0.0, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
 
 @dataclass(frozen=True)
 class Row:
-    """One run: terms (4,) of the forecast, whether the map was wrong, whether it was doubted."""
+    """One run: terms (6,) of the forecast, whether the map was wrong, the kinds of its doubts."""
 
     graph: str
     terms: Array
     wrong: bool
-    doubted: bool
+    doubts: frozenset[str]
+
+    @property
+    def doubted(self) -> bool:
+        """Whether the map is doubtful."""
+        return bool(self.doubts)
 
 
 def _ring(seed: int, tails: bool = False) -> Place:
@@ -124,10 +133,36 @@ MADE: dict[str, Callable[[int], Place]] = {
     'tails': lambda seed: (_ring if seed % 2 else _corridor)(50 + seed, True)}
 
 
-def run(name: str, found: Place, condition: int, seed: int) -> Row:
+# Drawn worlds, those whose weights are fitted and the others: the first number of their seeds, and
+# the kinds; of each kind its number.
+_DRAWN: dict[str, Callable[[np.random.Generator], Place]] = {
+    'streets': drawn.streets, 'laps': drawn.laps, 'spokes': drawn.spokes, 'lawn': drawn.lawn,
+    'rings': lambda rng: _ring(int(rng.integers(10**6)), rng.random() < 0.3),
+    'corridors': lambda rng: _corridor(int(rng.integers(10**6)), rng.random() < 0.3)}
+FRESH = 'fresh '
+
+
+def runs_drawn(base: int, count: int) -> Iterator[Row]:
+    """Yield what became of worlds that are drawn; base : of their seeds, 1 to fit, 2 fresh."""
+    for number, (name, world) in enumerate(_DRAWN.items()):
+        for seed in range(count) if base == 2 or name != 'lawn' else ():
+            rng = np.random.default_rng((base, number, seed))
+            found, asked = world(rng), drawn.condition(rng, name == 'rings')
+            report_progress(f'{name} seed {seed} of {base}: {asked}')
+            with suppress(GraphError):  # no room for so many lies
+                yield run(FRESH * (base == 2) + name, found, asked,
+                          np.random.default_rng((seed, 0, number)))
+
+
+def run_one(name: str, found: Place, condition: int, seed: int) -> Row:
     """Return what became of the map of a graph in one of `CONDITIONS`."""
-    change, amounts, lies, share = CONDITIONS[condition]
-    rng = np.random.default_rng((seed, condition, (FIT + HELD).index(name)))
+    return run(name, found, CONDITIONS[condition],
+               np.random.default_rng((seed, condition, (FIT + HELD).index(name))))
+
+
+def run(name: str, found: Place, condition: drawn.Condition, rng: np.random.Generator) -> Row:
+    """Return what became of the map of a graph in which something is made wrong."""
+    change, amounts, lies, share = condition
     what = changed(found, change, amounts, rng)
     graph, clean = what.graph, what.clean
     if lies:
@@ -141,9 +176,8 @@ def run(name: str, found: Place, condition: int, seed: int) -> Row:
     outcome = solve(graph, None, SolveOptions(robust=True))
     judgement, poses = outcome.judgement, outcome.solution.poses[:, :2]
     assert judgement is not None
-    rows = ~graph.between.is_odometry
-    terms = terms_of(judgement.accepted[rows], judgement.suspect[rows], judgement.variance[1])
-    return Row(name, terms, _is_wrong(found, poses, best), bool(judgement.doubts))
+    return Row(name, judgement.terms, _is_wrong(found, poses, best),
+               frozenset(doubt.kind for doubt in judgement.doubts))
 
 
 def _is_wrong(found: Place, positions: Array, best: Array) -> bool:
@@ -165,10 +199,12 @@ def _fitted(rows: list[Row]) -> Array:
 def _tell(name: str, rows: list[Row], weights: Array) -> None:
     wrong, doubted = (np.array([getattr(row, what) for row in rows])
                       for what in ('wrong', 'doubted'))
+    alone = sum(not row.wrong and row.doubts == {ONE_PLACE} for row in rows)
     forecast = 1 / (1 + np.exp(-np.array([row.terms for row in rows]) @ weights))
     print(f'\n{name}: {len(rows)} runs; right {(~wrong & ~doubted).sum()}, right and doubted '
           f'{(~wrong & doubted).sum()}, wrong and said {(wrong & doubted).sum()}, wrong and '
-          f'silent {(wrong & ~doubted).sum()}\n\n| confidence | runs | said | right |\n|---|---|'
+          f'silent {(wrong & ~doubted).sum()}; of the right and doubted {alone} are held by one '
+          'place\n\n| confidence | runs | said | right |\n|---|---|'
           '---|---|')
     for low, high in zip(_EDGES, _EDGES[1:], strict=False):
         among = (forecast >= low) & (forecast < high)
@@ -183,9 +219,10 @@ def main() -> int:
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--datasets', type=Path, required=True)
     parser.add_argument('--seeds', type=int, default=3, help='of graphs that are made')
+    parser.add_argument('--drawn', type=int, default=30, help='worlds of each kind')
     parser.add_argument('--only', nargs='+', choices=FIT + HELD, default=FIT + HELD)
     given = parser.parse_args()
-    rows = []
+    rows = [row for base in (1, 2) for row in runs_drawn(base, given.drawn)]
     for name in given.only:
         for seed in range(given.seeds if name in MADE else 1):
             found = MADE[name](seed) if name in MADE else place(given.datasets, name)
@@ -197,11 +234,14 @@ def main() -> int:
                 if share == 0.9 and name == 'bicocca25b':
                     continue
                 report_progress(f'{name} seed {seed}: {CONDITIONS[condition]}')
-                rows.append(run(name, found, condition, seed))
-    weights = _fitted([row for row in rows if row.graph in FIT] or rows)
+                rows.append(run_one(name, found, condition, seed))
+    halves = {half: [row for row in rows if of(row.graph)] for half, of in (
+        ('FIT', lambda name: name not in HELD and not name.startswith(FRESH)),
+        ('HELD', lambda name: name in HELD), ('FRESH', lambda name: name.startswith(FRESH)))}
+    weights = _fitted(halves['FIT'] or rows)
     print('weights:', ', '.join(f'{weight:.2f}' for weight in weights))
-    for half, graphs in {'FIT': FIT, 'HELD': HELD}.items():
-        if among := [row for row in rows if row.graph in graphs]:
+    for half, among in halves.items():
+        if among:
             _tell(half, among, weights)
     return 0
 

@@ -16,6 +16,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.graph.factor_graph import BetweenFactors
 from l1slam_ros.core.robust.judgement import (
+    DRIFTS,
     FAILED,
     MOSTLY_REFUSED,
     NORM,
@@ -64,6 +65,8 @@ _REASONS = {
                '{where}',
     SLIP: 'whether the odometry slipped or not {where}, the {loops} loops across that are used '
           'do not say for sure',
+    DRIFTS: 'the odometry turns by about {detail} rad too much on each metre, {where}, which the '
+            '{loops} loops that are used were too few to correct: it was taken for noise',
     UNFINISHED: 'the judgement did not come to an end: the {loops} loops that are left out, '
                 '{where}, were still coming in a few at a time',
     NORM: 'the map is further from the least squares map of the same {loops} loops than noise '

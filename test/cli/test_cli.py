@@ -279,11 +279,13 @@ def test_a_doubt_is_said_even_quietly_with_the_times_of_a_bag_and_beside_its_dam
         assert len(damage) == damages and all('is damaged' in sentence for sentence in damage)
 
 
-@pytest.mark.parametrize(('lies', 'code'), [(150, 0), (1800, 4)])
-def test_most_loops_refused_is_a_doubt_where_such_maps_were_wrong(capsys, world, tmp_path, lies,
-                                                                  code):
-    """Of maps with three false loops to two true ones nearly all were right."""
-    bad = tmp_path / 'bad.g2o'
+@pytest.mark.parametrize(('poses', 'true', 'lies', 'code'), [
+    (150, 101, 150, 0), (150, 101, 1800, 0), (600, 5, 100, 4)])
+def test_most_loops_refused_is_a_doubt_where_such_maps_were_wrong(capsys, tmp_path, poses, true,
+                                                                  lies, code):
+    """Of maps that most loops are refused of, those that the others hold were right."""
+    world, bad = tmp_path / 'world.g2o', tmp_path / 'bad.g2o'
+    run(capsys, 'simulate', world, '--poses', poses, '--edges', poses - 1 + true)
     run(capsys, 'corrupt', world, bad, '--false-loops', lies)
     out, err = run(capsys, 'solve', bad, '--json', code=code)
     report = json.loads(out)

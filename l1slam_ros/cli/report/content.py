@@ -21,6 +21,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust.batch_map import Outcome
 from l1slam_ros.core.robust.judgement import (
+    DRIFTS,
     FAILED,
     MOSTLY_REFUSED,
     NORM,
@@ -66,6 +67,8 @@ _ADVICE = {
                'and the loops that contradict them as false.',
     SLIP: 'Did the robot slip, hit something or get carried there? Loops across the step that are '
           'surely true, ticked as true, say where the robot went.',
+    DRIFTS: 'Calibrate the wheels or the gyroscope. Far loops that are surely true, ticked as '
+            'true, hold the map meanwhile.',
     UNFINISHED: 'A few loops ticked as true or as false shorten the judgement.',
     NORM: 'No single loop settles this. Switch to the least squares map: if that is the place as '
           'you know it, solve with `--norm l2`.',

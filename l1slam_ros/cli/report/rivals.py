@@ -13,6 +13,7 @@ The maps that a doubtful graph may have instead: each doubt decided the other wa
     refused loops agree on another map                    they are vouched for
     most loops are refused                                every loop is believed
     a step may have slipped                               it is left out, or believed
+    the odometry may drift                                it is corrected, and loops judged anew
     another norm has another map                          that of least squares
 """
 
@@ -28,6 +29,7 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions, solve
 from l1slam_ros.core.robust.judgement import (
+    DRIFTS,
     MOSTLY_REFUSED,
     NORM,
     ONE_JOINS,
@@ -99,6 +101,10 @@ def _plans(record: GraphRecord, judgement: Judgement, asked: SolveOptions) -> It
                         believing)
         elif doubt.kind == SLIP:
             yield from _of_step(record, judgement, doubt, number, believing)
+        elif doubt.kind == DRIFTS:
+            drift = judgement.drift - float(doubt.detail)
+            yield _Plan(f'each metre turned by {drift:+.2g} rad', number,
+                        straightened(graph, drift), asked)
         elif doubt.kind == NORM:
             yield _Plan('least squares', number, graph, replace(asked, norm='l2', loop_norm=SAME))
 

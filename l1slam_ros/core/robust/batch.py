@@ -45,7 +45,7 @@ A drift
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
-    is a rival explanation nearly as good as the one that won: `judgement` names it.
+    is a rival explanation nearly as good as the one that won: `reasons` names it.
 
 No loop is factored before it is accepted, so none bends what it is judged by. Read on in `rounds`,
 `gating`, `innovation`, `places`, `pairwise_consistency`, `motion`, `slips`, `judgement`.
@@ -59,11 +59,13 @@ import numpy as np
 
 from l1slam_ros.core import kernels
 from l1slam_ros.core.errors import GraphError
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import bridged, tied
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.robust.forecast import right_within
 from l1slam_ros.core.robust.innovation import chi2_quantile, covariances
 from l1slam_ros.core.robust.judgement import (
     NORM,
@@ -71,13 +73,13 @@ from l1slam_ros.core.robust.judgement import (
     Doubt,
     Judgement,
     doubt_of,
-    doubts,
     judgement_of,
     listed,
 )
 from l1slam_ros.core.robust.odometry.drift import straightened, vote
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
 from l1slam_ros.core.robust.places import places
+from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds import REFUSED, Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import l2_map
@@ -239,9 +241,12 @@ class _LeastSquares:
 
         Of normal noise, as it was found, the difference has pi/2 - 1 of the covariance of the L2
         map at most, which is what L1 pays for it. Of the keyframes of one way all may err
-        together.
+        together. No doubt where either map is right if the other one is.
         """
         manifold, held = graph.manifold, len(poses) - len(self.covariances)
+        ours, other = manifold.positions(poses), manifold.positions(self.poses)
+        if absolute_trajectory_error(ours, other) < right_within(other):
+            return ()
         step = manifold.local(self.poses, poses)[held:]
         square = kernels.prediction.normalise(self.covariances, step)[0]
         explained = (np.pi / 2 - 1) * chi2_quantile(1 - REFUSED, np.array([manifold.TANGENT_SIZE]))

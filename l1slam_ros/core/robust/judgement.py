@@ -14,7 +14,6 @@ reasons to doubt it, each with the keyframes where a person may look. What a per
 for a loop, strike one out, or state the noise as it is.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,34 +21,26 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, lowest_of_components
-from l1slam_ros.core.robust.forecast import CONFIDENT, forecast
-from l1slam_ros.core.robust.odometry.drift import straightened
-from l1slam_ros.core.robust.odometry.slips import JOINING, SPANNING, SURE, common_steps, spanning
-from l1slam_ros.core.robust.pairwise_consistency import (
-    ASKED,
-    Group,
-    agreement,
-    asked,
-    spanned,
-    strongest_group,
+from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.robust.forecast import (
+    CONFIDENT,
+    forecast,
+    terms_of,
+    unsureness,
 )
+from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.robust.places import err_together
 from l1slam_ros.core.robust.rounds import Growth
 
 # Most loops are refused; all that are accepted are of one place; loops of one place alone say how
 # two parts lie to each other; refused loops of several places agree on another map; an odometry
-# factor may have slipped, and it was not believed; there were more rounds to come; another norm of
-# the same factors has another map; judging the loops failed, and what is believed is what was by
-# then; so did solving for what is believed.
-MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP, UNFINISHED, NORM, FAILED, UNSOLVED = (
+# factor may have slipped, and it was not believed; the odometry drifts, which was taken for noise;
+# there were more rounds to come; another norm of the same factors has another map; judging the
+# loops failed, and what is believed is what was by then; so did solving for what is believed.
+(MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP, DRIFTS, UNFINISHED, NORM, FAILED,
+ UNSOLVED) = (
     'mostly refused', 'one place', 'one place joins', 'another map', 'a slip suspected',
-    'not at an end', 'another norm', 'judging failed', 'solving failed')
-
-# Of fewer loops most may well be refused, and be of one place; most are more than half by some.
-_HANDFUL, _MOST = 5, 0.55
-# Refused loops that agree count if they are so many for each accepted one across.
-_AGAINST = 0.25
+    'a drift suspected', 'not at an end', 'another norm', 'judging failed', 'solving failed')
 
 
 @dataclass(frozen=True)
@@ -83,7 +74,8 @@ class Judgement:
     of each in a map, in the same units; slips : (k,) the odometry factors that slipped, not
     accepted; doubts : reasons not to rely on the map; settled : no more is to be found out from
     the factors that are there; drift : by how much more each metre of the odometry turns than it
-    says [rad/m]; confidence : see `forecast`, NaN where nothing is recorded of such maps;
+    says [rad/m]; confidence : see `forecast`, NaN where nothing is recorded of such maps; terms :
+    what that was made of, see `forecast`;
     is_refusal_doubted : refused loops may be true.
     """
 
@@ -97,6 +89,7 @@ class Judgement:
     settled: bool = True
     drift: float = 0.0
     confidence: float = float('nan')
+    terms: Array = field(default_factory=lambda: np.zeros(0), compare=False, repr=False)
     is_refusal_doubted: bool = False
 
     @property
@@ -205,12 +198,21 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
     size, slip = growth.size, growth.cut & ~growth.gap
     accepted, sigmas = (growth.accepted & ~slip)[:size], np.sqrt(square[:size])
     loops, slips = growth.is_loop[:size], np.flatnonzero(slip[:size])
-    confidence = forecast(accepted[loops], suspect[:size][loops], growth.variance[1])
+    terms = _terms(growth, reasons)
+    confidence = forecast(terms) if loops.any() else float('nan')
     doubted = any(doubt.kind in (MOSTLY_REFUSED, OTHER_MAP) for doubt in reasons)
     if confidence >= CONFIDENT:
         reasons = tuple(doubt for doubt in reasons if doubt.kind != MOSTLY_REFUSED)
     return Judgement(accepted, suspect[:size], sigmas, growth.variance, _noise(growth)[:size],
-                     slips, reasons, settled, confidence=confidence, is_refusal_doubted=doubted)
+                     slips, reasons, settled, confidence=confidence, terms=terms,
+                     is_refusal_doubted=doubted)
+
+
+def _terms(growth: Growth, reasons: tuple[Doubt, ...]) -> Array:
+    """Return what a forecast is made of."""
+    kinds = {doubt.kind for doubt in reasons}
+    return terms_of(bool((growth.is_loop & growth.accepted).any()), unsureness(growth),
+                    *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
 
 
 def _noise(growth: Growth) -> Array:
@@ -248,110 +250,3 @@ def fits(growth: Growth) -> tuple[Array, Mask]:
     square[outside] = growth.uncut().innovations(outside).square
     far = square >= growth.gate(growth.factors.freedom)
     return square, ~accepted & ~far & growth.is_loop
-
-
-def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
-    """Return the reasons to doubt a map; none: (); ended : nothing more can be accepted."""
-    loops = growth.is_loop[: growth.size]
-    left_out = np.flatnonzero(loops & ~growth.accepted[: growth.size])
-    accepted = np.flatnonzero(loops & growth.accepted[: growth.size])
-    reasons = []
-    if np.count_nonzero(loops) >= _HANDFUL and len(left_out) > _MOST * np.count_nonzero(loops):
-        reasons.append(_doubt(growth, MOSTLY_REFUSED, left_out))
-    if not ended and len(left_out):
-        reasons.append(_doubt(growth, UNFINISHED, left_out))
-    if _carries_all(growth, accepted):
-        reasons.append(_doubt(growth, ONE_PLACE, accepted))
-    if growth.cut.any():
-        reasons += [_doubt(growth, ONE_JOINS, rows) for rows in _joining_alone(growth)]
-    reasons += _other_map(growth)
-    reasons += [
-        _slip_doubt(growth, step)
-        for step, odds in growth.slip_odds.items()
-        if (odds < SURE if growth.cut[step] else odds > -SURE)]
-    return tuple(dict.fromkeys(reasons))
-
-
-def _carries_all(growth: Growth, accepted: Indices) -> bool:
-    """Return whether all accepted loops are of one place, and join but a small part of the way."""
-    return (len(accepted) >= _HANDFUL and not growth.trusted[accepted].any()
-            and growth.may_err_as_one(accepted, 2))
-
-
-def _joining_alone(growth: Growth) -> Iterator[Indices]:
-    """
-    Yield the loops of one place, accepted or not, that alone say how two parts lie to each other.
-
-    Parts are what is between two gaps, or slips that were cut.
-    """
-    sure = ~growth.is_loop | growth.trusted | growth.factors.is_absolute
-    part = component_labels(growth.graph.subset(growth.accepted & ~growth.cut & sure))
-    rows = np.flatnonzero(growth.accepted & ~sure & (part[growth.low] != part[growth.high]))
-    rows = np.concatenate((rows, _agree_at_a_place(growth)))
-    i, j = part[growth.low[rows]], part[growth.high[rows]]
-    _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
-    joins = growth.accepted[rows]
-    for number in np.argsort(-count, kind='stable'):
-        own = place == number
-        without, joined = (
-            len(np.unique(lowest_of_components(i[some], j[some], part.max() + 1)))
-            for some in (joins & ~own, joins | own))
-        if joined < without:
-            # Rivals that say it otherwise are of the same doubt.
-            joins |= own
-            yield rows[own]
-
-
-def _agree_at_a_place(growth: Growth) -> Indices:
-    """Return loops from part to part that are left out, and agree with one of their place."""
-    rows = growth.joining()
-    _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
-    rows = asked(growth, rows[count[place] > 1])
-    one, other, _ = agreement(growth, rows)
-    agree: Indices = rows[np.unique(one[growth.place[rows[one]] == growth.place[rows[other]]])]
-    return agree
-
-
-def _other_map(growth: Growth) -> list[Doubt]:
-    """Return a doubt where refused loops of several places agree: they may be right."""
-    outside = growth.undecided()
-    group = strongest_group(growth, outside)
-    if len(group.places) < JOINING:
-        return []
-    accepted, size = growth.accepted & growth.is_loop, len(group.rows) * max(
-        len(outside) / ASKED, 1.0)
-    trusted, against = (_against(growth, group, rows)
-                        for rows in (accepted & growth.trusted, accepted))
-    # What is trusted is right, whatever else speaks against it.
-    few = len(group.places) < SPANNING and against
-    if trusted or few or size < _AGAINST * against:
-        return []
-    return [_doubt(growth, OTHER_MAP, group.rows)]
-
-
-def _against(growth: Growth, group: Group, rows: Mask) -> int:
-    """
-    Return how many of some loops would lie, at least, if a group of others were right.
-
-    Then the odometry slipped at a step that the group spans, or on either side of its first or
-    its second ends: what lies between is elsewhere as a whole.
-    """
-    low, high = growth.low, growth.high
-    across = spanned(low[rows], high[rows], growth.graph.n_poses)
-    against = [across[low[common_steps(growth, group)]].min()]
-    for ends in (low[group.rows], high[group.rows]):
-        inside = ((end >= ends.min()) & (end <= ends.max()) for end in (low[rows], high[rows]))
-        against.append(np.count_nonzero(np.logical_or(*inside)))
-    return int(min(against))
-
-
-def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
-    low, high = np.maximum(growth.low[rows], 0), growth.high[rows]
-    return Doubt(kind, len(rows), int(low.min()), int(high.max()),
-                 pairs=listed(growth.factors.pairs[rows]))
-
-
-def _slip_doubt(growth: Growth, step: int) -> Doubt:
-    across = growth.factors.pairs[growth.accepted & spanning(growth, step)]
-    return Doubt(SLIP, len(across), int(growth.low[step]), int(growth.high[step]),
-                 pairs=listed(across))

@@ -14,9 +14,9 @@ from lies import careful_world, is_false, slipped, spoilt
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import ends_in_time
-from l1slam_ros.core.robust.judgement import doubts
 from l1slam_ros.core.robust.odometry.slips import SPANNING, common_steps
 from l1slam_ros.core.robust.pairwise_consistency import spanned, strongest_group
+from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds import Growth
 
 # The robot turned by 90 degrees more, there.

@@ -1,0 +1,160 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""
+Why a map is not to be relied on: what its judgement could not settle.
+
+In: the end of a robust solve. Out: the reasons, each with the keyframes where a person may look.
+A reason counts where maps were wrong for it: see `forecast`.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Indices
+from l1slam_ros.core.geometry.noise import Mask
+from l1slam_ros.core.graph.factor_graph import component_labels, lowest_of_components
+from l1slam_ros.core.robust.forecast import left_drift, unsureness
+from l1slam_ros.core.robust.judgement import (
+    DRIFTS,
+    MOSTLY_REFUSED,
+    ONE_JOINS,
+    ONE_PLACE,
+    OTHER_MAP,
+    SLIP,
+    UNFINISHED,
+    Doubt,
+    listed,
+)
+from l1slam_ros.core.robust.odometry.slips import JOINING, SURE, common_steps, spanning
+from l1slam_ros.core.robust.pairwise_consistency import (
+    Group,
+    agreement,
+    asked,
+    spanned,
+    strongest_group,
+)
+from l1slam_ros.core.robust.rounds import Growth
+
+# Of fewer loops most may well be refused, and be of one place; most are more than half by some.
+_HANDFUL, _MOST = 5, 0.55
+# [sigmas] A drift counts from here on, where the map is less sure of itself than a right one is
+# exact.
+_DRIFTS = 3.5
+
+
+def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
+    """Return the reasons to doubt a map; none: (); ended : nothing more can be accepted."""
+    loops = growth.is_loop[: growth.size]
+    left_out = np.flatnonzero(loops & ~growth.accepted[: growth.size])
+    accepted = np.flatnonzero(loops & growth.accepted[: growth.size])
+    reasons = []
+    if np.count_nonzero(loops) >= _HANDFUL and len(left_out) > _MOST * np.count_nonzero(loops):
+        reasons.append(_doubt(growth, MOSTLY_REFUSED, left_out))
+    if not ended and len(left_out):
+        reasons.append(_doubt(growth, UNFINISHED, left_out))
+    if _carries_all(growth, accepted):
+        reasons.append(_doubt(growth, ONE_PLACE, accepted))
+    if growth.cut.any():
+        reasons += [_doubt(growth, ONE_JOINS, rows) for rows in _joining_alone(growth)]
+    reasons += _other_map(growth)
+    reasons += [
+        _slip_doubt(growth, step)
+        for step, odds in growth.slip_odds.items()
+        if (odds < SURE if growth.cut[step] else odds > -SURE)]
+    reasons += _drift_doubt(growth, accepted)
+    return tuple(dict.fromkeys(reasons))
+
+
+def _carries_all(growth: Growth, accepted: Indices) -> bool:
+    """Return whether all accepted loops are of one place, and join but a small part of the way."""
+    return (len(accepted) >= _HANDFUL and not growth.trusted[accepted].any()
+            and growth.may_err_as_one(accepted, 2))
+
+
+def _joining_alone(growth: Growth) -> Iterator[Indices]:
+    """
+    Yield the loops of one place, accepted or not, that alone say how two parts lie to each other.
+
+    Parts are what is between two gaps, or slips that were cut.
+    """
+    sure = ~growth.is_loop | growth.trusted | growth.factors.is_absolute
+    part = component_labels(growth.graph.subset(growth.accepted & ~growth.cut & sure))
+    rows = np.flatnonzero(growth.accepted & ~sure & (part[growth.low] != part[growth.high]))
+    rows = np.concatenate((rows, _agree_at_a_place(growth)))
+    i, j = part[growth.low[rows]], part[growth.high[rows]]
+    _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
+    joins = growth.accepted[rows]
+    for number in np.argsort(-count, kind='stable'):
+        own = place == number
+        without, joined = (
+            len(np.unique(lowest_of_components(i[some], j[some], part.max() + 1)))
+            for some in (joins & ~own, joins | own))
+        if joined < without:
+            # Rivals that say it otherwise are of the same doubt.
+            joins |= own
+            yield rows[own]
+
+
+def _agree_at_a_place(growth: Growth) -> Indices:
+    """Return loops from part to part that are left out, and agree with one of their place."""
+    rows = growth.joining()
+    _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
+    rows = asked(growth, rows[count[place] > 1])
+    one, other, _ = agreement(growth, rows)
+    agree: Indices = rows[np.unique(one[growth.place[rows[one]] == growth.place[rows[other]]])]
+    return agree
+
+
+def _other_map(growth: Growth) -> list[Doubt]:
+    """
+    Return a doubt where refused loops of several places agree, and no accepted one speaks against.
+
+    They may be right then: the odometry slipped, and nothing else knows of it.
+    """
+    group = strongest_group(growth, growth.undecided())
+    if len(group.places) < JOINING or _against(growth, group, growth.accepted & growth.is_loop):
+        return []
+    return [_doubt(growth, OTHER_MAP, group.rows)]
+
+
+def _against(growth: Growth, group: Group, rows: Mask) -> int:
+    """
+    Return how many of some loops would lie, at least, if a group of others were right.
+
+    Then the odometry slipped at a step that the group spans, or on either side of its first or
+    its second ends: what lies between is elsewhere as a whole.
+    """
+    low, high = growth.low, growth.high
+    across = spanned(low[rows], high[rows], growth.graph.n_poses)
+    against = [across[low[common_steps(growth, group)]].min()]
+    for ends in (low[group.rows], high[group.rows]):
+        inside = ((end >= ends.min()) & (end <= ends.max()) for end in (low[rows], high[rows]))
+        against.append(np.count_nonzero(np.logical_or(*inside)))
+    return int(min(against))
+
+
+def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
+    low, high = np.maximum(growth.low[rows], 0), growth.high[rows]
+    return Doubt(kind, len(rows), int(low.min()), int(high.max()),
+                 pairs=listed(growth.factors.pairs[rows]))
+
+
+def _drift_doubt(growth: Growth, accepted: Indices) -> list[Doubt]:
+    drift, sigmas = left_drift(growth)
+    if abs(sigmas) < _DRIFTS or unsureness(growth) < 1:
+        return []
+    return [replace(_doubt(growth, DRIFTS, accepted), detail=f'{-drift:+.2g}')]
+
+
+def _slip_doubt(growth: Growth, step: int) -> Doubt:
+    across = growth.factors.pairs[growth.accepted & spanning(growth, step)]
+    return Doubt(SLIP, len(across), int(growth.low[step]), int(growth.high[step]),
+                 pairs=listed(across))
