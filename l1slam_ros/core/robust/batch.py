@@ -40,8 +40,8 @@ A slip
     fit, lies are the other: `slips` compares their odds, with half a gate for each place that one
     of them calls a lie.
 A drift
-    is an error of all steps, the same on each metre. Where a slip would be believed, or most loops
-    are left out, it is a third explanation: loops are judged by odometry rid of it (`motion`).
+    is an error of all steps, the same on each metre. Where loops are left out it is a third
+    explanation, asked before slips: odometry rid of it has to win a place (`drift`).
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
@@ -63,8 +63,7 @@ from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
-from l1slam_ros.core.graph.parts import bridged, tied
-from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.forecast import right_within
 from l1slam_ros.core.robust.innovation import chi2_quantile, covariances
 from l1slam_ros.core.robust.judgement import (
@@ -78,7 +77,6 @@ from l1slam_ros.core.robust.judgement import (
 )
 from l1slam_ros.core.robust.odometry.drift import straightened, vote
 from l1slam_ros.core.robust.odometry.slips import join, without_slip
-from l1slam_ros.core.robust.places import places
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds import REFUSED, Growth
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
@@ -115,56 +113,60 @@ def robust_solve(
     known : what was believed before and stays if this fails; None: what was in the last round
 
     """
-    believed = _grown(graph, report, check, known)
-    drift = _suspected_drift(graph, believed[0])
-    if not drift:
-        return believed
-    straight = straightened(graph, drift)
-    judgement, poses = _grown(straight, report, check, known)
-    if _won(straight, judgement) > _won(straight, believed[0]):
-        return replace(judgement, drift=drift), poses
-    return believed
-
-
-def _suspected_drift(graph: FactorGraph, judgement: Judgement) -> float:
-    """Return the drift of the odometry that may be why loops do not fit; 0: there is none."""
-    left_out = ~graph.between.is_odometry & ~judgement.accepted & ~graph.between.struck
-    if not (left_out.any() or len(judgement.slips)):
-        return 0.0
-    drift, odds = vote(graph)
-    return drift if odds > 0 else 0.0
-
-
-def _won(graph: FactorGraph, judgement: Judgement) -> tuple[int, int]:
-    """Return how many places loops that are accepted are of, and how few steps slipped for it."""
-    place, _ = places(graph, odometry_poses(bridged(graph)))
-    loops = judgement.accepted & ~graph.between.is_odometry
-    return len(np.unique(place[: len(loops)][loops])), -len(judgement.slips)
-
-
-def _grown(graph: FactorGraph, report: OnRound, check: Callable[[], None],
-           known: Believed | None) -> Believed:
-    """Return what is believed of a graph whose odometry errs at random; see `robust_solve`."""
     first = growth = Growth(graph, check)
-    so_far, number = _so_far(first), 0
+    so_far, number, repair = _so_far(first), 0, _Repair(graph, check)
     try:
         first.begin()
-        for number, growth in enumerate(rounds(first, without_slip), 1):
-            so_far = _so_far(growth)
+        for number, growth in enumerate(rounds(first, repair), 1):
+            so_far = _so_far(growth, repair.drift)
             report(number, int(np.count_nonzero(growth.accepted & growth.is_loop)))
-        return judgement_of(growth, doubts(growth, number < _MOST_ROUNDS)), growth.poses
+        judgement = judgement_of(growth, doubts(growth, number < _MOST_ROUNDS))
+        return replace(judgement, drift=repair.drift), growth.poses
     except _FAILURES as error:
         judgement, poses = known or so_far
         return judgement.broken_off(graph, error), poses
 
 
-def _so_far(growth: Growth) -> Believed:
+class _Repair:
+    """What loops that are left out may be right by; drift : that of the odometry [rad/m]."""
+
+    def __init__(self, graph: FactorGraph, check: Callable[[], None]):
+        self._graph, self._check, self._asked, self.drift = graph, check, False, 0.0
+
+    def __call__(self, found: Growth, as_stated: Growth) -> Growth | None:
+        """Return a state without a drift, asked once, or without a slip; None: there is none."""
+        if not self._asked and len(as_stated.undecided()):
+            self._asked = True
+            drift, odds = vote(self._graph)
+            if odds > 0 and drift:
+                straight, told = self._without(drift)
+                if _won(told, told) > _won(told, as_stated):
+                    self.drift = drift
+                    return straight
+        return without_slip(found, as_stated)
+
+    def _without(self, drift: float) -> list[Growth]:
+        """Return the states, as found and as stated, that odometry without its drift leads to."""
+        growth = Growth(straightened(self._graph, drift), self._check)
+        ends: list[Growth] = []
+        growth.begin()
+        for _ in rounds(growth, lambda *states: ends.extend(states)):
+            self._check()
+        return ends
+
+
+def _won(places_of: Growth, growth: Growth) -> int:
+    """Return of how many places the loops are that a state accepts."""
+    return len(np.unique(places_of.place[growth.accepted & growth.is_loop]))
+
+
+def _so_far(growth: Growth, drift: float = 0.0) -> Believed:
     """Return what a state believes, to fall back on; the loops that it left out are suspect."""
     size, slip = growth.size, growth.cut & ~growth.gap
     accepted = (growth.accepted & ~slip)[:size]
     return Judgement(accepted, growth.is_loop[:size] & ~accepted, np.full(size, np.nan),
-                     growth.variance.copy(), np.ones(size), np.flatnonzero(slip[:size])
-                     ), growth.poses
+                     growth.variance.copy(), np.ones(size), np.flatnonzero(slip[:size]),
+                     drift=drift), growth.poses
 
 
 @dataclass(frozen=True)
