@@ -35,6 +35,7 @@ from l1slam_ros.core.graph.linear_system import (
     loose_keyframes,
     size_of_blocks,
 )
+from l1slam_ros.core.solvers import resources
 
 Result = TypeVar('Result')
 Places = NDArray[np.int32]
@@ -42,8 +43,6 @@ Columns = tuple[Places, Indices, Places]
 _NONE = np.zeros(0, np.int64)
 _NO_COLUMNS = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32)
 
-# Numbers that one gigabyte holds.
-MOST_ENTRIES = 135_000_000
 # Multiplications for each keyframe from which a factorisation is long: what another order spares
 # of a few of them is then more than it takes to find.
 _LONG = 8000
@@ -86,6 +85,11 @@ class Pattern:
     columns: Columns
     found: int
 
+    @property
+    def blocks(self) -> int:
+        """Blocks in all panels."""
+        return int((np.diff(self.first) * np.diff(self.start)).sum())
+
     @cached_property
     def owner(self) -> Places:
         """The panel of each position, (n,)."""
@@ -123,14 +127,14 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
 
     Raises
     ------
-    FillError : the factor would have more than `most_blocks`.
+    FillError : the factor would have more than `most_blocks`, as far as it was looked at.
 
     """
     graph = neighbours(keyframe, size)
     if before is not None and before.found <= size < _GROWN * before.found:
         begun = kernels.symbolic.untouched(*graph, *before.columns)
         pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), begun, before.found)
-        if pattern is not None:
+        if pattern is not None and pattern.blocks <= most_blocks:
             return pattern
     pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), _NO_COLUMNS, size)
     for dissect, least in (kernels.ordering.dissect, 0.0), (kernels.dissection.dissect, _VAST):
@@ -138,9 +142,10 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
             dissected = _laid_out(graph, most_blocks, dissect(*graph), _NO_COLUMNS, size)
             if dissected and not (pattern and pattern.work <= dissected.work):
                 pattern = dissected
-    if pattern is None:
-        raise FillError(f'the factor of {size} keyframes and {len(keyframe)} factors would have '
-                        f'more than {most_blocks} blocks: too many far places are joined')
+    blocks = most_blocks + 1 if pattern is None else pattern.blocks
+    if pattern is None or blocks > most_blocks:
+        raise FillError(f'the factor of {size} keyframes and {len(keyframe)} factors has '
+                        f'{blocks} blocks or more', blocks)
     return pattern
 
 
@@ -302,12 +307,19 @@ def cholesky_of(graph: FactorGraph, before: Pattern | None = None) -> BlockChole
 
     Raises
     ------
-    FillError : the factor would have more than `MOST_ENTRIES`.
+    FillError : a solve by them would take more memory than is free.
 
     """
     fixed = anchor(graph)
     keyframe = keyframes_of(graph, fixed)
-    most_blocks = MOST_ENTRIES // graph.manifold.TANGENT_SIZE**2
-    pattern = find_pattern(keyframe, graph.n_poses - fixed, most_blocks,
-                           graph.manifold.TANGENT_SIZE, before)
+    try:
+        pattern = find_pattern(keyframe, graph.n_poses - fixed, resources.most_blocks(graph),
+                               graph.manifold.TANGENT_SIZE, before)
+    except FillError as error:
+        takes = resources.needs(graph, error.blocks, 0.0).memory
+        raise FillError(
+            f'factorising {graph.n_poses} keyframes and {len(graph.between)} factors takes '
+            f'{resources.in_gigabytes(takes)} of memory or more, and '
+            f'{resources.in_gigabytes(resources.free())} are free',
+            error.blocks) from error
     return BlockCholesky(pattern, keyframe, loose_keyframes(graph))

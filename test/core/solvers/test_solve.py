@@ -8,13 +8,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which solver a graph gets: by what a factorisation costs, by name, and where one fails."""
 
+import re
+
 import pytest
 from problems import chain_and_loops, drive, graph_of
 
 from l1slam_ros.core.errors import FillError, L1SlamError
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import SOLVERS
-from l1slam_ros.core.solvers import block_cholesky as cholesky
+from l1slam_ros.core.solvers import resources
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import Status
 from l1slam_ros.core.solvers.seed import seed_poses
@@ -79,19 +81,21 @@ def test_a_graph_that_fills_in_gets_algorithm_4(world, monkeypatch):
     """With memory for a few blocks only: nothing is factored, and it is solved all the same."""
     graph = world.graph
     expected = minimise_by(choose(AUTO, graph), graph, world.truth, DEFAULTS)[0].cost
-    monkeypatch.setattr(cholesky, 'MOST_ENTRIES', 9 * 30)
+    monkeypatch.setattr(resources, 'most_blocks', lambda graph: 30)
     for solver in AUTO, PRIMAL_DUAL:
         method = choose(solver, graph)
         assert (method.cholesky, method.solver) == (None, PRIMAL_DUAL)
-        assert method.reason == 'the graph is too dense to be factorised'
+        assert re.fullmatch(r'factorising 60 keyframes and [0-9]+ factors takes [0-9.e-]+ GB of '
+                            r'memory or more, and [0-9.]+ GB are free', method.reason)
         solution, name = minimise_by(method, graph, seed_poses(graph, None), DEFAULTS)
         assert name == PRIMAL_DUAL
         assert solution.cost == pytest.approx(expected, rel=1e-3)
 
 
 def test_the_interior_point_of_a_graph_that_fills_in_is_refused(world, monkeypatch):
-    monkeypatch.setattr(cholesky, 'MOST_ENTRIES', 9 * 30)
-    with pytest.raises(FillError, match='60|59 keyframes') as refusal:
+    monkeypatch.setattr(resources, 'free', lambda: 200_000.0)
+    said = r'60 keyframes .* takes 0\.000[0-9]+ GB .* 0\.0002 GB are free'
+    with pytest.raises(FillError, match=said) as refusal:
         choose(INTERIOR_POINT, world.graph)
     assert isinstance(refusal.value, L1SlamError) and '\n' not in str(refusal.value)
 
