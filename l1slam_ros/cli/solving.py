@@ -21,13 +21,13 @@ import numpy as np
 from l1slam_ros.cli.commands import Ending, inputs, read, read_scan_map, warn
 from l1slam_ros.cli.reference import Truth, known_false, position_error, read_truth
 from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.memory import free, in_gigabytes, measure_by
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import SENTENCES
-from l1slam_ros.core.solvers.resources import free, in_gigabytes, measure_by
 from l1slam_ros.core.solvers.solve import PRIMAL_DUAL, Method
 from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import DENSE, JUDGEMENT, SPARSE, compile_now, with_space

@@ -24,7 +24,7 @@ from l1slam_ros.cli.main import main
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.solvers import resources
+from l1slam_ros.core.solvers import block_cholesky
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.io import progress
 from l1slam_ros.io.formats import read_input
@@ -319,15 +319,15 @@ def test_where_the_odometry_is_full_of_gaps_nothing_is_there_to_judge_by(capsys,
 def test_a_graph_too_dense_to_judge_is_solved_as_far_as_it_was_judged(
         capsys, world, monkeypatch):
     """With memory for few blocks: the odometry alone can be factored, all loops cannot."""
-    monkeypatch.setattr(resources, 'most_blocks', lambda graph: 400)
+    monkeypatch.setattr(block_cholesky, 'most_blocks', lambda graph: 700)
     for robust in ((), ('--robust',)):
         report = json.loads(run(capsys, 'solve', world, '--json', *robust, code=4)[0])
         assert report['status'] == 'doubtful' and report['suspect'] and not report['rejected']
         (warning,) = report['warnings']
         assert re.match(
             r'doubtful: judging the loops failed \(factorising [0-9]+ keyframes and [0-9]+ '
-            r'factors takes [0-9.e-]+ GB of memory or more, and [0-9.]+ GB are free\): the map is of '
-            rf'what was believed until then, and {len(report["suspect"])} loops between [0-9]+ '
+            r'factors takes [0-9.e-]+ GB of memory or more, and [0-9.]+ GB are free\): the map is '
+            rf'of what was believed until then, and {len(report["suspect"])} loops between [0-9]+ '
             r'and [0-9]+ are left out\. ', warning)
     report = solve_json(capsys, world, '--no-robust')
     assert report['solver'] == 'primal-dual' and report['warnings'] == []

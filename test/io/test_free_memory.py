@@ -12,7 +12,7 @@ import math
 
 import pytest
 
-from l1slam_ros.core.solvers import resources
+from l1slam_ros.core import memory
 from l1slam_ros.io.free_memory import free_memory
 
 GIGA = 2**30
@@ -54,6 +54,6 @@ def test_the_limit_of_a_group_above_counts(tmp_path, line, folder, limit, used, 
 
 
 def test_a_solve_may_take_most_of_it(monkeypatch):
-    monkeypatch.setattr(resources, '_reader', resources._reader)
-    resources.measure_by(lambda: 10.0)
-    assert 8 <= resources.free() < 10
+    monkeypatch.setattr(memory, '_reader', memory._reader)
+    memory.measure_by(lambda: 10.0)
+    assert 8 <= memory.free() < 10

@@ -24,7 +24,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import kernels, memory
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -35,7 +35,6 @@ from l1slam_ros.core.graph.linear_system import (
     loose_keyframes,
     size_of_blocks,
 )
-from l1slam_ros.core.solvers import resources
 
 Result = TypeVar('Result')
 Places = NDArray[np.int32]
@@ -61,6 +60,13 @@ _LOOSE = 1e-9
 # its own: what lies across two lines takes twice as long to read, a row is an eighth longer at
 # most.
 _LINE, _WIDE = 8, 64
+# Bytes of a number, and of all that a solve keeps of a factor for each entry of one of its
+# Jacobians: measured, 1.7 kB of a factor in the plane, most of it rows of the interior point.
+_NUMBER, _BYTES_PER_ENTRY = 8, 190
+# Seconds that the steps of an exact L1 map, its seed included, take of a factor for each such
+# entry; how many factorisations it needs, and how many multiplications a second has: measured from
+# 25,000 to 1,000,000 keyframes on a core of the machine of doc/performance.md.
+_SECONDS_PER_ENTRY, _FACTORISATIONS, _RATE = 6e-6, 45, 1e10
 
 
 @dataclass(frozen=True)
@@ -147,6 +153,29 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
         raise FillError(f'the factor of {size} keyframes and {len(keyframe)} factors has '
                         f'{blocks} blocks or more', blocks)
     return pattern
+
+
+def needs(graph: FactorGraph, blocks: float, work: float) -> memory.Needs:
+    """Predict the needs of a graph from the blocks and the work of its factor."""
+    k, m = graph.manifold.TANGENT_SIZE, len(graph.between)
+    return memory.Needs(blocks * _bytes_of_block(graph) + _BYTES_PER_ENTRY * k**2 * m,
+                        _SECONDS_PER_ENTRY * k**2 * m + _FACTORISATIONS * work * k**3 / _RATE)
+
+
+def most_blocks(graph: FactorGraph) -> int:
+    """Return how many blocks a factor of the graph may have that is to fit into memory."""
+    left = (memory.free() - needs(graph, 0.0, 0.0).memory) / _bytes_of_block(graph)
+    return int(min(max(left, 0.0), graph.n_poses * (graph.n_poses + 1.0)))
+
+
+def _bytes_of_block(graph: FactorGraph) -> int:
+    """Return what a block takes [B]: of whole poses, and of those parts that a seed solves for."""
+    manifold = graph.manifold
+    k = manifold.TANGENT_SIZE
+    parts = {len(range(*part.indices(k))) for part in (manifold.TRANSLATION, manifold.ROTATION)}
+    # The chordal relaxation has blocks of a rotation matrix.
+    parts |= {k, manifold.rotation(manifold.identity(1)).shape[-1]}
+    return _NUMBER * sum(size * size for size in parts)
 
 
 def _laid_out(graph: tuple[Places, Places], most_blocks: int, stage: Places, begun: Columns,
@@ -313,13 +342,13 @@ def cholesky_of(graph: FactorGraph, before: Pattern | None = None) -> BlockChole
     fixed = anchor(graph)
     keyframe = keyframes_of(graph, fixed)
     try:
-        pattern = find_pattern(keyframe, graph.n_poses - fixed, resources.most_blocks(graph),
+        pattern = find_pattern(keyframe, graph.n_poses - fixed, most_blocks(graph),
                                graph.manifold.TANGENT_SIZE, before)
     except FillError as error:
-        takes = resources.needs(graph, error.blocks, 0.0).memory
+        takes = needs(graph, error.blocks, 0.0).memory
         raise FillError(
             f'factorising {graph.n_poses} keyframes and {len(graph.between)} factors takes '
-            f'{resources.in_gigabytes(takes)} of memory or more, and '
-            f'{resources.in_gigabytes(resources.free())} are free',
+            f'{memory.in_gigabytes(takes)} of memory or more, and '
+            f'{memory.in_gigabytes(memory.free())} are free',
             error.blocks) from error
     return BlockCholesky(pattern, keyframe, loose_keyframes(graph))

@@ -18,15 +18,15 @@ from typing import Protocol
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.memory import Needs
 from l1slam_ros.core.names import NORMS, SAME, SOLVERS
-from l1slam_ros.core.solvers import resources
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, Pattern, cholesky_of
+from l1slam_ros.core.solvers.block_cholesky import needs as needs_of
 from l1slam_ros.core.solvers.exact import minimise_interior_point
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, gauss_newton
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution, minimise
 from l1slam_ros.core.solvers.optimality import Mixed, SmoothNorm, Status, norm_of
 from l1slam_ros.core.solvers.primal_dual_newton import minimise_norm
-from l1slam_ros.core.solvers.resources import Needs
 
 AUTO, PRIMAL_DUAL, INTERIOR_POINT, *_ = SOLVERS
 L1_NORM, GROUP_L1_NORM, *_ = NORMS
@@ -114,7 +114,7 @@ def choose(solver: str, graph: FactorGraph, norm: str = L1_NORM, loop_norm: str 
         if solver not in (AUTO, PRIMAL_DUAL):
             raise
         return Method(None, PRIMAL_DUAL, str(error))
-    needs = resources.needs(graph, cholesky.pattern.blocks, cholesky.pattern.work)
+    needs = needs_of(graph, cholesky.pattern.blocks, cholesky.pattern.work)
     if solver != AUTO:
         return Method(cholesky, solver, 'asked for',
                       needs=needs if solver == INTERIOR_POINT else None)

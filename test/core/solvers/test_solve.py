@@ -13,10 +13,11 @@ import re
 import pytest
 from problems import chain_and_loops, drive, graph_of
 
+from l1slam_ros.core import memory
 from l1slam_ros.core.errors import FillError, L1SlamError
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import SOLVERS
-from l1slam_ros.core.solvers import resources
+from l1slam_ros.core.solvers import block_cholesky
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import Status
 from l1slam_ros.core.solvers.seed import seed_poses
@@ -81,7 +82,7 @@ def test_a_graph_that_fills_in_gets_algorithm_4(world, monkeypatch):
     """With memory for a few blocks only: nothing is factored, and it is solved all the same."""
     graph = world.graph
     expected = minimise_by(choose(AUTO, graph), graph, world.truth, DEFAULTS)[0].cost
-    monkeypatch.setattr(resources, 'most_blocks', lambda graph: 30)
+    monkeypatch.setattr(block_cholesky, 'most_blocks', lambda graph: 30)
     for solver in AUTO, PRIMAL_DUAL:
         method = choose(solver, graph)
         assert (method.cholesky, method.solver) == (None, PRIMAL_DUAL)
@@ -93,8 +94,8 @@ def test_a_graph_that_fills_in_gets_algorithm_4(world, monkeypatch):
 
 
 def test_the_interior_point_of_a_graph_that_fills_in_is_refused(world, monkeypatch):
-    monkeypatch.setattr(resources, 'free', lambda: 200_000.0)
-    said = r'60 keyframes .* takes 0\.000[0-9]+ GB .* 0\.0002 GB are free'
+    monkeypatch.setattr(memory, 'free', lambda: 150_000.0)
+    said = r'60 keyframes .* takes 0\.000[0-9]+ GB .* 0\.00015 GB are free'
     with pytest.raises(FillError, match=said) as refusal:
         choose(INTERIOR_POINT, world.graph)
     assert isinstance(refusal.value, L1SlamError) and '\n' not in str(refusal.value)
