@@ -20,6 +20,7 @@ from rosbags.rosbag2 import StoragePlugin
 from torn import torn_graph
 
 from bags import NOTE, recording_of, rosbag2_directory
+from l1slam_ros.cli import solving
 from l1slam_ros.cli.main import main
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
@@ -331,6 +332,15 @@ def test_a_graph_too_dense_to_judge_is_solved_as_far_as_it_was_judged(
             r'and [0-9]+ are left out\. ', warning)
     report = solve_json(capsys, world, '--no-robust')
     assert report['solver'] == 'primal-dual' and report['warnings'] == []
+
+
+def test_what_a_long_solve_takes_is_said_before_it(capsys, world, monkeypatch):
+    monkeypatch.setattr(solving, '_LONG', 0.0)
+    said = run(capsys, 'solve', world, '--no-robust')[1].splitlines()
+    assert len(said) == 1 and re.fullmatch(
+        r'l1slam: interior-point: predicted to take some [0-9]+ s and [0-9.]+ GB, of which '
+        r'[0-9.]+ GB are free', said[0])
+    assert run(capsys, 'solve', world, '--no-robust', '--quiet')[1] == ''
 
 
 def test_absolute_poses_are_no_loops_but_doubted_too(capsys, world):

@@ -101,6 +101,26 @@ def test_the_interior_point_of_a_graph_that_fills_in_is_refused(world, monkeypat
     assert isinstance(refusal.value, L1SlamError) and '\n' not in str(refusal.value)
 
 
+def test_the_memory_of_the_factor_is_predicted_to_a_third(rng):
+    """That of the blocks of all sizes which a seed and a map lay out."""
+    graph = simulate_world(600, 1200, WorldOptions(), rng).graph
+    method = choose(AUTO, graph)
+    seed_poses(graph, method.cholesky)
+    minimise_by(method, graph, odometry_poses(graph), OptimiserOptions(outer_iterations=2))
+    taken = sum(layout.panels.nbytes for layout in method.cholesky._layouts.values())
+    blocks = method.needs.memory - block_cholesky.needs(graph, 0.0, 0.0).memory
+    assert 0.75 * taken < blocks < 1.33 * taken
+
+
+def test_what_does_not_fit_grows_with_the_graph_and_what_fits_is_never_refused(monkeypatch, rng):
+    graph = simulate_world(600, 1200, WorldOptions(), rng).graph
+    needed = choose(INTERIOR_POINT, graph).needs.memory
+    monkeypatch.setattr(memory, 'free', lambda: 1.001 * needed)
+    assert choose(AUTO, graph).solver == INTERIOR_POINT
+    monkeypatch.setattr(memory, 'free', lambda: 0.999 * needed)
+    assert choose(AUTO, graph).cholesky is None
+
+
 @pytest.mark.parametrize('solver, expected', [(AUTO, PRIMAL_DUAL), (INTERIOR_POINT,) * 2])
 def test_algorithm_4_goes_on_where_the_interior_point_failed_unless_it_was_asked_for(
         solver, expected, rng):
