@@ -31,7 +31,7 @@ LARGE = tuple((n, 2 * n) for n in (25_000, 100_000, 200_000, 1_000_000))
 DENSE = ((10_000, 64_000), (50_000, 700_000))
 PHASES = ('seed', 'solve')
 # [s] A world that takes longer than this, all in all, is given up.
-_PATIENCE = 900.0
+_PATIENCE = 1800.0
 
 
 def measure(repeats: int, limit: float) -> list[Row]:

@@ -7,11 +7,12 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-How much memory a process can still take: of the machine, and of its control groups.
+How much memory a process can still take: of the machine, its control groups, its own limit.
 
 In: what Linux tells in files. Out: bytes; infinite where nothing is told.
 """
 
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,8 +27,17 @@ _LIMITS = (('memory.max', 'memory.current', 'inactive_file'),
 def free_memory(root: Path = _ROOT) -> float:
     """Return the bytes that a process can take; root : of the file system."""
     match = re.search(r'^MemAvailable:\s+([0-9]+) kB', _text(root / 'proc/meminfo'), re.MULTILINE)
-    available = 1024.0 * int(match[1]) if match else float('inf')
-    return min([available, *(_left(folder) for folder in _groups(root))])
+    available = 1024.0 * int(match[1]) if match else math.inf
+    return min([available, _left_of_address_space(root),
+                *(_left(folder) for folder in _groups(root))])
+
+
+def _left_of_address_space(root: Path) -> float:
+    """Return what a limit of the process's own leaves [B]."""
+    match = re.search(r'^Max address space +([0-9]+)', _text(root / 'proc/self/limits'),
+                      re.MULTILINE)
+    taken = re.search(r'^VmSize:\s+([0-9]+) kB', _text(root / 'proc/self/status'), re.MULTILINE)
+    return float(int(match[1]) - (1024 * int(taken[1]) if taken else 0)) if match else math.inf
 
 
 def _groups(root: Path) -> Iterator[Path]:
@@ -55,7 +65,7 @@ def _left(folder: Path) -> float:
             match = re.search(rf'^{kept} ([0-9]+)', _text(folder / 'memory.stat'), re.MULTILINE)
             return float(int(most) - int(_text(folder / used) or 0)
                          + (int(match[1]) if match else 0))
-    return float('inf')
+    return math.inf
 
 
 def _text(path: Path) -> str:

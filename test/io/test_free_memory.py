@@ -53,6 +53,13 @@ def test_the_limit_of_a_group_above_counts(tmp_path, line, folder, limit, used, 
     assert free_memory(root) == 2 * GIGA
 
 
+def test_a_limit_of_the_process_counts(tmp_path):
+    root = machine(tmp_path, {
+        'proc/self/limits': f'Max address space         {4 * GIGA}  unlimited  bytes\n',
+        'proc/self/status': f'Name:\tone\nVmSize:\t {2**20} kB\n'})
+    assert free_memory(root) == 3 * GIGA
+
+
 def test_a_solve_may_take_most_of_it(monkeypatch):
     monkeypatch.setattr(memory, '_reader', memory._reader)
     memory.measure_by(lambda: 10.0)
