@@ -80,8 +80,8 @@ class Field:
         """
         The last of the `levels`, so that cells which are `WIDTH` apart are neighbours.
 
-        (w, w, c, r), w = `WIDTH`: element (p, q, c, r) is of cell (c w + p, (r - w) w + q); before and
-        behind r of the level's own blocks are w of nothing.
+        (w, w, c, r), w = `WIDTH`: element (p, q, c, r) is of cell (c w + p, (r - w) w + q). Before
+        and behind the rows of the level's own blocks are w of nothing.
         """
         last = self.levels[-1]
         columns, rows = (-(-size // WIDTH) for size in last.shape)
