@@ -36,7 +36,7 @@ from robust.kinds import GRAPHS, KINDS, MADE, SUITES
 if TYPE_CHECKING:
     from robust.runs import Run
 
-DEFAULT_SOLVERS = ('ours L', 'DCS from odometry', 'GM from odometry', 'GNC from odometry')
+DEFAULT_SOLVERS = ('ours L', 'from odometry')
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:

@@ -11,6 +11,7 @@ What the suite measures: kinds of wrong graphs, and the bar each has to pass; im
 
     suite      what is wrong
     synthetic  false loops of the package, 10 to 90% of all; fewer true ones; worse odometry
+    protocol   riSAM's: loops of no length between far poses, 10 to 90% of all
     recorded   what place recognition made
     aliased    far streets taken for each other for 50 keyframes, 1, 3 or 10 times
     noise      information that is not what it says
@@ -133,6 +134,8 @@ def _noise() -> list[Kind]:
 def _others() -> list[Kind]:
     slip = Bar(kept=0.002, lost=0.02, doubt=EXCUSES)
     return [
+        Kind('protocol', 'risam', (INTEL, MANHATTAN, *RECORDED_CLEAN), lies='identity',
+             shares=(0.1, 0.3, 0.5, 0.7, 0.9), bar=Bar(kept=0.002, doubt=EXCUSES)),
         Kind('recorded', 'recorded', (BICOCCA,), bar=Bar(lost=0.1, error=1.05, doubt=FREE)),
         Kind('recorded', 'recorded', (BOVISA,), bar=Bar(error=BOVISA_ERROR, doubt=FREE)),
         *(Kind('slips', f'slip-{what}-{count}', (INTEL, MANHATTAN, KITTI), 'slip',

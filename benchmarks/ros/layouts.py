@@ -43,7 +43,7 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.io.messages.conversion import stamped_pose
 from l1slam_ros.ros.demo import BACKEND, BAG, Listener, read_recording, running
 
-CONFIG, PNG = Path('config'), Path('bags/layouts.png')
+CONFIG, PNG = Path('config'), Path('doc/layouts.png')
 RATE, SHADES = '10', 200
 _WIDE, _HIGH = 1400, 900  # [dots] of a window
 _DOTS, _SHRUNK = 100, 0.7  # per inch of the figure, and how large it is drawn

@@ -35,7 +35,6 @@ from l1slam_ros.io.files import counted
 from l1slam_ros.io.free_memory import free_memory
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.left_out import left_out_by
-from l1slam_ros.io.node_options import read_params_file
 from l1slam_ros.io.ours import refuse_others
 from l1slam_ros.io.progress import Progress
 from l1slam_ros.io.sentences import (
@@ -205,6 +204,8 @@ def asked_of(arguments: argparse.Namespace) -> SolveOptions:
     """Return how a graph is to be solved."""
     solver, least_squares, robust = OptimiserOptions(), LeastSquaresOptions(), arguments.robust
     if arguments.params_file:
+        from l1slam_ros.io.node_options import read_params_file
+
         options = read_params_file(arguments.params_file)
         solver = options.solver
         if robust is None and not options.robust.enabled:

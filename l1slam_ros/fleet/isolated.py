@@ -27,8 +27,7 @@ from l1slam_ros.fleet.starter import CLOCK, Values
 
 # Linear algebra on one thread: the workers are the threads. Sets in one order.
 _ENVIRONMENT = {**dict.fromkeys(
-    ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS'), '1'),
-    'PYTHONHASHSEED': '0'}
+    ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS'), '1'), 'PYTHONHASHSEED': '0'}
 _TIME_IS_UP = -signal.SIGXCPU, -signal.SIGALRM
 _STARTERS = threading.local()
 # Of a job that was not brought to an end, nobody knows what it took.

@@ -20,22 +20,21 @@ numba and processor that it was made with, and while the files it names are ther
 import ctypes
 import gc
 import hashlib
-import importlib.util
 import json
 import os
-import platform
 import select
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
-from pathlib import Path
+from contextlib import ExitStack, contextmanager, suppress
 
 from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Manifold
+from l1slam_ros.core.kernels import compiled
+from l1slam_ros.core.kernels.kept import objects
 from l1slam_ros.io.progress import Progress
 
 # What a sparse graph is solved by, what false loops are told by, what a dense graph is solved by,
@@ -47,13 +46,13 @@ DENSE = ('halpern',)
 ONLINE = ('border',)
 STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
 # What poses in space need besides; after the colon: the versions for them of that module's loops.
-_SPACE = ':space'
-IN_SPACE = {'halpern': f'halpern{_SPACE}', 'cholesky': f'cholesky{_SPACE}',
-             'blocks': f'blocks{_SPACE}', 'se2': 'se3'}
+IN_SPACE = {'halpern': f'halpern{objects.SPACE}', 'cholesky': f'cholesky{objects.SPACE}',
+             'blocks': f'blocks{objects.SPACE}', 'se2': 'se3'}
 
-_KERNELS = Path(__file__).parents[1] / 'core' / 'kernels'
-# [s] How often the caller is asked whether to stop.
+# [s] How often the caller is asked whether to stop, and whether another process is done.
 _LOOK = 0.1
+# [s] How long a process waits for another one that makes the same step.
+_PATIENCE = 60.0
 # Of glibc's `mallopt`: from which size on an array has pages of its own, and how much may lie free
 # at the end of a heap. Left alone it raises both, to tens of megabytes for each thread.
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
@@ -61,8 +60,6 @@ _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1
 _HUGE = 2**22
 # Other processes go first, though not by far: whoever waits for the loops waits for these.
 _NICE = 5
-# What a processor is known by, of all that the kernel of Linux says of it.
-_PROCESSOR = ('model name', 'flags', 'Features', 'CPU implementer', 'CPU part')
 
 
 def with_space(steps: tuple[str, ...], manifold: Manifold) -> tuple[str, ...]:
@@ -100,7 +97,7 @@ def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
     missing = [step for step in steps if step not in known]
     if not missing:
         return True
-    if stopped() or not any(map(_is_writable, _folders())):
+    if stopped() or not any(map(objects.is_writable, objects.folders())):
         return False
     report(0, len(missing))
     for done, (step, files) in enumerate(_compiled(missing, stopped), 1):
@@ -149,8 +146,36 @@ def work(steps: list[str]) -> None:
         os._exit(0)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
+    # What numba makes it holds on to: to look for garbage takes a tenth of the time, in vain.
+    gc.disable()
     for step in steps:
-        print(json.dumps([step, make_ready(step)]), flush=True)
+        print(json.dumps([step, make(step)]), flush=True)
+
+
+def make(step: str) -> list[str]:
+    """Compile a step if no other process does; return the files that keep it."""
+    with alone(step):
+        return compiled.keep(step)
+
+
+@contextmanager
+def alone(step: str) -> Iterator[None]:
+    """Keep other processes from making a step for the same folder; wait until none does."""
+    with ExitStack() as held:
+        with suppress(ImportError, OSError, StopIteration):  # nowhere to lock
+            import fcntl
+
+            folder = next(filter(objects.is_writable, objects.folders()))
+            path = folder / objects.file_name(f'{step}.lock')
+            file = held.enter_context(path.open('w'))
+            # Whoever holds it may be stopped, by Ctrl-Z: then both make it.
+            end = time.monotonic() + _PATIENCE
+            while time.monotonic() < end:
+                with suppress(BlockingIOError):
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                time.sleep(_LOOK)
+        yield
 
 
 def load(steps: Sequence[str] = STEPS) -> None:
@@ -166,12 +191,12 @@ def load(steps: Sequence[str] = STEPS) -> None:
         ctypes.CDLL(None).mallopt(_TRIM_THRESHOLD, 2 * _HUGE)
 
 
-def make_ready(step: str) -> list[str]:
-    """Compile the loops of one step, or read them; return the files that keep them, if any."""
-    name = step.removesuffix(_SPACE)
-    loops = [value for value in vars(getattr(kernels, name)).values() if hasattr(value, 'takes')]
-    folders = {kernels.compiled.make_ready(loop, step != name) for loop in loops} - {''}
-    return sorted(str(file) for folder in folders for file in Path(folder).glob(f'{name}.*.nbi'))
+def make_ready(step: str) -> None:
+    """Link the loops of one step, or have them read or compiled."""
+    name = step.removesuffix(objects.SPACE)
+    for loop in list(vars(getattr(kernels, name)).values()):
+        if hasattr(loop, 'takes'):
+            compiled.make_ready(loop, step != name)
 
 
 def _cores() -> int:
@@ -180,33 +205,11 @@ def _cores() -> int:
         os.cpu_count() or 1)
 
 
-def _folders() -> list[Path]:
-    """Return where the note may be: where numba would keep what it compiles, the first first."""
-    user = os.environ.get('XDG_CACHE_HOME') or os.path.join(os.path.expanduser('~'), '.cache')
-    own = os.environ.get('NUMBA_CACHE_DIR')
-    return [*([Path(own)] if own else []), _KERNELS / '__pycache__', Path(user) / 'numba']
-
-
-def _is_writable(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False
-
-
-def _name() -> str:
-    """Return the name of the note: one for each place of the package, and Python, in a folder."""
-    place = hashlib.sha256(os.fsencode(_KERNELS)).hexdigest()[:12]
-    return f'l1slam-{sys.implementation.cache_tag}-{place}.json'
-
-
 def _noted() -> dict[str, list[str]]:
     """Return the steps that are in the cache, and the files that keep each."""
-    for folder in _folders():
+    for folder in objects.folders():
         try:
-            note = json.loads((folder / _name()).read_text())
+            note = json.loads((folder / objects.file_name('json')).read_text())
         except (OSError, ValueError):
             continue
         if note['key'] == _key():
@@ -217,26 +220,10 @@ def _noted() -> dict[str, list[str]]:
 
 def _note(steps: dict[str, list[str]]) -> None:
     """Write down what is in the cache; a reader finds all of the note or none."""
-    folder = next(filter(_is_writable, _folders()))
-    with tempfile.NamedTemporaryFile('w', dir=folder, delete=False) as file:
-        json.dump({'key': _key(), 'steps': steps}, file)
-    os.replace(file.name, folder / _name())
+    note = {'key': _key(), 'steps': steps}
+    objects.put(objects.file_name('json'), json.dumps(note).encode())
 
 
 def _key() -> str:
-    """Return what changes with all that a compiled loop depends on."""
-    numba = importlib.util.find_spec('numba')
-    sources = [Path(numba.origin)] if numba and numba.origin else []
-    stats = [(path.name, path.stat()) for path in (*sources, *sorted(_KERNELS.glob('*.py')))]
-    settings = sorted(pair for pair in os.environ.items() if pair[0].startswith('NUMBA_'))
-    facts = (sys.version, platform.machine(), _processor(), settings,
-             [(name, stat.st_mtime_ns, stat.st_size) for name, stat in stats])
-    return hashlib.sha256(repr(facts).encode()).hexdigest()
-
-
-def _processor() -> list[str]:
-    try:
-        first = Path('/proc/cpuinfo').read_text().split('\n\n')[0]
-    except OSError:
-        return [platform.processor()]
-    return [line for line in first.splitlines() if line.startswith(_PROCESSOR)]
+    """Return what changes with the sources; on the rest depends how the note is called."""
+    return hashlib.sha256(repr(objects.sources()).encode()).hexdigest()

@@ -6,17 +6,27 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Jobs that end badly, each in a process of its own."""
+"""Jobs for processes of their own: those that end badly, and one that says what it needs."""
 
 import os
 import signal
+import sys
 from pathlib import Path
 
+from l1slam_ros.cli import batching
 from l1slam_ros.fleet.starter import serve
 
 
 def begin():
     serve(lambda: None, lambda job: globals()[job['arguments'][0]](Path(job['output'])))
+
+
+def begin_prepared():
+    """Answer with the status of what a job of `batch` solves, and if numba was needed."""
+    def work(job):
+        return {**batching._solve(job), 'numba': 'numba' in sys.modules}
+
+    serve(batching._prepare, work)
 
 
 def bomb(output):

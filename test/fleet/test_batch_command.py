@@ -15,17 +15,21 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
 
 pytest.importorskip('distributed')
 
-from bad_jobs import begin
+from bad_jobs import begin, begin_prepared
 from command import run
 
+from l1slam_ros.core.kernels.kept import objects
+from l1slam_ros.fleet import isolated
 from l1slam_ros.fleet.finding import find
 from l1slam_ros.fleet.isolated import Job, Limits, run_job
+from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, fill_cache
 
 DASK = [sys.executable, '-m', 'distributed.cli.dask_']
 SECONDS = 120  # of patience
@@ -246,6 +250,26 @@ def test_what_crashes_once_is_tried_again(tmp_path, what):
     job = Job('name', 'input', str(tmp_path / 'map'), (what,))
     ended = run_job(begin, job, Limits(1, 2 * 10**9), 1)
     assert ended['row'] == {'recording': 'name', 'status': 'converged'} and ended['attempts'] == 2
+
+
+def states():
+    return {path: os.stat(path).st_mtime_ns
+            for step in (*SPARSE, *JUDGEMENT) for path in objects.files(step)}
+
+
+@pytest.mark.parametrize('threads', [None, '1', '2'])
+def test_a_job_compiles_nothing_once_the_cache_is_full(recordings, tmp_path, monkeypatch, threads):
+    """Whatever a worker's environment says of the threads of loops, of which none has many."""
+    assert fill_cache(lambda done, total: None, lambda: False, (*SPARSE, *JUDGEMENT))
+    before = states()
+    monkeypatch.setattr(isolated, '_STARTERS', threading.local())  # no process that is there
+    if threads:
+        monkeypatch.setenv('NUMBA_NUM_THREADS', threads)
+    job = Job('a', str(recordings / 'a.g2o'), str(tmp_path / 'map.g2o'))
+    row = run_job(begin_prepared, job, Limits(SECONDS, 10**10), 0)['row']
+    isolated._STARTERS.of[begin_prepared].close()
+    assert row['status'] != 'failed' and not row['numba']
+    assert before and states() == before
 
 
 def test_recordings_are_found_however_deep_and_bags_as_a_whole(tmp_path):

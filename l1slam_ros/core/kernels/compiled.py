@@ -9,70 +9,193 @@
 """
 The decorators of every compiled loop.
 
-A loop is compiled once per machine: numba keeps the result beside the package, or where that is
-read-only in the user's cache folder. Reading one back takes some 4 ms, however small it is, so
+A loop is compiled once per machine: its machine code is kept, and called without numba if the
+arguments are of types that it was compiled for ahead (see `kept`). Else, and where nothing could
+be kept, numba has the call: it keeps its results beside the package, or where that is read-only
+in the user's cache folder. Reading one of these back takes some 4 ms, however small it is, so
 loops that follow each other are one loop.
 
-A loop may call only functions of its own module: of others numba would not see that they changed.
+A loop may call only functions of its own module: of others neither would see that they changed.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
+from functools import update_wrapper
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
-import numba
-from numba.core.sigutils import normalize_signature
-from numba.np import linalg
+from numpy import ndarray
+
+from l1slam_ros.core.kernels.kept import link, objects
 
 Kernel = Callable[..., Any]
 # Of blocks of whole poses in the plane, and of parts of poses; see `cholesky`.
 ANY_SIZE = ('UniTuple(i8, 3)', 'f8[::1]')
 
 
-def compiled(function: Kernel) -> Kernel:
+class Loop:
     """
-    Compile a function of arrays and numbers; it runs without the interpreter's lock.
+    A function of arrays and numbers that is compiled; it runs without the interpreter's lock.
 
     Sums may be reordered (that is what lets them be vectorised); NaN and infinity keep their
     meaning. Where no folder can be written the result is not kept, and every process compiles.
-    """
-    options = {'nogil': True, 'error_model': 'numpy', 'fastmath': {'contract', 'reassoc', 'nsz'},
-               'no_cfunc_wrapper': True, 'no_cpython_wrapper': function.__name__.startswith('_')}
-    try:
-        kernel: Kernel = numba.njit(cache=True, **options)(function)
-    except RuntimeError:
-        kernel = numba.njit(**options)(function)
-    return kernel
 
-
-def loop(*takes: str, space: tuple[str, ...] = ()) -> Callable[[Kernel], Kernel]:
-    """
-    Compile, as `compiled`, a function that the interpreter calls.
-
+    Parameters
+    ----------
+    py_func : what to compile
     takes : the types of its arguments in numba's words, so that it can be compiled without them;
-    f8[:, ::1] is an array of doubles, rows one after the other. Several: one version for each;
-    space : those of the versions that only graphs in space need
-    """
-    def decorate(function: Kernel) -> Kernel:
-        kernel: Any = compiled(function)
-        kernel.takes, kernel.takes_in_space = takes, space
-        return kernel
+    f8[:, ::1] is an array of doubles, rows one after the other. Several: one version for each
+    takes_in_space : those of the versions that only graphs in space need
 
-    return decorate
+    Attributes
+    ----------
+    linked : versions of kept machine code that this process has called, or made ready
+    """
+
+    def __init__(self, py_func: Kernel, takes: tuple[str, ...] = (),
+                 takes_in_space: tuple[str, ...] = ()) -> None:
+        update_wrapper(self, py_func)
+        objects.note_import(_source(py_func))
+        self.py_func, self.takes, self.takes_in_space = py_func, takes, takes_in_space
+        self.linked: tuple[link.Linked, ...] = ()
+        self._sought: dict[bool, bool] = {}
+        self._dispatcher: Any = None
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call what was compiled for arguments of these types."""
+        tried = self.linked
+        for wanted, function in tried:
+            if len(wanted) != len(arguments):
+                continue
+            for argument, (entries, count, kinds) in zip(arguments, wanted, strict=True):
+                if entries is not None:
+                    # The last: in C order, aligned and writable.
+                    if not (type(argument) is ndarray and argument.ndim == count
+                            and (argument.dtype is entries or argument.dtype == entries)
+                            and argument.flags.carray):
+                        break
+                elif count < 0:
+                    if type(argument) not in kinds:
+                        break
+                elif (type(argument) is not tuple or len(argument) != count
+                        or not kinds.issuperset(map(type, argument))):
+                    break
+            else:
+                return function(*arguments)
+        for space in False, True:
+            self.seek(space)
+            if self.linked is not tried:
+                return self(*arguments)
+        return self.dispatcher(*arguments)
+
+    def seek(self, space: bool) -> bool:
+        """Link what is kept of the versions for space, or of the others; False: nothing is."""
+        with link.lock:
+            if space not in self._sought:
+                takes = self.takes_in_space if space else self.takes
+                of = self.py_func
+                found = link.link(of.__module__, of.__name__, space) if takes else []
+                self.linked = (*self.linked, *found) if found else self.linked
+                self._sought[space] = len(found) == len(takes)
+        return self._sought[space]
+
+    @property
+    def by_numba(self) -> bool:
+        """Whether this process has asked numba for it."""
+        return self._dispatcher is not None
+
+    @property
+    def dispatcher(self) -> Any:
+        """The loop as numba has it, which is imported now at the latest."""
+        with link.lock:
+            if self._dispatcher is None:
+                self._dispatcher = _dispatcher(self.py_func)
+        return self._dispatcher
+
+    @property
+    def _numba_type_(self) -> Any:
+        """What numba takes it for where another loop calls it."""
+        return self.dispatcher._numba_type_
+
+
+compiled = Loop
+
+
+def loop(*takes: str, space: tuple[str, ...] = ()) -> Callable[[Kernel], Loop]:
+    """Return what makes a function that the interpreter calls a `Loop`."""
+    return lambda function: Loop(function, takes, space)
 
 
 def for_sizes(takes: str, plane: tuple[str, ...] = ('UniTuple(i8, 3)',)) -> Callable[
-        [Kernel], Kernel]:
+        [Kernel], Loop]:
     """Return `loop` for functions whose last argument is a tuple as long as a block has rows."""
     return loop(*(f'({takes}, {size})' for size in plane),
                 space=(f'({takes}, UniTuple(i8, 6))',))
 
 
-def make_ready(kernel: Any, space: bool) -> str:
-    """Compile a loop, or read it from the cache; return the cache's folder, empty: none."""
-    for takes in kernel.takes_in_space if space else kernel.takes:
-        # As the types of a call, for these are what the cache goes by.
-        kernel.compile(tuple(normalize_signature(takes)[0]))
-    return kernel.stats.cache_path or ''
+def make_ready(kernel: Loop, space: bool) -> None:
+    """Link the versions of a loop, or where they are not kept have numba read or compile them."""
+    if not kernel.seek(space):
+        for takes in kernel.takes_in_space if space else kernel.takes:
+            _compile(kernel.dispatcher, takes)
+
+
+def keep(step: str) -> list[str]:
+    """Have what is not kept yet of a step compiled, and kept; return the files that keep it."""
+    if files := objects.files(step):
+        return files
+    from l1slam_ros.core.kernels.kept import make
+
+    name = step.removesuffix(objects.SPACE)
+    module = import_module(f'{__package__}.{name}')
+    kept, folders = {}, set()
+    for kernel in vars(module).values():
+        if takes := getattr(kernel, 'takes_in_space' if step != name else 'takes', ()):
+            dispatcher = kernel.dispatcher
+            # What numba reads back it does not give away.
+            dispatcher._cache.load_overload = lambda *_: None
+            versions = [_compile(dispatcher, one) for one in takes]
+            folders.add(dispatcher.stats.cache_path)
+            kept[kernel.py_func.__name__] = versions
+    beside = sorted(str(file) for folder in folders - {None}
+                    for file in Path(folder).glob(f'{name}.*.nbi'))
+    if not beside:
+        return []
+    with suppress(Exception):  # as another numba may have it, or another system
+        apart = {name: list(map(make.taken_apart, versions)) for name, versions in kept.items()}
+        return [objects.write(step, apart, beside), *beside]
+    return beside
+
+
+def _compile(dispatcher: Any, takes: str) -> Any:
+    """Compile or read a version of a loop; return what numba knows of it."""
+    from numba.core.sigutils import normalize_signature
+
+    # As the types of a call, for these are what the cache goes by.
+    types = tuple(normalize_signature(takes)[0])
+    dispatcher.compile(types)
+    return dispatcher.overloads[types]
+
+
+def _dispatcher(function: Kernel) -> Any:
+    """Return a function as numba has it."""
+    import numba
+
+    _spare_blas()
+    own = function.__name__.startswith('_')
+    # After an upgrade numba would keep what this process has under the source that is there now.
+    as_imported = objects.is_as_imported(_source(function))
+    options = {'nogil': True, 'error_model': 'numpy', 'fastmath': {'contract', 'reassoc', 'nsz'},
+               'no_cfunc_wrapper': True, 'no_cpython_wrapper': own}
+    try:
+        return numba.njit(cache=as_imported and not own, **options)(function)
+    except RuntimeError:
+        return numba.njit(**options)(function)
+
+
+def _source(function: Kernel) -> Path:
+    return Path(function.__code__.co_filename)
 
 
 def _spare_blas() -> None:
@@ -81,6 +204,8 @@ def _spare_blas() -> None:
 
     It would before it reads its first loop, which takes a fifth of a second; no loop uses it.
     """
+    from numba.np import linalg
+
     asked = linalg.ensure_blas
     linalg.ensure_blas = lambda: None
     try:
@@ -88,6 +213,3 @@ def _spare_blas() -> None:
     finally:
         linalg.ensure_blas = asked
     arraymath.ensure_blas = asked
-
-
-_spare_blas()
