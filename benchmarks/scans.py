@@ -7,7 +7,7 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What the scan front end makes of a laser log, by truth: error, loops, places, cost, memory.
+What the scan front end makes of a laser log, by truth: error, loops, places, grid, cost, memory.
 
     python benchmarks/scans.py --datasets DIR [--logs fr079,intel]
 
@@ -16,8 +16,10 @@ corrected pose, and scan-matched odometry from there. A loop is false where it i
 FAR or TURNED: where a robot turns, corrected poses are up to half a radian off, for all loops of a
 keyframe alike. A place is a square of SIDE; it is seen again each time that the robot comes into
 it, if it had been within NEAR of where it is then, and has gone APART since. It is closed where a
-true loop leads back from there, or from within NEAR of way. Seconds are the processor's, on one
-thread, and of the front end alone: what a scan costs `scan_loops`.
+true loop leads back from there, or from within NEAR of way. The grid is compared with the one of
+the same keyframes' scans where the corrected log has them, laid on the map as a whole: of the
+cells that both know, so many are free in both or occupied in both. Seconds are the processor's, on
+one thread, and of the front end alone: what a scan costs `scan_loops`.
 """
 
 import argparse
@@ -29,9 +31,12 @@ import numpy as np
 
 from l1slam_ros.cli.reference import position_error, read_truth
 from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.alignment import align
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
 from l1slam_ros.core.scans.front_end import ScanFrontEnd
+from l1slam_ros.core.scans.grid import draw
+from l1slam_ros.core.scans.points import Points
 from l1slam_ros.io.scans.carmen import read_carmen
 from l1slam_ros.io.scans.to_graph import ScanMap, map_scans
 from l1slam_ros.io.trajectory import read_reference
@@ -117,6 +122,27 @@ def places(pairs: Indices, truth: Array) -> tuple[int, int]:
     return len(set(comes[again])), len(set(comes[again & (from_loop < NEAR)]))
 
 
+def grid_agreement(points: list[Points], poses: Array, truth: Array) -> tuple[float, float]:
+    """Return how long the grid took to draw [s], and which part of its cells is as in truth's."""
+    draw(points[:1], poses[:1])  # compiled, or read
+    began = time.thread_time()
+    own = draw(points, poses)
+    took = time.thread_time() - began
+    R, t = align(truth[:, :2], poses[:, :2])
+    laid = np.column_stack((truth[:, :2] @ R.T + t,
+                            truth[:, 2] + np.arctan2(R[1, 0], R[0, 0])))
+    true = draw(points, laid)
+    first = np.round((true.origin - own.origin) / own.resolution).astype(int)
+    low = np.minimum(first, 0)
+    end = np.maximum(own.log_odds.shape, first + true.log_odds.shape)
+    cells = np.full((2, *(end - low)), -1, np.int8)
+    for both, grid, at in ((cells[0], own, -low), (cells[1], true, first - low)):
+        a, b = grid.log_odds.shape
+        both[at[0] : at[0] + a, at[1] : at[1] + b] = grid.occupancy
+    known = (cells >= 0).all(axis=0)
+    return took, float((cells[0] == cells[1])[known].mean())
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description='the scan front end on laser logs, by truth')
@@ -136,11 +162,14 @@ def main() -> None:
         outcome = solve(made.record.graph, None, SolveOptions())
         error = position_error(made.record, outcome.solution.poses, read_truth(
             str(table), made.record, folder / f'{name}.clf.bz2', made.path))
+        took, agree = grid_agreement(made.points, outcome.solution.poses, truth)
         milliseconds = 1e3 * np.array(timed.seconds)
         print(f'{name}: {len(log.scans):,} scans, {len(truth):,} keyframes, error {error:.3f} m, '
               f'{outcome.solution.status}')
         print(f'  {len(pairs)} loops, {false.sum()} false; {closed} of {again} places closed '
               f'({closed / max(again, 1):.0%})')
+        print(f'  the grid takes {took:.2f} s; {agree:.1%} of its cells are as the corrected log '
+              'has them')
         print(f'  a scan takes {np.median(milliseconds):.2f} ms in the median, p99 '
               f'{np.quantile(milliseconds, 0.99):.1f} ms; '
               f'{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB so far',

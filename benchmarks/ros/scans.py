@@ -22,6 +22,7 @@ stands, and goes on, is not on it.
 import subprocess
 import sys
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from peer import UpdateTimes, arguments, cpu_seconds
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import LaserScan
 
 from l1slam_ros.core.geometry import se2
@@ -55,7 +57,8 @@ def main() -> None:
     log = read_carmen(given.log)
     rclpy.init()
     node = rclpy.create_node('laser')
-    maps: list[PathMessage] = []
+    # As bytes, and the newest alone: those of a long drive are a gigabyte.
+    paths: deque[bytes] = deque(maxlen=1)
     way: list[Odometry] = []
     said: dict[str, str] = {}
     updates = UpdateTimes()
@@ -67,8 +70,8 @@ def main() -> None:
             if status.name.endswith('scans'):
                 said.update(values)
 
-    node.create_subscription(PathMessage, 'path', maps.append, QoSProfile(
-        depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    node.create_subscription(PathMessage, 'path', lambda data: paths.append(data), QoSProfile(
+        depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL), raw=True)
     node.create_subscription(Odometry, 'scan_odom', way.append, QoSProfile(depth=1000))
     node.create_subscription(DiagnosticArray, '/diagnostics', hear, 10)
     scans = node.create_publisher(LaserScan, 'scan', qos_profile_sensor_data)
@@ -95,8 +98,9 @@ def main() -> None:
         print(f'backend: {updates.sentence}')
         print(', '.join(f'{name} {said[name]}' for name in said
                         if name.startswith(('refused', 'scan', 'loops', 'parts'))))
-        print(f'{len(log.scans)} scans, {len(maps[-1].poses)} keyframes, '
-              f'{_error(maps[-1], way, given.truth):.3f} m from the truth')
+        path = deserialize_message(paths[-1], PathMessage)
+        print(f'{len(log.scans)} scans, {len(path.poses)} keyframes, '
+              f'{_error(path, way, given.truth):.3f} m from the truth')
     finally:
         for process in nodes:
             process.terminate()

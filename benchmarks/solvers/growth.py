@@ -26,20 +26,22 @@ from measuring import Answer, Row, interleaved, report_progress, row
 _FOLDER = Path(__file__).resolve().parents[1]
 # Loops enough that there are 1.6 edges to a pose, as in the paper's sparse graphs.
 SPARSE = tuple((n, 16 * n // 10) for n in (1_000, 2_000, 5_000, 10_000, 20_000, 50_000))
+# Worlds with as many loops as poses, up to what takes minutes.
+LARGE = tuple((n, 2 * n) for n in (25_000, 100_000, 200_000, 1_000_000))
 DENSE = ((10_000, 64_000), (50_000, 700_000))
 PHASES = ('seed', 'solve')
 # [s] A world that takes longer than this, all in all, is given up.
-_PATIENCE = 900.0
+_PATIENCE = 1800.0
 
 
 def measure(repeats: int, limit: float) -> list[Row]:
     """Return a row for each world, and phase of its solution."""
     reports: dict[tuple[int, int], dict[str, Any]] = {}
     measured = interleaved(
-        {size: _runner(size, reports) for size in (*SPARSE, *DENSE)}, repeats, limit)
+        {size: _runner(size, reports) for size in (*SPARSE, *DENSE, *LARGE)}, repeats, limit)
     rows: list[Row] = []
     for size, found in measured.items():
-        group = 'sparse' if size in SPARSE else 'dense'
+        group = 'sparse' if size in SPARSE else 'large' if size in LARGE else 'dense'
         name = f'world {size[0]} / {size[1]}'
         if not np.isfinite(found.seconds[0]):
             rows.append(row(name, group, 'ours', True, None, edges=size[1]))

@@ -12,7 +12,8 @@ One world in a process of its own, so that its memory is its own.
     python one_world.py POSES EDGES
 
 Prints one JSON object: seconds of seed and solve, the L1 costs of the solution and of the true
-poses, and the peak memory of the process before and after [MiB].
+poses, the part of the cost that the dual leaves open, the steps, the seconds and memory [MiB] that
+were predicted, and the peak memory of the process before and after [MiB].
 """
 
 import json
@@ -41,7 +42,11 @@ def solve(world: World) -> dict[str, float]:
     seeded = clock()
     solution, _ = minimise_by(method, graph, seed, OptimiserOptions())
     solved = clock()
+    needs = method.needs
     return {'seed': seeded - began, 'solve': solved - seeded, 'cost': solution.cost,
+            'gap': solution.gap / solution.cost, 'steps': float(solution.outer_iterations),
+            'predicted_seconds': needs.seconds if needs else float('nan'),
+            'predicted_memory': needs.memory / 2**20 if needs else float('nan'),
             'true_cost': l1_cost(whitened_residual(graph, world.truth))}
 
 

@@ -21,16 +21,18 @@ import numpy as np
 from l1slam_ros.cli.commands import Ending, inputs, read, read_scan_map, warn
 from l1slam_ros.cli.reference import Truth, known_false, position_error, read_truth
 from l1slam_ros.core.errors import OptionError
+from l1slam_ros.core.memory import free, in_gigabytes, measure_by
 from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import SENTENCES
-from l1slam_ros.core.solvers.solve import PRIMAL_DUAL
+from l1slam_ros.core.solvers.solve import PRIMAL_DUAL, Method
 from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import DENSE, JUDGEMENT, SPARSE, compile_now, with_space
 from l1slam_ros.io.files import counted
+from l1slam_ros.io.free_memory import free_memory
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.left_out import left_out_by
 from l1slam_ros.io.ours import refuse_others
@@ -48,6 +50,10 @@ from l1slam_ros.io.sentences import (
 
 if TYPE_CHECKING:
     from l1slam_ros.io.scans.to_graph import ScanMap
+
+
+# [s] What a solve takes from which it is said beforehand.
+_LONG = 10.0
 
 
 def solve(arguments: argparse.Namespace) -> Ending:
@@ -75,6 +81,7 @@ def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphReco
     warn(warnings, arguments.quiet)
     if arguments.plot:
         known_false(arguments.input, record)  # damaged, it is refused before the work
+    measure_by(free_memory)
     compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
     outcome, sentences = settled(_outcome(arguments, record, asked))
     remarks = [*_remarks(outcome), *sentences,
@@ -153,7 +160,15 @@ def _outcome(arguments: argparse.Namespace, record: GraphRecord, asked: SolveOpt
         return solve_graph(
             record.graph, record.poses, asked, solving.report,
             lambda _, accepted: judging.advance(1, f'{counted(accepted, "loop")} believed'),
-            record.ids)
+            record.ids, lambda method: _announce(method, quiet))
+
+
+def _announce(method: Method, quiet: bool) -> None:
+    """Say what a long solve will take."""
+    if method.needs and method.needs.seconds > _LONG:
+        warn([f'{method.solver}: predicted to take some {method.needs.seconds:.0f} s and '
+              f'{in_gigabytes(method.needs.memory)}, of which {in_gigabytes(free())} are free'],
+             quiet)
 
 
 def _steps(asked: SolveOptions) -> tuple[str, ...]:

@@ -24,7 +24,11 @@ class GraphError(L1SlamError):
 
 
 class FillError(GraphError):
-    """A graph whose factorisation would take more memory than is sensible."""
+    """A graph whose factorisation would take more memory than there is; blocks : of the factor."""
+
+    def __init__(self, message: str, blocks: int = 0):
+        super().__init__(message)
+        self.blocks = blocks
 
 
 class DoubtfulError(L1SlamError):

@@ -26,7 +26,9 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
+from l1slam_ros.core.memory import measure_by
 from l1slam_ros.core.running.backend import Backend
+from l1slam_ros.io.free_memory import free_memory
 from l1slam_ros.io.graphs.map_file import MapFile, unusable_path
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.diagnostics import Diagnostics, RobotLine
@@ -70,6 +72,7 @@ class BackendNode(LifecycleNode):
         self._declared = NodeParameters(
             self, NodeOptions(), lambda options: self._backend.set_options(options))
         options = self.options
+        measure_by(free_memory)
         self._backend = Backend(options, options.dimension)
         self.failures = Failures(self.get_logger(), self.context.ok)
         self._solver = SolverThread(

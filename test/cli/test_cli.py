@@ -20,11 +20,12 @@ from rosbags.rosbag2 import StoragePlugin
 from torn import torn_graph
 
 from bags import NOTE, recording_of, rosbag2_directory
+from l1slam_ros.cli import solving
 from l1slam_ros.cli.main import main
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
-from l1slam_ros.core.solvers import block_cholesky as cholesky
+from l1slam_ros.core.solvers import block_cholesky
 from l1slam_ros.core.solvers.optimality import l1_cost
 from l1slam_ros.io import progress
 from l1slam_ros.io.formats import read_input
@@ -321,18 +322,27 @@ def test_where_the_odometry_is_full_of_gaps_nothing_is_there_to_judge_by(capsys,
 def test_a_graph_too_dense_to_judge_is_solved_as_far_as_it_was_judged(
         capsys, world, monkeypatch):
     """With memory for few blocks: the odometry alone can be factored, all loops cannot."""
-    monkeypatch.setattr(cholesky, 'MOST_ENTRIES', 9 * 400)
+    monkeypatch.setattr(block_cholesky, 'most_blocks', lambda graph: 700)
     for robust in ((), ('--robust',)):
         report = json.loads(run(capsys, 'solve', world, '--json', *robust, code=4)[0])
         assert report['status'] == 'doubtful' and report['suspect'] and not report['rejected']
         (warning,) = report['warnings']
         assert re.match(
-            r'doubtful: judging the loops failed \(the factor of 149 keyframes and [0-9]+ factors '
-            r'would have more than 400 blocks: too many far places are joined\): the map is of '
-            rf'what was believed until then, and {len(report["suspect"])} loops between [0-9]+ '
+            r'doubtful: judging the loops failed \(factorising [0-9]+ keyframes and [0-9]+ '
+            r'factors takes [0-9.e-]+ GB of memory or more, and [0-9.]+ GB are free\): the map is '
+            rf'of what was believed until then, and {len(report["suspect"])} loops between [0-9]+ '
             r'and [0-9]+ are left out\. ', warning)
     report = solve_json(capsys, world, '--no-robust')
     assert report['solver'] == 'primal-dual' and report['warnings'] == []
+
+
+def test_what_a_long_solve_takes_is_said_before_it(capsys, world, monkeypatch):
+    monkeypatch.setattr(solving, '_LONG', 0.0)
+    said = run(capsys, 'solve', world, '--no-robust')[1].splitlines()
+    assert len(said) == 1 and re.fullmatch(
+        r'l1slam: interior-point: predicted to take some [0-9]+ s and [0-9.]+ GB, of which '
+        r'[0-9.]+ GB are free', said[0])
+    assert run(capsys, 'solve', world, '--no-robust', '--quiet')[1] == ''
 
 
 def test_absolute_poses_are_no_loops_but_doubted_too(capsys, world):

@@ -98,6 +98,7 @@ def solve(
     graph: FactorGraph, stored: Array | None, asked: SolveOptions,
     report: Report = lambda iteration, cost: None,
     on_round: OnRound = lambda round_, accepted: None, ids: Indices | None = None,
+    on_choice: Callable[[Method], None] = lambda method: None,
 ) -> Outcome:
     """
     Solve a graph; seconds: solving alone.
@@ -109,6 +110,7 @@ def solve(
     report : called with each iteration and its cost
     on_round : see `robust_solve`
     ids : (n,) what errors call the keyframes; None: their numbers
+    on_choice : called with what the map is solved by, before that is done
 
     Raises
     ------
@@ -122,7 +124,7 @@ def solve(
     seed = None
     initial = (odometry_poses(graph) if asked.start == 'odometry'
                else initial_poses(graph if asked.robust is False else bridged(graph), stored, ids))
-    minimiser = _Minimiser(asked, report)
+    minimiser = _Minimiser(asked, report, on_choice)
     began = time.perf_counter()
     robust, unjudged = _robust_map(graph, asked, minimiser, on_round, ids)
     if robust:
@@ -167,13 +169,15 @@ def _robust_map(graph: FactorGraph, asked: SolveOptions, minimiser: '_Minimiser'
 class _Minimiser:
     """Minimises the norm that was wished for; solver, reason : what did it last, and why."""
 
-    def __init__(self, asked: SolveOptions, report: Report):
-        self._asked, self._report = asked, report
+    def __init__(self, asked: SolveOptions, report: Report, on_choice: Callable[[Method], None]):
+        self._asked, self._report, self._on_choice = asked, report, on_choice
         self.solver = self.reason = ''
 
     def choose(self, graph: FactorGraph) -> Method:
         """Return what the graph is solved by."""
-        return choose(self._asked.solver, graph, self._asked.norm, self._asked.loop_norm)
+        method = choose(self._asked.solver, graph, self._asked.norm, self._asked.loop_norm)
+        self._on_choice(method)
+        return method
 
     def minimise(self, graph: FactorGraph, poses: Array) -> Solution:
         """Return the solution from poses (n, p)."""

@@ -15,11 +15,14 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.scans import kernels
+from l1slam_ros.core.scans.search_kernels import WIDTH
 
 # [m] Cells of the look-up, and how far it reaches.
 RESOLUTION, REACH = 0.1, 0.6
-# The widest bound of a search is over 2^_HEIGHT cells.
-_HEIGHT = 4
+# The widest bound of a search is over 2^_HEIGHT cells each way.
+_HEIGHT = WIDTH.bit_length() - 1
+# A likelihood of 1.
+CERTAIN = 255
 
 
 @dataclass(frozen=True)
@@ -28,50 +31,61 @@ class Field:
     Points of a map.
 
     xy, normals : (n, 2) [m], each has a normal; nearest : (a, b) for each cell the nearest point,
-    -1 where none is within reach; origin : (2,) the corner of cell (0, 0) [m]
+    -1 where none is within reach; square : (a, b) its squared distance from the middle of the cell
+    [m^2]; origin : (2,) the corner of cell (0, 0) [m]
     """
 
     xy: Array
     normals: Array
     nearest: Indices
+    square: Array
     origin: Array
 
     @staticmethod
     def of(xy: Array, normals: Array) -> 'Field':
         """Return that of some points."""
         if not len(xy):
-            return Field(xy, normals, np.full((1, 1), -1, np.int32), np.zeros(2))
+            return Field(xy, normals, np.full((1, 1), -1, np.int32),
+                         np.full((1, 1), REACH**2), np.zeros(2))
         origin = np.floor(xy.min(axis=0) / RESOLUTION - REACH / RESOLUTION) * RESOLUTION
         shape = np.ceil((xy.max(axis=0) - origin + REACH) / RESOLUTION).astype(np.int64)
         xy = np.ascontiguousarray(xy)
-        nearest = kernels.nearest_points(xy, origin, shape, RESOLUTION, REACH)
-        return Field(xy, np.ascontiguousarray(normals), nearest, origin)
+        nearest, square = kernels.nearest_points(xy, origin, shape, RESOLUTION, REACH)
+        return Field(xy, np.ascontiguousarray(normals), nearest, square, origin)
 
     @cached_property
     def likelihood(self) -> Array:
-        """How well a point in each cell fits, (a, b): exp(-d^2 / (2 RESOLUTION^2))."""
-        a, b = self.nearest.shape
-        centre = [self.origin[k] + RESOLUTION * (np.arange(size) + 0.5)
-                  for k, size in enumerate((a, b))]
-        if not len(self.xy):
-            return np.zeros((a, b), np.float32)
-        x, y = self.xy[self.nearest, 0], self.xy[self.nearest, 1]
-        square = (x - centre[0][:, None]) ** 2 + (y - centre[1]) ** 2
-        fit = np.exp(-square / (2 * RESOLUTION**2))
-        return np.where(self.nearest < 0, 0.0, fit).astype(np.float32)
+        """How well a point in each cell fits, (a, b): exp(-d^2 / (2 RESOLUTION^2)) of 255."""
+        # Beyond reach this is less than half of one.
+        fit = np.exp(self.square.astype(np.float32) * np.float32(-0.5 / RESOLUTION**2))
+        return np.rint(CERTAIN * fit).astype(np.uint8)
 
     @cached_property
-    def levels(self) -> tuple[Array, Array]:
+    def levels(self) -> Array:
         """
         The greatest likelihood over 1, 2, 4, ... cells from each cell on, (h + 1, a, b).
 
-        And the (2,) cells of nothing before the first one: so far a shift may reach out.
+        Cell (0, 0) of the likelihood is at (WIDTH, WIDTH). All that is on the edge is 0.
         """
-        width = 1 << _HEIGHT
-        levels = [np.pad(self.likelihood, ((width, 0), (width, 0)))]
+        levels = [np.pad(self.likelihood, ((WIDTH, 1), (WIDTH, 1)))]
         for level in range(_HEIGHT):
             half, last = 1 << level, levels[-1].copy()
             last[:-half] = np.maximum(last[:-half], last[half:])
             last[:, :-half] = np.maximum(last[:, :-half], last[:, half:])
             levels.append(last)
-        return np.stack(levels), np.full(2, width)
+        return np.stack(levels)
+
+    @cached_property
+    def blocks(self) -> Array:
+        """
+        The last of the `levels`, so that cells which are `WIDTH` apart are neighbours.
+
+        (w, w, c, r), w = `WIDTH`: element (p, q, c, r) is of cell (c w + p, (r - w) w + q). Before
+        and behind the rows of the level's own blocks are w of nothing.
+        """
+        last = self.levels[-1]
+        columns, rows = (-(-size // WIDTH) for size in last.shape)
+        whole = np.zeros((columns * WIDTH, rows * WIDTH), np.uint8)
+        whole[: last.shape[0], : last.shape[1]] = last
+        own = whole.reshape(columns, WIDTH, rows, WIDTH).transpose(1, 3, 0, 2)
+        return np.ascontiguousarray(np.pad(own, ((0, 0), (0, 0), (0, 0), (WIDTH, WIDTH))))

@@ -24,7 +24,9 @@ _WINDOWS = 3
 @loop('(f8[:, ::1], f8[::1], i8[::1], f8, f8)')
 def nearest_points(points, origin, shape, resolution, reach):
     """
-    Return which point is nearest to the centre of each cell, -1 where none is within `reach`.
+    Return which point is nearest to the centre of each cell, and its squared distance [m^2].
+
+    Where none is within `reach`: -1, and the square of that.
 
     points : (n, 2) [m]; origin : (2,) corner of cell (0, 0) [m]; shape : (2,) cells;
     resolution, reach : [m]
@@ -43,7 +45,7 @@ def nearest_points(points, origin, shape, resolution, reach):
                 if square < best[a, b]:
                     best[a, b] = square
                     nearest[a, b] = k
-    return nearest
+    return nearest, best
 
 
 @loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i4[:, ::1], f8[::1], f8, f8[::1], f8, f8)')

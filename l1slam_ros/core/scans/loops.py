@@ -109,7 +109,10 @@ class LoopFinder:
         self._keyframes, self._options = keyframes, options
         self._submaps = Submaps(keyframes)
         self._asked = AROUND
+        # Of each keyframe that may be asked for.
         self._looks: list[Array] = []
+        self._travelled: list[float] = []
+        self._part: list[int] = []
         self._waiting: deque[_Comparison] = deque()
 
     def due(self) -> Indices:
@@ -128,8 +131,10 @@ class LoopFinder:
         poses : (n, 3) of the keyframes in the map, at least j + 1; spread : (n, 2) standard
         deviation of where each lies from the last one placed [m], [rad]; see `_sigma`
         """
-        while len(self._looks) <= j:
-            self._looks.append(self._submaps[len(self._looks)].descriptor)
+        for k in range(len(self._looks), j + 1):
+            self._looks.append(self._submaps[k].descriptor)
+            self._travelled.append(self._keyframes[k].travelled)
+            self._part.append(self._keyframes[k].part)
         sigma = self._sigma(j, spread)
         reach = np.clip(_SIGMAS * sigma[:, 0], _LEAST_REACH, _MOST_REACH)
         turn = np.clip(_SIGMAS * sigma[:, 1], _LEAST_TURN, np.pi)
@@ -154,19 +159,18 @@ class LoopFinder:
 
     def _sigma(self, j: int, spread: Array) -> Array:
         """Return how far keyframe j may lie from where the map has it, seen from each, (j, 2)."""
-        way = np.array([self._keyframes[j].travelled - k.travelled for k in self._keyframes[:j]])
+        travelled = np.array(self._travelled[: j + 1])
+        way = travelled[j] - travelled[:j]
         known = spread[:, 0] > 0
         placed = int(np.flatnonzero(known)[-1]) if known.any() else -1
-        since = self._keyframes[j].travelled - (
-            self._keyframes[placed].travelled if 0 <= placed < j else np.inf)
+        since = travelled[j] - (travelled[placed] if 0 <= placed < j else np.inf)
         # By odometry alone from there, or by the map and odometry since, whichever is surer.
         by_map = np.hypot(np.where(known[:, None], spread, np.inf)[:j], max(since, 0.0) * _DRIFT)
         return np.fmin(way[:, None] * _DRIFT, by_map)
 
     def _candidates(self, j: int, poses: Array, reach: Array) -> list[tuple[int, bool]]:
         """Return keyframes to compare with, and whether for their looks alone."""
-        travelled = np.array([k.travelled for k in self._keyframes[: j + 1]])
-        part = np.array([k.part for k in self._keyframes[: j + 1]])
+        travelled, part = np.array(self._travelled[: j + 1]), np.array(self._part[: j + 1])
         far = np.flatnonzero(
             (travelled[j] - travelled > self._options.apart) | (part != part[j]))
         distance = np.hypot(*(poses[far, :2] - poses[j, :2]).T)
@@ -174,9 +178,10 @@ class LoopFinder:
         near = (distance <= reach[far]) & ~apart
         chosen: list[tuple[int, bool]] = []
         self._take(far[near], distance[near], _NEAREST, False, travelled, chosen)
-        looks = np.array([self._looks[i] @ self._looks[j] for i in far])
-        like = (looks > _LOOKS) & ((distance <= 2 * reach[far]) | apart) if len(far) else near
-        self._take(far[like], -looks[like], _ALIKE, True, travelled, chosen)
+        within = far[(distance <= 2 * reach[far]) | apart]
+        looks = np.array([self._looks[i] @ self._looks[j] for i in within])
+        alike = within[looks > _LOOKS] if len(within) else within
+        self._take(alike, -looks[looks > _LOOKS], _ALIKE, True, travelled, chosen)
         return chosen
 
     def _take(self, keyframes: Indices, rank: Array, most: int, alike: bool, travelled: Array,

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.scans import search_kernels
-from l1slam_ros.core.scans.field import RESOLUTION, Field
+from l1slam_ros.core.scans.field import CERTAIN, RESOLUTION, Field
+from l1slam_ros.core.scans.search_kernels import WIDTH
 
 # [rad] Step of the turns: at 4 m a cell.
 TURN = 0.025
@@ -47,22 +48,37 @@ def search(field: Field, xy: Array, centre: Array, reach: float, turn: float, le
     """
     if not len(xy) or not len(field.xy):
         return None
-    xy = xy[np.linspace(0, len(xy) - 1, min(len(xy), _MOST_POINTS)).astype(np.int64)]
+    points = xy[np.linspace(0, len(xy) - 1, min(len(xy), _MOST_POINTS)).astype(np.int64)]
+    certain = CERTAIN * len(points)
     turns = np.arange(-int(turn / TURN), int(turn / TURN) + 1) * TURN + centre[2]
-    c, s = np.cos(turns), np.sin(turns)
-    R = np.moveaxis(np.array([[c, s], [-s, c]]), 2, 0)
-    cells = np.floor((xy @ R + (centre[:2] - field.origin)) / RESOLUTION).astype(np.int64)
-    levels, margin = field.levels
-    most = np.full(2, int(reach / RESOLUTION))
-    nothing = np.full(6, -1.0)
-    nodes, scores = search_kernels.widest_nodes(levels, margin, cells, -most, most)
-    score, at, dx, dy = search_kernels.branch_and_bound(
-        levels, margin, cells, nodes, scores, most, least, nothing)
+    most = int(reach / RESOLUTION)
+    across = 2 * most // WIDTH + 1
+    if across > WIDTH:
+        raise ValueError(f'a search reaches {WIDTH * WIDTH * RESOLUTION / 2} m at most')
+    # Where the points would be without a turn at the lowest shift, in cells of the levels.
+    start = (centre[:2] - field.origin) / RESOLUTION + WIDTH - most
+    sums = np.zeros((len(turns), across, WIDTH), np.uint16)
+    cells = search_kernels.add_widest_bounds(
+        field.blocks, np.ascontiguousarray(points / RESOLUTION),
+        np.column_stack((np.cos(turns), np.sin(turns))), start, sums)
+    nodes = _sorted(sums[:, :, :across].astype(np.int64), rival * least * certain)
+    best, at, column, row = search_kernels.branch_and_bound(
+        field.levels, cells, nodes, 2 * most, int(least * certain), np.full(6, -1.0))
     if at < 0:
         return None
-    around = np.array([at, dx, dy, _SAME_TURN / TURN, _SAME / RESOLUTION,
+    around = np.array([at, column, row, _SAME_TURN / TURN, _SAME / RESOLUTION,
                        2 * np.pi / TURN])
     second, other, *_ = search_kernels.branch_and_bound(
-        levels, margin, cells, nodes, scores, most, rival * score, around)
-    pose = np.array([*(centre[:2] + RESOLUTION * np.array([dx, dy])), turns[at]])
-    return Peak(pose, score, second if other >= 0 else 0.0)
+        field.levels, cells, nodes, 2 * most, int(rival * best), around)
+    shift = RESOLUTION * (np.array([column, row]) - most)
+    return Peak(np.array([*(centre[:2] + shift), turns[at]]), best / certain,
+                second / certain if other >= 0 else 0.0)
+
+
+def _sorted(bounds: Indices, least: float) -> Indices:
+    """Return turn, column, row and bound of the squares above `least`, (k, 4), the best first."""
+    above = np.flatnonzero(bounds > least)
+    found = bounds.ravel()[above]
+    order = np.argsort(-found, kind='stable')
+    t, a, b = np.unravel_index(above[order], bounds.shape)
+    return np.column_stack((t, WIDTH * a, WIDTH * b, found[order])).astype(np.int64)

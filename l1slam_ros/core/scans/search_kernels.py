@@ -6,52 +6,63 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled loops of `search`: branch and bound over shifts and turns of a scan."""
+"""
+The compiled loops of `search`: branch and bound over shifts and turns of a scan.
+
+A scan's points are cells of a grid for each turn, (t, n, 2), at the lowest shift; shifts are so
+many cells from there. Scores are sums of likelihoods over the points.
+"""
 
 import numpy as np
 
 from l1slam_ros.core.kernels.compiled import compiled, loop
 
+# The widest bounds are over so many shifts each way, a power of two.
+WIDTH = 16
 
-@loop('(f4[:, :, ::1], i8[::1], i8[:, :, ::1], i8[::1], i8[::1])')
-def widest_nodes(levels, margin, cells, lowest, highest):
+
+@loop('(u1[:, :, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1], u2[:, :, ::1])')
+def add_widest_bounds(blocks, points, turns, start, sums):
     """
-    Return where a search begins: the nodes of the highest level, and bounds of their scores.
+    Add up bounds of the scores of all shifts, by squares of `WIDTH` shifts; return the cells.
 
-    levels : (h + 1, a, b) the likelihood, pooled over 1, 2, 4, ... cells; margin : (2,) cells of
-    the grid before cell (0, 0) of the shifts; cells : (t, n, 2) cells of the points for each turn,
-    unshifted; lowest, highest : (2,) of the shifts, inclusive
+    blocks : see `Field.blocks`; points : (n, 2) of the scan, in cells; turns : (t, 2) cosine and
+    sine of each; start : (2,) where the scan's (0, 0) lies at the lowest shift, in cells of the
+    levels; sums : (t, a, w) of each turn and so many squares each way, w = `WIDTH`: of more than a
+    nobody asks, but so many are added in one step of the processor
 
     Returns
     -------
-    nodes (k, 3): turn, column, row of each, and bounds (k,), the best one first
+    cells (t, n, 2) of the points
 
     """
-    height = len(levels) - 1
-    width = 1 << height
-    across = (highest[0] - lowest[0]) // width + 1
-    along = (highest[1] - lowest[1]) // width + 1
-    nodes = np.empty((len(cells) * across * along, 3), np.int64)
-    scores = np.empty(len(nodes))
-    count = 0
-    for t in range(len(cells)):
-        for x in range(lowest[0], highest[0] + 1, width):
-            for y in range(lowest[1], highest[1] + 1, width):
-                nodes[count, 0], nodes[count, 1], nodes[count, 2] = t, x, y
-                scores[count] = _score(levels[height], margin, cells[t], x, y)
-                count += 1
-    order = np.argsort(-scores)
-    return nodes[order], scores[order]
+    columns, rows, wide = blocks.shape[2], blocks.shape[3], np.uint64(sums.shape[2])
+    cells = np.empty((len(turns), len(points), 2), np.int32)
+    for t in range(len(turns)):
+        c, s = turns[t, 0], turns[t, 1]
+        for k in range(len(points)):
+            x, y = points[k, 0], points[k, 1]
+            u = int(np.floor(c * x - s * y + start[0]))
+            v = int(np.floor(s * x + c * y + start[1]))
+            cells[t, k, 0], cells[t, k, 1] = u, v
+            plane = blocks[u % WIDTH, v % WIDTH]
+            first, left = u // WIDTH, np.uint64(min(max(v // WIDTH + WIDTH, 0), rows - WIDTH))
+            for a in range(max(-first, 0), min(sums.shape[1], columns - first)):
+                for b in range(wide):
+                    sums[t, a, b] += plane[first + a, left + b]
+    return cells
 
 
-@loop('(f4[:, :, ::1], i8[::1], i8[:, :, ::1], i8[:, ::1], f8[::1], i8[::1], f8, f8[::1])')
-def branch_and_bound(levels, margin, cells, nodes, scores, highest, least, excluded):
+@loop('(u1[:, :, ::1], i4[:, :, ::1], i8[:, ::1], i8, i8, f8[::1])')
+def branch_and_bound(levels, cells, nodes, most, least, excluded):
     """
     Return the best shift of a scan over a likelihood grid for any of its turns.
 
-    levels, margin, cells, highest, nodes, scores : see `widest_nodes`; least : score to beat;
-    excluded : (6,) turn, shift (2), how many turns and cells around it do not count, and after how
-    many turns they begin anew; fewer than no turns: nothing is excluded
+    levels : see `Field.levels`; cells : see `widest_bounds`; nodes : (k, 4) turn, column, row and
+    bound of the squares of shifts to be looked into, the best one first; most : the greatest shift
+    each way; least : score to beat; excluded : (6,) turn, shift (2), how many turns and cells
+    around it do not count, and after how many turns they begin anew; fewer than no turns: nothing
+    is excluded
 
     Returns
     -------
@@ -61,66 +72,63 @@ def branch_and_bound(levels, margin, cells, nodes, scores, highest, least, exclu
     Algorithm 3.
 
     """
-    height = len(levels) - 1
-    best, found = least, np.array([-1, 0, 0])
-    stack = np.empty((4 * height + 4, 4), np.int64)
-    bounds = np.empty(4 * height + 4)
+    top = len(levels) - 1
+    best, turn, column, row = least, -1, 0, 0
+    # Turn, column, row, bound, level.
+    stack = np.empty((4 * top + 4, 5), np.int64)
     for at in range(len(nodes)):
-        if scores[at] <= best:
+        if nodes[at, 3] <= best:
             break
-        stack[0, :3] = nodes[at]
-        stack[0, 3], bounds[0] = height, scores[at]
+        for k in range(4):
+            stack[0, k] = nodes[at, k]
+        stack[0, 4] = top
         depth = 1
         while depth > 0:
             depth -= 1
-            if bounds[depth] <= best:
+            if stack[depth, 3] <= best:
                 continue
-            if stack[depth, 3] > 0:
-                depth = _branch(levels, margin, cells, highest, best, stack, bounds, depth)
-            elif _counts(stack[depth], excluded):
-                best = bounds[depth]
-                found[:] = stack[depth, :3]
-    return best, found[0], found[1], found[2]
+            if stack[depth, 4] > 0:
+                depth = _branch(levels, cells, most, best, stack, depth)
+            elif _counts(stack, depth, excluded):
+                turn, column, row = stack[depth, 0], stack[depth, 1], stack[depth, 2]
+                best = stack[depth, 3]
+    return best, turn, column, row
 
 
 @compiled
-def _branch(levels, margin, cells, highest, best, stack, bounds, depth):
+def _branch(levels, cells, most, best, stack, first):
     """Put the quarters of a node in its place on the stack, the best one on top; return depth."""
-    t, x, y, level = stack[depth, 0], stack[depth, 1], stack[depth, 2], stack[depth, 3] - 1
-    half, first = 1 << level, depth
-    for dx in (0, half):
-        for dy in (0, half):
-            if x + dx > highest[0] or y + dy > highest[1]:
-                continue
-            score = _score(levels[level], margin, cells[t], x + dx, y + dy)
-            if score <= best:
-                continue
-            place = depth
-            while place > first and bounds[place - 1] > score:
-                bounds[place] = bounds[place - 1]
-                stack[place] = stack[place - 1]
-                place -= 1
-            bounds[place] = score
-            stack[place, 0], stack[place, 1] = t, x + dx
-            stack[place, 2], stack[place, 3] = y + dy, level
-            depth += 1
+    t, x, y, level = stack[first, 0], stack[first, 1], stack[first, 2], stack[first, 4] - 1
+    half, depth = 1 << level, first
+    grid = levels[level]
+    last_column, last_row = np.uint64(grid.shape[0] - 1), np.uint64(grid.shape[1] - 1)
+    sums = (0, 0, 0, 0)
+    for k in range(cells.shape[1]):
+        u, v = cells[t, k, 0] + x, cells[t, k, 1] + y
+        # Beyond the edge there is nothing, as on it; what is negative is far beyond, unsigned.
+        a, b = min(np.uint64(u), last_column), min(np.uint64(u + half), last_column)
+        c, d = min(np.uint64(v), last_row), min(np.uint64(v + half), last_row)
+        sums = (sums[0] + grid[a, c], sums[1] + grid[a, d], sums[2] + grid[b, c],
+                sums[3] + grid[b, d])
+    for q in range(4):
+        u, v = x + half * (q >> 1), y + half * (q & 1)
+        if sums[q] <= best or u > most or v > most:
+            continue
+        place = depth
+        while place > first and stack[place - 1, 3] > sums[q]:
+            for k in range(5):
+                stack[place, k] = stack[place - 1, k]
+            place -= 1
+        stack[place, 0], stack[place, 1], stack[place, 2] = t, u, v
+        stack[place, 3], stack[place, 4] = sums[q], level
+        depth += 1
     return depth
 
 
 @compiled
-def _counts(node, excluded):
+def _counts(stack, at, excluded):
     """Tell whether a node is outside what is excluded."""
-    turns = abs(node[0] - excluded[0])
+    turns = abs(stack[at, 0] - excluded[0])
     return (excluded[3] < 0 or min(turns, excluded[5] - turns) > excluded[3]
-            or abs(node[1] - excluded[1]) > excluded[4]
-            or abs(node[2] - excluded[2]) > excluded[4])
-
-
-@compiled
-def _score(likelihood, margin, cells, x, y):
-    total = 0.0
-    for k in range(len(cells)):
-        column, row = cells[k, 0] + x + margin[0], cells[k, 1] + y + margin[1]
-        if 0 <= column < likelihood.shape[0] and 0 <= row < likelihood.shape[1]:
-            total += likelihood[column, row]
-    return total / len(cells)
+            or abs(stack[at, 1] - excluded[1]) > excluded[4]
+            or abs(stack[at, 2] - excluded[2]) > excluded[4])

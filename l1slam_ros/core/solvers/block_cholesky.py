@@ -24,7 +24,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from l1slam_ros.core import kernels
+from l1slam_ros.core import kernels, memory
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
@@ -42,8 +42,6 @@ Columns = tuple[Places, Indices, Places]
 _NONE = np.zeros(0, np.int64)
 _NO_COLUMNS = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32)
 
-# Numbers that one gigabyte holds.
-MOST_ENTRIES = 135_000_000
 # Multiplications for each keyframe from which a factorisation is long: what another order spares
 # of a few of them is then more than it takes to find.
 _LONG = 8000
@@ -62,6 +60,14 @@ _LOOSE = 1e-9
 # its own: what lies across two lines takes twice as long to read, a row is an eighth longer at
 # most.
 _LINE, _WIDE = 8, 64
+# Bytes of a number, and of all that a solve keeps of a factor for each entry of one of its
+# Jacobians: measured, 1.7 kB of a factor in the plane, most of it rows of the interior point.
+_NUMBER, _BYTES_PER_ENTRY = 8, 190
+# Seconds that the steps of an exact L1 map, its seed included, take of a factor for each such
+# entry; how many factorisations it needs, and how many multiplications a second has: measured from
+# 25,000 to 200,000 keyframes on a core of the machine of doc/performance.md; at 1,000,000 it takes
+# 1.4 times as long, and 1.1 times the memory.
+_SECONDS_PER_ENTRY, _FACTORISATIONS, _RATE = 6e-6, 45, 1e10
 
 
 @dataclass(frozen=True)
@@ -85,6 +91,11 @@ class Pattern:
     work: float
     columns: Columns
     found: int
+
+    @property
+    def blocks(self) -> int:
+        """Blocks in all panels."""
+        return int((np.diff(self.first) * np.diff(self.start)).sum())
 
     @cached_property
     def owner(self) -> Places:
@@ -123,14 +134,14 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
 
     Raises
     ------
-    FillError : the factor would have more than `most_blocks`.
+    FillError : the factor would have more than `most_blocks`, as far as it was looked at.
 
     """
     graph = neighbours(keyframe, size)
     if before is not None and before.found <= size < _GROWN * before.found:
         begun = kernels.symbolic.untouched(*graph, *before.columns)
         pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), begun, before.found)
-        if pattern is not None:
+        if pattern is not None and pattern.blocks <= most_blocks:
             return pattern
     pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), _NO_COLUMNS, size)
     for dissect, least in (kernels.ordering.dissect, 0.0), (kernels.dissection.dissect, _VAST):
@@ -138,10 +149,34 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
             dissected = _laid_out(graph, most_blocks, dissect(*graph), _NO_COLUMNS, size)
             if dissected and not (pattern and pattern.work <= dissected.work):
                 pattern = dissected
-    if pattern is None:
-        raise FillError(f'the factor of {size} keyframes and {len(keyframe)} factors would have '
-                        f'more than {most_blocks} blocks: too many far places are joined')
+    blocks = most_blocks + 1 if pattern is None else pattern.blocks
+    if pattern is None or blocks > most_blocks:
+        raise FillError(f'the factor of {size} keyframes and {len(keyframe)} factors has '
+                        f'{blocks} blocks or more', blocks)
     return pattern
+
+
+def needs(graph: FactorGraph, blocks: float, work: float) -> memory.Needs:
+    """Predict the needs of a graph from the blocks and the work of its factor."""
+    k, m = graph.manifold.TANGENT_SIZE, len(graph.between)
+    return memory.Needs(blocks * _bytes_of_block(graph) + _BYTES_PER_ENTRY * k**2 * m,
+                        _SECONDS_PER_ENTRY * k**2 * m + _FACTORISATIONS * work * k**3 / _RATE)
+
+
+def most_blocks(graph: FactorGraph) -> int:
+    """Return how many blocks a factor of the graph may have that is to fit into memory."""
+    left = (memory.free() - needs(graph, 0.0, 0.0).memory) / _bytes_of_block(graph)
+    return int(min(max(left, 0.0), graph.n_poses * (graph.n_poses + 1.0)))
+
+
+def _bytes_of_block(graph: FactorGraph) -> int:
+    """Return what a block takes [B]: of whole poses, and of those parts that a seed solves for."""
+    manifold = graph.manifold
+    k = manifold.TANGENT_SIZE
+    parts = {len(range(*part.indices(k))) for part in (manifold.TRANSLATION, manifold.ROTATION)}
+    # The chordal relaxation has blocks of a rotation matrix.
+    parts |= {k, manifold.rotation(manifold.identity(1)).shape[-1]}
+    return _NUMBER * sum(size * size for size in parts)
 
 
 def _laid_out(graph: tuple[Places, Places], most_blocks: int, stage: Places, begun: Columns,
@@ -302,12 +337,19 @@ def cholesky_of(graph: FactorGraph, before: Pattern | None = None) -> BlockChole
 
     Raises
     ------
-    FillError : the factor would have more than `MOST_ENTRIES`.
+    FillError : a solve by them would take more memory than is free.
 
     """
     fixed = anchor(graph)
     keyframe = keyframes_of(graph, fixed)
-    most_blocks = MOST_ENTRIES // graph.manifold.TANGENT_SIZE**2
-    pattern = find_pattern(keyframe, graph.n_poses - fixed, most_blocks,
-                           graph.manifold.TANGENT_SIZE, before)
+    try:
+        pattern = find_pattern(keyframe, graph.n_poses - fixed, most_blocks(graph),
+                               graph.manifold.TANGENT_SIZE, before)
+    except FillError as error:
+        takes = needs(graph, error.blocks, 0.0).memory
+        raise FillError(
+            f'factorising {graph.n_poses} keyframes and {len(graph.between)} factors takes '
+            f'{memory.in_gigabytes(takes)} of memory or more, and '
+            f'{memory.in_gigabytes(memory.free())} are free',
+            error.blocks) from error
     return BlockCholesky(pattern, keyframe, loose_keyframes(graph))

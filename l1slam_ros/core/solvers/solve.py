@@ -18,8 +18,10 @@ from typing import Protocol
 from l1slam_ros.core.errors import FillError
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.memory import Needs
 from l1slam_ros.core.names import NORMS, SAME, SOLVERS
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, Pattern, cholesky_of
+from l1slam_ros.core.solvers.block_cholesky import needs as needs_of
 from l1slam_ros.core.solvers.exact import minimise_interior_point
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, gauss_newton
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution, minimise
@@ -30,14 +32,13 @@ AUTO, PRIMAL_DUAL, INTERIOR_POINT, *_ = SOLVERS
 L1_NORM, GROUP_L1_NORM, *_ = NORMS
 # What other norms are minimised by.
 GAUSS_NEWTON, PRIMAL_DUAL_NEWTON = 'gauss-newton', 'primal-dual-newton'
-# Multiplications of blocks in one factorisation that a factor of the graph may cost before the
-# primal-dual method is the quicker one: measured, some 25 factorisations against some 6,000
-# iterations, each of which passes once over the factors.
-_WORK_PER_FACTOR = 700.0
+# Seconds of the primal-dual method for a factor and entry of its Jacobian, some 14,000 passes over
+# the factors; on a large graph it takes more of them, as that is wider: so many times as often as
+# the keyframes beyond this number.
+_SECONDS_OF_PASSES, _WIDE = 1.6e-5, 50_000
 # Why a solver was chosen.
 _SPARSE = 'the graph is sparse'
 _DENSE = 'the graph is dense'
-_TOO_DENSE = 'the graph is too dense to be factorised'
 
 
 class L1Solver(Protocol):
@@ -60,9 +61,10 @@ class Method:
     """
     What a graph is solved by.
 
-    cholesky : of the graph, None where it fills in too much; solver : of `SOLVERS`, not `auto`;
-    reason : a clause that says why; falls_back : another solver may go on where it fails; norm :
-    what is minimised of odometry; loop_norm : of all else.
+    cholesky : of the graph, None where it does not fit into memory; solver : of `SOLVERS`, not
+    `auto`; reason : a clause that says why; falls_back : another solver may go on where it fails;
+    norm : what is minimised of odometry; loop_norm : of all else; needs : what an exact L1 map
+    takes, None where another method was chosen.
     """
 
     cholesky: BlockCholesky | None
@@ -71,6 +73,7 @@ class Method:
     falls_back: bool = False
     norm: str = L1_NORM
     loop_norm: str = SAME
+    needs: Needs | None = None
 
 
 def norm_for(graph: FactorGraph, norm: str, loop_norm: str, delta: float) -> SmoothNorm:
@@ -90,13 +93,13 @@ def norm_for(graph: FactorGraph, norm: str, loop_norm: str, delta: float) -> Smo
 def choose(solver: str, graph: FactorGraph, norm: str = L1_NORM, loop_norm: str = SAME,
            before: Pattern | None = None) -> Method:
     """
-    Resolve one of `SOLVERS`: `auto` goes by the predicted work of a factorisation.
+    Resolve one of `SOLVERS`: `auto` goes by predicted memory and time.
 
     Norms other than L1 have one solver each, and mixed ones another. before : see `find_pattern`
 
     Raises
     ------
-    FillError : what was asked for needs a factorisation, and the graph fills in.
+    FillError : what was asked for needs a factorisation, and that does not fit into memory.
 
     """
     if loop_norm not in (SAME, norm):
@@ -107,15 +110,18 @@ def choose(solver: str, graph: FactorGraph, norm: str = L1_NORM, loop_norm: str 
         return Method(cholesky_of(graph), found_by, f'the norm is {norm}', norm=norm)
     try:
         cholesky = cholesky_of(graph, before)
-    except FillError:
+    except FillError as error:
         if solver not in (AUTO, PRIMAL_DUAL):
             raise
-        return Method(None, PRIMAL_DUAL, _TOO_DENSE)
+        return Method(None, PRIMAL_DUAL, str(error))
+    needs = needs_of(graph, cholesky.pattern.blocks, cholesky.pattern.work)
     if solver != AUTO:
-        return Method(cholesky, solver, 'asked for')
-    work = cholesky.pattern.work / max(len(graph.between), 1)
-    if work <= _WORK_PER_FACTOR:
-        return Method(cholesky, INTERIOR_POINT, _SPARSE, falls_back=True)
+        return Method(cholesky, solver, 'asked for',
+                      needs=needs if solver == INTERIOR_POINT else None)
+    passes = (_SECONDS_OF_PASSES * graph.manifold.TANGENT_SIZE**2 * len(graph.between)
+              * max(1.0, graph.n_poses / _WIDE))
+    if needs.seconds <= passes:
+        return Method(cholesky, INTERIOR_POINT, _SPARSE, falls_back=True, needs=needs)
     return Method(cholesky, PRIMAL_DUAL, _DENSE, falls_back=True)
 
 

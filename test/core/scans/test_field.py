@@ -11,7 +11,8 @@
 import numpy as np
 from scipy.spatial import KDTree
 
-from l1slam_ros.core.scans.field import REACH, RESOLUTION, Field
+from l1slam_ros.core.scans.field import CERTAIN, REACH, RESOLUTION, Field
+from l1slam_ros.core.scans.search_kernels import WIDTH
 
 
 def test_what_is_looked_up_is_the_nearest_point():
@@ -26,18 +27,29 @@ def test_what_is_looked_up_is_the_nearest_point():
     assert (field.nearest[near] == nearest[near]).all()
     assert (field.nearest[distance > REACH + 1e-9] == -1).all()
     expected = np.where(near, np.exp(-distance**2 / (2 * RESOLUTION**2)), 0)
-    assert np.allclose(field.likelihood, expected, atol=1e-6)
+    assert np.allclose(field.likelihood / CERTAIN, expected, atol=0.5 / CERTAIN + 1e-6)
 
 
 def test_a_level_bounds_what_is_in_its_cells():
     rng = np.random.default_rng(1)
     field = Field.of(rng.uniform(0, 4, (20, 2)), np.ones((20, 2)))
-    levels, margin = field.levels
+    levels = field.levels
     for height, level in enumerate(levels):
         width = 1 << height
         for a, b in rng.integers(0, np.array(level.shape) - width, (50, 2)):
             assert level[a, b] == levels[0][a : a + width, b : b + width].max()
-    assert (levels[0][margin[0]:, margin[1]:] == field.likelihood).all()
+        assert not level[[0, -1]].any() and not level[:, [0, -1]].any()
+    assert (levels[0][WIDTH:-1, WIDTH:-1] == field.likelihood).all()
+
+
+def test_blocks_are_the_widest_level():
+    rng = np.random.default_rng(2)
+    field = Field.of(rng.uniform(0, 6, (20, 2)), np.ones((20, 2)))
+    last = field.levels[-1]
+    blocks = field.blocks[..., WIDTH:-WIDTH]
+    for a, b in rng.integers(0, last.shape, (100, 2)):
+        assert blocks[a % WIDTH, b % WIDTH, a // WIDTH, b // WIDTH] == last[a, b]
+    assert blocks.sum(dtype=int) == field.blocks.sum(dtype=int) == last.sum(dtype=int)
 
 
 def test_a_field_of_nothing_has_nothing():

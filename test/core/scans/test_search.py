@@ -13,7 +13,7 @@ import pytest
 from rooms import WALLS, box, scan_at
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.scans.field import RESOLUTION, Field
+from l1slam_ros.core.scans.field import CERTAIN, RESOLUTION, Field
 from l1slam_ros.core.scans.points import points_of
 from l1slam_ros.core.scans.search import TURN, search
 
@@ -49,9 +49,21 @@ def test_it_is_the_best_of_all_shifts_and_turns():
                 a, b = (cells + (dx, dy)).T
                 inside = (a >= 0) & (b >= 0) & (a < field.likelihood.shape[0]) & (
                     b < field.likelihood.shape[1])
-                score = field.likelihood[a[inside], b[inside]].sum() / len(xy)
-                best = max(best, float(score))
+                score = field.likelihood[a[inside], b[inside]].sum(dtype=int) / len(xy)
+                best = max(best, float(score) / CERTAIN)
     assert peak.score == pytest.approx(best, abs=1e-6)
+
+
+def test_a_search_looks_beyond_the_edges_of_the_map():
+    """Where part of a scan, or all of it, is off the map, what is on it counts as ever."""
+    field = Field.of(*surface(HERE))
+    xy = surface((2.0, 1.3, 0.8), seed=1)[0]
+    near = search(field, xy, np.zeros(3), 1.0, 0.7, 0.3, 0.85)
+    for off in ((7.5, 0), (-7.5, 3), (0, -7.5), (5, 7.5)):
+        far = search(field, xy, np.array([*off, 0.0]), 8.0, 0.7, 0.3, 0.85)
+        assert far.score == pytest.approx(near.score, abs=0.02)
+        assert np.allclose(far.pose, near.pose, atol=RESOLUTION + 1e-9)
+        assert search(field, xy, np.array([300.0, *off[:1], 0.0]), 8.0, 0.7, 0.3, 0.85) is None
 
 
 def test_of_two_equal_rooms_it_cannot_tell_which():

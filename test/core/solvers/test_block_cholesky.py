@@ -364,7 +364,10 @@ def test_a_graph_that_grows_keeps_its_order_for_a_while(rng):
 def test_too_much_fill_is_refused():
     keyframe = np.array([(i, j) for i in range(20) for j in range(i)])
     below = 20 * 19 // 2
-    assert find_pattern(keyframe, 20, below).first.tolist() == [0, 20]
-    with pytest.raises(FillError, match=f'20 keyframes and {below} factors .* more than '
-                       f'{below - 1} blocks'):
-        find_pattern(keyframe, 20, below - 1)
+    assert find_pattern(keyframe, 20, 20**2).first.tolist() == [0, 20]
+    # Found, but too large; and given up on the way, which is a bound from below.
+    for most, least in (20**2 - 1, 20**2), (below - 1, below):
+        with pytest.raises(FillError, match=f'20 keyframes and {below} factors .* {least} blocks '
+                           'or more') as refusal:
+            find_pattern(keyframe, 20, most)
+        assert refusal.value.blocks == least

@@ -8,13 +8,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which solver a graph gets: by what a factorisation costs, by name, and where one fails."""
 
+import re
+
 import pytest
 from problems import chain_and_loops, drive, graph_of
 
+from l1slam_ros.core import memory
 from l1slam_ros.core.errors import FillError, L1SlamError
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.names import SOLVERS
-from l1slam_ros.core.solvers import block_cholesky as cholesky
+from l1slam_ros.core.solvers import block_cholesky
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import Status
 from l1slam_ros.core.solvers.seed import seed_poses
@@ -79,21 +82,43 @@ def test_a_graph_that_fills_in_gets_algorithm_4(world, monkeypatch):
     """With memory for a few blocks only: nothing is factored, and it is solved all the same."""
     graph = world.graph
     expected = minimise_by(choose(AUTO, graph), graph, world.truth, DEFAULTS)[0].cost
-    monkeypatch.setattr(cholesky, 'MOST_ENTRIES', 9 * 30)
+    monkeypatch.setattr(block_cholesky, 'most_blocks', lambda graph: 30)
     for solver in AUTO, PRIMAL_DUAL:
         method = choose(solver, graph)
         assert (method.cholesky, method.solver) == (None, PRIMAL_DUAL)
-        assert method.reason == 'the graph is too dense to be factorised'
+        assert re.fullmatch(r'factorising 60 keyframes and [0-9]+ factors takes [0-9.e-]+ GB of '
+                            r'memory or more, and [0-9.]+ GB are free', method.reason)
         solution, name = minimise_by(method, graph, seed_poses(graph, None), DEFAULTS)
         assert name == PRIMAL_DUAL
         assert solution.cost == pytest.approx(expected, rel=1e-3)
 
 
 def test_the_interior_point_of_a_graph_that_fills_in_is_refused(world, monkeypatch):
-    monkeypatch.setattr(cholesky, 'MOST_ENTRIES', 9 * 30)
-    with pytest.raises(FillError, match='60|59 keyframes') as refusal:
+    monkeypatch.setattr(memory, 'free', lambda: 150_000.0)
+    said = r'60 keyframes .* takes 0\.000[0-9]+ GB .* 0\.00015 GB are free'
+    with pytest.raises(FillError, match=said) as refusal:
         choose(INTERIOR_POINT, world.graph)
     assert isinstance(refusal.value, L1SlamError) and '\n' not in str(refusal.value)
+
+
+def test_the_memory_of_the_factor_is_predicted_to_a_third(rng):
+    """That of the blocks of all sizes which a seed and a map lay out."""
+    graph = simulate_world(600, 1200, WorldOptions(), rng).graph
+    method = choose(AUTO, graph)
+    seed_poses(graph, method.cholesky)
+    minimise_by(method, graph, odometry_poses(graph), OptimiserOptions(outer_iterations=2))
+    taken = sum(layout.panels.nbytes for layout in method.cholesky._layouts.values())
+    blocks = method.needs.memory - block_cholesky.needs(graph, 0.0, 0.0).memory
+    assert 0.75 * taken < blocks < 1.33 * taken
+
+
+def test_what_does_not_fit_grows_with_the_graph_and_what_fits_is_never_refused(monkeypatch, rng):
+    graph = simulate_world(600, 1200, WorldOptions(), rng).graph
+    needed = choose(INTERIOR_POINT, graph).needs.memory
+    monkeypatch.setattr(memory, 'free', lambda: 1.001 * needed)
+    assert choose(AUTO, graph).solver == INTERIOR_POINT
+    monkeypatch.setattr(memory, 'free', lambda: 0.999 * needed)
+    assert choose(AUTO, graph).cholesky is None
 
 
 @pytest.mark.parametrize('solver, expected', [(AUTO, PRIMAL_DUAL), (INTERIOR_POINT,) * 2])
