@@ -34,7 +34,7 @@ from l1slam_ros.core.robust.pairwise_consistency import (
     spanned,
     strongest_group,
 )
-from l1slam_ros.core.robust.places import err_together
+from l1slam_ros.core.robust.places import err_together, join_what_no_other
 from l1slam_ros.core.robust.rounds import Growth
 
 # Most loops are refused; all that are accepted are of one place; loops of one place alone say how
@@ -291,10 +291,8 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
     i, j = part[growth.low[rows]], part[growth.high[rows]]
     _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
     joins = growth.accepted[rows]
-    may = _joins_what_no_other(place, np.sort((i, j), axis=0), joins)
-    for number in np.argsort(-count, kind='stable'):
-        if not may[number]:
-            continue
+    order = np.argsort(-count, kind='stable')
+    for number in order[join_what_no_other(place, np.sort((i, j), axis=0), joins)[order]]:
         own = place == number
         without, joined = (
             len(np.unique(lowest_of_components(i[some], j[some], part.max() + 1)))
@@ -303,22 +301,6 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
             # Rivals that say it otherwise are of the same doubt.
             joins |= own
             yield rows[own]
-
-
-def _joins_what_no_other(place: Indices, parts: Indices, joins: Mask) -> Mask:
-    """
-    Return which places have a loop between two parts that no accepted loop elsewhere joins.
-
-    place : (m,) of each loop; parts : (2, m) that it joins, the lower first; joins : (m,) accepted
-    """
-    _, pair = np.unique(parts, axis=1, return_inverse=True)
-    pair, alone = pair.ravel(), np.zeros(place.max(initial=-1) + 1, bool)
-    accepted = np.bincount(pair[joins], minlength=len(pair))
-    of_place = place * (len(pair) + 1) + pair
-    _, number = np.unique(of_place, return_inverse=True)
-    here = np.bincount(number, joins, len(pair))
-    alone[place[accepted[pair] == here[number]]] = True
-    return alone
 
 
 def _agree_at_a_place(growth: Growth) -> Indices:
