@@ -48,6 +48,7 @@ def with_judge(state=RESTED, **changes):
     return replace(state, judged=replace(state.judged, **changes))
 
 
+MET = replace(with_front(closed=True), made=NOW - 1.0)
 PENDING = replace(RESTED, pending=JUDGEMENT)
 UNFINISHED = replace(RESTED, optimised=replace(MAP, status=Status.OUT_OF_TIME))
 DOUBTED = with_judge(loops=2, anew=1, doubted=2, anew_ended=NOW - 5.0, anew_took=1.0)
@@ -92,11 +93,12 @@ TABLE = {
     'no norm is asked of a map that is to be made anew': (
         with_judge(PENDING, compared=None), SIZE, IDLE, Work.ROUND, None),
     'two robots met: a map without their loops is not begun': (
-        with_judge(with_front(closed=True), wanted=True), MEETING, BUSY, None, Work.JUDGE),
-    'the same while they are judged': (with_front(closed=True), MEETING, JUDGING, None, None),
-    'the same once they are': (with_front(closed=True), MEETING, BUSY, Work.ROUND, None),
-    'the front takes what came': (
-        with_front(closed=True), ONE_MORE_LOOP, JUDGING, Work.ROUND, None),
+        with_judge(MET, wanted=True), MEETING, BUSY, None, Work.JUDGE),
+    'the same while they are judged': (MET, MEETING, JUDGING, None, None),
+    'the same once they are': (MET, MEETING, BUSY, Work.ROUND, None),
+    'the same while it judges on': (
+        with_judge(MET, ended=NOW - 0.5), MEETING, JUDGING, Work.ROUND, None),
+    'the front takes what came': (MET, ONE_MORE_LOOP, JUDGING, Work.ROUND, None),
     'the map that was judged first comes before a judgement anew': (
         with_judge(PENDING, anew=1), SIZE, IDLE, Work.ROUND, None),
     'where nothing is doubted, nothing is judged': (

@@ -124,10 +124,11 @@ def is_beyond_fronts(state: MapState, size: Size) -> bool:
     """
     Return whether more has come than the front of a new map would take, as when two robots meet.
 
-    Then a map that is begun before the loops are judged is out of date when it is made.
+    Then a map that is begun before the loops are judged is out of date when it is made. It waits
+    for one judgement at most.
     """
     carried = state.carried
-    return carried is not None and (
+    return carried is not None and state.judged.ended <= state.made and (
         (size.factors - carried.rows) * size.rows > MOST_ROWS * size.factors)
 
 
