@@ -10,13 +10,13 @@
 One graph cut into robots: whether the same loops are believed as in one piece.
 
     python benchmarks/fleet/cut.py --datasets DIR [--graphs manhattan3500,city10000,building]
-        [--robots 2,5,20] [--lies 0.3] [--late 5]
+        [--robots 2,5,20] [--lies 0.3] [--dropped 0.5] [--late 5]
 
-To the graph false loops of the kind `random` are added, so many for each loop. Its keyframes then
-go in equal pieces to so many robots, each with a letter in its vertex ids, as a g2o file: the
-edges are the same, but at a cut there is no odometry. Printed is for how many loops the verdict is
-another one, and how far the L1 optimum of the loops that the cut graph accepts is from that of the
-same loops in the graph in one piece.
+With `--dropped`, this share of the graph's loops is left out first. False loops of the kind
+`random` are added, so many for each loop. The keyframes then go in equal pieces to so many robots,
+each with a letter in its vertex ids, as a g2o file: the edges are the same, but at a cut there is
+no odometry. Printed is for how many loops the verdict is another one, and how far the L1 optimum
+of the loops that the cut graph accepts is from that of the same loops in the graph in one piece.
 
 With `--late` the pieces are driven as well, as messages to a running back end, a keyframe of each
 robot a second, each robot late by a number of seconds up to this; the last column is for how many
@@ -53,9 +53,12 @@ _EVERY = BackendOptions.from_mapping({
     'odometry': {'covariance_source': 'increment'}, 'loop': {'wait': 1e6}})
 
 
-def with_lies(record: GraphRecord, lies: float, seed: int = 0) -> GraphRecord:
-    """Return a graph with so many random false loops for each of its loops."""
-    graph = record.graph
+def with_lies(record: GraphRecord, lies: float, dropped: float = 0.0,
+              seed: int = 0) -> GraphRecord:
+    """Return a graph without some of its loops, and so many random false ones for each other."""
+    whole = record.graph
+    kept = np.random.default_rng(seed + 1).random(len(whole.between)) >= dropped
+    graph = whole.subset(kept | whole.between.is_odometry)
     loops = ~graph.between.is_odometry & ~graph.between.is_absolute
     poses = solve(graph, record.poses, SolveOptions(norm='l2', robust=False)).solution.poses
     false = FALSE_LOOPS['random'](graph, poses, round(lies * int(loops.sum())),
@@ -150,6 +153,7 @@ def main() -> None:
     parser.add_argument('--graphs', default=f'manhattan3500,city10000,{BUILDING}')
     parser.add_argument('--robots', default='2,5,20')
     parser.add_argument('--lies', type=float, default=0.3)
+    parser.add_argument('--dropped', type=float, default=0.0)
     parser.add_argument('--late', type=float, help='drive them, so late at most [s]')
     arguments = parser.parse_args()
     names = ['graph', 'robots', 'loops', 'refused in one piece', 'refused', 'other verdict',
@@ -161,7 +165,7 @@ def main() -> None:
             record = GraphRecord(world.graph, world.odometry, np.arange(_POSES))
         else:
             record = read_graph_file(arguments.datasets / f'{name}.g2o')
-        whole = with_lies(record, arguments.lies)
+        whole = with_lies(record, arguments.lies, arguments.dropped)
         outcome = solve(whole.graph, None, SolveOptions())
         for robots in map(int, arguments.robots.split(',')):
             print(row(name, whole, outcome, robots, arguments.late), flush=True)

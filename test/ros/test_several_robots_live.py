@@ -23,7 +23,7 @@ from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.io.messages.conversion import reference_frame_id
 from l1slam_ros.ros.publishing import header
 
-NAMES = ['r1', 'r2']
+NAMES = [f'r{k}' for k in range(1, 6)]
 
 
 def message_of(found):
@@ -44,7 +44,7 @@ def message_of(found):
 
 
 def play(b, team, late=0, between=True):
-    """Send all that two robots say, as fast as it is used."""
+    """Send all that robots say, as fast as it is used."""
     sent, traffic = 0, b.backend._inputs.traffic
     for robot, found in team.messages(late):
         topic, message = message_of(found)
@@ -71,17 +71,20 @@ def settled(b, joined):
         'map' if joined else 'r2/map'), 'the path of the second robot is in its map')
 
 
-@pytest.mark.parametrize('late', [0, 5])
-def test_two_robots_with_lies_between_them_have_the_loops_of_the_batch(bench, late):
-    team, b = Team(n=240, edges=800, lies=160), bench(robots=NAMES, **EVERY_MESSAGE)
+@pytest.mark.parametrize(('robots', 'late'), [(2, 0), (2, 5), (5, 1.25)])
+def test_robots_with_lies_between_them_have_the_loops_of_the_batch(bench, robots, late):
+    """Each is late by so much more than the one before it."""
+    team, share = Team(n=240, edges=800, lies=160, robots=robots), 240 // robots
+    b = bench(robots=NAMES[:robots], **EVERY_MESSAGE)
     play(b, team, late)
     settled(b, True)
     expected, found = team.believed(), believed_by(b.backend._backend.snapshot())
     assert len(expected) > 150 and len(expected ^ found) <= 0.01 * len(expected)
-    for robot, name in enumerate(NAMES):
+    for robot, name in enumerate(NAMES[:robots]):
+        assert b.backend._backend.robot(robot).joined
         path = b.received[f'{name}/path'][-1]
-        b.until(lambda name=name: len(b.received[f'{name}/path'][-1].poses) == 120, 'all of it')
-        truth = se2.between(np.tile(team.truth[:1], (120, 1)), team.truth[team.robot == robot])
+        b.until(lambda name=name: len(b.received[f'{name}/path'][-1].poses) == share, 'all of it')
+        truth = se2.between(np.tile(team.truth[:1], (share, 1)), team.truth[team.robot == robot])
         path = b.received[f'{name}/path'][-1]
         assert path.header.frame_id == 'map'
         assert np.abs(poses_of(path) - truth)[:, :2].max() < 0.7
@@ -92,7 +95,7 @@ def test_two_robots_with_lies_between_them_have_the_loops_of_the_batch(bench, la
 
 
 def test_a_robot_that_nothing_joins_is_published_in_its_own_map(bench):
-    team, b = Team(n=120, edges=400, lies=0), bench(robots=NAMES, **EVERY_MESSAGE)
+    team, b = Team(n=120, edges=400, lies=0), bench(robots=NAMES[:2], **EVERY_MESSAGE)
     play(b, team, between=False)
     settled(b, False)
     b.until(lambda: len(b.received['r2/path'][-1].poses) == 60, 'all of it')
@@ -110,7 +113,7 @@ def test_a_robot_that_nothing_joins_is_published_in_its_own_map(bench):
 
 def test_a_map_of_two_robots_is_loaded_by_their_names(bench, tmp_path):
     team, path = Team(n=120, edges=400, lies=0), str(tmp_path / 'map.g2o')
-    b = bench(robots=NAMES, save_path=path, **EVERY_MESSAGE)
+    b = bench(robots=NAMES[:2], save_path=path, **EVERY_MESSAGE)
     play(b, team)
     settled(b, True)
     b.until(lambda: len(b.received['r2/path'][-1].poses) == 60, 'all of it')
@@ -118,7 +121,7 @@ def test_a_map_of_two_robots_is_loaded_by_their_names(bench, tmp_path):
     assert call(b, 'save').success
     second = poses_of(b.received['r2/path'][-1])
     b.close()
-    b = bench(robots=NAMES[::-1], save_path=path, load_on_start=True, **EVERY_MESSAGE)
+    b = bench(robots=NAMES[1::-1], save_path=path, load_on_start=True, **EVERY_MESSAGE)
     b.until(lambda: b.received['r2/path'] and len(b.received['r2/path'][-1].poses) == 60,
             'the map is back')
     # The second one is the first now: its frame is that of the map.
@@ -133,7 +136,7 @@ def test_a_map_of_two_robots_is_loaded_by_their_names(bench, tmp_path):
 
 
 def test_a_loop_of_a_robot_that_nobody_named_is_counted_and_said_once(bench, capfd):
-    b = bench(robots=NAMES, **EVERY_MESSAGE)
+    b = bench(robots=NAMES[:2], **EVERY_MESSAGE)
     b.send('/r1/odom', odometry(10**9, 0.0))
     for k in range(3):
         b.send('/r1/loop_closures', loop((5 + k) * 10**9, frame=f'r9/base_link@{k + 1}.000000000'))
@@ -142,8 +145,19 @@ def test_a_loop_of_a_robot_that_nobody_named_is_counted_and_said_once(bench, cap
     assert len(said) == 1 and 'expected one of r1, r2' in said[0]
 
 
+def test_of_many_robots_that_nobody_named_the_first_are_said_and_all_counted(bench, capfd):
+    b = bench(robots=NAMES[:2], **EVERY_MESSAGE)
+    b.send('/r1/odom', odometry(10**9, 0.0))
+    for k in range(60):
+        b.send('/r1/loop_closures', loop(5 * 10**9, frame=f'x{k}/base_link@1.000000000'))
+    b.until(lambda: b.backend._inputs.refused['robot'] == 60, 'they are counted')
+    said = [line for line in capfd.readouterr().err.splitlines() if 'refused:' in line]
+    assert len(said) == 21 and 'more than 20 other robots' in said[-1]
+    assert len(b.backend._inputs._strangers) == 21
+
+
 def test_frames_may_have_the_name_of_the_robot_or_not(bench):
-    b = bench(robots=NAMES, **EVERY_MESSAGE)
+    b = bench(robots=NAMES[:2], **EVERY_MESSAGE)
     for k in range(4):
         b.send('/r1/odom', odometry((1 + k) * 10**9, 1.0 * k, frame='r1/base_link'))
         b.send('/r2/odom', odometry((1 + k) * 10**9, 1.0 * k))

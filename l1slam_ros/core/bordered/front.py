@@ -50,7 +50,7 @@ _REFUSED = 1e-3
 _SURE = 1000.0
 # Rows of a border, and keyframes it touches, that one more update has the time and the memory for.
 # What comes then waits for the next map.
-_MOST_ROWS, _MOST_POINTS = 1800, 1400
+MOST_ROWS, _MOST_POINTS = 1800, 1400
 # What to do with a factor: accept it; skip it, since the map has it or shall not have it; gate it.
 BELIEVE, SKIP, GATE = 1, 0, -1
 
@@ -155,7 +155,7 @@ class Front:
         # leave of it. Till then: of the first factor of a keyframe the mean of all weights and of
         # one without a residual; of a loop the geometric mean of that and of its own.
         self._usual = np.full(k, 1 / np.append(weights, 1 / self._mu).mean())
-        self._systems = [BorderedSystem(cholesky, system.size, k, _MOST_POINTS, _MOST_ROWS)
+        self._systems = [BorderedSystem(cholesky, system.size, k, _MOST_POINTS, MOST_ROWS)
                          for cholesky in choleskys]
         self._first = GrowingArray((2, part.manifold.POSE_SIZE))
         self._first.extend(np.stack(poses, axis=1))
@@ -233,7 +233,7 @@ class Front:
         """Tell whether a factor must wait for the next map."""
         return (max(factors.i[row], factors.j[row]) > self.keyframes
                 or (what == BELIEVE and self._turns(factors, row))
-                or self.border > _MOST_ROWS or self._systems[L2].points > _MOST_POINTS)
+                or self.border > MOST_ROWS or self._systems[L2].points > _MOST_POINTS)
 
     def _turns(self, factors: BetweenFactors, row: int) -> bool:
         """Tell whether a factor is the first that names the world: the gauge is another."""

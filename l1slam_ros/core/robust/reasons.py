@@ -41,6 +41,7 @@ from l1slam_ros.core.robust.pairwise_consistency import (
     spanned,
     strongest_group,
 )
+from l1slam_ros.core.robust.places import join_what_no_other
 from l1slam_ros.core.robust.rounds import Growth
 
 # Of fewer loops most may well be refused, and be of one place; most are more than half by some.
@@ -92,7 +93,8 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
     i, j = part[growth.low[rows]], part[growth.high[rows]]
     _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
     joins = growth.accepted[rows]
-    for number in np.argsort(-count, kind='stable'):
+    order = np.argsort(-count, kind='stable')
+    for number in order[join_what_no_other(place, np.sort((i, j), axis=0), joins)[order]]:
         own = place == number
         without, joined = (
             len(np.unique(lowest_of_components(i[some], j[some], part.max() + 1)))

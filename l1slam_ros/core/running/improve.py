@@ -33,7 +33,7 @@ from l1slam_ros.core.graph.world_frame import placed
 from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.robust.judgement import Judgement
 from l1slam_ros.core.running.optimised import Optimised
-from l1slam_ros.core.running.problem import Problem
+from l1slam_ros.core.running.problem import Problem, on_ties
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 from l1slam_ros.core.solvers.nonlinear import (
     OptimiserOptions,
@@ -271,10 +271,14 @@ def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
 
 def _improvement(solution: Solution, problem: Problem, judgement: Judgement, before: float,
                  steps: int, start: float) -> Improvement:
-    accepted = judgement.accepted
+    accepted, cost, gap = judgement.accepted, solution.cost, solution.gap
+    poses = on_ties(problem, judgement, solution.poses)
+    if poses is not solution.poses:
+        cost = l1_cost(whitened_residual(judgement.believed(problem.graph), poses))
+        gap += cost - solution.cost  # the bound stays
     # Factors that are not accepted have no dual yet.
     dual = np.zeros((len(accepted), problem.graph.manifold.TANGENT_SIZE))
     dual[accepted] = solution.dual.reshape(-1, dual.shape[1])
-    return Improvement(problem.map, solution.poses, dual.ravel(), judgement,
-                       before, solution.cost, solution.status, steps, solution.outer_iterations,
-                       solution.inner_iterations, solution.gap, time.monotonic() - start)
+    return Improvement(problem.map, poses, dual.ravel(), judgement, before, cost, solution.status,
+                       steps, solution.outer_iterations, solution.inner_iterations, gap,
+                       time.monotonic() - start)

@@ -240,7 +240,8 @@ class Snapshot:
         judgement = self.judgement if state.pending is None else self._of_all(state.pending)
         settled = not (grown or state.is_stale) and judgement.settled and last.at_rest
         return Problem(state.began, self.graph, starts, dual, judgement, state.robust,
-                       last.cost * rows / max(len(last.dual), 1), settled, self.pattern)
+                       last.cost * rows / max(len(last.dual), 1), settled,
+                       self._followed(last.poses, self.odometry), pattern=self.pattern)
 
     def optimised(self) -> Optimised:
         """Return the map that was solved for, grown to all keyframes and factors there are."""

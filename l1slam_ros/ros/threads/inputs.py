@@ -41,6 +41,8 @@ from l1slam_ros.ros.threads.intake import Intake
 # publication gives Python up and waits for its turn, and the robot is elsewhere by now.
 _ANSWERED = 5
 _REPEAT_WARNING = 5.0  # [s]
+# So many robots that nobody named are told of by name.
+_MOST_STRANGERS = 20
 
 
 class Inputs:
@@ -183,10 +185,18 @@ class Inputs:
     def _refuse(self, error: L1SlamError) -> None:
         cause = error.cause if isinstance(error, MessageError) else 'unusable'
         self.refused[cause] += 1
-        stranger = str(error).partition('@')[0] if cause == 'robot' else ''
-        if stranger in self._strangers:
+        if cause == 'robot':
+            self._tell_of_stranger(str(error))
+        else:
+            self._node.get_logger().warning(
+                f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
+
+    def _tell_of_stranger(self, sentence: str) -> None:
+        """Say of a robot that nobody named, once, why its loops are refused."""
+        known, stranger = len(self._strangers), sentence.partition('@')[0]
+        if stranger in self._strangers or known > _MOST_STRANGERS:
             return
-        if stranger:
-            self._strangers.add(stranger)
-        self._node.get_logger().warning(
-            f'refused: {error}', throttle_duration_sec=_REPEAT_WARNING)
+        self._strangers.add(stranger)
+        if known == _MOST_STRANGERS:
+            sentence = f'loops name more than {known} other robots; more are counted alone'
+        self._node.get_logger().warning(f'refused: {sentence}')

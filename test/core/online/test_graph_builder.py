@@ -38,6 +38,7 @@ from l1slam_ros.core.graph.factor_graph import WORLD
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.online.keyframes import KeyframeOptions, OdometryOptions
+from l1slam_ros.core.online.loops import loop_factors
 from l1slam_ros.core.online.loops.loop_factors import LoopOptions
 from l1slam_ros.core.online.options import GraphBuilderOptions
 
@@ -137,6 +138,27 @@ def test_a_loop_expires_when_it_has_waited_too_long_and_may_be_sent_again():
     drive_on(builder, poses[:70], 32)
     assert builder.add_due_loops() == 0 and loops_of(builder)[0] == []
     assert added(builder, one) == 1 and +builder.notes.refused == {'expired': 1}
+
+
+def test_loops_for_a_robot_that_never_comes_are_bounded(monkeypatch):
+    """Its own clock would let them expire. What waits for others is left alone."""
+    monkeypatch.setattr(loop_factors, '_MOST_WAITING', 300)
+    builder = grown(curve(20), DEFAULTS)
+    own = loop(1.0, 3.0, (1.0, 0.0, 0.0))
+    builder.add_loop(own)
+    for k in range(2000):
+        builder.add_loop(replace(loop(1.0, 1.0 + k, (1.0, 0.0, 0.0)), robot=1))
+        builder.add_odometry(odometry((20 + k) * PERIOD, (0.0, 0.0, 0.0)))
+    waiting, told = builder.loops.waiting, builder.notes.news()
+    assert builder.notes.refused['expired'] == builder.loops.lost == 1701
+    assert waiting.stamps()[1:, 1].tolist() == [seconds(1.0 + k) for k in range(1701, 2000)]
+    assert waiting.stamps()[:1].tolist() == stamps_of(own)
+    assert len(waiting._queues[1]._by_time) < 800
+    assert sum('expected odometry of that robot' in sentence for sentence in told) == 1
+    # It comes after all: those that still wait are used.
+    builder.add_odometry(odometry(1700.0, (0.0, 0.0, 0.0)), 1)
+    builder.add_odometry(odometry(1701.5, (0.3, 0.0, 0.0)), 1)
+    assert builder.add_due_loops() > 0
 
 
 @pytest.mark.parametrize('reference, time, cause', [

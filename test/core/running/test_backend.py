@@ -299,7 +299,7 @@ def test_a_loop_that_carries_all_it_closes_a_long_way_by_is_no_corner_to_stay_in
     graph.add_between(np.array([0]), np.array([n - 1]), se3.between(true[:1], true[-1:]),
                       np.diag(np.repeat([0.1, 0.005], 3) ** -2.0)[None])
     problem = Problem(0, graph, [chain], np.zeros(6 * n),
-                      Judgement.nothing().extended(graph, False), False, 1.0, False)
+                      Judgement.nothing().extended(graph, False), False, 1.0, False, chain)
     solved = improve(problem, one_round(OptimiserOptions(), True), PLENTY)
     best = min(minimise_by(choose(AUTO, graph), graph, start, OptimiserOptions())[0].cost
                for start in (chain, true))

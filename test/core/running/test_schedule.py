@@ -21,10 +21,12 @@ from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.solvers.optimality import Status
 
 # A graph of four keyframes and five factors, two of them loops, and more of it.
-SIZE, ONE_MORE = Size(4, 15, 2), Size(5, 18, 2)
-ONE_MORE_LOOP = Size(4, 18, 3)
+SIZE, ONE_MORE = Size(4, 15, 2, 5), Size(5, 18, 2, 6)
+ONE_MORE_LOOP = Size(4, 18, 3, 6)
+MEETING = Size(4, 15 + 3 * 601, 603, 606)
 NOW = 100.0
 BUSY, IDLE = Moment(NOW, False), Moment(NOW, True)
+JUDGING = Moment(NOW, False, judging=True)
 TIME_FOR_IT = Moment(NOW, False, budget=2.0)
 
 JUDGEMENT = Judgement(np.ones(5, bool), np.zeros(5, bool), np.zeros(5), np.ones(2), np.ones(5),
@@ -46,14 +48,15 @@ def with_judge(state=RESTED, **changes):
     return replace(state, judged=replace(state.judged, **changes))
 
 
+MET = replace(with_front(closed=True), made=NOW - 1.0)
 PENDING = replace(RESTED, pending=JUDGEMENT)
 UNFINISHED = replace(RESTED, optimised=replace(MAP, status=Status.OUT_OF_TIME))
 DOUBTED = with_judge(loops=2, anew=1, doubted=2, anew_ended=NOW - 5.0, anew_took=1.0)
 
 TABLE = {
-    'nothing of nothing': (EMPTY, Size(0, 0, 0), BUSY, None, None),
+    'nothing of nothing': (EMPTY, Size(0, 0, 0, 0), BUSY, None, None),
     'the first keyframe, and nobody has judged yet': (
-        EMPTY, Size(1, 0, 0), BUSY, Work.ROUND, None),
+        EMPTY, Size(1, 0, 0, 0), BUSY, Work.ROUND, None),
     'all is done': (RESTED, SIZE, BUSY, None, None),
     'all is done, at rest': (RESTED, SIZE, IDLE, None, None),
     'the front carries a keyframe': (with_front(taken=1), ONE_MORE, BUSY, None, None),
@@ -84,11 +87,20 @@ TABLE = {
     'what was refused lays a doubt': (DOUBTED, SIZE, BUSY, None, Work.JUDGE_ANEW),
     'it was asked just now': (
         with_judge(DOUBTED, anew_ended=NOW - 1.0), SIZE, BUSY, None, None),
-    'there are twice as many loops by now': (DOUBTED, Size(4, 21, 4), BUSY, None, None),
+    'there are twice as many loops by now': (DOUBTED, Size(4, 21, 4, 7), BUSY, None, None),
     'no other norm was asked yet': (with_judge(compared=None), SIZE, IDLE, None, Work.NORM),
     'the same while it drives': (with_judge(compared=None), SIZE, BUSY, None, None),
     'no norm is asked of a map that is to be made anew': (
         with_judge(PENDING, compared=None), SIZE, IDLE, Work.ROUND, None),
+    'two robots met: a map without their loops is not begun': (
+        with_judge(MET, wanted=True), MEETING, BUSY, None, Work.JUDGE),
+    'the same while they are judged': (MET, MEETING, JUDGING, None, None),
+    'the same once they are': (MET, MEETING, BUSY, Work.ROUND, None),
+    'the same while it judges on': (
+        with_judge(MET, ended=NOW - 0.5), MEETING, JUDGING, Work.ROUND, None),
+    'the front takes what came': (MET, ONE_MORE_LOOP, JUDGING, Work.ROUND, None),
+    'the map that was judged first comes before a judgement anew': (
+        with_judge(PENDING, anew=1), SIZE, IDLE, Work.ROUND, None),
     'where nothing is doubted, nothing is judged': (
         replace(with_judge(compared=None), robust=False), ONE_MORE_LOOP, BUSY, None, None),
 }

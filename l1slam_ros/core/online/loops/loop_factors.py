@@ -34,6 +34,10 @@ from l1slam_ros.core.online.loops.waiting_loops import WaitingLoop, WaitingLoops
 from l1slam_ros.core.online.odometry.tracks import Tracks
 from l1slam_ros.core.options import Options, option
 
+# So many loops wait at most: nothing else bounds those for a robot that never comes, or is gone,
+# since the time they wait is that of its own odometry.
+_MOST_WAITING = 50_000
+
 
 @dataclass(frozen=True)
 class LoopOptions(Options):
@@ -147,6 +151,10 @@ class LoopFactors:
         first, last = (tracks.ago(robot, age) for robot in robots)
         self.waiting.add(
             WaitingLoop(loop, (first, last), begin, end, measurement, covariance, key))
+        crowded = self.waiting.crowded(_MOST_WAITING)
+        if crowded is not None:
+            self._give_up(crowded, f'waited for odometry, as {_MOST_WAITING:,} others do, most of '
+                          'them for the same robot; expected odometry of that robot')
 
     def add_due(self, graph: FactorGraph, tracks: Tracks, options: LoopOptions) -> int:
         """Make factors of the loops whose times odometry has reached; return how many."""
@@ -163,13 +171,16 @@ class LoopFactors:
     def _expire(self, robot: int, since: int, stamp: int) -> None:
         """Give up what waits for a robot since before `since` [ns]; stamp : its last [ns]."""
         for one in self.waiting.expired(robot, since):
-            if not one.loop.struck:
-                self._expired.extend(np.array([one.loop.stamps]))
-                self._expired_robots.extend(np.array([one.loop.robots]))
-            self._refuse('expired', one.loop, f'waited for odometry until {stamp} ns; '
-                         'expected odometry of its times')
-            # A loop that is sent again once odometry has come that far is used.
-            self._seen.discard(one.key)
+            self._give_up(one, f'waited for odometry until {stamp} ns; expected odometry of its '
+                          'times')
+
+    def _give_up(self, one: WaitingLoop, why: str) -> None:
+        if not one.loop.struck:
+            self._expired.extend(np.array([one.loop.stamps]))
+            self._expired_robots.extend(np.array([one.loop.robots]))
+        self._refuse('expired', one.loop, why)
+        # A loop that is sent again once odometry has come that far is used.
+        self._seen.discard(one.key)
 
     def _add_due(self, due: list[WaitingLoop], graph: FactorGraph, tracks: Tracks,
                  options: LoopOptions) -> int:

@@ -23,6 +23,9 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.measurements import LoopClosure
 
+# So many times of loops that do not wait any more are no burden.
+_FEW = 100
+
 
 @dataclass(frozen=True)
 class WaitingLoop:
@@ -87,12 +90,28 @@ class _Queue:
 
     def expired(self, since: int) -> list[WaitingLoop]:
         early = list(takewhile(lambda item: item[1][1] < since, self.loops.items()))
-        return [self.loops.pop(number)[0] for number, _ in early]
+        found = [self.loops.pop(number)[0] for number, _ in early]
+        self._tidy()
+        return found
+
+    def first(self) -> WaitingLoop:
+        """Take out the one that came first."""
+        first = self.loops.pop(next(iter(self.loops)))[0]
+        self._tidy()
+        return first
 
     def change(self, how: Callable[[WaitingLoop], WaitingLoop], since: int | None) -> None:
         """Let the loops be others of the same numbers; since : when they have waited since."""
         self.loops = {number: (how(one), before if since is None else since)
                       for number, (one, before) in self.loops.items()}
+        self._sort()
+
+    def _tidy(self) -> None:
+        """Forget the times of loops that were taken out, where they are most of all."""
+        if len(self._by_time) > 2 * len(self.loops) + _FEW:
+            self._sort()
+
+    def _sort(self) -> None:
         self._by_time = [(one.time_of(self._robot), number)
                          for number, (one, _) in self.loops.items()]
         heapq.heapify(self._by_time)
@@ -147,6 +166,13 @@ class WaitingLoops:
         early = self._queues[robot].expired(since) if robot in self._queues else []
         self._told = None if early else self._told
         return early
+
+    def crowded(self, most: int) -> WaitingLoop | None:
+        """Take out one of those that wait for the same robot as most do, if more than so many."""
+        if len(self) <= most:
+            return None
+        self._told = None
+        return max(self._queues.values(), key=lambda queue: len(queue.loops)).first()
 
     def begin_anew(self, time: Callable[[int], int], robot: int) -> None:
         """Interpret the stamps of a robot again by `time`, after its odometry went back."""

@@ -16,6 +16,7 @@ for each worker at most. These functions are pure: `updates` has the threads tha
 from enum import Enum
 from typing import NamedTuple
 
+from l1slam_ros.core.bordered.front import MOST_ROWS
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.running.map_state import MapState
 
@@ -37,34 +38,46 @@ class Work(Enum):
     NORM = 'compare the map with that of another norm'
 
 
+_JUDGEMENTS = (Work.JUDGE, Work.JUDGE_ANEW)
+
+
 class Size(NamedTuple):
-    """How large a graph is: keyframes, rows of its residual, and loops among its factors."""
+    """How large a graph is: keyframes, rows of its residual, loops among its factors, and all."""
 
     keyframes: int
     rows: int
     loops: int
+    factors: int
 
     @staticmethod
     def of(builder: GraphBuilder) -> 'Size':
         """Return that of the graph of a builder."""
         graph = builder.graph
-        rows = len(graph.between) * graph.manifold.TANGENT_SIZE
-        return Size(graph.n_poses, rows, len(builder.loops.rows))
+        factors = len(graph.between)
+        return Size(graph.n_poses, factors * graph.manifold.TANGENT_SIZE,
+                    len(builder.loops.rows), factors)
 
 
 class Moment(NamedTuple):
-    """Now [s] by any clock; idle : no message came for a while; budget [s] of the update."""
+    """
+    Now [s] by any clock.
+
+    idle : no message came for a while; budget : [s] of the update; judging : the judge is at work
+    """
 
     now: float
     idle: bool
     budget: float = 0.0
+    judging: bool = False
 
 
 def due(state: MapState, size: Size, moment: Moment) -> tuple[Work | None, Work | None]:
     """Return the work that is due for the mapper and for the judge, each None where nothing is."""
     make = is_map_due(state, size, moment.idle)
-    return (_map(state, moment.idle) if make else None,
-            _judgement(state, size, moment, make))
+    judge = _judgement(state, size, moment, make)
+    if (moment.judging or judge in _JUDGEMENTS) and is_beyond_fronts(state, size):
+        make = False
+    return _map(state, moment.idle) if make else None, judge
 
 
 def _map(state: MapState, idle: bool) -> Work:
@@ -75,6 +88,8 @@ def _map(state: MapState, idle: bool) -> Work:
 
 def _judgement(state: MapState, size: Size, moment: Moment, make: bool) -> Work | None:
     anew = is_anew_due(state, size, moment)
+    if anew and moment.idle and state.pending is not None:
+        return None  # first the map of the last one, which somebody waits for
     if is_judge_due(state, size, moment):
         # At rest it first starts from the accepted loops: that is faster, and mostly finds as
         # much.
@@ -103,6 +118,18 @@ def is_late(state: MapState) -> bool:
     carried = state.carried
     return carried is None or carried.closed or carried.taken >= max(
         _FEWEST, carried.keyframes // _KEYFRAMES_EACH)
+
+
+def is_beyond_fronts(state: MapState, size: Size) -> bool:
+    """
+    Return whether more has come than the front of a new map would take, as when two robots meet.
+
+    Then a map that is begun before the loops are judged is out of date when it is made. It waits
+    for one judgement at most.
+    """
+    carried = state.carried
+    return carried is not None and state.judged.ended <= state.made and (
+        (size.factors - carried.rows) * size.rows > MOST_ROWS * size.factors)
 
 
 def is_judge_due(state: MapState, size: Size, moment: Moment) -> bool:

@@ -117,7 +117,7 @@ class Updates:
         """Start the work that is due; return whether there is any, or was just now."""
         # Asked before the state is read: work that ends in between makes other work due.
         busy = self._workers.busy
-        moment = Moment(time.monotonic(), idle, budget)
+        moment = Moment(time.monotonic(), idle, budget, self._workers.judge.busy)
         state, _, size = self._keeper.look()
         make, judge = due(state, size, moment)
         for worker, piece in ((self._workers.mapper, make), (self._workers.judge, judge)):
