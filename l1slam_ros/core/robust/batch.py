@@ -41,7 +41,8 @@ A slip
     of them calls a lie.
 A drift
     is an error of all steps, the same on each metre. Where loops are left out it is a third
-    explanation, asked before slips: odometry rid of it has to win a place (`drift`).
+    explanation, asked before slips: odometry rid of it has to win a place (`drift`). Where all
+    came in because the drift was learnt as noise, it is seen in what they leave of the odometry.
 A part
     is what accepted factors tie together. Parts are joined where loops of two places agree.
 A doubt
@@ -64,7 +65,7 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
-from l1slam_ros.core.robust.forecast import right_within
+from l1slam_ros.core.robust.forecast import SURE_DRIFT, left_drift, right_within
 from l1slam_ros.core.robust.innovation import chi2_quantile, covariances
 from l1slam_ros.core.robust.judgement import (
     NORM,
@@ -135,15 +136,24 @@ class _Repair:
 
     def __call__(self, found: Growth, as_stated: Growth) -> Growth | None:
         """Return a state without a drift, asked once, or without a slip; None: there is none."""
-        if not self._asked and len(as_stated.undecided()):
-            self._asked = True
-            drift, odds = vote(self._graph)
-            if odds > 0 and drift:
-                straight, told = self._without(drift)
-                if _won(told, told) > _won(told, as_stated):
-                    self.drift = drift
-                    return straight
-        return without_slip(found, as_stated)
+        straight = None if self._asked else self._straightened(as_stated)
+        self._asked = True
+        return straight or without_slip(found, as_stated)
+
+    def _straightened(self, as_stated: Growth) -> Growth | None:
+        """Return the state without a drift that wins a place, or was taken for noise."""
+        drift, odds = vote(self._graph) if len(as_stated.undecided()) else (0.0, 0.0)
+        least = _won(as_stated, as_stated) + 1
+        if not (drift and odds > 0):
+            drift, sigmas = left_drift(as_stated)
+            if abs(sigmas) < SURE_DRIFT:
+                return None
+            least -= 1
+        straight, told = self._without(drift)
+        if _won(as_stated, told) < least:
+            return None
+        self.drift = drift
+        return straight
 
     def _without(self, drift: float) -> list[Growth]:
         """Return the states, as found and as stated, that odometry without its drift leads to."""

@@ -31,6 +31,8 @@ CONFIDENT = 0.9
 _OFF, _OFF_PART = 0.25, 0.005
 # A map that is surer of itself, or less, by these factors is no more likely to be right, or wrong.
 _SUREST, _LEAST_SURE = 0.3, 30.0
+# [sigmas] Odometry drifts from here on.
+SURE_DRIFT = 3.5
 # So many samples of the posterior tell how sure it is.
 _ASKED = 16
 

@@ -21,7 +21,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import component_labels, lowest_of_components
-from l1slam_ros.core.robust.forecast import left_drift, unsureness
+from l1slam_ros.core.robust.forecast import SURE_DRIFT, left_drift, unsureness
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
     MOSTLY_REFUSED,
@@ -46,9 +46,6 @@ from l1slam_ros.core.robust.rounds import Growth
 
 # Of fewer loops most may well be refused, and be of one place; most are more than half by some.
 _HANDFUL, _MOST = 5, 0.55
-# [sigmas] A drift counts from here on, where the map is less sure of itself than a right one is
-# exact.
-_DRIFTS = 3.5
 
 
 def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
@@ -151,7 +148,7 @@ def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
 
 def _drift_doubt(growth: Growth, accepted: Indices) -> list[Doubt]:
     drift, sigmas = left_drift(growth)
-    if abs(sigmas) < _DRIFTS or unsureness(growth) < 1:
+    if abs(sigmas) < SURE_DRIFT or unsureness(growth) < 1:
         return []
     return [replace(_doubt(growth, DRIFTS, accepted), detail=f'{-drift:+.2g}')]
 
