@@ -65,7 +65,7 @@ from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
-from l1slam_ros.core.robust.forecast import SURE_DRIFT, left_drift, right_within
+from l1slam_ros.core.robust.forecast import drift_taken_for_noise, right_within
 from l1slam_ros.core.robust.innovation import chi2_quantile, covariances
 from l1slam_ros.core.robust.judgement import (
     NORM,
@@ -145,8 +145,8 @@ class _Repair:
         drift, odds = vote(self._graph) if len(as_stated.undecided()) else (0.0, 0.0)
         least = _won(as_stated, as_stated) + 1
         if not (drift and odds > 0):
-            drift, sigmas = left_drift(as_stated)
-            if abs(sigmas) < SURE_DRIFT:
+            drift = drift_taken_for_noise(as_stated)
+            if not drift:
                 return None
             least -= 1
         straight, told = self._without(drift)

@@ -31,8 +31,9 @@ CONFIDENT = 0.9
 _OFF, _OFF_PART = 0.25, 0.005
 # A map that is surer of itself, or less, by these factors is no more likely to be right, or wrong.
 _SUREST, _LEAST_SURE = 0.3, 30.0
-# [sigmas] Odometry drifts from here on.
-SURE_DRIFT = 3.5
+# [sigmas] A drift counts from here on, where the map is less sure of itself than a right one is
+# exact.
+_SURE_DRIFT = 3.5
 # So many samples of the posterior tell how sure it is.
 _ASKED = 16
 
@@ -96,3 +97,9 @@ def left_drift(growth: Growth) -> tuple[float, float]:
     by_noise = np.einsum('mi,miq->q', turn, growth.posterior.left_over(at))
     variance = float((by_noise**2).mean())
     return (found / variance, found / np.sqrt(variance)) if variance > 0 else (0.0, 0.0)
+
+
+def drift_taken_for_noise(growth: Growth) -> float:
+    """Return `left_drift` [rad/m] where it is sure and bends a map that is not; else 0."""
+    drift, sigmas = left_drift(growth)
+    return 0.0 if abs(sigmas) < _SURE_DRIFT or unsureness(growth) < 1 else drift

@@ -21,7 +21,7 @@ import numpy as np
 from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import component_labels, lowest_of_components
-from l1slam_ros.core.robust.forecast import SURE_DRIFT, left_drift, unsureness
+from l1slam_ros.core.robust.forecast import drift_taken_for_noise
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
     MOSTLY_REFUSED,
@@ -147,8 +147,8 @@ def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
 
 
 def _drift_doubt(growth: Growth, accepted: Indices) -> list[Doubt]:
-    drift, sigmas = left_drift(growth)
-    if abs(sigmas) < SURE_DRIFT or unsureness(growth) < 1:
+    drift = drift_taken_for_noise(growth)
+    if not drift:
         return []
     return [replace(_doubt(growth, DRIFTS, accepted), detail=f'{-drift:+.2g}')]
 

@@ -13,9 +13,11 @@ import pytest
 from lies import careful_world
 from problems import chain_of, graph_of
 
-from l1slam_ros.core.robust.batch import robust_solve
+from l1slam_ros.core.robust.batch import robust_solve, rounds
 from l1slam_ros.core.robust.forecast import CONFIDENT, forecast, terms_of
-from l1slam_ros.core.robust.judgement import DRIFTS, MOSTLY_REFUSED
+from l1slam_ros.core.robust.judgement import DRIFTS, MOSTLY_REFUSED, judgement_of
+from l1slam_ros.core.robust.reasons import doubts
+from l1slam_ros.core.robust.rounds import Growth
 
 
 def out_and_back(drift, legs=3, length=60, seed=0):
@@ -34,12 +36,21 @@ def out_and_back(drift, legs=3, length=60, seed=0):
 
 
 @pytest.mark.parametrize('seed', range(3))
-def test_a_drift_that_passes_for_noise_is_a_doubt_and_noise_is_none(seed):
+def test_a_drift_that_passes_for_noise_is_taken_out_and_noise_is_none(seed):
     found, _ = robust_solve(out_and_back(0.007, seed=seed))
-    doubt, = found.doubts
+    assert found.drift == pytest.approx(-0.007, rel=0.3) and not found.doubts
+    assert found.confidence > CONFIDENT
+    straight, _ = robust_solve(out_and_back(0.0, seed=seed))
+    assert not straight.drift and not straight.doubts
+
+
+def test_a_drift_that_is_not_taken_out_is_a_doubt():
+    growth = Growth(out_and_back(0.007), lambda: None)
+    growth.begin()
+    *_, last = rounds(growth)
+    doubt, = doubts(last)
     assert doubt.kind == DRIFTS and float(doubt.detail) == pytest.approx(0.007, rel=0.3)
-    assert found.confidence < CONFIDENT
-    assert not robust_solve(out_and_back(0.0, seed=seed))[0].doubts
+    assert judgement_of(last, (doubt,)).confidence < CONFIDENT
 
 
 def test_a_drift_that_dense_loops_hold_is_none():
