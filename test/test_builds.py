@@ -39,6 +39,13 @@ EXECUTABLES = {'backend', 'scan_loops', 'replay', 'l1slam'}
 # EmPy comes without a wheel.
 COLCON = ('colcon-bash', 'colcon-output', 'colcon-ros', 'setuptools<80', '--no-binary=empy')
 
+# Solves that world again, by kept machine code.
+AGAIN = """
+import sys
+from l1slam_ros.cli.main import main
+assert main(['solve', 'world.g2o', '--quiet']) == 0
+print('numba' in sys.modules)
+"""
 # What `l1slam` makes of one small world, run in a folder of its own.
 SMOKE = """
 import contextlib, importlib.util, io, json, sys
@@ -184,6 +191,7 @@ def test_every_python_comes_to_the_same_costs(
     fresh.install('--no-index', distributions['wheel'])
     found = json.loads(fresh.run('python', '-c', SMOKE, cwd=tmp_path))
     assert found['python'] == version and not found['ros']
+    assert fresh.run('python', '-c', AGAIN, cwd=tmp_path).strip() == 'False'
     assert found['numpy'].startswith('1.26.' if oldest else '2.')
     # Compilers order sums differently, and a solver stops within 10^-6 of the optimum.
     assert found['costs'] == pytest.approx(smoke['costs'], rel=1e-6)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from l1slam_ros.cli import summary
 from l1slam_ros.io import formats
 from l1slam_ros.io.bags.topics import Topics
-from l1slam_ros.io.compilation import JUDGEMENT, SPARSE, compile_now
+from l1slam_ros.io.compilation import JUDGEMENT, SCANS, SPARSE, compile_now
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.formats import is_log
 from l1slam_ros.io.graphs.graph_file import GraphRecord
@@ -96,7 +96,7 @@ def read_scan_map(arguments: argparse.Namespace, path: Path, quiet: bool = False
     """Return what the scans of a log, or of a bag's topic, make."""
     from l1slam_ros.io.scans.reading import read_scans
 
-    compile_now((*SPARSE, *JUDGEMENT), quiet)
+    compile_now((*SCANS, *SPARSE, *JUDGEMENT), quiet)
     with Progress(None, 'scan', quiet, 'matching scans') as progress:
         def report(scans: int, of_all: int, loops: int) -> None:
             progress.reach(scans, of_all)

@@ -12,8 +12,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from l1slam_ros.core.errors import FileError
 
 # [bytes] A text file as a whole (a graph of a million poses has .4e9), one line of it, and a
@@ -62,6 +60,8 @@ def read_yaml(text: str) -> Any:
     yaml.YAMLError : it is no YAML.
 
     """
+    import yaml
+
     depth = deepest = 0
     for found in _BRACKET.finditer(text) if len(text) <= _LONGEST_YAML else ():
         depth += 1 if found[0] in '[{' else -1

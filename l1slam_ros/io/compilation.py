@@ -30,8 +30,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from importlib import import_module
 
-from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry.manifold import Manifold
 from l1slam_ros.core.kernels import compiled
 from l1slam_ros.core.kernels.kept import objects
@@ -44,6 +44,8 @@ SPARSE = ('cholesky', 'substitution', 'ordering', 'symbolic', 'blocks', 'interio
 JUDGEMENT = ('prediction',)
 DENSE = ('halpern',)
 ONLINE = ('border',)
+# What scans are matched by: elsewhere in `core`.
+SCANS = ('scans.kernels', 'scans.search_kernels')
 STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
 # What poses in space need besides; after the colon: the versions for them of that module's loops.
 IN_SPACE = {'halpern': f'halpern{objects.SPACE}', 'cholesky': f'cholesky{objects.SPACE}',
@@ -102,7 +104,7 @@ def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
     report(0, len(missing))
     for done, (step, files) in enumerate(_compiled(missing, stopped), 1):
         if files:
-            known[step] = files
+            known = {**known, **_noted(), step: files}  # another thread may note others
             _note(known)
         report(done, len(missing))
     return set(steps) <= known.keys()
@@ -193,10 +195,10 @@ def load(steps: Sequence[str] = STEPS) -> None:
 
 def make_ready(step: str) -> None:
     """Link the loops of one step, or have them read or compiled."""
-    name = step.removesuffix(objects.SPACE)
-    for loop in list(vars(getattr(kernels, name)).values()):
+    module = import_module(objects.module_of(step))
+    for loop in list(vars(module).values()):
         if hasattr(loop, 'takes'):
-            compiled.make_ready(loop, step != name)
+            compiled.make_ready(loop, step.endswith(objects.SPACE))
 
 
 def _cores() -> int:

@@ -44,8 +44,6 @@ from l1slam_ros.io.graphs.robot_log import RobotLog
 from l1slam_ros.io.graphs.side_files import BESIDE, WRITTEN_BESIDE, beside
 from l1slam_ros.io.jrl.document import cbor_library, is_cbor
 from l1slam_ros.io.jrl.layout import JRL_SUFFIXES
-from l1slam_ros.io.jrl.reading import read_jrl_file
-from l1slam_ros.io.jrl.writing import write_jrl_file
 from l1slam_ros.io.ours import refuse_others
 from l1slam_ros.io.trajectory import write_tum
 
@@ -53,12 +51,19 @@ if TYPE_CHECKING:
     from l1slam_ros.core.online.options import GraphBuilderOptions
     from l1slam_ros.core.scans.points import Scan
 
+
+def _read_jrl_file(path: Path, rotation_information: str) -> GraphRecord:
+    from l1slam_ros.io.jrl.reading import read_jrl_file
+
+    return read_jrl_file(path, rotation_information)
+
+
 # By the suffix of a file. A reader takes the path and what the rotation block of the information
 # is of, and raises FileError.
 GRAPH_READERS: dict[str, Callable[[Path, str], GraphRecord]] = {
     '.g2o': read_graph_file,
-    '.jrl': read_jrl_file,
-    '.cbor': read_jrl_file,
+    '.jrl': _read_jrl_file,
+    '.cbor': _read_jrl_file,
     '.graph': read_graph_file,
 }
 
@@ -214,6 +219,8 @@ def write_output(path: Path, record: GraphRecord, truth: Array | None = None,
     if path.suffix.lower() == '.g2o':
         write_graph_file(path, record)
     elif path.suffix.lower() in JRL_SUFFIXES:
+        from l1slam_ros.io.jrl.writing import write_jrl_file
+
         write_jrl_file(path, record, truth)
     elif path.suffix.lower() == '.tum':
         write_tum(path, record.times, stored_poses(record), record.graph.manifold)

@@ -35,7 +35,6 @@ from l1slam_ros.io.files import (
 )
 from l1slam_ros.io.graphs.graph_file import read_vertices
 from l1slam_ros.io.jrl.layout import JRL_SUFFIXES
-from l1slam_ros.io.jrl.reading import read_truth
 from l1slam_ros.io.ours import marked
 
 _TUM_COLUMNS = 8
@@ -93,6 +92,8 @@ def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2,
 
     """
     if Path(path).suffix.lower() in JRL_SUFFIXES:
+        from l1slam_ros.io.jrl.reading import read_truth
+
         return Reference(*read_truth(Path(path), manifold), stamped=False)
     lines = read_lines(path)
     if not lines.texts:

@@ -10,6 +10,8 @@
 
 import bz2
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -18,6 +20,14 @@ from PIL import Image
 from rooms import WALLS, laps, write_log, write_scan_bag, write_truth
 
 from l1slam_ros.cli.main import main
+from l1slam_ros.io.compilation import JUDGEMENT, SCANS, SPARSE, compile_now
+
+SOLVE = """
+import sys
+from l1slam_ros.cli.main import main
+assert main(['solve', *sys.argv[1:], '--quiet']) == 0
+print(*{'numba', 'l1slam_ros.core.scans.search_kernels'} & set(sys.modules))
+"""
 
 
 @pytest.fixture(scope='module')
@@ -58,6 +68,16 @@ def test_a_log_becomes_a_map_and_a_grid_that_others_read(drive, truth, tmp_path,
     y = document['origin'][1] + 0.05 * (len(picture) - 1 - rows) + 1.5
     assert (x.min(), x.max()) == pytest.approx((0, WALLS[:, ::2].max()), abs=0.2)
     assert (y.min(), y.max()) == pytest.approx((0, WALLS[:, 1::2].max()), abs=0.2)
+
+
+def test_scans_need_no_numba_once_their_loops_are_compiled(drive, tmp_path):
+    compile_now((*SCANS, *SPARSE, *JUDGEMENT), quiet=True)
+    log = tmp_path / 'room.clf'
+    write_log(log, *drive[:2])
+    done = subprocess.run([sys.executable, '-c', SOLVE, str(log), '--grid', 'map.pgm'],
+                          cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ['l1slam_ros.core.scans.search_kernels']
 
 
 def test_truth_that_is_sparser_than_the_map_is_compared_where_it_is(drive, tmp_path, capsys):

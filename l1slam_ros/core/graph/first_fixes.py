@@ -179,7 +179,7 @@ def _drift(graph: FactorGraph, poses: Array, keyframe: Indices) -> Array:
     return covariance
 
 
-def _samples(covariance: Array, rng: np.random.Generator) -> Array:
+def _samples(covariance: Array, rng: 'np.random.Generator') -> Array:
     """Return noise of covariances (m, d, d), (samples + 1, m, d), none first."""
     m, d, _ = covariance.shape
     root = np.linalg.cholesky(covariance + _TINY * np.eye(d))

@@ -147,23 +147,24 @@ def keep(step: str) -> list[str]:
         return files
     from l1slam_ros.core.kernels.kept import make
 
-    name = step.removesuffix(objects.SPACE)
-    module = import_module(f'{__package__}.{name}')
+    module = import_module(objects.module_of(step))
+    attribute = 'takes_in_space' if step.endswith(objects.SPACE) else 'takes'
     kept, folders = {}, set()
     for kernel in vars(module).values():
-        if takes := getattr(kernel, 'takes_in_space' if step != name else 'takes', ()):
+        if takes := getattr(kernel, attribute, ()):
             dispatcher = kernel.dispatcher
             # What numba reads back it does not give away.
             dispatcher._cache.load_overload = lambda *_: None
             versions = [_compile(dispatcher, one) for one in takes]
             folders.add(dispatcher.stats.cache_path)
             kept[kernel.py_func.__name__] = versions
+    name = module.__name__.rpartition('.')[2]
     beside = sorted(str(file) for folder in folders - {None}
                     for file in Path(folder).glob(f'{name}.*.nbi'))
     if not beside:
         return []
     with suppress(Exception):  # as another numba may have it, or another system
-        apart = {name: list(map(make.taken_apart, versions)) for name, versions in kept.items()}
+        apart = {of: list(map(make.taken_apart, versions)) for of, versions in kept.items()}
         return [objects.write(step, apart, beside), *beside]
     return beside
 

@@ -132,7 +132,7 @@ class NoiseScales:
     offset: Array | None = None
 
 
-def noise_scales(graph: FactorGraph, rng: np.random.Generator) -> NoiseScales:
+def noise_scales(graph: FactorGraph, rng: 'np.random.Generator') -> NoiseScales:
     """
     Compare residuals at the L2 optimum with the information that came with them.
 

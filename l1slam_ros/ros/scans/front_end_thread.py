@@ -24,11 +24,10 @@ from sensor_msgs.msg import LaserScan
 from l1slam_ros.core.errors import L1SlamError, MessageError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
-from l1slam_ros.core.kernels.compiled import make_ready
-from l1slam_ros.core.scans import kernels, search_kernels
 from l1slam_ros.core.scans.front_end import ScanFrontEnd
 from l1slam_ros.core.scans.odometry import Step
 from l1slam_ros.core.scans.points import Mount, Scan
+from l1slam_ros.io.compilation import SCANS, fill_cache, make_ready
 from l1slam_ros.io.messages.conversion import odometry_in
 from l1slam_ros.ros.scans.map_drawer import MapDrawer
 from l1slam_ros.ros.scans.messages import covariance_in, path_in, scan_in
@@ -211,9 +210,9 @@ class FrontEndThread:
 
     def _work(self) -> None:
         try:
-            for loop in (*vars(kernels).values(), *vars(search_kernels).values()):
-                if hasattr(loop, 'takes') and not self._closing:
-                    make_ready(loop, False)
+            fill_cache(lambda done, total: None, lambda: self._closing, SCANS)
+            for step in SCANS if not self._closing else ():
+                make_ready(step)
         except Exception as error:  # what is missing is compiled when it is first called
             self._failures.note('compiling', error)
         self.ready = True

@@ -23,7 +23,7 @@ from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.kernels.compiled import Loop
 from l1slam_ros.core.kernels.kept import objects
 from l1slam_ros.io import compilation
-from l1slam_ros.io.compilation import STEPS, fill_cache, with_space
+from l1slam_ros.io.compilation import SCANS, STEPS, fill_cache, with_space
 
 TESTS = Path(__file__).parents[2]
 # Calls loops both ways, the first times that each is called with arguments of some types.
@@ -55,11 +55,19 @@ def both(loop, *arguments):
 calls, kept = collections.Counter(), Loop.__call__
 Loop.__call__ = both
 """
-# What the work of `test_warm_up` does not call: blocks of angles and of positions, dissection.
+# What the work of `test_warm_up` does not call: blocks of angles and of positions, dissection,
+# scans.
 MORE = """
 sys.path.insert(0, 'core/solvers')
 import test_restarted_pdhg as pages
+import tempfile
+from pathlib import Path
+from rooms import laps, write_log
+from l1slam_ros.core import scans
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.kernels import ordering
+from l1slam_ros.core.scans import grid
+from l1slam_ros.io.scans.reading import read_scans
 
 for k in (1, 2):
     generator = np.random.default_rng(0)
@@ -69,6 +77,11 @@ node = np.arange(1600).reshape(40, 40)  # of a torus
 beside = [np.roll(node, shift, axis) for shift, axis in ((1, 0), (-1, 0), (1, 1), (-1, 1))]
 adjacent = np.stack(beside, axis=-1).astype(np.int32).ravel()
 ordering.dissect(np.arange(0, 6401, 4, dtype=np.int32), adjacent)
+log = Path(tempfile.mkdtemp()) / 'room.clf'
+write_log(log, *laps()[:2])
+made = read_scans(log, 'odom', None, lambda *_: None)
+grid.draw(made.points, odometry_poses(made.record.graph))
+MODULES += scans.kernels, scans.search_kernels
 for loop in {loop for module in MODULES for loop in vars(module).values()
              if getattr(loop, 'takes', ()) or getattr(loop, 'takes_in_space', ())}:
     versions = len(loop.takes) + len(loop.takes_in_space)
@@ -100,7 +113,7 @@ FITS = (np.ones((2, 3, 3)), np.ones((2, 3)), (0, 0, 0))
 
 @pytest.fixture(scope='module', autouse=True)
 def full_cache():
-    fill_cache(lambda done, total: None, lambda: False, with_space(STEPS, se3))
+    fill_cache(lambda done, total: None, lambda: False, with_space((*STEPS, *SCANS), se3))
 
 
 def run(code, **settings):
@@ -186,6 +199,16 @@ def test_settings_that_code_does_not_depend_on_ask_for_no_other(copy_of_cache, m
                                                                 setting):
     monkeypatch.setenv(name, setting)
     assert objects.read('blocks')
+
+
+@pytest.mark.parametrize('made, whole', [(True, 1), (False, 3)])
+def test_only_a_folder_that_is_named_is_used_if_it_can_be(tmp_path, monkeypatch, made, whole):
+    named = tmp_path / 'named'
+    if not made:
+        named.write_text('')
+    monkeypatch.setenv('NUMBA_CACHE_DIR', str(named))
+    assert objects.folders()[0] == named
+    assert len(objects.folders()) == whole
 
 
 def test_who_shares_a_folder_but_not_the_settings_replaces_nothing(copy_of_cache, monkeypatch):

@@ -29,7 +29,8 @@ import numpy as np
 from l1slam_ros.core.kernels.kept import objects
 
 # Types of numbers that numba takes for such, too.
-_NUMBERS = {'int64': frozenset((int, np.int64)), 'float64': frozenset((float, np.float64))}
+_NUMBERS = {'int64': frozenset((int, np.int64)), 'float64': frozenset((float, np.float64)),
+            'float32': frozenset((np.float32,))}
 # What an argument has to be: its type of entries if it is an array, its dimensions or, of a tuple,
 # its length; the types of a number, or of the entries of a tuple.
 Wanted = tuple[np.dtype | None, int, frozenset[type]]
@@ -45,7 +46,7 @@ lock = threading.RLock()
 
 def link(module: str, name: str, space: bool) -> list[Linked]:
     """Return the versions of a loop that are kept, those for space or the others; maybe none."""
-    step = module.rpartition('.')[2] + (objects.SPACE if space else '')
+    step = objects.step_of(module, space)
     with lock:
         try:
             if step not in _read:

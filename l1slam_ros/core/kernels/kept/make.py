@@ -43,7 +43,7 @@ def _described(argument: Any) -> tuple[str, str, int]:
 
 
 def _number(number: Any) -> str:
-    if number not in (types.int64, types.float64):
+    if number not in (types.int64, types.float64, types.float32):
         raise TypeError(number)
     return str(number)
 

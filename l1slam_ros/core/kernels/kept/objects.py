@@ -33,7 +33,9 @@ from typing import NamedTuple
 import numpy as np
 
 KERNELS = Path(__file__).parents[1]
-# A step is a module's name, and with this at its end: the versions for space of its loops.
+_CORE = __name__.removesuffix('.kernels.kept.objects')
+# A step is the name of a module of `kernels`, or the path in `core` of another one; and with this
+# at its end: the versions for space of its loops.
 SPACE = ':space'
 # Extension modules of numba's that hold what its machine code calls: where they are in it.
 HELPERS = ('_helperlib', '_dynfunc', 'core/runtime/_nrt_python')
@@ -127,8 +129,11 @@ def _sound(step: str) -> tuple[str, dict, bytes]:
 def folders() -> list[Path]:
     """Return where files may be: where numba would keep what it compiles, the first first."""
     user = os.environ.get('XDG_CACHE_HOME') or os.path.join(os.path.expanduser('~'), '.cache')
-    own = os.environ.get('NUMBA_CACHE_DIR')
-    return [*([Path(own)] if own else []), KERNELS / '__pycache__', Path(user) / 'numba']
+    usual = [KERNELS / '__pycache__', Path(user) / 'numba']
+    if own := os.environ.get('NUMBA_CACHE_DIR'):
+        # Only there, as numba; of one that is read-only what it has, and the rest elsewhere.
+        return [Path(own), *(() if is_writable(Path(own)) else usual)]
+    return usual
 
 
 def is_writable(folder: Path) -> bool:
@@ -157,9 +162,22 @@ def key(step: str) -> str:
     return hashlib.sha256(repr(facts).encode()).hexdigest()
 
 
+def step_of(module: str, space: bool) -> str:
+    """Return the step that has the loops of a module, those for space or the others."""
+    name = module.removeprefix(f'{_CORE}.').removeprefix('kernels.')
+    return name + SPACE if space else name
+
+
+def module_of(step: str) -> str:
+    """Return the full name of the module that has the loops of a step."""
+    name = step.removesuffix(SPACE)
+    return f'{_CORE}.{name}' if '.' in name else f'{_CORE}.kernels.{name}'
+
+
 def sources() -> dict[str, tuple[int, int]]:
     """Return time of change [ns] and size of all sources of loops, and of what keeps them."""
-    return {str(path): _state(path) for path in sorted(KERNELS.rglob('*.py'))}
+    elsewhere = KERNELS.parent.glob('*/*kernels.py')
+    return {str(path): _state(path) for path in sorted((*KERNELS.rglob('*.py'), *elsewhere))}
 
 
 def note_import(source: Path) -> None:
@@ -182,7 +200,8 @@ def _state(path: Path) -> tuple[int, int]:
 
 
 def _sources(step: str) -> list[Path]:
-    return [KERNELS / f'{step.removesuffix(SPACE)}.py', *_SHARED]
+    path = module_of(step).removeprefix(f'{_CORE}.').replace('.', '/')
+    return [KERNELS.parent / f'{path}.py', *_SHARED]
 
 
 def surroundings() -> str:
