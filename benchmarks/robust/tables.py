@@ -44,10 +44,10 @@ def _introduction(recorded: Mapping[str, Any]) -> Lines:
         'from the odometry chain, kernels on loops only, GNC told that the odometry is sure.', '',
         '- **Beside others**: the error [m] of positions, RMSE after alignment, to the truth '
         'where it is known, else to the map of the true loops. The graphs with a share of false '
-        'loops are riSAM\'s protocol: of n true loops, n p / (1 - p) false ones are added that '
+        "loops are riSAM's protocol: of n true loops, n p / (1 - p) false ones are added that "
         'say that two far poses are the same; in the others place recognition made the false '
-        'ones. Of each peer the first column is the constant that its authors give (a kernel\'s '
-        '1, GNC\'s quantile .99), the second the best of three (1, 3, 10; 1, 10, 100; of two: '
+        "ones. Of each peer the first column is the constant that its authors give (a kernel's "
+        "1, GNC's quantile .99), the second the best of three (1, 3, 10; 1, 10, 100; of two: "
         '.99, .999), picked with the truth in hand, and which that is. kept: false loops; lost: '
         'true ones.',
         '- **pass**: the map is near enough '
