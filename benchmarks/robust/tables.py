@@ -82,7 +82,8 @@ def _beside(runs: Sequence[Run]) -> Lines:
             peers = {peer: {solver: _error([run for run in part if run.solver == solver])
                             for solver in _solvers(part) if f' {peer} ' in solver}
                      for peer in _PEERS}
-            best = min((error, name) for found in peers.values() for name, error in found.items())
+            best = min(((error, name) for found in peers.values()
+                        for name, error in found.items()), default=(float('inf'), ''))
             body.append([
                 graph, f'{share:.0%}' if share else '', _told(_error(ours)) + _word(ours),
                 _ratio(ours, 'kept', 'false'), _ratio(ours, 'lost', 'true'), _seconds(ours),
