@@ -51,6 +51,7 @@ class Loop:
     Attributes
     ----------
     linked : versions of kept machine code that this process has called, or made ready
+
     """
 
     def __init__(self, py_func: Kernel, takes: tuple[str, ...] = (),
