@@ -130,6 +130,16 @@ def _along(way: Array, i: Indices, j: Indices, rng: Rng, tails: bool = False) ->
     truth = np.column_stack((way, np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))))
     step = (_between(rng, 0.02, 0.1),) * 2 + (_between(rng, 0.002, 0.015),)
     loop = (_between(rng, 0.03, 0.3),) * 2 + (_between(rng, 0.005, 0.05),)
+    return of_truth(truth, i, j, step, loop, rng, tails)
+
+
+def of_truth(truth: Array, i: Indices, j: Indices, step: tuple[float, ...],
+             loop: tuple[float, ...], rng: Rng, tails: bool) -> Place:
+    """
+    Return what is measured of a truth (n, 3), with loops from keyframes i to j.
+
+    step, loop : sigmas [m, m, rad]; tails : of loops, with two degrees of freedom
+    """
     sigma = np.concatenate((np.tile(step, (len(truth) - 1, 1)), np.tile(loop, (len(i), 1))))
     noise = sigma * rng.standard_normal(sigma.shape)
     if tails:

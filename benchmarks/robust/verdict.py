@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from measuring import report_progress
 from robust import drawn
 from robust.changes import changed
-from robust.places import Place, error_by_time, measured, place, place_of
+from robust.places import Place, error_by_time, place, place_of
 from scipy.optimize import minimize
 
 from l1slam_ros.core.errors import GraphError
@@ -89,7 +89,7 @@ def _ring(seed: int, tails: bool = False) -> Place:
     along = np.gradient(way, axis=0)
     truth = np.column_stack((way, np.unwrap(np.arctan2(along[:, 1], along[:, 0]))))
     back = np.arange(loops)
-    return _measured(truth, back, back + n, (0.05, 0.05, 0.003), (0.1, 0.1, 0.02), rng, tails)
+    return drawn.of_truth(truth, back, back + n, (0.05, 0.05, 0.003), (0.1, 0.1, 0.02), rng, tails)
 
 
 def _corridor(seed: int, tails: bool = False) -> Place:
@@ -102,19 +102,8 @@ def _corridor(seed: int, tails: bool = False) -> Place:
     truth = np.column_stack((np.concatenate((there, back)), np.unwrap(
         np.concatenate((heading, heading[::-1] + np.pi)))))
     first = rng.choice(len(there) - 10, max(12, len(there) // 6), replace=False)
-    return _measured(truth, first, len(truth) - 1 - first, (0.05, 0.05, 0.005), (0.3, 0.1, 0.02),
-                     rng, tails)
-
-
-def _measured(truth: Array, i: Array, j: Array, step: tuple[float, ...], loop: tuple[float, ...],
-              rng: np.random.Generator, tails: bool) -> Place:
-    """Return what is measured of a truth (n, 3); tails: of loops with two degrees of freedom."""
-    sigma = np.concatenate((np.tile(step, (len(truth) - 1, 1)), np.tile(loop, (len(i), 1))))
-    noise = sigma * rng.standard_normal(sigma.shape)
-    if tails:
-        noise[len(truth) - 1:] *= np.abs(rng.standard_t(2, (len(i), 1)))
-    return place_of('made', measured(truth, i, j, sigma, noise), None,
-                    error_by_time(truth[:, :2]))
+    return drawn.of_truth(truth, first, len(truth) - 1 - first, (0.05, 0.05, 0.005),
+                          (0.3, 0.1, 0.02), rng, tails)
 
 
 def _world(poses: int, loops: int, options: WorldOptions, seed: int) -> Place:
