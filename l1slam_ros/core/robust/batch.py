@@ -143,14 +143,13 @@ class _Repair:
     def _straightened(self, as_stated: Growth) -> Growth | None:
         """Return the state without a drift that wins a place, or was taken for noise."""
         drift, odds = vote(self._graph) if len(as_stated.undecided()) else (0.0, 0.0)
-        least = _won(as_stated, as_stated) + 1
+        more = 1
         if not (drift and odds > 0):
-            drift = drift_taken_for_noise(as_stated)
-            if not drift:
-                return None
-            least -= 1
+            drift, more = drift_taken_for_noise(as_stated), 0
+        if not drift:
+            return None
         straight, told = self._without(drift)
-        if _won(as_stated, told) < least:
+        if _won(as_stated, told) < _won(as_stated, as_stated) + more:
             return None
         self.drift = drift
         return straight
