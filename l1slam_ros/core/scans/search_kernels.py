@@ -58,8 +58,8 @@ def branch_and_bound(levels, cells, nodes, most, least, excluded):
     """
     Return the best shift of a scan over a likelihood grid for any of its turns.
 
-    levels : see `Field.levels`; cells : of `add_widest_bounds`; nodes : (k, 4) turn, column, row and
-    bound of the squares of shifts to be looked into, the best one first; most : the greatest shift
+    levels : see `Field.levels`; cells : see `add_widest_bounds`; nodes : (k, 4) turn, column, row,
+    bound of the squares of shifts to look into, the best one first; most : the greatest shift
     each way; least : score to beat; excluded : (6,) turn, shift (2), how many turns and cells
     around it do not count, and after how many turns they begin anew; fewer than no turns: nothing
     is excluded
