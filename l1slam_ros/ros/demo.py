@@ -65,7 +65,7 @@ IN_TURN = ('--ros-args', '-p', 'backlog:=1000', '-p', f'{_OF_SCANS}.reliability:
 CALM = 3
 OF_THE_MAP = ('keyframes', 'factors', 'updates', 'l1_cost')
 # Given up only when nothing has moved for so long [s]; the node can be compiling its solver.
-PATIENCE = 300.0
+PATIENCE = 120.0
 END = 60.0  # [s] longest that a process may take to end when it is told to
 _INTERRUPTED = 130
 _TELL = 10.0  # [s] how often it is said how far things are
@@ -270,7 +270,7 @@ def record_map(bag: Path, recording: Recording) -> Heard:
         with running(BACKEND) as backend, running(FRONT_END, *IN_TURN) as front_end:
             nodes = {BACKEND: backend, FRONT_END: front_end}
             print(f'demo: playing {bag}, {RATE:g} times as fast as recorded', flush=True)
-            with running('replay', str(bag), '--rate', str(RATE)) as replay:
+            with running('replay', str(bag), '--rate', str(RATE), '--nodes', *nodes) as replay:
                 listener.wait(nodes, lambda: replay.poll() is not None)
             print('demo: waiting until nothing changes in the map any more', flush=True)
             listener.wait(nodes, listener.is_final)

@@ -15,7 +15,7 @@ Messages are published as the bytes they are in the bag; nothing is decoded.
 import argparse
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -40,8 +40,8 @@ from l1slam_ros.ros.threads.failures import reason
 _BAD_INPUT = 2
 _DAMAGED = 3
 _DEPTH = 1000
-# A publisher sends nothing to whom it has not met. A node is met one subscription at a time, so
-# once there is any, no other has come for this long [s] before messages go out.
+# A publisher sends nothing to whom it has not met. A node is met one subscription at a time, and
+# several may subscribe to one topic: none has come for this long [s] before messages go out.
 _REST = 1.0
 _SOON, _AGAIN = 2.0, 30.0  # [s] when it is said that nobody subscribes, and how often from then on
 _CLOCK_PERIOD = 0.01  # [s] of the bag's time
@@ -91,41 +91,50 @@ class Player:
                 node.get_logger().warning(f'{why}; it is left out')
         self._clock = node.create_publisher(Clock, '/clock', 10) if clock else None
 
-    def wait_for_subscribers(self, longest: float | None) -> None:
+    def wait_for_subscribers(self, longest: float | None, nodes: Collection[str] = ()) -> None:
         """
-        Wait until anybody subscribes, then until nobody else does.
+        Wait until anybody subscribes and each of some nodes does, then until nobody else does.
 
-        longest : [s] then play to nobody; None: as long as it takes; 0: do not wait at all
+        longest : [s] then play all the same; None: as long as it takes; 0: do not wait at all;
+        nodes : their names, without namespaces
 
         """
         if longest == 0:
             return
         began = time.monotonic()
         say = began + _SOON
-        while not self._subscribed():
+        while absent := self._who_is_absent(nodes):
             now = time.monotonic()
             if longest is not None and now > began + longest:
                 self._node.get_logger().warning(
-                    f'nobody subscribed for {longest:g} s; playing all the same')
+                    f'{absent} did not subscribe for {longest:g} s; playing all the same')
                 return
             if now > say:
                 say = now + _AGAIN
                 names = ', '.join(publisher.topic_name for publisher in self.publishers.values())
-                self._node.get_logger().info(f'waiting for a subscriber of {names}')
+                self._node.get_logger().info(f'waiting for {absent} to subscribe to {names}')
             _sleep_until(now + _PAUSE)
         self._wait_for_others()
 
-    def _subscribed(self) -> int:
-        """Return how many of the topics have a subscriber."""
-        return sum(publisher.get_subscription_count() > 0
-                   for publisher in self.publishers.values())
+    def _who_is_absent(self, nodes: Collection[str]) -> str:
+        """Return who does not subscribe to any topic yet, in words; empty: all are there."""
+        if not self._count_subscriptions():
+            return ' and '.join(nodes) or 'a node'
+        if not nodes:
+            return ''
+        there = {info.node_name for publisher in self.publishers.values()
+                 for info in self._node.get_subscriptions_info_by_topic(publisher.topic_name)}
+        return ' and '.join(name for name in nodes if name not in there)
+
+    def _count_subscriptions(self) -> int:
+        return sum(publisher.get_subscription_count() for publisher in self.publishers.values())
 
     def _wait_for_others(self) -> None:
-        known, quiet = self._subscribed(), time.monotonic() + _REST
-        while time.monotonic() < quiet and known < len(self.publishers):
+        known, quiet = self._count_subscriptions(), time.monotonic() + _REST
+        while time.monotonic() < quiet:
             _sleep_until(time.monotonic() + _PAUSE)
-            if self._subscribed() > known:
-                known, quiet = self._subscribed(), time.monotonic() + _REST
+            if (count := self._count_subscriptions()) > known:
+                known, quiet = count, time.monotonic() + _REST
 
     def play(self, messages: Iterable[BagMessage], rate: float, progress: Progress) -> None:
         """Publish the messages, `rate` times as fast as they were recorded."""
@@ -187,7 +196,7 @@ def _play(arguments: argparse.Namespace, tell: Callable[[str], None]) -> None:
         player = Player(node, summary, arguments.topics, arguments.remap, arguments.clock)
         if not player.publishers:
             raise FileError(arguments.bag, 'no topic of this bag can be played')
-        player.wait_for_subscribers(arguments.wait)
+        player.wait_for_subscribers(arguments.wait, arguments.nodes)
         seconds = max(summary.duration / NANOSECONDS - arguments.start, 0)
         again = True
         while again:
@@ -229,6 +238,8 @@ def _parser() -> argparse.ArgumentParser:
     add('--wait', type=_not_negative, metavar='SECONDS',
         help='play after so long even if nobody subscribes; 0: at once (default: until somebody '
              'does)')
+    add('--nodes', nargs='+', default=[], metavar='NODE',
+        help='play only when each of these nodes subscribes, too: two may hear one topic')
     add('--rate', type=_positive, default=1.0, help='times as fast as recorded')
     add('--start', type=_not_negative, default=0.0, help='skip so much of the bag [s]')
     add('--duration', type=_positive, help='play only so much of the bag [s]')

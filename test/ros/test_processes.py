@@ -53,12 +53,13 @@ def replay(*arguments):
 
 
 @contextmanager
-def waiting_replay(*arguments):
-    """Yield a replay that nobody subscribes to, once it has said so."""
+def waiting_replay(*arguments, whom='a node'):
+    """Yield a replay that nobody subscribes to, once it has said whom it waits for."""
     process = subprocess.Popen([executable('replay'), *map(str, arguments)],
                                stderr=subprocess.PIPE, text=True)
     try:
-        assert 'waiting for a subscriber of /loop_closures, /odom' in process.stderr.readline()
+        said = process.stderr.readline()
+        assert f'waiting for {whom} to subscribe to /loop_closures, /odom' in said
         yield process
     finally:
         process.kill()
@@ -67,7 +68,7 @@ def waiting_replay(*arguments):
 
 def complaints(played):
     """Return what a replay said, but for that it waited: a busy machine is slow to subscribe."""
-    return [line for line in played.stderr.splitlines() if 'waiting for a subscr' not in line]
+    return [line for line in played.stderr.splitlines() if 'waiting for a node' not in line]
 
 
 @pytest.fixture
@@ -142,6 +143,33 @@ def test_replay_waits_for_subscribers_and_loses_neither_the_first_nor_the_last(b
     node.destroy_node()
 
 
+def test_replay_waits_for_the_nodes_that_it_is_told_of(bag, ros):
+    """Another node has a subscription to each topic long before."""
+    with waiting_replay(bag, '--rate', '20', '--nodes', 'late', whom='late') as process:
+        other, late = ros.create_node('other'), ros.create_node('late')
+        heard = {node.get_name(): [] for node in (other, late)}
+
+        def listen(node):
+            for kind, topic in (Odometry, '/odom'), (PoseWithCovarianceStamped, '/loop_closures'):
+                node.create_subscription(
+                    kind, topic, heard[node.get_name()].append, QoSProfile(depth=1000))
+
+        listen(other)
+        until = time.monotonic() + 3.0
+        while time.monotonic() < until:
+            ros.spin_once(other, timeout_sec=0.1)
+        assert not heard['other'] and process.poll() is None
+        listen(late)
+        sent = sum(1 for _ in read_raw(bag, None, lambda _: None))
+        deadline = time.monotonic() + DEADLINE
+        while process.poll() is None or len(heard['late']) != sent:
+            assert time.monotonic() < deadline, f'{len(heard["late"])} of {sent}'
+            ros.spin_once(late, timeout_sec=0.1)
+        assert process.returncode == 0
+    other.destroy_node()
+    late.destroy_node()
+
+
 @pytest.mark.parametrize('name', ['SIGINT', 'SIGTERM'])
 def test_a_signal_ends_a_replay_that_waits(bag, name):
     with waiting_replay(bag) as process:
@@ -151,7 +179,7 @@ def test_a_signal_ends_a_replay_that_waits(bag, name):
 
 
 @pytest.mark.parametrize(('seconds', 'said'), [
-    ('0', []), ('0.5', ['nobody subscribed for 0.5 s; playing all the same'])])
+    ('0', []), ('0.5', ['a node did not subscribe for 0.5 s; playing all the same'])])
 def test_replay_plays_to_nobody_after_as_long_as_it_is_told(bag, seconds, said):
     played = replay(bag, '--rate', '100', '--wait', seconds)
     assert played.returncode == 0
