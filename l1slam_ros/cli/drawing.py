@@ -66,14 +66,16 @@ def _drawing(path: Path, record: GraphRecord, poses: Array, truth: Truth | None,
     loops beside the input `path` names, as false.
     """
     graph = record.graph
-    factors, positions = graph.between, graph.manifold.positions
+    factors = graph.between
+    positions = graph.manifold.positions
     try:
         chain = odometry_poses(graph)
         first = np.broadcast_to(poses[0], chain.shape)
         odometry = positions(graph.manifold.compose(first, chain))
     except GraphError:  # a graph without a whole chain can still be drawn
         odometry = None
-    false, is_loop = known_false(path, record), ~factors.is_odometry
+    false = known_false(path, record)
+    is_loop = ~factors.is_odometry
     kept, suspect = np.ones(len(factors), bool), np.zeros(len(factors), bool)
     if judgement is not None:
         kept, suspect = judgement.accepted, judgement.suspect

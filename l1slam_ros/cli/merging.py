@@ -71,7 +71,8 @@ def _part(arguments: argparse.Namespace, path: Path) -> Part:
 
 def _settled(outcome: Outcome, whole: Merged, paths: list[Path]) -> tuple[Outcome, list[str]]:
     """Return the outcome with unjoined parts beside each other, and a sentence on each."""
-    graph, judgement = whole.record.graph.without_struck(), outcome.judgement
+    graph = whole.record.graph.without_struck()
+    judgement = outcome.judgement
     if judgement:
         rivals = rival_doubts(whole.record.graph, outcome.solution.poses, judgement.accepted,
                               whole.of_input)

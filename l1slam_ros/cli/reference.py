@@ -27,7 +27,8 @@ from l1slam_ros.io.trajectory import Reference, read_reference
 # [ns] As far as that a pose may lie before the first or after the last true one: files round.
 _SAME_STAMP = 1_000_000
 # A gap in the truth is bridged up to so many of its usual steps, and up to so long [ns] anyway.
-_USUAL_STEPS, _SHORT = 3, NANOSECONDS
+_USUAL_STEPS = 3
+_SHORT = NANOSECONDS
 
 
 @dataclass(frozen=True)
@@ -76,12 +77,14 @@ def read_truth(source: str, record: GraphRecord, input_path: Path,
     if reference.stamped and scans is not None and _sparser(reference.keys, keys):
         theirs, rows, steps = scans.steps_at(
             reference.keys, _longest(scans.stamps), _SAME_STAMP)
-        poses, gaps = reference.poses[theirs], _gaps(reference.keys)
+        poses = reference.poses[theirs]
+        gaps = _gaps(reference.keys)
     elif reference.stamped:
         rows, poses, gaps = _at_stamps(record, reference, keys)
     else:
         _, rows, theirs = np.intersect1d(keys, reference.keys, return_indices=True)
-        poses, gaps = reference.poses[theirs], np.zeros(0, np.int64)
+        poses = reference.poses[theirs]
+        gaps = np.zeros(0, np.int64)
     if len(rows) < 2:
         stampless = reference.stamped and record.stamps is None
         hint = '; the graph has no stamps, so its poses are 0.1 s apart from 1000 s on'
@@ -127,7 +130,8 @@ def _gaps(stamps: Indices) -> Indices:
 def _sparser(true: Indices, own: Indices) -> bool:
     """Tell whether there are fewer true stamps than own ones, of the time that has both."""
     def between(stamps: Indices) -> int:
-        first, last = max(true[0], own[0]), min(true[-1], own[-1])
+        first = max(true[0], own[0])
+        last = min(true[-1], own[-1])
         return int(((stamps >= first) & (stamps <= last)).sum())
 
     return between(true) < between(own)

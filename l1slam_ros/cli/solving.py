@@ -202,7 +202,9 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
 
 def asked_of(arguments: argparse.Namespace) -> SolveOptions:
     """Return how a graph is to be solved."""
-    solver, least_squares, robust = OptimiserOptions(), LeastSquaresOptions(), arguments.robust
+    solver = OptimiserOptions()
+    least_squares = LeastSquaresOptions()
+    robust = arguments.robust
     if arguments.params_file:
         from l1slam_ros.io.node_options import read_params_file
 
@@ -227,7 +229,9 @@ def _cost_name(asked: SolveOptions) -> str:
 
 
 def _report(record: GraphRecord, outcome: Outcome) -> dict[str, object]:
-    solution, factors, judgement = outcome.solution, record.graph.between, outcome.judgement
+    solution = outcome.solution
+    factors = record.graph.between
+    judgement = outcome.judgement
     suspect = judgement.suspect if judgement else np.zeros(len(factors), bool)
     refused = ~judgement.accepted & ~suspect if judgement else suspect
     slips = judgement.slips if judgement else np.zeros(0, np.int64)

@@ -43,7 +43,8 @@ def simulate(arguments: argparse.Namespace) -> Ending:
     """Make a world and write its graph, its truth and which of its loops are false."""
     _check(arguments, (), ('truth', 'false'))
     _check_scans(arguments)
-    output, rng = arguments.output, np.random.default_rng(arguments.seed)
+    output = arguments.output
+    rng = np.random.default_rng(arguments.seed)
     world = simulate_world(arguments.poses, arguments.edges, WorldOptions(), rng, arguments.world)
     if arguments.false_loops:
         make = FALSE_LOOPS[arguments.kind]

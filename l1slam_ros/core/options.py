@@ -75,7 +75,9 @@ class Options:
                 require(nested, f.name, getattr(self, f.name),
                         f'{nested.__name__}; {nested.__name__}.from_mapping makes it of a mapping')
                 continue
-            meaning, value, kind = f.metadata['meaning'], getattr(self, f.name), type(f.default)
+            meaning = f.metadata['meaning']
+            value = getattr(self, f.name)
+            kind = type(f.default)
             if kind is float and type(value) is int:
                 value = float(value)
                 object.__setattr__(self, f.name, value)

@@ -20,7 +20,8 @@ _LARGEST, _LONGEST_LINE, _LONGEST_YAML = 2**31, 2**16, 2**22
 # Brackets and lists within each other: PyYAML takes the square of it.
 _DEEPEST = 64
 _BLOCK = 2**20
-_BRACKET, _LISTS = re.compile(r'[][{}]'), re.compile(r'^ *(?:[-?] )+', re.MULTILINE)
+_BRACKET = re.compile(r'[][{}]')
+_LISTS = re.compile(r'^ *(?:[-?] )+', re.MULTILINE)
 
 
 def read_text(path: Path) -> bytes:
@@ -36,7 +37,9 @@ def read_text(path: Path) -> bytes:
     size = path.stat().st_size
     if size > _LARGEST:
         raise FileError(path, f'{size:,} bytes; expected a text file of at most {_LARGEST:,}')
-    blocks, begun, number = list[bytes](), 0, 1
+    blocks = list[bytes]()
+    begun = 0
+    number = 1
     with path.open('rb') as file:
         while block := file.read(_BLOCK):
             lengths = [len(line) for line in block.split(b'\n')]
@@ -45,7 +48,8 @@ def read_text(path: Path) -> bytes:
                 number += next(k for k, length in enumerate(lengths) if length > _LONGEST_LINE)
                 raise FileError(path, f'a line of more than {_LONGEST_LINE:,} bytes; expected a '
                                 'text file', number)
-            begun, number = lengths[-1], number + len(lengths) - 1
+            begun = lengths[-1]
+            number = number + len(lengths) - 1
             blocks.append(block)
     return b''.join(blocks)
 

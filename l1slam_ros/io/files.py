@@ -239,7 +239,8 @@ def refuse_quaternions(path: object, quaternions: Array, numbers: list[int]) -> 
 
 def first_failure(count: int, works: Callable[[slice], bool]) -> int:
     """Return the first of `count` rows that fails, by bisection; `works` judges a slice."""
-    low, high = 0, count
+    low = 0
+    high = count
     while high - low > 1:
         middle = (low + high) // 2
         if works(slice(low, middle)):

@@ -304,7 +304,8 @@ def write_graph(path: str | os.PathLike[str], graph: FactorGraph, poses: Array, 
     if not np.isfinite(poses).all():
         row = int(np.argmin(np.isfinite(poses).all(axis=1)))
         raise GraphError(f'pose {row} is {poses[row]}, expected finite numbers')
-    origin, factors = _ORIGINS.get(graph), graph.between
+    origin = _ORIGINS.get(graph)
+    factors = graph.between
     if origin is None or len(origin.ids) != graph.n_poses:
         origin = _Origin(np.arange(graph.n_poses))
     left_out = origin.left_out

@@ -254,7 +254,8 @@ def _draw_map(axes: Axes, drawing: MapDrawing) -> None:
 def _draw_ground(axes: Axes, ground: Ground) -> None:
     """Draw what is occupied dark, what is free white, and what is unknown light grey."""
     shade = np.where(ground.occupancy < 0, _UNKNOWN, np.where(ground.occupancy > 0, _WALL, 0.0))
-    (x, y), (a, b) = ground.origin, ground.resolution * np.array(ground.occupancy.shape)
+    x, y = ground.origin
+    a, b = ground.resolution * np.array(ground.occupancy.shape)
     axes.imshow(shade.T, 'Greys', origin='lower', extent=(x, x + a, y, y + b), vmin=0, vmax=1,
                 zorder=0)
 
@@ -323,7 +324,8 @@ def _set_view(axes: Axes, drawing: MapDrawing) -> None:
     size = max(float((high - low).max()), 1.0)
     if (ground := drawing.ground) is not None:
         end = ground.origin + ground.resolution * np.array(ground.occupancy.shape)
-        low, high = np.minimum(low, ground.origin), np.maximum(high, end)
+        low = np.minimum(low, ground.origin)
+        high = np.maximum(high, end)
     if drawing.odometry is not None:
         strayed = drawing.odometry[:, :2].clip(low - _ASTRAY * size, high + _ASTRAY * size)
         low, high = np.minimum(low, strayed.min(axis=0)), np.maximum(high, strayed.max(axis=0))

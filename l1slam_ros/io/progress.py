@@ -40,7 +40,10 @@ class Progress:
 
     def __init__(self, total: float | None, unit: str, quiet: bool = False, label: str = '',
                  delay: float = 0.0):
-        self._total, self._unit, self._label, self._done = total, unit, label, 0.0
+        self._total = total
+        self._unit = unit
+        self._label = label
+        self._done = 0.0
         self._delay = delay
         self._next_line = time.monotonic() + _PATIENCE if label and not quiet else float('inf')
         self._on_terminal = not quiet and sys.stderr is not None and sys.stderr.isatty()

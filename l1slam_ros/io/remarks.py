@@ -33,7 +33,8 @@ from l1slam_ros.core.errors import FileError
 Remarks = Mapping[str, Any] | None
 
 KEYWORD = '#L1SLAM '
-_FIRST, _FIRST_OF_2 = f' {KEYWORD}map 3', f'{KEYWORD}map 2'
+_FIRST = f' {KEYWORD}map 3'
+_FIRST_OF_2 = f'{KEYWORD}map 2'
 _PROOF = f'{KEYWORD}sha256 '
 _LAST = len(_PROOF) + 2 * sha256().digest_size + 1  # bytes of the last line
 # Rows to a line: readers whose lines have an end get through, and other threads their turn.
@@ -60,7 +61,8 @@ def _together(lines: Iterable[str]) -> Iterator[str]:
         size += len(line)
         if size > _ENOUGH:
             yield '\n'.join(some)
-            some, size = [], 0
+            some = []
+            size = 0
     yield '\n'.join(some)
 
 
@@ -89,7 +91,8 @@ def is_proven(path: object, content: bytes) -> bool:
     FileError : it was one, and is not as it was written.
 
     """
-    first, last = content[: content.find(b'\n')], content[-_LAST:]
+    first = content[: content.find(b'\n')]
+    last = content[-_LAST:]
     if KEYWORD.encode() not in first and not last.startswith(_PROOF.encode()):
         return False
     if last != f'{_PROOF}{sha256(memoryview(content)[:-_LAST]).hexdigest()}\n'.encode():

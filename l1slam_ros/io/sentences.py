@@ -82,7 +82,8 @@ _REMEDY = 'Vouch for a loop that is right, strike out one that is false, or stat
 
 def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[str]:
     """Yield what was refused and why, the worst first; then what is noisier than it says."""
-    factors, accepted = record.graph.between, judgement.accepted
+    factors = record.graph.between
+    accepted = judgement.accepted
     is_loop = ~factors.is_odometry
     pairs = record.ids[factors.pairs]
     if judgement.drift:

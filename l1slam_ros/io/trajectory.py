@@ -98,15 +98,18 @@ def read_reference(path: str | os.PathLike[str], manifold: Manifold = se2,
     lines = read_lines(path)
     if not lines.texts:
         raise FileError(path, 'the file is empty; expected reference poses')
-    number, first = lines.numbers[0], lines.texts[0].strip()
-    is_csv, in_words = ',' in first, first[0].isalpha()
+    number = lines.numbers[0]
+    first = lines.texts[0].strip()
+    is_csv = ',' in first
+    in_words = first[0].isalpha()
     if is_csv:
         lines = TextLines(lines.numbers[in_words:],
                           [text.replace(',', ' ') for text in lines.texts[in_words:]])
     elif in_words:
         return _read_vertices(path, manifold, by_stamps)
     fields = lines.texts[0].split() if lines.texts else []
-    is_tum, size = len(fields) == _TUM_COLUMNS, 1 + manifold.POSE_SIZE
+    is_tum = len(fields) == _TUM_COLUMNS
+    size = 1 + manifold.POSE_SIZE
     if not is_tum and len(fields) != size:
         others = f' or {size} (stamp and pose)' if is_csv else (
             f', {size} (id and pose) or a graph file')

@@ -50,12 +50,14 @@ from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 
 PROBLEMS = ('angle', 'translation', 'global')
 # A time is the median of so many, or of as many as begin within so many seconds.
-_REPETITIONS, _LONGEST = 5, 10.0
+_REPETITIONS = 5
+_LONGEST = 10.0
 # A fused iteration is too short to be seen beside its set-up, unless there are so many times more.
 _MORE_FUSED = 10
 # Algorithm 4 as printed has settled after so many steps, each changing the cost by less than this
 # part of itself. From there on it only cycles, on a large world for minutes.
-_SETTLED_STEPS, _SETTLED = 5, 1e-4
+_SETTLED_STEPS = 5
+_SETTLED = 1e-4
 # It may pass over so many factors in all. Measured, that is a minute and a half for 700,000 edges,
 # where 30 linearisations would be nine minutes; the smaller graphs of the paper stay below it.
 _MOST_PASSES = 1.5e9
@@ -173,7 +175,8 @@ def _plain_seconds(system: LinearSystem, iterations: int) -> float:
 
 
 def _fused_seconds(system: LinearSystem, iterations: int) -> float:
-    x, y = np.zeros(system.size * system.block_size), np.zeros(len(system.b))
+    x = np.zeros(system.size * system.block_size)
+    y = np.zeros(len(system.b))
 
     def seconds(count: int) -> float:
         began = time.process_time()
@@ -253,12 +256,15 @@ def measure_largest(graph: FactorGraph, start: Array, effort: Effort) -> dict[st
     """
     l2 = minimise_l2(graph, start, LeastSquaresOptions(), cholesky_of(graph)).poses
     l1 = minimise_by(choose(AUTO, graph), graph, l2, OptimiserOptions())[0].poses
-    norm, poses = Largest(len(whitened_residual(graph, l2))), l2
-    y, options = np.zeros(norm.size), PrimalDualOptions(effort.iterations, _SETTLED)
+    norm = Largest(len(whitened_residual(graph, l2)))
+    poses = l2
+    y = np.zeros(norm.size)
+    options = PrimalDualOptions(effort.iterations, _SETTLED)
     for _ in range(_LARGEST_STEPS):
         system = linearise(graph, poses)
         found = minimise_l1(system.A, system.b, np.zeros(system.A.shape[1]), y, options, norm=norm)
-        poses, y = step_poses(graph, poses, found.x), found.y
+        poses = step_poses(graph, poses, found.x)
+        y = found.y
     rows = {name: whitened_residual(graph, found)
             for name, found in (('L-infinity', poses), ('L2', l2), ('L1', l1))}
     return {name: np.array([norm.cost(r), l1_cost(r), l2_cost(r)]) for name, r in rows.items()}
@@ -270,7 +276,8 @@ def _last(iterates: Iterator[tuple[Array, Array]], count: int) -> tuple[Array, A
 
 
 def _median(measure: Callable[[], float]) -> float:
-    began, seconds = time.perf_counter(), [measure()]
+    began = time.perf_counter()
+    seconds = [measure()]
     while len(seconds) < _REPETITIONS and time.perf_counter() - began < _LONGEST:
         seconds.append(measure())
     return float(np.median(seconds))

@@ -164,7 +164,8 @@ def _panels(name: str, clean: FactorGraph, run: LyingLoops) -> list[MapDrawing]:
 def _drawing(graph: FactorGraph, poses: Array, reference: Array, title: str,
              **shown: Any) -> MapDrawing:
     """Return the map of poses, laid on a reference, (n, p); its cost and loops, if not `shown`."""
-    factors, positions = graph.between, graph.manifold.positions
+    factors = graph.between
+    positions = graph.manifold.positions
     drawn = {'loops': factors.pairs[~factors.is_odometry],
              'note': f'L1 cost {l1_cost(whitened_residual(graph, poses)):.6g}', **shown}
     return MapDrawing(title, aligned_positions(positions(poses), positions(reference)), **drawn)

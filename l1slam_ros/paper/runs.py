@@ -68,7 +68,8 @@ class LyingLoops:
 
 def run_noisy_start(graph: FactorGraph, stored: Array, rng: np.random.Generator) -> NoisyStart:
     """Return what comes of the stored poses (n, p) under the least noise that bends the L2 map."""
-    cholesky, size = cholesky_of(graph), np.ptp(graph.manifold.positions(stored), axis=0)
+    cholesky = cholesky_of(graph)
+    size = np.ptp(graph.manifold.positions(stored), axis=0)
     seed = seed_poses(graph, cholesky)
     ours = _minimise_l1(graph, seed).poses
     for noise in NOISES:
@@ -100,7 +101,9 @@ def run_false_loops(graph: FactorGraph, stored: Array, count: int,
     clean = _minimise_l1(graph, seed_poses(graph, cholesky_of(graph))).poses
     loops = identity_false_loops(graph, clean, count, rng)
     lying = insert_loops(graph, loops)
-    cholesky, factors, n = cholesky_of(lying), lying.between, graph.n_poses
+    cholesky = cholesky_of(lying)
+    factors = lying.between
+    n = graph.n_poses
     seed, robust = seed_poses(lying, cholesky), minimise_robustly(lying, _minimise_l1)
     huber = gauss_newton(lying, stored, Huber(graph.manifold.TANGENT_SIZE, 1.0),
                          LeastSquaresOptions(), cholesky)

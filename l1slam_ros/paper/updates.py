@@ -115,7 +115,9 @@ class _Isam2:
 
     def __init__(self, graph: FactorGraph, patience: float = float('inf')):
         gtsam: Any = importlib.import_module('gtsam')
-        self._gtsam, self._factors, self._k = gtsam, graph.between, graph.manifold.TANGENT_SIZE
+        self._gtsam = gtsam
+        self._factors = graph.between
+        self._k = graph.manifold.TANGENT_SIZE
         self._Pose, self._Between, self._Prior = (
             (gtsam.Pose2, gtsam.BetweenFactorPose2, gtsam.PriorFactorPose2) if self._k == 3 else
             (gtsam.Pose3, gtsam.BetweenFactorPose3, gtsam.PriorFactorPose3))
@@ -126,14 +128,17 @@ class _Isam2:
         ends = np.maximum(self._factors.i, self._factors.j)
         self._rows = np.split(np.argsort(ends, kind='stable'),
                               np.searchsorted(np.sort(ends), np.arange(1, graph.n_poses)))
-        self._odometry, self._left = self._factors.is_odometry, patience
+        self._odometry = self._factors.is_odometry
+        self._left = patience
 
     def update(self, k: int) -> list[float]:
         """Add keyframe k and its factors; return the seconds, [] once its time was up."""
         if self._left <= 0:
             return []
-        gtsam, new, values, step = self._gtsam, self._gtsam.NonlinearFactorGraph(), \
-            self._gtsam.Values(), self._Pose()
+        gtsam = self._gtsam
+        new = self._gtsam.NonlinearFactorGraph()
+        values = self._gtsam.Values()
+        step = self._Pose()
         if k == 0:
             new.add(self._Prior(0, step, gtsam.noiseModel.Constrained.All(self._k)))
         for row in self._rows[k]:
@@ -195,7 +200,8 @@ def _serve(asked: Connection, graph_of: Callable[[], FactorGraph], patience: flo
 
 def first_of(graph: FactorGraph, poses: int, rows: Indices) -> FactorGraph:
     """Return the graph of the first keyframes, and of factors (k,) between them."""
-    factors, part = graph.between, FactorGraph(graph.manifold, poses)
+    factors = graph.between
+    part = FactorGraph(graph.manifold, poses)
     part.append_between(factors.i[rows], factors.j[rows], factors.measurement[rows],
                         factors.sqrt_information[rows])
     return part

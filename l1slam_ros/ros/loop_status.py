@@ -50,19 +50,23 @@ class LoopStatus:
         """Publish the loops whose state has changed since the last call; called by the worker."""
         known, count = len(self._in_graph), len(states.rows)
         if count < known:  # the map began anew
-            known, self._waiting = 0, set()
+            known = 0
+            self._waiting = set()
         now = states.state[:count]
         changed = np.ones(len(states.state), bool)
         changed[:known] = now[:known] != self._in_graph[:known]
         (expired,) = np.nonzero(states.state == EXPIRED)
         named = np.hstack((states.robots, states.stamps))
-        gone, before = named[expired], len(self._expired)
+        gone = named[expired]
+        before = len(self._expired)
         changed[expired[:before]] = not np.array_equal(gone[:before], self._expired)
         (waits,) = np.nonzero(states.state == WAITING)
         waiting = [tuple(one) for one in named[waits].tolist()]
         changed[waits] = [one not in self._waiting for one in waiting]
         rows = np.flatnonzero(changed).tolist()
-        self._in_graph, self._expired, self._waiting = now.copy(), gone, set(waiting)
+        self._in_graph = now.copy()
+        self._expired = gone
+        self._waiting = set(waiting)
         if rows:
             name, clock = self._node.get_fully_qualified_name(), self._node.get_clock()
             self._publisher.publish(states_bytes(

@@ -32,12 +32,14 @@ from l1slam_ros.io.messages.serialisation import cdr, header_bytes, string_bytes
 # As in the pictures: Okabe and Ito's, and a redder red.
 _BLUE, _GREY = (0.0, 0.447, 0.698), (0.5, 0.5, 0.5)
 # Loops: from green over yellow to red as their residual grows to so many sigmas.
-_SIGMAS, _WORST = (0.0, 2.5, 5.0), 5.0
+_SIGMAS = (0.0, 2.5, 5.0)
+_WORST = 5.0
 _LADDER = np.array([(0.0, 0.62, 0.451), (0.902, 0.624, 0.0), (0.835, 0.216, 0.055)])
 _LOOPS = {'loops': ACCEPTED, 'suspect_loops': SUSPECT, 'rejected_loops': REJECTED}
 _POINT, _LINE = 0.12, 0.05  # [m]
 # Keyframes or factors of one marker; what moves by less [m] is not sent again.
-_PIECE, _STILL = 500, 0.01
+_PIECE = 500
+_STILL = 0.01
 _EVERY = 1.0  # [s] shortest time between two publications: people see no faster
 # Lifetime: for ever; not locked to the frame.
 _FOR_EVER = struct.pack('<iI?', 0, 0, False)
@@ -81,9 +83,12 @@ class GraphMarkers:
             self._waits = True
             return
         if self._someone_new:
-            self._someone_new, self._sent = False, {}
-        self._waits, self._last = False, time.monotonic()
-        seen, news = {}, []
+            self._someone_new = False
+            self._sent = {}
+        self._waits = False
+        self._last = time.monotonic()
+        seen = {}
+        news = []
         for name, kind, size, points, colours in _namespaces(now):
             per = _PIECE * (2 if kind == Marker.LINE_LIST else 1)
             for number, first in enumerate(range(0, len(points), per)):
@@ -101,9 +106,12 @@ class GraphMarkers:
 
 def _namespaces(now: Snapshot) -> Iterator[tuple[str, int, float, Array, np.ndarray]]:
     """Yield name, type and size of what is drawn, its points (k, 3) and their colours (k, 4)."""
-    manifold, factors, loops = now.graph.manifold, now.graph.between, now.loop_states()
+    manifold = now.graph.manifold
+    factors = now.graph.between
+    loops = now.loop_states()
     points = manifold.to_pose3(now.drawn)[:, :3]
-    begin, end = points[np.maximum(factors.i, 0)], points[factors.j]
+    begin = points[np.maximum(factors.i, 0)]
+    end = points[factors.j]
     world = factors.i == WORLD
     begin[world] = manifold.to_pose3(factors.measurement[world])[:, :3]
     lines = np.stack((begin, end), axis=1)
@@ -111,7 +119,8 @@ def _namespaces(now: Snapshot) -> Iterator[tuple[str, int, float, Array, np.ndar
     yield 'keyframes', Marker.POINTS, _POINT, points, _colours(_BLUE, len(points))
     yield 'odometry', Marker.LINE_LIST, _LINE, odometry, _colours(_GREY, len(odometry))
     k = len(loops.rows)
-    state, sigmas = loops.state[:k], np.nan_to_num(loops.sigmas[:k], nan=_WORST)
+    state = loops.state[:k]
+    sigmas = np.nan_to_num(loops.sigmas[:k], nan=_WORST)
     ladder = np.stack([np.interp(sigmas, _SIGMAS, part) for part in _LADDER.T], axis=1)
     for name, kind in _LOOPS.items():
         chosen = state == kind

@@ -78,7 +78,8 @@ class Player:
         for topic in summary.topics:
             if topics is not None and topic.name not in topics:
                 continue
-            kind, name = _message_class(topic.msgtype), remap.get(topic.name, topic.name)
+            kind = _message_class(topic.msgtype)
+            name = remap.get(topic.name, topic.name)
             try:
                 if kind is None:
                     raise OptionError(f'the type {topic.msgtype} is not installed')
@@ -130,15 +131,20 @@ class Player:
         return sum(publisher.get_subscription_count() for publisher in self.publishers.values())
 
     def _wait_for_others(self) -> None:
-        known, quiet = self._count_subscriptions(), time.monotonic() + _REST
+        known = self._count_subscriptions()
+        quiet = time.monotonic() + _REST
         while time.monotonic() < quiet:
             _sleep_until(time.monotonic() + _PAUSE)
             if (count := self._count_subscriptions()) > known:
-                known, quiet = count, time.monotonic() + _REST
+                known = count
+                quiet = time.monotonic() + _REST
 
     def play(self, messages: Iterable[BagMessage], rate: float, progress: Progress) -> None:
         """Publish the messages, `rate` times as fast as they were recorded."""
-        first, began, shown, next_clock = None, time.monotonic(), 0.0, 0.0
+        first = None
+        began = time.monotonic()
+        shown = 0.0
+        next_clock = 0.0
         for message in messages:
             first = message.time if first is None else first
             recorded = (message.time - first) / NANOSECONDS

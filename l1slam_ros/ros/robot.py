@@ -123,7 +123,8 @@ class RobotPublisher:
         First the transform: who has heard of this odometry, too, is about to look it up, and what
         comes next is to find this one there.
         """
-        robot, manifold = self._look(), self._backend.manifold
+        robot = self._look()
+        manifold = self._backend.manifold
         if robot is None:  # the map has been emptied meanwhile
             return
         if robot.stamp != self._before and self._stamp < robot.stamp + _NEARLY * self._ahead():
@@ -175,7 +176,8 @@ class RobotPublisher:
         self._stamp = min(max(robot.stamp + self._ahead(), self._stamp + 1), LAST_STAMP)
         self._send(robot)
         now = time.monotonic()
-        late, period = now - self._due, self._parameters.options.transform_period
+        late = now - self._due
+        period = self._parameters.options.transform_period
         self._due = now + period - (late if 0 <= late < period else 0.0)
 
     def _send(self, robot: Robot) -> None:

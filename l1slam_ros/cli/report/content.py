@@ -89,7 +89,8 @@ def content(path: Path, norm: str | None, record: GraphRecord, outcome: Outcome,
     remarks : sentences that were said besides
 
     """
-    factors, judgement = record.graph.between, outcome.judgement
+    factors = record.graph.between
+    judgement = outcome.judgement
     slips = judgement.slips if judgement else np.zeros(0, np.int64)
     rows = np.concatenate((np.flatnonzero(~factors.is_odometry), slips))
     doubts = judgement.doubts if judgement else ()
@@ -121,7 +122,8 @@ def content(path: Path, norm: str | None, record: GraphRecord, outcome: Outcome,
 
 
 def _verdict(record: GraphRecord, outcome: Outcome) -> str:
-    factors, judgement = record.graph.between, outcome.judgement
+    factors = record.graph.between
+    judgement = outcome.judgement
     if judgement is None:
         return f'All of {doubted(factors)} were believed; none was judged.'
     used = int((judgement.accepted & ~factors.is_odometry).sum())
@@ -144,7 +146,8 @@ def _maps(record: GraphRecord, outcome: Outcome, rivals: Sequence[Rival],
     fate, sigmas = _fates(record.graph, outcome.judgement)
     maps = [('the map', _used(outcome, fate), -1, first, fate, sigmas)]
     for rival in rivals:
-        other, judgement = positions(rival.outcome.solution.poses), rival.outcome.judgement
+        other = positions(rival.outcome.solution.poses)
+        judgement = rival.outcome.judgement
         if judgement is not None:
             fate_there, sigmas_there = _fates(rival.graph, judgement)
         elif len(rival.graph.between) == len(record.graph.between):
@@ -169,7 +172,8 @@ def _note(rival: Rival, first: Array, other: Array, fate: Indices) -> str:
 
 
 def _used(outcome: Outcome, fate: Indices) -> str:
-    used, judgement = int(np.isin(fate, (_ACCEPTED, _TRUSTED)).sum()), outcome.judgement
+    used = int(np.isin(fate, (_ACCEPTED, _TRUSTED)).sum())
+    judgement = outcome.judgement
     status = DOUBTFUL if judgement and judgement.doubts else outcome.solution.status.value
     return f'{counted(used, "loop")} used, {status.replace("_", " ")}'
 
@@ -191,7 +195,8 @@ def _fates(graph: FactorGraph, judgement: Judgement | None) -> tuple[Indices, Ar
 
 def _path(graph: FactorGraph) -> list[int]:
     """Return the keyframes robot by robot, -1 before each that no odometry leads to."""
-    robot, path = graph.robot, list[int]()
+    robot = graph.robot
+    path = list[int]()
     for number in np.unique(robot).tolist():
         for keyframe in np.flatnonzero(robot == number).tolist():
             path += [keyframe] if graph.between.step_to[keyframe] >= 0 else [-1, keyframe]

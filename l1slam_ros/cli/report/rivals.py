@@ -87,7 +87,8 @@ def rival_maps(record: GraphRecord, outcome: Outcome, asked: SolveOptions,
 
 def _plans(record: GraphRecord, judgement: Judgement, asked: SolveOptions) -> Iterator[_Plan]:
     """Yield what to solve for each doubt, where it has a rival."""
-    graph, believing = record.graph, replace(asked, start='seed', robust=False)
+    graph = record.graph
+    believing = replace(asked, start='seed', robust=False)
     for number, doubt in enumerate(judgement.doubts):
         rows = doubted_rows(doubt, graph.between)
         loops = counted(len(rows), 'loop')
@@ -118,7 +119,8 @@ def _told(graph: FactorGraph, rows: Indices, trusted: bool) -> FactorGraph:
 def _of_step(record: GraphRecord, judgement: Judgement, doubt: Doubt, number: int,
              believing: SolveOptions) -> Iterator[_Plan]:
     """Yield the map of the accepted factors without a step, or with it if it was left out."""
-    factors, believed = record.graph.between, judgement.accepted.copy()
+    factors = record.graph.between
+    believed = judgement.accepted.copy()
     ends = np.sort(factors.pairs, axis=1) == (doubt.first, doubt.last)
     rows = np.flatnonzero(factors.is_odometry & ends.all(axis=1))
     if len(rows):

@@ -35,7 +35,8 @@ def poses_at(
 
     """
     after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
-    since, until = at - times[after - 1], times[after] - at
+    since = at - times[after - 1]
+    until = times[after] - at
     gap = since + until
     inside = (since >= 0) & (until >= 0) & (gap <= longest)
     rows = np.flatnonzero(inside | (np.minimum(np.abs(since), np.abs(until)) <= tolerance))

@@ -97,7 +97,8 @@ def nearest_definite(information: Array) -> tuple[Array, Array]:
     some = values[:, -1] > 0
     rows, values, vectors = rows[some], values[some], vectors[some]
     floor = LEAST_EIGENVALUE * values[:, -1:]
-    definite, least = information.copy(), np.full(len(information), np.nan)
+    definite = information.copy()
+    least = np.full(len(information), np.nan)
     definite[rows] = silenced(
         (vectors * np.maximum(values, floor)[:, None, :]) @ vectors.transpose(0, 2, 1),
         silent[rows])
@@ -168,7 +169,8 @@ def within_bounds(
     if large.any():
         scale = np.where(large, np.sqrt(most) / np.sqrt(variance), 1.0)
         covariance = scale[:, :, None] * covariance * scale[:, None, :]
-    used, out = np.diagonal(covariance, axis1=1, axis2=2), out | large
+    used = np.diagonal(covariance, axis1=1, axis2=2)
+    out = out | large
     return covariance, list(zip(found[out].tolist(), used[out].tolist(), strict=True))
 
 

@@ -55,16 +55,19 @@ def beta_quantile(a: float, b: float, probability: float) -> float:
 
 def _sum(term: float, ratio: Callable[[int], float]) -> float:
     """Return the sum of a series; ratio : of term n to the one before it."""
-    total, n = 0.0, 0
+    total = 0.0
+    n = 0
     while term > _NOTHING * total:
-        total, n = total + term, n + 1
+        total = total + term
+        n = n + 1
         term *= ratio(n)
     return total
 
 
 def _solve(values: Callable[[float], tuple[float, float]], wanted: float, high: float) -> float:
     """Return where a function is as wanted, between 0 and `high`; values : it, its derivative."""
-    low, x = 0.0, high / 2
+    low = 0.0
+    x = high / 2
     for _ in range(_STEPS):
         value, slope = values(x)
         low, high = (low, x) if value > wanted else (x, high)

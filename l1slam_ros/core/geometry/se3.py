@@ -59,7 +59,8 @@ def _turned(q: Array, v: Array) -> Array:
 
 def _matrix(q: Array) -> Array:
     """Return R(q), (n, 3, 3)."""
-    x, w = q[..., :3], q[..., 3, None, None]
+    x = q[..., :3]
+    w = q[..., 3, None, None]
     half = w**2 - 0.5
     return 2 * (half * np.eye(3) + x[..., :, None] * x[..., None, :] + w * _skew(x))
 

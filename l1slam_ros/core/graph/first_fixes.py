@@ -56,7 +56,8 @@ def first_fixes(graph: FactorGraph, latest: int | None = None,
     GraphError : the odometry has a gap.
 
     """
-    factors, leading = graph.between, graph.manifold.TRANSLATION.stop
+    factors = graph.between
+    leading = graph.manifold.TRANSLATION.stop
     rows = np.flatnonzero(factors.is_absolute)
     rows = rows[np.argsort(factors.j[rows], kind='stable')][-(latest or len(rows)):]
     size = min(_SIZE, len(rows))
@@ -67,8 +68,8 @@ def first_fixes(graph: FactorGraph, latest: int | None = None,
     near = list(strides[:, None] * np.arange(leading))
     if variance is None:
         variance = _likeliest_variance(samples, _windows(len(rows), size, _FOR_NOISE), near)
-    leads, windows = [*near, *(size - 1 - lead for lead in near)], _windows(
-        len(rows), size, _WINDOWS)
+    leads = [*near, *(size - 1 - lead for lead in near)]
+    windows = _windows(len(rows), size, _WINDOWS)
     ratio = np.concatenate([samples.log_ratio(windows, variance, lead) for lead in leads])
     windows = np.tile(windows, (len(leads), 1))
     agreed = np.where(ratio > 0, ratio, 0.0)
@@ -112,9 +113,12 @@ class _Samples:
 
     def __init__(self, graph: FactorGraph, rows: Indices):
         manifold, factors = graph.manifold, graph.between
-        rng, d = np.random.default_rng(_SEED), manifold.TANGENT_SIZE
-        poses, keyframe = odometry_poses(graph), factors.j[rows]
-        self._manifold, self._fixes = manifold, graph.subset(rows).between
+        rng = np.random.default_rng(_SEED)
+        d = manifold.TANGENT_SIZE
+        poses = odometry_poses(graph)
+        keyframe = factors.j[rows]
+        self._manifold = manifold
+        self._fixes = graph.subset(rows).between
         self._way = manifold.between(poses[keyframe[:-1]], poses[keyframe[1:]])
         self._drift = _samples(_drift(graph, poses, keyframe), rng)
         self._noise = _samples(covariance_of(self._fixes.sqrt_information), rng)
@@ -133,7 +137,9 @@ class _Samples:
         Infinite of those that say where the map is, `lead`; variance : of the odometry.
         """
         manifold, fixes = self._manifold, self._fixes
-        (w, k), q, d = windows.shape, _SAMPLES + 1, manifold.TANGENT_SIZE
+        w, k = windows.shape
+        q = _SAMPLES + 1
+        d = manifold.TANGENT_SIZE
         p = manifold.POSE_SIZE
         ways = self._retracted(self._way, np.sqrt(variance) * self._drift).reshape(q, -1, p)
         local = [np.tile(manifold.identity(1), (q * w, 1))]

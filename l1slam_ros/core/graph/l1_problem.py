@@ -54,7 +54,8 @@ class GraphProblem:
 
         The same to first order; but where a long way turns as a whole, none of it is torn.
         """
-        manifold, fixed = self.graph.manifold, anchor(self.graph)
+        manifold = self.graph.manifold
+        fixed = anchor(self.graph)
         step = np.zeros((len(poses), manifold.TANGENT_SIZE))
         step[fixed:] = x.reshape(-1, manifold.TANGENT_SIZE)
         parent = self.graph.parent

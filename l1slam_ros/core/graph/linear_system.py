@@ -90,7 +90,9 @@ class LinearSystem:
 
     def weighted(self, roots: Array) -> 'LinearSystem':
         """Return the system with the rows of each factor multiplied by its root (m, k, k)."""
-        k, roots, blocks = self.block_size, np.ascontiguousarray(roots), self.blocks.copy()
+        k = self.block_size
+        roots = np.ascontiguousarray(roots)
+        blocks = self.blocks.copy()
         kernels.blocks.whiten_blocks(roots, blocks, (0,) * k)
         return replace(self, blocks=blocks,
                        b=kernels.blocks.whiten(roots, self.b.reshape(-1, k), (0,) * k).ravel())
@@ -124,7 +126,8 @@ def loose_keyframes(graph: FactorGraph) -> Indices:
     whole = factors.freedom == graph.manifold.TANGENT_SIZE
     if whole.all():
         return np.zeros(0, np.int64)
-    lowest, fixed = lowest_joined(graph.subset(whole)), anchor(graph)
+    lowest = lowest_joined(graph.subset(whole))
+    fixed = anchor(graph)
     first = np.unique(lowest[:-1])
     return first[first != lowest[-1]][fixed:] - fixed
 
@@ -136,7 +139,8 @@ def with_world(manifold: Manifold, poses: Array) -> Array:
 
 def ends(graph: FactorGraph, poses: Array) -> tuple[Array, Array]:
     """Return the poses of the ends i and j of each between factor, (m, p) each."""
-    factors, poses = graph.between, with_world(graph.manifold, poses)
+    factors = graph.between
+    poses = with_world(graph.manifold, poses)
     return poses.take(factors.i, axis=0), poses.take(factors.j, axis=0)
 
 

@@ -233,7 +233,8 @@ class Notes:
 
     def news(self) -> list[str]:
         """Return a sentence of each cause that is new, or was told of, since the last call."""
-        news, self._unsaid = self._unsaid, {}
+        news = self._unsaid
+        self._unsaid = {}
         return list(news.values())
 
     def sentences(self) -> list[str]:

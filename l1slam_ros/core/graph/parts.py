@@ -25,7 +25,8 @@ _VAGUE, _TINY = 21.5, 1e-300
 
 def give_to(graph: FactorGraph, robot: Indices) -> None:
     """Let keyframes be of these robots, (n,), each follow the last one of its robot."""
-    order, before = np.argsort(robot, kind='stable'), np.full(len(robot), NO_PREDECESSOR)
+    order = np.argsort(robot, kind='stable')
+    before = np.full(len(robot), NO_PREDECESSOR)
     before[order[1:]] = np.where(np.diff(robot[order]), NO_PREDECESSOR, order[:-1])
     graph.follow(np.arange(len(robot)), before, robot)
 
@@ -88,7 +89,8 @@ def _with_steps(graph: FactorGraph, at: Indices, Z: Array) -> FactorGraph:
     """Return the graph with steps Z (k, p) from keyframes `at` (k,), as sure as its odometry."""
     if not len(at):
         return graph
-    whole, usual = graph.copy(), _usual(graph)
+    whole = graph.copy()
+    usual = _usual(graph)
     whole.follow(at + 1, at)
     whole.append_between(at, at + 1, Z, np.broadcast_to(usual, (len(at), *usual.shape)))
     return whole

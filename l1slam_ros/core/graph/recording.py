@@ -37,7 +37,8 @@ def loops_of(graph: FactorGraph) -> Indices:
     Of one end what is struck out is first: a strike means all loops of the same keyframes, and who
     vouches for one of them has the last word.
     """
-    factors, rows = graph.between, np.flatnonzero(~graph.between.is_odometry)
+    factors = graph.between
+    rows = np.flatnonzero(~graph.between.is_odometry)
     return rows[np.lexsort((~factors.struck[rows], factors.j[rows]))]
 
 
@@ -49,10 +50,13 @@ def recorded(graph: FactorGraph,
     A loop that is struck out is told, and then that it is false. Covariances are those of the
     factors; what is left unsaid has an infinite variance.
     """
-    factors, to_pose3 = graph.between, graph.manifold.to_pose3
-    steps, loops = factors.step_to, loops_of(graph)
-    poses, measured, covariances = to_pose3(_chain(graph)), to_pose3(
-        factors.measurement), _covariances(graph)
+    factors = graph.between
+    to_pose3 = graph.manifold.to_pose3
+    steps = factors.step_to
+    loops = loops_of(graph)
+    poses = to_pose3(_chain(graph))
+    measured = to_pose3(factors.measurement)
+    covariances = _covariances(graph)
     ends = np.searchsorted(factors.j[loops], np.arange(graph.n_poses + 1))
     still = np.zeros((6, 6))
     for k, stamp in enumerate(stamps):
@@ -73,7 +77,8 @@ def _chain(graph: FactorGraph) -> Array:
 
     One after the other: so each is exact to rounding *relative to the one before*.
     """
-    poses, parent = graph.manifold.identity(graph.n_poses), graph.parent
+    poses = graph.manifold.identity(graph.n_poses)
+    parent = graph.parent
     steps = graph.between.step_to
     for k in np.flatnonzero(steps >= 0).tolist():
         step = graph.between.measurement[steps[k]]
@@ -84,7 +89,8 @@ def _chain(graph: FactorGraph) -> Array:
 def _covariances(graph: FactorGraph) -> Array:
     """Return the covariance of each factor as messages have it, (m, 6, 6)."""
     manifold, factors = graph.manifold, graph.between
-    rows, diagonal = manifold.COVARIANCE_ROWS, np.arange(manifold.TANGENT_SIZE)
+    rows = manifold.COVARIANCE_ROWS
+    diagonal = np.arange(manifold.TANGENT_SIZE)
     of_manifold = covariance_of(factors.sqrt_information)
     of_manifold[:, diagonal, diagonal] += np.where(factors.speaks, 0.0, np.inf)
     covariances = np.zeros((len(factors), 6, 6))

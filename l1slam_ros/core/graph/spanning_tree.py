@@ -60,7 +60,9 @@ def _breadth_first(graph: FactorGraph, root: int) -> Indices:
     Where a path leads through the world, another tree begins: the first keyframe there is its own
     parent, too.
     """
-    factors, n, labels = graph.between, graph.n_poses, component_labels(graph)
+    factors = graph.between
+    n = graph.n_poses
+    labels = component_labels(graph)
     tied = factors.j[factors.is_absolute]
     i, j = factors.i[~factors.is_absolute], factors.j[~factors.is_absolute]
     near, far = np.concatenate((i, j)), np.concatenate((j, i))
@@ -72,7 +74,8 @@ def _breadth_first(graph: FactorGraph, root: int) -> Indices:
         if parent[first] >= 0:
             continue
         # One by one: a graph is often nearly a chain, with as many levels as keyframes.
-        parent[first], reached = first, [first]
+        parent[first] = first
+        reached = [first]
         for k in reached:
             for other in neighbours[start[k]:start[k + 1]]:
                 if parent[other] < 0:
@@ -93,7 +96,8 @@ def compose_tree(manifold: Manifold, parent: Indices, relative: Array) -> Array:
     root = parent == np.arange(len(parent))
     while not root.all():
         poses = np.where(root[:, None], poses, manifold.compose(poses[parent], poses))
-        root, parent = root | root[parent], parent[parent]
+        root = root | root[parent]
+        parent = parent[parent]
     return poses
 
 

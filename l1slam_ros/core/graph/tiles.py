@@ -48,7 +48,8 @@ class Tiles:
 
     def _side_by_side(self, values: np.ndarray, dtype: type, rest: int) -> np.ndarray:
         """Return values (m, c) as tiles (t, c, lanes), the last one filled up with `rest`."""
-        (m, columns), count = values.shape, -(-len(values) // self._lanes)
+        m, columns = values.shape
+        count = -(-len(values) // self._lanes)
         padded: np.ndarray = np.full((count * self._lanes, columns), rest, dtype)
         padded[:m] = values.take(self._order, axis=0)
         tiles = padded.reshape(count, self._lanes, columns).transpose(0, 2, 1)

@@ -37,9 +37,11 @@ def placed(graph: FactorGraph, poses: Array) -> Array:
     if not is_absolute.any():
         return poses
     part_of = lowest_joined(graph.subset(~is_absolute))[:-1]
-    tied, poses = part_of[graph.between.j], poses.copy()
+    tied = part_of[graph.between.j]
+    poses = poses.copy()
     for part in np.unique(tied[is_absolute]):
-        rows, inside = np.flatnonzero(is_absolute & (tied == part)), part_of == part
+        rows = np.flatnonzero(is_absolute & (tied == part))
+        inside = part_of == part
         rows = rows[:: -(-len(rows) // _ASKED)]
         motion = _best_motion(graph.subset(rows), poses)
         poses[inside] = graph.manifold.compose(
@@ -50,7 +52,8 @@ def placed(graph: FactorGraph, poses: Array) -> Array:
 def _best_motion(graph: FactorGraph, poses: Array) -> Array:
     """Return how a part with these absolute factors alone is best moved, (1, p)."""
     manifold, factors = graph.manifold, graph.between
-    here, speaks = poses[factors.j], factors.speaks
+    here = poses[factors.j]
+    speaks = factors.speaks
     there = manifold.retract(here, speaks * manifold.local(here, factors.measurement))
     motions = np.concatenate((
         manifold.identity(1), manifold.compose(there, manifold.inverse(here)),
@@ -71,7 +74,8 @@ def _motions_of_positions(graph: FactorGraph, poses: Array) -> Array:
     rows = np.flatnonzero(factors.speaks[:, manifold.TRANSLATION].all(axis=1))
     here = manifold.positions(poses[factors.j[rows]])
     there = manifold.positions(factors.measurement[rows])
-    size, m = here.shape[1], len(rows)
+    size = here.shape[1]
+    m = len(rows)
     if m < 2:
         return manifold.identity(0)
     # Each of them with those so many strides on, round in a circle.

@@ -32,7 +32,8 @@ from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS
 _FAR = 0.1
 # Standard deviations [m] and [rad] of where a false loop says its poses are to each other: near,
 # the policy of Vertigo (Suenderhauf and Protzel, 2012).
-_SIGMA_TRANSLATION, _SIGMA_ROTATION = 0.3, math.radians(10)
+_SIGMA_TRANSLATION = 0.3
+_SIGMA_ROTATION = math.radians(10)
 # Loops of one group, fewest and most.
 _GROUP = 10, 20
 # Rounds of drawing far pairs; in each about four of five find a place in an ordinary graph.
@@ -117,7 +118,8 @@ def grouped_false_loops(
     ends = np.cumsum(rng.integers(few, many + 1, size=count // few + 1)).clip(max=count)
     lengths = np.diff(ends, prepend=0)
     i, j, run = _far_runs(graph, poses, lengths[lengths > 0], rng)
-    manifold, chain = graph.manifold, odometry_poses(graph)
+    manifold = graph.manifold
+    chain = odometry_poses(graph)
     first = np.searchsorted(run, run)
     wrong = _small_offsets(manifold, count, rng)[first]
     back_along_i = manifold.between(chain[i], chain[i[first]])
@@ -154,7 +156,9 @@ def _far_runs(
 
     lengths : (r,); the pairs i, j (m,) come run by run with the number of their run (m,).
     """
-    positions, factors, n = graph.manifold.positions(poses), graph.between, graph.n_poses
+    positions = graph.manifold.positions(poses)
+    factors = graph.between
+    n = graph.n_poses
     taken = pair_key(factors.i, factors.j, n)
     start = np.zeros((len(lengths), 2), np.int64)
     todo = np.arange(len(lengths))

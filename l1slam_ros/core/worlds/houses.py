@@ -25,7 +25,9 @@ from l1slam_ros.core.worlds.simulate import WorldOptions
 _STREET = 0.7, 1.8
 # How far a bay stands back, at least and at most, how wide it is, and how far it is from the
 # corners at least, of the front's length.
-_BAY, _WIDTH, _OFF = (0.1, 0.25), (0.15, 0.4), 0.2
+_BAY = (0.1, 0.25)
+_WIDTH = (0.15, 0.4)
+_OFF = 0.2
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,8 @@ def houses(positions: Array, block: float, rng: np.random.Generator) -> Array:
     low, high = (np.rint(extreme / block).astype(int)
                  for extreme in (positions.min(axis=0), positions.max(axis=0)))
     # One more row around: the streets at the edge have two sides, too. Behind it is the fence.
-    (a, b), (c, d) = low - 1, high + 1
+    a, b = low - 1
+    c, d = high + 1
     corners = np.array([(x, y) for x in range(a, c) for y in range(b, d)])
     fence = block * np.array([(a, b, c, b), (c, b, c, d), (c, d, a, d), (a, d, a, b)])
     return np.concatenate([fence, *(_house(corner * block, block, rng) for corner in corners)])
@@ -92,7 +95,8 @@ def scans(truth: Array, stamps: Indices, walls: Array, laser: Laser, rng: np.ran
 def ranges(start: Array, angles: Array, walls: Array) -> Array:
     """Return the way from a start (2,) at each angle (r,) to the nearest wall [m]; none: inf."""
     c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
-    (x, y), (u, v) = (walls[:, :2] - start).T, (walls[:, 2:] - walls[:, :2]).T
+    x, y = (walls[:, :2] - start).T
+    u, v = (walls[:, 2:] - walls[:, :2]).T
     with np.errstate(divide='ignore', invalid='ignore'):
         cross = c * v - s * u
         way, along = (x * v - y * u) / cross, (x * s - y * c) / cross

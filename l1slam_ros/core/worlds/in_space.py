@@ -23,7 +23,8 @@ from l1slam_ros.core.geometry.manifold import Array
 # Of a building: the sides of a floor in blocks, how high a floor is in steps, and how many poses
 # there are for each floor, in laps of it.
 _LENGTH, _WIDTH = 4, 2
-_HEIGHT, _LAPS = 3.0, 5
+_HEIGHT = 3.0
+_LAPS = 5
 # Points of a curve for each pose of it, and the fewest poses that it has.
 _FINE, _FEWEST = 30, 30
 

@@ -102,7 +102,8 @@ def simulate_world(
     else:
         visits = max(_LEAST_VISITS, n_loops / n_poses / 2)
         side = max(2, round(math.sqrt(n_poses / (2 * options.block * visits))))
-        manifold, truth = se2, _drive(n_poses, side, options, rng)
+        manifold = se2
+        truth = _drive(n_poses, side, options, rng)
     loops = _near_pairs(manifold.positions(truth), n_loops, options.step, rng)
     chain = np.arange(n_poses - 1)
     i, j = np.concatenate((np.stack((chain, chain + 1), axis=1), loops)).T
@@ -122,7 +123,8 @@ def with_false_loops(world: World, loops: Loops) -> World:
 def _drive(n_poses: int, side: int, options: WorldOptions, rng: np.random.Generator) -> Array:
     """Return the poses of a drive through side x side crossings, from one near the middle."""
     headings = [0]
-    x, y = (side - 1) // 2 + 1, (side - 1) // 2
+    x = (side - 1) // 2 + 1
+    y = (side - 1) // 2
     # A choice hangs on where the ones before led, so this cannot be done in one piece.
     for first in rng.integers(3, size=(n_poses - 1) // options.block).tolist():
         for k in range(3):
@@ -146,7 +148,8 @@ def _near_pairs(positions: Array, count: int, step: float, rng: np.random.Genera
     # Many positions are the same, on which a balanced tree would spend its time.
     tree = cKDTree(positions, balanced_tree=False)
     radius = _FIRST_RADIUS * step
-    chain, itself = len(positions) - 1, len(positions)
+    chain = len(positions) - 1
+    itself = len(positions)
     while (tree.count_neighbors(tree, radius) - itself) // 2 - chain < count:
         radius *= _RADIUS_GROWTH
     pairs: Indices = tree.query_pairs(radius, output_type='ndarray')

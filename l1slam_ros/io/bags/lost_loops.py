@@ -66,7 +66,8 @@ class LoopCount:
         odometry : that of the odometry
 
         """
-        came, lost = self.came.total(), self.refused.total() + lost
+        came = self.came.total()
+        lost = self.refused.total() + lost
         if 2 * lost > came:
             reason = f', the first: {self._first}' if self._first else ''
             yield (f'{lost:,} of {counted(came, "loop")} on {" and ".join(sorted(self.came))} '

@@ -198,12 +198,15 @@ def _bag_path(path: str | os.PathLike[str]) -> Path:
 def _messages(path: str | os.PathLike[str], topics: Collection[str] | None, start: int | None,
               stop: int | None, on_damage: OnDamage) -> Iterator[tuple[BagMessage, Any]]:
     """Yield the messages of a bag, each with the types to decode it by."""
-    bag, count, last = _bag_path(path), 0, -math.inf
+    bag = _bag_path(path)
+    count = 0
+    last = -math.inf
     try:
         # All of one time or none: the library may have another order than the file.
         for time, group in groupby(_by_library(bag, topics, start, stop), lambda m: m[0].time):
             messages = list(group)
-            count, last = count + len(messages), time
+            count = count + len(messages)
+            last = time
             yield from messages
         return
     except Exception as error:  # damaged bags make the library raise anything

@@ -119,7 +119,8 @@ class _Growing:
     def __init__(self, manifold: Manifold, options: GraphBuilderOptions, topics: Topics,
                  foreign: Foreign | None, verbatim: bool):
         self._builder = GraphBuilder(manifold, options, verbatim)
-        self._topics, self._types = topics, topics.types()
+        self._topics = topics
+        self._types = topics.types()
         self._map_frame = ''
         self._foreign = foreign
         self._graph = foreign.graph() if foreign else None
@@ -128,7 +129,8 @@ class _Growing:
 
     def take(self, message: BagMessage) -> None:
         """Use a message, or note why not."""
-        topic, expected = message.topic, self._types.get(message.topic, message.msgtype)
+        topic = message.topic
+        expected = self._types.get(message.topic, message.msgtype)
         self.seen.add(topic)
         try:
             if self._foreign and self._foreign.topics.get(topic) == message.msgtype:

@@ -31,7 +31,8 @@ def anchors_of(groups: dict[str, TextLines], ids: Indices, edges: Rows) -> Indic
     fixed = fixed_in(groups)
     if not fixed:  # as in most files; else each vertex gets a name to compare
         return ids[:0]
-    anchors, ends = [], np.sort(edges.ids, axis=1)
+    anchors = []
+    ends = np.sort(edges.ids, axis=1)
     for k in np.flatnonzero(np.isin(ids.astype(str), fixed)):
         passed = (ends == ids[[k - 1, (k + 1) % len(ids)]]).all(axis=1)
         if (ends == ids[k]).any(axis=1).sum() == 1 and passed.any():

@@ -77,7 +77,9 @@ def restored(lines: TextLines) -> tuple[TextLines, dict[int, tuple[str, int]]]:
     is_ours = lines.remarks is not None or bool(lines.comments and lines.comments[-1][1] == MARK)
     if not is_ours:
         return lines, {}
-    rows, words, comments = list(zip(lines.numbers, lines.texts, strict=True)), {}, []
+    rows = list(zip(lines.numbers, lines.texts, strict=True))
+    words = {}
+    comments = []
     for number, text in lines.comments:
         if found := _COMMENT.fullmatch(text):
             words[number] = found[1], int(found[3])
@@ -103,7 +105,8 @@ def in_place(numbers: Indices, words: dict[int, tuple[str, int]]
     rest = np.flatnonzero(said != MEASURED)
     order, said = _in_order(said[rest], places[rest])
     order = rest[order]
-    as_measured, there = order.copy(), places[measured] < len(order)
+    as_measured = order.copy()
+    there = places[measured] < len(order)
     as_measured[places[measured[there]]] = measured[there]
     return order, said, as_measured
 

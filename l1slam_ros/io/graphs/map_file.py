@@ -51,11 +51,13 @@ class MapFile:
     def __init__(self, backend: Backend, options: Callable[[], NodeOptions],
                  warn: Callable[[str], object]):
         self._backend, self._options, self._warn = backend, options, warn
-        self.is_saving, self._one = False, threading.Lock()
+        self.is_saving = False
+        self._one = threading.Lock()
         # Names of robots by their numbers, behind those of the node the ones of a loaded map.
         self._robots = options().names
         # When the last save began, or the node; and whether there was one.
-        self._began, self._tried = time.monotonic(), False
+        self._began = time.monotonic()
+        self._tried = False
         # Where the map was saved or loaded last, and its revision then.
         self._known = _absolute(options().save_path), backend.revisions.now
         # The file that we wrote or loaded, its end, and what names the graph whose map it holds;
@@ -66,7 +68,8 @@ class MapFile:
     def save(self) -> str:
         """Save the map; return a sentence that says where, and which foreign file was kept."""
         with self._at_work(), self._backend.calm:
-            revision, path = self._backend.revisions.now, self._path()
+            revision = self._backend.revisions.now
+            path = self._path()
             saved = self._backend.saved()
             kept = self._keep_others(path, saved)
             return '; '.join([self._write(path, saved, revision), *kept])
@@ -92,7 +95,9 @@ class MapFile:
         """Keep foreign files in the places of a map under other names; return a sentence on it."""
         if saved is None:
             return []
-        sentences, before, end = [], before_of(path), _end_of(path)
+        sentences = []
+        before = before_of(path)
+        end = _end_of(path)
         end_before = _end_of(before)
         if end_before and self._ours_before != (before, end_before):
             sentences += _kept(before, path)
@@ -103,7 +108,8 @@ class MapFile:
     @contextmanager
     def _at_work(self) -> Iterator[None]:
         with self._one:
-            self._began, self.is_saving = time.monotonic(), True
+            self._began = time.monotonic()
+            self.is_saving = True
             try:
                 yield
             finally:
@@ -144,7 +150,8 @@ class MapFile:
 
     def _by_name(self, saved: SavedMap) -> SavedMap:
         """Return a loaded map; its robots get the numbers that their names have in this node."""
-        own, named = self._options().names, len(saved.robots)
+        own = self._options().names
+        named = len(saved.robots)
         names = self._robots = own + tuple(name for name in saved.robots if name not in own)
 
         def number(was: int) -> int:
@@ -160,7 +167,8 @@ class MapFile:
         try:
             sentence, well = self._loaded()
         except FileError as error:
-            sentence, well = f'the map begins empty: {error}', not os.path.exists(self._path())
+            sentence = f'the map begins empty: {error}'
+            well = not os.path.exists(self._path())
         (tell if well else self._warn)(sentence)
 
     def is_due(self) -> bool:
@@ -214,7 +222,8 @@ def _end_of(path: Path) -> bytes:
 
 def _kept(path: Path, of: Path) -> list[str]:
     """Keep a file under the name of its day; return a sentence, none if it is kept already."""
-    name, number = f'{of.stem}.{_time_of(path)}', 1
+    name = f'{of.stem}.{_time_of(path)}'
+    number = 1
     kept = of.with_name(f'{name}{of.suffix}')
     while os.path.lexists(kept):
         if os.path.isfile(kept) and filecmp.cmp(path, kept, shallow=False):

@@ -133,7 +133,8 @@ def rows_of(path: object, groups: dict[str, TextLines], manifold: Manifold, kind
 def _parse(path: object, name: str, lines: TextLines, rotation_information: str,
            offsets: Indices) -> Rows:
     tag = TAGS[name]
-    p, d = tag.values, tag.manifold.TANGENT_SIZE
+    p = tag.values
+    d = tag.manifold.TANGENT_SIZE
     ids, values = parse_rows(path, name, lines, tag.ids, p + len(tag.information))
     m = len(ids)
     if tag.has_quaternion:
@@ -143,7 +144,8 @@ def _parse(path: object, name: str, lines: TextLines, rotation_information: str,
         k = int(np.argmax(moved))
         raise FileError(path, f'{name}: measured by {OFFSET} {ids[k, 1]}, which is not where the '
                         'robot is; expected no offset', lines.numbers[k])
-    pose, information = tag.manifold.identity(m), np.zeros((m, d, d))
+    pose = tag.manifold.identity(m)
+    information = np.zeros((m, d, d))
     read = tag.read(values[:, :p])
     pose[:, :read.shape[1]] = read
     for k, (row, column) in enumerate(tag.information):
@@ -195,7 +197,8 @@ def made_definite(edges: Rows) -> tuple[Rows, list[str]]:
     changed = np.flatnonzero(np.isfinite(least))
     if not len(changed):
         return edges, []
-    information, units = edges.information.copy(), edges.units[changed]
+    information = edges.information.copy()
+    units = edges.units[changed]
     information[changed] = nearest[changed] / (units[:, :, None] * units[:, None, :])
     worst = changed[np.argmin(least[changed])]
     sentence = (f'{len(changed):,} of {counted(len(edges), "information matrix", _MATRICES)} not '

@@ -72,12 +72,16 @@ def load_map(path: Path) -> tuple[SavedMap, str, bool]:
     """
     before = before_of(path)
     try:
-        saved, which, whole = _read(path), f'{path}', True
+        saved = _read(path)
+        which = f'{path}'
+        whole = True
     except FileError as error:
         if not os.path.exists(before):
             raise
         try:
-            saved, which, whole = _read(before), f'{before}, the map before: {error}', False
+            saved = _read(before)
+            which = f'{before}, the map before: {error}'
+            whole = False
         except FileError as another:
             raise FileError(path, f'cannot be loaded: {error}; {another}') from another
     return saved, f'{_count(saved)} keyframes loaded from {which}', whole
@@ -132,7 +136,8 @@ def _remove_leftovers(path: Path) -> None:
 
 def _left_out(saved: SavedMap) -> np.ndarray:
     """Return why each factor is left out; loops newer than the judgement are not judged yet."""
-    factors, judgement = saved.builder.graph.between, saved.judgement
+    factors = saved.builder.graph.between
+    judgement = saved.judgement
     if not saved.robust or not len(judgement.accepted):
         return left_out_by(None, factors)
     words = left_out_by(judgement, factors)
@@ -188,7 +193,8 @@ def _read(path: Path) -> SavedMap:
     if record.poses is None or record.stamps is None:
         raise FileError(path, 'has no poses or no stamps; expected a saved map')
     state = BuilderState.of_graph(record.graph, record.poses, record.stamps)
-    optimised, values = Optimised.nothing(record.poses), dict(record.remarks or {})
+    optimised = Optimised.nothing(record.poses)
+    values = dict(record.remarks or {})
     if not values:
         return SavedMap(state, optimised, Judgement.nothing(), True)
     waiting = tuple(

@@ -136,7 +136,8 @@ def named_loops(path: str | os.PathLike[str], what: str, ids: Indices,
     # Ids may be any 64 bits, so pairs of them are numbered anew.
     both = np.sort(np.concatenate((ids[factors.pairs], named)), axis=1)
     number = np.unique(both, axis=0, return_inverse=True)[1].ravel()  # NumPy 2.0: (m, 1)
-    edges, chosen = number[:len(factors)], number[len(factors):]
+    edges = number[:len(factors)]
+    chosen = number[len(factors):]
     # Odometry is trusted anyway; that it is struck out would go unheard.
     kind, known = ('loop', edges[~factors.is_odometry]) if what == 'struck' else ('edge', edges)
     unknown = ~np.isin(chosen, known)

@@ -47,11 +47,13 @@ class Node:
 
     def refuse(self, expected: str) -> NoReturn:
         """Raise a FileError that names the file, the place, what was found and expected."""
-        place, node = '', self
+        place = ''
+        node = self
         while isinstance(node._above, Node):
             step = f'[{node._name}]' if isinstance(node._name, int) else (
                 f'.{quoted(node._name)[1:-1]}')
-            place, node = step + place, node._above
+            place = step + place
+            node = node._above
         where = f'{place.removeprefix(".")}: ' if place else ''
         raise FileError(node._above, f'{where}{_described(self.value)}; expected {expected}')
 

@@ -192,7 +192,8 @@ def _letter(node: Node) -> str:
 
 def _factors(root: Node, letters: dict[str, int]) -> tuple[_Factors, tuple[tuple[int, ...], ...]]:
     """Return the factors in the order of the robots, and the stamps of each robot's entries."""
-    factors, stamps = _Factors(), []
+    factors = _Factors()
+    stamps = []
     measurements = root['measurements']
     for letter, robot in letters.items():
         own = []
@@ -225,7 +226,8 @@ def _sorted(rows: dict[int, list[float]], manifold: Manifold) -> tuple[Indices, 
 
 def _log(path: Path, root: Node, letters: dict[str, int],
          stamps: tuple[tuple[int, ...], ...], factors: _Factors) -> RobotLog:
-    name, ours = root.find('name'), root.find(OURS)
+    name = root.find('name')
+    ours = root.find(OURS)
     false = ours.find('false') if ours and ours.find('left_out') else (
         root.find('outlier_factors'))
     manifold = factors.manifold or se2
@@ -250,7 +252,8 @@ def _flagged(node: Node | None, letters: dict[str, int], factors: _Factors) -> M
 def _named(node: Node, letters: dict[str, int], factors: _Factors,
            size: int) -> list[tuple[int, list[Node]]]:
     """Return the factors that a part names, and what it says of each: lists of `size` values."""
-    places, found = factors.places, []
+    places = factors.places
+    found = []
     for letter, list_ in node.members():
         for of_one in list_.elements():
             parts = list(of_one.elements())
@@ -266,7 +269,8 @@ def _named(node: Node, letters: dict[str, int], factors: _Factors,
 def _left_out(root: Node, letters: dict[str, int], factors: _Factors,
               measurement: Array) -> np.ndarray:
     """Return why each factor is left out, (m,); put back into place what was measured."""
-    words, ours = nothing_left_out(len(factors.nodes)), root.find(OURS)
+    words = nothing_left_out(len(factors.nodes))
+    ours = root.find(OURS)
     if ours is None or factors.manifold is None:
         return words
     if part := ours.find('left_out'):

@@ -43,7 +43,8 @@ def stamps_of(ids: Indices, keys: Indices, log: RobotLog) -> tuple[Indices | Non
                 for key in new[:-1]:
                     found[key] = empty.pop(0) if empty else stamp
                 if new:
-                    found[new[-1]], empty = stamp, []
+                    found[new[-1]] = stamp
+                    empty = []
                 else:
                     empty.append(stamp)
     if len(found) < len(ids):  # keys that no factor names

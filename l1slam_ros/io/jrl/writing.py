@@ -70,7 +70,8 @@ def write_jrl_file(path: str | os.PathLike[str], record: GraphRecord,
 
 def _log_of(path: Path, record: GraphRecord, truth: Array | None) -> RobotLog:
     """Return what a graph's log says, as it came, or made up."""
-    log, count = record.log, len(record.graph.between)
+    log = record.log
+    count = len(record.graph.between)
     if log is None or len(log.entries) > count:  # or it is of another graph
         log = _new_log(path, record)
     elif len(log.entries) < count:  # some were added to the graph that was read
@@ -81,7 +82,8 @@ def _log_of(path: Path, record: GraphRecord, truth: Array | None) -> RobotLog:
 
 
 def _new_log(path: Path, record: GraphRecord) -> RobotLog:
-    factors, codes = record.graph.between, _codes(record.ids)
+    factors = record.graph.between
+    codes = _codes(record.ids)
     n = len(codes)
     stamps = np.arange(n) if record.stamps is None else record.stamps
     robots = np.unique(codes)
@@ -121,9 +123,12 @@ def _codes(ids: Indices) -> Indices:
 
 
 def _document(record: GraphRecord, log: RobotLog) -> dict[str, Any]:
-    graph, words = record.graph, left_out_words(record)
-    factors, letters = graph.between, [chr(code) for code in log.robots]
-    is_out, is_loop = words != '', ~factors.is_odometry & ~factors.is_absolute
+    graph = record.graph
+    words = left_out_words(record)
+    factors = graph.between
+    letters = [chr(code) for code in log.robots]
+    is_out = words != ''
+    is_loop = ~factors.is_odometry & ~factors.is_absolute
     entries, places = _entries(_as_written(record, words), record.ids, log)
     flags = (is_loop & ~factors.trusted if log.doubtful is None else log.doubtful) | is_out
 
@@ -160,8 +165,10 @@ def _as_written(record: GraphRecord, words: np.ndarray) -> FactorGraph:
     """Return the graph with the odometry as the map has it, but for that which is left out."""
     if not record.drift:
         return record.graph
-    other, used = straightened(record.graph, record.drift), words == ''
-    graph, both = record.graph.without_factors(), (record.graph.between, other.between)
+    other = straightened(record.graph, record.drift)
+    used = words == ''
+    graph = record.graph.without_factors()
+    both = (record.graph.between, other.between)
     measured, corrected = (factors.measurement for factors in both)
     factors = both[0]
     graph.append_between(factors.i, factors.j, np.where(used[:, None], corrected, measured),
@@ -174,7 +181,9 @@ def _entries(graph: FactorGraph, ids: Indices,
     """Return the entries of each robot, and robot, entry and number in it of factors (m, 3)."""
     entries: list[list[dict[str, Any]]] = [
         [{'stamp': stamp} for stamp in own] for own in log.stamps]
-    factors, manifold, numbers = graph.between, graph.manifold, []
+    factors = graph.between
+    manifold = graph.manifold
+    numbers = []
     rows = zip(log.entries.tolist(), factors.is_absolute.tolist(), ids[factors.pairs].tolist(),
                values_of(factors.measurement, manifold),
                lists_of(factors.sqrt_information, manifold), strict=True)

@@ -170,7 +170,8 @@ def absolute_pose(message: Any, map_frame: str) -> LoopClosure:
     MessageError : it cannot be used.
 
     """
-    stamp, frame = stamp_of(message.header), message.header.frame_id.removeprefix('/')
+    stamp = stamp_of(message.header)
+    frame = message.header.frame_id.removeprefix('/')
     if not frame or frame != (map_frame or frame):
         raise MessageError('frame', f'frame {quoted(frame)} of an absolute pose; expected '
                            f'{map_frame or "that of the map"}')

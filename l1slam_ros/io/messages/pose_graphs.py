@@ -31,7 +31,8 @@ MAP_GRAPH = 'rtabmap_msgs/msg/MapGraph'
 POSE_GRAPH = 'pose_graph_tools_msgs/msg/PoseGraph'
 # Types of edges: the odometry's; loops, of RTAB-Map: global, local in space and time, by a user.
 _ODOMETRY = 0
-_LINKS, _EDGES = {_ODOMETRY, 1, 2, 3, 4}, {_ODOMETRY, 1}
+_LINKS = {_ODOMETRY, 1, 2, 3, 4}
+_EDGES = {_ODOMETRY, 1}
 
 
 class PoseGraphs(EdgeGraph):

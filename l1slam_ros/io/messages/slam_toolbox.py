@@ -52,7 +52,8 @@ class SlamToolbox(EdgeGraph):
 def _told_by(edge: Any) -> Told:
     pose = edge.relative_pose
     if hasattr(pose, 'theta'):
-        heading, position = float(pose.theta), SimpleNamespace(x=pose.x, y=pose.y, z=0.0)
+        heading = float(pose.theta)
+        position = SimpleNamespace(x=pose.x, y=pose.y, z=0.0)
         orientation = SimpleNamespace(
             x=0.0, y=0.0, z=float(np.sin(heading / 2)), w=float(np.cos(heading / 2)))
     else:

@@ -57,8 +57,10 @@ class SwarmSlam(EdgeGraph):
 
     def _step(self, message: Any, robot: int) -> Iterator[Told]:
         """Yield the way from a robot's last keyframe to this one."""
-        sample, number = odometry_sample(message.odom), _number(robot, message.id)
-        pose, last = sample.pose3[None], self._last.get(robot)
+        sample = odometry_sample(message.odom)
+        number = _number(robot, message.id)
+        pose = sample.pose3[None]
+        last = self._last.get(robot)
         self._stamps[number] = sample.stamp
         self._last[robot] = number, pose
         # Where the odometry began anew, nobody knows the way.

@@ -193,7 +193,8 @@ class Inputs:
 
     def _tell_of_stranger(self, sentence: str) -> None:
         """Say of a robot that nobody named, once, why its loops are refused."""
-        known, stranger = len(self._strangers), sentence.partition('@')[0]
+        known = len(self._strangers)
+        stranger = sentence.partition('@')[0]
         if stranger in self._strangers or known > _MOST_STRANGERS:
             return
         self._strangers.add(stranger)

@@ -159,7 +159,9 @@ class Intake:
     def __init__(self, node: Node, failures: Failures, used: Callable[[], None],
                  tick: Callable[[], float]):
         self._node, self._failures, self._used, self._tick = node, failures, used, tick
-        self._group, self.active, self._closing = _Apart(), False, False
+        self._group = _Apart()
+        self.active = False
+        self._closing = False
         self._topics: list[_Topic] = []
         self.traffic: dict[str, Traffic] = {}
         # As they came, and of each topic in its turn.
@@ -223,7 +225,8 @@ class Intake:
             # must be there until the wait is over.
             for one in self._topics:
                 held.enter_context(one.subscription.handle)
-            waiting, seconds = None, math.inf
+            waiting = None
+            seconds = math.inf
             while not self._closing and context.ok():
                 try:
                     waiting = waiting or rclpy_implementation.WaitSet(
@@ -269,7 +272,8 @@ class Intake:
             self._take()
             self._new.sort(key=itemgetter(0))
             count = bisect_right(self._new, until, key=itemgetter(0))
-            self._queue, self._new = deque(self._new[:count]), self._new[count:]
+            self._queue = deque(self._new[:count])
+            self._new = self._new[count:]
         for _ in range(min(_AT_ONCE, len(self._queue))):
             _, topic, content, information = self._queue.popleft()
             topic.traffic.note(information)

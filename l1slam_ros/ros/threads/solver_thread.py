@@ -47,7 +47,8 @@ class SolverThread:
         self._parameters = parameters
         self._woken = threading.Event()
         self._paused = self._closing = False
-        self._pause, self._not_before = _FIRST_PAUSE, 0.0
+        self._pause = _FIRST_PAUSE
+        self._not_before = 0.0
         self._behind_since = 0.0
         self.compiling = ''
 

@@ -194,7 +194,8 @@ def _decompressed(file: Path) -> Iterator[Path]:
         yield file
         return
     with TemporaryDirectory() as folder:
-        readable, decoder = Path(folder, file.stem), zstandard.ZstdDecompressor().decompressobj()
+        readable = Path(folder, file.stem)
+        decoder = zstandard.ZstdDecompressor().decompressobj()
         most = max(MOST_AT_ONCE, _MOST_PACKED * file.stat().st_size)
         with (file.open('rb') as source, readable.open('wb') as target,
               suppress(zstandard.ZstdError)):

@@ -52,7 +52,8 @@ def walk_mcap(path: Path, definitions: dict[str, str]) -> Iterator[BagMessage]:
     BrokenRecordError : after the last message before the first damage.
 
     """
-    size, channels = path.stat().st_size, _Channels(definitions)
+    size = path.stat().st_size
+    channels = _Channels(definitions)
     with path.open('rb') as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise BrokenRecordError(0)
