@@ -150,7 +150,8 @@ class ScanOdometry:
         near = off @ information @ off <= _GATE
         pose, covariance = expected, predicted
         if near:
-            pose, covariance = found.pose, np.linalg.inv(information + found.information)
+            pose = found.pose
+            covariance = np.linalg.inv(information + found.information).astype(float)
         fits = near and found.matched >= _MATCHED
         looked, contradicted = (True, False) if fits and found.matched >= _MUCH else (
             self._free_space(pose, points))
