@@ -34,7 +34,7 @@ _SMOOTH = 0.25
 _OF_SMOOTH = 0.3186 * 6.0**0.5
 # Far away rays are wide apart: neighbours within so many rays' distance.
 _RAYS = 10.0
-# Of fewer rays nobody can tell how noisy they are.
+# Of fewer rays that are so near to each other as points may be, nobody can tell how noisy they are.
 _FEWEST = 20
 # Bearings of a view.
 _BEARINGS = 720
@@ -114,7 +114,7 @@ def points_of(scan: Scan, mount: Mount = Mount(),  # noqa: B008
     seen = np.ascontiguousarray(xy[hit])
     if len(seen):
         seen = np.ascontiguousarray(seen[kernels.apart(seen, SPACING)])
-    noise = _noise(reach, hit)
+    noise = _noise(reach, hit, abs(scan.angle_increment))
     normals = kernels.normals_along(
         seen - centre, max(_NORMAL_REACH, _REACH_OF_NOISE * noise),
         _RAYS * abs(scan.angle_increment), max(_OFF_LINE, _OFF_OF_NOISE * noise))
@@ -130,9 +130,11 @@ def _at_stamp(xy: Array, velocity: Array, seconds: Array) -> Array:
     return np.stack((x, y), axis=1)
 
 
-def _noise(ranges: Array, hit: Mask) -> float:
+def _noise(ranges: Array, hit: Mask, increment: float) -> float:
     """Return the standard deviation of ranges, by how far they are off their neighbours [m]."""
-    off = np.abs(ranges[:-2] - 2 * ranges[1:-1] + ranges[2:])[hit[:-2] & hit[1:-1] & hit[2:]]
+    off = np.abs(ranges[:-2] - 2 * ranges[1:-1] + ranges[2:])
+    dense = ranges[1:-1] * increment < SPACING
+    off = off[hit[:-2] & hit[1:-1] & hit[2:] & dense]
     if len(off) < _FEWEST:
         return 0.0
     least = np.partition(off, int(_SMOOTH * len(off)))[int(_SMOOTH * len(off))]
