@@ -30,11 +30,9 @@ import numpy as np
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.options import Options, option
-from l1slam_ros.core.scans import kernels
 from l1slam_ros.core.scans.matching import match
-from l1slam_ros.core.scans.points import transformed
 from l1slam_ros.core.scans.search import search
-from l1slam_ros.core.scans.submaps import AROUND, Keyframe, Submap, Submaps
+from l1slam_ros.core.scans.submaps import AROUND, Keyframe, Submap, Submaps, seen_by
 
 # Every third keyframe asks: submaps of neighbours show the same.
 _EVERY = 3
@@ -53,8 +51,6 @@ _DRIFT = np.array((0.05, 0.01))
 _SCORE, _RIVAL, _OVERLAP, _AGREE, _HELD = 0.42, 0.85, 0.3, 0.93, 0.05
 # [m] A match that goes so far from the peak of the search slides.
 _WANDER = 0.4
-# [m] A ray that passes a point by so much contradicts it.
-_PAST = 0.3
 # Of neighbouring keyframes' submaps much is the same: a loop is half as certain as matches say.
 _SHARED = 2.0
 # Errors that no count of points lessens [m, m, rad].
@@ -217,6 +213,5 @@ class LoopFinder:
 
 def _agrees(seen: Submap, viewer: Submap, pose: Array) -> bool:
     """Tell whether what is seen at a pose (3,) is where the viewer's rays do not pass through."""
-    points = np.ascontiguousarray(transformed(pose, seen.xy))
-    agree, through = kernels.contradictions(points, viewer.views, viewer.centres, _PAST)
+    agree, through = seen_by(viewer, seen, pose)
     return agree >= _AGREE * (agree + through)

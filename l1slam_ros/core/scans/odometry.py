@@ -15,8 +15,9 @@ certain the motion since the last keyframe is, and whether scans and wheels can 
 The wheels are the prior of each match, with a covariance that grows with the way since the last
 keyframe: along a corridor scans say nothing, and the wheels' part stays in the covariance. Where a
 match is not believed, it is searched for, for wheels slip and lose their sign when a robot backs
-up; where no one place is found, the wheels are taken at their word. A robot that sees plenty and
-again and again nothing that it knows was carried away: a new part begins.
+up; where no one place is found, the wheels are taken at their word. A robot that comes round a
+corner sees little that it knows, but its rays contradict nothing; one whose rays pass again and
+again through what it knows was carried away: a new part begins.
 """
 
 from dataclasses import dataclass
@@ -30,18 +31,21 @@ from l1slam_ros.core.scans.field import Field
 from l1slam_ros.core.scans.matching import Match, match
 from l1slam_ros.core.scans.points import Points, rotated, transformed
 from l1slam_ros.core.scans.search import search
-from l1slam_ros.core.scans.submaps import Keyframe, submap_of
+from l1slam_ros.core.scans.submaps import Keyframe, Submap, seen_by, submap_of, submap_of_scan
 
 # So many keyframes are the map that scans are matched with.
 _MAP = 4
 # A match is believed where so much of a scan finds the map, no farther from the wheels than the
 # 99.9% quantile of chi-square with 3 degrees of freedom.
 _MATCHED, _GATE = 0.4, 16.27
+# Where so much does, nobody looks whether rays contradict it.
+_MUCH = 0.8
 # So much of a scan must find the map where it was searched for, and no other place come so near.
 _FOUND, _RIVAL = 0.6, 0.85
-# [m], [rad] How far from half the wheels' motion is searched, at least and at most; between, as
-# far as wheels that turned the other way would be off.
-_SEARCH, _SEARCH_TURN, _MOST_SEARCH, _MOST_TURN = 0.3, 0.3, 1.5, 0.8
+# Where the robot is not lost, so many of the points that rays look at are where these end.
+_AGREE = 0.85
+# [m], [rad] How far is searched beyond the wheels' way since a scan was matched, and at most.
+_SEARCH, _MOST_SEARCH = np.array((0.3, 0.3)), np.array((1.5, 0.8))
 # How far from the peak of a search the scan may be, where its surfaces do not say [m, m, rad].
 _NEAR_PEAK = np.diag(1 / np.array((0.2, 0.2, 0.1)) ** 2)
 # What is left unsure of a scan that was searched for.
@@ -101,12 +105,14 @@ class ScanOdometry:
         self._options = options
         self.keyframes: list[Keyframe] = []
         self._field: Field | None = None
+        self._map: Submap | None = None
         self._pose = np.zeros(3)
         self._covariance = np.zeros((3, 3))
         self._wheels: Array | None = None
         self._unmatched = 0
         self._distrusted = 0
-        self._blind = np.zeros(3)  # motion of the wheels since a scan was matched
+        # Where a scan was matched last, and the wheels' way and turns since.
+        self._known, self._blind = np.zeros(3), np.zeros(2)
 
     def add(self, stamp: int, points: Points, wheels: Array) -> Step:
         """Follow the robot to a scan; wheels : (3,) its pose by the wheels at that stamp."""
@@ -115,16 +121,16 @@ class ScanOdometry:
             return self._begin(stamp, points)
         motion = se2.between(self._wheels[None], wheels[None])[0]
         self._wheels = wheels
-        start = self._pose
-        expected = se2.compose(start[None], motion[None])[0]
+        expected = se2.compose(self._pose[None], motion[None])[0]
         Ad = se2.adjoint(se2.inverse(motion[None]))[0]
         predicted = Ad @ self._covariance @ Ad.T + wheel_covariance(motion)
         if self._distrusted:
             self._distrusted -= 1
             predicted = predicted + np.diag((_WRONG * motion) ** 2)
-        said = self._follow(start, expected, motion, predicted, points)
+        self._blind = self._blind + (np.hypot(motion[0], motion[1]), abs(motion[2]))
+        said = self._follow(expected, predicted, points)
         if self._unmatched >= _LOST_AFTER:
-            self._unmatched, self._blind = 0, np.zeros(3)
+            self._unmatched, self._blind = 0, np.zeros(2)
             return self._begin(stamp, points, 'the scans show nothing known any more; a new part '
                                'of the map begins')
         return self._step(stamp, points, said)
@@ -132,43 +138,78 @@ class ScanOdometry:
     def end_drive(self) -> None:
         """Let the next scan be the first of another drive: a part of its own."""
         self._wheels, self._unmatched, self._distrusted = None, 0, 0
-        self._blind = np.zeros(3)
+        self._blind = np.zeros(2)
 
-    def _follow(self, start: Array, expected: Array, motion: Array, predicted: Array,
-                points: Points) -> str:
+    def _follow(self, expected: Array, predicted: Array, points: Points) -> str:
         """Find the pose at a scan from what the wheels expect; return what is to be said."""
         xy, normals = points.surface
         assert self._field is not None
         information: Array = np.linalg.inv(predicted).astype(float)
         found = match(self._field, xy, normals, expected, expected, information)
         off = se2.local(expected[None], found.pose[None])[0]
-        said, floor = '', 0 * FLOOR
-        if found.matched < _MATCHED or off @ information @ off > _GATE:
-            searched = self._search(start, motion, points)
-            if searched is None:
-                known = len(xy) >= _FEWEST
-                self._unmatched = self._unmatched + 1 if known else 0
-                self._pose, self._covariance = expected, predicted
-                return ''
-            found, information, floor = searched, _NEAR_PEAK, _SEARCHED
+        near = off @ information @ off <= _GATE
+        pose, covariance = expected, predicted
+        if near:
+            pose = found.pose
+            covariance = np.linalg.inv(information + found.information).astype(float)
+        fits = near and found.matched >= _MATCHED
+        looked, contradicted = (True, False) if fits and found.matched >= _MUCH else (
+            self._free_space(pose, points))
+        if fits and not contradicted:
+            self._take(pose, covariance)
+            return ''
+        searched = self._search(expected, points)
+        if searched is not None and not (
+                fits and self._free_space(searched.pose, points)[1]):
+            self._take(searched.pose,
+                       np.linalg.inv(_NEAR_PEAK + searched.information) + _SEARCHED)
             said = '' if self._distrusted else (
                 'the scans disagree with the wheels, and are followed')
             self._distrusted = _DISTRUST
-        self._unmatched, self._blind = 0, np.zeros(3)
-        self._pose = found.pose
-        self._covariance = np.linalg.inv(information + found.information) + floor
-        return said
+            return said
+        if fits or (looked and not contradicted):
+            # It may have come to where little is known; what matches still helps.
+            self._take(pose, covariance)
+        else:
+            self._unmatched = self._unmatched + 1 if contradicted else 0
+            self._pose, self._covariance = expected, predicted
+        return ''
 
-    def _search(self, start: Array, motion: Array, points: Points) -> Match | None:
-        """Look for a scan around half the wheels' motion; None: there is no one place."""
+    def _take(self, pose: Array, covariance: Array) -> None:
+        """Believe that the robot is at a pose of the map."""
+        self._unmatched, self._blind = 0, np.zeros(2)
+        self._known = self._pose = pose
+        self._covariance = covariance
+
+    def _free_space(self, pose: Array, points: Points) -> tuple[bool, bool]:
+        """
+        Tell whether a scan at a pose (3,) and the map look at each other's points.
+
+        Second: whether their rays pass through these, so that the robot is not there.
+        """
+        seen = submap_of_scan(points)
+        if self._map is None or len(seen.xy) < _FEWEST:
+            return False, False
+        here = se2.between(self.keyframes[-1].pose[None], pose[None])
+        counts = np.array((seen_by(self._map, seen, here[0]),
+                           seen_by(seen, self._map, se2.inverse(here)[0])))
+        of_each = counts.sum(axis=1)
+        looked = of_each.sum() >= _FEWEST
+        return bool(looked), bool(looked and (counts[:, 0] < _AGREE * of_each).any())
+
+    def _search(self, expected: Array, points: Points) -> Match | None:
+        """
+        Look for a scan around where one was matched last; None: there is no one place.
+
+        Wheels that stood still, or turned the other way, have moved the robot no farther from
+        there than they said.
+        """
         xy, normals = points.surface
         if len(xy) < _FEWEST or self._field is None:
             return None
-        half = se2.compose(start[None], 0.5 * motion[None])[0]
-        self._blind = self._blind + abs(motion)
-        reach = min(_SEARCH + float(np.hypot(*self._blind[:2])), _MOST_SEARCH)
-        turn = min(_SEARCH_TURN + float(self._blind[2]), _MOST_TURN)
-        peak = search(self._field, xy, half, reach, turn, _MATCHED, _RIVAL)
+        reach, turn = np.minimum(_SEARCH + self._blind, _MOST_SEARCH)
+        centre = np.array([*self._known[:2], expected[2]])
+        peak = search(self._field, xy, centre, reach, turn, _MATCHED, _RIVAL)
         if peak is None or peak.second > _RIVAL * peak.score:
             return None
         found = match(self._field, xy, normals, peak.pose, peak.pose, _NEAR_PEAK, widest=0.3)
@@ -188,7 +229,7 @@ class ScanOdometry:
         return Step(self._pose, keyframe, covariance, said)
 
     def _begin(self, stamp: int, points: Points, said: str = '') -> Step:
-        part, travelled = 0, 0.0
+        part, travelled, self._known = 0, 0.0, self._pose
         if self.keyframes:
             part, travelled = self.keyframes[-1].part + 1, self.keyframes[-1].travelled
         self._keep(Keyframe(stamp, self._pose, points, part, travelled))
@@ -199,6 +240,7 @@ class ScanOdometry:
         """Take a keyframe into the map that scans are matched with."""
         self.keyframes.append(keyframe)
         local = submap_of(self.keyframes, len(self.keyframes) - 1, before=_MAP - 1, after=0)
+        self._map = local
         # In the frame of the odometry, where poses are.
         self._field = Field.of(transformed(keyframe.pose, local.xy),
                                rotated(keyframe.pose, local.normals))

@@ -19,14 +19,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.scans import kernels
 
 # [m] Points are at least so far apart along a scan.
 SPACING = 0.05
 # [m] A normal is of the line through neighbours within so much; RMS distance to that line.
 _NORMAL_REACH, _OFF_LINE = 0.25, 0.03
+# The same by the noise of the ranges, and the most that is taken for noise [m].
+_REACH_OF_NOISE, _OFF_OF_NOISE, _MOST_NOISE = 8.0, 1.5, 0.08
+# Of second differences the lower quartile, which corners and stray rays do not reach; by how much
+# it is less than the noise, where that is normal.
+_SMOOTH = 0.25
+_OF_SMOOTH = 0.3186 * 6.0**0.5
 # Far away rays are wide apart: neighbours within so many rays' distance.
 _RAYS = 10.0
+# Of fewer rays that are so near to each other as points may be, nobody can tell how noisy they are.
+_FEWEST = 20
 # Bearings of a view.
 _BEARINGS = 720
 
@@ -105,8 +114,10 @@ def points_of(scan: Scan, mount: Mount = Mount(),  # noqa: B008
     seen = np.ascontiguousarray(xy[hit])
     if len(seen):
         seen = np.ascontiguousarray(seen[kernels.apart(seen, SPACING)])
+    noise = _noise(reach, hit, abs(scan.angle_increment))
     normals = kernels.normals_along(
-        seen - centre, _NORMAL_REACH, _RAYS * abs(scan.angle_increment), _OFF_LINE)
+        seen - centre, max(_NORMAL_REACH, _REACH_OF_NOISE * noise),
+        _RAYS * abs(scan.angle_increment), max(_OFF_LINE, _OFF_OF_NOISE * noise))
     return Points(seen, normals, centre, view)
 
 
@@ -117,6 +128,17 @@ def _at_stamp(xy: Array, velocity: Array, seconds: Array) -> Array:
     x = c * xy[:, 0] - s * xy[:, 1] + velocity[0] * seconds
     y = s * xy[:, 0] + c * xy[:, 1] + velocity[1] * seconds
     return np.stack((x, y), axis=1)
+
+
+def _noise(ranges: Array, hit: Mask, increment: float) -> float:
+    """Return the standard deviation of ranges, by how far they are off their neighbours [m]."""
+    off = np.abs(ranges[:-2] - 2 * ranges[1:-1] + ranges[2:])
+    dense = ranges[1:-1] * increment < SPACING
+    off = off[hit[:-2] & hit[1:-1] & hit[2:] & dense]
+    if len(off) < _FEWEST:
+        return 0.0
+    least = np.partition(off, int(_SMOOTH * len(off)))[int(_SMOOTH * len(off))]
+    return min(float(least) / _OF_SMOOTH, _MOST_NOISE)
 
 
 def _view(ranges: Array, angles: Array) -> Array:

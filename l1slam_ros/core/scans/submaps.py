@@ -17,6 +17,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.scans import kernels
 from l1slam_ros.core.scans.field import Field
 from l1slam_ros.core.scans.points import Points, rotated, transformed
 
@@ -26,6 +27,8 @@ AROUND = 4
 _CELL = 0.05
 # So many submaps are kept at hand.
 _KEPT = 24
+# [m] A ray that passes a point by so much contradicts it.
+_PAST = 0.3
 # Rings and sectors of a descriptor, and how far it sees [m].
 _RINGS, _SECTORS, _SIGHT = 12, 60, 12.0
 
@@ -101,6 +104,23 @@ def submap_of(keyframes: Sequence[Keyframe], at: int, before: int = AROUND, afte
         row[:2] = transformed(row, keyframe.points.centre[None])[0]
     return Submap(np.ascontiguousarray(points[kept]), np.ascontiguousarray(normal[kept]),
                   np.stack([k.points.view for k in near]), centres)
+
+
+def submap_of_scan(points: Points) -> Submap:
+    """Return what one scan has seen, in its own frame."""
+    xy, normals = points.surface
+    return Submap(xy, normals, points.view[None], np.array([[*points.centre, 0.0]]))
+
+
+def seen_by(viewer: Submap, seen: Submap, pose: Array) -> tuple[int, int]:
+    """
+    Return how many points of a submap at a pose (3,) end rays of another, and how many do not.
+
+    The latter are where the viewer's rays pass through; where it did not look, none are counted.
+    """
+    points = np.ascontiguousarray(transformed(pose, seen.xy))
+    agree, through = kernels.contradictions(points, viewer.views, viewer.centres, _PAST)
+    return int(agree), int(through)
 
 
 class Submaps:

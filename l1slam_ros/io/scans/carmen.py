@@ -10,107 +10,170 @@
 CARMEN logs: text, one message a line, the logs of the field.
 
     FLASER n r_1 ... r_n  x y theta  odom_x odom_y odom_theta  stamp host logger_stamp
+    ROBOTLASER1 type start_angle field_of_view resolution maximum_range accuracy remission_mode
+        n r_1 ... r_n  m remission_1 ... remission_m  x y theta  odom_x odom_y odom_theta
+        tv rv forward side axis  stamp host logger_stamp
 
-n ranges [m] over 180 degrees (the first and last ray half a step inside where n is even), the
-pose of the laser and of the robot by the wheels, and the message's stamp [s]. Of all else in the
-file only `PARAM robot_frontlaser_offset` is used. Compressed by bz2 or gzip, or plain.
+Of both kinds the more frequent one is read. n ranges [m], of FLASER over 180 degrees (the first
+and last ray half a step inside where n is even), the pose of the laser and of the robot by the
+wheels, and the message's stamp [s]. A range may be no number. Packed by bz2 or gzip, or plain.
 """
 
 import bz2
 import gzip
 import math
-from bisect import bisect_left
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from l1slam_ros.core.errors import FileError
+from l1slam_ros.core.geometry import se2
+from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans.points import Mount, Scan
+from l1slam_ros.io.files import counted
 from l1slam_ros.io.scans.laser_log import LaserLog
+from l1slam_ros.io.scans.log_stamps import rising
 
 _OPEN: dict[str, Callable[[Path, str], Any]] = {'.bz2': bz2.open, '.gz': gzip.open}
 # [m] CARMEN's laser says so, or more, where nothing is in range.
 _FAR = 80.0
+# Near the farthest range, and below it, of that range; so often at least a laser says one number.
+_TOP, _BELOW, _OFTEN = 0.98, 0.88, 20
+# [m], [rad] What a laser on a robot moves on it, by rounding and because its pose is older.
+_FIXED = np.array((0.05, 0.05, 0.05))
 # A longer line is no message of a laser.
 _LONGEST = 1 << 18
-_SCAN = b'FLASER'
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A scan, and where laser and robot were by the wheels, (3,) each."""
+
+    scan: Scan
+    laser: Array
+    robot: Array
 
 
 def read_carmen(path: Path) -> LaserLog:
     """
-    Read a log.
+    Read a log; scans whose lines are damaged are left out.
 
     Raises
     ------
-    FileError : it cannot be read, a line is damaged, or it holds no scans.
+    FileError : it cannot be read, holds no scans, or more damaged ones than others.
 
     """
-    scans: list[Scan] = []
-    wheels: list[list[float]] = []
-    offsets: list[float] = []
-    for number, line in _lines(path):
-        if line.startswith(_SCAN + b' '):
-            scan, robot, offset = _scan(path, number, line)
-            scans.append(scan)
-            wheels.append(robot)
-            offsets.append(offset)
-    if not scans:
-        raise FileError(path, 'holds no FLASER line; expected a CARMEN log with laser scans')
-    kept = _in_order([scan.stamp for scan in scans])
-    out = len(scans) - len(kept)
-    skipped = (f'{out:,} scans left out: their stamps are not in the order of the file',)
-    return LaserLog([scans[k] for k in kept], np.array(wheels)[kept],
-                    Mount(x=float(np.median(offsets))), skipped if out else ())
+    damage: list[str] = []
+    found: dict[bytes, list[_Line]] = {kind: [] for kind in _READ}
+    wrong = 0
+    for number, line in _lines(path, damage):
+        kind = line[: line.find(b' ')]
+        if kind not in _READ:
+            continue
+        try:
+            found[kind].append(_READ[kind](line.split()))
+        except (ValueError, IndexError, ArithmeticError):
+            wrong += 1
+            if wrong == 1:
+                damage.append(f'line {number}: expected {_EXPECTED[kind]}; found {line[:40]!r}')
+    lines = max(found.values(), key=len)
+    if wrong >= max(len(lines), 1):
+        raise FileError(path, damage[0])
+    if not lines:
+        raise FileError(path, 'holds no FLASER or ROBOTLASER1 line; expected a CARMEN log with '
+                        'laser scans')
+    if wrong > 1:
+        damage.append(f'{wrong:,} scans are damaged like that')
+    return _log(lines, f'{path}: {"; ".join(damage)}' if damage else '')
 
 
-def _in_order(stamps: list[int]) -> list[int]:
-    """Return the most places whose stamps rise: those left out were stamped late or early."""
-    ends: list[int] = []  # of runs of each length the one that ends at the lowest stamp
-    before = [-1] * len(stamps)
-    for k, stamp in enumerate(stamps):
-        at = bisect_left(ends, stamp, key=lambda end: stamps[end])
-        before[k] = ends[at - 1] if at else -1
-        ends[at : at + 1] = [k]
-    kept, k = [], ends[-1]
-    while k >= 0:
-        kept.append(k)
-        k = before[k]
-    return kept[::-1]
+def _log(lines: list[_Line], damage: str) -> LaserLog:
+    said = []
+    stamps, rows, back = rising(np.array([line.scan.stamp for line in lines], np.int64))
+    if back:
+        said.append(f'the clock was set back by {back * 1e-9:.1f} s in all, and is taken to go on')
+    if out := len(lines) - len(rows):
+        said.append(f'{counted(out, "scan")} left out: their stamps are not in the order of the '
+                    'file')
+    scans = [line.scan for line in lines]
+    if (farthest := _farthest(scans)) < np.inf:
+        said.append(f'ranges from {farthest:.2f} m on are taken to say that nothing is in range')
+    scans = [replace(scans[row], stamp=stamp, range_max=min(farthest, scans[row].range_max))
+             for row, stamp in zip(rows, stamps.tolist(), strict=True)]
+    robots = np.array([line.robot for line in lines])
+    mount = se2.between(robots, np.array([line.laser for line in lines]))
+    middle = np.median(mount, axis=0)
+    if (np.median(abs(mount - middle), axis=0) > _FIXED).any():
+        said.append('the laser does not stay where it is on the robot, and is taken to be where '
+                    'the robot is')
+        middle = np.zeros(3)
+    return LaserLog(scans, robots[rows], Mount(*middle.tolist()), tuple(said), damage)
 
 
-def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
-    opened = _OPEN.get(path.suffix.lower(), Path.open)
+def _farthest(scans: list[Scan]) -> float:
+    """
+    Return from which range on nothing is in range, though no limit says so; infinite: none.
+
+    Lasers say one number, the greatest, where they see nothing. Of surfaces fewer lie near the
+    farthest range than before it, and not at one distance.
+    """
+    ranges = np.concatenate([scan.ranges[scan.ranges < scan.range_max] for scan in scans])
+    last = ranges.max(initial=0.0)
+    most = np.unique(ranges[ranges >= _TOP * last], return_counts=True)[1].max(initial=0)
+    below = ((ranges >= _BELOW * last) & (ranges < _TOP * last)).sum()
+    return float(_TOP * last) if most > max(below, _OFTEN) else np.inf
+
+
+def _lines(path: Path, damage: list[str]) -> Iterator[tuple[int, bytes]]:
+    """Yield the lines with their numbers; what ends a file too early is told as damage."""
+    opened, number = _OPEN.get(path.suffix.lower(), Path.open), 0
     try:
         with opened(path, 'rb') as file:
-            number = 0
             while line := file.readline(_LONGEST):
                 number += 1
                 yield number, line
     except (OSError, EOFError) as error:
-        raise FileError(path, f'cannot be read: {error}') from error
+        if not number:
+            raise FileError(path, f'cannot be read: {error}') from error
+        damage.append(f'cannot be read beyond line {number:,}: {error}')
 
 
-def _scan(path: Path, number: int, line: bytes) -> tuple[Scan, list[float], float]:
-    """Return a scan, the robot's pose (3,) by the wheels, and how far ahead the laser is [m]."""
-    words = line.split()
-    try:
-        count = int(words[1])
-        values = np.array(words[2 : count + 8], float)
-        stamp = round(float(words[count + 8]) * 1e9)
-        if len(values) != count + 6 or count < 2 or not np.isfinite(values).all():
-            raise ValueError
-    except (ValueError, IndexError, OverflowError) as error:
-        raise FileError(
-            path, f'line {number}: expected FLASER, a number of ranges, so many ranges [m], six '
-            f'numbers of poses and a stamp [s]; found {line[:40]!r}') from error
-    ranges, laser, robot = values[:count], values[count : count + 3], values[count + 3 :]
-    step = math.pi / count
+def _flaser(words: list[bytes]) -> _Line:
+    count = int(words[1])
     # 181 rays are at whole degrees, both ends included; 180 or 360 are half a step inside.
-    if count % 2:
-        step = math.pi / (count - 1)
-    first = -0.5 * step * (count - 1)
-    ahead = math.cos(robot[2]) * (laser[0] - robot[0]) + math.sin(robot[2]) * (
-        laser[1] - robot[1])
-    return Scan(stamp, ranges, first, step, 0.0, _FAR), robot.tolist(), float(ahead)
+    step = math.pi / (count - 1 if count % 2 else count)
+    return _line(words[2:], count, -0.5 * step * (count - 1), step, _FAR, 0, 0)
+
+
+def _robotlaser(words: list[bytes]) -> _Line:
+    start, _, step, farthest = np.array(words[2:6], float).tolist()
+    count = int(words[8])
+    remissions = int(words[9 + count])
+    if not (math.isfinite(start) and math.isfinite(step) and step) or remissions < 0:
+        raise ValueError
+    return _line(words[9:], count, start, step, min(farthest, _FAR) if farthest > 0 else _FAR,
+                 1 + remissions, 5)
+
+
+_READ: dict[bytes, Callable[[list[bytes]], _Line]] = {
+    b'FLASER': _flaser, b'ROBOTLASER1': _robotlaser}
+_EXPECTED = {
+    b'FLASER': 'FLASER, a number of ranges, so many ranges [m], six numbers of poses and a stamp '
+    '[s]',
+    b'ROBOTLASER1': 'ROBOTLASER1, seven numbers of the laser, a number of ranges, so many ranges '
+    '[m], a number of remissions, so many of these, eleven numbers of the robot and a stamp [s]'}
+
+
+def _line(words: list[bytes], count: int, start: float, step: float, farthest: float, skipped: int,
+          after: int) -> _Line:
+    """Return what a line says; words : from the ranges on; skipped, after : words around poses."""
+    first = count + skipped
+    ranges, poses = np.array(words[:count], float), np.array(words[first : first + 6], float)
+    stamp = float(words[first + 6 + after])
+    if count < 2 or len(poses) < 6 or not np.isfinite([*poses, stamp]).all():
+        raise ValueError
+    return _Line(Scan(round(stamp * 1e9), ranges, start, step, 0.0, farthest), poses[:3],
+                 poses[3:])

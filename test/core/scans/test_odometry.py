@@ -22,6 +22,14 @@ HALL = np.concatenate((box(-4, -3, 9, 5), box(2, 0.5, 2.6, 1.3), box(5.5, -1.5, 
                        np.array([(-4, 2, -2.5, 2), (9, -3, 7, -1.5)], float).reshape(2, 4)))
 ACROSS = along(np.array([(-2.0, -1.5), (4.0, -1.8), (4.4, 3.0), (-1.0, 3.2), (-2.0, 0.0)]))
 
+# Two rooms with a door between them, each with what tells its walls apart.
+ROOMS = np.concatenate((box(0, 0, 14, 6), np.array([
+    (7, 0, 7, 2.4), (7, 3.4, 7, 6), (2, 6, 2, 5), (2, 5, 3.5, 5), (3.5, 5, 3.5, 6),
+    (9, 0, 9, 1.2), (9, 1.2, 11, 0.8), (11, 0.8, 11, 0), (13, 6, 13, 4.5), (13, 4.5, 14, 4.2),
+    (8.5, 6, 8.9, 5), (8.9, 5, 9.6, 6)], float)))
+THROUGH = np.array([(1.0, 1.2), (4.0, 2.9), (8.4, 2.9), (9.0, 4.6), (12.0, 4.0), (12.0, 1.5),
+                    (9.0, 2.9), (5.0, 2.9), (1.5, 4.0)])
+
 
 def steps_of(true, walls=WALLS, seed=0, spoil=None, odometry=None, noise=0.01):
     """Return what odometry says of a drive, and how its steps between keyframes are wrong."""
@@ -110,6 +118,40 @@ def test_wheels_that_lie_are_not_followed():
     true = se2.between(ROUND[:1], ROUND[79:80])[0]
     assert np.hypot(*(found.pose - true)[:2]) < 0.15
     assert 'the scans disagree with the wheels, and are followed' in said
+
+
+def ahead(ranges, *_):
+    """Leave of a scan what a laser sees that looks ahead."""
+    quarter = len(ranges) // 4
+    return np.concatenate((ranges[:quarter], np.full(2 * quarter, np.nan), ranges[-quarter:]))
+
+
+def test_a_metre_between_scans_it_goes_through_a_door_and_back():
+    """Beyond the door little is known; what is seen there contradicts nothing."""
+    way = along(THROUGH, 1.0)
+    scans, wheels = drive(way, walls=ROOMS, spoil=ahead)
+    odometry = ScanOdometry()
+    steps = [odometry.add(scan.stamp, points_of(scan), pose)
+             for scan, pose in zip(scans, wheels, strict=True)]
+    true = se2.between(np.broadcast_to(way[0], way.shape), way)
+    assert np.hypot(*(np.array([step.pose for step in steps]) - true)[:, :2].T).max() < 0.1
+    assert {keyframe.part for keyframe in odometry.keyframes} == {0}
+
+
+def test_a_metre_backwards_that_the_wheels_count_as_forwards():
+    way = along(np.array([(1.5, 1.5), (10.5, 1.5)]), 0.75)
+    way = np.concatenate((way[:6], way[4:2:-1], way[3:]))
+    scans, wheels = drive(way, spoil=ahead)
+    steps = se2.between(way[:-1], way[1:])
+    steps[steps[:, 0] < 0] *= -1
+    odometry, pose = ScanOdometry(), wheels[0]
+    found = odometry.add(scans[0].stamp, points_of(scans[0]), pose)
+    for scan, step in zip(scans[1:], steps, strict=True):
+        pose = se2.compose(pose[None], step[None])[0]
+        found = odometry.add(scan.stamp, points_of(scan), pose)
+    true = se2.between(way[:1], way[-1:])[0]
+    assert np.hypot(*(found.pose - true)[:2]) < 0.1
+    assert {keyframe.part for keyframe in odometry.keyframes} == {0}
 
 
 def test_carried_away_it_says_so_and_begins_anew():

@@ -92,3 +92,14 @@ def test_motion_within_a_scan_is_taken_out(rng):
     off = [off_walls(transformed(POSE, points_of(scan, velocity=v).xy), WALLS)
            for v in (velocity, None)]
     assert off[0].max() < 0.01 < 0.1 < off[1].max()
+
+
+def test_a_noisy_laser_sees_surfaces_as_well(rng):
+    """With 5 cm off each range, points have normals, and these are across the walls."""
+    points = points_of(Scan(0, ranges_at(POSE, rng, ROOM, noise=0.05, rays=360), 0.0,
+                            2 * np.pi / 360, 0.05, 30.0))
+    _, normals = points.surface
+    angle = np.arctan2(*normals.T[::-1]) + POSE[2]
+    off = abs(angle - np.round(angle / (np.pi / 2)) * np.pi / 2)
+    assert len(normals) > 0.9 * len(points.xy)
+    assert np.degrees(np.quantile(off, 0.8)) < 8

@@ -1,0 +1,75 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""Stamps of a log as they were written -> stamps that rise, and the lines that have none."""
+
+from bisect import bisect_right
+
+import numpy as np
+
+from l1slam_ros.core.geometry.manifold import Indices
+
+# A clock that is behind for so many lines was set back; else a line was written late.
+_SET_BACK = 50
+# [ns] Between two stamps, where a log has no two that differ.
+_USUAL = 100_000_000
+
+
+def rising(stamps: Indices) -> tuple[Indices, Indices, int]:
+    """
+    Return stamps that rise, of which lines, and how far the clock was set back in all [ns].
+
+    stamps : (n,) in the order of the file [ns]. Where the clock was set back, it is taken to go on
+    from there. Of what is left, most lines are kept whose stamps do not fall: the others were
+    stamped late or early. Equal stamps are spread up to the next: they were rounded.
+    """
+    going_on, back = _set_forward(stamps)
+    rows = _not_falling(going_on.tolist())
+    return _spread(going_on[rows]), rows, back
+
+
+def _set_forward(stamps: Indices) -> tuple[Indices, int]:
+    """Return stamps by a clock that is never set back, and by how much it was [ns]."""
+    steps: Indices = np.diff(stamps)
+    usual = int(np.median(steps[steps > 0])) if (steps > 0).any() else _USUAL
+    found, last = stamps.copy(), 0
+    for at in (np.flatnonzero(steps < 0) + 1).tolist():
+        # The line before may be the one that is wrong: what counts is how long all are behind.
+        before = np.sort(found[last:at])[-2:]
+        behind = found[at : at + _SET_BACK] < before[0]
+        if len(behind) == _SET_BACK and behind.all():
+            found[at:] += before[-1] + usual - found[at]
+            last = at
+    return found, int(found[-1] - stamps[-1])
+
+
+def _not_falling(stamps: list[int]) -> Indices:
+    """Return the most places whose stamps do not fall."""
+    # Of runs of each length the one that ends at the lowest stamp.
+    ends: list[int] = []
+    lowest: list[int] = []
+    before = [-1] * len(stamps)
+    for k, stamp in enumerate(stamps):
+        at = bisect_right(lowest, stamp)
+        before[k] = ends[at - 1] if at else -1
+        ends[at : at + 1], lowest[at : at + 1] = [k], [stamp]
+    kept, k = [], ends[-1]
+    while k >= 0:
+        kept.append(k)
+        k = before[k]
+    return np.array(kept[::-1], np.int64)
+
+
+def _spread(stamps: Indices) -> Indices:
+    """Return stamps that do not fall with equal ones spread up to the next."""
+    first = np.flatnonzero(np.diff(stamps, prepend=stamps[0] - 1))
+    counts = np.diff(first, append=len(stamps))
+    gaps: Indices = np.diff(stamps[first])
+    gaps = np.append(gaps, int(np.median(gaps)) if len(gaps) else _USUAL * counts[-1])
+    since = np.arange(len(stamps)) - np.repeat(first, counts)
+    return stamps + (since * np.repeat(gaps / counts, counts)).astype(np.int64)
