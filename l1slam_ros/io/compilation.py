@@ -51,6 +51,8 @@ STEPS = ('halpern', *SPARSE[:2], *JUDGEMENT, *ONLINE, *SPARSE[2:])
 IN_SPACE = {'halpern': f'halpern{objects.SPACE}', 'cholesky': f'cholesky{objects.SPACE}',
              'blocks': f'blocks{objects.SPACE}', 'se2': 'se3'}
 
+# A process makes so many steps at least: to import numba takes as long as one of them.
+_STEPS_EACH = 3
 # [s] How often the caller is asked whether to stop, and whether another process is done.
 _LOOK = 0.1
 # [s] How long a process waits for another one that makes the same step.
@@ -112,7 +114,7 @@ def fill_cache(report: Callable[[int, int], None], stopped: Callable[[], bool],
 
 def _compiled(steps: list[str], stopped: Callable[[], bool]) -> Iterator[tuple[str, list[str]]]:
     """Yield each step and the files that keep it, as processes are done with them."""
-    count = min(_cores(), len(steps))
+    count = max(1, min(_cores(), len(steps) // _STEPS_EACH))
     workers = [_start(steps[first::count]) for first in range(count)]
     busy = {worker.stdout for worker in workers if worker.stdout}
     try:

@@ -116,7 +116,8 @@ class Heard:
 
     path : the last one; states : loop (reference, end) [ns] -> what has become of it; sentence :
     of its diagnostics; calm : how many of these in a row said the same of the map, with no other
-    news in between; ground : the last grid of the front end; scans : how many it has used.
+    news in between; ground : the last grid of the front end; scans : how many it has used;
+    comparisons : how many it has still to make, at least.
     """
 
     path: PathMessage | None = None
@@ -125,6 +126,7 @@ class Heard:
     states: dict[tuple[int, int], str] = field(default_factory=dict)
     sentence: str = 'nothing yet'
     calm: int = 0
+    comparisons: int = 0
 
     @property
     def stamps(self) -> list[int]:
@@ -177,8 +179,9 @@ class Listener:
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
             if 'scans' in values:  # the front end's
-                if int(values['scans']) != self.heard.scans:
-                    self.heard.scans = int(values['scans'])
+                counts = int(values['scans']), int(values['comparisons'])
+                if counts != (self.heard.scans, self.heard.comparisons):
+                    self.heard.scans, self.heard.comparisons = counts
                     self._move()
                 continue
             said = {key: values[key] for key in OF_THE_MAP if key in values}
@@ -198,8 +201,8 @@ class Listener:
     def is_final(self) -> bool:
         """Return whether all of the recording is in the map, and the map at rest."""
         heard, loops = self.heard, self.recording.loop_stamps
-        # As long as it uses scans, the front end is not calm.
-        return (heard.calm >= CALM and heard.scans > 0
+        # As long as it uses scans, or compares them, the front end is not calm.
+        return (heard.calm >= CALM and heard.scans > 0 and heard.comparisons == 0
                 and heard.stamps[-1:] == [self.recording.stamps[-1]]
                 and heard.count_judged(loops) == len(loops))
 

@@ -131,10 +131,11 @@ def diagnostics(updates):
         DiagnosticStatus(message='odom', values=[rate])])
 
 
-def scans_used(count):
-    """Return what the front end says of the scans it has used."""
+def scans_used(count, comparisons=0):
+    """Return what the front end says of the scans it has used, and has still to compare."""
     return DiagnosticArray(status=[DiagnosticStatus(
         message='ok', values=[KeyValue(key='scans', value=str(count)),
+                              KeyValue(key='comparisons', value=str(comparisons)),
                               KeyValue(key='keyframes', value='1')])])
 
 
@@ -173,6 +174,10 @@ def test_the_map_is_final_when_it_is_whole_and_the_node_says_the_same_of_it(list
     say(listener, publisher, scans_used(1000))
     assert not listener.is_final()  # another scan was used
     say(listener, publisher, *[diagnostics(8)] * 5)
+    assert listener.is_final()
+    say(listener, publisher, scans_used(1000, 3), *[diagnostics(8)] * 5)
+    assert not listener.is_final()  # a few are still to be compared
+    say(listener, publisher, scans_used(1000), *[diagnostics(8)] * 5)
     assert listener.is_final()
     say(listener, publisher, diagnostics(9))
     assert not listener.is_final()  # another update

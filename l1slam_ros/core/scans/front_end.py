@@ -16,6 +16,7 @@ The scan front end: scans and the wheels' poses in, keyframes, odometry and loop
 It knows no back end: whoever has one tells it with `place` where the keyframes lie in the map.
 """
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +29,7 @@ from l1slam_ros.core.scans.odometry import ScanKeyframes, ScanOdometry, Step
 from l1slam_ros.core.scans.points import Mount, Scan, points_of
 from l1slam_ros.core.scans.submaps import Keyframe
 
-# Of so many comparisons that wait one more is made at a time.
+# Where so many comparisons wait, two are made at a time, and no keyframe asks for more.
 _MANY = 8
 
 
@@ -57,6 +58,7 @@ class ScanFrontEnd:
         self._odometry = ScanOdometry(options.keyframe)
         self._finder = LoopFinder(self._odometry.keyframes, options.loop)
         self._poses, self._spread = np.zeros((0, 3)), np.zeros((0, 2))
+        self._due: deque[int] = deque()
         self._velocity: Array | None = None
         self._last: tuple[int, Array] | None = None
 
@@ -88,23 +90,39 @@ class ScanFrontEnd:
         """
         self._poses, self._spread = poses, spread
 
-    def loops(self) -> list[ScanLoop]:
+    @property
+    def waiting(self) -> int:
+        """How many keyframes are still to ask, and how many comparisons are still to be made."""
+        return len(self._due) + self._finder.waiting
+
+    def loops(self, wait: bool = False) -> list[ScanLoop]:
         """
         Look for loops for a while; return those found.
 
-        To be called after each scan: comparisons of keyframes take longer than anything else, so
-        that they wait for each other, and one is made at a call, more only where many wait.
+        To be called after each scan, and while there is nothing else to do: comparisons of
+        keyframes take longer than anything else, so that they wait for each other, and one is made
+        at a call, two only where many wait.
+
+        wait : no keyframe asks, for it will soon be known where they lie in the map; by odometry
+        alone a keyframe is searched for everywhere
         """
-        due = self._finder.due()
-        if len(due):
-            poses, spread = self._in_map()
-            for j in due:
-                self._finder.ask(int(j), poses, spread)
-        return self._finder.find(1 + self._finder.waiting // _MANY)
+        self._due.extend(self._finder.due().tolist())
+        if not wait:
+            self._ask(_MANY)
+        return self._finder.find(1 if self._finder.waiting < _MANY else 2)
 
     def last_loops(self) -> list[ScanLoop]:
         """Make all comparisons that wait, for no scan will come; return the loops found."""
+        self._ask(np.inf)
         return self._finder.find(self._finder.waiting)
+
+    def _ask(self, most: float) -> None:
+        """Let keyframes ask, until so many comparisons wait."""
+        if not self._due or self._finder.waiting >= most:
+            return
+        poses, spread = self._in_map()
+        while self._due and self._finder.waiting < most:
+            self._finder.ask(self._due.popleft(), poses, spread)
 
     def _in_map(self) -> tuple[Array, Array]:
         """Return all keyframes in the map (n, 3), those not placed by odometry, and `spread`."""

@@ -29,17 +29,18 @@ import numpy as np
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
+from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.scans.matching import match
 from l1slam_ros.core.scans.search import search
-from l1slam_ros.core.scans.submaps import AROUND, Keyframe, Submap, Submaps, seen_by
+from l1slam_ros.core.scans.submaps import AROUND, LOOKS, Keyframe, Submap, Submaps, seen_by
 
 # Every third keyframe asks: submaps of neighbours show the same.
 _EVERY = 3
 # So many candidates by their place in the map, and so many by their looks.
 _NEAREST, _ALIKE = 2, 2
 # Cosine of two descriptors.
-_LOOKS = 0.75
+_SIMILAR = 0.75
 # [m] Candidates are neighbours of each other where they are nearer along the way.
 _NEIGHBOURS = 4.0
 # [m], [rad] A search reaches at least so far, and at most; places that look alike are nearer.
@@ -81,10 +82,15 @@ class ScanLoop:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """Keyframe j is to be looked for so far from a pose (3,), seen from i [m], [rad]."""
+    """
+    Keyframe j is to be looked for so far from a pose (3,), seen from i [m], [rad].
+
+    alike : not because i is near, only because it looks alike
+    """
 
     i: int
     j: int
+    alike: bool
     expected: Array
     reach: float
     turn: float
@@ -105,11 +111,13 @@ class LoopFinder:
         self._keyframes, self._options = keyframes, options
         self._submaps = Submaps(keyframes)
         self._asked = AROUND
-        # Of each keyframe that may be asked for.
-        self._looks: list[Array] = []
         self._travelled: list[float] = []
         self._part: list[int] = []
+        # Of the keyframes that have asked: their numbers, and what they look like.
+        self._have_asked: list[int] = []
+        self._looks = GrowingArray((LOOKS,))
         self._waiting: deque[_Comparison] = deque()
+        self._closed = -1  # the last that was found to be where a near one is
 
     def due(self) -> Indices:
         """Return the keyframes that may ask now: their submaps are whole."""
@@ -127,10 +135,9 @@ class LoopFinder:
         poses : (n, 3) of the keyframes in the map, at least j + 1; spread : (n, 2) standard
         deviation of where each lies from the last one placed [m], [rad]; see `_sigma`
         """
-        for k in range(len(self._looks), j + 1):
-            self._looks.append(self._submaps[k].descriptor)
-            self._travelled.append(self._keyframes[k].travelled)
-            self._part.append(self._keyframes[k].part)
+        for keyframe in self._keyframes[len(self._part) : j + 1]:
+            self._travelled.append(keyframe.travelled)
+            self._part.append(keyframe.part)
         sigma = self._sigma(j, spread)
         reach = np.clip(_SIGMAS * sigma[:, 0], _LEAST_REACH, _MOST_REACH)
         turn = np.clip(_SIGMAS * sigma[:, 1], _LEAST_TURN, np.pi)
@@ -138,10 +145,10 @@ class LoopFinder:
             expected = se2.between(poses[i][None], poses[j][None])[0]
             if alike:
                 around = np.array([0.0, 0.0, expected[2]])
-                self._waiting.append(_Comparison(i, j, around, _ALIKE_REACH, np.pi))
+                self._waiting.append(_Comparison(i, j, True, around, _ALIKE_REACH, np.pi))
             else:
                 self._waiting.append(
-                    _Comparison(i, j, expected, float(reach[i]), float(turn[i])))
+                    _Comparison(i, j, False, expected, float(reach[i]), float(turn[i])))
 
     @property
     def waiting(self) -> int:
@@ -150,8 +157,17 @@ class LoopFinder:
 
     def find(self, most: int) -> list[ScanLoop]:
         """Make so many of the comparisons that wait; return the loops that they found."""
-        made = [self._compare(self._waiting.popleft()) for _ in range(min(most, self.waiting))]
-        return [loop for loop in made if loop is not None]
+        loops: list[ScanLoop] = []
+        while most and self._waiting:
+            asked = self._waiting.popleft()
+            # Where it is known to be near another, it needs no place that only looks alike.
+            if asked.alike and asked.j == self._closed:
+                continue
+            most -= 1
+            if (loop := self._compare(asked)) is not None:
+                loops.append(loop)
+                self._closed = self._closed if asked.alike else asked.j
+        return loops
 
     def _sigma(self, j: int, spread: Array) -> Array:
         """Return how far keyframe j may lie from where the map has it, seen from each, (j, 2)."""
@@ -174,10 +190,14 @@ class LoopFinder:
         near = (distance <= reach[far]) & ~apart
         chosen: list[tuple[int, bool]] = []
         self._take(far[near], distance[near], _NEAREST, False, travelled, chosen)
-        within = far[(distance <= 2 * reach[far]) | apart]
-        looks = np.array([self._looks[i] @ self._looks[j] for i in within])
-        alike = within[looks > _LOOKS] if len(within) else within
-        self._take(alike, -looks[looks > _LOOKS], _ALIKE, True, travelled, chosen)
+        # Of the earlier ones that have asked: neighbours of others look as they do.
+        looks = np.full(j + 1, -1.0)
+        own = self._submaps[j].descriptor
+        looks[self._have_asked] = self._looks.view() @ own
+        self._have_asked.append(j)
+        self._looks.extend(own[None])
+        alike = far[((distance <= 2 * reach[far]) | apart) & (looks[far] > _SIMILAR)]
+        self._take(alike, -looks[alike], _ALIKE, True, travelled, chosen)
         return chosen
 
     def _take(self, keyframes: Indices, rank: Array, most: int, alike: bool, travelled: Array,

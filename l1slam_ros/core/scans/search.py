@@ -15,6 +15,7 @@ Branch and bound over shifts and turns (Hess et al. 2016), on the likelihood of 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.scans import search_kernels
@@ -61,7 +62,7 @@ def search(field: Field, xy: Array, centre: Array, reach: float, turn: float, le
     cells = search_kernels.add_widest_bounds(
         field.blocks, np.ascontiguousarray(points / RESOLUTION),
         np.column_stack((np.cos(turns), np.sin(turns))), start, sums)
-    nodes = _sorted(sums[:, :, :across].astype(np.int64), rival * least * certain)
+    nodes = _sorted(sums[:, :, :across], rival * least * certain)
     best, at, column, row = search_kernels.branch_and_bound(
         field.levels, cells, nodes, 2 * most, int(least * certain), np.full(6, -1.0))
     if at < 0:
@@ -75,10 +76,11 @@ def search(field: Field, xy: Array, centre: Array, reach: float, turn: float, le
                 second / certain if other >= 0 else 0.0)
 
 
-def _sorted(bounds: Indices, least: float) -> Indices:
+def _sorted(bounds: NDArray[np.uint16], least: float) -> Indices:
     """Return turn, column, row and bound of the squares above `least`, (k, 4), the best first."""
     above = np.flatnonzero(bounds > least)
     found = bounds.ravel()[above]
-    order = np.argsort(-found, kind='stable')
+    # Numbers of 16 bits are sorted by their digits, ten times as fast as others.
+    order = np.argsort(~found, kind='stable')
     t, a, b = np.unravel_index(above[order], bounds.shape)
     return np.column_stack((t, WIDTH * a, WIDTH * b, found[order])).astype(np.int64)

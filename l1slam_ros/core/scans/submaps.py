@@ -31,6 +31,8 @@ _KEPT = 24
 _PAST = 0.3
 # Rings and sectors of a descriptor, and how far it sees [m].
 _RINGS, _SECTORS, _SIGHT = 12, 60, 12.0
+# Numbers of a descriptor.
+LOOKS = _RINGS * (_SECTORS // 2 + 1)
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class Submap:
 
     @cached_property
     def descriptor(self) -> Array:
-        """What the place looks like from whichever heading, (rings x spectrum,), of length 1."""
+        """What the place looks like from whichever heading, (`LOOKS`,), of length 1."""
         x, y = self.xy.T
         ring = np.minimum(np.hypot(x, y) / _SIGHT * _RINGS, _RINGS - 1).astype(np.int64)
         sector = np.floor((np.arctan2(y, x) / (2 * np.pi)) * _SECTORS).astype(np.int64) % _SECTORS

@@ -56,7 +56,7 @@ class ScanDiagnostics:
             f'{topic}.{name}': value for topic, traffic in self._topics.items()
             for name, value in traffic.values().items()}
         values |= {name: front_end.run.counts[name]
-                   for name in ('scans', 'keyframes', 'parts', 'loops')}
+                   for name in ('scans', 'keyframes', 'parts', 'loops', 'comparisons')}
         values['waiting'] = queue.waiting
         values |= {f'refused.{cause}': count for cause, count in sorted(lost.items())}
         median, most = front_end.run.cost()
