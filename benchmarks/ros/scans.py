@@ -9,16 +9,18 @@
 """
 A laser log over DDS, faster than it was driven: the map of `scan_loops` and `backend`.
 
-    python benchmarks/ros/scans.py LOG TRUTH [RATE]
+    python benchmarks/ros/scans.py LOG TRUTH [RATE [GROUPS]]
 
 LOG is a CARMEN log, TRUTH a table of `stamp,x,y,theta`. Both nodes run as shipped, each a process
 of its own; the log is sent as LaserScan and Odometry, so many scans a second. Said is what each
 process took of a core for a scan, its memory, how long updates of the map took, what the front end
 says of itself, and the error of the map at the truth's stamps: where the Path has the keyframe
 before, and `scan_odom` from there. A straight line between keyframes would not do: a robot that
-stands, and goes on, is not on it.
+stands, and goes on, is not on it. With GROUPS, see `small.py`, the two nodes share the first core
+within these control groups, and what plays to them runs elsewhere.
 """
 
+import os
 import subprocess
 import sys
 import time
@@ -35,6 +37,7 @@ from peer import UpdateTimes, arguments, cpu_seconds
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import LaserScan
+from small import groups_most
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, poses_at
@@ -53,7 +56,7 @@ _COMPILING, _END = 60.0, 30.0  # [s] nothing is sent before; the map may change 
 
 def main() -> None:
     """Measure and print."""
-    given = arguments(__doc__, log=Path, truth=Path, rate=RATE)
+    given = arguments(__doc__, log=Path, truth=Path, rate=RATE, groups='')
     log = read_carmen(given.log)
     rclpy.init()
     node = rclpy.create_node('laser')
@@ -77,8 +80,12 @@ def main() -> None:
     scans = node.create_publisher(LaserScan, 'scan', qos_profile_sensor_data)
     wheels = node.create_publisher(Odometry, 'odom', QoSProfile(depth=1000))
     files = ['--ros-args', '--params-file', str(_SHIPPED), '--log-level', 'error']
+    within = []
+    if given.groups:
+        os.sched_setaffinity(0, set(range(1, os.cpu_count() or 2)))
+        within = [sys.executable, str(Path(__file__).with_name('small.py')), 'join', given.groups]
     mount = ','.join(f'{v:g}' for v in (log.mount.x, log.mount.y, log.mount.yaw))
-    nodes = [subprocess.Popen([executable(name), *files, *more]) for name, more in (
+    nodes = [subprocess.Popen([*within, executable(name), *files, *more]) for name, more in (
         ('scan_loops', ['-p', f"laser_pose:='{mount}'"]), ('backend', ['-r', 'odom:=scan_odom']))]
     try:
         _listen(node, _COMPILING)
@@ -90,14 +97,17 @@ def main() -> None:
             due += 1 / given.rate
             _listen(node, due - time.monotonic())
         _listen(node, _END)
+        assert all(process.poll() is None for process in nodes), 'a node was killed'
         spent = [cpu_seconds(process.pid) - first
                  for process, first in zip(nodes, before, strict=True)]
         for name, seconds, process in zip(('scan_loops', 'backend'), spent, nodes, strict=True):
             print(f'{name}: {1e3 * seconds / len(log.scans):.2f} ms of a core for a scan, '
-                  f'{_memory(process.pid):.0f} MB')
+                  f'{_memory(process.pid):.0f} MiB')
         print(f'backend: {updates.sentence}')
         print(', '.join(f'{name} {said[name]}' for name in said
                         if name.startswith(('refused', 'scan', 'loops', 'parts'))))
+        if given.groups:
+            print(f'the groups had at most {groups_most(given.groups):.0f} MiB')
         path = deserialize_message(paths[-1], PathMessage)
         print(f'{len(log.scans)} scans, {len(path.poses)} keyframes, '
               f'{_error(path, way, given.truth):.3f} m from the truth')

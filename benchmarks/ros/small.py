@@ -88,7 +88,7 @@ def main() -> int:
             _tell(peer, sent, poses, cpu / seconds)
             most = _most(peer.process.pid)
             code = peer.end()
-    print(f'the node had at most {most:.0f} MiB, the groups {_groups_most(given.groups):.0f} MiB; '
+    print(f'the node had at most {most:.0f} MiB, the groups {groups_most(given.groups):.0f} MiB; '
           f'ended with {code}')
     return int(code != 0)
 
@@ -104,7 +104,7 @@ def _join(groups: str, command: list[str]) -> int:
 def _within(groups: str, command: list[str]) -> int:
     """Run a command on the first core, in control groups; say the most memory they had."""
     code = subprocess.call([sys.executable, __file__, 'join', groups, *command])
-    print(f'the groups had at most {_groups_most(groups):.0f} MiB; ended with {code}')
+    print(f'the groups had at most {groups_most(groups):.0f} MiB; ended with {code}')
     return code
 
 
@@ -125,7 +125,7 @@ def _most(process: int) -> float:
     return int(line.split()[1]) / 1024
 
 
-def _groups_most(groups: str) -> float:
+def groups_most(groups: str) -> float:
     """Return the most memory that control groups had [MiB], in either version of them."""
     (file,) = (file for group in groups.split(':')
                for file in (Path(group) / 'memory.max_usage_in_bytes', Path(group) / 'memory.peak')

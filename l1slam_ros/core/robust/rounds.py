@@ -40,7 +40,12 @@ from l1slam_ros.core.robust.innovation import (
 )
 from l1slam_ros.core.robust.inspection import repeated_factors
 from l1slam_ros.core.robust.places import beside_refused, mates, places
-from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.block_cholesky import (
+    BlockCholesky,
+    Pattern,
+    cholesky_of,
+    with_pattern,
+)
 from l1slam_ros.core.solvers.gauss_newton import l2_optimum
 
 # At most one in so many true loops is refused for its noise alone; and of accepted ones, dropped.
@@ -114,6 +119,7 @@ class Growth:
         self.learnt_of = np.zeros(0, bool)
         self.first_variance, self.at_their_word = np.ones(2), False
         self.posterior: Posterior
+        self._order: tuple[Indices, Pattern] | None = None
         self.slip_odds: dict[int, float] = {}
         none = np.zeros(len(self.factors), bool)
         self.ventured, self.in_tail, self.drops = none, ~none, none.astype(np.int64)
@@ -243,6 +249,11 @@ class Growth:
         still: Indices = np.flatnonzero(some & ~self.accepted & (self.drops < _CHANCES))
         return still
 
+    @property
+    def leaves_some_out(self) -> bool:
+        """Whether any loop is not accepted, for good or so far."""
+        return bool((self.is_loop & ~self.accepted).any())
+
     def across(self) -> Mask:
         """Return which factors lead from one part to another, (m,) bool."""
         across: Mask = self.part[self.low] != self.part[self.high]
@@ -261,7 +272,7 @@ class Growth:
                 self.part = component_labels(self.graph.subset(self.accepted & ~self.cut))
             rows = np.flatnonzero(self.accepted)
             subgraph = self.subgraph(rows)
-            cholesky = cholesky_of(subgraph)
+            cholesky = self._cholesky(rows, subgraph)
             self._check()
             self.poses, solved = l2_optimum(subgraph, self.poses, cholesky,
                                             lambda *_: self._check())
@@ -282,6 +293,14 @@ class Growth:
         if not self._knows_noise:
             self._learn_variance(rows)
             self.learnt_of = self.accepted.copy()
+
+    def _cholesky(self, rows: Indices, subgraph: FactorGraph) -> BlockCholesky:
+        """Return what factors the systems of some factors; an order is found once for them."""
+        if self._order is not None and np.array_equal(rows, self._order[0]):
+            return with_pattern(self._order[1], subgraph)
+        cholesky = cholesky_of(subgraph)
+        self._order = rows, cholesky.pattern
+        return cholesky
 
     @property
     def _knows_noise(self) -> bool:

@@ -353,3 +353,8 @@ def cholesky_of(graph: FactorGraph, before: Pattern | None = None) -> BlockChole
             f'{memory.in_gigabytes(memory.free())} are free',
             error.blocks) from error
     return BlockCholesky(pattern, keyframe, loose_keyframes(graph))
+
+
+def with_pattern(pattern: Pattern, graph: FactorGraph) -> BlockCholesky:
+    """Return what factors the systems of a graph, by a pattern of all its factors."""
+    return BlockCholesky(pattern, keyframes_of(graph, anchor(graph)), loose_keyframes(graph))

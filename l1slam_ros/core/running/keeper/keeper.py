@@ -245,12 +245,17 @@ class Keeper:
 
     # What the front takes.
 
-    def take_what_has_come(self, deadline: float) -> None:
-        """Make factors of the due loops; let the front take new factors until the deadline [s]."""
+    def take_what_has_come(self, deadline: float,
+                           in_vain: Callable[[], bool] = lambda: False) -> None:
+        """
+        Make factors of the due loops; let the front take new factors until the deadline [s].
+
+        in_vain : whether it is to take none
+        """
         with self._front_lock, self._graph_lock:
             self._add_due_loops()
         taken = False
-        while time.monotonic() < deadline:
+        while time.monotonic() < deadline and not in_vain():
             with self._front_lock:
                 if not self._take_some():
                     break

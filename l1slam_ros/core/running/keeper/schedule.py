@@ -127,8 +127,13 @@ def is_beyond_fronts(state: MapState, size: Size) -> bool:
     Then a map that is begun before the loops are judged is out of date when it is made. It waits
     for one judgement at most.
     """
+    return state.judged.ended <= state.made and outrun(state, size)
+
+
+def outrun(state: MapState, size: Size) -> bool:
+    """Return whether more has come than the front of a map takes."""
     carried = state.carried
-    return carried is not None and state.judged.ended <= state.made and (
+    return carried is not None and (
         (size.factors - carried.rows) * size.rows > MOST_ROWS * size.factors)
 
 

@@ -27,7 +27,7 @@ from functools import partial
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.running.improve import Check, Improvement, front_of, optimise
 from l1slam_ros.core.running.keeper.keeper import Keeper
-from l1slam_ros.core.running.keeper.schedule import Moment, due
+from l1slam_ros.core.running.keeper.schedule import Moment, due, outrun
 from l1slam_ros.core.running.keeper.work import carry_out, take_judgement
 from l1slam_ros.core.running.keeper.workers import (
     LOOK,
@@ -83,7 +83,7 @@ class Updates:
             if self._rested == keeper.revisions.now:
                 return None
             before = keeper.state
-            keeper.take_what_has_come(start + max(budget, _LEAST_TIME))
+            keeper.take_what_has_come(start + max(budget, _LEAST_TIME), self._in_vain)
             seen = keeper.revisions
             # What a map begins with is not news.
             came = seen.grown > max(self._updated, keeper.state.began)
@@ -106,6 +106,16 @@ class Updates:
             self._workers.check()
             self._rested = seen.now
         return None
+
+    def _in_vain(self) -> bool:
+        """
+        Return whether the front is to take nothing.
+
+        More has come than it would take, and is being judged, or the map of that is being made:
+        what it took would be gone with it, and take the time of the others.
+        """
+        state, _, size = self._keeper.look()
+        return outrun(state, size) and (self._workers.judge.busy or state.pending is not None)
 
     def _account(self, began: int, took: float) -> Improvement:
         state, _, size = self._keeper.look()
