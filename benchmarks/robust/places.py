@@ -174,11 +174,15 @@ def _closest(estimate: Array, track: Array, heading: float, rounds: int = 40) ->
 
 
 def _ring() -> Place:
-    """Return a lap of 600 keyframes, closed by 20 loops at the place where it began."""
+    """
+    Return a lap of 600 keyframes, closed by 20 loops at the place where it began.
+
+    By this draw odometry is three sigmas off there, as one lap in a hundred is.
+    """
     n, loops = 600, 20
     angle = 2 * np.pi * np.arange(n + loops) / n
     truth = np.stack((np.cos(angle), np.sin(angle), angle), axis=1) * [n / 6.3, n / 6.3, 1.0]
-    back, rng = np.arange(loops), np.random.default_rng(0)
+    back, rng = np.arange(loops), np.random.default_rng(1)
     sigma = np.broadcast_to([0.05, 0.05, 0.005], (n + 2 * loops - 1, 3))
     return place_of(RING, measured(truth, back, back + n, sigma,
                                    sigma * rng.standard_normal(sigma.shape)), None)

@@ -225,8 +225,8 @@ def test_odometry_that_lies_is_refused_and_named(capsys, lies):
 # Doubtful
 
 
-DOUBT = re.compile(r'doubtful: (\d+) refused loops of several places agree with each other on '
-                   r'another map, between (\d+) and (\d+)( \([0-9.]+ s to [0-9.]+ s\))?\. Vouch '
+DOUBT = re.compile(r'doubtful: (\d+) refused loops agree with each other on another map, '
+                   r'between (\d+) and (\d+)( \([0-9.]+ s to [0-9.]+ s\))?\. Vouch '
                    'for a loop that is right, strike out one that is false, or state the noise')
 
 

@@ -119,9 +119,9 @@ def test_a_doubt_says_why_and_where(stamps, when):
                           ids, stamps)
     assert said == (
         f'doubtful: 1,234 loops, most of all, are refused or suspect, {where}: either they are '
-        'false, or the odometry is worse than it says; 1,234 refused loops of several places '
-        f'agree with each other on another map, {where}. Vouch for a loop that is right, strike '
-        'out one that is false, or state the noise')
+        'false, or the odometry is worse than it says; 1,234 refused loops agree with each '
+        f'other on another map, {where}. Vouch for a loop that is right, strike out one that is '
+        'false, or state the noise')
     assert doubt_sentence((), ids, stamps) == ''
 
 

@@ -33,9 +33,8 @@ from l1slam_ros.core.robust.judgement import (
     Doubt,
     listed,
 )
-from l1slam_ros.core.robust.odometry.slips import JOINING, SURE, common_steps, spanning
+from l1slam_ros.core.robust.odometry.slips import SURE, common_steps, spanning
 from l1slam_ros.core.robust.pairwise_consistency import (
-    Group,
     agreement,
     asked,
     spanned,
@@ -58,7 +57,7 @@ def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
         reasons.append(_doubt(growth, MOSTLY_REFUSED, left_out))
     if not ended and len(left_out):
         reasons.append(_doubt(growth, UNFINISHED, left_out))
-    if _carries_all(growth, accepted):
+    if _decides_alone(growth, accepted):
         reasons.append(_doubt(growth, ONE_PLACE, accepted))
     if growth.cut.any():
         reasons += [_doubt(growth, ONE_JOINS, rows) for rows in _joining_alone(growth)]
@@ -71,10 +70,20 @@ def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
     return tuple(dict.fromkeys(reasons))
 
 
-def _carries_all(growth: Growth, accepted: Indices) -> bool:
-    """Return whether all accepted loops are of one place, and join but a small part of the way."""
-    return (len(accepted) >= _HANDFUL and not growth.trusted[accepted].any()
-            and growth.may_err_as_one(accepted, 2))
+def _decides_alone(growth: Growth, accepted: Indices) -> bool:
+    """
+    Return whether all accepted loops are of one place, and may be one mistake.
+
+    As one loop, by the median of what they say, it would not be believed by odometry alone.
+    """
+    if (len(accepted) < _HANDFUL or not growth.may_err_as_one(accepted, 2)
+            or (growth.trusted | growth.factors.is_absolute)[accepted].any()):
+        return False
+    odometry = growth.copy()
+    odometry.accepted = ~growth.is_loop
+    odometry.solve()
+    within = accepted[~odometry.across()[accepted]]
+    return len(within) > 0 and np.median(odometry.innovations(within).log_ratio()) < SURE
 
 
 def _joining_alone(growth: Growth) -> Iterator[Indices]:
@@ -86,7 +95,7 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
     sure = ~growth.is_loop | growth.trusted | growth.factors.is_absolute
     part = component_labels(growth.graph.subset(growth.accepted & ~growth.cut & sure))
     rows = np.flatnonzero(growth.accepted & ~sure & (part[growth.low] != part[growth.high]))
-    rows = np.concatenate((rows, _agree_at_a_place(growth)))
+    rows = np.concatenate((rows, _agree_at_a_place(growth, growth.joining())))
     i, j = part[growth.low[rows]], part[growth.high[rows]]
     _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
     joins = growth.accepted[rows]
@@ -102,9 +111,8 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
             yield rows[own]
 
 
-def _agree_at_a_place(growth: Growth) -> Indices:
-    """Return loops from part to part that are left out, and agree with one of their place."""
-    rows = growth.joining()
+def _agree_at_a_place(growth: Growth, rows: Indices) -> Indices:
+    """Return those of some loops that are left out, and agree with one of their place."""
     _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
     rows = asked(growth, rows[count[place] > 1])
     one, other, _ = agreement(growth, rows)
@@ -114,27 +122,31 @@ def _agree_at_a_place(growth: Growth) -> Indices:
 
 def _other_map(growth: Growth) -> list[Doubt]:
     """
-    Return a doubt where refused loops of several places agree, and no accepted one speaks against.
+    Return a doubt where refused loops agree, and no accepted one speaks against them.
 
-    They may be right then: the odometry slipped, and nothing else knows of it.
+    They may be right then: the odometry slipped, and nothing else knows of it. A place against
+    the odometry alone is one word against another.
     """
-    group = strongest_group(growth, growth.undecided())
-    if len(group.places) < JOINING or _against(growth, group, growth.accepted & growth.is_loop):
-        return []
-    return [_doubt(growth, OTHER_MAP, group.rows)]
+    rows, accepted = growth.undecided(), growth.accepted & growth.is_loop
+    agree = _agree_at_a_place(growth, rows)
+    groups = [strongest_group(growth, rows).rows, *(
+        agree[growth.place[agree] == place] for place in np.unique(growth.place[agree]))]
+    alone = [group for group in groups if len(group) and not _against(growth, group, accepted)]
+    return [_doubt(growth, OTHER_MAP, max(alone, key=len))] if alone else []
 
 
-def _against(growth: Growth, group: Group, rows: Mask) -> int:
+def _against(growth: Growth, group: Indices, rows: Mask) -> int:
     """
-    Return how many of some loops would lie, at least, if a group of others were right.
+    Return how many of some loops would lie, at least, if a group of others, (k,), were right.
 
-    Then the odometry slipped at a step that the group spans, or on either side of its first or
-    its second ends: what lies between is elsewhere as a whole.
+    Then the odometry slipped at a step that the group spans. Or on either side of its first or
+    its second ends, and what lies between is elsewhere as a whole: two slips are believed of
+    several places alone.
     """
     low, high = growth.low, growth.high
     across = spanned(low[rows], high[rows], growth.graph.n_poses)
     against = [across[low[common_steps(growth, group)]].min()]
-    for ends in (low[group.rows], high[group.rows]):
+    for ends in (low[group], high[group]) if np.ptp(growth.place[group]) else ():
         inside = ((end >= ends.min()) & (end <= ends.max()) for end in (low[rows], high[rows]))
         against.append(np.count_nonzero(np.logical_or(*inside)))
     return int(min(against))

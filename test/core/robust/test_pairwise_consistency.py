@@ -44,7 +44,7 @@ def test_loops_across_a_slip_agree(bad):
     assert len(group.places) >= SPANNING
     assert not is_false(bad, growth.factors)[group.rows].any()
     assert ((growth.low[group.rows] <= STEP) & (growth.high[group.rows] > STEP)).all()
-    steps = growth.low[common_steps(growth, group)]
+    steps = growth.low[common_steps(growth, group.rows)]
     assert steps.min() <= STEP <= steps.max()
 
 

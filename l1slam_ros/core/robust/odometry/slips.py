@@ -208,7 +208,7 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> 
         group = strongest_group(growth, left_out)
         if len(group.places) < SPANNING:
             break
-        common = common_steps(growth, group)
+        common = common_steps(growth, group.rows)
         common = common[~growth.cut[common]]
         if len(common):
             suspects.append(int(common[np.argmax(odds[common])]))
@@ -216,9 +216,9 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> 
     return list(dict.fromkeys(suspects))
 
 
-def common_steps(growth: Growth, group: Group) -> Indices:
-    """Return the odometry that most of a group span, (k,)."""
-    across = spanned(growth.low[group.rows], growth.high[group.rows], growth.graph.n_poses)
+def common_steps(growth: Growth, rows: Indices) -> Indices:
+    """Return the odometry that most of some loops span, (k,)."""
+    across = spanned(growth.low[rows], growth.high[rows], growth.graph.n_poses)
     common = np.flatnonzero(across == across.max())
     steps: Indices = np.flatnonzero(~growth.is_loop & np.isin(growth.low, common))
     return steps
