@@ -58,8 +58,8 @@ def path_in(data: bytes) -> tuple[str, Indices, Array]:
     """
     Return frame, stamps (n,) [ns] and poses (n, 3) of a serialised nav_msgs/Path.
 
-    By its layout where that is as `path_bytes` has it: rclpy takes some hundred times as long to make
-    the objects of a message, and a path comes with each update, whole.
+    By its layout where that is as `path_bytes` has it: rclpy takes some hundred times as long to
+    make the objects of a message, and a path comes with each update, whole.
     """
     with suppress(struct.error, ValueError):
         if (found := _path_parts(data)) is not None:
