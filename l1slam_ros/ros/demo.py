@@ -47,8 +47,8 @@ from l1slam_ros.io.bags.topics import SCAN_TOPIC, TRUTH_TOPIC
 from l1slam_ros.io.files import stamp_from_text
 from l1slam_ros.io.formats import read_input
 from l1slam_ros.io.graphs.side_files import read_pairs
-from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.io.plot import Ground, MapDrawing, plot_maps
+from l1slam_ros.ros.scans.messages import path_in
 from l1slam_ros.ros.shell.domain import go_where_nobody_is
 
 Process = subprocess.Popen[bytes]
@@ -114,13 +114,13 @@ class Heard:
     """
     What the back end and the front end published.
 
-    path : the last one; states : loop (reference, end) [ns] -> what has become of it; sentence :
-    of its diagnostics; calm : how many of these in a row said the same of the map, with no other
-    news in between; ground : the last grid of the front end; scans : how many it has used;
-    comparisons : how many it has still to make, at least.
+    path : the last one, serialised; states : loop (reference, end) [ns] -> what has become of it;
+    sentence : of its diagnostics; calm : how many of these in a row said the same of the map, with
+    no other news in between; ground : the last grid of the front end; scans : how many it has
+    used; comparisons : how many it has still to make, at least.
     """
 
-    path: PathMessage | None = None
+    path: bytes = b''
     ground: OccupancyGrid | None = None
     scans: int = 0
     states: dict[tuple[int, int], str] = field(default_factory=dict)
@@ -131,7 +131,8 @@ class Heard:
     @property
     def stamps(self) -> list[int]:
         """The stamps of the map's keyframes [ns]."""
-        return [] if self.path is None else [stamp_of(pose.header) for pose in self.path.poses]
+        stamps: list[int] = path_in(self.path)[1].tolist() if self.path else []
+        return stamps
 
     def count_judged(self, loops: list[tuple[int, int]]) -> int:
         """Return how many of some loops are in the map or refused."""
@@ -155,14 +156,14 @@ class Listener:
         self.moved = time.monotonic()
         self._said: dict[str, str] = {}
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        node.create_subscription(PathMessage, 'path', self._hear, latched)
+        node.create_subscription(PathMessage, 'path', self._hear, latched, raw=True)
         every = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         node.create_subscription(DiagnosticArray, 'loop_status', self._hear_of_loops, every)
         node.create_subscription(DiagnosticArray, '/diagnostics', self._hear_of_the_map, 10)
         node.create_subscription(OccupancyGrid, 'map', self._hear_ground, latched)
 
-    def _hear(self, message: PathMessage) -> None:
-        self.heard.path = message
+    def _hear(self, data: bytes) -> None:
+        self.heard.path = data
         self._move()
 
     def _hear_ground(self, message: OccupancyGrid) -> None:
@@ -284,9 +285,8 @@ def record_map(bag: Path, recording: Recording) -> Heard:
 
 def summarise(recording: Recording, heard: Heard, picture: Path) -> str:
     """Draw the map and return what to print about it."""
-    assert heard.path is not None
-    stamps = np.array(heard.stamps)
-    positions = np.array([(p.pose.position.x, p.pose.position.y) for p in heard.path.poses])
+    _, stamps, poses = path_in(heard.path)
+    positions = poses[:, :2]
     rows = np.searchsorted(recording.stamps, stamps)
     truth, odometry = recording.truth[rows], recording.odometry[rows]
     errors = (absolute_trajectory_error(odometry, truth),

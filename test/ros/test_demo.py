@@ -23,6 +23,7 @@ from geometry_msgs.msg import Point, Pose, PoseStamped
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import serialize_message
 
 from l1slam_ros.cli.main import main
 from l1slam_ros.io.bags.reader import read_messages
@@ -80,7 +81,7 @@ def test_the_summary_of_a_perfect_map_is_an_error_of_zero(tmp_path):
     grid = OccupancyGrid(data=[-1, 0, 100, 0, 0, 100])
     grid.info.resolution, grid.info.width, grid.info.height = 2.0, 3, 2
     states = {**states_of(recording), (1, 2): 'accepted', (1, 3): 'suspect'}
-    heard = Heard(path, grid, 1000, states)
+    heard = Heard(serialize_message(path), grid, 1000, states)
     for is_false in True, False:  # one of each is told apart wrongly
         ends = recording.loop_stamps[np.argmax(recording.is_false == is_false)]
         heard.states[ends] = 'accepted' if is_false else 'rejected'

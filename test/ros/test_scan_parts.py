@@ -18,6 +18,10 @@ import yaml
 
 pytest.importorskip('rclpy')
 
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Path as PathMessage
+from rclpy.serialization import serialize_message
+
 from l1slam_ros.core.errors import MessageError, OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import OdometrySample
@@ -28,7 +32,8 @@ from l1slam_ros.core.scans.points import Mount, Scan
 from l1slam_ros.core.scans.submaps import Keyframe
 from l1slam_ros.io.node_options import NodeOptions, read_params_file
 from l1slam_ros.ros.demo import executable
-from l1slam_ros.ros.scans.messages import scan_in, whole
+from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.scans.messages import path_in, scan_in, whole
 from l1slam_ros.ros.scans.mounting import StaticTransforms
 from l1slam_ros.ros.scans.options import ScanLoopsOptions
 from l1slam_ros.ros.scans.placing import Placing
@@ -231,6 +236,28 @@ def test_what_is_no_scan_is_refused(bad):
     with pytest.raises(MessageError, match='a scan of') as caught:
         scan_in(laser_scan(**bad), 0.0)
     assert caught.value.cause == 'scan'
+
+
+@pytest.mark.parametrize('frame', ['', 'map', 'maps', 'robot/map'])
+@pytest.mark.parametrize('other', [None, 'x', 'one/more'], ids=str)
+def test_a_path_is_read_as_ros_reads_it(rng, frame, other):
+    """Also where one pose has a frame of its own, so that there is no one layout."""
+    for count in (0, 1, 2, 7):
+        message = PathMessage(header=header(frame, 3 * S + 7))
+        for k in range(count):
+            x, yaw = rng.normal(size=2)
+            named = other if other is not None and k == 3 else frame
+            pose = PoseStamped(header=header(named, (k + 1) * S + k))
+            place, turn = pose.pose.position, pose.pose.orientation
+            place.x, place.y, turn.z, turn.w = x, -x, np.sin(yaw / 2), np.cos(yaw / 2)
+            message.poses.append(pose)
+        found, stamps, poses = path_in(serialize_message(message))
+        assert found == frame
+        np.testing.assert_array_equal(stamps, [(k + 1) * S + k for k in range(count)])
+        np.testing.assert_array_equal(poses, se2.from_pose3(np.array([
+            (p.position.x, p.position.y, p.position.z, p.orientation.x, p.orientation.y,
+             p.orientation.z, p.orientation.w)
+            for p in (one.pose for one in message.poses)]).reshape(-1, 7)))
 
 
 def test_keyframes_are_placed_by_the_path_and_odometry_from_there():

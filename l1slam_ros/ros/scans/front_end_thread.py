@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Path
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import LaserScan
@@ -164,7 +163,7 @@ class RunOfScans:
 
     def _place(self) -> None:
         """Let front end and map know where the path has the keyframes."""
-        self._placing.set_path(*path_in(deserialize_message(self._path, Path)))
+        self._placing.set_path(*path_in(self._path))
         self._path, self._read = b'', time.monotonic()
         keyframes = self._front_end.keyframes
         poses = self._placing.place(keyframes)

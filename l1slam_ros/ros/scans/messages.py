@@ -6,12 +6,16 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of `scan_loops` -> records, by their attributes, and back."""
+"""Messages of `scan_loops` -> records, and back."""
 
 import math
+import struct
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
+from nav_msgs.msg import Path
+from rclpy.serialization import deserialize_message
 
 from l1slam_ros.core.errors import MessageError
 from l1slam_ros.core.geometry import se2
@@ -22,6 +26,7 @@ from l1slam_ros.io.messages.conversion import stamp_of
 
 # Fewer rays are no scan, more no laser.
 _FEWEST, _MOST = 2, 100_000
+_LITTLE_ENDIAN = b'\0\1'
 _ROWS = np.array(se2.COVARIANCE_ROWS)
 
 
@@ -49,14 +54,49 @@ def scan_in(message: Any, range_max: float) -> Scan:
                 min(farthest, default=math.inf), increment)
 
 
-def path_in(message: Any) -> tuple[str, Indices, Array]:
-    """Return frame, stamps (n,) [ns] and poses (n, 3) of a nav_msgs/Path."""
+def path_in(data: bytes) -> tuple[str, Indices, Array]:
+    """
+    Return frame, stamps (n,) [ns] and poses (n, 3) of a serialised nav_msgs/Path.
+
+    By its layout where that is as `path_bytes` has it: rclpy takes some hundred times as long to
+    make the objects of a message, and a path comes with each update, whole.
+    """
+    with suppress(struct.error, ValueError):
+        if (found := _path_parts(data)) is not None:
+            frame, stamps, pose3 = found
+            return frame, stamps, se2.from_pose3(pose3)
+    message = deserialize_message(data, Path)
     stamps = np.array([pose.header.stamp.sec * NANOSECONDS + pose.header.stamp.nanosec
                        for pose in message.poses], np.int64)
     pose3 = np.array([(p.position.x, p.position.y, p.position.z, p.orientation.x, p.orientation.y,
                        p.orientation.z, p.orientation.w)
                       for p in (pose.pose for pose in message.poses)]).reshape(-1, 7)
     return message.header.frame_id, stamps, se2.from_pose3(pose3)
+
+
+def _path_parts(data: bytes) -> tuple[str, Indices, Array] | None:
+    """Return frame, stamps and poses (n, 7) of a path; None: its poses have no one layout."""
+    if bytes(data[:2]) != _LITTLE_ENDIAN:
+        return None
+    (length,) = struct.unpack_from('<I', data, 12)
+    frame = bytes(data[16 : 15 + length]).decode()
+    place = _aligned(16 + length, 4)
+    (count,) = struct.unpack_from('<I', data, place)
+    if not count:
+        return None
+    seconds, nanoseconds, own = struct.unpack_from('<iII', data, place + 4)
+    # The numbers of a pose and the header of the next: see `path_bytes`.
+    begin = _aligned(place + 16 + own, 8)
+    record = np.dtype([('pose', '<f8', 7), ('seconds', '<i4'), ('nanoseconds', '<u4'),
+                       ('length', '<u4'), ('frame', f'V{own + -(own + 12) % 8}')])
+    records = np.frombuffer(bytes(data[begin:]) + bytes(record.itemsize - 56), record, count)
+    if (records['length'][:-1] != own).any():
+        return None
+    stamps = np.empty(count, np.int64)
+    stamps[0] = seconds * NANOSECONDS + nanoseconds
+    stamps[1:] = records['seconds'][:-1].astype(np.int64) * NANOSECONDS + (
+        records['nanoseconds'][:-1])
+    return frame, stamps, records['pose'].astype(float)
 
 
 def covariance_in(message: Any) -> tuple[int, Array]:
@@ -80,3 +120,8 @@ def whole(covariance: Array) -> Array:
     found = np.zeros((6, 6))
     found[_ROWS[:, None], _ROWS] = covariance
     return found
+
+
+def _aligned(place: int, size: int) -> int:
+    """Return the next multiple of a size, counted from behind the first four bytes."""
+    return place + (4 - place) % size
