@@ -214,15 +214,12 @@ class Innovations:
                                          posterior.samples)
         # Of all with all: each is of many pairs.
         columns = moved.reshape(len(rows) * k, -1)
-        shared = (columns @ columns.T / columns.shape[1]).reshape(len(rows), k, len(rows), k)
-        pairs = place.reshape(2, -1)
-        covariance = np.empty((len(first), 2, k, 2, k))
-        for one, other in np.ndindex(2, 2):
-            covariance[:, one, :, other] = shared[pairs[one], :, pairs[other]]
-        covariance[:, [0, 1], :, [0, 1]] += np.eye(k)
-        residual = -system.b.reshape(-1, k)[rows[pairs.T]].reshape(-1, 2 * k)
-        square, log_det = kernels.prediction.normalise(
-            covariance.reshape(-1, 2 * k, 2 * k), residual)
+        shared = columns @ columns.T / columns.shape[1]
+        one, other = place.reshape(2, -1)
+        at = np.arange(len(rows))
+        own = shared.reshape(len(rows), k, len(rows), k)[at, :, at] + np.eye(k)
+        square, log_det = kernels.prediction.normalise_pairs(
+            own, -system.b.reshape(-1, k)[rows], shared, one, other)
         claim = self.log_claim[first] + self.log_claim[second]
         freedom = self.freedom[first] + self.freedom[second]
         return square, log_likelihood_ratio(square, log_det, claim, freedom, k)

@@ -9,8 +9,10 @@
 """
 What L1 is compared with: Gauss-Newton for L2, and Huber, on the same linearisation.
 
-In: a graph and poses. Out: poses of lower cost. Both solve sparse normal equations and add
-Marquardt's damping only when a plain Gauss-Newton step fails.
+In: a graph and poses. Out: poses of lower cost. Both solve sparse normal equations. A step that
+brings less than half of what it promised is shortened to the lowest point of a parabola, or its
+rotations alone are taken and the translations that suit them; Marquardt's damping is added only
+when neither lowers the cost.
 """
 
 from dataclasses import dataclass
@@ -48,6 +50,11 @@ _FITS, _NOISE_STEPS = 3, 60
 # Relative to chi2. The error of what a step promised is of first order in the way that is left,
 # the rest of chi2 is of second order.
 _SURPRISE = 0.1
+# Part of what its linear problem promised that a step has to bring, else others are looked at; and
+# of a last one, which is to say that little is left.
+_BRINGS, _LAST = 0.5, 0.25
+# The least part of a step: where less is best, it goes the wrong way, and damping turns it.
+_SHORTEST = 0.25
 
 
 @dataclass(frozen=True)
@@ -103,38 +110,80 @@ def _descend(
     surprise : stop after an undamped step whose decrease of the cost differs from that of its
     linear problem by no more than this
     """
-    residual = whitened_residual(graph, poses)
-    history = [norm.cost(residual)]
+    here = _at(graph, poses, norm)
+    history = [here.cost]
     status, damping, solved = Status.ITERATION_LIMIT, 0.0, None
     while len(history) <= options.iterations:
-        if fits_exactly(l1_cost(residual), len(residual)):
+        if fits_exactly(l1_cost(here.residual), len(here.residual)):
             status = Status.CONVERGED
             break
-        system, weights = linearise(graph, poses, residual), norm.weights(residual)
+        system = linearise(graph, here.poses, here.residual)
+        weights = norm.weights(here.residual)
         step = weighted_least_squares(system, cholesky, weights, damping)
         predicted = float((step * system.transposed_times(weights * system.b)).sum())
-        candidate = step_poses(graph, poses, step)
-        moved = whitened_residual(graph, candidate)
-        cost = norm.cost(moved)
-        decrease = history[-1] - cost
         full, free, solved = damping <= _HARDLY, not damping, None if damping else system
+        there = _at(graph, step_poses(graph, here.poses, step), norm)
+        little = options.tolerance * here.cost
+        if predicted > little and np.isfinite(there.cost) and (
+                here.cost - there.cost < _BRINGS * predicted):
+            there, translated = _nearer(graph, here, there, step, predicted, norm, cholesky)
+            solved = None if translated else solved
+        decrease = here.cost - there.cost
         if decrease >= 0:
-            poses, residual = candidate, moved
+            here = there
             damping = damping / 10 if damping > _LEAST_DAMPING else 0.0
         else:
-            damping, cost = max(10 * damping, _FIRST_DAMPING), history[-1]
-        history.append(cost)
-        report(len(history) - 1, cost)
+            damping = max(10 * damping, _FIRST_DAMPING)
+        history.append(here.cost)
+        report(len(history) - 1, here.cost)
         # By a step as good as undamped; at the optimum rounding may let the cost rise a little.
-        if (full and abs(decrease) <= options.tolerance * cost) or (
+        if (full and abs(decrease) <= little and predicted <= max(little, decrease / _LAST)) or (
                 free and abs(decrease - predicted) < surprise):
             status = Status.CONVERGED
             break
         if damping > _MOST_DAMPING:
             status = Status.STALLED
             break
-    return Solution(poses, history[-1], status, len(history) - 1, 0, np.array(history),
-                    np.zeros(len(residual))), solved
+    return Solution(here.poses, here.cost, status, len(history) - 1, 0, np.array(history),
+                    np.zeros(len(here.residual))), solved
+
+
+@dataclass(frozen=True)
+class _At:
+    """Poses (n, p), the whitened residual (rows,) there, and its cost."""
+
+    poses: Array
+    residual: Array
+    cost: float
+
+
+def _at(graph: FactorGraph, poses: Array, norm: SmoothNorm) -> _At:
+    residual = whitened_residual(graph, poses)
+    return _At(poses, residual, norm.cost(residual))
+
+
+def _nearer(graph: FactorGraph, here: _At, there: _At, step: Array, predicted: float,
+            norm: SmoothNorm, cholesky: BlockCholesky) -> tuple[_At, bool]:
+    """
+    Return a better place than that to which a step led, or that, and whether it was factored for.
+
+    The parabola through both costs that begins as promised is lowest after a part of the step. A
+    long chain that is to bend goes along the tangent, and all its factors tear: given its
+    rotations, its translations are a linear problem.
+    """
+    part = predicted / (2 * predicted - (here.cost - there.cost))
+    best = there
+    if part > _SHORTEST:
+        shorter = _at(graph, step_poses(graph, here.poses, part * step), norm)
+        best = shorter if shorter.cost < there.cost else there
+    if here.cost - best.cost >= _BRINGS * predicted:
+        return best, False
+    entries, k = graph.manifold.TRANSLATION, graph.manifold.TANGENT_SIZE
+    weights = norm.weights(there.residual).reshape(-1, k)[:, entries].ravel()
+    system = linearise(graph, there.poses, there.residual).part(entries)
+    step = weighted_least_squares(system, cholesky, weights)
+    bent = _at(graph, step_part(graph, there.poses, step, entries), norm)
+    return (bent if bent.cost < best.cost else best), True
 
 
 def l2_map(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
