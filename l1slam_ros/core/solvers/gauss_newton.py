@@ -15,7 +15,7 @@ rotations alone are taken and the translations that suit them; Marquardt's dampi
 when neither lowers the cost.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,7 +37,6 @@ from l1slam_ros.core.solvers.optimality import (
     Status,
     fits_exactly,
     l1_cost,
-    l2_cost,
 )
 from l1slam_ros.core.solvers.reweighting import weighted_least_squares
 
@@ -92,25 +91,38 @@ def gauss_newton(
     report: Report = lambda iteration, cost: None,
 ) -> Solution:
     """Minimise a norm, reweighted at each step; arguments as `nonlinear.minimise`."""
-    return _descend(graph, poses, norm, options, cholesky, report)[0]
+    return _descend(graph, _at(graph, poses, norm), norm, options, cholesky, report)[0]
+
+
+@dataclass(frozen=True)
+class _At:
+    """Poses (n, p), the whitened residual (rows,) there, and its cost."""
+
+    poses: Array
+    residual: Array
+    cost: float
+
+
+def _at(graph: FactorGraph, poses: Array, norm: SmoothNorm) -> _At:
+    residual = whitened_residual(graph, poses)
+    return _At(poses, residual, norm.cost(residual))
 
 
 def _descend(
     graph: FactorGraph,
-    poses: Array,
+    here: _At,
     norm: SmoothNorm,
     options: LeastSquaresOptions,
     cholesky: BlockCholesky,
     report: Report,
     surprise: float = 0.0,
-) -> tuple[Solution, LinearSystem | None]:
+) -> tuple[Solution, Array, LinearSystem | None]:
     """
-    Return what `gauss_newton` does, and the system that it solved last, None: a damped one.
+    Return what `gauss_newton` does, the residual (rows,) and the system solved last, None: damped.
 
     surprise : stop after an undamped step whose decrease of the cost differs from that of its
     linear problem by no more than this
     """
-    here = _at(graph, poses, norm)
     history = [here.cost]
     status, damping, solved = Status.ITERATION_LIMIT, 0.0, None
     while len(history) <= options.iterations:
@@ -145,21 +157,7 @@ def _descend(
             status = Status.STALLED
             break
     return Solution(here.poses, here.cost, status, len(history) - 1, 0, np.array(history),
-                    np.zeros(len(here.residual))), solved
-
-
-@dataclass(frozen=True)
-class _At:
-    """Poses (n, p), the whitened residual (rows,) there, and its cost."""
-
-    poses: Array
-    residual: Array
-    cost: float
-
-
-def _at(graph: FactorGraph, poses: Array, norm: SmoothNorm) -> _At:
-    residual = whitened_residual(graph, poses)
-    return _At(poses, residual, norm.cost(residual))
+                    np.zeros(len(here.residual))), here.residual, solved
 
 
 def _nearer(graph: FactorGraph, here: _At, there: _At, step: Array, predicted: float,
@@ -193,24 +191,26 @@ def l2_map(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
 
 
 def l2_optimum(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
-               report: Report) -> tuple[Array, LinearSystem | None]:
+               report: Report) -> tuple[Array, Array, LinearSystem | None]:
     """
     Return the L2 map of a graph to within its noise: chi2 one above the optimum or less.
 
     From poses (n, p) that may be far off: where they do not fit to within the noise, first
-    rotations alone, then translations, each of which is linear; then Gauss-Newton. And the system
-    of its last step, which `cholesky` has factored; None: it was damped, or there was none.
+    rotations alone, then translations, each of which is linear; then Gauss-Newton. And its
+    whitened residual, (rows,), and the system of its last step, b what is left, which `cholesky`
+    has factored; None: it was damped, or there was none.
     """
     # In units of its noise, chi2 is about as large as there are spare measurements.
     k = graph.manifold.TANGENT_SIZE
     spare = max(int(graph.between.freedom.sum()) - k * (graph.n_poses - anchor(graph)), k)
-    chi2 = _chi2(graph, poses)
-    if chi2 > _FITS * spare:
-        linear = _two_linear_steps(graph, poses, cholesky)
-        poses = linear if _chi2(graph, linear) < chi2 else poses
+    start = _at(graph, poses, Huber())
+    if start.cost > _FITS * spare:
+        linear = _at(graph, _two_linear_steps(graph, poses, cholesky), Huber())
+        start = linear if linear.cost < start.cost else start
     options = LeastSquaresOptions(_NOISE_STEPS, 1 / spare)
-    solution, solved = _descend(graph, poses, Huber(), options, cholesky, report, _SURPRISE)
-    return solution.poses, solved
+    solution, residual, solved = _descend(graph, start, Huber(), options, cholesky, report,
+                                          _SURPRISE)
+    return solution.poses, residual, replace(solved, b=-residual) if solved else None
 
 
 def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:
@@ -220,7 +220,3 @@ def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky)
         x = weighted_least_squares(system, cholesky, np.ones_like(system.b))
         poses = step_part(graph, poses, x, part)
     return poses
-
-
-def _chi2(graph: FactorGraph, poses: Array) -> float:
-    return l2_cost(whitened_residual(graph, poses))
