@@ -24,6 +24,8 @@ from l1slam_ros.core.kernels.compiled import compiled, loop
 # Standard deviations of so many samples are right to 10% (1 / sqrt(2 q)), and of two factors
 # together there are far more samples than rows.
 SAMPLES = 48
+# What is left of a covariance where this part of it was subtracted but rounding.
+_DEFINITE = 1e-14
 
 
 @loop('(i8[:, ::1], f8[:, :, :, ::1], i1[:, :, ::1], f8[:, :, ::1])')
@@ -154,6 +156,33 @@ def _add_moved(keyframe, J, x, sign, d, to):
                 _add(x, keyframe[side] * k + c, J[side, r:r + 3, c:c + 3], sign, d, to + r)
 
 
+@compiled
+def _normalised(C, whole, residual, u):
+    """
+    Turn C (k, k) into its Cholesky factor L; return r'C^-1 r and ln det C, and u = L^-1 r.
+
+    whole : (k,) the diagonal of which a pivot is a part
+    """
+    square = log_det = 0.0
+    for r in range(len(C)):
+        for c in range(r):
+            value = C[r, c]
+            for e in range(c):
+                value -= C[r, e] * C[c, e]
+            C[r, c] = value / C[c, c]
+        value, total = C[r, r], residual[r]
+        for e in range(r):
+            value -= C[r, e] ** 2
+            total -= C[r, e] * u[e]
+        if not value > _DEFINITE * whole[r]:
+            return np.inf, -np.inf
+        C[r, r] = np.sqrt(value)
+        u[r] = total / C[r, r]
+        square += u[r] ** 2
+        log_det += 2 * np.log(C[r, r])
+    return square, log_det
+
+
 @loop('(f8[:, :, ::1], f8[:, ::1])')
 def normalise(covariance, residual):
     """
@@ -162,26 +191,47 @@ def normalise(covariance, residual):
     Cholesky; where C is not definite beyond rounding, infinity and minus infinity.
     """
     m, k = residual.shape
-    square, log_det, u = np.empty(m), np.empty(m), np.empty(k)
+    square, log_det, u, whole = np.empty(m), np.empty(m), np.empty(k), np.empty(k)
     for f in range(m):
-        C = covariance[f]
-        square[f] = log_det[f] = 0.0
         for r in range(k):
-            least = 1e-14 * C[r, r]
-            for c in range(r):
-                value = C[r, c]
-                for e in range(c):
-                    value -= C[r, e] * C[c, e]
-                C[r, c] = value / C[c, c]
-            value, total = C[r, r], residual[f, r]
-            for e in range(r):
-                value -= C[r, e] ** 2
-                total -= C[r, e] * u[e]
-            if not value > least:
-                square[f], log_det[f] = np.inf, -np.inf
-                break
-            C[r, r] = np.sqrt(value)
-            u[r] = total / C[r, r]
-            square[f] += u[r] ** 2
-            log_det[f] += 2 * np.log(C[r, r])
+            whole[r] = covariance[f, r, r]
+        square[f], log_det[f] = _normalised(covariance[f], whole, residual[f], u)
+    return square, log_det
+
+
+@loop('(f8[:, :, ::1], f8[:, ::1], f8[:, ::1], i8[::1], i8[::1])')
+def normalise_pairs(covariance, residual, shared, first, second):
+    """
+    Return what `normalise` does, of pairs of factors together, (pairs,) each.
+
+    covariance : (m, k, k) of each; shared : (m k, m k) of all with all, what is read of it are
+    the blocks of first and second ones
+    """
+    m, k = residual.shape
+    square, log_det = np.empty(len(first)), np.empty(len(first))
+    own, logs, u = np.empty(m), np.empty(m), np.empty((m, k))
+    factor, whole = covariance.copy(), np.empty((m, k))
+    for f in range(m):
+        for r in range(k):
+            whole[f, r] = covariance[f, r, r]
+        own[f], logs[f] = _normalised(factor[f], whole[f], residual[f], u[f])
+    # Of the second one what the first one does not explain.
+    W, C, left, unused = np.empty((k, k)), np.empty((k, k)), np.empty(k), np.empty(k)
+    for pair in range(len(first)):
+        a, b = first[pair], second[pair]
+        for c in range(k):
+            left[c] = residual[b, c]
+            for r in range(k):
+                value = shared[a * k + r, b * k + c]
+                for e in range(r):
+                    value -= factor[a, r, e] * W[c, e]
+                W[c, r] = value / factor[a, r, r]
+                left[c] -= W[c, r] * u[a, r]
+            for r in range(c + 1):
+                value = covariance[b, c, r]
+                for e in range(k):
+                    value -= W[c, e] * W[r, e]
+                C[c, r] = value
+        more, log = _normalised(C, whole[b], left, unused)
+        square[pair], log_det[pair] = own[a] + more, logs[a] + log
     return square, log_det

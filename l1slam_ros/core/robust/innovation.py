@@ -34,7 +34,6 @@ from l1slam_ros.core.graph.linear_system import (
     LinearSystem,
     anchor,
     linearise,
-    whitened_residual,
 )
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
@@ -98,15 +97,15 @@ def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
     """
     Return the posterior of a graph about its optimum, poses (n, p).
 
-    solved : the system that was solved for these poses, which `cholesky` has factored
+    solved : the system of the last step to these poses, which `cholesky` has factored, b what is
+    left there
 
     Raises
     ------
     GraphError : some keyframe is not tied to the anchor.
 
     """
-    system = (replace(solved, b=-whitened_residual(graph, poses)) if solved
-              else factorised(graph, poses, cholesky))
+    system = solved or factorised(graph, poses, cholesky)
     # A map that is to within its noise is no optimum to a factor that others hardly check.
     step = cholesky.solve(system.transposed_times(system.b))
     system = replace(system, b=system.b - system.times(step))
@@ -168,8 +167,9 @@ def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array,
 
 def by_freedom(value: Callable[[int], float], freedom: Indices) -> Array:
     """Return a value for each of (m,) degrees of freedom, each worked out once."""
-    some, place = np.unique(freedom, return_inverse=True)
-    return np.array([value(int(k)) for k in some])[place]
+    count = np.bincount(freedom)
+    values: Array = np.array([value(k) if some else 0.0 for k, some in enumerate(count.tolist())])
+    return values[freedom]
 
 
 @dataclass(frozen=True)
@@ -209,20 +209,18 @@ class Innovations:
         first, second : (pairs,) factors
         """
         system, k = self.system, self.system.block_size
-        rows, place = np.unique(np.concatenate((first, second)), return_inverse=True)
+        used = np.zeros(len(self.square), bool)
+        used[first] = used[second] = True
+        rows, place = np.flatnonzero(used), np.cumsum(used) - 1
         moved = kernels.prediction.moved(system.keyframe[rows], system.blocks[rows],
                                          posterior.samples)
         # Of all with all: each is of many pairs.
         columns = moved.reshape(len(rows) * k, -1)
-        shared = (columns @ columns.T / columns.shape[1]).reshape(len(rows), k, len(rows), k)
-        pairs = place.reshape(2, -1)
-        covariance = np.empty((len(first), 2, k, 2, k))
-        for one, other in np.ndindex(2, 2):
-            covariance[:, one, :, other] = shared[pairs[one], :, pairs[other]]
-        covariance[:, [0, 1], :, [0, 1]] += np.eye(k)
-        residual = -system.b.reshape(-1, k)[rows[pairs.T]].reshape(-1, 2 * k)
-        square, log_det = kernels.prediction.normalise(
-            covariance.reshape(-1, 2 * k, 2 * k), residual)
+        shared = columns @ columns.T / columns.shape[1]
+        at = np.arange(len(rows))
+        own = shared.reshape(len(rows), k, len(rows), k)[at, :, at] + np.eye(k)
+        square, log_det = kernels.prediction.normalise_pairs(
+            own, -system.b.reshape(-1, k)[rows], shared, place[first], place[second])
         claim = self.log_claim[first] + self.log_claim[second]
         freedom = self.freedom[first] + self.freedom[second]
         return square, log_likelihood_ratio(square, log_det, claim, freedom, k)
@@ -308,9 +306,9 @@ def claimed_volume(manifold: Manifold, poses: Array) -> Array:
     random pairs lie apart (a false factor need not know of the corridor), with any rotation.
     """
     others = np.random.default_rng(0).permutation(len(poses))
-    apart = manifold.local(poses, poses[others])
+    positions = manifold.positions(poses)
     variance = np.full(manifold.TANGENT_SIZE, np.pi**2 / 3)
-    variance[manifold.TRANSLATION] = (apart[:, manifold.TRANSLATION] ** 2).mean()
+    variance[manifold.TRANSLATION] = ((positions[others] - positions) ** 2).mean()
     with np.errstate(divide='ignore'):
         return np.log(2 * np.pi * variance) / 2
 

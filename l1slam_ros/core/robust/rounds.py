@@ -21,7 +21,6 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import FactorGraph, component_labels, turned
 from l1slam_ros.core.graph.first_fixes import first_fixes
-from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import as_sure, bridged, vague_odometry
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.graph.world_frame import placed
@@ -274,11 +273,11 @@ class Growth:
             subgraph = self.subgraph(rows)
             cholesky = self._cholesky(rows, subgraph)
             self._check()
-            self.poses, solved = l2_optimum(subgraph, self.poses, cholesky,
-                                            lambda *_: self._check())
+            self.poses, residual, solved = l2_optimum(subgraph, self.poses, cholesky,
+                                                      lambda *_: self._check())
             self._check()
             # What is far goes by its residual alone: to sample takes longer than to solve.
-            residual = whitened_residual(subgraph, self.poses).reshape(len(rows), -1)
+            residual = residual.reshape(len(rows), -1)
             misfits = self._misfits(rows, residual) if noise_fits else rows[:0]
             if not len(misfits):
                 self.posterior = sample_posterior(subgraph, self.poses, cholesky, solved)

@@ -9,11 +9,13 @@
 """
 What L1 is compared with: Gauss-Newton for L2, and Huber, on the same linearisation.
 
-In: a graph and poses. Out: poses of lower cost. Both solve sparse normal equations and add
-Marquardt's damping only when a plain Gauss-Newton step fails.
+In: a graph and poses. Out: poses of lower cost. Both solve sparse normal equations. A step that
+brings less than half of what it promised is shortened to the lowest point of a parabola, or its
+rotations alone are taken and the translations that suit them; Marquardt's damping is added only
+when neither lowers the cost.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,7 +37,6 @@ from l1slam_ros.core.solvers.optimality import (
     Status,
     fits_exactly,
     l1_cost,
-    l2_cost,
 )
 from l1slam_ros.core.solvers.reweighting import weighted_least_squares
 
@@ -48,6 +49,11 @@ _FITS, _NOISE_STEPS = 3, 60
 # Relative to chi2. The error of what a step promised is of first order in the way that is left,
 # the rest of chi2 is of second order.
 _SURPRISE = 0.1
+# Part of what its linear problem promised that a step has to bring, else others are looked at; and
+# of a last one, which is to say that little is left.
+_BRINGS, _LAST = 0.5, 0.25
+# The least part of a step: where less is best, it goes the wrong way, and damping turns it.
+_SHORTEST = 0.25
 
 
 @dataclass(frozen=True)
@@ -85,56 +91,97 @@ def gauss_newton(
     report: Report = lambda iteration, cost: None,
 ) -> Solution:
     """Minimise a norm, reweighted at each step; arguments as `nonlinear.minimise`."""
-    return _descend(graph, poses, norm, options, cholesky, report)[0]
+    return _descend(graph, _at(graph, poses, norm), norm, options, cholesky, report)[0]
+
+
+@dataclass(frozen=True)
+class _At:
+    """Poses (n, p), the whitened residual (rows,) there, and its cost."""
+
+    poses: Array
+    residual: Array
+    cost: float
+
+
+def _at(graph: FactorGraph, poses: Array, norm: SmoothNorm) -> _At:
+    residual = whitened_residual(graph, poses)
+    return _At(poses, residual, norm.cost(residual))
 
 
 def _descend(
     graph: FactorGraph,
-    poses: Array,
+    here: _At,
     norm: SmoothNorm,
     options: LeastSquaresOptions,
     cholesky: BlockCholesky,
     report: Report,
     surprise: float = 0.0,
-) -> tuple[Solution, LinearSystem | None]:
+) -> tuple[Solution, Array, LinearSystem | None]:
     """
-    Return what `gauss_newton` does, and the system that it solved last, None: a damped one.
+    Return what `gauss_newton` does, the residual (rows,) and the system solved last, None: damped.
 
     surprise : stop after an undamped step whose decrease of the cost differs from that of its
     linear problem by no more than this
     """
-    residual = whitened_residual(graph, poses)
-    history = [norm.cost(residual)]
+    history = [here.cost]
     status, damping, solved = Status.ITERATION_LIMIT, 0.0, None
     while len(history) <= options.iterations:
-        if fits_exactly(l1_cost(residual), len(residual)):
+        if fits_exactly(l1_cost(here.residual), len(here.residual)):
             status = Status.CONVERGED
             break
-        system, weights = linearise(graph, poses, residual), norm.weights(residual)
+        system = linearise(graph, here.poses, here.residual)
+        weights = norm.weights(here.residual)
         step = weighted_least_squares(system, cholesky, weights, damping)
         predicted = float((step * system.transposed_times(weights * system.b)).sum())
-        candidate = step_poses(graph, poses, step)
-        moved = whitened_residual(graph, candidate)
-        cost = norm.cost(moved)
-        decrease = history[-1] - cost
         full, free, solved = damping <= _HARDLY, not damping, None if damping else system
+        there = _at(graph, step_poses(graph, here.poses, step), norm)
+        little = options.tolerance * here.cost
+        if predicted > little and np.isfinite(there.cost) and (
+                here.cost - there.cost < _BRINGS * predicted):
+            there, translated = _nearer(graph, here, there, step, predicted, norm, cholesky)
+            solved = None if translated else solved
+        decrease = here.cost - there.cost
         if decrease >= 0:
-            poses, residual = candidate, moved
+            here = there
             damping = damping / 10 if damping > _LEAST_DAMPING else 0.0
         else:
-            damping, cost = max(10 * damping, _FIRST_DAMPING), history[-1]
-        history.append(cost)
-        report(len(history) - 1, cost)
+            damping = max(10 * damping, _FIRST_DAMPING)
+        history.append(here.cost)
+        report(len(history) - 1, here.cost)
         # By a step as good as undamped; at the optimum rounding may let the cost rise a little.
-        if (full and abs(decrease) <= options.tolerance * cost) or (
+        if (full and abs(decrease) <= little and predicted <= max(little, decrease / _LAST)) or (
                 free and abs(decrease - predicted) < surprise):
             status = Status.CONVERGED
             break
         if damping > _MOST_DAMPING:
             status = Status.STALLED
             break
-    return Solution(poses, history[-1], status, len(history) - 1, 0, np.array(history),
-                    np.zeros(len(residual))), solved
+    return Solution(here.poses, here.cost, status, len(history) - 1, 0, np.array(history),
+                    np.zeros(len(here.residual))), here.residual, solved
+
+
+def _nearer(graph: FactorGraph, here: _At, there: _At, step: Array, predicted: float,
+            norm: SmoothNorm, cholesky: BlockCholesky) -> tuple[_At, bool]:
+    """
+    Return a better place than that to which a step led, or that, and whether it was factored for.
+
+    The parabola through both costs that begins as promised is lowest after a part of the step. A
+    long chain that is to bend goes along the tangent, and all its factors tear: given its
+    rotations, its translations are a linear problem.
+    """
+    part = predicted / (2 * predicted - (here.cost - there.cost))
+    best = there
+    if part > _SHORTEST:
+        shorter = _at(graph, step_poses(graph, here.poses, part * step), norm)
+        best = shorter if shorter.cost < there.cost else there
+    if here.cost - best.cost >= _BRINGS * predicted:
+        return best, False
+    entries, k = graph.manifold.TRANSLATION, graph.manifold.TANGENT_SIZE
+    weights = norm.weights(there.residual).reshape(-1, k)[:, entries].ravel()
+    system = linearise(graph, there.poses, there.residual).part(entries)
+    step = weighted_least_squares(system, cholesky, weights)
+    bent = _at(graph, step_part(graph, there.poses, step, entries), norm)
+    return (bent if bent.cost < best.cost else best), True
 
 
 def l2_map(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
@@ -144,24 +191,26 @@ def l2_map(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
 
 
 def l2_optimum(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
-               report: Report) -> tuple[Array, LinearSystem | None]:
+               report: Report) -> tuple[Array, Array, LinearSystem | None]:
     """
     Return the L2 map of a graph to within its noise: chi2 one above the optimum or less.
 
     From poses (n, p) that may be far off: where they do not fit to within the noise, first
-    rotations alone, then translations, each of which is linear; then Gauss-Newton. And the system
-    of its last step, which `cholesky` has factored; None: it was damped, or there was none.
+    rotations alone, then translations, each of which is linear; then Gauss-Newton. And its
+    whitened residual, (rows,), and the system of its last step, b what is left, which `cholesky`
+    has factored; None: it was damped, or there was none.
     """
     # In units of its noise, chi2 is about as large as there are spare measurements.
     k = graph.manifold.TANGENT_SIZE
     spare = max(int(graph.between.freedom.sum()) - k * (graph.n_poses - anchor(graph)), k)
-    chi2 = _chi2(graph, poses)
-    if chi2 > _FITS * spare:
-        linear = _two_linear_steps(graph, poses, cholesky)
-        poses = linear if _chi2(graph, linear) < chi2 else poses
+    start = _at(graph, poses, Huber())
+    if start.cost > _FITS * spare:
+        linear = _at(graph, _two_linear_steps(graph, poses, cholesky), Huber())
+        start = linear if linear.cost < start.cost else start
     options = LeastSquaresOptions(_NOISE_STEPS, 1 / spare)
-    solution, solved = _descend(graph, poses, Huber(), options, cholesky, report, _SURPRISE)
-    return solution.poses, solved
+    solution, residual, solved = _descend(graph, start, Huber(), options, cholesky, report,
+                                          _SURPRISE)
+    return solution.poses, residual, replace(solved, b=-residual) if solved else None
 
 
 def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:
@@ -171,7 +220,3 @@ def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky)
         x = weighted_least_squares(system, cholesky, np.ones_like(system.b))
         poses = step_part(graph, poses, x, part)
     return poses
-
-
-def _chi2(graph: FactorGraph, poses: Array) -> float:
-    return l2_cost(whitened_residual(graph, poses))

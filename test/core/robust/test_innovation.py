@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from lies import careful_world
 
+from l1slam_ros.core import kernels
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.linear_system import linearise
 from l1slam_ros.core.robust.innovation import (
@@ -124,3 +125,27 @@ def test_a_corridor_does_not_narrow_what_false_factors_claim():
     area = np.column_stack((rng.uniform(0, 500, (500, 2)) / np.sqrt(2), np.zeros(500)))
     along, about = (claimed_volume(se2, poses) for poses in (straight, area))
     assert along == pytest.approx(about, abs=0.3)
+
+
+@pytest.mark.parametrize('k', [3, 6])
+def test_pairs_are_normalised_as_their_whole_covariance_says(k, rng):
+    m = 7
+    samples, residual = rng.standard_normal((m * k, 48)), rng.standard_normal((m, k))
+    shared = samples @ samples.T / 48
+    first, second = np.triu_indices(m, 1)
+    first, second = np.append(second, first), np.append(first, second)  # either way round
+    blocks = shared.reshape(m, k, m, k)[np.arange(m), :, np.arange(m)] + np.eye(k)
+    square, log_det = kernels.prediction.normalise_pairs(blocks, residual, shared, first, second)
+    rows = np.arange(m * k).reshape(m, k)
+    for a, b, found, log in zip(first, second, square, log_det, strict=True):
+        own = np.append(rows[a], rows[b])
+        C, r = shared[np.ix_(own, own)] + np.eye(2 * k), residual.ravel()[own]
+        assert found == pytest.approx(r @ np.linalg.solve(C, r), rel=1e-12)
+        assert log == pytest.approx(np.linalg.slogdet(C)[1], rel=1e-12)
+
+
+def test_a_pair_that_is_not_definite_is_infinitely_far_off():
+    shared = np.full((6, 6), 2.0)
+    square, log_det = kernels.prediction.normalise_pairs(
+        np.stack((np.eye(3), np.eye(3))), np.ones((2, 3)), shared, np.array([0]), np.array([1]))
+    assert square == np.inf and log_det == -np.inf

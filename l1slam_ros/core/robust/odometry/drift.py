@@ -115,9 +115,12 @@ def _log_likelihood(phi: Array, metres: Array, variance: Array, weight: Array, d
     # All around the circle, what is wider than it is even.
     normal = np.exp(-error**2 / (2 * variance)) / np.sqrt(2 * np.pi * variance)
     normal = np.maximum(normal, np.where(variance > np.pi**2 / 3, 1 / (2 * np.pi), 0.0))
-    even, share = 1 / (2 * np.pi), np.full((len(drift), 1), 0.5)
+    even, share, part = 1 / (2 * np.pi), np.full((len(drift), 1), 0.5), weight / weight.sum()
+    true = np.empty_like(normal)
     for _ in range(_ROUNDS):
-        true = share * normal / (share * normal + (1 - share) * even)
-        share = (true @ weight / weight.sum())[:, None].clip(1e-3, 1 - 1e-3)
+        # normal / (normal + even (1 - share) / share)
+        np.add(normal, even * (1 / share - 1), out=true)
+        np.divide(normal, true, out=true)
+        share = (true @ part)[:, None].clip(1e-3, 1 - 1e-3)
     value: Array = np.log(share * normal + (1 - share) * even) @ weight
     return value
