@@ -86,7 +86,7 @@ class BackendNode(LifecycleNode):
         self._inputs = Inputs(self, self._backend, options, self.failures, self._robots)
         self._diagnostics = Diagnostics(self, self._inputs.traffic, self._solver, self.failures)
         self._map = MapPublisher(
-            self, self._backend, self._declared, self._diagnostics, self._robots)
+            self, self._backend, self._declared, self._diagnostics, self._robots, self.failures)
         self._map_services = MapServices(
             self, self._backend, self._jobs, self._map_file, self.failures,
             self._solver.pause, self._solver.is_closing)
@@ -163,6 +163,7 @@ class BackendNode(LifecycleNode):
         ended &= self._jobs.close(seconds)
         ended &= self._map_services.is_closed(max(deadline - time.monotonic(), 0.0) + _SAVING)
         ended &= self._solver.close(max(deadline - time.monotonic(), 0.0))
+        ended &= self._map.close(max(deadline - time.monotonic(), 0.0))
         if ended:
             self.destroy_node()
             # It holds the node in the graph of ROS, and rclpy forgets it.

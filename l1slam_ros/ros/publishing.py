@@ -6,8 +6,15 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""The map on its topics, as often as there is something new in it."""
+"""
+The map on its topics, as often as there is something new in it.
 
+All keyframes of a large map take longer to be worked out and sent than an update takes. They are
+sent by a thread of their own then, for a part of its time; what came meanwhile is in the next.
+"""
+
+import threading
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -31,6 +38,12 @@ from l1slam_ros.ros.loop_status import LoopStatus
 from l1slam_ros.ros.markers import GraphMarkers
 from l1slam_ros.ros.parameters import NodeParameters
 from l1slam_ros.ros.robot import RobotPublisher
+from l1slam_ros.ros.threads.background import background
+from l1slam_ros.ros.threads.failures import Failures
+
+# Keyframes from which a map is large: some 10 ms to publish. The thread that does it rests for so
+# many times as long as it worked.
+_LARGE, _REST = 10_000, 3
 
 
 class MapPublisher:
@@ -44,12 +57,16 @@ class MapPublisher:
     parameters : of the node
     diagnostics : told of updates, and of how far they moved the robots
     robots : each has a path of its own
+    failures : where to tell what the thread of a large map meets
 
     """
 
     def __init__(self, node: Node, backend: Backend, parameters: NodeParameters[NodeOptions],
-                 diagnostics: Diagnostics, robots: Sequence[RobotPublisher]):
+                 diagnostics: Diagnostics, robots: Sequence[RobotPublisher], failures: Failures):
         self._backend, self._diagnostics, self._robots = backend, diagnostics, robots
+        self._failures, self._one = failures, threading.Lock()
+        self._woken, self._ending = threading.Event(), threading.Event()
+        self._thread: threading.Thread | None = None
         self._frame = parameters.options.map_frame
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._paths = [node.create_publisher(Path, f'{robot.prefix}path', latched)
@@ -59,26 +76,59 @@ class MapPublisher:
             for robot in robots]
         self._markers = GraphMarkers(node)
         self._loop_status = LoopStatus(node, parameters.options.names)
-        # The revision that was published last.
-        self._published = 0
+        # The revision that was published last, and how many keyframes there were.
+        self._published = self._keyframes = 0
 
     def tell(self, improvement: Improvement | None = None) -> None:
-        """Publish what is new; improvement : what the last update did, None: nothing."""
+        """
+        Publish what is new; improvement : what the last update did, None: nothing.
+
+        A large map is published soon, by another thread.
+        """
         if improvement is not None:
             self._diagnostics.note(improvement)
-        revisions = self._backend.revisions
-        if revisions.map > self._published:
-            self._publish_map()
-        elif revisions.now > self._published:
-            # Nothing new in the map, but a loop can have come for later, or expired.
-            self._loop_status.publish(self._backend.loop_states())
-        elif self._markers.behind:
-            self._markers.publish(self._frame, self._newest(), self._backend.snapshot())
-        self._published = revisions.now
+        if self._thread is None and self._keyframes > _LARGE:
+            self._thread = background('path', self._keep_publishing)
+            self._thread.start()
+        if self._thread is None:
+            self._publish_news()
+        else:
+            self._woken.set()
+
+    def close(self, seconds: float) -> bool:
+        """End the thread, if there is one; return whether it did within some seconds."""
+        self._ending.set()
+        self._woken.set()
+        if self._thread is not None:
+            self._thread.join(seconds)
+        return self._thread is None or not self._thread.is_alive()
+
+    def _keep_publishing(self) -> None:
+        publish = self._failures.guarded('publishing', self._publish_news)
+        while not self._ending.is_set():
+            self._woken.wait()
+            # In this order, or news would be lost.
+            self._woken.clear()
+            began = time.monotonic()
+            publish()
+            self._ending.wait(_REST * (time.monotonic() - began))
+
+    def _publish_news(self) -> None:
+        with self._one:  # of the last call of an update, and the first of the thread
+            revisions = self._backend.revisions
+            if revisions.map > self._published:
+                self._publish_map()
+            elif revisions.now > self._published:
+                # Nothing new in the map, but a loop can have come for later, or expired.
+                self._loop_status.publish(self._backend.loop_states())
+            elif self._markers.behind:
+                self._markers.publish(self._frame, self._newest(), self._backend.snapshot())
+            self._published = revisions.now
 
     def _publish_map(self) -> None:
         now = self._backend.snapshot()
         poses, loops = now.poses, now.loop_states()
+        self._keyframes = len(poses)
         if not np.isfinite(poses).all() or not np.isfinite(now.map_to_odom).all():
             raise ArithmeticError('a pose of the map is not finite: it is not published')
         for robot, path, covariance in zip(

@@ -27,6 +27,7 @@ from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.core.running.keeper import updates, work
 from l1slam_ros.io.graphs.saved_map import load_map
 from l1slam_ros.io.messages import conversion
+from l1slam_ros.ros import publishing
 from l1slam_ros.ros.threads import solver_thread
 
 DEADLINE = 60.0
@@ -143,6 +144,21 @@ def test_the_path_does_not_wait_for_the_work_behind_an_update(bench, monkeypatch
     b.drive(3, 40)
     b.until(began.is_set, 'an update that takes for ever')
     b.until(lambda: len(b.path().poses) > 3, 'the Path of what had come')
+
+
+def test_updates_do_not_wait_for_the_path_of_a_large_map(bench, monkeypatch):
+    monkeypatch.setattr(publishing, '_LARGE', 2)
+    b, goes_on, made = bench(), threading.Event(), publishing.path_bytes
+    b.drive(0, 4)
+    b.until(lambda: len(b.path().poses) == 4, 'a map, by the thread of a large one')
+    monkeypatch.setattr(
+        publishing, 'path_bytes', lambda *of: goes_on.wait(DEADLINE) and made(*of))
+    b.drive(4, 9)
+    b.until(lambda: len(b.backend._backend.snapshot().state.optimised.poses) == 9,
+            'the map has all keyframes')
+    assert len(b.path().poses) == 4
+    goes_on.set()
+    b.until(lambda: len(b.path().poses) == 9, 'the Path has them, too')
 
 
 def test_a_backlog_is_taken_over_from_dds_and_answered_at_its_end(bench, monkeypatch):

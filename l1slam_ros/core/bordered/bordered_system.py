@@ -176,9 +176,14 @@ class BorderedSystem:
         """
         before, blocks = self.points, np.stack((np.eye(self._k), -turn))
         covariance = self.predict((keyframe, other), blocks, np.zeros(self._k)).covariance
-        while self.points > before:
-            self._points.forget_last()
+        self.forget_unused(before)
         return covariance
+
+    def forget_unused(self, since: int) -> None:
+        """Take back the points that came since there were so many, where no factor kept them."""
+        if self.points > since:
+            self._points.forget(since, np.append(self._ends.view(), self._points.parents))
+            self._pulled = self._pulled[:self.points]
 
     def step(self, keyframes: list[int]) -> Array:
         """Return the steps of some keyframes, (m, k); zero of those that are not here yet."""

@@ -212,6 +212,7 @@ class Front:
         if self.closed:
             return looks
         # Only these: each keyframe that is touched makes the next one cost more.
+        before = [system.points for system in self._systems]
         linearised = self._linearise(factors, self.rows + asked)
         place = np.cumsum(what != SKIP) - 1
         for one, at in zip(what.tolist(), place.tolist(), strict=True):
@@ -227,6 +228,8 @@ class Front:
             self.rows += 1
             self.taken += one != SKIP
             looks.append(look)
+        for system, points in zip(self._systems, before, strict=True):
+            system.forget_unused(points)
         return looks
 
     def _is_beyond(self, factors: BetweenFactors, row: int, what: int) -> bool:

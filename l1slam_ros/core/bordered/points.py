@@ -13,12 +13,12 @@ In: a factored normal matrix H = L L', and the keyframes that factors name. Out:
 between all of these *points*, and m, their means.
 
 An old keyframe, one of H, becomes a point when a factor first names it. C between two of them is
-a block of H^-1, the product of their *climbs* of the elimination tree, L^-1 e_p, which are zero
-but between p and the root. A new keyframe hangs on the point from which its first factor leads to
-it, its parent: x = turn x_parent + mean + noise; so its covariances follow from the parent's.
+a block of H^-1. A new keyframe hangs on the point from which its first factor leads to it, its
+parent: x = turn x_parent + mean + noise; so its covariances follow from the parent's.
 """
 
 from dataclasses import dataclass
+from itertools import takewhile
 
 import numpy as np
 
@@ -84,12 +84,8 @@ class Points:
         self._cholesky, self._size, self._k = cholesky, size, k
         self._of_old: dict[int, int] = {}
         self._of_new: list[int] = []
-        # All climbs one after the other, and where each begins; see `kernels.border`.
-        places = min(most, size) * cholesky.pattern.depth
-        self._begin = GrowingArray((), np.int64)
-        self._begin.extend(np.zeros(1, np.int64))
-        self._places = GrowingArray((), np.int32, places)
-        self._values = GrowingArray(room=places * k * k)
+        # Where each is in the order of elimination, -1 for a new one.
+        self._at = GrowingArray((), np.int64)
         self._covariance = GrowingArray((k, k), room=triangle(most))
         self._mean = GrowingArray((k,))
         self._parent = GrowingArray((), np.int64)
@@ -113,6 +109,11 @@ class Points:
         """m, (t, k)."""
         return self._mean.view()
 
+    @property
+    def parents(self) -> Indices:
+        """Of each the point that it hangs on, (t,), `FIXED` for none."""
+        return self._parent.view()
+
     def now(self) -> PointsNow:
         """Return the points as they are; those to come change nothing of it."""
         old = np.array([*self._of_old.items()], np.int64).reshape(-1, 2).T[::-1]
@@ -125,7 +126,7 @@ class Points:
             return self._of_new[keyframe - self._size]
         if keyframe == FIXED or keyframe in self._of_old:
             return self._of_old.get(keyframe, FIXED)
-        point = self._climb(keyframe)
+        point = self._reach(keyframe)
         self._of_old[keyframe] = point
         return point
 
@@ -139,34 +140,39 @@ class Points:
             mean = mean + turn @ self.mean[parent]
         product = np.empty((len(self) + 1, self._k, self._k))
         kernels.border.follow(self.covariance, parent, turn, noise, product)
+        self._at.extend(np.array([FIXED]))
         self._of_new.append(self._append(product, mean, parent, turn, noise))
 
-    def forget_last(self) -> None:
-        """Take back the last point, an old keyframe: each makes the next one cost more."""
-        last, climb = len(self) - 1, int(self._begin.view()[-2])
-        self._of_old.popitem()
-        ends = ((self._begin, last + 1), (self._places, climb),
-                (self._values, climb * self._k**2), (self._covariance, triangle(last)),
-                (self._mean, last), (self._parent, last), (self._turn, last), (self._noise, last))
-        for array, length in ends:
-            array.replace(length, array.view()[:0])
+    def forget(self, since: int, used: Indices) -> None:
+        """
+        Take back points of old keyframes that came since there were so many, but for those used.
 
-    def _climb(self, keyframe: int) -> int:
+        Each makes the next one cost more. The last ones leave nothing behind.
+        """
+        came = takewhile(lambda one: one[1] >= since, reversed(self._of_old.items()))
+        for keyframe, point in [one for one in came if one[1] not in used]:
+            del self._of_old[keyframe]
+            self._at.view()[point] = FIXED
+            if point == len(self) - 1:
+                ends = ((self._at, point), (self._covariance, triangle(point)),
+                        (self._mean, point), (self._parent, point), (self._turn, point),
+                        (self._noise, point))
+                for array, length in ends:
+                    array.replace(length, array.view()[:0])
+
+    def _reach(self, keyframe: int) -> int:
         """Append an old keyframe; return its point."""
-        places, values = self._cholesky.climb(keyframe)
-        self._places.extend(places)
-        self._values.extend(values.ravel())
-        k = self._k
-        product, none = np.empty((len(self) + 1, k, k)), np.zeros((k, k))
-        begin = np.append(self._begin.view(), len(self._places))
-        kernels.border.meet(begin, self._places.view(), self._values.view(),
-                            np.append(self._parent.view(), FIXED), self._turn.view(), product)
-        return self._append(product, np.zeros(k), FIXED, none, none)
+        none = np.zeros((1, self._k, self._k))
+        position = int(self._cholesky.pattern.position[keyframe])
+        self._at.extend(np.array([position]))
+        product = self._cholesky.covariances(
+            self._at.view(), np.append(self._parent.view(), FIXED),
+            np.concatenate((self._turn.view(), none)))
+        return self._append(product, np.zeros(self._k), FIXED, *none, *none)
 
     def _append(self, product: Array, mean: Array, parent: int, turn: Array,
                 noise: Array) -> int:
         """Append a point with its covariances with all, (t + 1, k, k); return it."""
-        self._begin.extend(np.array([len(self._places)]))
         self._covariance.extend(product)
         self._mean.extend(mean[None])
         self._parent.extend(np.array([parent]))

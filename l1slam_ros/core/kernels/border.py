@@ -7,16 +7,16 @@
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
 """
-What comes after a factorisation: covariances by climbs, and a small dense factor that grows.
+What comes after a factorisation: covariances, and a small dense factor that grows.
 
-The arrays of the sparse factor are those of `cholesky`. A climb is L^-1 e_p for the k columns of
-one keyframe p: it is zero but on the way from p to the root of the elimination tree. Climbs are
-kept one after the other: the positions on the way, ascending, and the columns, each in one run.
+The arrays of the sparse factor are those of `cholesky`. L^-1 e_p for the k columns of one keyframe
+p is zero but on the way from p to the root of the elimination tree. Of H^-1 e_p what is asked for
+lies on the ways of the other points. These have most in common: what loops join is near.
 
-Points are the keyframes that factors touch. Those that came later have an empty climb; where they
-are hangs on another point, their parent: x = turn x_parent + noise. Triangles are kept row after
-row, row r from r (r + 1) / 2 on, so that they grow at their end: that of the factor F, and the
-covariances of points, that of s <= t at t (t + 1) / 2 + s.
+Points are the keyframes that factors touch. Those that came later have no position in the factor;
+where they are hangs on another point, their parent: x = turn x_parent + noise. Triangles are kept
+row after row, row r from r (r + 1) / 2 on, so that they grow at their end: that of the factor F,
+and the covariances of points, that of s <= t at t (t + 1) / 2 + s.
 """
 
 import numpy as np
@@ -24,40 +24,61 @@ import numpy as np
 from l1slam_ros.core.kernels.compiled import compiled, loop
 
 
-@loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1], i4[::1], i8, i8)')
-def climb(panels, first, start, pattern, offset, stride, owner, at, k):
+@loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1], i4[::1], i8[::1], i8[::1], '
+      'f8[:, :, ::1], f8[:, :, ::1])')
+def reach(panels, first, start, pattern, offset, stride, owner, at, parent, turn, product):
     """
-    Return the positions (p,) on the way from position `at` to the root, and L^-1 e_at there.
+    Write the covariances of all points with the last one, (t, k, k).
 
-    owner : (n,) the supernode of each position. The columns are (k, p k), one after the other.
+    owner : (n,) the supernode of each position; at : (t,) the position of each point, -1 for what
+    has none; parent, turn : (t,), (t, k, k), see above
     """
-    length, s = first[owner[at]] - at, owner[at]
-    while s >= 0:
-        length += first[s + 1] - first[s]
-        s = _parent(first, start, pattern, owner, s)
-    places, values = np.empty(length, np.int32), np.empty((k, length * k))
-    # Where in `places` each position on the way is.
-    where = np.empty(len(owner), np.int32)
-    done, s, begin = 0, owner[at], at
-    while s >= 0:
-        for position in range(begin, first[s + 1]):
-            places[done], where[position] = position, done
-            done += 1
-        s = _parent(first, start, pattern, owner, s)
-        begin = first[s]
+    t, k = product.shape[:2]
+    ways = _ways(first, start, pattern, owner, at)
+    # Where in the columns each position on a way is.
+    where, length = np.empty(len(owner), np.int32), 0
+    for s in ways:
+        for position in range(first[s], first[s + 1]):
+            where[position] = length
+            length += 1
+    values = np.zeros((k, length * k))
+    begin = at[t - 1]
     for q in range(k):
-        for r in range(length * k):
-            values[q, r] = 0.0
-        values[q, q] = 1.0
-    done, s, begin = 0, owner[at], at
+        values[q, where[begin] * k + q] = 1.0
+    s = owner[begin]
     while s >= 0:
         _climb_panel(panels[offset[s]:offset[s + 1]], stride[s],
                      pattern[start[s]:start[s + 1]], first[s + 1] - first[s], begin - first[s],
-                     where, values, done * k)
-        done += first[s + 1] - begin
+                     where, values, where[begin] * k)
         s = _parent(first, start, pattern, owner, s)
         begin = first[s]
-    return places, values
+    for s in ways[::-1]:
+        _descend_panel(panels[offset[s]:offset[s + 1]], stride[s],
+                       pattern[start[s]:start[s + 1]], first[s + 1] - first[s], where, values,
+                       where[first[s]] * k)
+    for s in range(t):
+        if parent[s] >= 0:
+            _multiply(turn[s], product[parent[s]], product[s])
+        elif at[s] < 0:
+            product[s] = 0.0
+        else:
+            for a in range(k):
+                for b in range(k):
+                    product[s, a, b] = values[b, where[at[s]] * k + a]
+
+
+@compiled
+def _ways(first, start, pattern, owner, at):
+    """Return the supernodes on the ways from some positions, -1 for none, to the root."""
+    seen, ways = np.zeros(len(first) - 1, np.bool_), np.empty(len(first) - 1, np.int32)
+    count = 0
+    for position in at:
+        s = owner[position] if position >= 0 else -1
+        while s >= 0 and not seen[s]:
+            seen[s], ways[count] = True, s
+            count += 1
+            s = _parent(first, start, pattern, owner, s)
+    return np.sort(ways[:count])
 
 
 @compiled
@@ -94,6 +115,36 @@ def _climb_panel(panel, stride, rows, columns, skip, where, values, own):
 
 
 @compiled
+def _descend_panel(panel, stride, rows, columns, where, values, own):
+    """Solve with the transpose for a supernode's own rows, once all above it are known."""
+    k, width = len(values), columns * len(values)
+    for q in range(0, k, 3):
+        x, y, z = (values[q, own:own + width], values[q + 1, own:own + width],
+                   values[q + 2, own:own + width])
+        for b in range(columns, len(rows)):
+            for a in range(k):
+                begin, target = (b * k + a) * stride, where[rows[b]] * k + a
+                of_x, of_y, of_z = values[q, target], values[q + 1, target], values[q + 2, target]
+                _subtract_three(panel[begin:begin + width], width, of_x, of_y, of_z, x, y, z)
+        for r in range(width - 1, -1, -1):
+            line = panel[r * stride:r * stride + r + 1]
+            x[r] /= line[r]
+            y[r] /= line[r]
+            z[r] /= line[r]
+            _subtract_three(line, r, x[r], y[r], z[r], x, y, z)
+
+
+@compiled
+def _subtract_three(line, length, of_x, of_y, of_z, x, y, z):
+    """Subtract multiples of a line from x, y and z."""
+    for c in range(length):
+        value = line[c]
+        x[c] -= of_x * value
+        y[c] -= of_y * value
+        z[c] -= of_z * value
+
+
+@compiled
 def _dot_three(line, length, x, y, z):
     """Return the products of a line with x, y and z."""
     of_x = of_y = of_z = 0.0
@@ -103,40 +154,6 @@ def _dot_three(line, length, x, y, z):
         of_y += value * y[c]
         of_z += value * z[c]
     return of_x, of_y, of_z
-
-
-@loop('(i8[::1], i4[::1], f8[::1], i8[::1], f8[:, :, ::1], f8[:, :, ::1])')
-def meet(begin, places, values, parent, turn, product):
-    """
-    Write the covariances of all points with the last one, that was climbed from, (t, k, k).
-
-    begin : (t + 1,) of each climb in `places`; its columns begin at values[begin k^2]; parent,
-    turn : (t,), (t, k, k), see above
-    """
-    t, k = product.shape[:2]
-    own_end, own = begin[t], begin[t - 1]
-    own_length = (own_end - own) * k
-    for s in range(t):
-        if parent[s] >= 0:
-            _multiply(turn[s], product[parent[s]], product[s])
-            continue
-        end, common = begin[s + 1], 0
-        most = min(end - begin[s], own_end - own)
-        # What two ways have in common is their end.
-        while common < most and places[end - 1 - common] == places[own_end - 1 - common]:
-            common += 1
-        length = (end - begin[s]) * k
-        for a in range(k):
-            stop = begin[s] * k * k + (a + 1) * length
-            left = values[stop - common * k:stop]
-            # Three at a time (k is 3 or 6): what takes the time is reading.
-            for b in range(0, k, 3):
-                stop = own * k * k + (b + 1) * own_length
-                x = values[stop - common * k:stop]
-                y = values[stop + own_length - common * k:stop + own_length]
-                z = values[stop + 2 * own_length - common * k:stop + 2 * own_length]
-                product[s, a, b], product[s, a, b + 1], product[s, a, b + 2] = _dot_three(
-                    left, len(left), x, y, z)
 
 
 @loop('(f8[:, :, ::1], i8, f8[:, ::1], f8[:, ::1], f8[:, :, ::1])')

@@ -203,7 +203,7 @@ class Backend:
         """
         Take new factors into the map and start background work; None: there was nothing to do.
 
-        What has come, up to some twenty milliseconds of work, is in the map when `taken` is
+        What has come, up to some ten milliseconds of work, is in the map when `taken` is
         called; up to there the `seconds` of what is returned count. Then it waits up to `budget`
         seconds for the background work, which goes on by itself after that; with
         `background=True` it does not wait.

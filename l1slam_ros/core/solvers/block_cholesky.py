@@ -102,19 +102,6 @@ class Pattern:
         """The panel of each position, (n,)."""
         return np.repeat(np.arange(len(self.first) - 1, dtype=np.int32), np.diff(self.first))
 
-    @property
-    def depth(self) -> int:
-        """Positions on the longest way up the elimination tree."""
-        width, height = np.diff(self.first), np.diff(self.start)
-        below = np.minimum(self.start[:-1] + width, len(self.rows) - 1)
-        # The panel above each, of a root one that is none.
-        parent = np.where(width < height, self.owner[self.rows[below]], len(width))
-        above, way = np.append(parent, len(parent)), np.append(width, 0)
-        while (above < len(parent)).any():
-            # Of each the way to the 2nd panel above, the 4th, the 8th ...
-            above, way = above[above], way + way[above]
-        return int(way.max())
-
 
 def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
                  before: Pattern | None = None) -> Pattern:
@@ -279,16 +266,17 @@ class BlockCholesky:
         layout = self._last
         kernels.prediction.solve_many(layout.panels, *layout.shape, self.pattern.position, right)
 
-    def climb(self, keyframe: int) -> tuple[Places, Array]:
+    def covariances(self, at: Indices, parent: Indices, turn: Array) -> Array:
         """
-        Return L^-1 e for the k columns of a free keyframe, by the last factorisation.
+        Return the covariances of points with the last one by the last factorisation, (t, k, k).
 
-        Positions (p,), ascending, where it is not zero, and the columns, (k, p k).
+        at : (t,) the place of each in the order of elimination, -1 for none; parent, turn : see
+        `kernels.border`
         """
-        layout = self._last
-        return kernels.border.climb(
-            layout.panels, *layout.shape, self.pattern.owner,
-            int(self.pattern.position[keyframe]), len(layout.size))
+        layout, product = self._last, np.empty((len(at), *turn.shape[1:]))
+        kernels.border.reach(layout.panels, *layout.shape, self.pattern.owner, at, parent, turn,
+                             product)
+        return product
 
 
 def _at_once(share: Callable[[int], Result]) -> tuple[Result, Result]:

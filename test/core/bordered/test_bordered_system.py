@@ -71,16 +71,18 @@ def factored(k, shape, rng):
 
 
 @pytest.mark.parametrize('shape, k', CASES)
-def test_a_climb_is_the_inverse_factor_where_that_is_not_zero(k, shape, rng):
+def test_covariances_of_points_are_blocks_of_the_inverse(k, shape, rng):
     system, weights, cholesky = factored(k, shape, rng)
     A = system.A.toarray()
-    inverse = np.linalg.inv(A.T @ (weights[:, None] * A))
-    climbs = np.zeros((OLD, k, OLD, k))
-    for v in range(OLD):
-        places, values = cholesky.climb(v)
-        climbs[v][:, places] = values.reshape(k, -1, k)
-    climbs = climbs.reshape(OLD * k, OLD * k)
-    assert_allclose(climbs @ climbs.T, inverse, atol=1e-9 * np.abs(inverse).max())
+    inverse = np.linalg.inv(A.T @ (weights[:, None] * A)).reshape(OLD, k, OLD, k)
+    order = rng.permutation(OLD)
+    at, none = cholesky.pattern.position[order].astype(np.int64), np.full(OLD, FIXED)
+    at[2] = FIXED
+    for count in 1, 2, OLD:
+        found = cholesky.covariances(at[:count], none[:count], np.zeros((count, k, k)))
+        expected = inverse[order[:count], :, order[count - 1]].copy()
+        expected[2:3] = 0.0
+        assert_allclose(found, expected, atol=1e-9 * np.abs(inverse).max())
 
 
 @pytest.mark.parametrize('shape, k', CASES)

@@ -66,6 +66,8 @@ TABLE = {
         with_front(taken=10), ONE_MORE, BUSY, Work.ROUND, None),
     'of a large map it may carry more': (
         with_front(taken=10, keyframes=4000), ONE_MORE, BUSY, None, None),
+    'but not so many loops that the next one is dear': (
+        with_front(taken=10, keyframes=4000, border=601), ONE_MORE, BUSY, Work.ROUND, None),
     'the front is closed': (with_front(closed=True), ONE_MORE, BUSY, Work.ROUND, None),
     'there is no front': (replace(RESTED, carried=None), ONE_MORE, BUSY, Work.ROUND, None),
     'a judgement waits for its map': (PENDING, SIZE, BUSY, Work.ROUND, None),

@@ -37,6 +37,8 @@ from l1slam_ros.core.options import Options, option
 # So many loops wait at most: nothing else bounds those for a robot that never comes, or is gone,
 # since the time they wait is that of its own odometry.
 _MOST_WAITING = 50_000
+# The row of a loop that is no factor.
+_NO_ROW = -1
 
 
 @dataclass(frozen=True)
@@ -79,9 +81,8 @@ class LoopFactors:
         """Begin with an empty graph; loops that wait may yet find odometry of their times."""
         # Their times of arrival are of another clock.
         self.waiting.forget_clocks()
-        # The loops that came, by their identities; and their rows once they are factors.
-        self._seen = {one.key for one in self.waiting.all() if not one.loop.struck}
-        self._row_of: dict[bytes, int] = {}
+        # The rows of the loops that came, by their identities, -1 until they are factors.
+        self._row_of = {one.key: _NO_ROW for one in self.waiting.all() if not one.loop.struck}
         # Keyframes of the loops that are struck out, those to come too.
         self._struck: set[tuple[int, int]] = set()
         # Of the stamps of loops, reference and end, and of the robots of these.
@@ -115,7 +116,7 @@ class LoopFactors:
 
     def seen(self) -> dict[bytes, int]:
         """Return of each loop that came, by its identity, its factor, -1 for none."""
-        return {key: self._row_of.get(key, -1) for key in self._seen}
+        return self._row_of.copy()
 
     def restore(self, state: BuilderState, tracks: Tracks, options: LoopOptions) -> None:
         """Go on with the loops of an earlier run."""
@@ -128,8 +129,7 @@ class LoopFactors:
             else state.expired_robots)
         for loop, age in state.waiting:
             self.add(loop, tracks, options, age)
-        self._seen.update(state.seen)
-        self._row_of.update({key: row for key, row in state.seen.items() if row >= 0})
+        self._row_of.update(state.seen)
         self._struck.update(map(tuple, state.struck_pairs.tolist()))
 
     def add(self, loop: LoopClosure, tracks: Tracks, options: LoopOptions,
@@ -143,10 +143,10 @@ class LoopFactors:
         key = key_of(noise.loop_identity(*loop.stamps, measurement, covariance), robots)
         # Of what a person says the last word counts, though it was said before.
         if not loop.struck:
-            if key in self._seen and not (loop.trusted or self._verbatim):
+            if key in self._row_of and not (loop.trusted or self._verbatim):
                 self._refuse('repeated', loop, 'was sent before; expected each loop once')
                 return
-            self._seen.add(key)
+            self._row_of.setdefault(key, _NO_ROW)
         begin, end = map(tracks.time, robots, loop.stamps)
         first, last = (tracks.ago(robot, age) for robot in robots)
         self.waiting.add(
@@ -180,7 +180,8 @@ class LoopFactors:
             self._expired_robots.extend(np.array([one.loop.robots]))
         self._refuse('expired', one.loop, why)
         # A loop that is sent again once odometry has come that far is used.
-        self._seen.discard(one.key)
+        if self._row_of.get(one.key) == _NO_ROW:
+            del self._row_of[one.key]
 
     def _add_due(self, due: list[WaitingLoop], graph: FactorGraph, tracks: Tracks,
                  options: LoopOptions) -> int:
@@ -197,7 +198,8 @@ class LoopFactors:
         before, came = len(graph.between), len(self.rows)
         for k in can:
             # A person vouches for a loop that is in the graph already: there is no second factor.
-            if not due[k].loop.struck and (self._verbatim or due[k].key not in self._row_of):
+            if not due[k].loop.struck and (
+                    self._verbatim or self._row_of.get(due[k].key, _NO_ROW) == _NO_ROW):
                 self._row_of[due[k].key] = before + len(new)
                 new.append(k)
         if new:

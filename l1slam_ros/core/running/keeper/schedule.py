@@ -24,6 +24,9 @@ from l1slam_ros.core.running.map_state import MapState
 # is factored anew when one factor has come for so many of its keyframes: the cost of this for each
 # keyframe does not grow with the map.
 _FEWEST, _KEYFRAMES_EACH = 10, 200
+# And when this part of what a front takes is taken: what comes while the next map is made has the
+# rest, and a loop costs as the square of what the front has taken.
+_PART_TAKEN = 1 / 3
 # [s] The period of judgements while loops come and none of them fits.
 _JUDGE_EVERY = 2.0
 
@@ -116,8 +119,8 @@ def is_map_due(state: MapState, size: Size, idle: bool) -> bool:
 def is_late(state: MapState) -> bool:
     """Return whether the front has taken so many factors that the map is to be factored anew."""
     carried = state.carried
-    return carried is None or carried.closed or carried.taken >= max(
-        _FEWEST, carried.keyframes // _KEYFRAMES_EACH)
+    return (carried is None or carried.closed or carried.border > _PART_TAKEN * MOST_ROWS
+            or carried.taken >= max(_FEWEST, carried.keyframes // _KEYFRAMES_EACH))
 
 
 def is_beyond_fronts(state: MapState, size: Size) -> bool:

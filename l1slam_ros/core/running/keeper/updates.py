@@ -40,7 +40,7 @@ from l1slam_ros.core.running.keeper.workers import (
 from l1slam_ros.core.running.problem import as_numbered, as_one, by_robot
 
 # [s] The longest time an update takes in new factors, whatever the budget.
-_LEAST_TIME = 0.02
+_LEAST_TIME = 0.01
 
 
 class Updates:
