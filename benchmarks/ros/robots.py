@@ -36,6 +36,8 @@ KEYFRAMES, TIMED, ROBOTS = 10_000, 500, 5
 # An update as often as the node makes one, and no budget: what goes on behind is not waited for.
 _PERIOD, _SECOND = 0.05, 10**9
 _UNKNOWN = np.zeros((6, 6))
+# Keyframes that are driven before a rendezvous: whoever meets has drawn maps before.
+_DRIVEN = 50
 # [s] A join that takes longer is given up.
 _PATIENCE = 60.0
 _OPTIONS = BackendOptions.from_mapping({
@@ -129,6 +131,10 @@ def rendezvous(keyframes: int) -> None:
                     backend.add_loop(loop)
                 else:
                     between.append(loop)
+            if at == keyframes - _DRIVEN:
+                backend.settle()
+            elif at > keyframes - _DRIVEN:
+                _update(backend)
         backend.settle()
         robot = backend.robot(1)
         joined = robot is not None and robot.joined

@@ -28,7 +28,7 @@ import numpy as np
 from l1slam_ros.core.bordered.front import Front
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import BetweenFactors, lowest_of_components
+from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, lowest_of_components
 from l1slam_ros.core.online.graph_builder import GraphBuilder
 from l1slam_ros.core.running.map_to_odom import Newest
 
@@ -45,8 +45,8 @@ class RobotMap(NamedTuple):
     turn: Array | None
 
 
-def robot_maps(manifold: Manifold, robot: Indices, factors: BetweenFactors, accepted: Mask,
-               odometry: Callable[[Indices], Array],
+def robot_maps(manifold: Manifold, robot: Indices, firsts: Indices, factors: BetweenFactors,
+               accepted: Mask, odometry: Callable[[Indices], Array],
                pose: Callable[[Indices], Array]) -> dict[int, RobotMap]:
     """
     Return the map that each robot is in, by its number.
@@ -54,17 +54,21 @@ def robot_maps(manifold: Manifold, robot: Indices, factors: BetweenFactors, acce
     Parameters
     ----------
     robot : (n,) of each keyframe
+    firsts : (r,) the first keyframe of each robot, by the numbers of these
     factors, accepted : and which of the first ones are, (m,) bool
     odometry, pose : return of some keyframes their odometry, and where they are, (k, p) each
 
     """
-    numbers, firsts = np.unique(robot, return_index=True)
+    numbers = robot[firsts]
     if len(numbers) < 2:
         return {number: RobotMap(True, None) for number in numbers.tolist()}
     joined, root = _joined(robot, numbers, factors, accepted)
-    turns = manifold.compose(odometry(firsts), manifold.inverse(pose(firsts)))
     # The frame of the graph is that of the world, or of its first keyframe.
-    of_root = None if root is None or firsts[root] == 0 else turns[root:root + 1]
+    is_root = root is None or firsts[root] == 0
+    if is_root and joined.all():
+        return {number: RobotMap(True, None) for number in numbers.tolist()}
+    turns = manifold.compose(odometry(firsts), manifold.inverse(pose(firsts)))
+    of_root = None if is_root else turns[root:root + 1]
     return {number: RobotMap(joins, of_root if joins else turns[row:row + 1])
             for row, (number, joins) in enumerate(zip(
                 numbers.tolist(), joined.tolist(), strict=True))}
@@ -103,8 +107,9 @@ class Seen(NamedTuple):
         def odometry(keyframes: Indices) -> Array:
             return np.concatenate([self.firsts[robot] for robot in self.robot[keyframes].tolist()])
 
-        return robot_maps(self.manifold, self.robot[:known], factors, accepted[:len(inside)] &
-                          inside, odometry, pose)
+        firsts = np.array([numbers[0] for _, numbers in sorted(self.numbers.items())])
+        return robot_maps(self.manifold, self.robot[:known], firsts[firsts < known], factors,
+                          accepted[:len(inside)] & inside, odometry, pose)
 
 
 def map_ends(seen: Seen, poses: Array, front: Front | None, accepted: Mask) -> dict[int, Newest]:
@@ -116,25 +121,28 @@ def map_ends(seen: Seen, poses: Array, front: Front | None, accepted: Mask) -> d
     known = front.keyframes if front else len(poses)
     pose = front.poses_of if front else poses.__getitem__
     maps, ends = seen.maps(known, accepted, pose), {}
-    for robot, numbers in seen.numbers.items():
-        last = int(np.searchsorted(numbers, known)) - 1
-        if last >= 0:
-            joined, turn = maps.get(robot, RobotMap(True, None))
-            at = pose(numbers[last:last + 1])
-            ends[robot] = Newest(
-                last, at if turn is None else seen.manifold.compose(turn, at), joined)
+    lasts = {robot: int(np.searchsorted(numbers, known)) - 1
+             for robot, numbers in seen.numbers.items()}
+    lasts = {robot: last for robot, last in lasts.items() if last >= 0}
+    if not lasts:
+        return {}
+    poses = pose(np.array([seen.numbers[robot][last] for robot, last in lasts.items()]))
+    for row, (robot, last) in enumerate(lasts.items()):
+        (joined, turn), at = maps.get(robot, RobotMap(True, None)), poses[row:row + 1]
+        ends[robot] = Newest(
+            last, at if turn is None else seen.manifold.compose(turn, at), joined)
     return ends
 
 
 def _joined(robot: Indices, numbers: Indices, factors: BetweenFactors,
             accepted: Mask) -> tuple[Mask, int | None]:
     """Return which robots are joined to the first one, (r,), or the world: then None, else it."""
-    rows = np.flatnonzero(accepted)
-    i, j, absolute = factors.i[rows], factors.j[rows], factors.is_absolute[rows]
-    ends = np.searchsorted(numbers, robot[j])
-    others = np.where(absolute, len(numbers), np.searchsorted(numbers, robot[i]))
-    between = np.flatnonzero(ends != others)
-    component = lowest_of_components(others[between], ends[between], len(numbers) + 1)
-    if absolute.any():
+    rows, r = np.flatnonzero(accepted), len(numbers)
+    i, j, place = factors.i[rows], factors.j[rows], np.searchsorted(numbers, robot)
+    # Thousands of factors, but few pairs of robots; the world comes after them.
+    pairs = np.flatnonzero(np.bincount(np.where(i == WORLD, r, place[i]) * r + place[j]))
+    one, other = np.divmod(pairs, r)
+    component = lowest_of_components(one, other, r + 1)
+    if (one == r).any():
         return component[:-1] == component[-1], None
     return component[:-1] == component[0], 0

@@ -165,8 +165,9 @@ class Snapshot:
     @cached_property
     def robot_maps(self) -> dict[int, RobotMap]:
         """The map that each robot is in, by its number."""
-        graph = self.graph
-        return robot_maps(graph.manifold, graph.robot, graph.between, self.judgement.accepted,
+        graph, (_, firsts) = self.graph, np.unique(self.graph.robot, return_index=True)
+        return robot_maps(graph.manifold, graph.robot, firsts, graph.between,
+                          self.judgement.accepted,
                           lambda keyframes: self.odometry[keyframes],
                           lambda keyframes: self.poses[keyframes])
 

@@ -15,7 +15,7 @@ import pytest
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.robust.judgement import MOSTLY_REFUSED, Doubt, Judgement
-from l1slam_ros.core.running.keeper.schedule import Moment, Size, Work, due
+from l1slam_ros.core.running.keeper.schedule import Moment, Size, Work, due, outrun
 from l1slam_ros.core.running.map_state import Carried, MapState
 from l1slam_ros.core.running.optimised import Optimised
 from l1slam_ros.core.solvers.optimality import Status
@@ -111,6 +111,12 @@ TABLE = {
 @pytest.mark.parametrize(('state', 'size', 'moment', 'make', 'judge'), TABLE.values(), ids=TABLE)
 def test_what_is_due(state, size, moment, make, judge):
     assert due(state, size, moment) == (make, judge)
+
+
+def test_a_front_is_outrun_by_more_than_it_takes():
+    assert outrun(RESTED, MEETING) and outrun(MET, MEETING)
+    assert not outrun(RESTED, ONE_MORE_LOOP)
+    assert not outrun(EMPTY, MEETING)
 
 
 def test_a_judgement_that_doubts_what_it_refused_is_asked_until_there_are_twice_as_many_loops():

@@ -20,6 +20,7 @@ from l1slam_ros.core.errors import OptionError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import LoopClosure, OdometrySample
 from l1slam_ros.core.running.backend import Backend, BackendOptions
+from l1slam_ros.core.running.keeper import schedule
 from l1slam_ros.io.graphs.saved_map import load_map, save_map
 
 EVERY = BackendOptions.from_mapping({
@@ -80,6 +81,31 @@ def test_a_robot_that_nothing_joins_has_its_own_map_and_moves_whole_when_a_loop_
     assert np.abs(poses - truth)[:, :2].max() < 0.7
     assert_allclose(se2.compose(one.map_to_odom, one.odometry), poses[-1:], atol=1e-9)
     assert_array_equal(keyframes, now.poses_in_map(1)[0])
+
+
+def test_a_front_takes_nothing_of_more_than_it_would_take_while_that_is_judged(monkeypatch):
+    """As when two robots meet: what it took would be gone with it."""
+    team, backend = Team(lies=0, n=160, edges=500), Backend(EVERY)
+    messages = team.messages()
+    for robot, message in messages[:200]:
+        if isinstance(message, OdometrySample):
+            backend.add_odometry(message, robot)
+        else:
+            backend.add_loop(message)
+    backend.settle()
+    front, judge = backend._keeper._front, backend._updates._workers.judge
+    known = front.rows
+    robot, sample = next((robot, message) for robot, message in messages[200:]
+                         if isinstance(message, OdometrySample))
+    backend.add_odometry(sample, robot)
+    monkeypatch.setattr(schedule, 'MOST_ROWS', 0)
+    judge.busy = True
+    backend.update(0.0)
+    assert backend._keeper._front is front and front.rows == known
+    judge.busy = False
+    backend.update(0.0)
+    assert front.rows == known + 1
+    backend.close()
 
 
 def test_a_map_of_two_robots_is_saved_and_goes_on(tmp_path):
