@@ -53,6 +53,8 @@ NOT_RUN = {
     'python benchmarks/solvers ': PEERS,
     'python benchmarks/incremental.py': PEERS,
     'python benchmarks/cli/startup.py': MINUTES,
+    'python benchmarks/large_map.py': MINUTES,
+    'python benchmarks/ros/large.py': MINUTES,
     'python benchmarks/ros/clocks.py': MINUTES,
     'python benchmarks/ros/small.py': MINUTES,
     'python benchmarks/ros/scans.py': MINUTES,

@@ -94,10 +94,10 @@ def _measure(peer: Peer, seconds: float, rate: float, loops: float
     peer.until(lambda: all(p.get_subscription_count() == 2 for p in publishers.values()))
     sent, cpu = dict.fromkeys(publishers, 0), cpu_seconds(process)
     rng, began = np.random.default_rng(0), time.monotonic_ns()
-    odometry, loop = _odometry(), _loop()
+    odometry, loop = some_odometry(), some_loop()
     while (now := (time.monotonic_ns() - began) * 1e-9) < seconds:
         if sent[ODOMETRY_TOPIC] < now * rate:
-            _place(odometry, began, now)
+            place(odometry, began, now, _SPEED)
             publishers[ODOMETRY_TOPIC].publish(serialize_message(odometry))
             sent[ODOMETRY_TOPIC] += 1
         if sent[LOOP_TOPIC] < now * loops and now > 1:
@@ -114,17 +114,19 @@ def _measure(peer: Peer, seconds: float, rate: float, loops: float
     return sent, cpu
 
 
-def _odometry() -> Odometry:
+def some_odometry() -> Odometry:
+    """Return odometry that is to be placed."""
     return Odometry(child_frame_id='base_link')
 
 
-def _place(message: Odometry, began: int, now: float) -> None:
+def place(message: Odometry, began: int, now: float, speed: float) -> None:
     """Let odometry be that of a straight drive, its stamp the clock of this machine."""
     message.header = header('odom', began + round(now * 1e9))
-    message.pose.pose.position.x = _SPEED * now
+    message.pose.pose.position.x = speed * now
 
 
-def _loop() -> PoseWithCovarianceStamped:
+def some_loop() -> PoseWithCovarianceStamped:
+    """Return a loop that is to be stamped and placed."""
     message = PoseWithCovarianceStamped()
     message.pose.pose.orientation.w = 1.0
     message.pose.covariance = (_SIGMA**2 * np.eye(6)).ravel()

@@ -141,3 +141,30 @@ def test_a_border_is_the_whole_problem(k, shape, rng):
     taken = border.steps()
     factor((0, OLD + NEW - 1), OLD + NEW)
     assert_allclose(taken.all(), steps, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize('shape, k', CASES)
+def test_a_keyframe_that_no_factor_kept_is_as_if_it_had_not_been_named(k, shape, rng):
+    system, weights, cholesky = factored(k, shape, rng)
+    whole, border = Whole(system, weights, k), BorderedSystem(cholesky, OLD, k)
+
+    def add(ends):
+        blocks, noise, residual = block(k, rng), rng.uniform(0.5, 2, k), rng.standard_normal(k)
+        predicted = border.predict(ends, blocks, residual)
+        assert_allclose(predicted.covariance, whole.covariance(ends, blocks, OLD), rtol=1e-7,
+                        atol=1e-9)
+        border.add(predicted, noise)
+        whole.add(ends, blocks, noise, residual)
+
+    border.step([3, 4, 5, 6])
+    add((FIXED, 4))
+    border.step([7])
+    border.forget_unused(0)
+    # Those behind the last that is used are gone, those before it name nothing any more.
+    assert border.points == 2
+    add((3, 6))
+    add((5, 4))
+    assert border.points == 5
+    steps = whole.steps(OLD)
+    assert_allclose(border.steps().all(), steps, rtol=1e-6, atol=1e-8)
+    assert_allclose(border.step([3, 4, 5, 6, 7]), steps[3:8], rtol=1e-6, atol=1e-8)

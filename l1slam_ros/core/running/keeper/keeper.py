@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from l1slam_ros.core.bordered.front import Front, Look
+from l1slam_ros.core.bordered.front import MOST_ROWS, Front, Look
 from l1slam_ros.core.errors import Interrupted
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.graph.factor_graph import BetweenFactors
@@ -45,9 +45,9 @@ from l1slam_ros.core.running.robot_maps import Seen, map_ends
 from l1slam_ros.core.running.snapshot import Robot, SavedMap, Snapshot
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 
-# Factors that a front takes while its lock is held, and between two looks at the clock: on a large
-# map a loop takes milliseconds.
-_AT_ONCE = 4
+# Factors that a front takes while its lock is held, and between two looks at the clock; one where
+# it has so many rows that a loop takes milliseconds.
+_AT_ONCE, _LONG = 4, MOST_ROWS // 2
 
 
 class Revisions(NamedTuple):
@@ -286,7 +286,8 @@ class Keeper:
             front, state, factors = self._front, self._state, self._builder.graph.between
         if front is None or front.closed or front.rows >= len(factors):
             return False
-        what = state.table.for_front(factors, front.rows, front.rows + _AT_ONCE, state.robust)
+        end = front.rows + (_AT_ONCE if front.border < _LONG else 1)
+        what = state.table.for_front(factors, front.rows, end, state.robust)
         looks = front.take(factors, what)
         with self._graph_lock:
             if self._state is state:  # else another map has begun
