@@ -167,7 +167,7 @@ def log_likelihood_ratio(square: Array, log_det: Array, log_claim: Array,
 
 def by_freedom(value: Callable[[int], float], freedom: Indices) -> Array:
     """Return a value for each of (m,) degrees of freedom, each worked out once."""
-    count = np.bincount(freedom)
+    count = np.bincount(np.ravel(freedom))
     values: Array = np.array([value(k) if some else 0.0 for k, some in enumerate(count.tolist())])
     return values[freedom]
 
@@ -215,8 +215,8 @@ class Innovations:
         moved = kernels.prediction.moved(system.keyframe[rows], system.blocks[rows],
                                          posterior.samples)
         # Of all with all: each is of many pairs.
-        columns = moved.reshape(len(rows) * k, -1)
-        shared = columns @ columns.T / columns.shape[1]
+        columns = moved.reshape(len(rows) * k, -1) / np.sqrt(kernels.prediction.SAMPLES)
+        shared = columns @ columns.T
         at = np.arange(len(rows))
         own = shared.reshape(len(rows), k, len(rows), k)[at, :, at] + np.eye(k)
         square, log_det = kernels.prediction.normalise_pairs(

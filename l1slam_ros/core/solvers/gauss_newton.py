@@ -129,17 +129,8 @@ def _descend(
         if fits_exactly(l1_cost(here.residual), len(here.residual)):
             status = Status.CONVERGED
             break
-        system = linearise(graph, here.poses, here.residual)
-        weights = norm.weights(here.residual)
-        step = weighted_least_squares(system, cholesky, weights, damping)
-        predicted = float((step * system.transposed_times(weights * system.b)).sum())
-        full, free, solved = damping <= _HARDLY, not damping, None if damping else system
-        there = _at(graph, step_poses(graph, here.poses, step), norm)
-        little = options.tolerance * here.cost
-        if predicted > little and np.isfinite(there.cost) and (
-                here.cost - there.cost < _BRINGS * predicted):
-            there, translated = _nearer(graph, here, there, step, predicted, norm, cholesky)
-            solved = None if translated else solved
+        little, full, free = options.tolerance * here.cost, damping <= _HARDLY, not damping
+        there, predicted, solved = _stepped(graph, here, norm, cholesky, damping, little)
         decrease = here.cost - there.cost
         if decrease >= 0:
             here = there
@@ -160,10 +151,27 @@ def _descend(
                     np.zeros(len(here.residual))), here.residual, solved
 
 
+def _stepped(graph: FactorGraph, here: _At, norm: SmoothNorm, cholesky: BlockCholesky,
+             damping: float, little: float) -> tuple[_At, float, LinearSystem | None]:
+    """
+    Return where a step leads, what it promised, and the system that was solved last, undamped.
+
+    little : a promise of no more is not looked at any closer
+    """
+    system, weights = linearise(graph, here.poses, here.residual), norm.weights(here.residual)
+    step = weighted_least_squares(system, cholesky, weights, damping)
+    predicted = float((step * system.transposed_times(weights * system.b)).sum())
+    there, translated = _at(graph, step_poses(graph, here.poses, step), norm), False
+    is_short = here.cost - there.cost < _BRINGS * predicted
+    if predicted > little and np.isfinite(there.cost) and is_short:
+        there, translated = _nearer(graph, here, there, step, predicted, norm, cholesky)
+    return there, predicted, None if damping or translated else system
+
+
 def _nearer(graph: FactorGraph, here: _At, there: _At, step: Array, predicted: float,
             norm: SmoothNorm, cholesky: BlockCholesky) -> tuple[_At, bool]:
     """
-    Return a better place than that to which a step led, or that, and whether it was factored for.
+    Return a better place than where a step led, or that, and whether another system was factored.
 
     The parabola through both costs that begins as promised is lowest after a part of the step. A
     long chain that is to bend goes along the tangent, and all its factors tear: given its
