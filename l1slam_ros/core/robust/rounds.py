@@ -39,12 +39,7 @@ from l1slam_ros.core.robust.innovation import (
 )
 from l1slam_ros.core.robust.inspection import repeated_factors
 from l1slam_ros.core.robust.places import beside_refused, mates, places
-from l1slam_ros.core.solvers.block_cholesky import (
-    BlockCholesky,
-    Pattern,
-    cholesky_of,
-    with_pattern,
-)
+from l1slam_ros.core.solvers.block_cholesky import Pattern, cholesky_of, with_pattern
 from l1slam_ros.core.solvers.gauss_newton import l2_optimum
 
 # At most one in so many true loops is refused for its noise alone; and of accepted ones, dropped.
@@ -245,13 +240,7 @@ class Growth:
         return self._open(self.across())
 
     def _open(self, some: Mask) -> Indices:
-        still: Indices = np.flatnonzero(some & ~self.accepted & (self.drops < _CHANCES))
-        return still
-
-    @property
-    def leaves_some_out(self) -> bool:
-        """Whether any loop is not accepted, for good or so far."""
-        return bool((self.is_loop & ~self.accepted).any())
+        return np.asarray(np.flatnonzero(some & ~self.accepted & (self.drops < _CHANCES)))
 
     def across(self) -> Mask:
         """Return which factors lead from one part to another, (m,) bool."""
@@ -271,7 +260,9 @@ class Growth:
                 self.part = component_labels(self.graph.subset(self.accepted & ~self.cut))
             rows = np.flatnonzero(self.accepted)
             subgraph = self.subgraph(rows)
-            cholesky = self._cholesky(rows, subgraph)
+            if self._order is None or not np.array_equal(rows, self._order[0]):
+                self._order = rows, cholesky_of(subgraph).pattern
+            cholesky = with_pattern(self._order[1], subgraph)
             self._check()
             self.poses, residual, solved = l2_optimum(subgraph, self.poses, cholesky,
                                                       lambda *_: self._check())
@@ -292,14 +283,6 @@ class Growth:
         if not self._knows_noise:
             self._learn_variance(rows)
             self.learnt_of = self.accepted.copy()
-
-    def _cholesky(self, rows: Indices, subgraph: FactorGraph) -> BlockCholesky:
-        """Return what factors the systems of some factors; an order is found once for them."""
-        if self._order is not None and np.array_equal(rows, self._order[0]):
-            return with_pattern(self._order[1], subgraph)
-        cholesky = cholesky_of(subgraph)
-        self._order = rows, cholesky.pattern
-        return cholesky
 
     @property
     def _knows_noise(self) -> bool:
@@ -329,8 +312,7 @@ class Growth:
         # Next to a false loop the true ones look bad too: only the worst go.
         doubted = self.gate(freedom, _DOUBTED / len(rows))
         far |= against > np.maximum(doubted, against.max(initial=0.0) / 2)
-        misfits: Indices = rows[far & may_go]
-        return misfits
+        return np.asarray(rows[far & may_go])
 
     def _learn_variance(self, rows: Indices) -> None:
         """
@@ -370,7 +352,6 @@ class Growth:
         # Taken at their word all are noisier than they are, so that more fit by chance: then only
         # the rest says how many of the rest are false.
         true = 0 if self.at_their_word else np.count_nonzero(loops)
-        believed: Indices = rows[believable(
+        return np.asarray(rows[believable(
             found, self.posterior, self.gate, fits, int(true), self.place[rows],
-            beside_refused(self.mates, refused, loops)[rows])]
-        return believed
+            beside_refused(self.mates, refused, loops)[rows])])

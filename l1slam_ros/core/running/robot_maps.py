@@ -64,11 +64,11 @@ def robot_maps(manifold: Manifold, robot: Indices, firsts: Indices, factors: Bet
         return {number: RobotMap(True, None) for number in numbers.tolist()}
     joined, root = _joined(robot, numbers, factors, accepted)
     # The frame of the graph is that of the world, or of its first keyframe.
-    is_root = root is None or firsts[root] == 0
-    if is_root and joined.all():
+    root = None if root is None or firsts[root] == 0 else root
+    if root is None and joined.all():
         return {number: RobotMap(True, None) for number in numbers.tolist()}
     turns = manifold.compose(odometry(firsts), manifold.inverse(pose(firsts)))
-    of_root = None if is_root else turns[root:root + 1]
+    of_root = None if root is None else turns[root:root + 1]
     return {number: RobotMap(joins, of_root if joins else turns[row:row + 1])
             for row, (number, joins) in enumerate(zip(
                 numbers.tolist(), joined.tolist(), strict=True))}

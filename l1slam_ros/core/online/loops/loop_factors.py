@@ -190,9 +190,10 @@ class LoopFactors:
         own = robots[:, 0] == robots[:, 1]
         # What one robot saw of itself was known with its later end.
         until = np.where(own[:, None], times[:, 1:], times)
-        known = tracks.known_until(robots.ravel(), arrivals.ravel(), until.ravel())
-        pairs = tracks.nearest_keyframe(robots.ravel(), times.ravel(), known).reshape(-1, 2)
-        first = tracks.first(robots.ravel()).reshape(-1, 2)
+        ends = tracks.of_each(robots.ravel())
+        known = ends.known_until(arrivals.ravel(), until.ravel())
+        pairs = ends.nearest_keyframe(times.ravel(), known).reshape(-1, 2)
+        first = ends.first().reshape(-1, 2)
         can = np.flatnonzero(self._can_be_factors(due, pairs, first)).tolist()
         new: list[int] = []
         before, came = len(graph.between), len(self.rows)
@@ -215,10 +216,11 @@ class LoopFactors:
         """Carry loops to the keyframes pairs (m, 2), and make factors of them."""
         manifold, m = self._manifold, len(loops)
         times, robots = (column.T.ravel() for column in _times(loops))
-        at, keyframes = tracks.at(robots, times), tracks.poses_of(robots, pairs.T.ravel())
+        ends = tracks.of_each(robots)
+        at, keyframes = ends.at(times), ends.poses_of(pairs.T.ravel())
         ways = manifold.between(np.concatenate((keyframes[:m], at[m:])),
                                 np.concatenate((at[:m], keyframes[m:])))
-        unseen = tracks.unseen(robots, times)
+        unseen = ends.unseen(times)
         measurement, covariance, sound = carried(
             manifold, loops, ways[:m], ways[m:], unseen.reshape(2, m, 2))
         covariance = np.where(sound[:, None, None], covariance, self._model(options))

@@ -78,43 +78,59 @@ class Tracks:
         numbers = np.concatenate([track.numbers.view() for track in tracks])
         return values[np.argsort(numbers)]
 
-    # Of loops, robots (m,).
+    def of_each(self, robots: Indices) -> 'Ends':
+        """Return what is asked of the tracks of some robots, (m,), one for each end of loops."""
+        return Ends([(self._tracks[robot], np.flatnonzero(robots == robot))
+                     for robot in np.unique(robots).tolist()], len(robots))
 
-    def first(self, robots: Indices) -> Indices:
+
+class Ends:
+    """
+    Ends of loops, (m,), each of the track of its robot.
+
+    Parameters
+    ----------
+    groups : tracks, and which ends are of them
+    count : of ends
+
+    """
+
+    def __init__(self, groups: list[tuple[OdometryTrack, Indices]], count: int):
+        self._groups, self._count = groups, count
+
+    def first(self) -> Indices:
         """Return when the odometry of each begins, (m,) [ns]."""
-        return self._by_robot(robots, lambda track, _: track.first, np.int64)
+        return self._of_all(lambda track, _: track.first, np.int64)
 
-    def known_until(self, robots: Indices, arrivals: Indices, times: Indices) -> Indices:
+    def known_until(self, arrivals: Indices, times: Indices) -> Indices:
         """Return up to which time odometry had come, see `OdometryTrack`, (m,) [ns]."""
-        return self._by_robot(
-            robots, lambda track, at: track.known_until(arrivals[at], times[at]), np.int64)
+        return self._of_all(
+            lambda track, at: track.known_until(arrivals[at], times[at]), np.int64)
 
-    def nearest_keyframe(self, robots: Indices, times: Indices, known: Indices) -> Indices:
+    def nearest_keyframe(self, times: Indices, known: Indices) -> Indices:
         """Return the keyframe of the graph that is nearest, see `OdometryTrack`, (m,)."""
-        return self._by_robot(robots, lambda track, at: track.numbers.view()[
+        return self._of_all(lambda track, at: track.numbers.view()[
             track.nearest_keyframe(times[at], known[at])], np.int64)
 
-    def at(self, robots: Indices, times: Indices) -> Array:
+    def at(self, times: Indices) -> Array:
         """Return where each was at a time in its odometry, (m, p)."""
-        return self._by_robot(robots, lambda track, at: track.at(times[at]))
+        return self._of_all(lambda track, at: track.at(times[at]))
 
-    def unseen(self, robots: Indices, times: Indices) -> Array:
+    def unseen(self, times: Indices) -> Array:
         """Return the sigmas of what `at` returns, (m, 2) [m] and [rad]."""
-        return self._by_robot(robots, lambda track, at: track.unseen(times[at]))
+        return self._of_all(lambda track, at: track.unseen(times[at]))
 
-    def poses_of(self, robots: Indices, keyframes: Indices) -> Array:
+    def poses_of(self, keyframes: Indices) -> Array:
         """Return the poses of keyframes of the graph, (m, p)."""
-        return self._by_robot(robots, lambda track, at: track.poses_of(
+        return self._of_all(lambda track, at: track.poses_of(
             np.searchsorted(track.numbers.view(), keyframes[at])))
 
-    def _by_robot(self, robots: Indices, of: Callable[[OdometryTrack, Indices], Any],
-                  kind: type = float) -> Any:
-        """Return what tracks say, one after the other, each of the rows of its robot."""
+    def _of_all(self, of: Callable[[OdometryTrack, Indices], Any], kind: type = float) -> Any:
+        """Return what tracks say, one after the other, each of its rows."""
         said: Any = None
-        for robot in np.unique(robots).tolist():
-            rows = np.flatnonzero(robots == robot)
-            values = np.asarray(of(self._tracks[robot], rows))
+        for track, rows in self._groups:
+            values = np.asarray(of(track, rows))
             if said is None:
-                said = np.zeros((len(robots), *values.shape[1:]), kind)
+                said = np.zeros((self._count, *values.shape[1:]), kind)
             said[rows] = values
         return np.zeros(0, kind) if said is None else said
