@@ -33,10 +33,15 @@ from l1slam_ros.core.robust.judgement import (
     Doubt,
     listed,
 )
-from l1slam_ros.core.robust.odometry.slips import SURE, common_steps, spanning
+from l1slam_ros.core.robust.odometry.slips import (
+    SURE,
+    common_steps,
+    may_be_right,
+    spanning,
+    unopposed,
+)
 from l1slam_ros.core.robust.pairwise_consistency import (
-    agreement,
-    asked,
+    agree_at_a_place,
     spanned,
     strongest_group,
 )
@@ -95,7 +100,7 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
     sure = ~growth.is_loop | growth.trusted | growth.factors.is_absolute
     part = component_labels(growth.graph.subset(growth.accepted & ~growth.cut & sure))
     rows = np.flatnonzero(growth.accepted & ~sure & (part[growth.low] != part[growth.high]))
-    rows = np.concatenate((rows, _agree_at_a_place(growth, growth.joining())))
+    rows = np.concatenate((rows, agree_at_a_place(growth, growth.joining())))
     i, j = part[growth.low[rows]], part[growth.high[rows]]
     _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
     joins = growth.accepted[rows]
@@ -111,42 +116,32 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
             yield rows[own]
 
 
-def _agree_at_a_place(growth: Growth, rows: Indices) -> Indices:
-    """Return those of some loops that are left out, and agree with one of their place."""
-    _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
-    rows = asked(growth, rows[count[place] > 1])
-    one, other, _ = agreement(growth, rows)
-    agree: Indices = rows[np.unique(one[growth.place[rows[one]] == growth.place[rows[other]]])]
-    return agree
-
-
 def _other_map(growth: Growth) -> list[Doubt]:
     """
     Return a doubt where refused loops agree, and no accepted one speaks against them.
 
     They may be right then: the odometry slipped, and nothing else knows of it. A place against
-    the odometry alone is one word against another.
+    the odometry alone is one word against another, if the robot moved as usual then.
     """
-    rows, accepted = growth.undecided(), growth.accepted & growth.is_loop
-    agree = _agree_at_a_place(growth, rows)
-    groups = [strongest_group(growth, rows).rows, *(
-        agree[growth.place[agree] == place] for place in np.unique(growth.place[agree]))]
-    alone = [group for group in groups if len(group) and not _against(growth, group, accepted)]
-    return [_doubt(growth, OTHER_MAP, max(alone, key=len))] if alone else []
+    rows = growth.undecided()
+    group = strongest_group(growth, rows)
+    if len(group.rows) and not _against(growth, group.rows, growth.accepted & growth.is_loop):
+        return [_doubt(growth, OTHER_MAP, group.rows)]
+    alone = (group for group in unopposed(growth, rows) if may_be_right(growth, group))
+    return [_doubt(growth, OTHER_MAP, group.rows) for group in list(alone)[:1]]
 
 
 def _against(growth: Growth, group: Indices, rows: Mask) -> int:
     """
     Return how many of some loops would lie, at least, if a group of others, (k,), were right.
 
-    Then the odometry slipped at a step that the group spans. Or on either side of its first or
-    its second ends, and what lies between is elsewhere as a whole: two slips are believed of
-    several places alone.
+    Then the odometry slipped at a step that the group spans, or on either side of its first or
+    its second ends: what lies between is elsewhere as a whole.
     """
     low, high = growth.low, growth.high
     across = spanned(low[rows], high[rows], growth.graph.n_poses)
     against = [across[low[common_steps(growth, group)]].min()]
-    for ends in (low[group], high[group]) if np.ptp(growth.place[group]) else ():
+    for ends in (low[group], high[group]):
         inside = ((end >= ends.min()) & (end <= ends.max()) for end in (low[rows], high[rows]))
         against.append(np.count_nonzero(np.logical_or(*inside)))
     return int(min(against))

@@ -36,8 +36,10 @@ from l1slam_ros.core.robust.odometry.motion import (
     usual_motion,
 )
 from l1slam_ros.core.robust.pairwise_consistency import (
+    NO_GROUP,
     RUN,
     Group,
+    agree_at_a_place,
     longest_run,
     runs,
     spanned,
@@ -177,8 +179,8 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
     odds, left_out = log_odds_of_slips(growth, motion), as_stated.undecided()
     # Where loops are left out, one more place may be won.
     least = max(SURE, _place(growth)) if len(left_out) else SURE
-    for step in _suspected(growth, odds, left_out, least if first else np.inf):
-        state, usual = _without(growth, step), False
+    for step, told in _suspected(growth, odds, left_out, least if first else np.inf):
+        state, usual = _without(growth, step, told), False
         if state:
             state, step, usual = _cut_rather(state, step, motion)
         yield [step], float(odds[step]), state, usual
@@ -191,9 +193,12 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
                 yield [one, *second], float(odds[one]) + other, both, usual
 
 
-def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> list[int]:
+def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float
+               ) -> list[tuple[int, Group]]:
     """
-    Return the odometry factors that may have slipped: two by their odds, two by groups.
+    Return the odometry factors that may have slipped: by their odds, by groups, by one place.
+
+    Two each, and of the last ones the loops that say so.
 
     least : how large the odds are against those that are suspected for their own, at most
     """
@@ -203,17 +208,40 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> 
     # Where no loop can tell, an unusual motion is no more than that.
     told = np.where((across[growth.low] > 0) & ~growth.cut, odds, -np.inf)
     order = np.argsort(-told, kind='stable')[:_TRIED]
-    suspects: list[int] = order[told[order] > -least].tolist()
+    suspects = dict.fromkeys(order[told[order] > -least].tolist(), NO_GROUP)
+    alone = unopposed(growth, left_out)[:_TRIED]
     for _ in range(_TRIED):
         group = strongest_group(growth, left_out)
         if len(group.places) < SPANNING:
             break
-        common = common_steps(growth, group.rows)
-        common = common[~growth.cut[common]]
-        if len(common):
-            suspects.append(int(common[np.argmax(odds[common])]))
+        suspects |= _likeliest_of(growth, group.rows, odds, NO_GROUP)
         left_out = np.setdiff1d(left_out, group.rows)
-    return list(dict.fromkeys(suspects))
+    for group in alone:
+        suspects = _likeliest_of(growth, group.rows, odds, group) | suspects
+    return list(suspects.items())
+
+
+def _likeliest_of(growth: Growth, rows: Indices, odds: Array, told: Group) -> dict[int, Group]:
+    """Return the likeliest step to have slipped that most of some loops span, and who told."""
+    common = common_steps(growth, rows)
+    common = common[~growth.cut[common]]
+    return {int(common[np.argmax(odds[common])]): told} if len(common) else {}
+
+
+def unopposed(growth: Growth, rows: Indices) -> list[Group]:
+    """
+    Return of loops that are left out those of a place that agree, the largest first.
+
+    No accepted one speaks against them: a step that all of them span no accepted one spans.
+    """
+    accepted = growth.accepted & growth.is_loop
+    across = spanned(growth.low[accepted], growth.high[accepted], growth.graph.n_poses)
+    agree = agree_at_a_place(growth, rows)
+    groups = [Group(agree[growth.place[agree] == place], np.array([place]))
+              for place in np.unique(growth.place[agree])]
+    return sorted((group for group in groups
+                   if not across[growth.low[common_steps(growth, group.rows)]].all()),
+                  key=lambda group: -len(group.rows))
 
 
 def common_steps(growth: Growth, rows: Indices) -> Indices:
@@ -224,14 +252,27 @@ def common_steps(growth: Growth, rows: Indices) -> Indices:
     return steps
 
 
-def _without(growth: Growth, step: int) -> Growth | None:
-    """Return the state after the rounds that follow if a step is cut; None: it falls apart."""
+def may_be_right(growth: Growth, group: Group) -> bool:
+    """Return whether the robot moved as usual, if loops of one place are right."""
+    step = int(common_steps(growth, group.rows)[0])
+    state = _without(growth, step, group)
+    return state is not None and _cut_rather(state, step, usual_motion(growth))[2]
+
+
+def _without(growth: Growth, step: int, told: Group = NO_GROUP) -> Growth | None:
+    """
+    Return the state after the rounds that follow if a step is cut; None: it falls apart.
+
+    told : loops that join its sides where no others do
+    """
     state, span = growth.copy(), spanning(growth, step)
     state.cut[step] = True
     state.drops[:] = 0
     state.accepted[span] = state.trusted[span]
     state.solve()
-    if not join(state) or state.across()[step]:
+    if not join(state) and state.across()[told.rows].any():
+        _join_by(state, told)
+    if state.across()[step]:
         return None
     _accept_more(state)
     return state
