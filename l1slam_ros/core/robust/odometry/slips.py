@@ -179,7 +179,8 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
     odds, left_out = log_odds_of_slips(growth, motion), as_stated.undecided()
     # Where loops are left out, one more place may be won.
     least = max(SURE, _place(growth)) if len(left_out) else SURE
-    for step, told in _suspected(growth, odds, left_out, least if first else np.inf):
+    suspects = _suspected(growth, odds, left_out, least if first else np.inf)
+    for step, told in suspects.items():
         state, usual = _without(growth, step, told), False
         if state:
             state, step, usual = _cut_rather(state, step, motion)
@@ -194,11 +195,11 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
 
 
 def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float
-               ) -> list[tuple[int, Group]]:
+               ) -> dict[int, Group]:
     """
-    Return the odometry factors that may have slipped: by their odds, by groups, by one place.
+    Return the odometry factors that may have slipped, two by their odds, and those by groups.
 
-    Two each, and of the last ones the loops that say so.
+    With the loops that say so, where any do.
 
     least : how large the odds are against those that are suspected for their own, at most
     """
@@ -209,39 +210,34 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float
     told = np.where((across[growth.low] > 0) & ~growth.cut, odds, -np.inf)
     order = np.argsort(-told, kind='stable')[:_TRIED]
     suspects = dict.fromkeys(order[told[order] > -least].tolist(), NO_GROUP)
-    alone = unopposed(growth, left_out)[:_TRIED]
+    for group in _telling(growth, left_out):
+        common = common_steps(growth, group.rows)
+        common = common[~growth.cut[common]]
+        if len(common):
+            suspects[int(common[np.argmax(odds[common])])] = group
+    return suspects
+
+
+def _telling(growth: Growth, left_out: Indices) -> Iterator[Group]:
+    """Yield two groups of several places, and two of one place that nothing speaks against."""
     for _ in range(_TRIED):
         group = strongest_group(growth, left_out)
         if len(group.places) < SPANNING:
             break
-        suspects |= _likeliest_of(growth, group.rows, odds, NO_GROUP)
+        yield group
         left_out = np.setdiff1d(left_out, group.rows)
-    for group in alone:
-        suspects = _likeliest_of(growth, group.rows, odds, group) | suspects
-    return list(suspects.items())
+    yield from unopposed(growth, left_out)[:_TRIED]
 
 
-def _likeliest_of(growth: Growth, rows: Indices, odds: Array, told: Group) -> dict[int, Group]:
-    """Return the likeliest step to have slipped that most of some loops span, and who told."""
-    common = common_steps(growth, rows)
-    common = common[~growth.cut[common]]
-    return {int(common[np.argmax(odds[common])]): told} if len(common) else {}
-
-
-def unopposed(growth: Growth, rows: Indices) -> list[Group]:
-    """
-    Return of loops that are left out those of a place that agree, the largest first.
-
-    No accepted one speaks against them: a step that all of them span no accepted one spans.
-    """
-    accepted = growth.accepted & growth.is_loop
-    across = spanned(growth.low[accepted], growth.high[accepted], growth.graph.n_poses)
-    agree = agree_at_a_place(growth, rows)
-    groups = [Group(agree[growth.place[agree] == place], np.array([place]))
-              for place in np.unique(growth.place[agree])]
-    return sorted((group for group in groups
-                   if not across[growth.low[common_steps(growth, group.rows)]].all()),
-                  key=lambda group: -len(group.rows))
+def unopposed(growth: Growth, left_out: Indices) -> list[Group]:
+    """Return loops of one place each that agree, and span a step that no accepted one spans."""
+    known = growth.accepted & growth.is_loop
+    across = spanned(growth.low[known], growth.high[known], growth.graph.n_poses)
+    agree = agree_at_a_place(growth, left_out)
+    groups = (Group(agree[growth.place[agree] == place], np.array([place]))
+              for place in np.unique(growth.place[agree]))
+    return sorted((group for group in groups if not across[
+        growth.low[common_steps(growth, group.rows)]].all()), key=lambda group: -len(group.rows))
 
 
 def common_steps(growth: Growth, rows: Indices) -> Indices:
@@ -250,13 +246,6 @@ def common_steps(growth: Growth, rows: Indices) -> Indices:
     common = np.flatnonzero(across == across.max())
     steps: Indices = np.flatnonzero(~growth.is_loop & np.isin(growth.low, common))
     return steps
-
-
-def may_be_right(growth: Growth, group: Group) -> bool:
-    """Return whether the robot moved as usual, if loops of one place are right."""
-    step = int(common_steps(growth, group.rows)[0])
-    state = _without(growth, step, group)
-    return state is not None and _cut_rather(state, step, usual_motion(growth))[2]
 
 
 def _without(growth: Growth, step: int, told: Group = NO_GROUP) -> Growth | None:
