@@ -33,7 +33,13 @@ from l1slam_ros.core.robust.judgement import (
     Doubt,
     listed,
 )
-from l1slam_ros.core.robust.odometry.slips import SURE, common_steps, spanning, unopposed
+from l1slam_ros.core.robust.odometry.slips import (
+    SURE,
+    common_steps,
+    may_be_right,
+    spanning,
+    unopposed,
+)
 from l1slam_ros.core.robust.pairwise_consistency import (
     NO_GROUP,
     agree_at_a_place,
@@ -116,12 +122,13 @@ def _other_map(growth: Growth) -> list[Doubt]:
     Return a doubt where refused loops agree, and no accepted one speaks against them.
 
     They may be right then: the odometry slipped, and nothing else knows of it. A place against
-    the odometry alone is one word against another.
+    the odometry alone is one word against another, if the robot moved as ever then.
     """
     rows = growth.undecided()
     group = strongest_group(growth, rows)
     if not len(group.rows) or _against(growth, group.rows, growth.accepted & growth.is_loop):
-        group = next(iter(unopposed(growth, rows)), NO_GROUP)
+        group = next((one for one in unopposed(growth, rows) if may_be_right(growth, one)),
+                     NO_GROUP)
     return [_doubt(growth, OTHER_MAP, group.rows)] if len(group.rows) else []
 
 

@@ -28,6 +28,7 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.gating import DOUBT
+from l1slam_ros.core.robust.innovation import claimed_volume
 from l1slam_ros.core.robust.odometry.motion import (
     Motion,
     log_odds_of_slips,
@@ -238,6 +239,21 @@ def unopposed(growth: Growth, left_out: Indices) -> list[Group]:
               for place in np.unique(growth.place[agree]))
     return sorted((group for group in groups if not across[
         growth.low[common_steps(growth, group.rows)]].all()), key=lambda group: -len(group.rows))
+
+
+def may_be_right(growth: Growth, group: Group) -> bool:
+    """
+    Return whether a slip that loops of one place tell of leaves the robot moving as ever.
+
+    Where these lie, the step that they leave in place of one that they span is any, as claims are.
+    """
+    motion, step = usual_motion(growth), int(common_steps(growth, group.rows)[0])
+    state = _without(growth, step, group)
+    if state is None:
+        return False
+    state, step, _ = _cut_rather(state, step, motion)
+    claim = claimed_volume(growth.graph.manifold, growth.poses).sum()
+    return bool(motion.log_density(*_repaired(state, step, np.array([step])))[0] + claim > SURE)
 
 
 def common_steps(growth: Growth, rows: Indices) -> Indices:
