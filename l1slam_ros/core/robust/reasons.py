@@ -33,15 +33,8 @@ from l1slam_ros.core.robust.judgement import (
     Doubt,
     listed,
 )
-from l1slam_ros.core.robust.odometry.slips import (
-    SURE,
-    common_steps,
-    may_be_right,
-    spanning,
-    unopposed,
-)
+from l1slam_ros.core.robust.odometry.slips import SURE, common_steps, spanning
 from l1slam_ros.core.robust.pairwise_consistency import (
-    NO_GROUP,
     agree_at_a_place,
     spanned,
     strongest_group,
@@ -122,27 +115,28 @@ def _other_map(growth: Growth) -> list[Doubt]:
     Return a doubt where refused loops agree, and no accepted one speaks against them.
 
     They may be right then: the odometry slipped, and nothing else knows of it. A place against
-    the odometry alone is one word against another, if the robot moved as ever then.
+    the odometry alone is one word against another.
     """
-    rows = growth.undecided()
-    group = strongest_group(growth, rows)
-    if not len(group.rows) or _against(growth, group.rows, growth.accepted & growth.is_loop):
-        group = next((one for one in unopposed(growth, rows) if may_be_right(growth, one)),
-                     NO_GROUP)
-    return [_doubt(growth, OTHER_MAP, group.rows)] if len(group.rows) else []
+    rows, accepted = growth.undecided(), growth.accepted & growth.is_loop
+    agree = agree_at_a_place(growth, rows)
+    groups = [strongest_group(growth, rows).rows, *(
+        agree[growth.place[agree] == place] for place in np.unique(growth.place[agree]))]
+    alone = [group for group in groups if len(group) and not _against(growth, group, accepted)]
+    return [_doubt(growth, OTHER_MAP, max(alone, key=len))] if alone else []
 
 
 def _against(growth: Growth, group: Indices, rows: Mask) -> int:
     """
     Return how many of some loops would lie, at least, if a group of others, (k,), were right.
 
-    Then the odometry slipped at a step that the group spans, or on either side of its first or
-    its second ends: what lies between is elsewhere as a whole.
+    Then the odometry slipped at a step that the group spans. Or on either side of its first or
+    its second ends, and what lies between is elsewhere as a whole: two slips are believed of
+    several places alone.
     """
     low, high = growth.low, growth.high
     across = spanned(low[rows], high[rows], growth.graph.n_poses)
     against = [across[low[common_steps(growth, group)]].min()]
-    for ends in (low[group], high[group]):
+    for ends in (low[group], high[group]) if np.ptp(growth.place[group]) else ():
         inside = ((end >= ends.min()) & (end <= ends.max()) for end in (low[rows], high[rows]))
         against.append(np.count_nonzero(np.logical_or(*inside)))
     return int(min(against))

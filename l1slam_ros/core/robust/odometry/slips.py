@@ -28,7 +28,6 @@ from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.gating import DOUBT
-from l1slam_ros.core.robust.innovation import claimed_volume
 from l1slam_ros.core.robust.odometry.motion import (
     Motion,
     log_odds_of_slips,
@@ -37,10 +36,8 @@ from l1slam_ros.core.robust.odometry.motion import (
     usual_motion,
 )
 from l1slam_ros.core.robust.pairwise_consistency import (
-    NO_GROUP,
     RUN,
     Group,
-    agree_at_a_place,
     longest_run,
     runs,
     spanned,
@@ -180,9 +177,8 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
     odds, left_out = log_odds_of_slips(growth, motion), as_stated.undecided()
     # Where loops are left out, one more place may be won.
     least = max(SURE, _place(growth)) if len(left_out) else SURE
-    suspects = _suspected(growth, odds, left_out, least if first else np.inf)
-    for step, told in suspects.items():
-        state, usual = _without(growth, step, told), False
+    for step in _suspected(growth, odds, left_out, least if first else np.inf):
+        state, usual = _without(growth, step), False
         if state:
             state, step, usual = _cut_rather(state, step, motion)
         yield [step], float(odds[step]), state, usual
@@ -195,12 +191,9 @@ def _tried(growth: Growth, as_stated: Growth, motion: Motion, first: bool = True
                 yield [one, *second], float(odds[one]) + other, both, usual
 
 
-def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float
-               ) -> dict[int, Group]:
+def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float) -> list[int]:
     """
-    Return the odometry factors that may have slipped, two by their odds, and those by groups.
-
-    With the loops that say so, where any do.
+    Return the odometry factors that may have slipped: two by their odds, two by groups.
 
     least : how large the odds are against those that are suspected for their own, at most
     """
@@ -210,50 +203,17 @@ def _suspected(growth: Growth, odds: Array, left_out: Indices, least: float
     # Where no loop can tell, an unusual motion is no more than that.
     told = np.where((across[growth.low] > 0) & ~growth.cut, odds, -np.inf)
     order = np.argsort(-told, kind='stable')[:_TRIED]
-    suspects = dict.fromkeys(order[told[order] > -least].tolist(), NO_GROUP)
-    for group in _telling(growth, left_out):
-        common = common_steps(growth, group.rows)
-        common = common[~growth.cut[common]]
-        if len(common):
-            suspects[int(common[np.argmax(odds[common])])] = group
-    return suspects
-
-
-def _telling(growth: Growth, left_out: Indices) -> Iterator[Group]:
-    """Yield two groups of several places, and two of one place that nothing speaks against."""
+    suspects: list[int] = order[told[order] > -least].tolist()
     for _ in range(_TRIED):
         group = strongest_group(growth, left_out)
         if len(group.places) < SPANNING:
             break
-        yield group
+        common = common_steps(growth, group.rows)
+        common = common[~growth.cut[common]]
+        if len(common):
+            suspects.append(int(common[np.argmax(odds[common])]))
         left_out = np.setdiff1d(left_out, group.rows)
-    yield from unopposed(growth, left_out)[:_TRIED]
-
-
-def unopposed(growth: Growth, left_out: Indices) -> list[Group]:
-    """Return loops of one place each that agree, and span a step that no accepted one spans."""
-    known = growth.accepted & growth.is_loop
-    across = spanned(growth.low[known], growth.high[known], growth.graph.n_poses)
-    agree = agree_at_a_place(growth, left_out)
-    groups = (Group(agree[growth.place[agree] == place], np.array([place]))
-              for place in np.unique(growth.place[agree]))
-    return sorted((group for group in groups if not across[
-        growth.low[common_steps(growth, group.rows)]].all()), key=lambda group: -len(group.rows))
-
-
-def may_be_right(growth: Growth, group: Group) -> bool:
-    """
-    Return whether a slip that loops of one place tell of leaves the robot moving as ever.
-
-    Where these lie, the step that they leave in place of one that they span is any, as claims are.
-    """
-    motion, step = usual_motion(growth), int(common_steps(growth, group.rows)[0])
-    state = _without(growth, step, group)
-    if state is None:
-        return False
-    state, step, _ = _cut_rather(state, step, motion)
-    claim = claimed_volume(growth.graph.manifold, growth.poses).sum()
-    return bool(motion.log_density(*_repaired(state, step, np.array([step])))[0] + claim > SURE)
+    return list(dict.fromkeys(suspects))
 
 
 def common_steps(growth: Growth, rows: Indices) -> Indices:
@@ -264,20 +224,14 @@ def common_steps(growth: Growth, rows: Indices) -> Indices:
     return steps
 
 
-def _without(growth: Growth, step: int, told: Group = NO_GROUP) -> Growth | None:
-    """
-    Return the state after the rounds that follow if a step is cut; None: it falls apart.
-
-    told : loops that join its sides where no others do
-    """
+def _without(growth: Growth, step: int) -> Growth | None:
+    """Return the state after the rounds that follow if a step is cut; None: it falls apart."""
     state, span = growth.copy(), spanning(growth, step)
     state.cut[step] = True
     state.drops[:] = 0
     state.accepted[span] = state.trusted[span]
     state.solve()
-    if not join(state) and state.across()[told.rows].any():
-        _join_by(state, told)
-    if state.across()[step]:
+    if not join(state) or state.across()[step]:
         return None
     _accept_more(state)
     return state
