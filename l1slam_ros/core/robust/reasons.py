@@ -82,7 +82,9 @@ def _decides_alone(growth: Growth, accepted: Indices) -> bool:
     odometry.accepted = ~growth.is_loop
     odometry.solve()
     within = accepted[~odometry.across()[accepted]]
-    return len(within) > 0 and np.median(odometry.innovations(within).log_ratio()) < SURE
+    if not len(within):
+        return False
+    return bool(np.median(odometry.innovations(within).log_ratio()) < SURE)
 
 
 def _joining_alone(growth: Growth) -> Iterator[Indices]:
