@@ -58,8 +58,8 @@ _TOGETHER = ('the loops of a place err together: in the map each place counts as
 _REASONS = {
     MOSTLY_REFUSED: '{loops} loops, most of all, are refused or suspect, {where}: either they are '
                     'false, or the odometry is worse than it says',
-    ONE_PLACE: 'all {loops} loops that are used are of one place, {where}, which the odometry alone '
-               'does not bear out, so they may be one mistake',
+    ONE_PLACE: 'all {loops} loops that are used are of one place, {where}, which the odometry '
+               'alone hardly bears out, so they may be one mistake',
     ONE_JOINS: 'of how two parts lie to each other only loops of one place agree ({loops}, '
                '{where}), and they may be one mistake',
     OTHER_MAP: '{loops} refused loops agree with each other on another map, {where}',

@@ -32,8 +32,8 @@ from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.robust.places import err_together
 from l1slam_ros.core.robust.rounds import Growth
 
-# Most loops are refused; all that are accepted are of one place, which odometry alone does not bear
-# out; loops of one place alone say how two parts lie to each other; refused loops agree on another
+# Most loops are refused; all that are accepted are of one place, which odometry hardly bears out;
+# loops of one place alone say how two parts lie to each other; refused loops agree on another
 # map, and none that is accepted speaks against them; an odometry factor may have slipped, and it
 # was not believed; the odometry drifts, which was taken for noise; there were more rounds to come;
 # another norm of the same factors has another map; judging the loops failed, and what is believed

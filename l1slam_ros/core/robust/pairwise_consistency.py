@@ -110,6 +110,26 @@ def runs(growth: Growth, rows: Indices) -> list[Group]:
     return found
 
 
+def agree_at_a_place(growth: Growth, rows: Indices) -> Indices:
+    """
+    Return those of some loops that agree with others of their place, (k,), if hardly by chance.
+
+    The evidence is that of the best loop of a place: of all that agree with it, as of places in
+    `strongest_group`.
+    """
+    _, number, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
+    rows = asked(growth, rows[count[number] > 1])
+    one, other, log_ratio = agreement(growth, rows)
+    number, m = np.unique(growth.place[rows], return_inverse=True)[1], max(len(rows), 1)
+    same = number[one] == number[other]
+    best = np.zeros(m)
+    np.maximum.at(best, number, np.bincount(
+        one[same], log_ratio[same] - np.log(m), len(rows)))
+    sure = np.unique(one[same & (best[number[one]] > np.log(m / DOUBT))])
+    agree: Indices = rows[sure]
+    return agree
+
+
 def asked(growth: Growth, rows: Indices) -> Indices:
     """Return `ASKED` of some loops, as if at random, or all, (k,)."""
     chosen: Indices = rows[np.argsort(keys(growth.low[rows], growth.high[rows]))[:ASKED]]

@@ -35,8 +35,7 @@ from l1slam_ros.core.robust.judgement import (
 )
 from l1slam_ros.core.robust.odometry.slips import SURE, common_steps, spanning
 from l1slam_ros.core.robust.pairwise_consistency import (
-    agreement,
-    asked,
+    agree_at_a_place,
     spanned,
     strongest_group,
 )
@@ -83,7 +82,9 @@ def _decides_alone(growth: Growth, accepted: Indices) -> bool:
     odometry.accepted = ~growth.is_loop
     odometry.solve()
     within = accepted[~odometry.across()[accepted]]
-    return len(within) > 0 and np.median(odometry.innovations(within).log_ratio()) < SURE
+    if not len(within):
+        return False
+    return bool(np.median(odometry.innovations(within).log_ratio()) < SURE)
 
 
 def _joining_alone(growth: Growth) -> Iterator[Indices]:
@@ -95,7 +96,7 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
     sure = ~growth.is_loop | growth.trusted | growth.factors.is_absolute
     part = component_labels(growth.graph.subset(growth.accepted & ~growth.cut & sure))
     rows = np.flatnonzero(growth.accepted & ~sure & (part[growth.low] != part[growth.high]))
-    rows = np.concatenate((rows, _agree_at_a_place(growth, growth.joining())))
+    rows = np.concatenate((rows, agree_at_a_place(growth, growth.joining())))
     i, j = part[growth.low[rows]], part[growth.high[rows]]
     _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
     joins = growth.accepted[rows]
@@ -111,15 +112,6 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
             yield rows[own]
 
 
-def _agree_at_a_place(growth: Growth, rows: Indices) -> Indices:
-    """Return those of some loops that are left out, and agree with one of their place."""
-    _, place, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
-    rows = asked(growth, rows[count[place] > 1])
-    one, other, _ = agreement(growth, rows)
-    agree: Indices = rows[np.unique(one[growth.place[rows[one]] == growth.place[rows[other]]])]
-    return agree
-
-
 def _other_map(growth: Growth) -> list[Doubt]:
     """
     Return a doubt where refused loops agree, and no accepted one speaks against them.
@@ -128,7 +120,7 @@ def _other_map(growth: Growth) -> list[Doubt]:
     the odometry alone is one word against another.
     """
     rows, accepted = growth.undecided(), growth.accepted & growth.is_loop
-    agree = _agree_at_a_place(growth, rows)
+    agree = agree_at_a_place(growth, rows)
     groups = [strongest_group(growth, rows).rows, *(
         agree[growth.place[agree] == place] for place in np.unique(growth.place[agree]))]
     alone = [group for group in groups if len(group) and not _against(growth, group, accepted)]

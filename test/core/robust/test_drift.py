@@ -11,6 +11,7 @@
 import numpy as np
 import pytest
 from lies import careful_world, is_false, position_error, spoilt
+from problems import chain_of, graph_of
 
 from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS
 from l1slam_ros.core.robust import batch_map
@@ -25,6 +26,16 @@ def test_loops_vote_for_the_drift_that_there_is(drift):
     found, odds = vote(straightened(WORLD.graph, -drift))
     assert odds > 0
     assert found == pytest.approx(drift, abs=2e-3)
+
+
+def test_a_full_turn_more_on_ways_that_are_equally_long_is_as_good_a_drift():
+    n = 300
+    angle = 2 * np.pi * np.arange(2 * n) / n
+    truth = np.column_stack((48 * np.cos(angle), 48 * np.sin(angle), angle))
+    chain, back = chain_of(2 * n), np.arange(0, n, 10)
+    pairs = np.concatenate((chain, np.column_stack((back, back + n))))
+    graph = graph_of(truth, pairs, np.zeros((len(pairs), 3)), np.diag([400.0, 400.0, 4e4]))
+    assert vote(straightened(graph, -DRIFT))[1] < 0
 
 
 @pytest.mark.parametrize('kind', KINDS_OF_FALSE_LOOPS)

@@ -16,7 +16,9 @@ from lies import careful_world, is_false, position_error, spoilt
 from problems import chain_of, graph_of, measure, retold
 from torn import shifted_runs
 
+from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.parts import odometry_gaps
+from l1slam_ros.core.graph.spanning_tree import odometry_poses
 from l1slam_ros.core.robust.batch import judge, robust_solve
 from l1slam_ros.core.robust.batch_map import SolveOptions
 from l1slam_ros.core.robust.batch_map import solve as solve_graph
@@ -125,6 +127,23 @@ def test_one_place_that_carries_all_is_doubtful_where_odometry_hardly_bears_it_o
     assert [doubt.kind for doubt in found.doubts] == [ONE_PLACE] * doubted
     few, _ = robust_solve(graph.subset(np.arange(steps + 3)))
     assert ONE_PLACE not in [doubt.kind for doubt in few.doubts]
+
+
+@pytest.mark.parametrize('turn, doubted', [(0.0, False), (np.pi / 2, True)])
+def test_a_slip_that_one_place_alone_tells_of_is_doubtful(turn, doubted):
+    """The second lap's loops are refused then; those of the first half do not span the step."""
+    lap, _ = ring(0)
+    near, true, factors = np.arange(0, 240, 6), odometry_poses(lap), lap.between
+    Z = factors.measurement.copy()
+    Z[factors.is_odometry & (factors.i == 400), 2] += turn
+    graph = retold(lap, Z)
+    noise = np.random.default_rng(3).standard_normal((len(near), 3)) * [0.1, 0.1, 0.01]
+    graph.append_between(
+        near, near + 6, se2.retract(se2.between(true[near], true[near + 6]), noise),
+        np.repeat(factors.sqrt_information[:1], len(near), axis=0))
+    found, _ = robust_solve(graph)
+    assert [doubt.kind for doubt in found.doubts] == [OTHER_MAP] * doubted
+    assert np.count_nonzero(~found.accepted) == 20 * doubted
 
 
 @pytest.mark.parametrize('believed', [False, True])

@@ -24,7 +24,6 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.online.keyframes import KeyframeOptions
 from l1slam_ros.core.robust import batch
-from l1slam_ros.core.robust.judgement import ONE_PLACE
 from l1slam_ros.core.running.backend import Backend, BackendOptions
 from l1slam_ros.core.running.improve import Improvement, improve
 from l1slam_ros.core.running.keeper import updates, work
@@ -358,7 +357,7 @@ def test_a_judgement_that_doubts_itself_is_followed_by_one_from_the_graph_alone(
         deadline = time.monotonic() + DEADLINE
         while not anew and time.monotonic() < deadline:
             backend._updates.update(MOMENT, lambda: False, idle=False)
-        assert anew and backend.snapshot().judgement.doubt.kind == ONE_PLACE
+        assert anew and backend.snapshot().judgement.is_refusal_doubted
 
 
 def test_in_the_background_an_update_never_waits_for_the_workers(monkeypatch):

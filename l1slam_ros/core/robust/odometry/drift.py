@@ -30,6 +30,7 @@ from l1slam_ros.core.geometry.noise import covariance_of
 from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph, ends_in_time
 from l1slam_ros.core.graph.parts import bridged
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.places import places
 
 # [rad/m] What wheels and gyros drift by: its standard deviation, and the most that is looked for.
@@ -62,7 +63,12 @@ def corrected(factors: BetweenFactors, rows: Indices, drift: float) -> Array:
 
 
 def vote(graph: FactorGraph) -> tuple[float, float]:
-    """Return the drift of the heading [rad/m] that loops agree on, and the ln of its odds."""
+    """
+    Return the drift of the heading [rad/m] that loops agree on, and the ln of its odds.
+
+    Positive where it is likelier than none, and surely than any other: to loops of equally long
+    ways a full turn more on each is the same.
+    """
     rows = np.flatnonzero(~graph.between.is_odometry & ~graph.between.is_absolute)
     if graph.manifold is not se2 or not len(rows):
         return 0.0, -np.inf
@@ -82,7 +88,8 @@ def vote(graph: FactorGraph) -> tuple[float, float]:
         best[name] = max(
             _highest(phi, metres, own[:, 2, 2] + q * (turned[high] - turned[low]), weight,
                      usual + q * walk) for q in _NOISE)
-    return best['drift'][1], best['drift'][0] - best['none'][0]
+    value, drift, lead = best['drift']
+    return drift, min(value - best['none'][0], lead - np.log(1 / DOUBT - 1))
 
 
 def _along(graph: FactorGraph) -> tuple[Array, Array]:
@@ -97,15 +104,22 @@ def _along(graph: FactorGraph) -> tuple[Array, Array]:
 
 
 def _highest(phi: Array, metres: Array, variance: Array, weight: Array, prior: float
-             ) -> tuple[float, float]:
-    """Return the highest ln of likelihood and prior over drifts N(0, prior), and where it is."""
-    centre, step, most = 0.0, _STEP, min(_MOST, 4 * np.sqrt(prior) + _STEP)
+             ) -> tuple[float, float, float]:
+    """
+    Return the highest ln of likelihood and prior over drifts N(0, prior), and where it is.
+
+    And by how much it is above the next peak.
+    """
+    centre, step, most, lead = 0.0, _STEP, min(_MOST, 4 * np.sqrt(prior) + _STEP), np.inf
     for _ in range(_LEVELS):
         drift = centre + np.arange(-most, most + step / 2, step)
         value = _log_likelihood(phi, metres, variance + (metres * step) ** 2 / 12, weight, drift
                                 ) - drift**2 / (2 * prior) - np.log(2 * np.pi * prior) / 2
+        is_peak = (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:])
+        peaks = np.sort(value[1:-1][is_peak])
+        lead = float(peaks[-1] - peaks[-2]) if len(peaks) > 1 and most > 2 * step else lead
         centre, most, step = float(drift[np.argmax(value)]), 2 * step, step / _FINER
-    return float(value.max()), centre
+    return float(value.max()), centre, lead
 
 
 def _log_likelihood(phi: Array, metres: Array, variance: Array, weight: Array, drift: Array
