@@ -158,12 +158,15 @@ class LoopFinder:
     def find(self, most: int) -> list[ScanLoop]:
         """Make so many of the comparisons that wait; return the loops that they found."""
         loops: list[ScanLoop] = []
-        for _ in range(min(most, self.waiting)):
+        while most and self._waiting:
             asked = self._waiting.popleft()
-            # Where it was found by a near one, the map is not lost, and tells of others, too.
             if asked.alike and asked.j != self._closed:
                 around = np.array([0.0, 0.0, asked.expected[2]])
                 asked = replace(asked, expected=around, reach=_ALIKE_REACH, turn=np.pi)
+            elif asked.alike and asked.reach > _ALIKE_REACH:
+                # A near one was found; where the map is as unsure as this, that is enough.
+                continue
+            most -= 1
             if (loop := self._compare(asked)) is not None:
                 loops.append(loop)
                 self._closed = self._closed if asked.alike else asked.j
