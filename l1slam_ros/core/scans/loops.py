@@ -29,7 +29,6 @@ import numpy as np
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.scans import kernels
 from l1slam_ros.core.scans.matching import match
@@ -116,7 +115,7 @@ class LoopFinder:
         self._submaps = Submaps(keyframes)
         self._asked = AROUND
         # Of each keyframe that may be asked for.
-        self._looks = GrowingArray((LOOKS,))
+        self._looks: list[Array] = []
         self._travelled: list[float] = []
         self._part: list[int] = []
         self._waiting: deque[_Comparison] = deque()
@@ -139,7 +138,7 @@ class LoopFinder:
         deviation of where each lies from the last one placed [m], [rad]; see `_sigma`
         """
         for k in range(len(self._part), j + 1):
-            self._looks.extend(self._submaps[k].descriptor[None])
+            self._looks.append(self._submaps[k].descriptor)
             self._travelled.append(self._keyframes[k].travelled)
             self._part.append(self._keyframes[k].part)
         sigma = self._sigma(j, spread)
@@ -193,9 +192,10 @@ class LoopFinder:
         near = (distance <= reach[far]) & ~apart
         chosen: list[tuple[int, bool]] = []
         self._take(far[near], distance[near], _NEAREST, False, travelled, chosen)
-        looks = self._looks.view() @ self._looks.view()[j]
-        alike = far[((distance <= 2 * reach[far]) | apart) & (looks[far] > _SIMILAR)]
-        self._take(alike, -looks[alike], _ALIKE, True, travelled, chosen)
+        within = far[(distance <= 2 * reach[far]) | apart]
+        looks = np.array([self._looks[i] for i in within]).reshape(-1, LOOKS) @ self._looks[j]
+        alike = looks > _SIMILAR
+        self._take(within[alike], -looks[alike], _ALIKE, True, travelled, chosen)
         return chosen
 
     def _take(self, keyframes: Indices, rank: Array, most: int, alike: bool, travelled: Array,
