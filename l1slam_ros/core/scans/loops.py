@@ -23,13 +23,12 @@ What is sent is a proposal: the back end doubts it as any other loop.
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices
-from l1slam_ros.core.graph.growable_array import GrowingArray
 from l1slam_ros.core.options import Options, option
 from l1slam_ros.core.scans.matching import match
 from l1slam_ros.core.scans.search import search
@@ -111,11 +110,10 @@ class LoopFinder:
         self._keyframes, self._options = keyframes, options
         self._submaps = Submaps(keyframes)
         self._asked = AROUND
+        # Of each keyframe that may be asked for.
+        self._looks: list[Array] = []
         self._travelled: list[float] = []
         self._part: list[int] = []
-        # Of the keyframes that have asked: their numbers, and what they look like.
-        self._have_asked: list[int] = []
-        self._looks = GrowingArray((LOOKS,))
         self._waiting: deque[_Comparison] = deque()
         self._closed = -1  # the last that was found to be where a near one is
 
@@ -135,20 +133,17 @@ class LoopFinder:
         poses : (n, 3) of the keyframes in the map, at least j + 1; spread : (n, 2) standard
         deviation of where each lies from the last one placed [m], [rad]; see `_sigma`
         """
-        for keyframe in self._keyframes[len(self._part) : j + 1]:
-            self._travelled.append(keyframe.travelled)
-            self._part.append(keyframe.part)
+        for k in range(len(self._part), j + 1):
+            self._looks.append(self._submaps[k].descriptor)
+            self._travelled.append(self._keyframes[k].travelled)
+            self._part.append(self._keyframes[k].part)
         sigma = self._sigma(j, spread)
         reach = np.clip(_SIGMAS * sigma[:, 0], _LEAST_REACH, _MOST_REACH)
         turn = np.clip(_SIGMAS * sigma[:, 1], _LEAST_TURN, np.pi)
         for i, alike in self._candidates(j, poses, reach):
             expected = se2.between(poses[i][None], poses[j][None])[0]
-            if alike:
-                around = np.array([0.0, 0.0, expected[2]])
-                self._waiting.append(_Comparison(i, j, True, around, _ALIKE_REACH, np.pi))
-            else:
-                self._waiting.append(
-                    _Comparison(i, j, False, expected, float(reach[i]), float(turn[i])))
+            self._waiting.append(
+                _Comparison(i, j, alike, expected, float(reach[i]), float(turn[i])))
 
     @property
     def waiting(self) -> int:
@@ -160,8 +155,11 @@ class LoopFinder:
         loops: list[ScanLoop] = []
         while most and self._waiting:
             asked = self._waiting.popleft()
-            # Where it is known to be near another, it needs no place that only looks alike.
-            if asked.alike and asked.j == self._closed:
+            if asked.alike and asked.j != self._closed:
+                around = np.array([0.0, 0.0, asked.expected[2]])
+                asked = replace(asked, expected=around, reach=_ALIKE_REACH, turn=np.pi)
+            elif asked.alike and asked.reach > _ALIKE_REACH:
+                # A near one was found; where the map is as unsure as this, that is enough.
                 continue
             most -= 1
             if (loop := self._compare(asked)) is not None:
@@ -190,14 +188,10 @@ class LoopFinder:
         near = (distance <= reach[far]) & ~apart
         chosen: list[tuple[int, bool]] = []
         self._take(far[near], distance[near], _NEAREST, False, travelled, chosen)
-        # Of the earlier ones that have asked: neighbours of others look as they do.
-        looks = np.full(j + 1, -1.0)
-        own = self._submaps[j].descriptor
-        looks[self._have_asked] = self._looks.view() @ own
-        self._have_asked.append(j)
-        self._looks.extend(own[None])
-        alike = far[((distance <= 2 * reach[far]) | apart) & (looks[far] > _SIMILAR)]
-        self._take(alike, -looks[alike], _ALIKE, True, travelled, chosen)
+        within = far[(distance <= 2 * reach[far]) | apart]
+        looks = np.array([self._looks[i] for i in within]).reshape(-1, LOOKS) @ self._looks[j]
+        alike = looks > _SIMILAR
+        self._take(within[alike], -looks[alike], _ALIKE, True, travelled, chosen)
         return chosen
 
     def _take(self, keyframes: Indices, rank: Array, most: int, alike: bool, travelled: Array,

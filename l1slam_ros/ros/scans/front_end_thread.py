@@ -44,8 +44,8 @@ _BACKLOG = 20_000
 # new keyframe; and the map looked at. To read it takes as long as some scans do.
 _READ, _FRESH, _LOOK = 1.0, 0.2, 0.1
 _REPEAT_WARNING = 5.0  # [s]
-# [s] So long keyframes wait for the first path, which tells where to look for them: a back end
-# that compiles its solver takes a minute.
+# [s] So long keyframes wait for the first path and how well it is known, which tell where to look
+# for them: a back end that compiles its solver takes a minute.
 _PATIENCE = 180.0
 # [s] Pause after an error, so that one which recurs does not keep a core busy.
 _BREATH = 0.05
@@ -89,7 +89,7 @@ class RunOfScans:
         self._front_end = ScanFrontEnd(options, self._frames.mount or Mount())
         self._odometry = IncrementalOdometry(options.keyframe)
         self._placing = Placing()
-        self._path, self._read = b'', 0.0
+        self._path, self._read, self._news = b'', 0.0, False
         # The first path is waited for: no more once this is the time.
         self._placed, self._patience = False, float('inf')
         self._drawer.begin_anew()
@@ -101,6 +101,7 @@ class RunOfScans:
     def add_known(self, stamp: int, covariance: Array) -> None:
         """Hear how well a pose of the path is known, (3, 3) at its stamp [ns]."""
         self._placing.add_known(stamp, covariance)
+        self._news = True
 
     def follow(self, scan: Scan, wheels: Array) -> None:
         """Follow the robot to a scan, the wheels being at a pose (3,); publish what came of it."""
@@ -140,8 +141,8 @@ class RunOfScans:
         return now < self._patience and self._expects_path()
 
     def place_if_due(self, seconds: float = _READ) -> None:
-        """Read a path that has come, if the last one was read some seconds ago."""
-        if self._path and time.monotonic() - self._read > seconds:
+        """Read a path that has come, or how well it is known, if that was some seconds ago."""
+        if (self._path or self._news) and time.monotonic() - self._read > seconds:
             self._place()
 
     def cost(self) -> tuple[float, float]:
@@ -163,13 +164,14 @@ class RunOfScans:
 
     def _place(self) -> None:
         """Let front end and map know where the path has the keyframes."""
-        self._placing.set_path(*path_in(self._path))
-        self._path, self._read = b'', time.monotonic()
+        if self._path:
+            self._placing.set_path(*path_in(self._path))
+        self._path, self._read, self._news = b'', time.monotonic(), False
         keyframes = self._front_end.keyframes
         poses = self._placing.place(keyframes)
         if not len(poses):
             return
-        self._placed = True
+        self._placed = self._placing.is_known
         placed = keyframes[: len(poses)]
         self._front_end.place(poses, self._placing.spread(placed))
         joined = self._placing.joined(placed)

@@ -44,6 +44,11 @@ class Placing:
         # Of the newest keyframe of each update: stamp, metres, radians from the first keyframe.
         self._known: list[tuple[int, float, float]] = []
 
+    @property
+    def is_known(self) -> bool:
+        """Whether it has been heard how well any pose of the path is known."""
+        return bool(self._known)
+
     def add_odometry(self, stamp: int, pose: Array) -> None:
         """Hear where the robot was by its scans, (3,), in their frame; stamps [ns] rise."""
         self._stamps.extend(np.array([stamp]))
