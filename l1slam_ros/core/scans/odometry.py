@@ -50,9 +50,9 @@ _SEARCH, _MOST_SEARCH = np.array((0.3, 0.3)), np.array((1.5, 0.8))
 _NEAR_PEAK = np.diag(1 / np.array((0.2, 0.2, 0.1)) ** 2)
 # What is left unsure of a scan that was searched for.
 _SEARCHED = np.diag((0.1, 0.1, 0.05)) ** 2
-# Fewer points say nothing about where the robot is; so many scans in a row without a match say
-# that it is somewhere else.
-_FEWEST, _LOST_AFTER = 30, 6
+# Fewer points say nothing about where the robot is; so many scans in a row without a match, on so
+# much of a way and turns [m + rad], say that it is somewhere else.
+_FEWEST, _LOST_AFTER, _LOST_WAY = 30, 6, 1.0
 # Wheels: part of the way and of the turn, turn for each metre, and of each scan [m, rad].
 _WAY, _TURN, _TURN_OF_WAY, _STEP, _STEP_TURN = 0.3, 0.2, 0.3, 0.01, 0.01
 # [m] So far from where it is said to be a laser may sit: what it moves when the robot turns.
@@ -135,7 +135,7 @@ class ScanOdometry:
         off = se2.local(expected[None], self._pose[None])[0]
         if self._distrusted and off @ np.linalg.solve(trusted, off) > _GATE:
             self._distrusted = _DISTRUST
-        if self._unmatched >= _LOST_AFTER:
+        if self._unmatched >= _LOST_AFTER and self._blind.sum() >= _LOST_WAY:
             self._unmatched, self._blind = 0, np.zeros(2)
             return self._begin(stamp, points, 'the scans show nothing known any more; a new part '
                                'of the map begins')
