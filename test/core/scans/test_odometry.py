@@ -180,6 +180,19 @@ def test_carried_away_it_says_so_and_begins_anew():
     assert {keyframe.part for keyframe in odometry.keyframes} == {0, 1}
 
 
+def test_a_crowd_that_passes_is_no_other_place():
+    """For 1.2 s and less than a metre nothing is seen but what stands around."""
+    scans, wheels = drive(ROUND[:60], spoil=lambda ranges, k, rng: (
+        rng.uniform(0.5, 1.0) + 0.2 * np.sin(np.arange(len(ranges)) / 9 + k)
+        if 20 <= k < 26 else ranges))
+    odometry = ScanOdometry()
+    steps = [odometry.add(scan.stamp, points_of(scan), pose)
+             for scan, pose in zip(scans, wheels, strict=True)]
+    true = se2.between(ROUND[:1], ROUND[59:60])[0]
+    assert np.hypot(*(steps[-1].pose - true)[:2]) < 0.15
+    assert {keyframe.part for keyframe in odometry.keyframes} == {0}
+
+
 def test_random_rays_do_not_disturb_it():
     steps, _, _ = steps_of(ROUND[:80], spoil=random_rays)
     true = se2.between(ROUND[:1], ROUND[79:80])[0]
