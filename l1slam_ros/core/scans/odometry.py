@@ -165,8 +165,7 @@ class ScanOdometry:
             self._take(pose, covariance)
             return ''
         searched = self._search(expected, points)
-        if searched is not None and not (
-                fits and self._free_space(searched.pose, points)[1]):
+        if searched is not None and not self._free_space(searched.pose, points)[1]:
             self._take(searched.pose,
                        np.linalg.inv(_NEAR_PEAK + searched.information) + _SEARCHED)
             said = '' if self._distrusted else (
