@@ -9,7 +9,7 @@
 """
 What the scan front end makes of a laser log, by truth: error, loops, places, grid, cost, memory.
 
-    python benchmarks/scans.py --datasets DIR [--logs fr079,intel]
+    python benchmarks/scans.py --datasets DIR [--logs fr079,intel] [--variants all]
 
 DIR/lidar holds the logs and their corrected poses. Each of these is of one scan, and does not bear
 its stamp but the time at which the logger wrote it down, in six digits: by that the scan is found.
@@ -22,6 +22,9 @@ true loop leads back from there, or from within NEAR of way. The grid is compare
 the same keyframes' scans where the corrected log has them, laid on the map as a whole: of the
 cells that both know, so many are free in both or occupied in both. Seconds are the processor's, on
 one thread, and of the front end alone: what a scan costs `scan_loops`.
+
+With --variants a row for each log made of a recorded one, see `log_variants`: the error where a
+scan is near a corrected pose, false loops and all, parts, and the doubts of the map.
 """
 
 import argparse
@@ -31,10 +34,11 @@ import time
 from pathlib import Path
 
 import numpy as np
+from log_variants import VARIANTS, TrueLog
 
 from l1slam_ros.cli.reference import position_error, read_truth
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.geometry.alignment import align
+from l1slam_ros.core.geometry.alignment import absolute_trajectory_error, align
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
 from l1slam_ros.core.scans.front_end import ScanFrontEnd
@@ -48,6 +52,8 @@ from l1slam_ros.io.trajectory import read_reference
 FAR, TURNED = 0.5, 0.1
 # [m]
 SIDE, NEAR, APART = 2.0, 2.0, 10.0
+# [ns] So near to a corrected pose a scan tells the error of a variant, which may have few.
+NEAR_SCAN = 10**8
 
 
 class Timed:
@@ -168,12 +174,46 @@ def rms(off: Array) -> float:
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
+def print_variants(given: argparse.Namespace) -> None:
+    """Measure logs made of the recorded ones, and print a row for each."""
+    names = VARIANTS if given.variants == 'all' else given.variants.split(',')
+    for name in given.logs.split(','):
+        folder = given.datasets / 'lidar'
+        reference = read_reference(folder / f'{name}.truth.csv', se2, by_stamps=True)
+        recorded = TrueLog(read_carmen(folder / f'{name}.clf.bz2'), reference.keys,
+                           reference.poses)
+        for variant in names:
+            drawn = VARIANTS[variant](recorded, np.random.default_rng(0))
+            log = drawn.log
+            made = map_scans(zip(log.scans, log.wheels, strict=True), log.mount)
+            outcome = solve(made.record.graph, None, SolveOptions())
+            poses = outcome.solution.poses
+            _, false = false_loops(made, true_poses(made, drawn.stamps, drawn.truth))
+            rows, keyframes, steps = made.path.steps_at(drawn.stamps, 10**10, 10**6)
+            after = np.searchsorted(made.path.stamps, drawn.stamps[rows], side='right')
+            nearest = np.stack([abs(drawn.stamps[rows] - made.path.stamps[np.clip(
+                k, 0, len(made.path.stamps) - 1)]) for k in (after - 1, after)]).min(axis=0)
+            near = nearest < NEAR_SCAN
+            error = absolute_trajectory_error(
+                se2.compose(poses[keyframes], steps)[near, :2], drawn.truth[rows][near, :2])
+            doubts = outcome.judgement.doubts if outcome.judgement else ()
+            said = ', '.join(dict.fromkeys(doubt.kind for doubt in doubts)) or 'none'
+            print(f'{name}, {variant}: error {error:.3f} m, {outcome.parts} parts, loops '
+                  f'{len(false)}, {false.sum()} false; doubts: {said}', flush=True)
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description='the scan front end on laser logs, by truth')
     parser.add_argument('--datasets', type=Path, required=True, metavar='DIR')
     parser.add_argument('--logs', default='fr079,intel')
+    parser.add_argument('--variants', metavar='NAME,...',
+                        help='logs made of the recorded ones instead; all, or some of '
+                        + ', '.join(VARIANTS))
     given = parser.parse_args()
+    if given.variants:
+        print_variants(given)
+        return
     for name in given.logs.split(','):
         folder = given.datasets / 'lidar'
         log = read_carmen(folder / f'{name}.clf.bz2')

@@ -50,11 +50,13 @@ _SEARCH, _MOST_SEARCH = np.array((0.3, 0.3)), np.array((1.5, 0.8))
 _NEAR_PEAK = np.diag(1 / np.array((0.2, 0.2, 0.1)) ** 2)
 # What is left unsure of a scan that was searched for.
 _SEARCHED = np.diag((0.1, 0.1, 0.05)) ** 2
-# Fewer points say nothing about where the robot is; so many scans in a row without a match say
-# that it is somewhere else.
-_FEWEST, _LOST_AFTER = 30, 6
+# Fewer points say nothing about where the robot is; so many scans in a row without a match, on so
+# much of a way and turns [m + rad], say that it is somewhere else.
+_FEWEST, _LOST_AFTER, _LOST_WAY = 30, 6, 1.0
 # Wheels: part of the way and of the turn, turn for each metre, and of each scan [m, rad].
 _WAY, _TURN, _TURN_OF_WAY, _STEP, _STEP_TURN = 0.3, 0.2, 0.3, 0.01, 0.01
+# [m] So far from where it is said to be a laser may sit: what it moves when the robot turns.
+_ASIDE = 0.1
 # After scans and wheels disagreed, for so many scans the wheels may be wrong by twice their
 # motion: where a driver loses the sign of wheels that turn backwards, it does for a while.
 _DISTRUST, _WRONG = 25, 2.0
@@ -123,13 +125,17 @@ class ScanOdometry:
         self._wheels = wheels
         expected = se2.compose(self._pose[None], motion[None])[0]
         Ad = se2.adjoint(se2.inverse(motion[None]))[0]
-        predicted = Ad @ self._covariance @ Ad.T + wheel_covariance(motion)
+        trusted = Ad @ self._covariance @ Ad.T + wheel_covariance(motion)
+        predicted = trusted
         if self._distrusted:
             self._distrusted -= 1
-            predicted = predicted + np.diag((_WRONG * motion) ** 2)
+            predicted = trusted + np.diag((_WRONG * motion) ** 2)
         self._blind = self._blind + (np.hypot(motion[0], motion[1]), abs(motion[2]))
         said = self._follow(expected, predicted, points)
-        if self._unmatched >= _LOST_AFTER:
+        off = se2.local(expected[None], self._pose[None])[0]
+        if self._distrusted and off @ np.linalg.solve(trusted, off) > _GATE:
+            self._distrusted = _DISTRUST
+        if self._unmatched >= _LOST_AFTER and self._blind.sum() >= _LOST_WAY:
             self._unmatched, self._blind = 0, np.zeros(2)
             return self._begin(stamp, points, 'the scans show nothing known any more; a new part '
                                'of the map begins')
@@ -159,8 +165,7 @@ class ScanOdometry:
             self._take(pose, covariance)
             return ''
         searched = self._search(expected, points)
-        if searched is not None and not (
-                fits and self._free_space(searched.pose, points)[1]):
+        if searched is not None and not self._free_space(searched.pose, points)[1]:
             self._take(searched.pose,
                        np.linalg.inv(_NEAR_PEAK + searched.information) + _SEARCHED)
             said = '' if self._distrusted else (
@@ -250,6 +255,6 @@ class ScanOdometry:
 def wheel_covariance(motion: Array) -> Array:
     """Return the covariance of a motion (3,) of the wheels, (3, 3) in the axes of its end."""
     way, turn = float(np.hypot(motion[0], motion[1])), abs(float(motion[2]))
-    along = (_WAY * way) ** 2 + _STEP**2
+    along = (_WAY * way) ** 2 + (_ASIDE * turn) ** 2 + _STEP**2
     heading = (_TURN * turn) ** 2 + (_TURN_OF_WAY * way) ** 2 + _STEP_TURN**2
     return np.diag((along, along, heading))

@@ -34,7 +34,7 @@ _SMOOTH = 0.25
 _OF_SMOOTH = 0.3186 * 6.0**0.5
 # Far away rays are wide apart: neighbours within so many rays' distance.
 _RAYS = 10.0
-# Of fewer rays that are as near to each other as points may be, nobody can tell the noise.
+# Of fewer rays that are as near to each other as points may be, nobody can tell their noise.
 _FEWEST = 20
 # Bearings of a view.
 _BEARINGS = 720

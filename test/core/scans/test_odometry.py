@@ -154,6 +154,19 @@ def test_a_metre_backwards_that_the_wheels_count_as_forwards():
     assert {keyframe.part for keyframe in odometry.keyframes} == {0}
 
 
+def test_a_laser_a_little_aside_is_no_reason_to_doubt_the_wheels():
+    """It sits 9 cm ahead of where it is said to be, and the robot turns on the spot."""
+    true = np.column_stack((np.full((12, 2), (4.0, 1.5)), 0.5 * np.arange(12)))
+    laser = se2.compose(true, np.tile((0.09, 0.0, 0.0), (12, 1)))
+    scans, _ = drive(laser)
+    odometry = ScanOdometry()
+    steps = [odometry.add(scan.stamp, points_of(scan), pose)
+             for scan, pose in zip(scans, true, strict=True)]
+    moved = se2.between(laser[:1], laser[-1:])[0]
+    assert {step.said for step in steps} == {''}
+    assert np.hypot(*(steps[-1].pose - moved)[:2]) < 0.05
+
+
 def test_carried_away_it_says_so_and_begins_anew():
     scans, wheels = drive(np.concatenate((ROUND[:40], ACROSS[:40])), spoil=lambda ranges, k, rng: (
         ranges if k < 40 else ranges_at(ACROSS[k - 40], rng, HALL)))
@@ -165,6 +178,19 @@ def test_carried_away_it_says_so_and_begins_anew():
     said = {step.said for step in steps}
     assert 'the scans show nothing known any more; a new part of the map begins' in said
     assert {keyframe.part for keyframe in odometry.keyframes} == {0, 1}
+
+
+def test_a_crowd_that_passes_is_no_other_place():
+    """For 1.2 s and less than a metre nothing is seen but what stands around."""
+    scans, wheels = drive(ROUND[:60], spoil=lambda ranges, k, rng: (
+        rng.uniform(0.5, 1.0) + 0.2 * np.sin(np.arange(len(ranges)) / 9 + k)
+        if 20 <= k < 26 else ranges))
+    odometry = ScanOdometry()
+    steps = [odometry.add(scan.stamp, points_of(scan), pose)
+             for scan, pose in zip(scans, wheels, strict=True)]
+    true = se2.between(ROUND[:1], ROUND[59:60])[0]
+    assert np.hypot(*(steps[-1].pose - true)[:2]) < 0.15
+    assert {keyframe.part for keyframe in odometry.keyframes} == {0}
 
 
 def test_random_rays_do_not_disturb_it():
