@@ -91,7 +91,7 @@ class RunOfScans:
         self._placing = Placing()
         self._path, self._read, self._news = b'', 0.0, False
         # The first path is waited for: no more once this is the time.
-        self._placed, self._patience = False, float('inf')
+        self._patience = float('inf')
         self._drawer.begin_anew()
 
     def set_path(self, data: bytes) -> None:
@@ -134,7 +134,7 @@ class RunOfScans:
     def _waits_for_path(self) -> bool:
         """Return whether it will be known soon where keyframes lie in the map."""
         keyframes = self._front_end.keyframes
-        if not keyframes or self._placed:
+        if not keyframes or self._placing.is_known:
             return False
         now = time.monotonic()
         self._patience = min(self._patience, now + _PATIENCE)
@@ -171,7 +171,6 @@ class RunOfScans:
         poses = self._placing.place(keyframes)
         if not len(poses):
             return
-        self._placed = self._placing.is_known
         placed = keyframes[: len(poses)]
         self._front_end.place(poses, self._placing.spread(placed))
         joined = self._placing.joined(placed)
