@@ -95,20 +95,16 @@ class ScanFrontEnd:
         """How many keyframes are still to ask, and how many comparisons are still to be made."""
         return len(self._due) + self._finder.waiting
 
-    def loops(self, wait: bool = False) -> list[ScanLoop]:
+    def loops(self) -> list[ScanLoop]:
         """
         Look for loops for a while; return those found.
 
         To be called after each scan, and while there is nothing else to do: comparisons of
         keyframes take longer than anything else, so that they wait for each other, and one is made
         at a call, two only where many wait.
-
-        wait : no keyframe asks, for it will soon be known where they lie in the map; by odometry
-        alone a keyframe is searched for everywhere
         """
         self._due.extend(self._finder.due().tolist())
-        if not wait:
-            self._ask(_MANY)
+        self._ask(_MANY)
         return self._finder.find(1 if self._finder.waiting < _MANY else 2)
 
     def last_loops(self) -> list[ScanLoop]:

@@ -44,9 +44,6 @@ _BACKLOG = 20_000
 # new keyframe; and the map looked at. To read it takes as long as some scans do.
 _READ, _FRESH, _LOOK = 1.0, 0.2, 0.1
 _REPEAT_WARNING = 5.0  # [s]
-# [s] So long keyframes wait for the first path and how well it is known, which tell where to look
-# for them: a back end that compiles its solver takes a minute.
-_PATIENCE = 180.0
 # [s] Pause after an error, so that one which recurs does not keep a core busy.
 _BREATH = 0.05
 # Costs of so many scans are kept.
@@ -64,7 +61,6 @@ class RunOfScans:
     publisher : of odometry and loops
     drawer : of the map
     logger : to warn with
-    expects_path : returns whether there is a back end
 
     Attributes
     ----------
@@ -74,10 +70,8 @@ class RunOfScans:
     """
 
     def __init__(self, options: Callable[[], ScanLoopsOptions], frames: RobotFrames,
-                 publisher: ScanPublisher, drawer: MapDrawer, logger: Any,
-                 expects_path: Callable[[], bool]):
+                 publisher: ScanPublisher, drawer: MapDrawer, logger: Any):
         self._options, self._frames, self._logger = options, frames, logger
-        self._expects_path = expects_path
         self._publisher, self._drawer = publisher, drawer
         self.counts = Counter[str]()
         self.costs: deque[float] = deque(maxlen=_COSTS)
@@ -90,8 +84,6 @@ class RunOfScans:
         self._odometry = IncrementalOdometry(options.keyframe)
         self._placing = Placing()
         self._path, self._read, self._news = b'', 0.0, False
-        # The first path is waited for: no more once this is the time.
-        self._patience = float('inf')
         self._drawer.begin_anew()
 
     def set_path(self, data: bytes) -> None:
@@ -124,21 +116,11 @@ class RunOfScans:
 
     def look_for_loops(self) -> bool:
         """Look for loops for a moment; return whether there is more to look for now."""
-        wait = self._waits_for_path()
-        for loop in self._front_end.loops(wait):
+        for loop in self._front_end.loops():
             self._publisher.loop(self._frames.base, self._front_end.keyframes, loop)
             self.counts['loops'] += 1
         self._count()
-        return not wait and self._front_end.waiting > 0
-
-    def _waits_for_path(self) -> bool:
-        """Return whether it will be known soon where keyframes lie in the map."""
-        keyframes = self._front_end.keyframes
-        if not keyframes or self._placing.is_known:
-            return False
-        now = time.monotonic()
-        self._patience = min(self._patience, now + _PATIENCE)
-        return now < self._patience and self._expects_path()
+        return self._front_end.waiting > 0
 
     def place_if_due(self, seconds: float = _READ) -> None:
         """Read a path that has come, or how well it is known, if that was some seconds ago."""
@@ -192,7 +174,6 @@ class FrontEndThread:
     drawer : of the map
     failures : where to tell what nobody foresaw
     static : whether /tf_static is heard
-    expects_path : returns whether there is a back end
 
     Attributes
     ----------
@@ -204,16 +185,14 @@ class FrontEndThread:
     """
 
     def __init__(self, node: Node, options: Callable[[], ScanLoopsOptions],
-                 publisher: ScanPublisher, drawer: MapDrawer, failures: Failures, static: bool,
-                 expects_path: Callable[[], bool]):
+                 publisher: ScanPublisher, drawer: MapDrawer, failures: Failures, static: bool):
         self._logger, self._options = node.get_logger(), options
         self._drawer, self._failures = drawer, failures
         self._frames = RobotFrames(options, self._logger, static)
         self.refused = Counter[str]()
         self.queue, self.ready = ScanQueue(lambda: options().backlog), False
         self._restarts = self.queue.restarts
-        self.run = RunOfScans(options, self._frames, publisher, drawer, self._logger,
-                              expects_path)
+        self.run = RunOfScans(options, self._frames, publisher, drawer, self._logger)
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=_BACKLOG)
         self._woken, self._closing = threading.Event(), False
         self._uses = {'scan': self._on_scan, 'odom': self._on_odometry, 'path': self.run.set_path,

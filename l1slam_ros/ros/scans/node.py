@@ -77,8 +77,7 @@ class ScanLoopsNode(Node):
         self._drawer = MapDrawer(self, lambda: self.options)
         self._front_end = FrontEndThread(
             self, lambda: self.options, ScanPublisher(self, self.options), self._drawer,
-            self.failures, TFMessage is not None and not self.options.laser_pose,
-            lambda: self._traffic['path'].publishers() > 0)
+            self.failures, TFMessage is not None and not self.options.laser_pose)
         self._traffic: dict[str, Traffic] = {}
         self._hear(LaserScan, 'scan', _SENSOR)
         self._hear(Odometry, 'odom', _RELIABLE)

@@ -34,12 +34,11 @@ class Placing:
     Attributes
     ----------
     frame : of the map, as `path` says
-    is_known : whether keyframes were placed by a path of which it was heard how well it is known
 
     """
 
     def __init__(self) -> None:
-        self.frame, self.is_known = '', False
+        self.frame = ''
         self._stamps, self._odometry = GrowingArray((), np.int64), GrowingArray((3,))
         self._path: tuple[Indices, Array] = np.zeros(0, np.int64), np.zeros((0, 3))
         # Of the newest keyframe of each update: stamp, metres, radians from the first keyframe.
@@ -71,7 +70,6 @@ class Placing:
         stamps, poses = self._path
         if not len(stamps) or not len(self._stamps):
             return np.zeros((0, 3))
-        self.is_known = bool(self._known)
         wanted = np.array([keyframe.stamp for keyframe in keyframes], np.int64)
         wanted = wanted[: int(np.searchsorted(wanted, stamps[-1], side='right'))]
         before = np.maximum(np.searchsorted(stamps, wanted, side='right') - 1, 0)
