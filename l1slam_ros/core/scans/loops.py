@@ -34,8 +34,8 @@ from l1slam_ros.core.scans.matching import match
 from l1slam_ros.core.scans.search import search
 from l1slam_ros.core.scans.submaps import AROUND, LOOKS, Keyframe, Submap, Submaps, seen_by
 
-# Every third keyframe asks: submaps of neighbours show the same.
-_EVERY = 3
+# Every other keyframe asks: submaps of neighbours show the same.
+_EVERY = 2
 # So many candidates by their place in the map, and so many by their looks.
 _NEAREST, _ALIKE = 2, 2
 # Cosine of two descriptors.

@@ -17,7 +17,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust import innovation, rounds
-from l1slam_ros.core.robust.batch import judge, robust_solve
+from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.rounds import Growth
 
 
@@ -130,19 +130,3 @@ def test_an_order_is_found_once_for_the_same_factors(monkeypatch):
     growth.accepted[np.flatnonzero(growth.is_loop)[0]] = False
     growth.solve()
     assert found == [600, 599]
-
-
-@pytest.mark.parametrize('lies', [False, True])
-def test_a_judgement_asks_for_the_word_of_factors_only_where_a_loop_is_left_out(lies, monkeypatch):
-    graph, asked = careful_world(200, 600, 0).graph, []
-    if lies:
-        graph.append_between([3, 20], [120, 190], [[30.0, 40.0, 1.0], [-50.0, 9.0, 2.0]],
-                             np.diag([10.0, 10.0, 100.0])[None].repeat(2, axis=0))
-    believed, poses = robust_solve(graph)
-    assert np.count_nonzero(~believed.accepted) == 2 * lies
-    monkeypatch.setattr(Growth, 'take_at_their_word', lambda self, take=Growth.take_at_their_word:
-                        asked.append(take(self)))
-    judged, _ = judge(graph, poses, believed, np.inf)
-    assert len(asked) == lies
-    np.testing.assert_array_equal(judged.accepted, believed.accepted)
-    assert judged.settled and not judged.doubts
