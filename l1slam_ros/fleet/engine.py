@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 _PATIENCE = 30
 # So many jobs wait for each thread of a worker: enough that none is idle, few enough that a
 # million do not fill the scheduler's memory. A cluster that grows is looked at so often [s].
-_WAITING, _LOOK = 4, 10.0
+_WAITING = 4
+_LOOK = 10.0
 
 
 @contextmanager
@@ -101,7 +102,8 @@ def results(client: 'Client', work: Callable[[Job], Values], jobs: Iterable[Job]
     """
     from distributed import as_completed
 
-    waiting, run = iter(jobs), uuid4().hex
+    waiting = iter(jobs)
+    run = uuid4().hex
     attempts: dict[Any, tuple[Job, int]] = {}
     running = as_completed(loop=client.loop)
 
@@ -114,7 +116,8 @@ def results(client: 'Client', work: Callable[[Job], Values], jobs: Iterable[Job]
         while len(attempts) < room and (job := next(waiting, None)) is not None:
             start(job, 0)
 
-    room, looked = _room(client), time.monotonic()
+    room = _room(client)
+    looked = time.monotonic()
     fill(room)
     for future in running:
         job, attempt = attempts.pop(future.key)
@@ -130,7 +133,8 @@ def results(client: 'Client', work: Callable[[Job], Values], jobs: Iterable[Job]
             yield job, _lost(job, error, attempt + 1)
         future.release()
         if time.monotonic() > looked + _LOOK:
-            room, looked = _room(client), time.monotonic()
+            room = _room(client)
+            looked = time.monotonic()
         fill(room)
 
 

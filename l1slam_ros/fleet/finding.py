@@ -24,7 +24,9 @@ from l1slam_ros.io.formats import GRAPH_READERS, LOG_SUFFIXES, files_of
 
 _SUFFIXES = (*GRAPH_READERS, *BAG_SUFFIXES, *LOG_SUFFIXES)
 # What makes a directory a bag: its metadata, and a file with messages or a word in the metadata.
-_METADATA, _WORD, _ENOUGH = 'metadata.yaml', b'rosbag2_bagfile_information', 2**16
+_METADATA = 'metadata.yaml'
+_WORD = b'rosbag2_bagfile_information'
+_ENOUGH = 2**16
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,8 @@ from l1slam_ros.io.files import reported
 from l1slam_ros.io.ours import PROGRAM
 
 # What the first line says besides what the results depend on.
-_KIND, _BATCH = PROGRAM, 'batch'
+_KIND = PROGRAM
+_BATCH = 'batch'
 
 
 class Journal:
@@ -116,7 +117,8 @@ def journal(path: Path, about: dict[str, Any], resume: bool) -> Iterator[Journal
 
 def _lines(path: Path, file: IO[str], first: Values) -> list[Values]:
     """Return what a log says, with its first line; it ends there."""
-    whole, lines = 0, list[Values]()
+    whole = 0
+    lines = list[Values]()
     try:
         for text in file:
             if text.endswith('\n'):

@@ -163,7 +163,8 @@ def _ends(parts: Sequence[Part], own: list[Indices], number: int, edges: Rows) -
     wrong = (mine < 0) & (there != 1)
     if wrong.any():
         k = int(np.argmax(wrong.any(axis=1)))
-        name, count = edges.ids[k][wrong[k]][0], there[k][wrong[k]][0]
+        name = edges.ids[k][wrong[k]][0]
+        count = there[k][wrong[k]][0]
         where = 'of no input' if not count else f'of {count} other inputs'
         raise FileError(parts[number].path, f'vertex {name} is {where}; expected a vertex of this '
                         'file, or of one of the others', int(edges.lines[k]))
@@ -226,7 +227,8 @@ def _end(parts: Sequence[Part], own: list[Indices], path: Path, name: str, line:
     """Return the keyframe that a file of loops names."""
     number, _, vertex = name.partition(':')
     try:
-        k, wanted = int(number), np.array([int(vertex)], np.int64)
+        k = int(number)
+        wanted = np.array([int(vertex)], np.int64)
     except (ValueError, OverflowError) as error:
         raise FileError(path, f'{quoted(name)}; expected NUMBER:ID, the number of an input and a '
                         'vertex of it, as 1:17', line) from error
@@ -246,7 +248,8 @@ def parts_beside(graph: FactorGraph, poses: Array) -> Array:
     along = graph.manifold.positions(poses)[:, 0]
     width = [along[label == part].max() - along[label == part].min()
              for part in range(label.max() + 1)]
-    apart, edge = _BESIDE * max(width), along[label == 0].max()
+    apart = _BESIDE * max(width)
+    edge = along[label == 0].max()
     for part in range(1, label.max() + 1):
         rows = label == part
         moved[rows, 0] += edge + apart - along[rows].min()

@@ -39,7 +39,8 @@ def numbered(graphs: Sequence[Indices]) -> list[Indices]:
 
     """
     step = _step(graphs)
-    taken, found = np.zeros(0, np.int64), list[Indices]()
+    taken = np.zeros(0, np.int64)
+    found = list[Indices]()
     letters = {int(code) for ids in graphs for code in np.unique(robots_of(ids))}
     for number, ids in enumerate(graphs):
         new = ids.copy()

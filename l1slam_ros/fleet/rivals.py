@@ -26,7 +26,8 @@ from l1slam_ros.core.robust.judgement import OTHER_MAP, Doubt, listed
 # Loops agree where they put the second input within so far of each other [m], [rad].
 _NEAR, _TURN = 1.0, 0.2
 # So many at least, and so large a part of those that are believed, may be right instead.
-_FEWEST, _PART = 3, 1 / 3
+_FEWEST = 3
+_PART = 1 / 3
 # Of so many of them, evenly chosen, the neighbours are counted.
 _CENTRES = 500
 
@@ -53,7 +54,8 @@ def _doubts(graph: FactorGraph, poses: Array, accepted: Mask,
     between = (ends[:, 0] != ends[:, 1]) & ~factors.struck
     for pair in np.unique(ends[between], axis=0):
         own = between & (ends == pair).all(axis=1)
-        believed, refused = int((own & accepted).sum()), np.flatnonzero(own & ~accepted)
+        believed = int((own & accepted).sum())
+        refused = np.flatnonzero(own & ~accepted)
         if len(refused) < max(_FEWEST, _PART * believed):
             continue
         agree = refused[_largest_group(graph, _placed(graph, poses, refused, of_input))]

@@ -75,7 +75,8 @@ def scanned(paths: Sequence[Path], odom_topic: str, scan_topic: str,
 
 def _record(made: ScanMap, keyframes: Indices, log: LaserLog) -> GraphRecord:
     """Return what is of one drive alone; its keyframes stand behind each other."""
-    factors, first = made.record.graph.between, int(keyframes[0])
+    factors = made.record.graph.between
+    first = int(keyframes[0])
     graph = FactorGraph(made.record.graph.manifold, len(keyframes))
     own = np.isin(factors.pairs, keyframes).all(axis=1)
     graph.append_between(factors.i[own] - first, factors.j[own] - first,

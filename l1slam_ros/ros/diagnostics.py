@@ -51,7 +51,8 @@ class RobotLine(NamedTuple):
         frame = self.map_frame(robot is not None and robot.joined)
         sentence = f'in {frame}'
         if robot is None:
-            level, sentence = DiagnosticStatus.STALE, 'no odometry has come'
+            level = DiagnosticStatus.STALE
+            sentence = 'no odometry has come'
         elif not robot.joined:
             sentence += ': nothing that is believed joins it to the first robot'
         values = {'map_frame': frame, 'joined': robot is not None and robot.joined} | {

@@ -64,7 +64,8 @@ class MapPublisher:
     def __init__(self, node: Node, backend: Backend, parameters: NodeParameters[NodeOptions],
                  diagnostics: Diagnostics, robots: Sequence[RobotPublisher], failures: Failures):
         self._backend, self._diagnostics, self._robots = backend, diagnostics, robots
-        self._failures, self._one = failures, threading.Lock()
+        self._failures = failures
+        self._one = threading.Lock()
         self._woken, self._ending = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
         self._frame = parameters.options.map_frame
@@ -127,7 +128,8 @@ class MapPublisher:
 
     def _publish_map(self) -> None:
         now = self._backend.snapshot()
-        poses, loops = now.poses, now.loop_states()
+        poses = now.poses
+        loops = now.loop_states()
         self._keyframes = len(poses)
         if not np.isfinite(poses).all() or not np.isfinite(now.map_to_odom).all():
             raise ArithmeticError('a pose of the map is not finite: it is not published')
@@ -140,18 +142,22 @@ class MapPublisher:
     def _publish_robot(self, now: Snapshot, one: RobotPublisher, path: Publisher,
                        covariance: Publisher) -> None:
         """Publish the path of a robot; without a name it has all keyframes there are."""
-        manifold, robot = self._backend.manifold, self._backend.robot(one.number)
+        manifold = self._backend.manifold
+        robot = self._backend.robot(one.number)
         if robot is not None:
             before, after = (manifold.compose(transform, robot.odometry)
                              for transform in self._backend.moved(one.number))
             self._diagnostics.note_jump(manifold, before, after, one.prefix)
-        keyframes, poses, joined = np.arange(len(now.poses)), now.drawn, True
+        keyframes = np.arange(len(now.poses))
+        poses = now.drawn
+        joined = True
         if one.name:
             keyframes, poses = now.poses_in_map(one.number)
             joined = len(keyframes) > 0 and now.robot_maps[one.number].joined
             if not len(keyframes) and not path.get_subscription_count():
                 return
-        stamps, frame = now.stamps[keyframes], one.map_frame(joined)
+        stamps = now.stamps[keyframes]
+        frame = one.map_frame(joined)
         stamp = robot.stamp if robot is not None else 0
         path.publish(path_bytes(frame, stamp, stamps, manifold.to_pose3(poses)))
         if covariance.get_subscription_count() and len(poses):
@@ -180,7 +186,8 @@ def pose_with_covariance(frame: str, stamp: int, manifold: Manifold, pose: Array
     pose3 = manifold.to_pose3(pose)
     turn = pose3 * [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]
     Ad = manifold.adjoint(manifold.from_pose3(turn))[0]
-    rows, whole = np.array(manifold.COVARIANCE_ROWS), np.zeros((6, 6))
+    rows = np.array(manifold.COVARIANCE_ROWS)
+    whole = np.zeros((6, 6))
     whole[rows[:, None], rows] = Ad @ covariance @ Ad.T
     return pose_bytes(frame, stamp, pose3[0], whole)
 

@@ -122,7 +122,8 @@ def run(name: str, load: Callable[[], Any], ready: str) -> None:
         said = 'arguments that ROS does not know: ' if unknown else ''
         print(f'{name}: {said}{" ".join(str(error).split())}', file=sys.stderr)
         leave(_BAD_INPUT if unknown else 1)
-    node, code = None, 0
+    node = None
+    code = 0
     signals.orderly(rclpy.try_shutdown)
     try:
         node = make()

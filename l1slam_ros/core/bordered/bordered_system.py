@@ -100,9 +100,12 @@ class BorderedSystem:
 
     def __init__(self, cholesky: BlockCholesky, size: int, k: int, points: int = 0,
                  rows: int = 0):
-        self._points, self._k = Points(cholesky, size, k, points), k
-        self._ends, self._blocks = GrowingArray((2,), np.int64), GrowingArray((2, k, k))
-        self._factor, self._right = GrowingArray(room=triangle(rows)), GrowingArray()
+        self._points = Points(cholesky, size, k, points)
+        self._k = k
+        self._ends = GrowingArray((2,), np.int64)
+        self._blocks = GrowingArray((2, k, k))
+        self._factor = GrowingArray(room=triangle(rows))
+        self._right = GrowingArray()
         # A' lambda at the first points; nothing pulls at those that came since. Empty: not known.
         self._pulled = np.zeros((0, k))
 
@@ -131,7 +134,8 @@ class BorderedSystem:
 
         """
         own = ends.index(self.keyframes)
-        parent, inverse = self._points.of(ends[1 - own]), np.linalg.inv(blocks[own])
+        parent = self._points.of(ends[1 - own])
+        inverse = np.linalg.inv(blocks[own])
         self._points.hang(parent, -inverse @ blocks[1 - own], -inverse @ residual,
                           inverse * noise @ inverse.T)
 
@@ -142,8 +146,10 @@ class BorderedSystem:
         ends : the keyframes i and j, `FIXED` for none; blocks : (2, k, k); residual : r, (k,)
         """
         points = np.array([self._points.of(end) for end in ends])
-        rows, expected = np.empty((self._k, self.rows)), residual.copy()
-        covariance, now = np.empty((self._k, self._k)), self._now
+        rows = np.empty((self._k, self.rows))
+        expected = residual.copy()
+        covariance = np.empty((self._k, self._k))
+        now = self._now
         kernels.border.predict(
             self._points.covariance, self._points.mean, now.ends, now.blocks, now.factor,
             now.right, points, blocks, rows, covariance, expected)
@@ -174,7 +180,8 @@ class BorderedSystem:
 
         keyframe, other : `FIXED` for none; turn : (k, k)
         """
-        before, blocks = self.points, np.stack((np.eye(self._k), -turn))
+        before = self.points
+        blocks = np.stack((np.eye(self._k), -turn))
         covariance = self.predict((keyframe, other), blocks, np.zeros(self._k)).covariance
         self.forget_unused(before)
         return covariance

@@ -52,7 +52,9 @@ _SURE = 1000.0
 # What comes then waits for the next map.
 MOST_ROWS, _MOST_POINTS = 1800, 1400
 # What to do with a factor: accept it; skip it, since the map has it or shall not have it; gate it.
-BELIEVE, SKIP, GATE = 1, 0, -1
+BELIEVE = 1
+SKIP = 0
+GATE = -1
 
 
 @dataclass(frozen=True)
@@ -138,10 +140,15 @@ class Front:
                  choleskys: tuple[BlockCholesky, BlockCholesky], variance: Array,
                  log_odds: float, rows: int, drift: float = 0.0):
         self._drift = drift
-        self.rows, self.taken, self.closed = rows, 0, False
-        self.pattern, self.variance = choleskys[L1].pattern, variance
-        self._manifold, self._fixed = part.manifold, anchor(part)
-        system, k = linearise(part, poses[L1]), part.manifold.TANGENT_SIZE
+        self.rows = rows
+        self.taken = 0
+        self.closed = False
+        self.pattern = choleskys[L1].pattern
+        self.variance = variance
+        self._manifold = part.manifold
+        self._fixed = anchor(part)
+        system = linearise(part, poses[L1])
+        k = part.manifold.TANGENT_SIZE
         # What a square stays below, and the log ratio but for what hangs on the factor.
         self._limit = float(chi2_quantile(1 - _REFUSED, np.array([k]))[0])
         self._volume = (float(claimed_volume(part.manifold, poses[L1]).sum())
@@ -189,7 +196,8 @@ class Front:
 
         seen_from : relative to this keyframe, None: to what the map is held by
         """
-        turn, other = np.zeros((len(self._usual),) * 2), FIXED
+        turn = np.zeros((len(self._usual),) * 2)
+        other = FIXED
         if seen_from is not None:
             here, there = self.poses_of(np.array([keyframe, seen_from]))[:, None]
             turn = self._manifold.adjoint(self._manifold.between(here, there))[0]
@@ -255,7 +263,8 @@ class Front:
                 l2.begin(*new.of(L2, at), self._variance[0])
                 l1.begin(*new.of(L1, at), self._usual)
                 return Look(True, False, 0.0)
-            variance, predicted = self._variance[1], l2.predict(*new.of(L2, at))
+            variance = self._variance[1]
+            predicted = l2.predict(*new.of(L2, at))
             look, left = self._gate(predicted, own, variance, what == BELIEVE)
             if look.accepted:
                 l2.add(predicted, variance)
@@ -310,7 +319,8 @@ class Front:
         first, steps, poses = self._moved(pairs.T.ravel())
         p, k = first.shape[2], steps.shape[2]
         # Of each factor in both maps: Jacobians at the first poses, residuals at those of now.
-        Z, root = np.repeat(Z, 2, axis=0), root[:, None]
+        Z = np.repeat(Z, 2, axis=0)
+        root = root[:, None]
         J = manifold.residual_jacobians(Z, *first.reshape(2, -1, p)).reshape(-1, 2, 2, k, k)
         e = manifold.residual(Z, *poses.reshape(2, -1, p)).reshape(-1, 2, k)
         blocks = root[:, None] @ J

@@ -57,7 +57,8 @@ class PointsNow:
 
     def steps(self, gradient: Array) -> Array:
         """Return m + C g of all keyframes, old and new, (n + b, k); gradient : g, (t, k)."""
-        gradient, (points, keyframes) = gradient.copy(), self.old
+        gradient = gradient.copy()
+        points, keyframes = self.old
         kernels.border.pull_parents(self.parent, self.turn, gradient)
         right = np.zeros((self.size, gradient.shape[1]))
         right[keyframes] = gradient[points]

@@ -110,7 +110,8 @@ class BuilderState:
     @staticmethod
     def of_graph(graph: FactorGraph, poses: Array, stamps: Indices) -> 'BuilderState':
         """Return that of a graph alone, whose odometry went from pose to pose (n, p)."""
-        d, none = graph.manifold.TANGENT_SIZE, np.zeros((0, 2), np.int64)
+        d = graph.manifold.TANGENT_SIZE
+        none = np.zeros((0, 2), np.int64)
         loops = np.flatnonzero(~graph.between.is_odometry)
         ends = np.sort(stamps[graph.between.pairs[loops]], axis=1)
         struck = np.sort(graph.between.pairs[graph.between.struck], axis=1)

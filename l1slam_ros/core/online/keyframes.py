@@ -197,7 +197,8 @@ class KeyframeMotion:
         """Replace the covariances of all messages so far by their sum."""
         end = self._poses[-1]
         total = self._seen_from(end)
-        self._poses, self._stated = [end], None if total is None else [total.sum(axis=0)]
+        self._poses = [end]
+        self._stated = None if total is None else [total.sum(axis=0)]
 
     def is_keyframe(self, options: KeyframeOptions) -> bool:
         """Tell whether the motion passes any threshold that is on."""

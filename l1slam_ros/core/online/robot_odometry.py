@@ -60,7 +60,8 @@ class GrowingGraph:
 
     def begin(self, graph: FactorGraph) -> None:
         """Begin with a graph, of which no keyframe is known yet."""
-        self.graph, self.tracks = graph, Tracks(graph.manifold)
+        self.graph = graph
+        self.tracks = Tracks(graph.manifold)
         for begin in self.members:
             begin()
 
@@ -110,12 +111,14 @@ class RobotOdometry:
         self._resumed = False
         self.track = OdometryTrack(self.manifold)
         self._shared.tracks.add(self._robot, self.track)
-        self.offset, self._level = self.manifold.identity(1), Level(self.manifold)
+        self.offset = self.manifold.identity(1)
+        self._level = Level(self.manifold)
         self._moved, self._glued = False, True
 
     def add(self, sample: OdometrySample) -> bool:
         """See `GraphBuilder.add_odometry`."""
-        ignore, track = self._shared.options.on_time_jump == 'ignore', self.track
+        ignore = self._shared.options.on_time_jump == 'ignore'
+        track = self.track
         if ignore and not self._glued and sample.stamp <= track.last_stamp:
             raise MessageError('old_stamp', f'odometry stamp {sample.stamp} ns is not after the '
                                f'last one, {track.last_stamp} ns')
@@ -171,7 +174,9 @@ class RobotOdometry:
             self._glued = False  # the odometry begins again
         elif point.anew:
             self._shared.forget()
-        on_gap, pose, manifold = self._shared.options.on_time_jump, point.pose, self.manifold
+        on_gap = self._shared.options.on_time_jump
+        pose = point.pose
+        manifold = self.manifold
         goes_on = self._glued or self.track.goes_on(point.stamp, pose, self.offset)
         gap = self._gap(point, goes_on)
         if gap:
@@ -207,7 +212,8 @@ class RobotOdometry:
 
     def _go_on(self, point: Point, pose: Array) -> None:
         """Continue to a sample at `pose` (1, p); where that makes a keyframe, add its factor."""
-        unseen, turned = None, min(UNSEEN_TURN * point.seconds, math.pi)
+        unseen = None
+        turned = min(UNSEEN_TURN * point.seconds, math.pi)
         if point.gap or point.unsure:
             unseen = point.unseen, turned
         if point.unsure:

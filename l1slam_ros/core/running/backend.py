@@ -106,7 +106,8 @@ class Backend:
         require(int, 'dimension', dimension, '2 or 3')
         if dimension not in _MANIFOLDS:
             raise OptionError(f'dimension is {dimension!r}, expected 2 or 3')
-        self.manifold, self.options = _MANIFOLDS[dimension], options
+        self.manifold = _MANIFOLDS[dimension]
+        self.options = options
         self.base_frame_of = cache(lambda _: BaseFrame(options.base_frame))
         self.base_frame = self.base_frame_of(0)
         self._keeper = Keeper(_builder(self), options.solver, options.robust.enabled)
@@ -277,7 +278,8 @@ class Backend:
     def counts(self) -> Counts:
         """Return how large the graph is, and what was noted of messages."""
         with self._keeper.reading() as builder:
-            revision, notes = self.revisions.now, builder.notes
+            revision = self.revisions.now
+            notes = builder.notes
             refused, told = dict(notes.refused), dict(notes.told)
         if self._counted[0] != revision:
             self._counted = revision, self.snapshot().sizes()

@@ -145,8 +145,10 @@ class FactorTable:
         proved : a bound was proved of the map
 
         """
-        size, begun = len(made.accepted), end - len(looks)
-        said, seen = _rows(made, FRONT), _rows_of_looks(looks)
+        size = len(made.accepted)
+        begun = end - len(looks)
+        said = _rows(made, FRONT)
+        seen = _rows_of_looks(looks)
         said['noise'] = np.nan
         said['said_by'][end:] = NOBODY
         among = slice(begun, min(size, end))

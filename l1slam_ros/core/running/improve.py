@@ -113,7 +113,8 @@ class Improvement:
     def of_all(self, problem: Problem) -> 'Improvement':
         """Return what was made of `as_one(problem)`, for the factors of the problem."""
         graph = problem.graph
-        rows, d = graph.not_struck, graph.manifold.TANGENT_SIZE
+        rows = graph.not_struck
+        d = graph.manifold.TANGENT_SIZE
         dual = np.zeros((len(graph.between), d))
         dual[rows] = self.dual.reshape(-1, d)[:len(rows)]
         return replace(self, dual=dual.ravel(), judgement=self.judgement.of_all(graph))
@@ -140,14 +141,18 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
     out of it. Second, Algorithm 4 from the kept dual.
     """
     start = time.monotonic()
-    graph, method, deadline = problem.part, problem.method, start + budget
+    graph = problem.part
+    method = problem.method
+    deadline = start + budget
     poses, residual, before = _nearest(problem)
     if exact and problem.is_sparse:
         solution, _ = minimise_by(method, graph, poses, options, lambda *_: check())
         return _improvement(solution, problem, problem.judgement, before, 0, start)
-    dual, cost = _dual_of(problem, residual), l1_cost(residual)
+    dual = _dual_of(problem, residual)
+    cost = l1_cost(residual)
     exactly = fits_exactly(cost, len(dual))
-    steps, far = 0, not exactly and is_far(cost, problem.last_cost)
+    steps = 0
+    far = not exactly and is_far(cost, problem.last_cost)
     mu = _SMOOTHING if far else _SHARPEST
     while method.cholesky and not exactly and (
             not steps or (far and time.monotonic() < deadline)):
@@ -161,8 +166,13 @@ def improve(problem: Problem, options: OptimiserOptions, budget: float,
                 moved, after = backtrack(graph, poses, residual, step)
         except GraphError:  # sharper weights are beyond double precision
             break
-        previous, poses, residual, cost = cost, moved, after, l1_cost(after)
-        steps, mu, far = steps + 1, max(_SHARPER * mu, _SHARPEST), is_far(previous, cost)
+        previous = cost
+        poses = moved
+        residual = after
+        cost = l1_cost(after)
+        steps = steps + 1
+        mu = max(_SHARPER * mu, _SHARPEST)
+        far = is_far(previous, cost)
     solution = minimise(graph, poses, options, method.cholesky if steps else None, dual, deadline,
                         lambda *_: check())
     return _improvement(solution, problem, problem.judgement, before, steps, start)

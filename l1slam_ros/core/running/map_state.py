@@ -173,7 +173,8 @@ class MapState:
         """Return the state once the front has taken some factors, which it looked at."""
         # At what it takes again nobody else looks.
         new = looks[max(self.table.looked - (carried.rows - len(looks)), 0):]
-        judged, wanted = self.judged, any(look.suspect for look in new)
+        judged = self.judged
+        wanted = any(look.suspect for look in new)
         if wanted and not judged.wanted:
             judged = replace(judged, wanted=True)
         return replace(self, table=self.table.with_looks(new), carried=carried, judged=judged)
@@ -220,7 +221,8 @@ class MapState:
         tolerance : see `OptimiserOptions.outer_tolerance`
 
         """
-        after, made = self, improvement.judgement
+        after = self
+        made = improvement.judgement
         if pending is not None:
             after = self._committed(pending, factors)
             after = replace(after, pending=None if self.pending is pending else self.pending)
@@ -244,7 +246,8 @@ class MapState:
 
     def account(self, loops: int, seconds: float) -> Improvement:
         """Return the account of the last map for an update that took so many seconds."""
-        settled, last = self.all_judged(loops), self.last
+        settled = self.all_judged(loops)
+        last = self.last
         if last is None:
             judgement = replace(self.table.judgement(self.of_all), settled=settled)
             return Improvement(self.began, self.optimised.poses, self.optimised.dual, judgement,

@@ -67,5 +67,6 @@ class MapToOdom:
 
     def moved(self, robot: RobotOdometry) -> tuple[Array, Array]:
         """Return the transform as it was when this was asked before, and as it is now."""
-        (before, after), self._moved = self._moved or 2 * (self.now(robot),), None
+        before, after = self._moved or 2 * (self.now(robot),)
+        self._moved = None
         return before, after

@@ -92,7 +92,8 @@ def as_one(problem: Problem) -> Problem:
     stood in the last map that was solved for: what came since may have bent them.
     """
     graph, judgement = problem.graph, problem.judgement
-    rows, d = graph.not_struck, graph.manifold.TANGENT_SIZE
+    rows = graph.not_struck
+    d = graph.manifold.TANGENT_SIZE
     firsts = graph.firsts
     g = len(firsts)
     if not g and len(rows) == len(graph.between):
@@ -119,7 +120,8 @@ def by_robot(problem: Problem) -> tuple[Problem, Indices]:
     if (np.diff(order) == 1).all():
         return problem, order
     place = np.argsort(order)
-    whole, factors = FactorGraph(graph.manifold, len(order)), graph.between
+    whole = FactorGraph(graph.manifold, len(order))
+    factors = graph.between
     give_to(whole, graph.robot[order])
     before = graph.predecessor[order]
     whole.follow(np.arange(len(order)), np.where(before < 0, before, place[before]))
@@ -186,7 +188,8 @@ def _tree_of_ties(i: Indices, j: Indices, within: Mask, n: int) -> Indices:
 
 def _tied(graph: FactorGraph, poses: Array, firsts: Indices) -> FactorGraph:
     """Return the graph with the first keyframes of parts tied to others; poses : (n, p)."""
-    manifold, d = graph.manifold, graph.manifold.TANGENT_SIZE
+    manifold = graph.manifold
+    d = graph.manifold.TANGENT_SIZE
     extent = float(np.ptp(manifold.positions(poses), axis=0).max()) if len(poses) else 0.0
     sigma = sigmas(manifold, 1.0 + extent, _HEADING)
     others = ends_before(graph)

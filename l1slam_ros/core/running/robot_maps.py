@@ -120,7 +120,8 @@ def map_ends(seen: Seen, poses: Array, front: Front | None, accepted: Mask) -> d
     """
     known = front.keyframes if front else len(poses)
     pose = front.poses_of if front else poses.__getitem__
-    maps, ends = seen.maps(known, accepted, pose), {}
+    maps = seen.maps(known, accepted, pose)
+    ends = {}
     lasts = {robot: int(np.searchsorted(numbers, known)) - 1
              for robot, numbers in seen.numbers.items()}
     lasts = {robot: last for robot, last in lasts.items() if last >= 0}
@@ -128,7 +129,8 @@ def map_ends(seen: Seen, poses: Array, front: Front | None, accepted: Mask) -> d
         return {}
     poses = pose(np.array([seen.numbers[robot][last] for robot, last in lasts.items()]))
     for row, (robot, last) in enumerate(lasts.items()):
-        (joined, turn), at = maps.get(robot, RobotMap(True, None)), poses[row:row + 1]
+        joined, turn = maps.get(robot, RobotMap(True, None))
+        at = poses[row:row + 1]
         ends[robot] = Newest(
             last, at if turn is None else seen.manifold.compose(turn, at), joined)
     return ends
@@ -137,8 +139,11 @@ def map_ends(seen: Seen, poses: Array, front: Front | None, accepted: Mask) -> d
 def _joined(robot: Indices, numbers: Indices, factors: BetweenFactors,
             accepted: Mask) -> tuple[Mask, int | None]:
     """Return which robots are joined to the first one, (r,), or the world: then None, else it."""
-    rows, r = np.flatnonzero(accepted), len(numbers)
-    i, j, place = factors.i[rows], factors.j[rows], np.searchsorted(numbers, robot)
+    rows = np.flatnonzero(accepted)
+    r = len(numbers)
+    i = factors.i[rows]
+    j = factors.j[rows]
+    place = np.searchsorted(numbers, robot)
     # Thousands of factors, but few pairs of robots; the world comes after them.
     pairs = np.flatnonzero(np.bincount(np.where(i == WORLD, r, place[i]) * r + place[j]))
     one, other = np.divmod(pairs, r)

@@ -118,7 +118,8 @@ class Behind:
     @staticmethod
     def of(state: MapState, loops: int, now: float, failing: bool) -> 'Behind':
         """Return what goes on behind a state, with so many loops in the graph."""
-        carried, holds = state.carried, state.table.is_proof_of_accepted
+        carried = state.carried
+        holds = state.table.is_proof_of_accepted
         waiting = 0 if state.all_judged(loops) else loops - max(state.judged.loops, 0)
         return Behind(
             now - state.made if carried else np.nan, carried.border if carried else 0, waiting,
@@ -165,7 +166,8 @@ class Snapshot:
     @cached_property
     def robot_maps(self) -> dict[int, RobotMap]:
         """The map that each robot is in, by its number."""
-        graph, (_, firsts) = self.graph, np.unique(self.graph.robot, return_index=True)
+        graph = self.graph
+        _, firsts = np.unique(self.graph.robot, return_index=True)
         return robot_maps(graph.manifold, graph.robot, firsts, graph.between,
                           self.judgement.accepted,
                           lambda keyframes: self.odometry[keyframes],
@@ -174,7 +176,8 @@ class Snapshot:
     def poses_in_map(self, robot: int) -> tuple[Indices, Array]:
         """Return the keyframes of a robot, (k,), and where they are in its map, (k, p)."""
         keyframes = np.flatnonzero(self.graph.robot == robot)
-        poses, turn = self.poses[keyframes], self.robot_maps.get(robot, RobotMap(True, None)).turn
+        poses = self.poses[keyframes]
+        turn = self.robot_maps.get(robot, RobotMap(True, None)).turn
         return keyframes, poses if turn is None else self.graph.manifold.compose(turn, poses)
 
     @property
@@ -192,7 +195,8 @@ class Snapshot:
         Each follows the last of its predecessors that is known; the first of a part the end of
         the one of its robot before, or of none of its robot the last keyframe that is known.
         """
-        manifold, known = self.graph.manifold, len(poses)
+        manifold = self.graph.manifold
+        known = len(poses)
         if not known or known == len(others):
             return np.concatenate((poses, others[known:]))
         before, firsts = self.graph.parent, self.graph.firsts
@@ -228,7 +232,8 @@ class Snapshot:
 
     def problem(self) -> Problem:
         """Return what an update begins with: the graph, and the warm start for all of it."""
-        state, last = self.state, self.state.optimised
+        state = self.state
+        last = self.state.optimised
         rows = len(self.graph.between) * self.graph.manifold.TANGENT_SIZE
         # Rows are only ever appended, so the dual of the old ones stays; new ones start at zero.
         dual = np.concatenate((last.dual, np.zeros(rows - len(last.dual))))
@@ -246,7 +251,8 @@ class Snapshot:
 
     def optimised(self) -> Optimised:
         """Return the map that was solved for, grown to all keyframes and factors there are."""
-        problem, last = self.problem(), self.state.optimised
+        problem = self.problem()
+        last = self.state.optimised
         same = len(last.poses) == len(problem.poses) and len(last.dual) == len(problem.dual)
         grown = replace(last, poses=problem.poses, dual=problem.dual)
         return grown if same else replace(grown.unfinished(), quiet_updates=0)

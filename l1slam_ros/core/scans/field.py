@@ -69,7 +69,8 @@ class Field:
         """
         levels = [np.pad(self.likelihood, ((WIDTH, 1), (WIDTH, 1)))]
         for level in range(_HEIGHT):
-            half, last = 1 << level, levels[-1].copy()
+            half = 1 << level
+            last = levels[-1].copy()
             last[:-half] = np.maximum(last[:-half], last[half:])
             last[:, :-half] = np.maximum(last[:, :-half], last[:, half:])
             levels.append(last)

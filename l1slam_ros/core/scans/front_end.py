@@ -78,7 +78,9 @@ class ScanFrontEnd:
 
     def begin_drive(self, mount: Mount) -> None:
         """Let the next scan be the first of another drive, by a laser mounted like this."""
-        self._mount, self._velocity, self._last = mount, None, None
+        self._mount = mount
+        self._velocity = None
+        self._last = None
         self._odometry.end_drive()
 
     def place(self, poses: Array, spread: Array) -> None:

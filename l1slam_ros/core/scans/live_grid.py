@@ -45,7 +45,8 @@ class LiveGrid:
         self._log_odds = np.zeros((0, 0), np.float32)
         self._origin = np.zeros(2)
         # What is drawn: lowest and highest corner [m], and of each keyframe where.
-        self._low, self._high = np.full(2, np.inf), np.full(2, -np.inf)
+        self._low = np.full(2, np.inf)
+        self._high = np.full(2, -np.inf)
         self._drawn: dict[int, tuple[Points, Array]] = {}
 
     def __len__(self) -> int:
@@ -99,7 +100,8 @@ class LiveGrid:
         # Whole cells from the origin before, so that what is drawn stays in its cells.
         first = np.floor((self._low - _MARGIN - self._origin) / self._resolution).astype(int)
         last = np.ceil((self._high + _MARGIN - self._origin) / self._resolution).astype(int)
-        before, at = self._log_odds, -first
+        before = self._log_odds
+        at = -first
         self._log_odds = np.zeros(tuple(last - first), np.float32)
         if before.size:
             self._log_odds[at[0] : at[0] + before.shape[0],

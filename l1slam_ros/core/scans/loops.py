@@ -119,7 +119,8 @@ class LoopFinder:
 
     def due(self) -> Indices:
         """Return the keyframes that may ask now: their submaps are whole."""
-        first, end = self._asked, len(self._keyframes) - AROUND
+        first = self._asked
+        end = len(self._keyframes) - AROUND
         if end <= first:
             return np.zeros(0, np.int64)
         self._asked = end

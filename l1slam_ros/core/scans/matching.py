@@ -38,7 +38,9 @@ FINEST = 0.02
 # of the odometry: the squared error of a step, over its variance, is 1 in x, y and heading.
 KAPPA = 1.5
 # [m] Points farther than this do not match: by rounds, narrower each time.
-_WIDEST, _NARROWEST, _SHRINK = REACH, 0.15, 0.75
+_WIDEST = REACH
+_NARROWEST = 0.15
+_SHRINK = 0.75
 _MOST_ITERATIONS = 20
 # [m], [rad] A step that is no step any more.
 _STILL = 1e-4
@@ -72,8 +74,10 @@ def match(field: Field, xy: Array, normals: Array, start: Array, prior: Array | 
     """
     W = np.zeros((3, 3)) if prior_information is None else prior_information
     prior = start if prior is None else prior
-    pose, gate = start.astype(float), widest
-    H, sums = np.zeros((3, 3)), np.zeros(11)
+    pose = start.astype(float)
+    gate = widest
+    H = np.zeros((3, 3))
+    sums = np.zeros(11)
     for _ in range(_MOST_ITERATIONS):
         H, g, sums = _sums(field, xy, normals, pose, gate)
         expected = se2.between(prior[None], pose[None])[0]

@@ -52,14 +52,17 @@ _NEAR_PEAK = np.diag(1 / np.array((0.2, 0.2, 0.1)) ** 2)
 _SEARCHED = np.diag((0.1, 0.1, 0.05)) ** 2
 # Fewer points say nothing about where the robot is; so many scans in a row without a match, on so
 # much of a way and turns [m + rad], say that it is somewhere else.
-_FEWEST, _LOST_AFTER, _LOST_WAY = 30, 6, 1.0
+_FEWEST = 30
+_LOST_AFTER = 6
+_LOST_WAY = 1.0
 # Wheels: part of the way and of the turn, turn for each metre, and of each scan [m, rad].
 _WAY, _TURN, _TURN_OF_WAY, _STEP, _STEP_TURN = 0.3, 0.2, 0.3, 0.01, 0.01
 # [m] So far from where it is said to be a laser may sit: what it moves when the robot turns.
 _ASIDE = 0.1
 # After scans and wheels disagreed, for so many scans the wheels may be wrong by twice their
 # motion: where a driver loses the sign of wheels that turn backwards, it does for a while.
-_DISTRUST, _WRONG = 25, 2.0
+_DISTRUST = 25
+_WRONG = 2.0
 # Errors of a match that no count of points lessens, of the map and of normals: ahead, to the
 # left [m, m, rad]. Found by simulation; see `matching.KAPPA`.
 FLOOR = np.diag((0.003, 0.002, 0.0002)) ** 2
@@ -136,14 +139,17 @@ class ScanOdometry:
         if self._distrusted and off @ np.linalg.solve(trusted, off) > _GATE:
             self._distrusted = _DISTRUST
         if self._unmatched >= _LOST_AFTER and self._blind.sum() >= _LOST_WAY:
-            self._unmatched, self._blind = 0, np.zeros(2)
+            self._unmatched = 0
+            self._blind = np.zeros(2)
             return self._begin(stamp, points, 'the scans show nothing known any more; a new part '
                                'of the map begins')
         return self._step(stamp, points, said)
 
     def end_drive(self) -> None:
         """Let the next scan be the first of another drive: a part of its own."""
-        self._wheels, self._unmatched, self._distrusted = None, 0, 0
+        self._wheels = None
+        self._unmatched = 0
+        self._distrusted = 0
         self._blind = np.zeros(2)
 
     def _follow(self, expected: Array, predicted: Array, points: Points) -> str:
@@ -182,7 +188,8 @@ class ScanOdometry:
 
     def _take(self, pose: Array, covariance: Array) -> None:
         """Believe that the robot is at a pose of the map."""
-        self._unmatched, self._blind = 0, np.zeros(2)
+        self._unmatched = 0
+        self._blind = np.zeros(2)
         self._known = self._pose = pose
         self._covariance = covariance
 
@@ -234,9 +241,12 @@ class ScanOdometry:
         return Step(self._pose, keyframe, covariance, said)
 
     def _begin(self, stamp: int, points: Points, said: str = '') -> Step:
-        part, travelled, self._known = 0, 0.0, self._pose
+        part = 0
+        travelled = 0.0
+        self._known = self._pose
         if self.keyframes:
-            part, travelled = self.keyframes[-1].part + 1, self.keyframes[-1].travelled
+            part = self.keyframes[-1].part + 1
+            travelled = self.keyframes[-1].travelled
         self._keep(Keyframe(stamp, self._pose, points, part, travelled))
         keyframe = self.keyframes[-1]
         return Step(self._pose, keyframe, FLOOR, said)
@@ -254,7 +264,8 @@ class ScanOdometry:
 
 def wheel_covariance(motion: Array) -> Array:
     """Return the covariance of a motion (3,) of the wheels, (3, 3) in the axes of its end."""
-    way, turn = float(np.hypot(motion[0], motion[1])), abs(float(motion[2]))
+    way = float(np.hypot(motion[0], motion[1]))
+    turn = abs(float(motion[2]))
     along = (_WAY * way) ** 2 + (_ASIDE * turn) ** 2 + _STEP**2
     heading = (_TURN * turn) ** 2 + (_TURN_OF_WAY * way) ** 2 + _STEP_TURN**2
     return np.diag((along, along, heading))

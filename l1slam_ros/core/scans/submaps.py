@@ -30,7 +30,9 @@ _KEPT = 24
 # [m] A ray that passes a point by so much contradicts it.
 _PAST = 0.3
 # Rings and sectors of a descriptor, and how far it sees [m].
-_RINGS, _SECTORS, _SIGHT = 12, 60, 12.0
+_RINGS = 12
+_SECTORS = 60
+_SIGHT = 12.0
 # Numbers of a descriptor.
 LOOKS = _RINGS * (_SECTORS // 2 + 1)
 

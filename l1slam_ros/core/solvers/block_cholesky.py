@@ -67,7 +67,9 @@ _NUMBER, _BYTES_PER_ENTRY = 8, 190
 # entry; how many factorisations it needs, and how many multiplications a second has: measured from
 # 25,000 to 200,000 keyframes on a core of the machine of doc/performance.md; at 1,000,000 it takes
 # 1.4 times as long, and 1.1 times the memory.
-_SECONDS_PER_ENTRY, _FACTORISATIONS, _RATE = 6e-6, 45, 1e10
+_SECONDS_PER_ENTRY = 6e-6
+_FACTORISATIONS = 45
+_RATE = 1e10
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,8 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
 
 def needs(graph: FactorGraph, blocks: float, work: float) -> memory.Needs:
     """Predict the needs of a graph from the blocks and the work of its factor."""
-    k, m = graph.manifold.TANGENT_SIZE, len(graph.between)
+    k = graph.manifold.TANGENT_SIZE
+    m = len(graph.between)
     return memory.Needs(blocks * _bytes_of_block(graph) + _BYTES_PER_ENTRY * k**2 * m,
                         _SECONDS_PER_ENTRY * k**2 * m + _FACTORISATIONS * work * k**3 / _RATE)
 
@@ -237,10 +240,12 @@ class BlockCholesky:
 
     def _factorise(self, layout: '_Layout') -> int:
         """Return how many positions have a positive pivot before the first that has not."""
-        pattern, shared = self.pattern, self.pattern.work * len(layout.size) ** 3 > _SHARED
+        pattern = self.pattern
+        shared = self.pattern.work * len(layout.size) ** 3 > _SHARED
         count = len(pattern.first) - 1
         shares = pattern.halves if shared else np.zeros(count, np.int8)
-        lists, reach = np.full((2, count), -1, np.int32), np.zeros(count, np.int64)
+        lists = np.full((2, count), -1, np.int32)
+        reach = np.zeros(count, np.int64)
 
         def share(mine: int) -> int:
             return kernels.cholesky.factorise(
@@ -273,7 +278,8 @@ class BlockCholesky:
         at : (t,) the place of each in the order of elimination, -1 for none; parent, turn : see
         `kernels.border`
         """
-        layout, product = self._last, np.empty((len(at), *turn.shape[1:]))
+        layout = self._last
+        product = np.empty((len(at), *turn.shape[1:]))
         kernels.border.reach(layout.panels, *layout.shape, self.pattern.owner, at, parent, turn,
                              product)
         return product

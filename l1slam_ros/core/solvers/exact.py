@@ -33,7 +33,8 @@ _ROUGH_L2 = LeastSquaresOptions(iterations=30, tolerance=1e-3)
 _PROVEN = 1e-2
 # Of the dual at the end: most projections to make it feasible (each costs a solution, none a
 # factorisation), and the part of the cost that is a gap small enough.
-_PROJECTIONS, _CLOSE = 10, 1e-4
+_PROJECTIONS = 10
+_CLOSE = 1e-4
 # A row at its bound still gives way a little, or there might be no feasible dual nearby. With a
 # tenth of it the proof misses by percents on the torus in space; in the plane it costs nothing.
 _LEAST_WEIGHT = 1e-2
@@ -99,7 +100,8 @@ def feasible_dual(system: LinearSystem, y: Array, slack: Array, norm: Norm,
 
     norm : L1 or group L1
     """
-    residual, slack = -system.b, np.maximum(slack, _LEAST_WEIGHT)
+    residual = -system.b
+    slack = np.maximum(slack, _LEAST_WEIGHT)
     cost = norm.cost(residual)
     if not cholesky.factorise(system, slack):
         return np.zeros_like(y), cost

@@ -124,12 +124,16 @@ def _descend(
     linear problem by no more than this
     """
     history = [here.cost]
-    status, damping, solved = Status.ITERATION_LIMIT, 0.0, None
+    status = Status.ITERATION_LIMIT
+    damping = 0.0
+    solved = None
     while len(history) <= options.iterations:
         if fits_exactly(l1_cost(here.residual), len(here.residual)):
             status = Status.CONVERGED
             break
-        little, full, free = options.tolerance * here.cost, damping <= _HARDLY, not damping
+        little = options.tolerance * here.cost
+        full = damping <= _HARDLY
+        free = not damping
         there, predicted, solved = _stepped(graph, here, norm, cholesky, damping, little)
         decrease = here.cost - there.cost
         if decrease >= 0:
@@ -158,10 +162,12 @@ def _stepped(graph: FactorGraph, here: _At, norm: SmoothNorm, cholesky: BlockCho
 
     little : a promise of no more is not looked at any closer
     """
-    system, weights = linearise(graph, here.poses, here.residual), norm.weights(here.residual)
+    system = linearise(graph, here.poses, here.residual)
+    weights = norm.weights(here.residual)
     step = weighted_least_squares(system, cholesky, weights, damping)
     predicted = float((step * system.transposed_times(weights * system.b)).sum())
-    there, translated = _at(graph, step_poses(graph, here.poses, step), norm), False
+    there = _at(graph, step_poses(graph, here.poses, step), norm)
+    translated = False
     is_short = here.cost - there.cost < _BRINGS * predicted
     if predicted > little and np.isfinite(there.cost) and is_short:
         there, translated = _nearer(graph, here, there, step, predicted, norm, cholesky)

@@ -168,7 +168,8 @@ class Curvature:
     def factorise(self, system: LinearSystem, weights: Array, C: Array | None,
                   cholesky: BlockCholesky) -> bool:
         """Factor J'QJ + kappa C, with less of C while it is not definite; False: it never is."""
-        wanted, self._kappa = self._kappa, _NEXT * self._kappa
+        wanted = self._kappa
+        self._kappa = _NEXT * self._kappa
         for share in (1.0, _REFUSED, 0.0):
             if cholesky.factorise(system, weights, 0.0, C, share * wanted):
                 if share == 1:
@@ -196,8 +197,11 @@ def interior_point(
 
     """
     at = _start(problem, poses)
-    costs, best, curvature = [l1_cost(at.residual)], at, Curvature()
-    status, worst = Status.ITERATION_LIMIT, 1 + tolerance
+    costs = [l1_cost(at.residual)]
+    best = at
+    curvature = Curvature()
+    status = Status.ITERATION_LIMIT
+    worst = 1 + tolerance
     for iteration in range(iterations + 1):
         cost = l1_cost(at.residual)
         if at.check_termination(cost, tolerance) or fits_exactly(cost, len(at.y)):
@@ -285,7 +289,8 @@ def _centrality_corrector_rhs(direction: _Direction, rhs: _Products, mu: float) 
     Meant to become c1 and c2, they end as c1 - du dy and c2 + dv dy. Of those far too large no
     more is taken than the most they may be, or they would rule the step.
     """
-    least, most = _ALIKE * mu, mu / _ALIKE
+    least = _ALIKE * mu
+    most = mu / _ALIKE
     ends = rhs[0] - direction.u * direction.y, rhs[1] + direction.v * direction.y
     wanted = []
     for c, end in zip(rhs, ends, strict=True):
@@ -318,14 +323,19 @@ def _line_search(problem: L1Problem, at: _Iterate,
     Each pose moves by itself, until such a step is refused for once: to second order that tears a
     long way. From then on poses may move along the way as well, whichever costs less.
     """
-    length, allowed = direction.primal, _DEPARTURE * at.gap
+    length = direction.primal
+    allowed = _DEPARTURE * at.gap
     while True:
-        linear, best = at.residual + length * direction.residual, np.inf
+        linear = at.residual + length * direction.residual
+        best = np.inf
         for step in problem.step, problem.step_along:
             moved = step(at.poses, length * direction.x)
             after = problem.residual(moved)
             if not (cost := l1_cost(after)) > best:
-                best, poses, residual, departure = cost, moved, after, l1_cost(after - linear)
+                best = cost
+                poses = moved
+                residual = after
+                departure = l1_cost(after - linear)
             if not at.is_torn and departure <= allowed:
                 break
             at.is_torn = True

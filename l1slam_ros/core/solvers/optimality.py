@@ -249,7 +249,9 @@ class Mixed:
 
     def smoothed(self, e: Array, y: Array, mu: float) -> Smoothed:
         """See `SmoothNorm`."""
-        gradient, curvature, cost = np.empty_like(e), np.empty((*e.shape, e.shape[1])), 0.0
+        gradient = np.empty_like(e)
+        curvature = np.empty((*e.shape, e.shape[1]))
+        cost = 0.0
         for norm, own in self.parts:
             part, gradient[own], curvature[own] = norm.smoothed(e[own], y[own], mu)
             cost += part

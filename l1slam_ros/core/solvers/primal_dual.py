@@ -150,7 +150,8 @@ def minimise_l1(
     """
     tau, sigma = diagonal_step_sizes(A)
     omega = primal_weight(A, b, x)
-    tau, sigma = tau / omega, sigma * omega
+    tau = tau / omega
+    sigma = sigma * omega
     sigma = np.repeat(sigma.reshape(-1, norm.size).min(axis=1), norm.size)
     sigma_b = sigma * b
     iterates = primal_dual(A, lambda v: norm.resolvent(v - sigma_b, sigma), lambda v: v,

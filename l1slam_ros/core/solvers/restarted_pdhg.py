@@ -106,7 +106,8 @@ def minimise_l1_halpern(
                                   np.array([(0.0, cost)]), weight or 1.0)
     run = _Run(system, x, y, weight)
     history = [(0.0, run.cost)]
-    done, status = 0, Status.ITERATION_LIMIT
+    done = 0
+    status = Status.ITERATION_LIMIT
     while done < options.iterations and status is Status.ITERATION_LIMIT:
         count = min(CHECK_EVERY, options.iterations - done)
         done += count
@@ -237,7 +238,8 @@ class _Run:
         """Let x of the loop count from the origin; return the cost there."""
         residual = self._system.times(self._origin) - self._system.b
         self._arrays.set_origin(residual)
-        self._since, self._residuals = 0, ()
+        self._since = 0
+        self._residuals = ()
         return l1_cost(residual)
 
     def _typical_weight(self, cost: float) -> float:

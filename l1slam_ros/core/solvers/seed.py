@@ -103,10 +103,14 @@ def chordal_poses(graph: FactorGraph, cholesky: BlockCholesky) -> Array | None:
     The rows r of the matrices R are found each by the same system, r_j = Z_ij' r_i of each factor,
     as sure as it is of its rotation. None: that is singular.
     """
-    manifold, factors, fixed = graph.manifold, graph.between, anchor(graph)
+    manifold = graph.manifold
+    factors = graph.between
+    fixed = anchor(graph)
     part = manifold.ROTATION
     Z_t = np.swapaxes(manifold.rotation(factors.measurement), 1, 2)
-    m, k, size = len(factors), Z_t.shape[1], graph.n_poses - fixed
+    m = len(factors)
+    k = Z_t.shape[1]
+    size = graph.n_poses - fixed
     blocks = np.empty((m, 2, k, k))
     blocks[:, 0], blocks[:, 1] = -Z_t, np.eye(k)
     keyframe = keyframes_of(graph, fixed)
@@ -179,7 +183,8 @@ def _minimise(system: LinearSystem, cholesky: BlockCholesky | None,
 
 def _unwrap_alike(graph: FactorGraph, poses: Array, others: Array) -> bool:
     """Tell whether the rotation problems at two sets of poses are one and the same."""
-    fixed, part = anchor(graph), graph.manifold.ROTATION
+    fixed = anchor(graph)
+    part = graph.manifold.ROTATION
     apart = graph.manifold.local(poses, others)[fixed:, part].ravel()
     system = rotation_system(graph, poses)
     return _is_same(system.times(apart) - system.b, _rotation_residual(graph, others))

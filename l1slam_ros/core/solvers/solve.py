@@ -35,7 +35,8 @@ GAUSS_NEWTON, PRIMAL_DUAL_NEWTON = 'gauss-newton', 'primal-dual-newton'
 # Seconds of the primal-dual method for a factor and entry of its Jacobian, some 14,000 passes over
 # the factors; on a large graph it takes more of them, as that is wider: so many times as often as
 # the keyframes beyond this number.
-_SECONDS_OF_PASSES, _WIDE = 1.6e-5, 50_000
+_SECONDS_OF_PASSES = 1.6e-5
+_WIDE = 50_000
 # Why a solver was chosen.
 _SPARSE = 'the graph is sparse'
 _DENSE = 'the graph is dense'

@@ -100,7 +100,8 @@ class _Taken:
 
     def mount(self) -> tuple[Mount, tuple[str, ...]]:
         """Return where the laser is on the robot, and what is to be said of it."""
-        pose, frame = se3.identity(1), self._frame
+        pose = se3.identity(1)
+        frame = self._frame
         for _ in self._transforms:
             if frame in (self._base, '') or frame not in self._transforms:
                 break

@@ -41,7 +41,9 @@ _OPEN: dict[str, Callable[[Path, str], Any]] = {'.bz2': bz2.open, '.gz': gzip.op
 # [m] CARMEN's laser says so, or more, where nothing is in range.
 _FAR = 80.0
 # Near the farthest range, and below it, of that range; so often at least a laser says one number.
-_TOP, _BELOW, _OFTEN = 0.98, 0.88, 20
+_TOP = 0.98
+_BELOW = 0.88
+_OFTEN = 20
 # [m], [rad] What a laser on a robot moves on it, by rounding and because its pose is older.
 _FIXED = np.array((0.05, 0.05, 0.05))
 # A longer line is no message of a laser.
@@ -129,7 +131,8 @@ def _farthest(scans: list[Scan]) -> float:
 
 def _lines(path: Path, damage: list[str]) -> Iterator[tuple[int, bytes]]:
     """Yield the lines with their numbers; what ends a file too early is told as damage."""
-    opened, number = _OPEN.get(path.suffix.lower(), Path.open), 0
+    opened = _OPEN.get(path.suffix.lower(), Path.open)
+    number = 0
     try:
         with opened(path, 'rb') as file:
             while line := file.readline(_LONGEST):
@@ -171,7 +174,8 @@ def _line(words: list[bytes], count: int, start: float, step: float, farthest: f
           after: int) -> _Line:
     """Return what a line says; words : from the ranges on; skipped, after : words around poses."""
     first = count + skipped
-    ranges, poses = np.array(words[:count], float), np.array(words[first : first + 6], float)
+    ranges = np.array(words[:count], float)
+    poses = np.array(words[first : first + 6], float)
     stamp = float(words[first + 6 + after])
     if count < 2 or len(poses) < 6 or not np.isfinite([*poses, stamp]).all():
         raise ValueError

@@ -37,7 +37,8 @@ def _set_forward(stamps: Indices) -> tuple[Indices, int]:
     """Return stamps by a clock that is never set back, and by how much it was [ns]."""
     steps: Indices = np.diff(stamps)
     usual = int(np.median(steps[steps > 0])) if (steps > 0).any() else _USUAL
-    found, last = stamps.copy(), 0
+    found = stamps.copy()
+    last = 0
     for at in (np.flatnonzero(steps < 0) + 1).tolist():
         # The line before may be the one that is wrong: what counts is how long all are behind.
         before = np.sort(found[last:at])[-2:]
@@ -58,7 +59,8 @@ def _not_falling(stamps: list[int]) -> Indices:
         at = bisect_right(lowest, stamp)
         before[k] = ends[at - 1] if at else -1
         ends[at : at + 1], lowest[at : at + 1] = [k], [stamp]
-    kept, k = [], ends[-1]
+    kept = []
+    k = ends[-1]
     while k >= 0:
         kept.append(k)
         k = before[k]

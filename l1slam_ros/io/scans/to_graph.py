@@ -72,7 +72,8 @@ def map_drives(drives: Iterable[tuple[Iterable[tuple[Scan, Array]], Mount]],
 
     drives : scans and mount of each; in the graph each is a robot, numbered from 0
     """
-    made, count = _Making(ScanFrontEnd(options)), 0
+    made = _Making(ScanFrontEnd(options))
+    count = 0
     for scans, mount in drives:
         made.begin_drive(mount)
         for scan, wheels in scans:
@@ -86,8 +87,10 @@ class _Making:
     """A graph that grows with the scans."""
 
     def __init__(self, front_end: ScanFrontEnd):
-        self.loops, self._drive = 0, -1
-        self._front_end, self._graph = front_end, FactorGraph(se2)
+        self.loops = 0
+        self._drive = -1
+        self._front_end = front_end
+        self._graph = FactorGraph(se2)
         self._mapped = 0  # loops in the map that the front end knows
         self._said: list[str] = []
         self._stamps: list[int] = []

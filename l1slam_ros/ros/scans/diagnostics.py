@@ -48,7 +48,8 @@ class ScanDiagnostics:
 
     def publish(self) -> None:
         """Publish one status."""
-        front_end, queue = self._front_end, self._front_end.queue
+        front_end = self._front_end
+        queue = self._front_end.queue
         lost = queue.counts.copy() + front_end.refused.copy()
         lately = lost - self._minute[0]
         self._minute.append(Counter(lost))

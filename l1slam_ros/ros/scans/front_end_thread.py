@@ -83,7 +83,9 @@ class RunOfScans:
         self._front_end = ScanFrontEnd(options, self._frames.mount or Mount())
         self._odometry = IncrementalOdometry(options.keyframe)
         self._placing = Placing()
-        self._path, self._read, self._news = b'', 0.0, False
+        self._path = b''
+        self._read = 0.0
+        self._news = False
         self._drawer.begin_anew()
 
     def set_path(self, data: bytes) -> None:
@@ -148,7 +150,9 @@ class RunOfScans:
         """Let front end and map know where the path has the keyframes."""
         if self._path:
             self._placing.set_path(*path_in(self._path))
-        self._path, self._read, self._news = b'', time.monotonic(), False
+        self._path = b''
+        self._read = time.monotonic()
+        self._news = False
         keyframes = self._front_end.keyframes
         poses = self._placing.place(keyframes)
         if not len(poses):
@@ -186,15 +190,18 @@ class FrontEndThread:
 
     def __init__(self, node: Node, options: Callable[[], ScanLoopsOptions],
                  publisher: ScanPublisher, drawer: MapDrawer, failures: Failures, static: bool):
-        self._logger, self._options = node.get_logger(), options
+        self._logger = node.get_logger()
+        self._options = options
         self._drawer, self._failures = drawer, failures
         self._frames = RobotFrames(options, self._logger, static)
         self.refused = Counter[str]()
-        self.queue, self.ready = ScanQueue(lambda: options().backlog), False
+        self.queue = ScanQueue(lambda: options().backlog)
+        self.ready = False
         self._restarts = self.queue.restarts
         self.run = RunOfScans(options, self._frames, publisher, drawer, self._logger)
         self._inbox: deque[tuple[str, bytes]] = deque(maxlen=_BACKLOG)
-        self._woken, self._closing = threading.Event(), False
+        self._woken = threading.Event()
+        self._closing = False
         self._uses = {'scan': self._on_scan, 'odom': self._on_odometry, 'path': self.run.set_path,
                       'pose_with_covariance': self._on_covariance, '/tf_static': self._on_static}
         self._thread = threading.Thread(target=self._work, name='front end', daemon=True)

@@ -59,10 +59,12 @@ class MapDrawer:
         """Forget all that is drawn."""
         with self._lock:
             self._grid = LiveGrid(self._options().map_resolution)
-            self._frame, self._stamp = 'map', 0
+            self._frame = 'map'
+            self._stamp = 0
             self._wanted: dict[int, tuple[Points, Array]] = {}
             self._to_draw: list[int] = []
-            self._changed, self._due = False, 0.0
+            self._changed = False
+            self._due = 0.0
 
     def follow(self, frame: str, stamp: int, placed: dict[int, tuple[Points, Array]]) -> None:
         """Hear where keyframes lie, by their numbers; stamp : of the newest [ns]."""
@@ -101,7 +103,8 @@ class MapDrawer:
             raise OptionError('map_path is empty, expected the name of a .pgm file')
         with self._lock:
             self._draw(float('inf'))
-            drawn, grid = len(self._grid), self._grid.grid()
+            drawn = len(self._grid)
+            grid = self._grid.grid()
         if not drawn:
             raise OptionError('there is no map yet; expected scans, and a path from the back end')
         write_grid(Path(path), grid)

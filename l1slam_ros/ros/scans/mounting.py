@@ -54,7 +54,8 @@ class StaticTransforms:
         MessageError : the laser does not look along a floor.
 
         """
-        pose, frame = se3.from_pose3(np.array([[0.0, 0, 0, 0, 0, 0, 1]])), laser
+        pose = se3.from_pose3(np.array([[0.0, 0, 0, 0, 0, 0, 1]]))
+        frame = laser
         for _ in range(_LINKS):
             if frame == base:
                 return _mount(laser, se3.to_pose3(pose)[0])
@@ -87,7 +88,9 @@ class RobotFrames:
     def __init__(self, options: Callable[[], ScanLoopsOptions], logger: Any, static: bool):
         self._options, self._logger = options, logger
         self._transforms = StaticTransforms() if static else None
-        self.base, self.wheels, self.laser = options().base_frame, '', ''
+        self.base = options().base_frame
+        self.wheels = ''
+        self.laser = ''
         self.mount: Mount | None = None
         # [s] When it was first asked where the laser is.
         self._asked = 0.0
@@ -126,15 +129,19 @@ class RobotFrames:
             return False
         now = time.monotonic()
         self._asked = self._asked or now
-        mount, how = self._options().mount(), 'as laser_pose says'
+        mount = self._options().mount()
+        how = 'as laser_pose says'
         if mount is None and self.laser == self.base:
-            mount, how = Mount(), 'for that is the frame of the scans'
+            mount = Mount()
+            how = 'for that is the frame of the scans'
         if mount is None and self._transforms is not None:
-            mount, how = self._transforms.mount(self.base, self.laser), 'as /tf_static says'
+            mount = self._transforms.mount(self.base, self.laser)
+            how = 'as /tf_static says'
             if mount is None and now - self._asked < _MOUNTING:
                 return False
         if mount is None:
-            mount, how = Mount(), 'for neither laser_pose nor /tf_static says otherwise'
+            mount = Mount()
+            how = 'for neither laser_pose nor /tf_static says otherwise'
         upside_down = ', upside down' if mount.upside_down else ''
         self._logger.info(f'the laser {self.laser!r} is at x {mount.x:g} m, y {mount.y:g} m, yaw '
                           f'{mount.yaw:g} rad{upside_down} of {self.base!r}, {how}')

@@ -39,7 +39,8 @@ class Placing:
 
     def __init__(self) -> None:
         self.frame = ''
-        self._stamps, self._odometry = GrowingArray((), np.int64), GrowingArray((3,))
+        self._stamps = GrowingArray((), np.int64)
+        self._odometry = GrowingArray((3,))
         self._path: tuple[Indices, Array] = np.zeros(0, np.int64), np.zeros((0, 3))
         # Of the newest keyframe of each update: stamp, metres, radians from the first keyframe.
         self._known: list[tuple[int, float, float]] = []

@@ -70,14 +70,16 @@ class IncrementalOdometry:
         self._stated = before + increment
         self._last = stamp, step.pose
         if step.keyframe is not None:
-            self._keyframe, self._stated = step.pose, np.zeros((3, 3))
+            self._keyframe = step.pose
+            self._stated = np.zeros((3, 3))
         return self._shifted(step.pose), increment
 
     def _begin(self, stamp: int, step: Step) -> tuple[Array, Array]:
         if self._keyframe is not None:
             seconds = abs(stamp - self._last[0]) * 1e-9
             self._shift = self._shift + (max(_APART, _FARTHER * FASTEST * seconds), 0.0, 0.0)
-        self._keyframe, self._stated = step.pose, np.zeros((3, 3))
+        self._keyframe = step.pose
+        self._stated = np.zeros((3, 3))
         self._last = stamp, step.pose
         return self._shifted(step.pose), step.covariance
 

@@ -73,7 +73,8 @@ class ScanQueue:
 
     def _went_back(self, stamp: int) -> bool:
         """Tell whether time went back: two stamps in a row are of an earlier time, and rise."""
-        before, self._back = self._back, stamp
+        before = self._back
+        self._back = stamp
         return 0 < before < stamp <= self._wheels[-1][0] - _BACK
 
     def add_scan(self, scan: Scan) -> None:

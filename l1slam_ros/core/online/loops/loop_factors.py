@@ -74,7 +74,8 @@ class LoopFactors:
 
     def __init__(self, manifold: Manifold, notes: Notes, verbatim: bool):
         self._manifold, self._notes, self._verbatim = manifold, notes, verbatim
-        self.waiting, self.lost = WaitingLoops(), 0
+        self.waiting = WaitingLoops()
+        self.lost = 0
         self.forget()
 
     def forget(self) -> None:
@@ -163,7 +164,8 @@ class LoopFactors:
         clocks = tracks.clocks
         due = self.waiting.due(clocks)
         for robot, now in clocks.items():
-            since, track = now - int(options.wait * 1e9), tracks.of(robot)
+            since = now - int(options.wait * 1e9)
+            track = tracks.of(robot)
             if track is not None and track.first < since:
                 self._expire(robot, since, track.last_stamp)
         return self._add_due(due, graph, tracks, options) if due else 0
@@ -214,10 +216,12 @@ class LoopFactors:
     def _append(self, loops: list[WaitingLoop], pairs: Indices, graph: FactorGraph,
                 tracks: Tracks, options: LoopOptions) -> None:
         """Carry loops to the keyframes pairs (m, 2), and make factors of them."""
-        manifold, m = self._manifold, len(loops)
+        manifold = self._manifold
+        m = len(loops)
         times, robots = (column.T.ravel() for column in _times(loops))
         ends = tracks.of_each(robots)
-        at, keyframes = ends.at(times), ends.poses_of(pairs.T.ravel())
+        at = ends.at(times)
+        keyframes = ends.poses_of(pairs.T.ravel())
         ways = manifold.between(np.concatenate((keyframes[:m], at[m:])),
                                 np.concatenate((at[:m], keyframes[m:])))
         unseen = ends.unseen(times)
@@ -284,7 +288,8 @@ class LoopFactors:
         Where that is no covariance, the model; there is none of absolute poses: None, refused.
         """
         stated = reduced_covariance(self._manifold, loop.covariance[None])
-        model, absolute = self._model(options), loop.is_absolute
+        model = self._model(options)
+        absolute = loop.is_absolute
         if options.covariance_source == 'model' and not absolute:
             return model[None]
         used, bounded = _loop_covariance(stated, None if absolute else model, self._verbatim)

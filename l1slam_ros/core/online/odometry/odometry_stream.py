@@ -89,7 +89,8 @@ class BaseFrame:
         """
         frame = _frame(sample)
         if frame and not self.name:
-            self.name, self._sure = frame, self._used > 0
+            self.name = frame
+            self._sure = self._used > 0
         elif frame == self.name:
             self._sure = True
         if frame in (self.name, ''):
@@ -103,7 +104,9 @@ class BaseFrame:
         if len(ours) == 1:
             self._held.append(sample)
             return []
-        stray, self.name, self._sure = self.name, frame, True
+        stray = self.name
+        self.name = frame
+        self._sure = True
         for _ in range(self._used):
             notes.refuse('child_frame', str(self._error(stray)))
         self.refuse_rest(notes)
@@ -173,13 +176,16 @@ class OdometryStream:
             self._recent.forget()
         for one in ours:
             point = Point(self._manifold, one)
-            point.anew, stray = stray, False
+            point.anew = stray
+            stray = False
             yield from self._taken(point, verbatim, back, put_in_place)
 
     def _taken(self, point: Point, verbatim: bool, back: bool,
                put_in_place: Callable[[Point], bool]) -> list[Point]:
         """Return what may be used now that the robot's next sample is here; see `take`."""
-        last, held, how = self.last, self.held, (verbatim, back, put_in_place)
+        last = self.last
+        held = self.held
+        how = (verbatim, back, put_in_place)
         if last is None:
             used = self._used(point)
             self._alone = not self._resumed
@@ -232,7 +238,9 @@ class OdometryStream:
         return self._why(self.last, self.held)
 
     def _used(self, point: Point) -> list[Point]:
-        last, self.last, self._alone = self.last, point, False
+        last = self.last
+        self.last = point
+        self._alone = False
         if last is not None and point.anew:
             self._notes.refuse('stamp_ahead', f'first odometry stamp {last.stamp} ns; expected '
                                f'one before that of the next, {point.stamp} ns')
@@ -248,13 +256,15 @@ class OdometryStream:
 
     def _explain(self, last: Point, held: Point, after: Step | None) -> None:
         """Tell what is not known of the motion to a held sample that is used now."""
-        step, recent = Step(self._manifold, last, held), self._recent
+        step = Step(self._manifold, last, held)
+        recent = self._recent
         if held.doubt == 'old_stamp' or (
                 held.doubt == 'jump' and recent.jumps(last, held, step, after)):
             held.gap = self._why(last, held)
             held.unseen = max(UNSEEN * step.seconds, recent.longest)
         elif unseen := recent.unsure(last, held, step, after):
-            held.unsure, held.unseen = self._why(last, held, 'unsure'), unseen
+            held.unsure = self._why(last, held, 'unsure')
+            held.unseen = unseen
 
     def _doubt(self, last: Point, point: Point) -> str:
         """Return the cause for which a sample after `last` is to be doubted; empty: none."""
@@ -290,7 +300,8 @@ class OdometryStream:
         return self._alone and (last.stamp - point.stamp) * 1e-9 > LONGEST_PAUSE
 
     def _why(self, last: Point, held: Point, doubt: str = '') -> str:
-        step, doubt = Step(self._manifold, last, held), doubt or held.doubt
+        step = Step(self._manifold, last, held)
+        doubt = doubt or held.doubt
         if doubt in ('jump', 'unsure'):
             expected = 'a motion that robots make' if doubt == 'jump' else (
                 'a robot that moves on as before and after')

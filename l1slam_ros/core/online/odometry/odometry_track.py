@@ -192,9 +192,11 @@ class OdometryTrack:
 
     def thin(self) -> None:
         """Leave out of a block of samples what interpolation finds again; keyframes stay."""
-        start, end = self._thinned, self._thinned + _BLOCK
+        start = self._thinned
+        end = self._thinned + _BLOCK
         times, poses = self._times.view()[start:].copy(), self._poses.view()[start:].copy()
-        keyframes, parts = self._keyframes.view(), self._parts.view().copy()
+        keyframes = self._keyframes.view()
+        parts = self._parts.view().copy()
         first = int(np.searchsorted(keyframes, start))
         fixed = np.zeros(len(times), bool)
         fixed[keyframes[first:] - start] = True
@@ -219,7 +221,10 @@ class OdometryTrack:
         Every other one is left out where all samples between its neighbours are found without it,
         then every other one of the rest, and so on.
         """
-        manifold, needed, first, idle = self._manifold, np.ones(len(times), bool), 1, 0
+        manifold = self._manifold
+        needed = np.ones(len(times), bool)
+        first = 1
+        idle = 0
         while idle < 2:
             kept = np.flatnonzero(needed)
             tried = kept[first:-1:2]
@@ -228,7 +233,8 @@ class OdometryTrack:
             rest[tried] = False
             ends = np.flatnonzero(rest)
             after = np.clip(np.searchsorted(ends, np.arange(len(times))), 1, None)
-            i, j = ends[after - 1], ends[after]
+            i = ends[after - 1]
+            j = ends[after]
             found = manifold.interpolate(
                 poses[i], poses[j], (times - times[i]) / (times[j] - times[i]))
             metres, radians = manifold.motion(manifold.local(found, poses))
@@ -259,10 +265,12 @@ class OdometryTrack:
             return False
         pose = self._manifold.compose(offset, pose)
         recent = slice(max(int(self._parts.view()[-1, 2]), len(self._keyframes) - _RECENT), None)
-        times, poses = self.keyframe_stamps[recent], self.poses_of(recent)
+        times = self.keyframe_stamps[recent]
+        poses = self.poses_of(recent)
         step = self._manifold.local(np.concatenate((poses[:-1], self.last_pose)),
                                     np.concatenate((poses[1:], pose)))
-        way, seconds = self._manifold.motion(step)[0], np.diff(times, append=stamp) * 1e-9
+        way = self._manifold.motion(step)[0]
+        seconds = np.diff(times, append=stamp) * 1e-9
         speed = max(2 * (way[:-1] / seconds[:-1]).max(initial=0.0), UNSEEN)
         pause = (stamp - self.last_stamp) * 1e-9
         return bool(pause <= LONGEST_PAUSE and way[-1] <= pause * speed)

@@ -81,11 +81,14 @@ class Point:
                  'stamp', 'unseen', 'unsure')
 
     def __init__(self, manifold: Manifold, sample: OdometrySample):
-        self.sample, self.stamp = sample, sample.stamp
+        self.sample = sample
+        self.stamp = sample.stamp
         self.pose: Array = manifold.from_pose3(sample.pose3[None])
         self.position: list[float] = manifold.positions(self.pose)[0].tolist()
         self.doubt = self.gap = self.unsure = ''
-        self.unseen, self.anew, self.seconds = 0.0, False, 0.0
+        self.unseen = 0.0
+        self.anew = False
+        self.seconds = 0.0
         self.reach = 0.0, 0.0
 
     @property
@@ -190,9 +193,12 @@ class RecentMotion:
             return True
         if not self._begins_anew(last, point):
             return False
-        metres, radians, off = step.metres, step.radians, _SOME
+        metres = step.metres
+        radians = step.radians
+        off = _SOME
         if self.is_silence(step.seconds):
-            (metres, radians), off = self._from_expected(last, point, step.seconds), _OFF
+            metres, radians = self._from_expected(last, point, step.seconds)
+            off = _OFF
         return (metres > _SLACK + off * speed * step.span
                 or radians > _SLACK + off * max(turn, self._fastest_turn) * step.span)
 
@@ -214,14 +220,17 @@ class RecentMotion:
             return 0.0
         if self._begins_anew(last, point):
             return way if way > _SLACK else 0.0
-        off, part = step.metres, _SOME
+        off = step.metres
+        part = _SOME
         if step.seconds < _STOPS:
-            off, part = self._from_expected(last, point, step.seconds, after)[0], _WIDE
+            off = self._from_expected(last, point, step.seconds, after)[0]
+            part = _WIDE
         return max(way, step.metres) if off > _NEAR + part * way else 0.0
 
     def _stood_only_then(self, step: Step, after: Step | None) -> bool:
         """Tell whether the robot made next to no way in a step, but at all before, and after."""
-        seconds, usual = [one.seconds for one in self._steps], self._usual
+        seconds = [one.seconds for one in self._steps]
+        usual = self._usual
         jitters = min(seconds) < usual / _ONE or max(seconds) > usual * _ONE
         if jitters and step.seconds < max(SILENCE, _MANY * max(seconds)):
             return False  # such stamps say as much of any robot
@@ -277,7 +286,8 @@ class RecentMotion:
         after : what it does next, from where it may have come; None: not known
         """
         manifold = self._manifold
-        way, span = np.zeros((1, manifold.TANGENT_SIZE)), 0.0
+        way = np.zeros((1, manifold.TANGENT_SIZE))
+        span = 0.0
         for step in reversed(self._steps):
             way, span = way + step.tangent, span + step.seconds
             if span >= SHORTEST_STEP:

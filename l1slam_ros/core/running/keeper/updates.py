@@ -59,11 +59,14 @@ class Updates:
     """
 
     def __init__(self, keeper: Keeper, done: Callable[[], None]):
-        self._keeper, self._workers, self.calm = keeper, Workers(done), Calm()
+        self._keeper = keeper
+        self._workers = Workers(done)
+        self.calm = Calm()
         self._update_lock = threading.Lock()
         self._claims, self._urgent = Requests(), Requests()
         # The revisions to which the map was updated last, and at which nothing was left to do.
-        self._updated, self._rested = 0, -1
+        self._updated = 0
+        self._rested = -1
 
     @property
     def failing(self) -> bool:
@@ -77,7 +80,8 @@ class Updates:
 
         idle : nothing has come for a while, None: find out; waits : up to `budget` for the workers
         """
-        start, keeper = time.monotonic(), self._keeper
+        start = time.monotonic()
+        keeper = self._keeper
         with self._update_lock:
             self._workers.check()
             if self._rested == keeper.revisions.now:

@@ -31,7 +31,8 @@ from l1slam_ros.core.running.snapshot import Snapshot
 
 # [s] So long a map is improved, whatever the budget; of the clock a round may take some times as
 # long.
-_LEAST_ROUND, _PATIENCE = 0.1, 4
+_LEAST_ROUND = 0.1
+_PATIENCE = 4
 # So often a new front takes what came meanwhile, before it is one; so many factors at once.
 _PASSES, _AT_ONCE = 3, 16
 
@@ -48,8 +49,11 @@ def carry_out(keeper: Keeper, piece: Work, moment: Moment, check: Check) -> None
 
 def make_map(keeper: Keeper, exact: bool, budget: float, check: Check) -> None:
     """Lower the cost of the map (exact : to the optimum), factor it, let its front catch up."""
-    now, solver = keeper.snapshot(), keeper.solver
-    whole, pending, looked = now.problem(), now.state.pending, now.looked
+    now = keeper.snapshot()
+    solver = keeper.solver
+    whole = now.problem()
+    pending = now.state.pending
+    looked = now.looked
     del now  # holds the factors of a front that may be replaced meanwhile
     problem = as_one(whole)
     if pending is None:

@@ -79,7 +79,8 @@ class Requests:
     """How many threads ask for something at the moment; true while any does."""
 
     def __init__(self) -> None:
-        self._count, self._none = 0, threading.Condition()
+        self._count = 0
+        self._none = threading.Condition()
 
     def __bool__(self) -> bool:
         return self._count > 0
@@ -140,7 +141,8 @@ class Worker:
 
     def check(self) -> None:
         """Raise what the last work raised, once."""
-        error, self._error = self._error, None
+        error = self._error
+        self._error = None
         if error is not None:
             raise error
 
@@ -151,7 +153,8 @@ class Worker:
         except Interrupted:  # its result is not wanted any more
             pass
         except Exception as error:
-            self._error, self.failed = error, True
+            self._error = error
+            self.failed = True
         self.busy = False
         self._done()
 
@@ -236,7 +239,8 @@ class Background:
         self._closing = True
         self._woken.set()
         self._thread.join()
-        error, self._error = self._error, None
+        error = self._error
+        self._error = None
         if error is not None:
             raise error
 
