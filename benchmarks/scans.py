@@ -188,7 +188,6 @@ def print_variants(given: argparse.Namespace) -> None:
             made = map_scans(zip(log.scans, log.wheels, strict=True), log.mount)
             outcome = solve(made.record.graph, None, SolveOptions())
             poses = outcome.solution.poses
-            _, false = false_loops(made, true_poses(made, drawn.stamps, drawn.truth))
             rows, keyframes, steps = made.path.steps_at(drawn.stamps, 10**10, 10**6)
             after = np.searchsorted(made.path.stamps, drawn.stamps[rows], side='right')
             nearest = np.stack([abs(drawn.stamps[rows] - made.path.stamps[np.clip(
@@ -198,8 +197,8 @@ def print_variants(given: argparse.Namespace) -> None:
                 se2.compose(poses[keyframes], steps)[near, :2], drawn.truth[rows][near, :2])
             doubts = outcome.judgement.doubts if outcome.judgement else ()
             said = ', '.join(dict.fromkeys(doubt.kind for doubt in doubts)) or 'none'
-            print(f'{name}, {variant}: error {error:.3f} m, {outcome.parts} parts, loops '
-                  f'{len(false)}, {false.sum()} false; doubts: {said}', flush=True)
+            print(f'{name}, {variant}: error {error:.3f} m, {outcome.parts} parts; doubts: {said}',
+                  flush=True)
 
 
 def main() -> None:
