@@ -153,7 +153,7 @@ class _Samples:
         T = np.where(whole, manifold.compose(first[0], manifold.inverse(local[lead[0]])),
                      manifold.from_rotation(*align(here, there)))
         ratio = np.full((w, k), np.inf)
-        for at in np.setdiff1d(np.arange(k), lead):
+        for at in np.setdiff1d(np.arange(k), lead).tolist():
             row = windows[:, at]
             seen = manifold.compose(T, local[at])
             e = manifold.local(np.tile(fixes.measurement[row], (q, 1)), seen).reshape(q, w, d)

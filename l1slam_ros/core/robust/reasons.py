@@ -104,7 +104,7 @@ def _joining_alone(growth: Growth) -> Iterator[Indices]:
     for number in order[join_what_no_other(place, np.sort((i, j), axis=0), joins)[order]]:
         own = place == number
         without, joined = (
-            len(np.unique(lowest_of_components(i[some], j[some], part.max() + 1)))
+            len(np.unique(lowest_of_components(i[some], j[some], int(part.max()) + 1)))
             for some in (joins & ~own, joins | own))
         if joined < without:
             # Rivals that say it otherwise are of the same doubt.

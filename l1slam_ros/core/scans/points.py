@@ -102,7 +102,8 @@ def points_of(scan: Scan, mount: Mount = Mount(),  # noqa: B008
     """
     ranges = np.asarray(scan.ranges, float)
     turn = -1.0 if mount.upside_down else 1.0
-    angles = mount.yaw + turn * (scan.angle_min + scan.angle_increment * np.arange(len(ranges)))
+    ray = np.arange(0.0, len(ranges))
+    angles = mount.yaw + turn * (scan.angle_min + scan.angle_increment * ray)
     looked = ~np.isnan(ranges) & (ranges > max(scan.range_min, 0.0))
     hit = looked & (ranges < scan.range_max)
     reach = np.where(hit, ranges, 0.0)
