@@ -121,16 +121,15 @@ def map_ends(seen: Seen, poses: Array, front: Front | None, accepted: Mask) -> d
     known = front.keyframes if front else len(poses)
     pose = front.poses_of if front else poses.__getitem__
     maps = seen.maps(known, accepted, pose)
-    ends = {}
-    lasts = {robot: int(np.searchsorted(numbers, known)) - 1
-             for robot, numbers in seen.numbers.items()}
-    lasts = {robot: last for robot, last in lasts.items() if last >= 0}
+    lasts = {robot: last for robot, numbers in seen.numbers.items()
+             if (last := int(np.searchsorted(numbers, known)) - 1) >= 0}
     if not lasts:
         return {}
-    poses = pose(np.array([seen.numbers[robot][last] for robot, last in lasts.items()]))
+    newest = pose(np.array([seen.numbers[robot][last] for robot, last in lasts.items()]))
+    ends = {}
     for row, (robot, last) in enumerate(lasts.items()):
         joined, turn = maps.get(robot, RobotMap(True, None))
-        at = poses[row:row + 1]
+        at = newest[row:row + 1]
         ends[robot] = Newest(
             last, at if turn is None else seen.manifold.compose(turn, at), joined)
     return ends

@@ -334,7 +334,8 @@ def cholesky_of(graph: FactorGraph, before: Pattern | None = None) -> BlockChole
     FillError : a solve by them would take more memory than is free.
 
     """
-    keyframe = keyframes_of(graph, fixed := anchor(graph))
+    fixed = anchor(graph)
+    keyframe = keyframes_of(graph, fixed)
     try:
         pattern = find_pattern(keyframe, graph.n_poses - fixed, most_blocks(graph),
                                graph.manifold.TANGENT_SIZE, before)
@@ -343,7 +344,8 @@ def cholesky_of(graph: FactorGraph, before: Pattern | None = None) -> BlockChole
         raise FillError(
             f'factorising {graph.n_poses} keyframes and {len(graph.between)} factors takes '
             f'{memory.in_gigabytes(takes)} of memory or more, and '
-            f'{memory.in_gigabytes(memory.free())} are free', error.blocks) from error
+            f'{memory.in_gigabytes(memory.free())} are free',
+            error.blocks) from error
     return BlockCholesky(pattern, keyframe, loose_keyframes(graph))
 
 
