@@ -26,7 +26,11 @@ from l1slam_ros.io.bags.topics import DEFAULT_TOPICS
 from l1slam_ros.io.progress import say
 from l1slam_ros.paper import printed as paper
 
-BAD_INPUT, READ_IN_PART, DOUBTFUL, INTERRUPTED, BROKEN_PIPE = 2, 3, 4, 130, 141
+BAD_INPUT = 2
+READ_IN_PART = 3
+DOUBTFUL = 4
+INTERRUPTED = 130
+BROKEN_PIPE = 141
 _INPUT = ('.g2o, TORO .graph, .jrl or its .cbor, a rosbag2 directory, .mcap, .db3, .bag of ROS 1, '
           'or a CARMEN log with scans: .clf, .log, .bz2, .gz')
 _WORD = ('beside a graph INPUT.trusted.txt and INPUT.struck.txt, lines `i j` of vertex ids, may '

@@ -35,7 +35,9 @@ from l1slam_ros.fleet.table import Row, as_csv, as_parquet
 from l1slam_ros.io.files import replacing, reported
 from l1slam_ros.io.progress import Progress
 
-MAPS, LOG, TABLE = 'maps', 'log.jsonl', 'table'
+MAPS = 'maps'
+LOG = 'log.jsonl'
+TABLE = 'table'
 FAILED = 'failed'
 # What a process that was killed amid writing left beside its file, see `files.replacing`.
 _LEFTOVER = re.compile(r'\..+\.[0-9a-f]{8}\.tmp')

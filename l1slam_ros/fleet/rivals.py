@@ -68,7 +68,9 @@ def _doubts(graph: FactorGraph, poses: Array, accepted: Mask,
 def _placed(graph: FactorGraph, poses: Array, rows: Indices, of_input: Indices) -> Array:
     """Return where each loop has the middle of the later input, in the map, (k, p)."""
     manifold, factors = graph.manifold, graph.between
-    i, j, Z = factors.i[rows], factors.j[rows], factors.measurement[rows]
+    i = factors.i[rows]
+    j = factors.j[rows]
+    Z = factors.measurement[rows]
     turned = of_input[i] > of_input[j]
     Z = np.where(turned[:, None], manifold.inverse(Z), Z)
     i, j = np.where(turned, j, i), np.where(turned, i, j)

@@ -16,7 +16,9 @@ from l1slam_ros.core.errors import FileError
 
 # [bytes] A text file as a whole (a graph of a million poses has .4e9), one line of it, and a
 # document of YAML.
-_LARGEST, _LONGEST_LINE, _LONGEST_YAML = 2**31, 2**16, 2**22
+_LARGEST = 2**31
+_LONGEST_LINE = 2**16
+_LONGEST_YAML = 2**22
 # Brackets and lists within each other: PyYAML takes the square of it.
 _DEEPEST = 64
 _BLOCK = 2**20

@@ -33,7 +33,11 @@ from l1slam_ros.io.files import counted, replacing, require_file
 from l1slam_ros.io.ours import PROGRAM
 
 _SUFFIXES = ('.png', '.svg', '.pdf')
-_BLUE, _GREEN, _ORANGE, _RED, _GREY = '#0072B2', '#009E73', '#E69F00', '#D5370E', '#808080'
+_BLUE = '#0072B2'
+_GREEN = '#009E73'
+_ORANGE = '#E69F00'
+_RED = '#D5370E'
+_GREY = '#808080'
 _PURPLE, _BLACK = '#CC79A7', '#000000'
 _CURVE_COLOURS = (_BLUE, '#D55E00', _GREEN, _PURPLE, _ORANGE, '#56B4E9', _BLACK)
 # What maps show, in the order of every legend; what the positions are comes last.

@@ -242,7 +242,9 @@ def run_updates(drive: Drive, peer: Peer | None, rate: float, maps: int,
     kept = set(np.linspace(drive.keyframes / maps, drive.keyframes, maps).astype(int))
     found = Updates()
     with Backend(options, drive.dimension) as backend:
-        began, whole, alone = time.perf_counter(), time.process_time(), time.thread_time()
+        began = time.perf_counter()
+        whole = time.process_time()
+        alone = time.thread_time()
         due = began
         for k, (sample, loops) in enumerate(drive.messages):
             backend.add_odometry(sample)

@@ -79,7 +79,10 @@ class Diagnostics:
 
     def __init__(self, node: Node, topics: Mapping[str, Traffic], solver: SolverThread,
                  failures: Failures):
-        self._node, self._topics, self._solver, self._failures = node, topics, solver, failures
+        self._node = node
+        self._topics = topics
+        self._solver = solver
+        self._failures = failures
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._last: Improvement | None = None
         self._updates = 0

@@ -63,7 +63,9 @@ class MapPublisher:
 
     def __init__(self, node: Node, backend: Backend, parameters: NodeParameters[NodeOptions],
                  diagnostics: Diagnostics, robots: Sequence[RobotPublisher], failures: Failures):
-        self._backend, self._diagnostics, self._robots = backend, diagnostics, robots
+        self._backend = backend
+        self._diagnostics = diagnostics
+        self._robots = robots
         self._failures = failures
         self._one = threading.Lock()
         self._woken, self._ending = threading.Event(), threading.Event()

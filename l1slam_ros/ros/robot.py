@@ -88,7 +88,10 @@ class RobotPublisher:
 
     def __init__(self, node: Node, backend: Backend, parameters: NodeParameters[NodeOptions],
                  number: int = 0, name: str = ''):
-        self._backend, self._parameters, self.number, self.name = backend, parameters, number, name
+        self._backend = backend
+        self._parameters = parameters
+        self.number = number
+        self.name = name
         self._pose = node.create_publisher(PoseStamped, f'{self.prefix}pose', 10)
         self._transform = node.create_publisher(
             TransformStamped, f'{self.prefix}map_to_odom', 10)

@@ -54,8 +54,12 @@ class MapServices:
 
     def __init__(self, node: Node, backend: Backend, jobs: JobQueue, map_file: MapFile,
                  failures: Failures, pause: Callable[[bool], None], stopped: Stopped):
-        self._backend, self._jobs, self._map_file = backend, jobs, map_file
-        self._failures, self._pause, self._stopped = failures, pause, stopped
+        self._backend = backend
+        self._jobs = jobs
+        self._map_file = map_file
+        self._failures = failures
+        self._pause = pause
+        self._stopped = stopped
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._keep_saving, name='autosave', daemon=True)
         # A group of their own: a service that awaits its answer would block its whole group.

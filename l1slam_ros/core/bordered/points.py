@@ -82,7 +82,9 @@ class Points:
     """
 
     def __init__(self, cholesky: BlockCholesky, size: int, k: int, most: int = 0):
-        self._cholesky, self._size, self._k = cholesky, size, k
+        self._cholesky = cholesky
+        self._size = size
+        self._k = k
         self._of_old: dict[int, int] = {}
         self._of_new: list[int] = []
         # Where each is in the order of elimination, -1 for a new one.

@@ -95,7 +95,9 @@ def nearest_definite(information: Array) -> tuple[Array, Array]:
     rows = rows[~_is_definite(filled(information[rows], silent[rows]))]
     values, vectors = np.linalg.eigh(information[rows])
     some = values[:, -1] > 0
-    rows, values, vectors = rows[some], values[some], vectors[some]
+    rows = rows[some]
+    values = values[some]
+    vectors = vectors[some]
     floor = LEAST_EIGENVALUE * values[:, -1:]
     definite = information.copy()
     least = np.full(len(information), np.nan)

@@ -27,7 +27,9 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph, ends_in_time, lowest
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
 
 # So many windows at most are looked at, of so many fixes; and so many for the noise alone.
-_WINDOWS, _SIZE, _FOR_NOISE = 2000, 8, 100
+_WINDOWS = 2000
+_SIZE = 8
+_FOR_NOISE = 100
 # By so many samples, the same each time.
 _SAMPLES, _SEED = 24, 2014
 # Variances that the odometry may have, in units of what it states.

@@ -103,7 +103,9 @@ def compose_tree(manifold: Manifold, parent: Indices, relative: Array) -> Array:
 
 def _compose_along(graph: FactorGraph, parent: Indices, candidates: Indices) -> Array:
     """Compose along the tree `parent`, each step the first of the candidate factors it has."""
-    factors, manifold, n = graph.between, graph.manifold, graph.n_poses
+    factors = graph.between
+    manifold = graph.manifold
+    n = graph.n_poses
     child = np.flatnonzero(parent != np.arange(n))
     if (parent[child] < 0).any():
         lost = child[np.argmax(parent[child] < 0)]

@@ -99,7 +99,9 @@ class RobotOdometry:
     """
 
     def __init__(self, robot: int, shared: GrowingGraph, base_frame: BaseFrame):
-        self._robot, self._shared, self._base_frame = robot, shared, base_frame
+        self._robot = robot
+        self._shared = shared
+        self._base_frame = base_frame
         self.manifold = shared.graph.manifold
         self.stream = OdometryStream(self.manifold, shared.notes, base_frame)
         self._motion: KeyframeMotion
@@ -275,6 +277,8 @@ class RobotOdometry:
             by_model = self._shared.options.odometry.covariance_source == 'model'
             self._motion.add_known(
                 end.end, end.end_pose, None if by_model else end.end_covariance)
-        self._glued, self._moved, self._resumed = False, True, True
+        self._glued = False
+        self._moved = True
+        self._resumed = True
         self.stream = OdometryStream(
             self.manifold, self._shared.notes, self._base_frame, resumed=True)

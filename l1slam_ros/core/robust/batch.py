@@ -115,7 +115,9 @@ def robust_solve(
 
     """
     first = growth = Growth(graph, check)
-    so_far, number, repair = _so_far(first), 0, _Repair(graph, check)
+    so_far = _so_far(first)
+    number = 0
+    repair = _Repair(graph, check)
     try:
         first.begin()
         for number, growth in enumerate(rounds(first, repair), 1):
@@ -132,7 +134,10 @@ class _Repair:
     """What loops that are left out may be right by; drift : that of the odometry [rad/m]."""
 
     def __init__(self, graph: FactorGraph, check: Callable[[], None]):
-        self._graph, self._check, self._asked, self.drift = graph, check, False, 0.0
+        self._graph = graph
+        self._check = check
+        self._asked = False
+        self.drift = 0.0
 
     def __call__(self, found: Growth, as_stated: Growth) -> Growth | None:
         """Return a state without a drift, asked once, or without a slip; None: there is none."""
@@ -145,7 +150,8 @@ class _Repair:
         drift, odds = vote(self._graph) if len(as_stated.undecided()) else (0.0, 0.0)
         more = 1
         if not (drift and odds > 0):
-            drift, more = drift_taken_for_noise(as_stated), 0
+            drift = drift_taken_for_noise(as_stated)
+            more = 0
         if not drift:
             return None
         straight, told = self._without(drift)
@@ -171,7 +177,8 @@ def _won(places_of: Growth, growth: Growth) -> int:
 
 def _so_far(growth: Growth, drift: float = 0.0) -> Believed:
     """Return what a state believes, to fall back on; the loops that it left out are suspect."""
-    size, slip = growth.size, growth.cut & ~growth.gap
+    size = growth.size
+    slip = growth.cut & ~growth.gap
     accepted = (growth.accepted & ~slip)[:size]
     return Judgement(accepted, growth.is_loop[:size] & ~accepted, np.full(size, np.nan),
                      growth.variance.copy(), np.ones(size), np.flatnonzero(slip[:size]),
@@ -204,11 +211,13 @@ def minimise_robustly(
     judgement, poses = robust_solve(graph, report, check, known)
     try:
         whole, least = _least_squares(graph, judgement, poses, check)
-        solution, seed = minimise(whole, least.poses), least.poses
+        solution = minimise(whole, least.poses)
+        seed = least.poses
         check()
         more = least.doubts(graph, judgement, solution.poses)
     except _FAILURES as error:
-        solution, seed = _standing(judgement.believed(graph), poses), poses
+        solution = _standing(judgement.believed(graph), poses)
+        seed = poses
         more = (_unsolved(graph, judgement, error),)
     rows = int(judgement.accepted.sum()) * graph.manifold.TANGENT_SIZE
     judgement = replace(judgement, doubts=judgement.doubts + more)
@@ -254,8 +263,10 @@ class _LeastSquares:
         map at most, which is what L1 pays for it. Of the keyframes of one way all may err
         together. No doubt where either map is right if the other one is.
         """
-        manifold, held = graph.manifold, len(poses) - len(self.covariances)
-        ours, other = manifold.positions(poses), manifold.positions(self.poses)
+        manifold = graph.manifold
+        held = len(poses) - len(self.covariances)
+        ours = manifold.positions(poses)
+        other = manifold.positions(self.poses)
         if absolute_trajectory_error(ours, other) < right_within(other):
             return ()
         step = manifold.local(self.poses, poses)[held:]
@@ -303,7 +314,8 @@ def rounds(
                 growth.slip_odds = found.slip_odds
                 if not other:
                     break
-                growth, found = other, None
+                growth = other
+                found = None
         yield growth
 
 
@@ -324,7 +336,8 @@ def judge(
     check : called before long steps, raises where the work shall stop
 
     """
-    first, settled = Growth(straightened(graph, known.drift), check), True
+    first = Growth(straightened(graph, known.drift), check)
+    settled = True
     growth = first
     try:
         first.resume(poses, known.accepted, known.variance)

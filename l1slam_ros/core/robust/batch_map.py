@@ -119,7 +119,8 @@ def solve(
 
     """
     ids = np.arange(graph.n_poses) if ids is None else ids
-    whole, graph = graph, graph.without_struck()  # what is struck out is there for nobody
+    whole = graph
+    graph = graph.without_struck()  # what is struck out is there for nobody
     _require_start(graph, stored, asked, ids)
     seed = None
     initial = (odometry_poses(graph) if asked.start == 'odometry'
@@ -153,7 +154,8 @@ def _robust_map(graph: FactorGraph, asked: SolveOptions, minimiser: '_Minimiser'
                 on_round: OnRound, ids: Indices) -> tuple[RobustMap | None, str]:
     """Return the robust map; where nobody insists on one and there is none, None and why."""
     # No odometry leads to a robot's first keyframe, so that is no gap.
-    unjudged, gaps = '', np.setdiff1d(odometry_gaps(graph), graph.firsts - 1)
+    unjudged = ''
+    gaps = np.setdiff1d(odometry_gaps(graph), graph.firsts - 1)
     if asked.robust is None and len(gaps) > _MOST_GAPS * (graph.n_poses - 1):
         unjudged = (f'no edge between the consecutive vertices {ids[gaps[0]]} and '
                     f'{ids[gaps[0] + 1]}, so no chain of odometry to judge loops by')
@@ -170,7 +172,9 @@ class _Minimiser:
     """Minimises the norm that was wished for; solver, reason : what did it last, and why."""
 
     def __init__(self, asked: SolveOptions, report: Report, on_choice: Callable[[Method], None]):
-        self._asked, self._report, self._on_choice = asked, report, on_choice
+        self._asked = asked
+        self._report = report
+        self._on_choice = on_choice
         self.solver = self.reason = ''
 
     def choose(self, graph: FactorGraph) -> Method:
@@ -185,7 +189,9 @@ class _Minimiser:
 
     def minimise_by(self, method: Method, graph: FactorGraph, poses: Array) -> Solution:
         """Return the solution by what was chosen."""
-        asked, self.solver, self.reason = self._asked, method.solver, method.reason
+        asked = self._asked
+        self.solver = method.solver
+        self.reason = method.reason
         solution, self.solver = minimise_by(method, graph, poses, asked.options, self._report,
                                             asked.least_squares)
         if self.solver != method.solver:
@@ -194,7 +200,8 @@ class _Minimiser:
 
     def fail(self) -> None:
         """Note that the map is another than what was wished for."""
-        self.solver, self.reason = GAUSS_NEWTON, 'the loops were judged by its map'
+        self.solver = GAUSS_NEWTON
+        self.reason = 'the loops were judged by its map'
 
 
 def shared_offset(graph: FactorGraph, poses: Array, judgement: Judgement) -> Array | None:
@@ -205,7 +212,8 @@ def shared_offset(graph: FactorGraph, poses: Array, judgement: Judgement) -> Arr
             rows, judgement.noise[rows] * judgement.found_variance(graph)))
     if (len(part.between) - part.n_poses) * graph.manifold.TANGENT_SIZE < FEWEST_SPARE:
         return None
-    cholesky, system = cholesky_of(part), linearise(part, poses[keyframes])
+    cholesky = cholesky_of(part)
+    system = linearise(part, poses[keyframes])
     if not cholesky.factorise(system, np.ones_like(system.b)):
         return None
 

@@ -83,9 +83,11 @@ def solve(graph: FactorGraph, *, norm: str = 'l1', robust: bool = True,
     asked = batch_map.SolveOptions('seed' if start is None else 'file', norm, loop_norm,
                                    robust=bool(robust))
     outcome = batch_map.solve(graph, start, asked)
-    judgement, status = outcome.judgement, outcome.solution.status.value
+    judgement = outcome.judgement
+    status = outcome.solution.status.value
     if judgement is None:
-        inliers, drift = ~graph.between.struck, 0.0
+        inliers = ~graph.between.struck
+        drift = 0.0
     else:
         inliers, drift = judgement.accepted, judgement.drift
         status = 'doubtful' if judgement.doubt else status

@@ -65,9 +65,11 @@ def unsureness(growth: Growth) -> float:
 
     That of its positions, aligned, over what a right map is off by at most.
     """
-    manifold, posterior = growth.graph.manifold, growth.posterior
+    manifold = growth.graph.manifold
+    posterior = growth.posterior
     own = growth.part[posterior.fixed:] == np.bincount(growth.part).argmax()
-    poses, samples = growth.poses[posterior.fixed:][own], posterior.samples[:-1][own]
+    poses = growth.poses[posterior.fixed:][own]
+    samples = posterior.samples[:-1][own]
     if len(poses) < 2:
         return 0.0
     positions = manifold.positions(poses)
@@ -88,7 +90,8 @@ def left_drift(growth: Growth) -> tuple[float, float]:
         return 0.0, 0.0
     rows = np.flatnonzero(growth.accepted)
     at = np.flatnonzero(~(growth.is_loop | growth.cut)[rows])
-    steps, factors = rows[at], growth.factors
+    steps = rows[at]
+    factors = growth.factors
     turn = np.zeros((len(at), 3))
     turn[:, 2] = np.hypot(*factors.measurement[steps, :2].T)
     noise = growth.variance_at_their_word() if growth.at_their_word else growth.variance

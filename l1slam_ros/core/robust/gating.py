@@ -54,10 +54,12 @@ def log_odds_of_false(log_ratio: Array, others: int, believed: int = 0) -> float
     are true for sure. One of each kind is added, so that a crowd without a true or a false one
     still says how sure that is.
     """
-    count, odds = len(log_ratio) + others + believed, 0.0
+    count = len(log_ratio) + others + believed
+    odds = 0.0
     for _ in range(_ROUNDS):
         true = float(probability(log_ratio - odds).sum()) + believed + 1
-        before, odds = odds, float(np.log((count + 2 - true) / true))
+        before = odds
+        odds = float(np.log((count + 2 - true) / true))
         if abs(odds - before) < _SAME:
             break
     return odds
@@ -118,7 +120,8 @@ def together(found: Innovations, posterior: Posterior, gate: Gate,
     """
     fits, log_ratio, odds = alone
     one, other, square, both = _pairs(found, posterior, np.flatnonzero(fits), log_ratio, place)
-    far, agree = np.zeros(len(fits)), square < gate(found.freedom[one] + found.freedom[other])
+    far = np.zeros(len(fits))
+    agree = square < gate(found.freedom[one] + found.freedom[other])
     gain = both - log_ratio[one] - np.maximum(odds[other], 0.0)
     np.maximum.at(far, one[agree], gain[agree])
     believed: Indices = np.flatnonzero(
@@ -190,8 +193,11 @@ def noise_variance(found: Innovations) -> Array:
     asked: their fit tells most.
     """
     best = np.argsort(found.log_det, kind='stable')[:_BEST_PREDICTED]
-    k, log_claim, freedom = found.system.block_size, found.log_claim[best], found.freedom[best]
-    residual, spread = -found.system.b.reshape(-1, k)[best], found.spread[best]
+    k = found.system.block_size
+    log_claim = found.log_claim[best]
+    freedom = found.freedom[best]
+    residual = -found.system.b.reshape(-1, k)[best]
+    spread = found.spread[best]
     fits: list[tuple[float, float, float]] = []
     for ratio in _RATIOS:
         square, log_det = kernels.prediction.normalise(spread + ratio * np.eye(k), residual)
@@ -215,7 +221,8 @@ def _fitted_scale(square: Array, log_det: Array, log_claim: Array, freedom: Indi
         odds = log_odds_of_false(log_ratio, 0)
         true = probability(log_ratio - odds)
         # The one pseudo-factor at the start is for crowds without a true one.
-        before, scale = scale, float((true @ square + start) / (true @ freedom + 1))
+        before = scale
+        scale = float((true @ square + start) / (true @ freedom + 1))
         if abs(scale / before - 1) < _SAME:
             break
     likelihood = np.logaddexp(log_ratio - odds, 0.0).sum() - len(square) * np.logaddexp(0, -odds)

@@ -140,7 +140,8 @@ def _steps(graph: FactorGraph, system: LinearSystem,
            cholesky: BlockCholesky) -> tuple[np.ndarray, Array]:
     """Return signs (m, k, q), and the steps (free keyframes + 1, k, q) that such noise makes."""
     # Signs have the covariance of white noise, and are quicker to draw.
-    k, q = system.block_size, kernels.prediction.SAMPLES
+    k = system.block_size
+    q = kernels.prediction.SAMPLES
     noise = signs(keys(graph.between.i, graph.between.j), k, q)
     noise[~graph.between.speaks] = 0
     samples = np.zeros((system.size + 1, k, q))
@@ -208,10 +209,12 @@ class Innovations:
 
         first, second : (pairs,) factors
         """
-        system, k = self.system, self.system.block_size
+        system = self.system
+        k = self.system.block_size
         used = np.zeros(len(self.square), bool)
         used[first] = used[second] = True
-        rows, place = np.flatnonzero(used), np.cumsum(used) - 1
+        rows = np.flatnonzero(used)
+        place = np.cumsum(used) - 1
         moved = kernels.prediction.moved(system.keyframe[rows], system.blocks[rows],
                                          posterior.samples)
         # Of all with all: each is of many pairs.
@@ -233,7 +236,8 @@ def innovations(graph: FactorGraph, poses: Array, posterior: Posterior,
 
     log_volume : (k,) of `claimed_volume`
     """
-    system, factors = linearise(graph, poses, fixed=posterior.fixed), graph.between
+    system = linearise(graph, poses, fixed=posterior.fixed)
+    factors = graph.between
     k = system.block_size
     spread = kernels.prediction.left_over(system.keyframe, system.blocks, posterior.samples,
                                           posterior.noise[:0])

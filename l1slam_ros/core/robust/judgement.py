@@ -38,10 +38,16 @@ from l1slam_ros.core.robust.rounds import Growth
 # was not believed; the odometry drifts, which was taken for noise; there were more rounds to come;
 # another norm of the same factors has another map; judging the loops failed, and what is believed
 # is what was by then; so did solving for what is believed.
-(MOSTLY_REFUSED, ONE_PLACE, ONE_JOINS, OTHER_MAP, SLIP, DRIFTS, UNFINISHED, NORM, FAILED,
- UNSOLVED) = (
-    'mostly refused', 'one place', 'one place joins', 'another map', 'a slip suspected',
-    'a drift suspected', 'not at an end', 'another norm', 'judging failed', 'solving failed')
+MOSTLY_REFUSED = 'mostly refused'
+ONE_PLACE = 'one place'
+ONE_JOINS = 'one place joins'
+OTHER_MAP = 'another map'
+SLIP = 'a slip suspected'
+DRIFTS = 'a drift suspected'
+UNFINISHED = 'not at an end'
+NORM = 'another norm'
+FAILED = 'judging failed'
+UNSOLVED = 'solving failed'
 
 
 @dataclass(frozen=True)
@@ -165,7 +171,8 @@ class Judgement:
         Of the new ones, odometry is believed; a loop is suspect until it was looked at, or where
         no loop is to be doubted, believed too. Whatever a person said by now counts.
         """
-        factors, known = graph.between, len(self.accepted)
+        factors = graph.between
+        known = len(self.accepted)
         odometry = factors.is_odometry[known:]
         accepted = np.concatenate((self.accepted, odometry)) if robust else True
         accepted = (accepted | factors.trusted) & ~factors.struck
@@ -196,9 +203,12 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
                  settled: bool = True) -> Judgement:
     """Return what a state says of the factors that were given."""
     square, suspect = fits(growth)
-    size, slip = growth.size, growth.cut & ~growth.gap
-    accepted, sigmas = (growth.accepted & ~slip)[:size], np.sqrt(square[:size])
-    loops, slips = growth.is_loop[:size], np.flatnonzero(slip[:size])
+    size = growth.size
+    slip = growth.cut & ~growth.gap
+    accepted = (growth.accepted & ~slip)[:size]
+    sigmas = np.sqrt(square[:size])
+    loops = growth.is_loop[:size]
+    slips = np.flatnonzero(slip[:size])
     terms = _terms(growth, reasons)
     confidence = forecast(terms) if loops.any() else float('nan')
     doubted = any(doubt.kind in (MOSTLY_REFUSED, OTHER_MAP) for doubt in reasons)
@@ -224,9 +234,11 @@ def _noise(growth: Growth) -> Array:
     of a place err together, these are worth one, and all are as noisy as was found; odometry
     is the unit.
     """
-    noise, rows = np.ones(len(growth.factors)), np.flatnonzero(growth.accepted)
+    noise = np.ones(len(growth.factors))
+    rows = np.flatnonzero(growth.accepted)
     at = np.flatnonzero((growth.is_loop & ~growth.factors.is_absolute)[rows])
-    loops, variance = rows[at], growth.variance
+    loops = rows[at]
+    variance = growth.variance
     if len(loops) and variance[1] > 1 and err_together(
             growth.place[loops], growth.posterior.residual[at], growth.posterior.left_over(at)):
         noise[growth.is_loop] = variance[1] / variance[0]
@@ -242,7 +254,8 @@ def fits(growth: Growth) -> tuple[Array, Mask]:
     The square is that of the residual, and of what is not accepted, of the innovation. Suspect,
     (m,) bool, is a loop that fits and yet was not accepted.
     """
-    accepted, square = growth.accepted & ~growth.cut, np.zeros(len(growth.factors))
+    accepted = growth.accepted & ~growth.cut
+    square = np.zeros(len(growth.factors))
     square[growth.accepted] = (growth.posterior.residual**2).sum(axis=1)
     # While nothing ties the map to the world, nothing is known of what names it; nor, while
     # nothing joins two parts, of what leads from one to the other.

@@ -35,7 +35,9 @@ ASKED = 250
 # Of each one so many pairs are looked at closely, those that differ least.
 _NEAREST = 20
 # A run has so many loops, each agrees with so many others of it, and it is so long [m].
-RUN, _MATES, _RUN_WAY = 6, 3, 2.5
+RUN = 6
+_MATES = 3
+_RUN_WAY = 2.5
 # One that is to outweigh the odometry has so many: of recorded ones five in six are true then.
 _LONG_RUN = 10
 # So many times vaguer than the surest one, a loop says little.
@@ -66,7 +68,8 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
     one, other, log_ratio = agreement(growth, rows)
     place, first = np.unique(growth.place[rows], return_index=True, return_inverse=True)[2:0:-1]
     evidence = _evidence(place, one, other, log_ratio)
-    best, needed = int(np.argmax(evidence)), np.log(len(rows) / DOUBT)
+    best = int(np.argmax(evidence))
+    needed = np.log(len(rows) / DOUBT)
     one_each = rows[np.sort(first)]  # in the order of `asked`, whatever places are called
     if evidence[best] < needed or evidence[best] < needed + _by_chance(growth, one_each):
         return NO_GROUP
@@ -96,7 +99,8 @@ def runs(growth: Growth, rows: Indices) -> list[Group]:
     """
     rows = asked(growth, rows)
     one, other, _ = agreement(growth, rows)
-    place, poses = growth.place[rows], growth.graph.manifold.positions(growth.poses)
+    place = growth.place[rows]
+    poses = growth.graph.manifold.positions(growth.poses)
     count = np.bincount(one[place[one] == place[other]], minlength=len(rows))
     found = []
     for number in np.unique(place):
@@ -120,7 +124,8 @@ def agree_at_a_place(growth: Growth, rows: Indices) -> Indices:
     _, number, count = np.unique(growth.place[rows], return_inverse=True, return_counts=True)
     rows = asked(growth, rows[count[number] > 1])
     one, other, log_ratio = agreement(growth, rows)
-    number, m = np.unique(growth.place[rows], return_inverse=True)[1], max(len(rows), 1)
+    number = np.unique(growth.place[rows], return_inverse=True)[1]
+    m = max(len(rows), 1)
     same = number[one] == number[other]
     best = np.zeros(m)
     np.maximum.at(best, number, np.bincount(
@@ -175,7 +180,8 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
     From the one loop follows the other, if the map is right about how their first ends lie to
     each other, and their second ends; whatever it says of the loops themselves.
     """
-    manifold, poses = growth.graph.manifold, growth.poses
+    manifold = growth.graph.manifold
+    poses = growth.poses
     first, second, Z = _ends_by_part(growth, rows)
     same_way = growth.part[first] * (growth.part.max() + 1) + growth.part[second]
     a, b = np.triu_indices(len(rows), 1)
@@ -189,8 +195,11 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
     scatter = np.linalg.pinv(error.T @ error, hermitian=True)
     near = np.argsort(np.einsum('mi,ij,mj->m', error, scatter, error), kind='stable')
     near = near[: _NEAREST * len(rows)]
-    a, b, error = a[near], b[near], error[near]
-    factors, k = growth.subgraph(rows).between, manifold.TANGENT_SIZE
+    a = a[near]
+    b = b[near]
+    error = error[near]
+    factors = growth.subgraph(rows).between
+    k = manifold.TANGENT_SIZE
     roots = factors.sqrt_information[b]
     covariance = 2 * np.eye(k) + _spread(growth, ends, a, b, roots)
     square, log_det = kernels.prediction.normalise(covariance, whiten(roots, error))
@@ -199,13 +208,17 @@ def agreement(growth: Growth, rows: Indices) -> tuple[Indices, Indices, Array]:
     log_ratio = log_likelihood_ratio(square, log_det, log_claims(factors, volume)[b], freedom,
                                      k)
     good = np.flatnonzero((square < growth.gate(freedom)) & (log_ratio > np.log(len(rows))))
-    a, b, log_ratio = a[good], b[good], log_ratio[good]
+    a = a[good]
+    b = b[good]
+    log_ratio = log_ratio[good]
     return np.concatenate((a, b)), np.concatenate((b, a)), np.tile(log_ratio, 2)
 
 
 def _ends_by_part(growth: Growth, rows: Indices) -> Ends:
     """Return loops as from an earlier part to a later one, within a part to the later keyframe."""
-    low, high, Z = growth.low[rows], growth.high[rows], growth.factors.measurement[rows]
+    low = growth.low[rows]
+    high = growth.high[rows]
+    Z = growth.factors.measurement[rows]
     turn = growth.part[low] > growth.part[high]
     return (np.where(turn, high, low), np.where(turn, low, high),
             np.where(turn[:, None], growth.graph.manifold.inverse(Z), Z))
@@ -228,7 +241,8 @@ def _spread(growth: Growth, ends: Ends, a: Indices, b: Indices, roots: Array) ->
     To first order Ad (Za S)^-1 and -Ad (F Za S)^-1 times the steps of the first ends of a and b,
     -Ad S^-1 and the identity times those of the second ends.
     """
-    manifold, (low, high, _) = growth.graph.manifold, ends
+    manifold = growth.graph.manifold
+    low, high, _ = ends
     samples, noise = growth.posterior.samples, growth.posterior.noise
     F, onward, S = _follows(manifold, ends, growth.poses, a, b)
     J = [manifold.adjoint(manifold.inverse(T)) for T in (onward, manifold.compose(F, onward), S)]

@@ -24,7 +24,8 @@ from l1slam_ros.core.graph.linear_system import with_world
 
 # Linked are loops whose ends lie within so many metres along the way, in sum, or within the length
 # of so many ordinary steps, where keyframes are far apart; and what they claim, too.
-_NEAR, _NEAR_STEPS = 5.0, 10
+_NEAR = 5.0
+_NEAR_STEPS = 10
 # Claims are told apart to this part of it, so that a robot that stands has few different ones.
 _GRAIN = 0.1
 # [sigmas] One in ten thousand maps of loops that err each for itself is taken for one where they
@@ -73,7 +74,8 @@ def places(graph: FactorGraph, chain: Array) -> tuple[Indices, Array]:
 
     chain : (n, p) poses along the odometry
     """
-    manifold, (low, high, Z) = graph.manifold, ends_in_time(graph)
+    manifold = graph.manifold
+    low, high, Z = ends_in_time(graph)
     positions = manifold.positions(chain)
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     # The world is where the way begins, as WORLD finds it: last.
@@ -104,7 +106,8 @@ def join_what_no_other(place: Indices, parts: Indices, joins: Mask) -> Mask:
     place : (m,) of each loop; parts : (2, m) that it joins, the lower first; joins : (m,) accepted
     """
     _, pair = np.unique(parts, axis=1, return_inverse=True)
-    pair, alone = pair.ravel(), np.zeros(place.max(initial=-1) + 1, bool)
+    pair = pair.ravel()
+    alone = np.zeros(place.max(initial=-1) + 1, bool)
     accepted = np.bincount(pair[joins], minlength=len(pair))
     of_place = place * (len(pair) + 1) + pair
     _, number = np.unique(of_place, return_inverse=True)
@@ -140,7 +143,9 @@ def _near(points: Array, reach: float) -> tuple[Indices, Indices]:
     height = np.ptp(points[:, 1]) + 4 * reach if len(points) else 0.0
     where = strip * height + points[:, 1]
     order = np.argsort(where, kind='stable')
-    points, where, number = points[order], where[order], np.arange(len(order))
+    points = points[order]
+    where = where[order]
+    number = np.arange(len(order))
     found = []
     for first, last in ((number + 1, where + reach),
                         (np.searchsorted(where, where + height - reach), where + height + reach)):

@@ -43,7 +43,8 @@ from l1slam_ros.core.robust.places import join_what_no_other
 from l1slam_ros.core.robust.rounds import Growth
 
 # Of fewer loops most may well be refused, and be of one place; most are more than half by some.
-_HANDFUL, _MOST = 5, 0.55
+_HANDFUL = 5
+_MOST = 0.55
 
 
 def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
@@ -119,7 +120,8 @@ def _other_map(growth: Growth) -> list[Doubt]:
     They may be right then: the odometry slipped, and nothing else knows of it. A place against
     the odometry alone is one word against another.
     """
-    rows, accepted = growth.undecided(), growth.accepted & growth.is_loop
+    rows = growth.undecided()
+    accepted = growth.accepted & growth.is_loop
     agree = agree_at_a_place(growth, rows)
     groups = [strongest_group(growth, rows).rows, *(
         agree[growth.place[agree] == place] for place in np.unique(growth.place[agree]))]
@@ -145,7 +147,8 @@ def _against(growth: Growth, group: Indices, rows: Mask) -> int:
 
 
 def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
-    low, high = np.maximum(growth.low[rows], 0), growth.high[rows]
+    low = np.maximum(growth.low[rows], 0)
+    high = growth.high[rows]
     return Doubt(kind, len(rows), int(low.min()), int(high.max()),
                  pairs=listed(growth.factors.pairs[rows]))
 

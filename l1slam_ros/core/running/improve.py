@@ -59,7 +59,9 @@ from l1slam_ros.core.solvers.solve import AUTO, choose, minimise_by
 
 # Where the weights of reweighted steps turn over, in mean |e|: at first, from one to the next, and
 # at last.
-_SMOOTHING, _SHARPER, _SHARPEST = 0.1, 0.3, 1e-2
+_SMOOTHING = 0.1
+_SHARPER = 0.3
+_SHARPEST = 1e-2
 # Linearisations of one round, and iterations of one linearisation where there is a front: with
 # more, the map comes too late.
 _OUTER, _INNER = 2, 120
@@ -221,7 +223,9 @@ def front_of(problem: Problem, poses: Array, rows: int,
     None: the graph is too dense to be factored in the time of an update, or some keyframe is not
     tied to the others.
     """
-    judgement, method, part = problem.judgement, problem.method, problem.part
+    judgement = problem.judgement
+    method = problem.method
+    part = problem.part
     if not problem.is_sparse or method.cholesky is None:
         return None
     loops = ~problem.graph.between.is_odometry
@@ -281,7 +285,9 @@ def _solved(graph: FactorGraph, poses: Array, options: OptimiserOptions,
 
 def _improvement(solution: Solution, problem: Problem, judgement: Judgement, before: float,
                  steps: int, start: float) -> Improvement:
-    accepted, cost, gap = judgement.accepted, solution.cost, solution.gap
+    accepted = judgement.accepted
+    cost = solution.cost
+    gap = solution.gap
     poses = on_ties(problem, judgement, solution.poses)
     if poses is not solution.poses:
         cost = l1_cost(whitened_residual(judgement.believed(problem.graph), poses))

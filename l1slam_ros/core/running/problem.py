@@ -148,7 +148,9 @@ def on_ties(problem: Problem, judgement: Judgement, poses: Array) -> Array:
     of odometry is refused that alone joins two components, none is moved.
     """
     graph, g = problem.graph, problem.ties
-    factors, manifold, n = graph.between, graph.manifold, graph.n_poses
+    factors = graph.between
+    manifold = graph.manifold
+    n = graph.n_poses
     if not g:
         return poses
     known = np.flatnonzero(judgement.accepted[:len(factors) - g])

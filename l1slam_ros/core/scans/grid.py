@@ -27,7 +27,9 @@ from l1slam_ros.core.scans import kernels
 from l1slam_ros.core.scans.points import Points, transformed
 
 # Log odds that one ray adds, and the most that all do.
-_FREE, _OCCUPIED, _MOST = np.float32(0.4), np.float32(0.85), np.float32(100.0)
+_FREE = np.float32(0.4)
+_OCCUPIED = np.float32(0.85)
+_MOST = np.float32(100.0)
 # Cells above, and below, are occupied and free: probabilities .65 and .25, as nav2's map saver
 # has them.
 OCCUPIED, FREE = np.log(0.65 / 0.35), np.log(0.25 / 0.75)

@@ -43,12 +43,19 @@ _SIMILAR = 0.75
 # [m] Candidates are neighbours of each other where they are nearer along the way.
 _NEIGHBOURS = 4.0
 # [m], [rad] A search reaches at least so far, and at most; places that look alike are nearer.
-_LEAST_REACH, _MOST_REACH, _LEAST_TURN, _ALIKE_REACH = 1.5, 8.0, 0.5, 4.0
+_LEAST_REACH = 1.5
+_MOST_REACH = 8.0
+_LEAST_TURN = 0.5
+_ALIKE_REACH = 4.0
 _SIGMAS = 3.0
 # [m/m], [rad/m] How the odometry's error grows with the way, beyond where the map is known.
 _DRIFT = np.array((0.05, 0.01))
 # What a loop must show; see above.
-_SCORE, _RIVAL, _OVERLAP, _AGREE, _HELD = 0.42, 0.85, 0.3, 0.93, 0.05
+_SCORE = 0.42
+_RIVAL = 0.85
+_OVERLAP = 0.3
+_AGREE = 0.93
+_HELD = 0.05
 # [m] A match that goes so far from the peak of the search slides.
 _WANDER = 0.4
 # Of neighbouring keyframes' submaps much is the same: a loop is half as certain as matches say.

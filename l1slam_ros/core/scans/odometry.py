@@ -56,7 +56,11 @@ _FEWEST = 30
 _LOST_AFTER = 6
 _LOST_WAY = 1.0
 # Wheels: part of the way and of the turn, turn for each metre, and of each scan [m, rad].
-_WAY, _TURN, _TURN_OF_WAY, _STEP, _STEP_TURN = 0.3, 0.2, 0.3, 0.01, 0.01
+_WAY = 0.3
+_TURN = 0.2
+_TURN_OF_WAY = 0.3
+_STEP = 0.01
+_STEP_TURN = 0.01
 # [m] So far from where it is said to be a laser may sit: what it moves when the robot turns.
 _ASIDE = 0.1
 # After scans and wheels disagreed, for so many scans the wheels may be wrong by twice their

@@ -27,7 +27,9 @@ SPACING = 0.05
 # [m] A normal is of the line through neighbours within so much; RMS distance to that line.
 _NORMAL_REACH, _OFF_LINE = 0.25, 0.03
 # The same by the noise of the ranges, and the most that is taken for noise [m].
-_REACH_OF_NOISE, _OFF_OF_NOISE, _MOST_NOISE = 8.0, 1.5, 0.08
+_REACH_OF_NOISE = 8.0
+_OFF_OF_NOISE = 1.5
+_MOST_NOISE = 0.08
 # Of second differences the lower quartile, which corners and stray rays do not reach; by how much
 # it is less than the noise, where that is normal.
 _SMOOTH = 0.25

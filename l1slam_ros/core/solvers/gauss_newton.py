@@ -42,7 +42,10 @@ from l1slam_ros.core.solvers.reweighting import weighted_least_squares
 
 # Damping: the first, the least, the most, and as good as none. Slow bends of a chain feel even the
 # least of it.
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING, _HARDLY = 1e-8, 3e-10, 1e6, 1e-6
+_FIRST_DAMPING = 1e-8
+_LEAST_DAMPING = 3e-10
+_MOST_DAMPING = 1e6
+_HARDLY = 1e-6
 # A map to within its noise: Gauss-Newton begins where chi2 is at most so many times what the noise
 # makes of it, and takes so many steps at most.
 _FITS, _NOISE_STEPS = 3, 60

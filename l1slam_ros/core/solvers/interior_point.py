@@ -62,7 +62,10 @@ _MANY_ROWS = 100_000
 # Of the curvature: how much of it is wanted; once refused, what is tried at once (a try that is
 # refused takes as long as any, for it fails at its end) and the next time; and how fast it is
 # taken up again.
-_CURVATURE, _REFUSED, _NEXT, _RECOVERY = 0.7, 0.25, 0.5, 1.3
+_CURVATURE = 0.7
+_REFUSED = 0.25
+_NEXT = 0.5
+_RECOVERY = 1.3
 # Part of its diagonal that J'QJ gets where rounding leaves it indefinite: ten times what is taken
 # for rounding there, and so many times more each time that it is so again.
 _ROUNDING, _MORE = 1e-12, 100.0

@@ -32,7 +32,11 @@ from l1slam_ros.io.files import TextLines
 from l1slam_ros.io.ours import MARK
 from l1slam_ros.io.remarks import KEYWORD
 
-REJECTED, SUSPECT, SLIP, STRUCK, MEASURED = 'rejected', 'suspect', 'slip', 'struck', 'measured'
+REJECTED = 'rejected'
+SUSPECT = 'suspect'
+SLIP = 'slip'
+STRUCK = 'struck'
+MEASURED = 'measured'
 _COMMENT = re.compile(f'# ({REJECTED}|{SUSPECT}|{SLIP}|{STRUCK}|{MEASURED}) '
                       '([A-Z].*?) # factor ([0-9]{1,9})')
 

@@ -50,7 +50,9 @@ class MapFile:
 
     def __init__(self, backend: Backend, options: Callable[[], NodeOptions],
                  warn: Callable[[str], object]):
-        self._backend, self._options, self._warn = backend, options, warn
+        self._backend = backend
+        self._options = options
+        self._warn = warn
         self.is_saving = False
         self._one = threading.Lock()
         # Names of robots by their numbers, behind those of the node the ones of a loaded map.

@@ -22,7 +22,9 @@ from l1slam_ros.core.scans.grid import Grid
 from l1slam_ros.io.files import replacing, require_file, write_lines
 from l1slam_ros.io.ours import MARK, marked, refuse_others
 
-_FREE, _UNKNOWN, _OCCUPIED = 254, 205, 0
+_FREE = 254
+_UNKNOWN = 205
+_OCCUPIED = 0
 # A shade is read as (255 - shade) / 255 occupied: 205 is .19608, which .25 would call free.
 _FREE_BELOW = 0.196
 

@@ -41,7 +41,9 @@ class ScanDiagnostics:
 
     def __init__(self, node: Node, topics: Mapping[str, Traffic], front_end: FrontEndThread,
                  drawer: MapDrawer, failures: Failures):
-        self._node, self._topics, self._front_end = node, topics, front_end
+        self._node = node
+        self._topics = topics
+        self._front_end = front_end
         self._drawer, self._failures = drawer, failures
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._minute = deque([Counter[str]()], maxlen=_MINUTE)

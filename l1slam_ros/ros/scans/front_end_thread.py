@@ -42,7 +42,9 @@ from l1slam_ros.ros.threads.failures import Failures
 _BACKLOG = 20_000
 # [s] So often, at most, the path is read while there is nothing else to do, and where there is a
 # new keyframe; and the map looked at. To read it takes as long as some scans do.
-_READ, _FRESH, _LOOK = 1.0, 0.2, 0.1
+_READ = 1.0
+_FRESH = 0.2
+_LOOK = 0.1
 _REPEAT_WARNING = 5.0  # [s]
 # [s] Pause after an error, so that one which recurs does not keep a core busy.
 _BREATH = 0.05
@@ -71,7 +73,9 @@ class RunOfScans:
 
     def __init__(self, options: Callable[[], ScanLoopsOptions], frames: RobotFrames,
                  publisher: ScanPublisher, drawer: MapDrawer, logger: Any):
-        self._options, self._frames, self._logger = options, frames, logger
+        self._options = options
+        self._frames = frames
+        self._logger = logger
         self._publisher, self._drawer = publisher, drawer
         self.counts = Counter[str]()
         self.costs: deque[float] = deque(maxlen=_COSTS)

@@ -72,7 +72,9 @@ class MapDrawer:
             for keyframe in self._wanted.keys() - placed.keys():
                 self._grid.erase(keyframe)
                 self._changed = True
-            self._frame, self._stamp, self._wanted = frame, stamp, placed
+            self._frame = frame
+            self._stamp = stamp
+            self._wanted = placed
             self._to_draw = [keyframe for keyframe, (_, pose) in placed.items()
                              if not self._grid.is_as_drawn(keyframe, pose)]
 

@@ -67,7 +67,9 @@ class Inputs:
 
     def __init__(self, node: Node, backend: Backend, options: NodeOptions, failures: Failures,
                  robots: Sequence[RobotPublisher]):
-        self._node, self._backend, self._robots = node, backend, robots
+        self._node = node
+        self._backend = backend
+        self._robots = robots
         self._map_frame, self._odom_frame = options.map_frame, options.odom_frame
         self._unanswered: set[RobotPublisher] = set()
         # Robots that nobody named, and that was said.

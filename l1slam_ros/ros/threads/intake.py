@@ -158,7 +158,10 @@ class Intake:
 
     def __init__(self, node: Node, failures: Failures, used: Callable[[], None],
                  tick: Callable[[], float]):
-        self._node, self._failures, self._used, self._tick = node, failures, used, tick
+        self._node = node
+        self._failures = failures
+        self._used = used
+        self._tick = tick
         self._group = _Apart()
         self.active = False
         self._closing = False

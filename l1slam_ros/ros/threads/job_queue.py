@@ -39,7 +39,9 @@ class JobQueue:
     """
 
     def __init__(self, node: Node, failures: Failures, done: Callable[[], None]):
-        self._node, self._failures, self._done = node, failures, done
+        self._node = node
+        self._failures = failures
+        self._done = done
         # What it is called, what is to be done, and where its answer goes; None: the end.
         self._queue: queue.SimpleQueue[tuple[str, Callable[[], str], Future] | None] = (
             queue.SimpleQueue())

@@ -43,7 +43,9 @@ class SolverThread:
 
     def __init__(self, backend: Backend, failures: Failures, logger: Any,
                  parameters: NodeParameters[NodeOptions]):
-        self._backend, self._failures, self._logger = backend, failures, logger
+        self._backend = backend
+        self._failures = failures
+        self._logger = logger
         self._parameters = parameters
         self._woken = threading.Event()
         self._paused = self._closing = False

@@ -73,7 +73,9 @@ class LoopFactors:
     """
 
     def __init__(self, manifold: Manifold, notes: Notes, verbatim: bool):
-        self._manifold, self._notes, self._verbatim = manifold, notes, verbatim
+        self._manifold = manifold
+        self._notes = notes
+        self._verbatim = verbatim
         self.waiting = WaitingLoops()
         self.lost = 0
         self.forget()

@@ -148,7 +148,9 @@ class OdometryStream:
 
     def __init__(self, manifold: Manifold, notes: Notes, base_frame: BaseFrame,
                  resumed: bool = False):
-        self._manifold, self._notes, self._resumed = manifold, notes, resumed
+        self._manifold = manifold
+        self._notes = notes
+        self._resumed = resumed
         self._base_frame = base_frame
         self.last: Point | None = None
         self._recent = RecentMotion(manifold)

@@ -56,7 +56,9 @@ _ANEW = 0.25
 _WIDE = 0.75
 # A sample is missing after so many times the usual time; and many are, which is a silence, after
 # so many times, and so long [s]: what the robot did meanwhile, nobody saw.
-_ONE, _MANY, SILENCE = 1.5, 5.0, 0.5
+_ONE = 1.5
+_MANY = 5.0
+SILENCE = 0.5
 # [m] A robot turns about so short a radius, whatever its speed.
 _TIGHT = 1.0
 # [m/s] Slower, a robot stands; and in a longer silence [s] any may have stood.

@@ -36,7 +36,9 @@ from l1slam_ros.core.robust.places import places
 # [rad/m] What wheels and gyros drift by: its standard deviation, and the most that is looked for.
 _USUAL, _MOST = 0.03, 0.18
 # From coarse to fine: steps of the drift, each a part of the one before.
-_STEP, _FINER, _LEVELS = 0.004, 5.0, 3
+_STEP = 0.004
+_FINER = 5.0
+_LEVELS = 3
 # What the odometry states of its turns may be off by, in variance.
 _NOISE = np.logspace(-3, 3, 13)
 # Rounds of expectation and maximisation of the share of true loops; so many loops vote at most.
@@ -48,7 +50,8 @@ def straightened(graph: FactorGraph, drift: float) -> FactorGraph:
     if not drift:
         return graph
     other = graph.subset(np.arange(len(graph.between)))
-    factors, rows = other.between, np.flatnonzero(other.between.is_odometry)
+    factors = other.between
+    rows = np.flatnonzero(other.between.is_odometry)
     factors.measurement[rows] = corrected(factors, rows, drift)
     return other
 
@@ -78,7 +81,8 @@ def vote(graph: FactorGraph) -> tuple[float, float]:
     place = places(whole, chain)[0][rows]
     low, high, Z = (ends[rows] for ends in ends_in_time(graph))
     way, turned = _along(whole)
-    metres, own = way[high] - way[low], covariance_of(graph.between.sqrt_information[rows])
+    metres = way[high] - way[low]
+    own = covariance_of(graph.between.sqrt_information[rows])
     phi = se2.wrap(Z[:, 2] - (chain[high, 2] - chain[low, 2]))
     weight = 1.0 / np.unique(place, return_inverse=True, return_counts=True)[2][
         np.unique(place, return_inverse=True)[1]]
@@ -110,7 +114,10 @@ def _highest(phi: Array, metres: Array, variance: Array, weight: Array, prior: f
 
     And by how much it is above the next peak.
     """
-    centre, step, most, lead = 0.0, _STEP, min(_MOST, 4 * np.sqrt(prior) + _STEP), np.inf
+    centre = 0.0
+    step = _STEP
+    most = min(_MOST, 4 * np.sqrt(prior) + _STEP)
+    lead = np.inf
     for _ in range(_LEVELS):
         drift = centre + np.arange(-most, most + step / 2, step)
         value = _log_likelihood(phi, metres, variance + (metres * step) ** 2 / 12, weight, drift
@@ -118,7 +125,9 @@ def _highest(phi: Array, metres: Array, variance: Array, weight: Array, prior: f
         is_peak = (value[1:-1] > value[:-2]) & (value[1:-1] >= value[2:])
         peaks = np.sort(value[1:-1][is_peak])
         lead = float(peaks[-1] - peaks[-2]) if len(peaks) > 1 and most > 2 * step else lead
-        centre, most, step = float(drift[np.argmax(value)]), 2 * step, step / _FINER
+        centre = float(drift[np.argmax(value)])
+        most = 2 * step
+        step = step / _FINER
     return float(value.max()), centre, lead
 
 
@@ -129,7 +138,9 @@ def _log_likelihood(phi: Array, metres: Array, variance: Array, weight: Array, d
     # All around the circle, what is wider than it is even.
     normal = np.exp(-error**2 / (2 * variance)) / np.sqrt(2 * np.pi * variance)
     normal = np.maximum(normal, np.where(variance > np.pi**2 / 3, 1 / (2 * np.pi), 0.0))
-    even, share, part = 1 / (2 * np.pi), np.full((len(drift), 1), 0.5), weight / weight.sum()
+    even = 1 / (2 * np.pi)
+    share = np.full((len(drift), 1), 0.5)
+    part = weight / weight.sum()
     true = np.empty_like(normal)
     for _ in range(_ROUNDS):
         # normal / (normal + even (1 - share) / share)

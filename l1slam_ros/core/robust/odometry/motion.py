@@ -57,13 +57,15 @@ class Motion:
 
     def log_density(self, step: Array, spread: Array | float = 0.0) -> Array:
         """Return the logarithm of the density of steps (m, k), known to spread (m, k, k), (m,)."""
-        (square, log_det), k = self.square(step, spread), len(self.mean)
+        square, log_det = self.square(step, spread)
+        k = len(self.mean)
         normal = -(square + k * np.log(2 * np.pi)) / 2
         # From the density of the square to that of a point on its ellipsoid.
         tail = (np.log(self.power / np.sqrt(len(self.step))) + self.power * np.log(self.start)
                 - (self.power + k / 2) * np.log(np.maximum(square, self.start))
                 + lgamma(k / 2) - k / 2 * np.log(np.pi))
-        (square, wide), n = _square(step, self.rare + spread), len(self.step)
+        square, wide = _square(step, self.rare + spread)
+        n = len(self.step)
         rare = -(square + wide + k * np.log(2 * np.pi)) / 2 - np.log(n)
         return np.logaddexp(np.maximum(normal, tail) - log_det / 2, rare)
 
@@ -86,11 +88,13 @@ def usual_motion(growth: Growth) -> Motion:
     """Return how the robot moves by its odometry."""
     step = steps_of(growth, np.flatnonzero(~growth.is_loop & ~growth.cut))
     least = np.diag(_GRAIN**2 * (step**2).mean(axis=0) + _TINY)
-    translation, width = growth.graph.manifold.TRANSLATION, np.full(len(least), np.pi**2 / 3)
+    translation = growth.graph.manifold.TRANSLATION
+    width = np.full(len(least), np.pi**2 / 3)
     width[translation] = (step[:, translation] ** 2).mean()
     motion = Motion(step, step.mean(axis=0), np.cov(step.T) + least, np.inf, 1.0,
                     np.diag(width) + least)
-    square, few = np.sort(motion.square(step)[0]), int(np.sqrt(len(step)))
+    square = np.sort(motion.square(step)[0])
+    few = int(np.sqrt(len(step)))
     start = max(float(square[-few - 1]), float(len(least)))
     # The one at the start is for steps that are all alike.
     power = few / (1 + np.log(np.maximum(square[-few:] / start, 1.0)).sum())
@@ -116,7 +120,8 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     Of one that is cut, all others know nothing of it as it is.
     """
     odds = np.full(len(growth.factors), -np.inf)
-    manifold, factors = growth.graph.manifold, growth.factors
+    manifold = growth.graph.manifold
+    factors = growth.factors
     k = manifold.TANGENT_SIZE
     rows = np.flatnonzero(~growth.is_loop & ~growth.gap & (factors.freedom == k))
     at = np.searchsorted(np.flatnonzero(growth.accepted), rows)
@@ -124,7 +129,8 @@ def log_odds_of_slips(growth: Growth, motion: Motion) -> Array:
     inverse = np.linalg.inv(R + _ALONE * np.eye(k))
     # Of what no other says, the residual is rounding.
     innovation = inverse @ R @ inverse @ r[:, :, None]
-    measured, cut = growth.uncut(), growth.cut[rows]
+    measured = growth.uncut()
+    cut = growth.cut[rows]
     without = measured.innovations(rows[cut])
     inverse[cut] = without.spread + np.eye(k)
     innovation[cut, :, 0] = -without.system.b.reshape(-1, k)

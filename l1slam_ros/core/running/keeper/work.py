@@ -85,7 +85,9 @@ def judge_all(keeper: Keeper, anew: bool, idle: bool, check: Check) -> None:
     turned, order = by_robot(whole)
     problem = as_one(turned)
     alone = until(lambda: keeper.revisions.grown != grown, check) if idle else check
-    graph, known, poses = problem.graph, problem.judgement, problem.poses
+    graph = problem.graph
+    known = problem.judgement
+    poses = problem.poses
     judgement, l2_poses = (robust_solve(graph, check=alone, known=(known, poses)) if anew
                            else judge(graph, poses, known, np.inf, check))
     check()

@@ -29,7 +29,12 @@ from l1slam_ros.io.bags.bounds import BombError, require_small, unpacked
 from l1slam_ros.io.bags.damaged.walk import BagMessage, BrokenRecordError
 
 MAGIC = b'\x89MCAP0\r\n'
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _METADATA, _DATA_END = 3, 4, 5, 6, 12, 15
+_SCHEMA = 3
+_CHANNEL = 4
+_MESSAGE = 5
+_CHUNK = 6
+_METADATA = 12
+_DATA_END = 15
 # Opcodes between are kept for later versions of the format; zeros are what a power cut leaves.
 _LAST_OPCODE, _FIRST_FOREIGN_OPCODE = 15, 128
 _HEAD = struct.Struct('<BQ')
