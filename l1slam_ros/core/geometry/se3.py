@@ -62,7 +62,7 @@ def _matrix(q: Array) -> Array:
     x = q[..., :3]
     w = q[..., 3, None, None]
     half = w**2 - 0.5
-    return 2 * (half * np.eye(3) + x[..., :, None] * x[..., None, :] + w * _skew(x))
+    return 2.0 * (half * np.eye(3) + x[..., :, None] * x[..., None, :] + w * _skew(x))
 
 
 def _opposite(q: Array) -> Array:

@@ -69,7 +69,7 @@ _DISTRUST = 25
 _WRONG = 2.0
 # Errors of a match that no count of points lessens, of the map and of normals: ahead, to the
 # left [m, m, rad]. Found by simulation; see `matching.KAPPA`.
-FLOOR = np.diag((0.003, 0.002, 0.0002)) ** 2
+FLOOR: Array = np.square(np.diag((0.003, 0.002, 0.0002)))
 
 
 @dataclass(frozen=True)

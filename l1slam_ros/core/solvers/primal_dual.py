@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 # Iterations between two looks at the stopping test, which costs as much as one iteration.
 CHECK_EVERY = 40
+# What is no larger counts as nothing.
+_LEAST = float(np.finfo(float).eps)
 
 Resolvent = Callable[[Array], Array]
 
@@ -111,7 +113,7 @@ def diagonal_step_sizes(A: 'csr_array') -> tuple[Array, Array]:
     magnitude = abs(A)
     # Nothing moves with an empty column; an empty row's dual is to jump to its bound.
     return (_inverse(magnitude.sum(axis=0), where_zero=0.0),
-            _inverse(magnitude.sum(axis=1), where_zero=1 / np.finfo(float).eps))
+            _inverse(magnitude.sum(axis=1), where_zero=1 / _LEAST))
 
 
 def primal_weight(A: 'csr_array', b: Array, x: Array) -> float:
@@ -123,7 +125,7 @@ def primal_weight(A: 'csr_array', b: Array, x: Array) -> float:
     """
     largest = abs(A).max(axis=1).toarray().ravel()
     needed = np.abs(A @ x - b) * _inverse(largest, where_zero=0.0)
-    return 1 / max(float(needed.mean()), np.finfo(float).eps)
+    return 1 / max(float(needed.mean()), _LEAST)
 
 
 def minimise_l1(
