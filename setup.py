@@ -75,7 +75,7 @@ setup(
         'fleet': ['distributed>=2024.1'],
         # Newer style tools find other things, and a test asserts that they find none.
         # setuptools: a test builds the wheel, and from 70.1 on it can do so by itself.
-        # pip: tests install into other environments; before 23.1 it cannot where those are of 3.12.
+        # pip: tests install into other environments; before 23.1 it cannot into those of 3.12.
         'test': [
             'pytest>=7.4',
             'pytest-xdist>=3.2',
