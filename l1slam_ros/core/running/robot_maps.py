@@ -101,14 +101,14 @@ class Seen(NamedTuple):
         """Return the maps of robots by the first keyframes, see `robot_maps`."""
         if len(self.numbers) < 2:
             return {}
-        factors = self.factors
-        inside = np.maximum(factors.i, factors.j)[:len(accepted)] < known
+        factors, m = self.factors, len(accepted)
+        inside = (factors.i[:m] < known) & (factors.j[:m] < known)
 
         def odometry(keyframes: Indices) -> Array:
             return np.concatenate([self.firsts[robot] for robot in self.robot[keyframes].tolist()])
 
         firsts = np.array([numbers[0] for _, numbers in sorted(self.numbers.items())])
-        return robot_maps(self.manifold, self.robot[:known], firsts[firsts < known], factors,
+        return robot_maps(self.manifold, self.robot, firsts[firsts < known], factors,
                           accepted[:len(inside)] & inside, odometry, pose)
 
 
@@ -138,13 +138,16 @@ def map_ends(seen: Seen, poses: Array, front: Front | None, accepted: Mask) -> d
 def _joined(robot: Indices, numbers: Indices, factors: BetweenFactors,
             accepted: Mask) -> tuple[Mask, int | None]:
     """Return which robots are joined to the first one, (r,), or the world: then None, else it."""
-    rows = np.flatnonzero(accepted)
     r = len(numbers)
-    i = factors.i[rows]
-    j = factors.j[rows]
-    place = np.searchsorted(numbers, robot)
-    # Thousands of factors, but few pairs of robots; the world comes after them.
-    pairs = np.flatnonzero(np.bincount(np.where(i == WORLD, r, place[i]) * r + place[j]))
+    # Of thousands of factors few join robots, and every update asks: small numbers take less time.
+    place = np.searchsorted(numbers, robot).astype(np.min_scalar_type(r))
+    i, j = factors.i[:len(accepted)], factors.j[:len(accepted)]
+    one, other = place[i], place[j]
+    rows = np.flatnonzero(accepted & ((one != other) | (i == WORLD)))
+    # The world comes after the robots.
+    one = np.where(i[rows] == WORLD, r, one[rows].astype(np.int64))
+    # Few pairs of robots.
+    pairs = np.flatnonzero(np.bincount(one * r + other[rows]))
     one, other = np.divmod(pairs, r)
     component = lowest_of_components(one, other, r + 1)
     if (one == r).any():
