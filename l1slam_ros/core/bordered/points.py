@@ -29,6 +29,8 @@ from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
 
 # Stands for a keyframe, or a point, that is held fixed.
 FIXED = -1
+# The longest columns that are kept of a point, in keyframes: a map of a million has some 3,000.
+_LONGEST = 1024
 
 
 def triangle(rows: int) -> int:
@@ -90,6 +92,9 @@ class Points:
         # Where each is in the order of elimination, -1 for a new one.
         self._at = GrowingArray((), np.int64)
         self._covariance = GrowingArray((k, k), room=triangle(most))
+        # What covariances with later ones are made of, see `kernels.border`; where it begins.
+        self._columns = GrowingArray(room=most * _LONGEST * k * k)
+        self._begins = GrowingArray((), np.int64)
         self._mean = GrowingArray((k,))
         self._parent = GrowingArray((), np.int64)
         self._turn, self._noise = GrowingArray((k, k)), GrowingArray((k, k))
@@ -144,6 +149,7 @@ class Points:
         product = np.empty((len(self) + 1, self._k, self._k))
         kernels.border.follow(self.covariance, parent, turn, noise, product)
         self._at.extend(np.array([FIXED]))
+        self._begins.extend(np.array([FIXED]))
         self._of_new.append(self._append(product, mean, parent, turn, noise))
 
     def forget(self, since: int, used: Indices) -> None:
@@ -157,9 +163,11 @@ class Points:
             del self._of_old[keyframe]
             self._at.view()[point] = FIXED
             if point == len(self) - 1:
-                ends = ((self._at, point), (self._covariance, triangle(point)),
-                        (self._mean, point), (self._parent, point), (self._turn, point),
-                        (self._noise, point))
+                begin = int(self._begins.view()[point])
+                columns = len(self._columns) if begin < 0 else begin
+                ends = ((self._at, point), (self._begins, point), (self._columns, columns),
+                        (self._covariance, triangle(point)), (self._mean, point),
+                        (self._parent, point), (self._turn, point), (self._noise, point))
                 for array, length in ends:
                     array.replace(length, array.view()[:0])
 
@@ -168,9 +176,13 @@ class Points:
         none = np.zeros((1, self._k, self._k))
         position = int(self._cholesky.pattern.position[keyframe])
         self._at.extend(np.array([position]))
-        product = self._cholesky.covariances(
+        self._begins.extend(np.array([FIXED]))
+        product, columns = self._cholesky.covariances(
             self._at.view(), np.append(self._parent.view(), FIXED),
-            np.concatenate((self._turn.view(), none)))
+            np.concatenate((self._turn.view(), none)), self._columns.view(), self._begins.view())
+        if columns.size <= _LONGEST * self._k * self._k:
+            self._begins.view()[-1] = len(self._columns)
+            self._columns.extend(columns.ravel())
         return self._append(product, np.zeros(self._k), FIXED, *none, *none)
 
     def _append(self, product: Array, mean: Array, parent: int, turn: Array,

@@ -9,9 +9,11 @@
 """
 What comes after a factorisation: covariances, and a small dense factor that grows.
 
-The arrays of the sparse factor are those of `cholesky`. L^-1 e_p for the k columns of one keyframe
-p is zero but on the way from p to the root of the elimination tree. Of H^-1 e_p what is asked for
-lies on the ways of the other points. These have most in common: what loops join is near.
+The arrays of the sparse factor are those of `cholesky`. L^-1 e_p, the k columns of one keyframe p,
+is zero but on the way from p to the root of the elimination tree. The covariance of two keyframes
+is the product of their columns on what their ways have in common, which is the end of both. Where
+columns were too long to be kept, H^-1 e_p is solved for on the ways of those keyframes instead:
+in a chain a way may be as long as the chain.
 
 Points are the keyframes that factors touch. Those that came later have no position in the factor;
 where they are hangs on another point, their parent: x = turn x_parent + noise. Triangles are kept
@@ -25,16 +27,19 @@ from l1slam_ros.core.kernels.compiled import compiled, loop
 
 
 @loop('(f8[::1], i4[::1], i8[::1], i4[::1], i8[::1], i8[::1], i4[::1], i8[::1], i8[::1], '
-      'f8[:, :, ::1], f8[:, :, ::1])')
-def reach(panels, first, start, pattern, offset, stride, owner, at, parent, turn, product):
+      'f8[:, :, ::1], f8[::1], i8[::1], f8[:, :, ::1])')
+def reach(panels, first, start, pattern, offset, stride, owner, at, parent, turn, kept, begins,
+          product):
     """
-    Write the covariances of all points with the last one, (t, k, k).
+    Write the covariances of all points with the last one, (t, k, k); return its columns, (k, w).
 
     owner : (n,) the supernode of each position; at : (t,) the position of each point, -1 for what
-    has none; parent, turn : (t,), (t, k, k), see above
+    has none; parent, turn : (t,), (t, k, k), see above; kept : columns of points, one after the
+    other; begins : (t,) where those of each are among them, -1 for none
     """
     t, k = product.shape[:2]
-    ways = _ways(first, start, pattern, owner, at)
+    solved = np.where(begins < 0, at, -1)
+    ways = _ways(first, start, pattern, owner, solved)
     # Where in the columns each position on a way is.
     where, length = np.empty(len(owner), np.int32), 0
     for s in ways:
@@ -45,14 +50,19 @@ def reach(panels, first, start, pattern, offset, stride, owner, at, parent, turn
     begin = at[t - 1]
     for q in range(k):
         values[q, where[begin] * k + q] = 1.0
+    own_way, count = np.empty(len(ways), np.int32), 0
     s = owner[begin]
     while s >= 0:
+        own_way[count] = s
+        count += 1
         _climb_panel(panels[offset[s]:offset[s + 1]], stride[s],
                      pattern[start[s]:start[s + 1]], first[s + 1] - first[s], begin - first[s],
                      where, values, where[begin] * k)
         s = _parent(first, start, pattern, owner, s)
         begin = first[s]
-    for s in ways[::-1]:
+    columns, left = _along(first, own_way[:count], where, values)
+    solved[t - 1] = -1
+    for s in _ways(first, start, pattern, owner, solved)[::-1]:
         _descend_panel(panels[offset[s]:offset[s + 1]], stride[s],
                        pattern[start[s]:start[s + 1]], first[s + 1] - first[s], where, values,
                        where[first[s]] * k)
@@ -61,10 +71,57 @@ def reach(panels, first, start, pattern, offset, stride, owner, at, parent, turn
             _multiply(turn[s], product[parent[s]], product[s])
         elif at[s] < 0:
             product[s] = 0.0
+        elif s == t - 1:
+            _multiply_ends(columns.ravel(), columns.shape[1], columns, columns.shape[1],
+                           product[s])
+        elif begins[s] >= 0:
+            width, common = _lengths(first, start, pattern, owner, left, owner[at[s]], k)
+            _multiply_ends(kept[begins[s]:begins[s] + k * width], width, columns, common,
+                           product[s])
         else:
             for a in range(k):
                 for b in range(k):
                     product[s, a, b] = values[b, where[at[s]] * k + a]
+    return columns
+
+
+@compiled
+def _along(first, way, where, values):
+    """Return the values on a way to the root, and how many numbers each supernode has left."""
+    k, width = len(values), 0
+    left = np.zeros(len(first) - 1, np.int64)
+    for s in way[::-1]:
+        width += (first[s + 1] - first[s]) * k
+        left[s] = width
+    columns = np.empty((k, width))
+    for s in way:
+        own, size = where[first[s]] * k, (first[s + 1] - first[s]) * k
+        begin = width - left[s]
+        for q in range(k):
+            columns[q, begin:begin + size] = values[q, own:own + size]
+    return columns, left
+
+
+@compiled
+def _lengths(first, start, pattern, owner, left, s, k):
+    """Return how long the way of a supernode is, and what it has in common with another one."""
+    below = 0
+    while s >= 0 and left[s] == 0:
+        below += (first[s + 1] - first[s]) * k
+        s = _parent(first, start, pattern, owner, s)
+    common = left[s] if s >= 0 else 0
+    return below + common, common
+
+
+@compiled
+def _multiply_ends(others, width, columns, common, product):
+    """Write the products of the ends of columns, (k, width) one after the other, and (k, w)."""
+    k, begin = len(columns), columns.shape[1] - common
+    for a in range(k):
+        line = others[(a + 1) * width - common:(a + 1) * width]
+        for b in range(0, k, 3):
+            product[a, b], product[a, b + 1], product[a, b + 2] = _dot_three(
+                line, common, columns[b, begin:], columns[b + 1, begin:], columns[b + 2, begin:])
 
 
 @compiled

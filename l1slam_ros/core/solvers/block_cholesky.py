@@ -271,18 +271,20 @@ class BlockCholesky:
         layout = self._last
         kernels.prediction.solve_many(layout.panels, *layout.shape, self.pattern.position, right)
 
-    def covariances(self, at: Indices, parent: Indices, turn: Array) -> Array:
+    def covariances(self, at: Indices, parent: Indices, turn: Array, kept: Array,
+                    begins: Indices) -> tuple[Array, Array]:
         """
         Return the covariances of points with the last one by the last factorisation, (t, k, k).
 
-        at : (t,) the place of each in the order of elimination, -1 for none; parent, turn : see
-        `kernels.border`
+        And the columns of that one, (k, w). at : (t,) the place of each in the order of
+        elimination, -1 for none; parent, turn, kept, begins : see `kernels.border`
         """
         layout = self._last
         product = np.empty((len(at), *turn.shape[1:]))
-        kernels.border.reach(layout.panels, *layout.shape, self.pattern.owner, at, parent, turn,
-                             product)
-        return product
+        columns: Array = kernels.border.reach(
+            layout.panels, *layout.shape, self.pattern.owner, at, parent, turn, kept, begins,
+            product)
+        return product, columns
 
 
 def _at_once(share: Callable[[int], Result]) -> tuple[Result, Result]:
