@@ -13,6 +13,7 @@ import pytest
 from numpy.testing import assert_allclose
 from systems import SHAPES, random_system
 
+from l1slam_ros.core.bordered import points
 from l1slam_ros.core.bordered.bordered_system import BorderedSystem
 from l1slam_ros.core.bordered.points import FIXED
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, find_pattern
@@ -94,9 +95,11 @@ def test_covariances_of_points_are_blocks_of_the_inverse(k, shape, of_three, rng
             kept = np.append(kept, columns)
 
 
+@pytest.mark.parametrize('longest', [0, 6, OLD])
 @pytest.mark.parametrize('shape, k', CASES)
-def test_a_border_is_the_whole_problem(k, shape, rng):
+def test_a_border_is_the_whole_problem(k, shape, longest, rng, monkeypatch):
     """Old, new and fixed keyframes in all mixtures: steps, and what is predicted, are exact."""
+    monkeypatch.setattr(points, '_LONGEST', longest)
     system, weights, cholesky = factored(k, shape, rng)
     whole, border = Whole(system, weights, k), BorderedSystem(cholesky, OLD, k)
     assert_allclose(border.steps().all(), 0)
@@ -136,7 +139,7 @@ def test_a_border_is_the_whole_problem(k, shape, rng):
         some = [i, j, OLD - 1, count]
         assert_allclose(border.step([*some, FIXED, known]),
                         [*steps[some], *np.zeros((2, k))], rtol=1e-6, atol=1e-8)
-    points = border.points
+    before = border.points
     for v in range(OLD + NEW):
         for other, turn in (FIXED, np.zeros((k, k))), (int(rng.integers(OLD)), rng.normal(
                 size=(k, k))):
@@ -145,7 +148,7 @@ def test_a_border_is_the_whole_problem(k, shape, rng):
                     border.covariance(v, other, turn), whole.covariance(
                         (v, other), np.stack((np.eye(k), -turn)), OLD + NEW),
                     rtol=1e-7, atol=1e-9)
-    assert border.points == points
+    assert border.points == before
     assert_allclose(border.steps().all(), steps, rtol=1e-6, atol=1e-8)
     taken = border.steps()
     factor((0, OLD + NEW - 1), OLD + NEW)
