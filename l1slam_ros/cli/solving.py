@@ -32,7 +32,7 @@ from l1slam_ros.core.solvers.solve import PRIMAL_DUAL, Method
 from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import DENSE, JUDGEMENT, SPARSE, compile_now, with_space
 from l1slam_ros.io.files import counted
-from l1slam_ros.io.free_memory import free_memory
+from l1slam_ros.io.free_memory import free_memory, keep_freed_memory
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.left_out import left_out_by
 from l1slam_ros.io.ours import refuse_others
@@ -82,6 +82,7 @@ def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphReco
     if arguments.plot:
         known_false(arguments.input, record)  # damaged, it is refused before the work
     measure_by(free_memory)
+    keep_freed_memory()
     compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
     outcome, sentences = settled(_outcome(arguments, record, asked))
     remarks = [*_remarks(outcome), *sentences,
