@@ -60,6 +60,7 @@ def solve(arguments: argparse.Namespace) -> Ending:
     """Optimise a graph; print, write and draw what came out."""
     _check_outputs(arguments)
     asked = asked_of(arguments)
+    keep_freed_memory()
     record, made = _read(arguments)
     return solved(arguments, asked, record, made)
 
@@ -82,7 +83,6 @@ def solved(arguments: argparse.Namespace, asked: SolveOptions, record: GraphReco
     if arguments.plot:
         known_false(arguments.input, record)  # damaged, it is refused before the work
     measure_by(free_memory)
-    keep_freed_memory()
     compile_now(with_space(_steps(asked), record.graph.manifold), arguments.quiet)
     outcome, sentences = settled(_outcome(arguments, record, asked))
     remarks = [*_remarks(outcome), *sentences,
