@@ -32,7 +32,7 @@ from l1slam_ros.core.solvers.solve import PRIMAL_DUAL, Method
 from l1slam_ros.io import formats
 from l1slam_ros.io.compilation import DENSE, JUDGEMENT, SPARSE, compile_now, with_space
 from l1slam_ros.io.files import counted
-from l1slam_ros.io.free_memory import free_memory
+from l1slam_ros.io.free_memory import free_memory, keep_freed_memory
 from l1slam_ros.io.graphs.graph_file import GraphRecord
 from l1slam_ros.io.graphs.left_out import left_out_by
 from l1slam_ros.io.ours import refuse_others
@@ -60,6 +60,7 @@ def solve(arguments: argparse.Namespace) -> Ending:
     """Optimise a graph; print, write and draw what came out."""
     _check_outputs(arguments)
     asked = asked_of(arguments)
+    keep_freed_memory()
     record, made = _read(arguments)
     return solved(arguments, asked, record, made)
 

@@ -12,6 +12,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from l1slam_ros.core.errors import FileError
 
 # [bytes] A text file as a whole (a graph of a million poses has .4e9), one line of it, and a
@@ -22,6 +24,7 @@ _LONGEST_YAML = 2**22
 # Brackets and lists within each other: PyYAML takes the square of it.
 _DEEPEST = 64
 _BLOCK = 2**20
+_NEWLINE = ord('\n')
 _BRACKET = re.compile(r'[][{}]')
 _LISTS = re.compile(r'^ *(?:[-?] )+', re.MULTILINE)
 
@@ -44,14 +47,15 @@ def read_text(path: Path) -> bytes:
     number = 1
     with path.open('rb') as file:
         while block := file.read(_BLOCK):
-            lengths = [len(line) for line in block.split(b'\n')]
+            ends = np.flatnonzero(np.frombuffer(block, np.uint8) == _NEWLINE)
+            lengths = np.diff(ends, prepend=-1, append=len(block)) - 1
             lengths[0] += begun  # a line may begin in one block and end in another
-            if max(lengths) > _LONGEST_LINE:
-                number += next(k for k, length in enumerate(lengths) if length > _LONGEST_LINE)
+            if lengths.max() > _LONGEST_LINE:
+                number += int(np.argmax(lengths > _LONGEST_LINE))
                 raise FileError(path, f'a line of more than {_LONGEST_LINE:,} bytes; expected a '
                                 'text file', number)
-            begun = lengths[-1]
-            number = number + len(lengths) - 1
+            begun = int(lengths[-1])
+            number += len(ends)
             blocks.append(block)
     return b''.join(blocks)
 

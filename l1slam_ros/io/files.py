@@ -184,12 +184,13 @@ def read_lines(path: str | os.PathLike[str]) -> TextLines:
     except UnicodeDecodeError as error:
         found = f'byte 0x{error.object[error.start]:02x} at offset {error.start}'
         raise FileError(path, f'{found}; expected a text file') from error
-    kept = [(number, line) for number, line in enumerate(text.split('\n'), 1)
-            if line and not line.isspace()]
-    lines = [pair for pair in kept if not pair[1].lstrip().startswith('#')]
-    comments = tuple(pair for pair in kept if pair[1].lstrip().startswith('#'))
-    return TextLines([number for number, _ in lines], [line for _, line in lines], remarks,
-                     comments)
+    lines = text.split('\n')
+    blank = [k for k, line in enumerate(lines) if not line or line.isspace()]
+    comments = [k for k, line in enumerate(lines) if '#' in line and line.lstrip()[0] == '#']
+    apart = {*blank, *comments}
+    kept = [k for k in range(len(lines)) if k not in apart]
+    return TextLines([k + 1 for k in kept], [lines[k] for k in kept], remarks,
+                     tuple((k + 1, lines[k]) for k in comments))
 
 
 def counted(count: int, noun: str, plural: str = '') -> str:

@@ -12,9 +12,11 @@ How much memory a process can still take: of the machine, its control groups, it
 In: what Linux tells in files. Out: bytes; infinite where nothing is told.
 """
 
+import ctypes
 import math
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 _ROOT = Path('/')
@@ -22,6 +24,10 @@ _ROOT = Path('/')
 # of that is kept for files and given back when it is needed.
 _LIMITS = (('memory.max', 'memory.current', 'inactive_file'),
            ('memory.limit_in_bytes', 'memory.usage_in_bytes', 'total_inactive_file'))
+# Settings of glibc's mallopt: how many arrays may be memory of their own; and from how many bytes
+# on what is free at the end is given back.
+_MMAP_MAX, _TRIM_THRESHOLD = -4, -1
+_KEPT = 2**30
 
 
 def free_memory(root: Path = _ROOT) -> float:
@@ -30,6 +36,19 @@ def free_memory(root: Path = _ROOT) -> float:
     available = 1024.0 * int(match[1]) if match else math.inf
     return min([available, _left_of_address_space(root),
                 *(_left(folder) for folder in _groups(root))])
+
+
+def keep_freed_memory() -> None:
+    """
+    Let the process keep what is freed for its next arrays, as far as the C library is glibc.
+
+    An array of some megabytes is else new memory of the system each time: to be given its pages
+    takes longer than the sums that it is for.
+    """
+    with suppress(AttributeError, OSError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_MMAP_MAX, 0)
+        mallopt(_TRIM_THRESHOLD, _KEPT)
 
 
 def _left_of_address_space(root: Path) -> float:

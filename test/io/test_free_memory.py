@@ -9,6 +9,9 @@
 """What is free: of the machine, of control groups of both versions, of nothing that is told."""
 
 import math
+import os
+import subprocess
+import sys
 
 import pytest
 
@@ -16,6 +19,22 @@ from l1slam_ros.core import memory
 from l1slam_ros.io.free_memory import free_memory
 
 GIGA = 2**30
+# Arrays of 32 MB, one after the other, and how often memory had to be asked for after the first.
+ARRAYS = """
+import resource
+
+import numpy as np
+
+from l1slam_ros.io.free_memory import keep_freed_memory
+
+def faults():
+    np.ones(2**22)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+
+keep_freed_memory()
+first = faults()
+print(max(faults() for _ in range(10)) - first)
+"""
 
 
 def machine(root, files):
@@ -64,3 +83,10 @@ def test_a_solve_may_take_most_of_it(monkeypatch):
     monkeypatch.setattr(memory, '_reader', memory._reader)
     memory.measure_by(lambda: 10.0)
     assert 8 <= memory.free() < 10
+
+
+@pytest.mark.skipif('CS_GNU_LIBC_VERSION' not in os.confstr_names, reason='not by glibc')
+def test_freed_memory_serves_the_next_array():
+    done = subprocess.run([sys.executable, '-c', ARRAYS], capture_output=True, text=True,
+                          check=True)
+    assert int(done.stdout) < 100

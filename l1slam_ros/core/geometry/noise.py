@@ -34,6 +34,8 @@ _ASYMMETRY = 1e-4
 _SMALLEST, _LARGEST = 1e-30, 1e30
 # Least eigenvalue of the correlation: below it is rounding, and the root would be noise.
 _SINGULAR = 1e-14
+# Correlations of one row that leave all eigenvalues far above that, whatever they are.
+_BESIDE = 0.5
 # Of the largest eigenvalue of an information matrix: less than that is none. Where a matrix says
 # nothing of a direction, or less than nothing, it then knows it a thousand times worse than its
 # best one, which other factors overrule, and maps can still be factored.
@@ -237,8 +239,15 @@ def _is_definite(matrices: Array) -> Mask:
     with np.errstate(over='ignore'):  # an infinite correlation is refused like any above 1
         correlation = matrices / root[:, :, None] / root[:, None, :]
     # A correlation above 1 is not definite; clipped, so that nothing overflows, it still is not.
-    smallest = np.linalg.eigvalsh(np.clip(correlation, -2, 2))[:, 0]
-    return positive & np.asarray(smallest > _SINGULAR)
+    correlation = np.clip(correlation, -2, 2)
+    # Gershgorin's circles: most matrices have little beside their diagonal, hence no eigenvalue
+    # near zero.
+    size = np.abs(correlation)
+    beside = size @ np.ones(size.shape[-1]) - np.diagonal(size, axis1=1, axis2=2)
+    doubtful = ~(beside < _BESIDE).all(axis=1)
+    definite = positive.copy()
+    definite[doubtful] &= np.linalg.eigvalsh(correlation[doubtful])[:, 0] > _SINGULAR
+    return definite
 
 
 def whiten(sqrt_information: Array, vectors: Array) -> Array:

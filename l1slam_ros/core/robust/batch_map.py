@@ -39,10 +39,11 @@ from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
-from l1slam_ros.core.solvers.seed import seed_poses
+from l1slam_ros.core.solvers.seed import first_poses, seed_poses
 from l1slam_ros.core.solvers.solve import (
     AUTO,
     GAUSS_NEWTON,
+    PRIMAL_DUAL,
     Method,
     choose,
     minimise_by,
@@ -133,7 +134,7 @@ def solve(
         graph = straightened(graph, robust.judgement.drift).subset(robust.judgement.accepted)
     else:
         method = minimiser.choose(graph)
-        seed = seed_poses(graph, method.cholesky) if asked.start == 'seed' else None
+        seed = _seed(graph, method) if asked.start == 'seed' else None
         solution = minimiser.minimise_by(method, graph, initial if seed is None else seed)
     seconds = time.perf_counter() - began
     cost = cost_function(graph, asked)
@@ -148,6 +149,13 @@ def solve(
     offset = shared_offset(whole, solution.poses, judgement) if judgement else None
     return Outcome(solution, minimiser.solver, minimiser.reason, cost(initial), seed_cost, seconds,
                    judgement, unjudged, int(component_labels(graph).max()) + 1, offset)
+
+
+def _seed(graph: FactorGraph, method: Method) -> Array:
+    """Return the poses that a solve begins with; the paper's Algorithm 4 by its Algorithm 3."""
+    if method.cholesky is None or method.solver == PRIMAL_DUAL:
+        return seed_poses(graph, method.cholesky)
+    return first_poses(graph, method.cholesky)
 
 
 def _robust_map(graph: FactorGraph, asked: SolveOptions, minimiser: '_Minimiser',

@@ -20,14 +20,13 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.l1_problem import GraphProblem
 from l1slam_ros.core.graph.linear_system import LinearSystem, whitened_residual
 from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
-from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
+from l1slam_ros.core.solvers.gauss_newton import ROUGH_L2, minimise_l2
 from l1slam_ros.core.solvers.interior_point import Optimum, interior_point
 from l1slam_ros.core.solvers.nonlinear import OptimiserOptions, Report, Solution
 from l1slam_ros.core.solvers.optimality import L1, Norm, Status, fits_exactly, l1_cost
 
 # It leaves the cost some 10^-6 above the optimum, in flat valleys and small worlds up to 6 10^-6.
 _TOLERANCE = 2e-5
-_ROUGH_L2 = LeastSquaresOptions(iterations=30, tolerance=1e-3)
 # Converged must also mean that no step of the last linear problem would lower the cost by more
 # than this part: with many false loops it can come to rest where one would.
 _PROVEN = 1e-2
@@ -61,7 +60,7 @@ def minimise_interior_point(
         return Solution(poses, start, Status.ITERATION_LIMIT, 0, 0, np.array([start]),
                         np.zeros(len(residual)))
     problem = GraphProblem(graph)
-    rough = minimise_l2(graph, poses, _ROUGH_L2, cholesky).poses
+    rough = minimise_l2(graph, poses, ROUGH_L2, cholesky).poses
     optimum = interior_point(problem, rough, cholesky, steps, _TOLERANCE, report)
     if optimum.costs[-1] > start:
         optimum = interior_point(problem, poses, cholesky, steps, _TOLERANCE, report)

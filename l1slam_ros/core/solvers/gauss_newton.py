@@ -48,7 +48,7 @@ _MOST_DAMPING = 1e6
 _HARDLY = 1e-6
 # A map to within its noise: Gauss-Newton begins where chi2 is at most so many times what the noise
 # makes of it, and takes so many steps at most.
-_FITS, _NOISE_STEPS = 3, 60
+FITS, _NOISE_STEPS = 3, 60
 # Relative to chi2. The error of what a step promised is of first order in the way that is left,
 # the rest of chi2 is of second order.
 _SURPRISE = 0.1
@@ -72,6 +72,10 @@ class LeastSquaresOptions:
     iterations: int = 100
     tolerance: float = 1e-9
     huber_delta: float = 1.345
+
+
+# As much as a start of an exact L1 map needs.
+ROUGH_L2 = LeastSquaresOptions(iterations=30, tolerance=1e-3)
 
 
 def minimise_l2(
@@ -217,17 +221,21 @@ def l2_optimum(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
     whitened residual, (rows,), and the system of its last step, b what is left, which `cholesky`
     has factored; None: it was damped, or there was none.
     """
-    # In units of its noise, chi2 is about as large as there are spare measurements.
-    k = graph.manifold.TANGENT_SIZE
-    spare = max(int(graph.between.freedom.sum()) - k * (graph.n_poses - anchor(graph)), k)
+    free = spare(graph)
     start = _at(graph, poses, Huber())
-    if start.cost > _FITS * spare:
+    if start.cost > FITS * free:
         linear = _at(graph, _two_linear_steps(graph, poses, cholesky), Huber())
         start = linear if linear.cost < start.cost else start
-    options = LeastSquaresOptions(_NOISE_STEPS, 1 / spare)
+    options = LeastSquaresOptions(_NOISE_STEPS, 1 / free)
     solution, residual, solved = _descend(graph, start, Huber(), options, cholesky, report,
                                           _SURPRISE)
     return solution.poses, residual, replace(solved, b=-residual) if solved else None
+
+
+def spare(graph: FactorGraph) -> int:
+    """Return how many measurements are spare; in units of its noise, chi2 is about as large."""
+    k = graph.manifold.TANGENT_SIZE
+    return max(int(graph.between.freedom.sum()) - k * (graph.n_poses - anchor(graph)), k)
 
 
 def _two_linear_steps(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> Array:

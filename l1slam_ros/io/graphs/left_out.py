@@ -81,18 +81,21 @@ def restored(lines: TextLines) -> tuple[TextLines, dict[int, tuple[str, int]]]:
     is_ours = lines.remarks is not None or bool(lines.comments and lines.comments[-1][1] == MARK)
     if not is_ours:
         return lines, {}
-    rows = list(zip(lines.numbers, lines.texts, strict=True))
     words = {}
+    again = []
     comments = []
     for number, text in lines.comments:
         if found := _COMMENT.fullmatch(text):
             words[number] = found[1], int(found[3])
-            rows.append((number, found[2]))
+            again.append((number, found[2]))
         elif text != MARK and not text.startswith(KEYWORD):
             comments.append((number, text))
-    rows.sort(key=lambda row: row[0])
-    return TextLines([number for number, _ in rows], [text for _, text in rows], lines.remarks,
-                     tuple(comments)), words
+    numbers = lines.numbers
+    texts = lines.texts
+    if again:
+        rows = sorted([*zip(numbers, texts, strict=True), *again], key=lambda row: row[0])
+        numbers, texts = [number for number, _ in rows], [text for _, text in rows]
+    return TextLines(numbers, texts, lines.remarks, tuple(comments)), words
 
 
 def in_place(numbers: Indices, words: dict[int, tuple[str, int]]
@@ -102,6 +105,9 @@ def in_place(numbers: Indices, words: dict[int, tuple[str, int]]
 
     And the order (m,) of their measurements: of what was corrected, as it was measured.
     """
+    if not words:
+        all_of_them = np.arange(len(numbers))
+        return all_of_them, nothing_left_out(len(numbers)), all_of_them
     found = [words.get(number, ('', -1)) for number in numbers.tolist()]
     said = np.array([word for word, _ in found], object)
     places = np.array([place for _, place in found], np.int64)

@@ -58,6 +58,9 @@ class Rows:
 
     def chosen(self, rows: Indices | Mask) -> 'Rows':
         """Return some of the lines, in the order of `rows`."""
+        rows = np.flatnonzero(rows) if rows.dtype == bool else rows
+        if np.array_equal(rows, np.arange(len(self))):
+            return self  # as mostly: a copy of all takes longer than to find that out
         return Rows(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     @property
@@ -125,8 +128,10 @@ def rows_of(path: object, groups: dict[str, TextLines], manifold: Manifold, kind
     offsets = _offsets(path, groups)
     parts = [_parse(path, name, groups.get(name, TextLines([], [])), rotation_information, offsets)
              for name, tag in TAGS.items() if tag.kind in kinds and tag.manifold is manifold]
-    both = Rows(*(np.concatenate([getattr(part, column.name) for part in parts])
-                   for column in fields(Rows)))
+    filled = [part for part in parts if len(part)] or parts[:1]
+    both = filled[0] if len(filled) == 1 else Rows(
+        *(np.concatenate([getattr(part, column.name) for part in filled])
+          for column in fields(Rows)))
     return both.chosen(np.argsort(both.lines))
 
 
@@ -153,7 +158,7 @@ def _parse(path: object, name: str, lines: TextLines, rotation_information: str,
     return Rows(np.array(lines.numbers, np.int64),
                  np.repeat(ids[:, :tag.vertices], 2 // tag.vertices, axis=1),
                  np.full(m, tag.vertices == 1), pose, information,
-                 np.tile(tag.units(rotation_information), (m, 1)))
+                 np.broadcast_to(tag.units(rotation_information), (m, d)))
 
 
 def _offsets(path: object, groups: dict[str, TextLines]) -> Indices:

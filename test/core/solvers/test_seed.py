@@ -18,9 +18,15 @@ from l1slam_ros.core.geometry import se2, se3
 from l1slam_ros.core.graph.factor_graph import WORLD, FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise, whitened_residual
 from l1slam_ros.core.graph.spanning_tree import odometry_poses
+from l1slam_ros.core.solvers import seed as seeding
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
+from l1slam_ros.core.solvers.exact import minimise_interior_point
+from l1slam_ros.core.solvers.gauss_newton import LeastSquaresOptions, minimise_l2
+from l1slam_ros.core.solvers.nonlinear import OptimiserOptions
 from l1slam_ros.core.solvers.optimality import l1_cost
-from l1slam_ros.core.solvers.seed import chordal_poses, seed_poses
+from l1slam_ros.core.solvers.seed import chordal_poses, first_poses, seed_poses
+from l1slam_ros.core.worlds.false_loops import random_false_loops
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
 
 
 def seed_of(graph):
@@ -150,3 +156,57 @@ def test_in_space_it_finds_what_the_odometry_does_not(rng):
     costs = [np.abs(whitened_residual(graph, at).reshape(-1, 6)[:, 3:]).sum()
              for at in (poses, truth)]
     assert costs[0] < costs[1]
+
+
+@pytest.fixture
+def no_graph_is_small(monkeypatch):
+    monkeypatch.setattr(seeding, '_MANY_ROWS', 0)
+
+
+@pytest.mark.parametrize('sigma', [0.01, 0.05, 0.1])
+@pytest.mark.usefixtures('no_graph_is_small')
+def test_a_clean_graph_is_solved_from_its_l2_map(sigma, rng):
+    """That is no worse a start: exact L1 ends at the same cost."""
+    options = WorldOptions(odometry_sigma_rotation=sigma, loop_sigma_rotation=sigma)
+    graph = simulate_world(1000, 3000, options, rng).graph
+    cholesky = cholesky_of(graph)
+    poses = first_poses(graph, cholesky)
+    best = minimise_l2(graph, poses, LeastSquaresOptions(), cholesky).poses
+    assert cost(graph, poses) == pytest.approx(cost(graph, best), rel=1e-2)
+    ends = [minimise_interior_point(graph, start, OptimiserOptions(), cholesky).cost
+            for start in (poses, seed_poses(graph, cholesky))]
+    assert ends[0] <= ends[1] * (1 + 6e-6)
+
+
+@pytest.mark.usefixtures('no_graph_is_small')
+def test_noise_of_twenty_degrees_asks_for_the_seed(rng):
+    """L1 has several optima there; from the L2 map it may end a part in a thousand above."""
+    options = WorldOptions(odometry_sigma_rotation=0.35, loop_sigma_rotation=0.35)
+    graph = simulate_world(300, 900, options, rng).graph
+    cholesky = cholesky_of(graph)
+    assert (first_poses(graph, cholesky) == seed_poses(graph, cholesky)).all()
+
+
+@pytest.mark.usefixtures('no_graph_is_small')
+def test_a_single_lie_among_thousands_of_loops_asks_for_the_seed(rng):
+    world = simulate_world(1000, 5000, WorldOptions(), rng)
+    world = with_false_loops(world, random_false_loops(world.graph, world.truth, 1, rng))
+    cholesky = cholesky_of(world.graph)
+    assert (first_poses(world.graph, cholesky) == seed_poses(world.graph, cholesky)).all()
+
+
+@pytest.mark.usefixtures('no_graph_is_small')
+def test_noise_beyond_what_is_stated_asks_for_the_seed(rng):
+    stated = simulate_world(1000, 3000, WorldOptions(), rng).graph
+    factors = stated.between
+    graph = stated.without_factors()
+    graph.add_between(factors.i, factors.j, factors.measurement,
+                      4 * factors.sqrt_information.transpose(0, 2, 1) @ factors.sqrt_information)
+    cholesky = cholesky_of(graph)
+    assert (first_poses(graph, cholesky) == seed_poses(graph, cholesky)).all()
+
+
+def test_a_small_graph_starts_from_the_seed(rng):
+    graph = simulate_world(300, 900, WorldOptions(), rng).graph
+    cholesky = cholesky_of(graph)
+    assert (first_poses(graph, cholesky) == seed_poses(graph, cholesky)).all()
