@@ -44,7 +44,8 @@ _SHRINK = 0.75
 _MOST_ITERATIONS = 20
 # [m], [rad] A step that is no step any more.
 _STILL = 1e-4
-_UPPER = np.triu_indices(3)
+# Where the sums have the entries of H.
+_SYMMETRIC = np.array(((0, 1, 2), (1, 3, 4), (2, 4, 5)))
 
 
 @dataclass(frozen=True)
@@ -102,10 +103,8 @@ def match(field: Field, xy: Array, normals: Array, start: Array, prior: Array | 
 
 def _sums(field: Field, xy: Array, normals: Array, pose: Array, gate: float
           ) -> tuple[Array, Array, Array]:
-    sums = kernels.normal_equations(
+    sums = np.zeros(11)
+    kernels.normal_equations(
         xy, normals, field.xy, field.normals, field.nearest, field.origin, RESOLUTION, pose, gate,
-        _SCALE)
-    H = np.zeros((3, 3))
-    H[_UPPER] = sums[:6]
-    H = H + np.triu(H, 1).T
-    return H, sums[6:9], sums
+        _SCALE, sums)
+    return sums[_SYMMETRIC], sums[6:9], sums

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.scans import kernels
 
@@ -114,14 +114,14 @@ def points_of(scan: Scan, mount: Mount = Mount(),  # noqa: B008
     if velocity is not None and scan.time_increment:
         xy = _at_stamp(xy, velocity, scan.time_increment * np.arange(0.0, len(ranges)))
     view = _view(np.where(hit, ranges, np.inf)[looked], angles[looked])
-    seen = np.ascontiguousarray(xy[hit])
-    if len(seen):
-        seen = np.ascontiguousarray(seen[kernels.apart(seen, SPACING)])
+    seen = xy[hit]
+    normals = np.zeros_like(seen)
     noise = _noise(reach, hit, abs(scan.angle_increment))
-    normals = kernels.normals_along(
-        seen - centre, max(_NORMAL_REACH, _REACH_OF_NOISE * noise),
-        _RAYS * abs(scan.angle_increment), max(_OFF_LINE, _OFF_OF_NOISE * noise))
-    return Points(seen, normals, centre, view)
+    count = kernels.surface_along(
+        seen, centre, SPACING, max(_NORMAL_REACH, _REACH_OF_NOISE * noise),
+        _RAYS * abs(scan.angle_increment), max(_OFF_LINE, _OFF_OF_NOISE * noise),
+        np.empty_like(seen), normals)
+    return Points(seen[:count].copy(), normals[:count].copy(), centre, view)
 
 
 def _at_stamp(xy: Array, velocity: Array, seconds: Array) -> Array:
@@ -150,12 +150,20 @@ def _view(ranges: Array, angles: Array) -> Array:
     at = np.floor(angles / (2 * np.pi) * _BEARINGS).astype(np.int64) % _BEARINGS
     np.fmin.at(view, at, ranges)
     # A bearing between two rays is seen by both: so far as the nearer one.
-    width = 1 + int(_BEARINGS * _spacing_of(angles) / (2 * np.pi) + 1e-6)
-    before, after = view, view
-    for _ in range(width - 1):
-        before = np.where(np.isnan(before), np.roll(before, 1), before)
-        after = np.where(np.isnan(after), np.roll(after, -1), after)
-    return np.where(np.isnan(view), np.minimum(before, after), view)
+    steps = np.arange(1, 1 + int(_BEARINGS * _spacing_of(angles) / (2 * np.pi) + 1e-6))
+    between = np.flatnonzero(np.isnan(view))
+    view[between] = np.minimum(_first_seen(view, between[:, None] - steps),
+                               _first_seen(view, between[:, None] + steps))
+    return view
+
+
+def _first_seen(view: Array, bearings: Indices) -> Array:
+    """Return of each row of bearings (n, k) the range in the first that is seen, NaN: of none."""
+    if not bearings.shape[1]:
+        return np.full(len(bearings), np.nan)
+    ranges = view[bearings % _BEARINGS]
+    first = np.isnan(ranges).argmin(axis=1)
+    return ranges[np.arange(len(ranges)), first]
 
 
 def _spacing_of(angles: Array) -> float:
