@@ -108,7 +108,8 @@ def surface_along(points, centre, spacing, least_reach, widening, off, away, nor
     (n, 2) of zeros, takes the normals, turned to the laser; a point that has no neighbour on one
     side, or no line, has none
     """
-    count = 0
+    # As a variable: for the number 0 itself `_window` would be compiled once more.
+    count = np.int64(0)
     for k in range(len(points)):
         if count == 0 or not _near(points, k, count - 1, spacing):
             for axis in range(2):

@@ -90,7 +90,7 @@ class Points:
     @property
     def surface(self) -> tuple[Array, Array]:
         """The points that have a normal, and these normals, (k, 2) each."""
-        has = self.normals.any(axis=1)
+        has = have_normal(self.normals)
         return self.xy[has], self.normals[has]
 
 
@@ -170,6 +170,11 @@ def _spacing_of(angles: Array) -> float:
     return float(np.median(abs(np.diff(angles)))) if len(angles) > 1 else 0.0
 
 
+def have_normal(normals: Array) -> Mask:
+    """Return which of some normals (n, 2) are not zero."""
+    return (normals[:, 0] != 0) | (normals[:, 1] != 0)
+
+
 def transformed(pose: Array, xy: Array) -> Array:
     """Return points (n, 2) of the frame at a pose (3,), in the frame of that pose."""
     return rotated(pose, xy) + pose[:2]
@@ -177,5 +182,10 @@ def transformed(pose: Array, xy: Array) -> Array:
 
 def rotated(pose: Array, vectors: Array) -> Array:
     """Return vectors (n, 2) of the frame at a pose (3,), turned to that of the pose."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return vectors @ np.array([[c, s], [-s, c]])
+    return vectors @ turn(pose[2])
+
+
+def turn(angle: float) -> Array:
+    """Return what rows of vectors are multiplied by to turn them by an angle [rad], (2, 2)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, s], [-s, c]])
