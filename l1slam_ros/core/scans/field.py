@@ -91,5 +91,6 @@ class Field:
         whole = np.zeros((columns * WIDTH, rows * WIDTH), np.uint8)
         whole[: last.shape[0], : last.shape[1]] = last
         blocks = np.zeros((WIDTH, WIDTH, columns, rows + 2 * WIDTH), np.uint8)
-        blocks[..., WIDTH:-WIDTH] = whole.reshape(columns, WIDTH, rows, WIDTH).transpose(1, 3, 0, 2)
+        own = whole.reshape(columns, WIDTH, rows, WIDTH)
+        blocks[..., WIDTH:-WIDTH] = own.transpose(1, 3, 0, 2)
         return blocks

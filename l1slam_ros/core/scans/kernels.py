@@ -97,12 +97,13 @@ def normal_equations(points, normals, map_points, map_normals, nearest, origin, 
 @loop('(f8[:, ::1], f8[::1], f8, f8, f8, f8, f8[:, ::1], f8[:, ::1])')
 def surface_along(points, centre, spacing, least_reach, widening, off, away, normals):
     """
-    Thin out the points of a scan, which follow each other, and find their normals; return how many.
+    Thin out the points of a scan and find their normals; return how many are left.
 
-    Those that are at least `spacing` [m] from the last one kept come to the front of `points`,
-    (n, 2), in place. To their neighbours on both sides that hang together within `least_reach`
-    [m], or within `widening` of the range, a line is fitted; where they are further than `off` [m]
-    from the line (RMS), as at a corner, to those within half as much, and half of that.
+    The points follow each other. Those that are at least `spacing` [m] from the last one kept come
+    to the front of `points`, (n, 2), in place. To their neighbours on both sides that hang
+    together within `least_reach` [m], or within `widening` of the range, a line is fitted; where
+    they are further than `off` [m] from the line (RMS), as at a corner, to those within half as
+    much, and half of that.
 
     centre : (2,) where the laser was; away : (n, 2) takes the points as seen from there; normals :
     (n, 2) of zeros, takes the normals, turned to the laser; a point that has no neighbour on one
