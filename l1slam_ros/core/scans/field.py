@@ -15,7 +15,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.scans import kernels
-from l1slam_ros.core.scans.search_kernels import WIDTH
+from l1slam_ros.core.scans.search_kernels import ACROSS, WIDTH
 
 # [m] Cells of the look-up, and how far it reaches.
 RESOLUTION, REACH = 0.1, 0.6
@@ -83,14 +83,14 @@ class Field:
         """
         The last of the `levels`, so that cells which are `WIDTH` apart are neighbours.
 
-        (w, w, c, r), w = `WIDTH`: element (p, q, c, r) is of cell (c w + p, (r - w) w + q). Before
-        and behind the rows of the level's own blocks are w of nothing.
+        (w, w, c, r), w = `WIDTH`: element (p, q, c, r) is of cell (c w + p, (r - a) w + q). Before
+        and behind the rows of the level's own blocks are a = `ACROSS` of nothing.
         """
         last = self.levels[-1]
         columns, rows = (-(-size // WIDTH) for size in last.shape)
         whole = np.zeros((columns * WIDTH, rows * WIDTH), np.uint8)
         whole[: last.shape[0], : last.shape[1]] = last
-        blocks = np.zeros((WIDTH, WIDTH, columns, rows + 2 * WIDTH), np.uint8)
+        blocks = np.zeros((WIDTH, WIDTH, columns, rows + 2 * ACROSS), np.uint8)
         own = whole.reshape(columns, WIDTH, rows, WIDTH)
-        blocks[..., WIDTH:-WIDTH] = own.transpose(1, 3, 0, 2)
+        blocks[..., ACROSS:-ACROSS] = own.transpose(1, 3, 0, 2)
         return blocks

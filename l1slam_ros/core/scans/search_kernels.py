@@ -17,8 +17,11 @@ import numpy as np
 
 from l1slam_ros.core.kernels.compiled import compiled, loop
 
-# The widest bounds are over so many shifts each way, a power of two.
-WIDTH = 16
+# The widest bounds are over so many shifts each way, a power of two: wider ones are sooner added
+# up, and so loose that ten times as many squares must be looked into.
+WIDTH = 8
+# A search has at most so many squares each way.
+ACROSS = 32
 
 
 @loop('(u1[:, :, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1], u2[:, :, ::1], i4[:, :, ::1])')
@@ -28,9 +31,9 @@ def add_widest_bounds(blocks, points, turns, start, sums, cells):
 
     blocks : see `Field.blocks`; points : (n, 2) of the scan, in cells; turns : (t, 2) cosine and
     sine of each; start : (2,) where the scan's (0, 0) lies at the lowest shift, in cells of the
-    levels; sums : (t, a, w) of each turn and so many squares each way, w = `WIDTH`: of more than a
-    nobody asks, but so many are added in one step of the processor; cells : (t, n, 2) takes those
-    of the points
+    levels; sums : (t, a, w) of each turn and so many squares each way, w = 16 or `ACROSS`: of more
+    than a nobody asks, but so many are added in one step of the processor; cells : (t, n, 2) takes
+    those of the points
     """
     columns, rows, wide = blocks.shape[2], blocks.shape[3], np.uint64(sums.shape[2])
     for t in range(len(turns)):
@@ -41,7 +44,7 @@ def add_widest_bounds(blocks, points, turns, start, sums, cells):
             v = int(np.floor(s * x + c * y + start[1]))
             cells[t, k, 0], cells[t, k, 1] = u, v
             plane = blocks[u % WIDTH, v % WIDTH]
-            first, left = u // WIDTH, np.uint64(min(max(v // WIDTH + WIDTH, 0), rows - WIDTH))
+            first, left = u // WIDTH, np.uint64(min(max(v // WIDTH + ACROSS, 0), rows - ACROSS))
             for a in range(max(-first, 0), min(sums.shape[1], columns - first)):
                 for b in range(wide):
                     sums[t, a, b] += plane[first + a, left + b]
