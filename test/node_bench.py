@@ -22,7 +22,7 @@ from std_srvs.srv import SetBool, Trigger
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.io.bags.reader import read_raw
 from l1slam_ros.ros.node import BackendNode
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 DEADLINE = 60.0
 TYPES = {'/odom': Odometry, **dict.fromkeys(

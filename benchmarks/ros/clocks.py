@@ -51,7 +51,7 @@ from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC, TRUTH_TOPIC
 from l1slam_ros.io.graphs.saved_map import load_map
 from l1slam_ros.io.messages import conversion
 from l1slam_ros.io.messages.conversion import stamp_of, stamped_pose
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 BAG, RATE = Path('bags/demo'), 20.0
 _SECOND = 10**9  # [ns]

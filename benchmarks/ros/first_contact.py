@@ -39,7 +39,7 @@ from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC
 from l1slam_ros.io.graphs.graph_file import GraphRecord, read_graph_file, write_graph_file
 from l1slam_ros.io.messages.conversion import reference_frame_id
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 LOOPS, POSES, EDGES = 20_000, 50_000, 80_000
 _SECOND = 10**9  # [ns]

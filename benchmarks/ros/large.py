@@ -36,7 +36,7 @@ from throughput import place, some_loop, some_odometry
 
 from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC
 from l1slam_ros.io.messages.conversion import reference_frame_id
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 _LONGEST, _SPEED = 20.0, 1.0  # [s] that a loop goes back; [m/s]
 

@@ -39,7 +39,7 @@ from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bags.topics import ODOMETRY_TOPIC
 from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
 from l1slam_ros.io.messages.conversion import stamp_of
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 KEYFRAMES, SECONDS, TURNS = 10_000, 5.0, 12
 _BETWEEN = 1.5  # [s] from one turn to the next: who begins to look is sent all of the graph

@@ -40,7 +40,7 @@ from rclpy.qos import QoSProfile
 
 from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC
 from l1slam_ros.io.messages.conversion import reference_frame_id, stamp_of
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 SECONDS, PATTERNS = 40.0, '5,10,20,50,10j'
 _LISTENERS = 2  # the node, and who looks up

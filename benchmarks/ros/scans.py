@@ -45,7 +45,7 @@ from l1slam_ros.io.messages.conversion import stamp_of
 from l1slam_ros.io.scans.carmen import read_carmen
 from l1slam_ros.io.trajectory import read_reference
 from l1slam_ros.ros.demo import executable
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 RATE = 40.0
 # Both nodes' parameters.

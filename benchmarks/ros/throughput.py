@@ -37,7 +37,7 @@ from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bags.topics import LOOP_TOPIC, ODOMETRY_TOPIC
 from l1slam_ros.io.graphs.graph_file import GraphRecord, write_graph_file
 from l1slam_ros.io.messages.conversion import reference_frame_id
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 SECONDS, RATE, LOOPS, KEYFRAMES = 60.0, 1_000.0, 100.0, 10_000
 _SPEED = 5.0  # [m/s] ten keyframes a second

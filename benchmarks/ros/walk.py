@@ -42,8 +42,8 @@ import l1slam_ros
 from l1slam_ros.io.compilation import STEPS, compile_now
 from l1slam_ros.io.messages.conversion import reference_frame_id
 from l1slam_ros.ros.node import BackendNode
-from l1slam_ros.ros.publishing import header
 from l1slam_ros.ros.shell.domain import go_where_nobody_is
+from l1slam_ros.ros.shell.header import header
 
 PACKAGE = f'{Path(l1slam_ros.__file__).parent}{os.sep}'
 KEYFRAMES, SECOND = 10, 10**9

@@ -18,19 +18,16 @@ import time
 from collections.abc import Sequence
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from std_msgs.msg import Header
 
 from l1slam_ros.core.geometry.manifold import Array, Manifold
 from l1slam_ros.core.running.backend import Backend
 from l1slam_ros.core.running.improve import Improvement
 from l1slam_ros.core.running.snapshot import Snapshot
-from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.messages.serialisation import path_bytes, pose_bytes
 from l1slam_ros.io.node_options import NodeOptions
 from l1slam_ros.ros.diagnostics import Diagnostics
@@ -192,9 +189,3 @@ def pose_with_covariance(frame: str, stamp: int, manifold: Manifold, pose: Array
     whole = np.zeros((6, 6))
     whole[rows[:, None], rows] = Ad @ covariance @ Ad.T
     return pose_bytes(frame, stamp, pose3[0], whole)
-
-
-def header(frame: str, stamp: int) -> Header:
-    """Return a header with its stamp [ns]."""
-    seconds, nanoseconds = divmod(int(stamp), NANOSECONDS)
-    return Header(frame_id=frame, stamp=Time(sec=seconds, nanosec=nanoseconds))

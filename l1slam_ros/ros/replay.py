@@ -33,8 +33,8 @@ from l1slam_ros.io.bags.damaged.walk import BagMessage
 from l1slam_ros.io.bags.reader import BagSummary, bag_summary, read_raw
 from l1slam_ros.io.files import NANOSECONDS
 from l1slam_ros.io.progress import Progress
-from l1slam_ros.ros.publishing import header
 from l1slam_ros.ros.shell.arguments import split
+from l1slam_ros.ros.shell.header import header
 from l1slam_ros.ros.threads.failures import reason
 
 _BAD_INPUT = 2

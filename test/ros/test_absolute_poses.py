@@ -22,7 +22,7 @@ from l1slam_ros.core.running.snapshot import ACCEPTED
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 from l1slam_ros.io.bags.from_graph import write_graph_bag
 from l1slam_ros.io.graphs.graph_file import GraphRecord
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 
 def fix(stamp, position, frame='map', variance=0.01):

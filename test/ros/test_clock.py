@@ -21,7 +21,7 @@ from rosgraph_msgs.msg import Clock
 import l1slam_ros as l1
 from bags import write_world
 from l1slam_ros.io.bags.reader import read_raw
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 N = 120
 KINDS = {'/odom': Odometry, '/loop_closures': PoseWithCovarianceStamped}

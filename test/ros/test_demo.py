@@ -39,7 +39,7 @@ from l1slam_ros.ros.demo import (
     require_the_truth,
     summarise,
 )
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 DEMO = Path(__file__).parents[2] / BAG
 DEADLINE = 60.0

@@ -20,7 +20,7 @@ pytest.importorskip('rclpy')
 from node_bench import odometry, poses_of
 from sensor_msgs.msg import LaserScan
 
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 EXAMPLE = Path(__file__).parents[2] / 'config' / 'front_end.py'
 RAYS = 360

@@ -24,7 +24,7 @@ from rclpy.qos import QoSProfile
 
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.io.messages.conversion import reference_frame_id, stamp_of
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 
 def message_of(found):

@@ -31,8 +31,8 @@ from std_srvs.srv import Trigger
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.ros.node import BackendNode
-from l1slam_ros.ros.publishing import header
 from l1slam_ros.ros.scans.node import ScanLoopsNode
+from l1slam_ros.ros.shell.header import header
 
 DEADLINE = 60.0
 PERIOD = 10**8

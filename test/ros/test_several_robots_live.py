@@ -21,7 +21,7 @@ from team import Team, believed_by
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.measurements import LoopClosure
 from l1slam_ros.io.messages.conversion import reference_frame_id
-from l1slam_ros.ros.publishing import header
+from l1slam_ros.ros.shell.header import header
 
 NAMES = [f'r{k}' for k in range(1, 6)]
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.scans import kernels
-from l1slam_ros.core.scans.search_kernels import WIDTH
+from l1slam_ros.core.scans.search_kernels import ACROSS, WIDTH
 
 # [m] Cells of the look-up, and how far it reaches.
 RESOLUTION, REACH = 0.1, 0.6
@@ -50,7 +50,8 @@ class Field:
         origin = np.floor(xy.min(axis=0) / RESOLUTION - REACH / RESOLUTION) * RESOLUTION
         shape = np.ceil((xy.max(axis=0) - origin + REACH) / RESOLUTION).astype(np.int64)
         xy = np.ascontiguousarray(xy)
-        nearest, square = kernels.nearest_points(xy, origin, shape, RESOLUTION, REACH)
+        nearest, square = np.full(shape, -1, np.int32), np.full(shape, REACH**2)
+        kernels.nearest_points(xy, origin, RESOLUTION, REACH, nearest, square)
         return Field(xy, np.ascontiguousarray(normals), nearest, square, origin)
 
     @cached_property
@@ -67,26 +68,29 @@ class Field:
 
         Cell (0, 0) of the likelihood is at (WIDTH, WIDTH). All that is on the edge is 0.
         """
-        levels = [np.pad(self.likelihood, ((WIDTH, 1), (WIDTH, 1)))]
-        for level in range(_HEIGHT):
+        columns, rows = self.nearest.shape
+        levels = np.zeros((_HEIGHT + 1, columns + WIDTH + 1, rows + WIDTH + 1), np.uint8)
+        levels[0, WIDTH:-1, WIDTH:-1] = self.likelihood
+        for level, (finer, wider) in enumerate(zip(levels, levels[1:], strict=False)):
             half = 1 << level
-            last = levels[-1].copy()
-            last[:-half] = np.maximum(last[:-half], last[half:])
-            last[:, :-half] = np.maximum(last[:, :-half], last[:, half:])
-            levels.append(last)
-        return np.stack(levels)
+            wider[:] = finer
+            np.maximum(finer[:-half], finer[half:], out=wider[:-half])
+            wider[:, :-half] = np.maximum(wider[:, :-half], wider[:, half:])
+        return levels
 
     @cached_property
     def blocks(self) -> Array:
         """
         The last of the `levels`, so that cells which are `WIDTH` apart are neighbours.
 
-        (w, w, c, r), w = `WIDTH`: element (p, q, c, r) is of cell (c w + p, (r - w) w + q). Before
-        and behind the rows of the level's own blocks are w of nothing.
+        (w, w, c, r), w = `WIDTH`: element (p, q, c, r) is of cell (c w + p, (r - a) w + q). Before
+        and behind the rows of the level's own blocks are a = `ACROSS` of nothing.
         """
         last = self.levels[-1]
         columns, rows = (-(-size // WIDTH) for size in last.shape)
         whole = np.zeros((columns * WIDTH, rows * WIDTH), np.uint8)
         whole[: last.shape[0], : last.shape[1]] = last
-        own = whole.reshape(columns, WIDTH, rows, WIDTH).transpose(1, 3, 0, 2)
-        return np.ascontiguousarray(np.pad(own, ((0, 0), (0, 0), (0, 0), (WIDTH, WIDTH))))
+        blocks = np.zeros((WIDTH, WIDTH, columns, rows + 2 * ACROSS), np.uint8)
+        own = whole.reshape(columns, WIDTH, rows, WIDTH)
+        blocks[..., ACROSS:-ACROSS] = own.transpose(1, 3, 0, 2)
+        return blocks

@@ -21,52 +21,44 @@ from l1slam_ros.core.kernels.compiled import compiled, loop
 _WINDOWS = 3
 
 
-@loop('(f8[:, ::1], f8[::1], i8[::1], f8, f8)')
-def nearest_points(points, origin, shape, resolution, reach):
+@loop('(f8[:, ::1], f8[::1], f8, f8, i4[:, ::1], f8[:, ::1])')
+def nearest_points(points, origin, resolution, reach, nearest, best):
     """
-    Return which point is nearest to the centre of each cell, and its squared distance [m^2].
+    Find which point is nearest to the centre of each cell, and its squared distance [m^2].
 
-    Where none is within `reach`: -1, and the square of that.
-
-    points : (n, 2) [m]; origin : (2,) corner of cell (0, 0) [m]; shape : (2,) cells;
-    resolution, reach : [m]
+    points : (n, 2) [m]; origin : (2,) corner of cell (0, 0) [m]; resolution, reach : [m];
+    nearest, best : (a, b) for each cell, changed where a point is nearer than `best`, and within
+    `reach`
     """
-    nearest = np.full((shape[0], shape[1]), -1, np.int32)
-    best = np.full((shape[0], shape[1]), reach * reach)
+    columns, rows = nearest.shape
     radius = int(np.ceil(reach / resolution))
     for k in range(len(points)):
         column = int((points[k, 0] - origin[0]) / resolution)
         row = int((points[k, 1] - origin[1]) / resolution)
-        for a in range(max(column - radius, 0), min(column + radius + 1, shape[0])):
+        for a in range(max(column - radius, 0), min(column + radius + 1, columns)):
             dx = origin[0] + (a + 0.5) * resolution - points[k, 0]
-            for b in range(max(row - radius, 0), min(row + radius + 1, shape[1])):
+            for b in range(max(row - radius, 0), min(row + radius + 1, rows)):
                 dy = origin[1] + (b + 0.5) * resolution - points[k, 1]
                 square = dx * dx + dy * dy
                 if square < best[a, b]:
                     best[a, b] = square
                     nearest[a, b] = k
-    return nearest, best
 
 
-@loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i4[:, ::1], f8[::1], f8, f8[::1], f8, f8)')
+@loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], i4[:, ::1], f8[::1], f8, f8[::1], f8, f8,'
+      ' f8[::1])')
 def normal_equations(points, normals, map_points, map_normals, nearest, origin, resolution, pose,
-                     gate, scale):
+                     gate, scale, sums):
     """
-    Return the sums of one Gauss-Newton step of point-to-line matching.
+    Add up the sums of one Gauss-Newton step of point-to-line matching.
 
     The residual of a point p with the map's nearest point m and its normal n is n'(R p + t - m);
     its Jacobian is taken in the axes of the moving pose. Weights are Cauchy's, 1 / (1 + (e/s)^2).
 
     gate : [m] farther points, and those whose normals differ by more than 45 degrees, do not
-    match; scale : s [m]
-
-    Returns
-    -------
-    sums : (11,) the upper triangle of H by rows (6), g (3), the number of matches, and the sum of
-        weighted squared residuals [m^2]
-
+    match; scale : s [m]; sums : (11,) the upper triangle of H by rows (6), g (3), the number of
+    matches, and the sum of weighted squared residuals [m^2]
     """
-    sums = np.zeros(11)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     for k in range(len(points)):
         px, py = points[k, 0], points[k, 1]
@@ -100,46 +92,56 @@ def normal_equations(points, normals, map_points, map_normals, nearest, origin, 
         sums[8] += w * turn * e
         sums[9] += 1.0
         sums[10] += w * e * e
-    return sums
 
 
-@loop('(f8[:, ::1], f8, f8, f8)')
-def normals_along(points, least_reach, widening, off):
+@loop('(f8[:, ::1], f8[::1], f8, f8, f8, f8, f8[:, ::1], f8[:, ::1])')
+def surface_along(points, centre, spacing, least_reach, widening, off, away, normals):
     """
-    Return the normals of points that follow each other along a scan, (n, 2), turned to (0, 0).
+    Thin out the points of a scan and find their normals; return how many are left.
 
-    A line is fitted to the neighbours on both sides that hang together within `least_reach` [m],
-    or within `widening` of the range; where they are further than `off` [m] from the line (RMS),
-    as at a corner, to those within half as much, and half of that. Zero where one side has none,
-    or there is no line.
+    The points follow each other. Those that are at least `spacing` [m] from the last one kept come
+    to the front of `points`, (n, 2), in place. To their neighbours on both sides that hang
+    together within `least_reach` [m], or within `widening` of the range, a line is fitted; where
+    they are further than `off` [m] from the line (RMS), as at a corner, to those within half as
+    much, and half of that.
+
+    centre : (2,) where the laser was; away : (n, 2) takes the points as seen from there; normals :
+    (n, 2) of zeros, takes the normals, turned to the laser; a point that has no neighbour on one
+    side, or no line, has none
     """
-    n = len(points)
-    normals = np.zeros((n, 2))
-    for k in range(n):
-        reach = max(least_reach, widening * np.sqrt(points[k, 0] ** 2 + points[k, 1] ** 2))
+    # As a variable: for the number 0 itself `_window` would be compiled once more.
+    count = np.int64(0)
+    for k in range(len(points)):
+        if count == 0 or not _near(points, k, count - 1, spacing):
+            for axis in range(2):
+                points[count, axis] = points[k, axis]
+                away[count, axis] = points[k, axis] - centre[axis]
+            count += 1
+    for k in range(count):
+        reach = max(least_reach, widening * np.sqrt(away[k, 0] ** 2 + away[k, 1] ** 2))
         linked = 0.5 * reach
         for _ in range(_WINDOWS):
-            first, last = _window(points, k, reach, linked)
+            first, last = _window(away, count, k, reach, linked)
             if first == k or last == k:
                 break
-            angle, least = _line(points, first, last)
+            angle, least = _line(away, first, last)
             if least <= off * off:
                 nx, ny = -np.sin(angle), np.cos(angle)
-                away = nx * points[k, 0] + ny * points[k, 1] > 0
-                normals[k, 0], normals[k, 1] = (-nx, -ny) if away else (nx, ny)
+                turn = -1.0 if nx * away[k, 0] + ny * away[k, 1] > 0 else 1.0
+                normals[k, 0], normals[k, 1] = turn * nx, turn * ny
                 break
             reach *= 0.5
-    return normals
+    return count
 
 
 @compiled
-def _window(points, k, reach, linked):
+def _window(points, count, k, reach, linked):
     """Return the first and the last point around k within reach, none further than `linked`."""
     first = last = k
     while first > 0 and _near(points, first - 1, k, reach) and (
             _near(points, first - 1, first, linked)):
         first -= 1
-    while last < len(points) - 1 and _near(points, last + 1, k, reach) and (
+    while last < count - 1 and _near(points, last + 1, k, reach) and (
             _near(points, last + 1, last, linked)):
         last += 1
     return first, last
@@ -167,18 +169,6 @@ def _line(points, first, last):
 def _near(points, a, b, reach):
     dx, dy = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1]
     return dx * dx + dy * dy <= reach * reach
-
-
-@loop('(f8[:, ::1], f8)')
-def apart(points, spacing):
-    """Return which points of a scan are at least `spacing` [m] from the last one kept, (n,)."""
-    kept = np.zeros(len(points), np.bool_)
-    last = -1
-    for k in range(len(points)):
-        if last < 0 or not _near(points, k, last, spacing):
-            kept[k] = True
-            last = k
-    return kept
 
 
 @loop('(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8)')

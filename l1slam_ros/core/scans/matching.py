@@ -28,6 +28,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans import kernels
 from l1slam_ros.core.scans.field import REACH, RESOLUTION, Field
+from l1slam_ros.core.scans.points import turn
 
 # [m] Noise of a point off its line, in a map of several scans; where Cauchy's weight turns over.
 SIGMA = 0.03
@@ -37,6 +38,9 @@ FINEST = 0.02
 # So many points along a surface count as one. From simulated drives, with `FINEST` and the floor
 # of the odometry: the squared error of a step, over its variance, is 1 in x, y and heading.
 KAPPA = 1.5
+_VARIANCE = KAPPA * SIGMA**2
+# What a step is held by where neither points nor a prior hold it.
+_LEAST = 1e-9 * np.eye(3)
 # [m] Points farther than this do not match: by rounds, narrower each time.
 _WIDEST = REACH
 _NARROWEST = 0.15
@@ -44,7 +48,8 @@ _SHRINK = 0.75
 _MOST_ITERATIONS = 20
 # [m], [rad] A step that is no step any more.
 _STILL = 1e-4
-_UPPER = np.triu_indices(3)
+# Where the sums have the entries of H.
+_SYMMETRIC = np.array(((0, 1, 2), (1, 3, 4), (2, 4, 5)))
 
 
 @dataclass(frozen=True)
@@ -72,21 +77,21 @@ def match(field: Field, xy: Array, normals: Array, start: Array, prior: Array | 
     prior : (3,) pose that is expected, with `prior_information` (3, 3) in its axes; widest : gate
     of the first round [m]
     """
-    W = np.zeros((3, 3)) if prior_information is None else prior_information
-    prior = start if prior is None else prior
     pose = start.astype(float)
     gate = widest
     H = np.zeros((3, 3))
     sums = np.zeros(11)
     for _ in range(_MOST_ITERATIONS):
         H, g, sums = _sums(field, xy, normals, pose, gate)
-        expected = se2.between(prior[None], pose[None])[0]
-        J = np.eye(3)
-        c, s = np.cos(expected[2]), np.sin(expected[2])
-        J[:2, :2] = (c, -s), (s, c)
-        scale = KAPPA * SIGMA**2
-        A = H / scale + J.T @ W @ J + 1e-9 * np.eye(3)
-        step = -np.linalg.solve(A, g / scale + J.T @ W @ expected)
+        A, b = H / _VARIANCE, g / _VARIANCE
+        if prior is not None and prior_information is not None:
+            expected = se2.between(prior[None], pose[None])[0]
+            J = np.eye(3)
+            J[:2, :2] = turn(expected[2]).T
+            weighted = J.T @ prior_information
+            A = A + weighted @ J
+            b = b + weighted @ expected
+        step = -np.linalg.solve(A + _LEAST, b)
         pose = se2.retract(pose[None], step[None])[0]
         narrow = gate <= _NARROWEST
         gate = max(gate * _SHRINK, _NARROWEST)
@@ -102,10 +107,8 @@ def match(field: Field, xy: Array, normals: Array, start: Array, prior: Array | 
 
 def _sums(field: Field, xy: Array, normals: Array, pose: Array, gate: float
           ) -> tuple[Array, Array, Array]:
-    sums = kernels.normal_equations(
+    sums = np.zeros(11)
+    kernels.normal_equations(
         xy, normals, field.xy, field.normals, field.nearest, field.origin, RESOLUTION, pose, gate,
-        _SCALE)
-    H = np.zeros((3, 3))
-    H[_UPPER] = sums[:6]
-    H = H + np.triu(H, 1).T
-    return H, sums[6:9], sums
+        _SCALE, sums)
+    return sums[_SYMMETRIC], sums[6:9], sums

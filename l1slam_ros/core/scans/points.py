@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.scans import kernels
 
@@ -90,7 +90,7 @@ class Points:
     @property
     def surface(self) -> tuple[Array, Array]:
         """The points that have a normal, and these normals, (k, 2) each."""
-        has = self.normals.any(axis=1)
+        has = have_normal(self.normals)
         return self.xy[has], self.normals[has]
 
 
@@ -114,14 +114,14 @@ def points_of(scan: Scan, mount: Mount = Mount(),  # noqa: B008
     if velocity is not None and scan.time_increment:
         xy = _at_stamp(xy, velocity, scan.time_increment * np.arange(0.0, len(ranges)))
     view = _view(np.where(hit, ranges, np.inf)[looked], angles[looked])
-    seen = np.ascontiguousarray(xy[hit])
-    if len(seen):
-        seen = np.ascontiguousarray(seen[kernels.apart(seen, SPACING)])
+    seen = xy[hit]
+    normals = np.zeros_like(seen)
     noise = _noise(reach, hit, abs(scan.angle_increment))
-    normals = kernels.normals_along(
-        seen - centre, max(_NORMAL_REACH, _REACH_OF_NOISE * noise),
-        _RAYS * abs(scan.angle_increment), max(_OFF_LINE, _OFF_OF_NOISE * noise))
-    return Points(seen, normals, centre, view)
+    count = kernels.surface_along(
+        seen, centre, SPACING, max(_NORMAL_REACH, _REACH_OF_NOISE * noise),
+        _RAYS * abs(scan.angle_increment), max(_OFF_LINE, _OFF_OF_NOISE * noise),
+        np.empty_like(seen), normals)
+    return Points(seen[:count].copy(), normals[:count].copy(), centre, view)
 
 
 def _at_stamp(xy: Array, velocity: Array, seconds: Array) -> Array:
@@ -150,16 +150,29 @@ def _view(ranges: Array, angles: Array) -> Array:
     at = np.floor(angles / (2 * np.pi) * _BEARINGS).astype(np.int64) % _BEARINGS
     np.fmin.at(view, at, ranges)
     # A bearing between two rays is seen by both: so far as the nearer one.
-    width = 1 + int(_BEARINGS * _spacing_of(angles) / (2 * np.pi) + 1e-6)
-    before, after = view, view
-    for _ in range(width - 1):
-        before = np.where(np.isnan(before), np.roll(before, 1), before)
-        after = np.where(np.isnan(after), np.roll(after, -1), after)
-    return np.where(np.isnan(view), np.minimum(before, after), view)
+    steps = np.arange(1, 1 + int(_BEARINGS * _spacing_of(angles) / (2 * np.pi) + 1e-6))
+    between = np.flatnonzero(np.isnan(view))
+    view[between] = np.minimum(_first_seen(view, between[:, None] - steps),
+                               _first_seen(view, between[:, None] + steps))
+    return view
+
+
+def _first_seen(view: Array, bearings: Indices) -> Array:
+    """Return of each row of bearings (n, k) the range in the first that is seen, NaN: of none."""
+    if not bearings.shape[1]:
+        return np.full(len(bearings), np.nan)
+    ranges = view[bearings % _BEARINGS]
+    first = np.isnan(ranges).argmin(axis=1)
+    return ranges[np.arange(len(ranges)), first]
 
 
 def _spacing_of(angles: Array) -> float:
     return float(np.median(abs(np.diff(angles)))) if len(angles) > 1 else 0.0
+
+
+def have_normal(normals: Array) -> Mask:
+    """Return which of some normals (n, 2) are not zero."""
+    return (normals[:, 0] != 0) | (normals[:, 1] != 0)
 
 
 def transformed(pose: Array, xy: Array) -> Array:
@@ -169,5 +182,10 @@ def transformed(pose: Array, xy: Array) -> Array:
 
 def rotated(pose: Array, vectors: Array) -> Array:
     """Return vectors (n, 2) of the frame at a pose (3,), turned to that of the pose."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return vectors @ np.array([[c, s], [-s, c]])
+    return vectors @ turn(pose[2])
+
+
+def turn(angle: float) -> Array:
+    """Return what rows of vectors are multiplied by to turn them by an angle [rad], (2, 2)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, s], [-s, c]])

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.scans import search_kernels
 from l1slam_ros.core.scans.field import CERTAIN, RESOLUTION, Field
-from l1slam_ros.core.scans.search_kernels import WIDTH
+from l1slam_ros.core.scans.search_kernels import ACROSS, WIDTH
 
 # [rad] Step of the turns: at 4 m a cell.
 TURN = 0.025
@@ -54,23 +54,26 @@ def search(field: Field, xy: Array, centre: Array, reach: float, turn: float, le
     turns = np.arange(-int(turn / TURN), int(turn / TURN) + 1) * TURN + centre[2]
     most = int(reach / RESOLUTION)
     across = 2 * most // WIDTH + 1
-    if across > WIDTH:
-        raise ValueError(f'a search reaches {WIDTH * WIDTH * RESOLUTION / 2} m at most')
+    if across > ACROSS:
+        raise ValueError(f'a search reaches {WIDTH * ACROSS * RESOLUTION / 2} m at most')
     # Where the points would be without a turn at the lowest shift, in cells of the levels.
     start = (centre[:2] - field.origin) / RESOLUTION + WIDTH - most
-    sums = np.zeros((len(turns), across, WIDTH), np.uint16)
-    cells = search_kernels.add_widest_bounds(
+    sums = np.zeros((len(turns), across, ACROSS if across > 16 else 16), np.uint16)
+    cells = np.empty((len(turns), len(points), 2), np.int32)
+    search_kernels.add_widest_bounds(
         field.blocks, np.ascontiguousarray(points / RESOLUTION),
-        np.column_stack((np.cos(turns), np.sin(turns))), start, sums)
+        np.column_stack((np.cos(turns), np.sin(turns))), start, sums, cells)
+    stack = np.empty((4 * len(field.levels), 5), np.int64)
     nodes = _sorted(sums[:, :, :across], rival * least * certain)
     best, at, column, row = search_kernels.branch_and_bound(
-        field.levels, cells, nodes, 2 * most, int(least * certain), np.full(6, -1.0))
+        field.levels, cells, nodes, 2 * most, int(least * certain), np.full(6, -1.0),
+        stack)
     if at < 0:
         return None
     around = np.array([at, column, row, _SAME_TURN / TURN, _SAME / RESOLUTION,
                        2 * np.pi / TURN])
     second, other, *_ = search_kernels.branch_and_bound(
-        field.levels, cells, nodes, 2 * most, int(rival * best), around)
+        field.levels, cells, nodes, 2 * most, int(rival * best), around, stack)
     shift = RESOLUTION * (np.array([column, row]) - most)
     return Peak(np.array([*(centre[:2] + shift), turns[at]]), best / certain,
                 second / certain if other >= 0 else 0.0)

@@ -17,27 +17,25 @@ import numpy as np
 
 from l1slam_ros.core.kernels.compiled import compiled, loop
 
-# The widest bounds are over so many shifts each way, a power of two.
-WIDTH = 16
+# The widest bounds are over so many shifts each way, a power of two: wider ones are sooner added
+# up, and so loose that ten times as many squares must be looked into.
+WIDTH = 8
+# A search has at most so many squares each way.
+ACROSS = 32
 
 
-@loop('(u1[:, :, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1], u2[:, :, ::1])')
-def add_widest_bounds(blocks, points, turns, start, sums):
+@loop('(u1[:, :, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1], u2[:, :, ::1], i4[:, :, ::1])')
+def add_widest_bounds(blocks, points, turns, start, sums, cells):
     """
-    Add up bounds of the scores of all shifts, by squares of `WIDTH` shifts; return the cells.
+    Add up bounds of the scores of all shifts, by squares of `WIDTH` shifts.
 
     blocks : see `Field.blocks`; points : (n, 2) of the scan, in cells; turns : (t, 2) cosine and
     sine of each; start : (2,) where the scan's (0, 0) lies at the lowest shift, in cells of the
-    levels; sums : (t, a, w) of each turn and so many squares each way, w = `WIDTH`: of more than a
-    nobody asks, but so many are added in one step of the processor
-
-    Returns
-    -------
-    cells (t, n, 2) of the points
-
+    levels; sums : (t, a, w) of each turn and so many squares each way, w = 16 or `ACROSS`: of more
+    than a nobody asks, but so many are added in one step of the processor; cells : (t, n, 2) takes
+    those of the points
     """
     columns, rows, wide = blocks.shape[2], blocks.shape[3], np.uint64(sums.shape[2])
-    cells = np.empty((len(turns), len(points), 2), np.int32)
     for t in range(len(turns)):
         c, s = turns[t, 0], turns[t, 1]
         for k in range(len(points)):
@@ -46,15 +44,14 @@ def add_widest_bounds(blocks, points, turns, start, sums):
             v = int(np.floor(s * x + c * y + start[1]))
             cells[t, k, 0], cells[t, k, 1] = u, v
             plane = blocks[u % WIDTH, v % WIDTH]
-            first, left = u // WIDTH, np.uint64(min(max(v // WIDTH + WIDTH, 0), rows - WIDTH))
+            first, left = u // WIDTH, np.uint64(min(max(v // WIDTH + ACROSS, 0), rows - ACROSS))
             for a in range(max(-first, 0), min(sums.shape[1], columns - first)):
                 for b in range(wide):
                     sums[t, a, b] += plane[first + a, left + b]
-    return cells
 
 
-@loop('(u1[:, :, ::1], i4[:, :, ::1], i8[:, ::1], i8, i8, f8[::1])')
-def branch_and_bound(levels, cells, nodes, most, least, excluded):
+@loop('(u1[:, :, ::1], i4[:, :, ::1], i8[:, ::1], i8, i8, f8[::1], i8[:, ::1])')
+def branch_and_bound(levels, cells, nodes, most, least, excluded, stack):
     """
     Return the best shift of a scan over a likelihood grid for any of its turns.
 
@@ -62,7 +59,8 @@ def branch_and_bound(levels, cells, nodes, most, least, excluded):
     bound of the squares of shifts to look into, the best one first; most : the greatest shift
     each way; least : score to beat; excluded : (6,) turn, shift (2), how many turns and cells
     around it do not count, and after how many turns they begin anew; fewer than no turns: nothing
-    is excluded
+    is excluded; stack : (4 h, 5) for h levels, for the nodes that are still to be looked into:
+    turn, column, row, bound, level
 
     Returns
     -------
@@ -74,8 +72,6 @@ def branch_and_bound(levels, cells, nodes, most, least, excluded):
     """
     top = len(levels) - 1
     best, turn, column, row = least, -1, 0, 0
-    # Turn, column, row, bound, level.
-    stack = np.empty((4 * top + 4, 5), np.int64)
     for at in range(len(nodes)):
         if nodes[at, 3] <= best:
             break

@@ -19,7 +19,7 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.scans import kernels
 from l1slam_ros.core.scans.field import Field
-from l1slam_ros.core.scans.points import Points, rotated, transformed
+from l1slam_ros.core.scans.points import Points, have_normal, transformed, turn
 
 # A submap is of so many keyframes before and after its own.
 AROUND = 4
@@ -91,23 +91,25 @@ def submap_of(keyframes: Sequence[Keyframe], at: int, before: int = AROUND, afte
     near = [keyframe for keyframe in keyframes[max(at - before, 0) : at + after + 1]
             if keyframe.part == own.part]
     poses = se2.between(np.tile(own.pose, (len(near), 1)), np.array([k.pose for k in near]))
-    # Of the points of a cell the first is kept, which is of the oldest scan.
-    xy, normals = [], []
+    seen = np.concatenate([keyframe.points.xy for keyframe in near])
+    normal = np.concatenate([keyframe.points.normals for keyframe in near])
+    end = 0
     for keyframe, pose in zip(near, poses, strict=True):
-        points, normal = keyframe.points.surface
-        xy.append(transformed(pose, points))
-        normals.append(rotated(pose, normal))
-    points, normal = np.concatenate(xy), np.concatenate(normals)
+        of = slice(end, end := end + len(keyframe.points.xy))
+        R = turn(pose[2])
+        seen[of] = seen[of] @ R + pose[:2]
+        normal[of] = normal[of] @ R
+    has = have_normal(normal)
+    points, normal = seen[has], normal[has]
+    # Of the points of a cell the first is kept, which is of the oldest scan.
     side = np.round(np.arctan2(normal[:, 1], normal[:, 0]) / (np.pi / 2)).astype(np.int64) % 4
     cell = np.floor(points / _CELL).astype(np.int64)
     # One number for each cell and side; no map is 2^29 cells wide.
     _, first = np.unique((cell[:, 0] * 2**31 + cell[:, 1]) * 4 + side, return_index=True)
     kept = np.sort(first)
-    centres = poses.copy()
-    for row, keyframe in zip(centres, near, strict=True):
-        row[:2] = transformed(row, keyframe.points.centre[None])[0]
-    return Submap(np.ascontiguousarray(points[kept]), np.ascontiguousarray(normal[kept]),
-                  np.stack([k.points.view for k in near]), centres)
+    centres = np.array([[*keyframe.points.centre, 0.0] for keyframe in near])
+    return Submap(points[kept], normal[kept], np.stack([k.points.view for k in near]),
+                  se2.compose(poses, centres))
 
 
 def submap_of_scan(points: Points) -> Submap:

@@ -89,7 +89,6 @@ class RunOfScans:
         self._placing = Placing()
         self._path = b''
         self._read = 0.0
-        self._news = False
         self._drawer.begin_anew()
 
     def set_path(self, data: bytes) -> None:
@@ -99,7 +98,6 @@ class RunOfScans:
     def add_known(self, stamp: int, covariance: Array) -> None:
         """Hear how well a pose of the path is known, (3, 3) at its stamp [ns]."""
         self._placing.add_known(stamp, covariance)
-        self._news = True
 
     def follow(self, scan: Scan, wheels: Array) -> None:
         """Follow the robot to a scan, the wheels being at a pose (3,); publish what came of it."""
@@ -129,8 +127,8 @@ class RunOfScans:
         return self._front_end.waiting > 0
 
     def place_if_due(self, seconds: float = _READ) -> None:
-        """Read a path that has come, or how well it is known, if that was some seconds ago."""
-        if (self._path or self._news) and time.monotonic() - self._read > seconds:
+        """Read a path that has come, if the one before was some seconds ago."""
+        if self._path and time.monotonic() - self._read > seconds:
             self._place()
 
     def cost(self) -> tuple[float, float]:
@@ -152,11 +150,9 @@ class RunOfScans:
 
     def _place(self) -> None:
         """Let front end and map know where the path has the keyframes."""
-        if self._path:
-            self._placing.set_path(*path_in(self._path))
+        self._placing.set_path(*path_in(self._path))
         self._path = b''
         self._read = time.monotonic()
-        self._news = False
         keyframes = self._front_end.keyframes
         poses = self._placing.place(keyframes)
         if not len(poses):

@@ -25,8 +25,8 @@ from l1slam_ros.core.scans.live_grid import LiveGrid
 from l1slam_ros.core.scans.points import Points
 from l1slam_ros.io.files import counted
 from l1slam_ros.io.scans.grid_file import write_grid
-from l1slam_ros.ros.publishing import header
 from l1slam_ros.ros.scans.options import ScanLoopsOptions
+from l1slam_ros.ros.shell.header import header
 
 # [s] Scans wait no longer for the map.
 _SLICE = 0.01

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from l1slam_ros.core.scans.field import CERTAIN, REACH, RESOLUTION, Field
-from l1slam_ros.core.scans.search_kernels import WIDTH
+from l1slam_ros.core.scans.search_kernels import ACROSS, WIDTH
 
 
 def test_what_is_looked_up_is_the_nearest_point():
@@ -46,7 +46,7 @@ def test_blocks_are_the_widest_level():
     rng = np.random.default_rng(2)
     field = Field.of(rng.uniform(0, 6, (20, 2)), np.ones((20, 2)))
     last = field.levels[-1]
-    blocks = field.blocks[..., WIDTH:-WIDTH]
+    blocks = field.blocks[..., ACROSS:-ACROSS]
     for a, b in rng.integers(0, last.shape, (100, 2)):
         assert blocks[a % WIDTH, b % WIDTH, a // WIDTH, b // WIDTH] == last[a, b]
     assert blocks.sum(dtype=int) == field.blocks.sum(dtype=int) == last.sum(dtype=int)

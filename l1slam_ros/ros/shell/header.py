@@ -1,0 +1,20 @@
+# Copyright 2026 l1slam_ros maintainers
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0 Unless required by applicable law or agreed to in
+# writing, software distributed under the License is distributed on an "AS IS" BASIS, WITHOUT
+# WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
+# language governing permissions and limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""The header of a message."""
+
+from builtin_interfaces.msg import Time
+from std_msgs.msg import Header
+
+from l1slam_ros.io.files import NANOSECONDS
+
+
+def header(frame: str, stamp: int) -> Header:
+    """Return a header with its stamp [ns]."""
+    seconds, nanoseconds = divmod(int(stamp), NANOSECONDS)
+    return Header(frame_id=frame, stamp=Time(sec=seconds, nanosec=nanoseconds))
