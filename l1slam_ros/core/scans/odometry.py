@@ -40,7 +40,8 @@ _MAP = 4
 _MATCHED, _GATE = 0.4, 16.27
 # Where so much does, nobody looks whether rays contradict it.
 _MUCH = 0.8
-# So much of a scan must find the map where it was searched for, and no other place come so near.
+# So much of a scan must find the map where it was searched for, or where rays contradict it a
+# little; no other place may come so near to what a search found.
 _FOUND, _RIVAL = 0.3, 0.85
 # Of the points that rays look at so many are where these end, or the scan is searched for; where
 # the robot is not lost, at least so many: what is thin is seen from one side and not from another.
@@ -163,6 +164,7 @@ class ScanOdometry:
         found, covariance = self._match(expected, expected, information, points)
         pose = found.pose
         fits = covariance is not None and found.matched >= _MATCHED
+        helps = covariance is not None and found.matched >= _FOUND
         if covariance is None:
             pose, covariance = expected, predicted
         agree = 1.0 if fits and found.matched >= _MUCH else self._free_space(pose, points)
@@ -173,8 +175,8 @@ class ScanOdometry:
         if searched is not None and self._free_space(searched.pose, points) >= np.fmax(
                 agree, _LEAST_AGREE):
             return self._follow_search(searched, expected, information, points)
-        if fits or agree >= _LEAST_AGREE:
-            # It may have come to where little is known; what matches still helps.
+        if fits or agree >= (_LEAST_AGREE if helps else _AGREE):
+            # It may have come to where little is known; what matches there still helps.
             self._take(pose, covariance)
         else:
             # Where rays look at nothing, they contradict nothing.
