@@ -34,8 +34,8 @@ from l1slam_ros.core.scans.matching import match
 from l1slam_ros.core.scans.search import search
 from l1slam_ros.core.scans.submaps import AROUND, LOOKS, Keyframe, Submap, Submaps, seen_by
 
-# Every other keyframe asks: submaps of neighbours show the same.
-_EVERY = 2
+# [m] A keyframe asks so far from the last one that did: submaps of neighbours show the same.
+_ASK_WAY = 1.0
 # So many candidates by their place in the map, and so many by their looks.
 _NEAREST, _ALIKE = 2, 2
 # Cosine of two descriptors.
@@ -117,6 +117,7 @@ class LoopFinder:
         self._keyframes, self._options = keyframes, options
         self._submaps = Submaps(keyframes)
         self._asked = AROUND
+        self._asked_at = -np.inf  # [m] the way to the last that asked
         # Of each keyframe that may be asked for.
         self._looks: list[Array] = []
         self._travelled: list[float] = []
@@ -125,14 +126,15 @@ class LoopFinder:
         self._closed = -1  # the last that was found to be where a near one is
 
     def due(self) -> Indices:
-        """Return the keyframes that may ask now: their submaps are whole."""
-        first = self._asked
-        end = len(self._keyframes) - AROUND
-        if end <= first:
-            return np.zeros(0, np.int64)
-        self._asked = end
-        asking = np.arange(first, end)
-        return asking[asking % _EVERY == 0]
+        """Return the keyframes that ask now: their submaps are whole, the last is a way back."""
+        due: list[int] = []
+        while self._asked < len(self._keyframes) - AROUND:
+            travelled = self._keyframes[self._asked].travelled
+            if travelled - self._asked_at >= _ASK_WAY:
+                self._asked_at = travelled
+                due.append(self._asked)
+            self._asked += 1
+        return np.array(due, np.int64)
 
     def ask(self, j: int, poses: Array, spread: Array) -> None:
         """

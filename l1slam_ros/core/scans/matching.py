@@ -41,6 +41,8 @@ KAPPA = 1.5
 _VARIANCE = KAPPA * SIGMA**2
 # What a step is held by where neither points nor a prior hold it.
 _LEAST = 1e-9 * np.eye(3)
+# [rad] Normals are off by so much: what they say of the way along a wall is noise.
+_OFF_NORMAL = 0.05
 # [m] Points farther than this do not match: by rounds, narrower each time.
 _WIDEST = REACH
 _NARROWEST = 0.15
@@ -81,8 +83,11 @@ def match(field: Field, xy: Array, normals: Array, start: Array, prior: Array | 
     gate = widest
     H = np.zeros((3, 3))
     sums = np.zeros(11)
+    radius = float(np.sqrt((xy**2).sum(axis=1).mean())) if len(xy) else 1.0
+    units = np.array([1.0, 1.0, 1.0 / max(radius, 0.1)])
     for _ in range(_MOST_ITERATIONS):
         H, g, sums = _sums(field, xy, normals, pose, gate)
+        H, g = _held(H, g, units)
         A, b = H / _VARIANCE, g / _VARIANCE
         if prior is not None and prior_information is not None:
             expected = se2.between(prior[None], pose[None])[0]
@@ -98,8 +103,6 @@ def match(field: Field, xy: Array, normals: Array, start: Array, prior: Array | 
         if narrow and abs(step).max() < _STILL:
             break
     count = sums[9]
-    radius = float(np.sqrt((xy**2).sum(axis=1).mean())) if len(xy) else 1.0
-    units = np.array([1.0, 1.0, 1.0 / max(radius, 0.1)])
     curvature = float(np.linalg.eigvalsh(H * np.outer(units, units))[0] / max(count, 1.0))
     square = max(FINEST**2, sums[10] / max(count, 1.0))
     return Match(pose, H / (KAPPA * square), count / max(len(xy), 1), curvature)
@@ -112,3 +115,16 @@ def _sums(field: Field, xy: Array, normals: Array, pose: Array, gate: float
         xy, normals, field.xy, field.normals, field.nearest, field.origin, RESOLUTION, pose, gate,
         _SCALE, sums)
     return sums[_SYMMETRIC], sums[6:9], sums
+
+
+def _held(H: Array, g: Array, units: Array) -> tuple[Array, Array]:
+    """
+    Return the sums without what is said of a direction by the errors of normals alone.
+
+    units : (3,) in which directions are compared
+    """
+    values, axes = np.linalg.eigh(H * np.outer(units, units))
+    noise = _OFF_NORMAL**2 * (H[0, 0] + H[1, 1])
+    part = np.maximum(1 - noise / np.maximum(values, 1e-12), 0.0)
+    V = axes / units[:, None]
+    return (V * (part * values)) @ V.T, V @ (part * (axes.T @ (units * g)))

@@ -40,10 +40,12 @@ _MAP = 4
 _MATCHED, _GATE = 0.4, 16.27
 # Where so much does, nobody looks whether rays contradict it.
 _MUCH = 0.8
-# So much of a scan must find the map where it was searched for, and no other place come so near.
-_FOUND, _RIVAL = 0.6, 0.85
-# Where the robot is not lost, so many of the points that rays look at are where these end.
-_AGREE = 0.85
+# So much of a scan must find the map where it was searched for, or where rays contradict it a
+# little; no other place may come so near to what a search found.
+_FOUND, _RIVAL = 0.3, 0.85
+# Of the points that rays look at so many are where these end, or the scan is searched for; where
+# the robot is not lost, at least so many: what is thin is seen from one side and not from another.
+_AGREE, _LEAST_AGREE = 0.85, 0.75
 # [m], [rad] How far is searched beyond the wheels' way since a scan was matched, and at most.
 _SEARCH, _MOST_SEARCH = np.array((0.3, 0.3)), np.array((1.5, 0.8))
 # How far from the peak of a search the scan may be, where its surfaces do not say [m, m, rad].
@@ -158,37 +160,52 @@ class ScanOdometry:
 
     def _follow(self, expected: Array, predicted: Array, points: Points) -> str:
         """Find the pose at a scan from what the wheels expect; return what is to be said."""
-        xy, normals = points.surface
-        assert self._field is not None
         information: Array = np.linalg.inv(predicted).astype(float)
-        found = match(self._field, xy, normals, expected, expected, information)
-        off = se2.local(expected[None], found.pose[None])[0]
-        near = off @ information @ off <= _GATE
-        pose, covariance = expected, predicted
-        if near:
-            pose = found.pose
-            covariance = np.linalg.inv(information + found.information).astype(float)
-        fits = near and found.matched >= _MATCHED
-        looked, contradicted = (True, False) if fits and found.matched >= _MUCH else (
-            self._free_space(pose, points))
-        if fits and not contradicted:
+        found, covariance = self._match(expected, expected, information, points)
+        pose = found.pose
+        fits = covariance is not None and found.matched >= _MATCHED
+        helps = covariance is not None and found.matched >= _FOUND
+        if covariance is None:
+            pose, covariance = expected, predicted
+        agree = 1.0 if fits and found.matched >= _MUCH else self._free_space(pose, points)
+        if fits and not agree < _AGREE:
             self._take(pose, covariance)
             return ''
         searched = self._search(expected, points)
-        if searched is not None and not self._free_space(searched.pose, points)[1]:
-            self._take(searched.pose,
-                       np.linalg.inv(_NEAR_PEAK + searched.information) + _SEARCHED)
-            said = '' if self._distrusted else (
-                'the scans disagree with the wheels, and are followed')
-            self._distrusted = _DISTRUST
-            return said
-        if fits or (looked and not contradicted):
-            # It may have come to where little is known; what matches still helps.
+        if searched is not None and self._free_space(searched.pose, points) >= np.fmax(
+                agree, _LEAST_AGREE):
+            return self._follow_search(searched, expected, information, points)
+        if fits or agree >= (_LEAST_AGREE if helps else _AGREE):
+            # It may have come to where little is known; what matches there still helps.
             self._take(pose, covariance)
         else:
-            self._unmatched = self._unmatched + 1 if contradicted else 0
+            # Where rays look at nothing, they contradict nothing.
+            self._unmatched = 0 if np.isnan(agree) else self._unmatched + 1
             self._pose, self._covariance = expected, predicted
         return ''
+
+    def _match(self, start: Array, expected: Array, information: Array, points: Points
+               ) -> tuple[Match, Array | None]:
+        """Match from a pose on; return its covariance, too; None: the wheels cannot be right."""
+        xy, normals = points.surface
+        assert self._field is not None
+        found = match(self._field, xy, normals, start, expected, information)
+        off = se2.local(expected[None], found.pose[None])[0]
+        if off @ information @ off > _GATE:
+            return found, None
+        return found, np.linalg.inv(information + found.information).astype(float)
+
+    def _follow_search(self, searched: Match, expected: Array, information: Array,
+                       points: Points) -> str:
+        """Believe a search; return what is to be said where the wheels say otherwise."""
+        found, covariance = self._match(searched.pose, expected, information, points)
+        if covariance is not None and found.matched >= _FOUND:
+            self._take(found.pose, covariance)
+            return ''
+        self._take(searched.pose, np.linalg.inv(_NEAR_PEAK + searched.information) + _SEARCHED)
+        said = '' if self._distrusted else 'the scans disagree with the wheels, and are followed'
+        self._distrusted = _DISTRUST
+        return said
 
     def _take(self, pose: Array, covariance: Array) -> None:
         """Believe that the robot is at a pose of the map."""
@@ -197,21 +214,22 @@ class ScanOdometry:
         self._known = self._pose = pose
         self._covariance = covariance
 
-    def _free_space(self, pose: Array, points: Points) -> tuple[bool, bool]:
+    def _free_space(self, pose: Array, points: Points) -> float:
         """
-        Tell whether a scan at a pose (3,) and the map look at each other's points.
+        Return how many of each other's points a scan at a pose (3,) and the map bear out, 0 to 1.
 
-        Second: whether their rays pass through these, so that the robot is not there.
+        The others are where the rays of one pass through. NaN: they look at too few to tell.
         """
         seen = submap_of_scan(points)
         if self._map is None or len(seen.xy) < _FEWEST:
-            return False, False
+            return np.nan
         here = se2.between(self.keyframes[-1].pose[None], pose[None])
         counts = np.array((seen_by(self._map, seen, here[0]),
                            seen_by(seen, self._map, se2.inverse(here)[0])))
         of_each = counts.sum(axis=1)
-        looked = of_each.sum() >= _FEWEST
-        return bool(looked), bool(looked and (counts[:, 0] < _AGREE * of_each).any())
+        if of_each.sum() < _FEWEST:
+            return np.nan
+        return float((counts[:, 0] / np.maximum(of_each, 1))[of_each > 0].min())
 
     def _search(self, expected: Array, points: Points) -> Match | None:
         """
@@ -225,7 +243,7 @@ class ScanOdometry:
             return None
         reach, turn = np.minimum(_SEARCH + self._blind, _MOST_SEARCH)
         centre = np.array([*self._known[:2], expected[2]])
-        peak = search(self._field, xy, centre, reach, turn, _MATCHED, _RIVAL)
+        peak = search(self._field, xy, centre, reach, turn, _FOUND, _RIVAL)
         if peak is None or peak.second > _RIVAL * peak.score:
             return None
         found = match(self._field, xy, normals, peak.pose, peak.pose, _NEAR_PEAK, widest=0.3)

@@ -115,3 +115,15 @@ def test_keyframes_ask_once_their_surroundings_are_known():
     growing += keyframes[8:]
     due = finder.due()
     assert len(due) and due.max() < len(growing) - 4 and not len(finder.due())
+
+
+@pytest.mark.parametrize(('step', 'ask'), [(1.5, 1), (1.0, 1), (0.5, 2), (0.25, 4), (0.0, 40)])
+def test_keyframes_ask_by_the_way_and_not_by_their_number(step, ask):
+    """Of a log with few scans each asks, of one that turns on the spot the first."""
+    points = keyframes_at(OUT[:1])[0].points
+    growing, due = [], []
+    finder = LoopFinder(growing)
+    for k in range(40):
+        growing.append(Keyframe(k, np.array((step * k, 0.0, 0.0)), points, 0, step * k))
+        due += finder.due().tolist()
+    assert due == list(range(4, 36, ask))
