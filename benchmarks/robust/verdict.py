@@ -9,13 +9,15 @@
 """
 How often a map was right, beside the forecast that was made of it: fits it, and counts its record.
 
-    python benchmarks/robust/verdict.py --datasets DIR [--seeds N] [--drawn N] [--only GRAPH...]
+    python benchmarks/robust/verdict.py --datasets DIR [--seeds N] [--drawn N] [--fresh SET...]
+        [--only GRAPH...]
 
 Graphs, made and recorded, get lies, slips, drift and misstated noise. A map is wrong where it is
 further from the truth than 1.5 times the map of the true loops alone, and 5 cm; where no truth is
 known, more than .25 m and .5% of the map's diagonal from that map. The weights are fitted on the
 graphs of `FIT` and on worlds that `drawn` draws. The tables count those of `HELD`, of which
-nothing was used, and fresh worlds, of other seeds and one kind more.
+nothing was used, and sets of fresh worlds, of other seeds and one kind more. Each table names the
+runs whose map was not right and silent.
 """
 
 import argparse
@@ -40,7 +42,6 @@ from l1slam_ros.core.errors import GraphError
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
 from l1slam_ros.core.robust.batch_map import SolveOptions, solve
-from l1slam_ros.core.robust.judgement import ONE_PLACE
 from l1slam_ros.core.worlds.false_loops import FALSE_LOOPS, insert_loops
 from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
@@ -66,9 +67,15 @@ _EDGES = (0.0, 0.02, 0.05, 0.1, 0.25, 0.5, 1.0)
 
 @dataclass(frozen=True)
 class Row:
-    """One run: terms (6,) of the forecast, whether the map was wrong, the kinds of its doubts."""
+    """
+    One run.
+
+    graph : its name, of a drawn world behind that of its set; asked : its seed and what was made
+    wrong in it; terms : (6,) of the forecast; wrong : whether the map was; doubts : their kinds.
+    """
 
     graph: str
+    asked: str
     terms: Array
     wrong: bool
     doubts: frozenset[str]
@@ -122,34 +129,39 @@ MADE: dict[str, Callable[[int], Place]] = {
     'tails': lambda seed: (_ring if seed % 2 else _corridor)(50 + seed, True)}
 
 
-# Drawn worlds, those whose weights are fitted and the others: the first number of their seeds, and
-# the kinds; of each kind its number.
+# Kinds of drawn worlds. The first number of a seed is that of its set: weights are fitted on the
+# first, the others are fresh. The second was looked at while rules were made.
 _DRAWN: dict[str, Callable[[np.random.Generator], Place]] = {
     'streets': drawn.streets, 'laps': drawn.laps, 'spokes': drawn.spokes, 'lawn': drawn.lawn,
     'rings': lambda rng: _ring(int(rng.integers(10**6)), rng.random() < 0.3),
     'corridors': lambda rng: _corridor(int(rng.integers(10**6)), rng.random() < 0.3)}
-FRESH = 'fresh '
+_FITTED, _LOOKED_AT, _NEVER_SEEN = 1, 2, 3
 
 
 def runs_drawn(base: int, count: int) -> Iterator[Row]:
-    """Yield what became of worlds that are drawn; base : of their seeds, 1 to fit, 2 fresh."""
+    """Yield what became of worlds that are drawn; base : the number of their set."""
     for number, (name, world) in enumerate(_DRAWN.items()):
-        for seed in range(count) if base == 2 or name != 'lawn' else ():
+        for seed in range(count) if base != _FITTED or name != 'lawn' else ():
             rng = np.random.default_rng((base, number, seed))
             found, asked = world(rng), drawn.condition(rng, name == 'rings')
             report_progress(f'{name} seed {seed} of {base}: {asked}')
             with suppress(GraphError):  # no room for so many lies
-                yield run(FRESH * (base == 2) + name, found, asked,
-                          np.random.default_rng((seed, 0, number)))
+                yield run(f'{_set(base)}{name}', found, asked,
+                          np.random.default_rng((seed, 0, number)), seed)
+
+
+def _set(base: int) -> str:
+    return '' if base == _FITTED else f'FRESH {base}: '
 
 
 def run_one(name: str, found: Place, condition: int, seed: int) -> Row:
     """Return what became of the map of a graph in one of `CONDITIONS`."""
     return run(name, found, CONDITIONS[condition],
-               np.random.default_rng((seed, condition, (FIT + HELD).index(name))))
+               np.random.default_rng((seed, condition, (FIT + HELD).index(name))), seed)
 
 
-def run(name: str, found: Place, condition: drawn.Condition, rng: np.random.Generator) -> Row:
+def run(name: str, found: Place, condition: drawn.Condition, rng: np.random.Generator,
+        seed: int) -> Row:
     """Return what became of the map of a graph in which something is made wrong."""
     change, amounts, lies, share = condition
     what = changed(found, change, amounts, rng)
@@ -165,7 +177,7 @@ def run(name: str, found: Place, condition: drawn.Condition, rng: np.random.Gene
     outcome = solve(graph, None, SolveOptions(robust=True))
     judgement, poses = outcome.judgement, outcome.solution.poses[:, :2]
     assert judgement is not None
-    return Row(name, judgement.terms, _is_wrong(found, poses, best),
+    return Row(name, f'seed {seed} {condition}', judgement.terms, _is_wrong(found, poses, best),
                frozenset(doubt.kind for doubt in judgement.doubts))
 
 
@@ -186,20 +198,30 @@ def _fitted(rows: list[Row]) -> Array:
 
 
 def _tell(name: str, rows: list[Row], weights: Array) -> None:
+    """Print how often some runs were said to be right and were, and which were misjudged."""
     wrong, doubted = (np.array([getattr(row, what) for row in rows])
                       for what in ('wrong', 'doubted'))
-    alone = sum(not row.wrong and row.doubts == {ONE_PLACE} for row in rows)
-    forecast = 1 / (1 + np.exp(-np.array([row.terms for row in rows]) @ weights))
-    print(f'\n{name}: {len(rows)} runs; right {(~wrong & ~doubted).sum()}, right and doubted '
+    count = len(rows)
+    print(f'\n{name}: {count} runs; right {(~wrong & ~doubted).sum()}, right and doubted '
           f'{(~wrong & doubted).sum()}, wrong and said {(wrong & doubted).sum()}, wrong and '
-          f'silent {(wrong & ~doubted).sum()}; of the right and doubted {alone} are held by one '
-          'place\n\n| confidence | runs | said | right |\n|---|---|'
-          '---|---|')
+          f'silent {(wrong & ~doubted).sum()}\nof the wrong {_share(doubted[wrong])} are said, of '
+          f'the right {_share(~doubted[~wrong])} are not doubted, of all '
+          f'{_share(wrong & ~doubted)} are wrong and silent\n')
+    for row in rows:
+        if row.wrong != row.doubted:
+            print('  wrong and silent:' if row.wrong else '  right and doubted:', row.graph,
+                  row.asked, ', '.join(sorted(row.doubts)))
+    print('\n| confidence | runs | said | right |\n|---|---|---|---|')
+    forecast = 1 / (1 + np.exp(-np.array([row.terms for row in rows]) @ weights))
     for low, high in zip(_EDGES, _EDGES[1:], strict=False):
         among = (forecast >= low) & (forecast < high)
         if among.any():
             print(f'| {1 - high:.2f} to {1 - low:.2f} | {among.sum()} | '
                   f'{1 - forecast[among].mean():.3f} | {1 - wrong[among].mean():.3f} |')
+
+
+def _share(some: Array) -> str:
+    return f'{some.mean():.1%}' if len(some) else 'none'
 
 
 def main() -> int:
@@ -209,9 +231,12 @@ def main() -> int:
     parser.add_argument('--datasets', type=Path, required=True)
     parser.add_argument('--seeds', type=int, default=3, help='of graphs that are made')
     parser.add_argument('--drawn', type=int, default=30, help='worlds of each kind')
+    parser.add_argument('--fresh', type=int, nargs='*', default=(_LOOKED_AT, _NEVER_SEEN),
+                        help='the numbers of sets of fresh worlds, from 2 on')
     parser.add_argument('--only', nargs='+', choices=FIT + HELD, default=FIT + HELD)
     given = parser.parse_args()
-    rows = [row for base in (1, 2) for row in runs_drawn(base, given.drawn)]
+    rows = [row for base in (_FITTED, *given.fresh)
+            for row in runs_drawn(base, given.drawn)]
     for name in given.only:
         for seed in range(given.seeds if name in MADE else 1):
             found = MADE[name](seed) if name in MADE else place(given.datasets, name)
@@ -224,9 +249,10 @@ def main() -> int:
                     continue
                 report_progress(f'{name} seed {seed}: {CONDITIONS[condition]}')
                 rows.append(run_one(name, found, condition, seed))
-    halves = {half: [row for row in rows if of(row.graph)] for half, of in (
-        ('FIT', lambda name: name not in HELD and not name.startswith(FRESH)),
-        ('HELD', lambda name: name in HELD), ('FRESH', lambda name: name.startswith(FRESH)))}
+    halves: dict[str, list[Row]] = {'FIT': [], 'HELD': []}
+    for row in rows:
+        fresh, _, name = row.graph.rpartition(': ')
+        halves.setdefault(fresh or ('HELD' if name in HELD else 'FIT'), []).append(row)
     weights = _fitted(halves['FIT'] or rows)
     print('weights:', ', '.join(f'{weight:.2f}' for weight in weights))
     for half, among in halves.items():

@@ -18,7 +18,6 @@ from l1slam_ros.core.graph.factor_graph import BetweenFactors
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
     FAILED,
-    MOSTLY_REFUSED,
     NORM,
     ONE_JOINS,
     ONE_PLACE,
@@ -26,6 +25,7 @@ from l1slam_ros.core.robust.judgement import (
     SLIP,
     UNFINISHED,
     UNSOLVED,
+    WEAK,
     Doubt,
     Judgement,
 )
@@ -56,8 +56,8 @@ _TOGETHER = ('the loops of a place err together: in the map each place counts as
 
 # By the kind of a doubt.
 _REASONS = {
-    MOSTLY_REFUSED: '{loops} loops, most of all, are refused or suspect, {where}: either they are '
-                    'false, or the odometry is worse than it says',
+    WEAK: 'the map may well be {detail} m off: by the noise that was found, the loops that are '
+          'used hold it no better; {loops} are left out, {where}',
     ONE_PLACE: 'all {loops} loops that are used are of one place, {where}, which the odometry '
                'alone hardly bears out, so they may be one mistake',
     ONE_JOINS: 'of how two parts lie to each other only loops of one place agree ({loops}, '

@@ -19,8 +19,8 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust.batch import minimise_robustly
 from l1slam_ros.core.robust.judgement import (
-    MOSTLY_REFUSED,
     OTHER_MAP,
+    WEAK,
     Doubt,
     Judgement,
 )
@@ -115,11 +115,11 @@ def test_a_map_of_other_noise_than_is_stated_is_told(record):
     (None, ''), (10**9 * np.arange(N), ' (2.000000000 s to 7.000000000 s)')])
 def test_a_doubt_says_why_and_where(stamps, when):
     ids, where = 10 + 3 * np.arange(N), f'between 16 and 31{when}'
-    said = doubt_sentence([Doubt(kind, 1234, 2, 7) for kind in (MOSTLY_REFUSED, OTHER_MAP)],
+    said = doubt_sentence([Doubt(kind, 1234, 2, 7, '2.5') for kind in (WEAK, OTHER_MAP)],
                           ids, stamps)
     assert said == (
-        f'doubtful: 1,234 loops, most of all, are refused or suspect, {where}: either they are '
-        'false, or the odometry is worse than it says; 1,234 refused loops agree with each '
+        'doubtful: the map may well be 2.5 m off: by the noise that was found, the loops that are '
+        f'used hold it no better; 1,234 are left out, {where}; 1,234 refused loops agree with each '
         f'other on another map, {where}. Vouch for a loop that is right, strike out one that is '
         'false, or state the noise')
     assert doubt_sentence((), ids, stamps) == ''

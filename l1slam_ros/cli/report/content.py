@@ -23,7 +23,6 @@ from l1slam_ros.core.robust.batch_map import Outcome
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
     FAILED,
-    MOSTLY_REFUSED,
     NORM,
     ONE_JOINS,
     ONE_PLACE,
@@ -31,6 +30,7 @@ from l1slam_ros.core.robust.judgement import (
     SLIP,
     UNFINISHED,
     UNSOLVED,
+    WEAK,
     Judgement,
 )
 from l1slam_ros.io import formats
@@ -57,8 +57,8 @@ _ACCEPTED, _REJECTED, _SUSPECT, _SLIP, _TRUSTED, _STRUCK = range(len(_FATES))
 _LOOK = 'Look at the images or scans of a few of them'
 # What a person can do about a doubt, by its kind.
 _ADVICE = {
-    MOSTLY_REFUSED: f'{_LOOK}. If they are false, as most loops of a careless front end are, tick '
-                    'them all as false. Tick as true those of places that you know.',
+    WEAK: f'Record loops of more places, or calibrate the odometry. {_LOOK}: tick as true those '
+          'of places that you know.',
     ONE_PLACE: f'{_LOOK}. One of them ticked as true settles it; ticked as false, they all go.',
     ONE_JOINS: f'{_LOOK}. Ticked as true, they join the two parts for good; ticked as false, '
                'nothing does.',

@@ -11,7 +11,7 @@ The maps that a doubtful graph may have instead: each doubt decided the other wa
 
     one place alone holds the map, or joins two parts     its loops are struck out
     refused loops agree on another map                    they are vouched for
-    most loops are refused                                every loop is believed
+    the map is weak                                       every loop is believed
     a step may have slipped                               it is left out, or believed
     the odometry may drift                                it is corrected, and loops judged anew
     another norm has another map                          that of least squares
@@ -30,12 +30,12 @@ from l1slam_ros.core.names import SAME
 from l1slam_ros.core.robust.batch_map import Outcome, SolveOptions, solve
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
-    MOSTLY_REFUSED,
     NORM,
     ONE_JOINS,
     ONE_PLACE,
     OTHER_MAP,
     SLIP,
+    WEAK,
     Doubt,
     Judgement,
 )
@@ -96,7 +96,7 @@ def _plans(record: GraphRecord, judgement: Judgement, asked: SolveOptions) -> It
             yield _Plan(f'{loops} struck out', number, _told(graph, rows, False), asked)
         elif doubt.kind == OTHER_MAP and len(rows):
             yield _Plan(f'{loops} vouched for', number, _told(graph, rows, True), asked)
-        elif doubt.kind == MOSTLY_REFUSED and len(rows) <= graph.n_poses:
+        elif doubt.kind == WEAK and len(rows) <= graph.n_poses:
             # Of many more a graph fills in, and nobody would take them all for true.
             yield _Plan('every loop believed', number, straightened(graph, judgement.drift),
                         believing)

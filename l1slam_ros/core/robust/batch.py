@@ -66,7 +66,7 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import whitened_residual
 from l1slam_ros.core.graph.parts import tied
 from l1slam_ros.core.robust.forecast import drift_taken_for_noise, right_within
-from l1slam_ros.core.robust.innovation import chi2_quantile, covariances
+from l1slam_ros.core.robust.innovation import chi2_quantile, covariances, spread_of
 from l1slam_ros.core.robust.judgement import (
     NORM,
     UNSOLVED,
@@ -147,18 +147,14 @@ class _Repair:
 
     def _straightened(self, as_stated: Growth) -> Growth | None:
         """Return the state without a drift that wins a place, or was taken for noise."""
-        drift, odds = vote(self._graph) if len(as_stated.undecided()) else (0.0, 0.0)
-        more = 1
-        if not (drift and odds > 0):
-            drift = drift_taken_for_noise(as_stated)
-            more = 0
-        if not drift:
-            return None
-        straight, told = self._without(drift)
-        if _won(as_stated, told) < _won(as_stated, as_stated) + more:
-            return None
-        self.drift = drift
-        return straight
+        voted, odds = vote(self._graph) if len(as_stated.undecided()) else (0.0, 0.0)
+        for drift, more in ((voted * (odds > 0), 1), (drift_taken_for_noise(as_stated), 0)):
+            if drift:
+                straight, told = self._without(drift)
+                if _won(as_stated, told) >= _won(as_stated, as_stated) + more:
+                    self.drift = drift
+                    return straight
+        return None
 
     def _without(self, drift: float) -> list[Growth]:
         """Return the states, as found and as stated, that odometry without its drift leads to."""
@@ -286,7 +282,7 @@ def _least_squares(graph: FactorGraph, judgement: Judgement, poses: Array,
     seed = l2_map(whole, poses, cholesky, lambda *_: check())
     noise = judgement.found_variance(graph)
     noise = np.concatenate((noise, np.ones(len(whole.between) - len(noise))))
-    return whole, _LeastSquares(seed, covariances(whole, seed, cholesky, noise))
+    return whole, _LeastSquares(seed, covariances(spread_of(whole, seed, cholesky, noise)))
 
 
 def rounds(

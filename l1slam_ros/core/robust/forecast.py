@@ -19,13 +19,15 @@ import numpy as np
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.alignment import absolute_trajectory_error
 from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.robust.innovation import spread_of
 from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 
 # Of a map of which all is well; then for one without an accepted loop, each power of e by which it
 # is less sure of itself than a right one is exact, odometry that drifts, refused loops that
 # nothing speaks against, and a slip that is neither believed nor ruled out.
 _WEIGHTS = np.array([-4.32, 5.17, 1.41, 2.55, 3.86, 3.45])
-# From here on it is no reason to doubt a map that most of its loops are left out.
+# Below, by how unsure it is alone, a map is doubtful.
 CONFIDENT = 0.9
 # A right map is off by so much at most: [m], or this part of its diagonal.
 _OFF, _OFF_PART = 0.25, 0.005
@@ -39,8 +41,8 @@ _ASKED = 16
 
 
 def forecast(terms: Array) -> float:
-    """Return how often maps of such terms, see `terms_of`, were right."""
-    return float(1 / (1 + np.exp(_WEIGHTS @ terms)))
+    """Return how often maps of such terms, see `terms_of`, or of the first of them, were right."""
+    return float(1 / (1 + np.exp(_WEIGHTS[:len(terms)] @ terms)))
 
 
 def terms_of(accepts_any: bool, unsure: float, *reasons: bool) -> Array:
@@ -63,13 +65,14 @@ def unsureness(growth: Growth) -> float:
     """
     Return how large the error is that a map expects of itself, of its largest part.
 
-    That of its positions, aligned, over what a right map is off by at most.
+    That of its positions, aligned, over what a right map is off by at most. By the noise that was
+    found: what a file states may be ten times as much.
     """
     manifold = growth.graph.manifold
-    posterior = growth.posterior
-    own = growth.part[posterior.fixed:] == np.bincount(growth.part).argmax()
-    poses = growth.poses[posterior.fixed:][own]
-    samples = posterior.samples[:-1][own]
+    fixed = growth.posterior.fixed
+    own = growth.part[fixed:] == np.bincount(growth.part).argmax()
+    poses = growth.poses[fixed:][own]
+    samples = _spread(growth)[own]
     if len(poses) < 2:
         return 0.0
     positions = manifold.positions(poses)
@@ -77,6 +80,18 @@ def unsureness(growth: Growth) -> float:
         manifold.positions(manifold.retract(poses, samples[:, :, number])), positions) ** 2
         for number in range(_ASKED)]
     return float(np.sqrt(np.mean(square))) / right_within(positions)
+
+
+def _spread(growth: Growth) -> Array:
+    """Return samples of the error that noise as it was found makes, (free keyframes, k, q)."""
+    used = growth.variance_at_their_word() if growth.at_their_word else growth.variance
+    if np.allclose(growth.variance, used):
+        return growth.posterior.samples[:-1]
+    rows = np.flatnonzero(growth.accepted)
+    graph = growth.subgraph(rows)
+    noise = (growth.variance / used)[growth.is_loop[rows].astype(np.int64)]
+    noise[growth.factors.is_absolute[rows]] = 1.0
+    return spread_of(graph, growth.poses, cholesky_of(graph), noise)
 
 
 def left_drift(growth: Growth) -> tuple[float, float]:

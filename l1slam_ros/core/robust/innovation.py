@@ -114,17 +114,21 @@ def sample_posterior(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
     return Posterior(system, noise, samples, moment, graph.between.speaks, anchor(graph))
 
 
-def covariances(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
-                variance: Array) -> Array:
+def spread_of(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,
+              variance: Array) -> Array:
     """
-    Return the covariances of the L2 map (n, p) of a graph, (free keyframes, k, k).
+    Return samples of the error of the L2 map (n, p) of a graph, (free keyframes, k, q).
 
     variance : (m,) of the noise that there is, in units of what each factor states
     """
     system = factorised(graph, poses, cholesky)
     noisy = replace(system, blocks=system.blocks * np.sqrt(variance)[:, None, None, None])
-    samples = _steps(graph, noisy, cholesky)[1][:-1]
-    return samples @ samples.transpose(0, 2, 1) / kernels.prediction.SAMPLES
+    return _steps(graph, noisy, cholesky)[1][:-1]
+
+
+def covariances(samples: Array) -> Array:
+    """Return the covariance of each keyframe, (n, k, k), by samples (n, k, q)."""
+    return samples @ samples.transpose(0, 2, 1) / samples.shape[2]
 
 
 def factorised(graph: FactorGraph, poses: Array, cholesky: BlockCholesky) -> LinearSystem:

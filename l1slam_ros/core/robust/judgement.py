@@ -25,6 +25,7 @@ from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.robust.forecast import (
     CONFIDENT,
     forecast,
+    right_within,
     terms_of,
     unsureness,
 )
@@ -32,13 +33,14 @@ from l1slam_ros.core.robust.odometry.drift import straightened
 from l1slam_ros.core.robust.places import err_together
 from l1slam_ros.core.robust.rounds import Growth
 
-# Most loops are refused; all that are accepted are of one place, which odometry hardly bears out;
-# loops of one place alone say how two parts lie to each other; refused loops agree on another
-# map, and none that is accepted speaks against them; an odometry factor may have slipped, and it
-# was not believed; the odometry drifts, which was taken for noise; there were more rounds to come;
-# another norm of the same factors has another map; judging the loops failed, and what is believed
-# is what was by then; so did solving for what is believed.
-MOSTLY_REFUSED = 'mostly refused'
+# The map expects a large error of itself, or no loop is accepted; all that are accepted are of one
+# place, which odometry hardly bears out; loops of one place alone say how two parts lie to each
+# other; refused loops agree on another map, and none that is accepted speaks against them; an
+# odometry factor may have slipped, and it was not believed; the odometry drifts, which was taken
+# for noise; there were more rounds to come; another norm of the same factors has another map;
+# judging the loops failed, and what is believed is what was by then; so did solving for what is
+# believed.
+WEAK = 'a weak map'
 ONE_PLACE = 'one place'
 ONE_JOINS = 'one place joins'
 OTHER_MAP = 'another map'
@@ -48,6 +50,8 @@ UNFINISHED = 'not at an end'
 NORM = 'another norm'
 FAILED = 'judging failed'
 UNSOLVED = 'solving failed'
+# Of fewer loops nothing is recorded.
+_HANDFUL = 5
 
 
 @dataclass(frozen=True)
@@ -190,7 +194,7 @@ class Judgement:
 
 def doubt_of(pairs: Indices, n_poses: int, kind: str, detail: str) -> Doubt:
     """Return a doubt about the loops between pairs of keyframes (k, 2), none: about them all."""
-    first, last = (int(pairs.min()), int(pairs.max())) if len(pairs) else (0, n_poses - 1)
+    first, last = (max(int(pairs.min()), 0), int(pairs.max())) if len(pairs) else (0, n_poses - 1)
     return Doubt(kind, len(pairs), first, last, detail, listed(pairs))
 
 
@@ -209,20 +213,25 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
     sigmas = np.sqrt(square[:size])
     loops = growth.is_loop[:size]
     slips = np.flatnonzero(slip[:size])
-    terms = _terms(growth, reasons)
+    unsure = unsureness(growth)
+    terms = _terms(growth, unsure, reasons)
     confidence = forecast(terms) if loops.any() else float('nan')
-    doubted = any(doubt.kind in (MOSTLY_REFUSED, OTHER_MAP) for doubt in reasons)
-    if confidence >= CONFIDENT:
-        reasons = tuple(doubt for doubt in reasons if doubt.kind != MOSTLY_REFUSED)
+    left_out = np.flatnonzero(loops & ~accepted)
+    if settled and np.count_nonzero(loops) >= _HANDFUL and forecast(terms[:3]) < CONFIDENT:
+        metres = unsure * right_within(growth.graph.manifold.positions(growth.poses))
+        reasons += (doubt_of(growth.factors.pairs[left_out], growth.graph.n_poses, WEAK,
+                             f'{metres:.2g}'),)
+    doubted = bool(2 * len(left_out) > np.count_nonzero(loops) >= _HANDFUL) or any(
+        doubt.kind == OTHER_MAP for doubt in reasons)
     return Judgement(accepted, suspect[:size], sigmas, growth.variance, _noise(growth)[:size],
                      slips, reasons, settled, confidence=confidence, terms=terms,
                      is_refusal_doubted=doubted)
 
 
-def _terms(growth: Growth, reasons: tuple[Doubt, ...]) -> Array:
+def _terms(growth: Growth, unsure: float, reasons: tuple[Doubt, ...]) -> Array:
     """Return what a forecast is made of."""
     kinds = {doubt.kind for doubt in reasons}
-    return terms_of(bool((growth.is_loop & growth.accepted).any()), unsureness(growth),
+    return terms_of(bool((growth.is_loop & growth.accepted).any()), unsure,
                     *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
 
 

@@ -22,9 +22,9 @@ from l1slam_ros.core.geometry.manifold import Indices
 from l1slam_ros.core.geometry.noise import Mask
 from l1slam_ros.core.graph.factor_graph import component_labels, lowest_of_components
 from l1slam_ros.core.robust.forecast import drift_taken_for_noise
+from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
-    MOSTLY_REFUSED,
     ONE_JOINS,
     ONE_PLACE,
     OTHER_MAP,
@@ -42,9 +42,8 @@ from l1slam_ros.core.robust.pairwise_consistency import (
 from l1slam_ros.core.robust.places import join_what_no_other
 from l1slam_ros.core.robust.rounds import Growth
 
-# Of fewer loops most may well be refused, and be of one place; most are more than half by some.
+# Fewer loops may well be of one place.
 _HANDFUL = 5
-_MOST = 0.55
 
 
 def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
@@ -53,8 +52,6 @@ def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
     left_out = np.flatnonzero(loops & ~growth.accepted[: growth.size])
     accepted = np.flatnonzero(loops & growth.accepted[: growth.size])
     reasons = []
-    if np.count_nonzero(loops) >= _HANDFUL and len(left_out) > _MOST * np.count_nonzero(loops):
-        reasons.append(_doubt(growth, MOSTLY_REFUSED, left_out))
     if not ended and len(left_out):
         reasons.append(_doubt(growth, UNFINISHED, left_out))
     if _decides_alone(growth, accepted):
@@ -125,25 +122,22 @@ def _other_map(growth: Growth) -> list[Doubt]:
     agree = agree_at_a_place(growth, rows)
     groups = [strongest_group(growth, rows).rows, *(
         agree[growth.place[agree] == place] for place in np.unique(growth.place[agree]))]
-    alone = [group for group in groups if len(group) and not _against(growth, group, accepted)]
+    alone = [group for group in groups if len(group) and _may_be_right(growth, group, accepted)]
     return [_doubt(growth, OTHER_MAP, max(alone, key=len))] if alone else []
 
 
-def _against(growth: Growth, group: Indices, rows: Mask) -> int:
+def _may_be_right(growth: Growth, group: Indices, accepted: Mask) -> bool:
     """
-    Return how many of some loops would lie, at least, if a group of others, (k,), were right.
+    Return whether a group of loops, (k,), may be right, and no accepted one false, (m,).
 
-    Then the odometry slipped at a step that the group spans. Or on either side of its first or
-    its second ends, and what lies between is elsewhere as a whole: two slips are believed of
-    several places alone.
+    Then the odometry slipped at a step that the group spans and no accepted loop does. Of all
+    steps one is expected to have slipped: if these are less than a hundredth of them, a place is
+    rather one mistake.
     """
-    low, high = growth.low, growth.high
-    across = spanned(low[rows], high[rows], growth.graph.n_poses)
-    against = [across[low[common_steps(growth, group)]].min()]
-    for ends in (low[group], high[group]) if np.ptp(growth.place[group]) else ():
-        inside = ((end >= ends.min()) & (end <= ends.max()) for end in (low[rows], high[rows]))
-        against.append(np.count_nonzero(np.logical_or(*inside)))
-    return int(min(against))
+    across = spanned(growth.low[accepted], growth.high[accepted], growth.graph.n_poses)
+    untold = np.count_nonzero(across[growth.low[common_steps(growth, group)]] == 0)
+    few = DOUBT * np.count_nonzero(~growth.is_loop) if growth.may_err_as_one(group, 2) else 1
+    return bool(untold >= few)
 
 
 def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:

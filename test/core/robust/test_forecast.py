@@ -15,7 +15,7 @@ from problems import chain_of, graph_of
 
 from l1slam_ros.core.robust.batch import robust_solve, rounds
 from l1slam_ros.core.robust.forecast import CONFIDENT, forecast, terms_of
-from l1slam_ros.core.robust.judgement import DRIFTS, MOSTLY_REFUSED, judgement_of
+from l1slam_ros.core.robust.judgement import DRIFTS, WEAK, judgement_of
 from l1slam_ros.core.robust.reasons import doubts
 from l1slam_ros.core.robust.rounds import Growth
 
@@ -67,7 +67,7 @@ def test_a_map_without_an_accepted_loop_is_hardly_ever_right():
     factors.measurement[turned, :2] += np.random.default_rng(0).uniform(
         20, 60, (np.count_nonzero(turned), 2))
     found, _ = robust_solve(graph)
-    assert [doubt.kind for doubt in found.doubts] == [MOSTLY_REFUSED]
+    assert [doubt.kind for doubt in found.doubts] == [WEAK]
     assert found.confidence < 0.2 and forecast(found.terms) == found.confidence
 
 

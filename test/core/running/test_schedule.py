@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from l1slam_ros.core.geometry import se2
-from l1slam_ros.core.robust.judgement import MOSTLY_REFUSED, Doubt, Judgement
+from l1slam_ros.core.robust.judgement import WEAK, Doubt, Judgement
 from l1slam_ros.core.running.keeper.schedule import Moment, Size, Work, due, outrun
 from l1slam_ros.core.running.map_state import Carried, MapState
 from l1slam_ros.core.running.optimised import Optimised
@@ -120,7 +120,7 @@ def test_a_front_is_outrun_by_more_than_it_takes():
 
 
 def test_a_judgement_that_doubts_what_it_refused_is_asked_until_there_are_twice_as_many_loops():
-    doubt = Doubt(MOSTLY_REFUSED, 2, 0, 3)
+    doubt = Doubt(WEAK, 2, 0, 3)
     doubtful = replace(JUDGEMENT, doubts=(doubt,), is_refusal_doubted=True)
     judged = RESTED.judged.after(doubtful, se2.identity(4), 2, False, NOW)
     assert (judged.doubted, judged.loops, judged.anew) == (2, 2, 2)
