@@ -83,13 +83,13 @@ class NodeOptions(BackendOptions):
         frames = self.map_frame, self.odom_frame
         if '' in frames or frames[0] == frames[1]:
             raise OptionError(f'map_frame is {frames[0]!r} and odom_frame {frames[1]!r}, expected '
-                              'two names that differ')
+                              'two different names')
         # In a parameter file ROS reads no list of nothing.
         object.__setattr__(self, 'robots', self.robots or ('',))
         wrong = not all(_NAME.fullmatch(name) for name in self.names)
         if wrong or len({*self.names}) < len(self.robots) > 1:
-            raise OptionError(f'robots is {list(self.robots)}, expected names of letters, digits '
-                              'and underscores that differ')
+            raise OptionError(f'robots is {list(self.robots)}, expected different names of '
+                              'letters, digits and underscores')
         if self.save_path and not self.save_path.endswith('.g2o'):
             raise OptionError(f'save_path is {self.save_path!r}, expected the name of a .g2o file')
 
