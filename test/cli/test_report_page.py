@@ -272,7 +272,8 @@ def test_a_page_replaces_a_page_and_nothing_of_others(capsys, tmp_path):
     reported(capsys, path)
     for name in 'map.png', 'map':
         err = run(capsys, 'solve', path, '--report', tmp_path / name, code=2)[1]
-        assert err.endswith('is no name of a page; expected one that ends in .html or .htm\n')
+        assert err.endswith('is not the name of a web page; expected one that ends in .html or '
+                            '.htm\n')
     link = tmp_path / 'graph.g2o'
     link.symlink_to(page)
     assert 'is an input' in run(capsys, 'solve', link, '--report', page, '--force', code=2)[1]
