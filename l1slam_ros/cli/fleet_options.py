@@ -18,48 +18,53 @@ def add_batch(parser: argparse.ArgumentParser) -> None:
     """Add the options of `batch`, without those on how a recording is read."""
     add = parser.add_argument
     add('folder', type=Path, metavar='FOLDER',
-        help='each file and rosbag2 directory in it that `solve` takes, however deep, is one '
-        'recording; hidden ones are none')
+        help='folder that is searched, with its subfolders, for recordings: files and rosbag2 '
+        'directories that `solve` reads; hidden ones are left out')
     add('--output', type=Path, required=True, metavar='FOLDER',
-        help='new or empty: maps/RECORDING.g2o, log.jsonl with a line for each recording, '
-        'table.csv, and table.parquet where pyarrow is installed')
+        help='folder for the results, new or empty: maps/RECORDING.g2o, log.jsonl with a line '
+        'for each recording, table.csv, and table.parquet if pyarrow is installed')
     add('--resume', nargs='?', choices=('missing', 'failed'), const='missing',
-        help='take up a batch that was ended or killed: do what is missing or was changed since; '
-        'failed: and once more what failed')
+        help='go on with a batch that was ended or killed. missing: solve the recordings that '
+        'have no result yet or were changed since; failed: also those that failed (default: '
+        'missing)')
     where = parser.add_mutually_exclusive_group().add_argument
     where('--workers', type=int, metavar='N',
-          help='so many recordings at once on this machine (default: one for each core)')
+          help='number of recordings solved at once on this machine (default: one for each core)')
     where('--scheduler', metavar='ADDRESS',
-          help='of a dask scheduler, as tcp://host:8786, whose workers see the same files')
+          help='address of a dask scheduler, as tcp://host:8786; its workers must see the same '
+          'files under the same paths')
     add('--retries', type=int, default=2, metavar='N',
-        help='how often a recording is tried again whose process or worker was killed '
+        help='how often a recording is tried again after its process or worker was killed '
         '(default: %(default)s)')
     add('--seconds', type=int, default=600, metavar='S',
-        help='of the processor that one recording may take, and ten times as long by the clock '
-        '(default: %(default)s)')
+        help='processor time that one recording may take; by the clock it may take ten times as '
+        'long (default: %(default)s)')
     add('--memory', type=float, default=4.0, metavar='GB',
-        help='that one recording may take, of address space (default: %(default)s)')
+        help='address space that one recording may take (default: %(default)s)')
 
 
 def add_merge(parser: argparse.ArgumentParser) -> None:
     """Add the options of `merge`, without those on how an input is read."""
     add = parser.add_argument
     add('input', type=Path, nargs='+', metavar='INPUT',
-        help='two or more of what `solve` takes; an edge of a graph file may lead to a vertex of '
-        'another one')
-    add('--output', type=Path, required=True, metavar='OUT', help='.g2o, as `solve` writes it')
+        help='two or more inputs, each of a kind that `solve` reads; an edge in one graph file '
+        'may lead to a vertex of another')
+    add('--output', type=Path, required=True, metavar='OUT',
+        help='write the map, as `solve` does: .g2o')
     add('--loops', type=Path, metavar='FILE',
-        help='loops between inputs: edges as of g2o, their vertices written NUMBER:ID, the number '
-        'of the input, from 1, and its vertex: `EDGE_SE2 1:17 2:305 dx dy dtheta ...`')
+        help='file of loops between the inputs: g2o edges whose vertices are NUMBER:ID, with the '
+        'number of the input, from 1, and the vertex id in it, as in `EDGE_SE2 1:17 2:305 dx dy '
+        'dtheta ...`')
     add('--scans', nargs='?', const='/scan', metavar='TOPIC',
-        help='all inputs are CARMEN logs, or bags with scans on this topic (%(const)s): find the '
-        'loops between them by their scans, too')
-    add('--norm', choices=names.NORMS, help='as of `solve`')
-    add('--robust', action=argparse.BooleanOptionalAction, help='as of `solve`')
-    add('--reference', metavar='TRUTH', help='as of `solve`, with the ids of the merged map')
-    add('--force', action='store_true', help='replace OUT, though l1slam did not write it')
-    add('--json', action='store_true', help='one object on standard output, as of `solve`')
-    add('--quiet', action='store_true', help='no progress, no summary, no warning')
-    # What else `solve` can be told.
+        help='also find loops between the inputs by their laser scans; all inputs must be CARMEN '
+        'logs, or bags with scans on this topic (default topic: %(const)s)')
+    add('--norm', choices=names.NORMS, help='as in `solve`')
+    add('--robust', action=argparse.BooleanOptionalAction, help='as in `solve`')
+    add('--reference', metavar='TRUTH', help='as in `solve`, with the ids of the merged map')
+    add('--force', action='store_true', help='replace OUT even if l1slam did not write it')
+    add('--json', action='store_true',
+        help='print one JSON object on standard output, as `solve` does')
+    add('--quiet', action='store_true', help='print no progress, no summary and no warnings')
+    # The other options of `solve`, at their defaults.
     parser.set_defaults(start=names.STARTS[0], loop_norm=None, solver=names.SOLVERS[0],
                         outer=None, inner=None, plot=None, grid=None, report=None)

@@ -31,14 +31,15 @@ READ_IN_PART = 3
 DOUBTFUL = 4
 INTERRUPTED = 130
 BROKEN_PIPE = 141
-_INPUT = ('.g2o, TORO .graph, .jrl or its .cbor, a rosbag2 directory, .mcap, .db3, .bag of ROS 1, '
-          'or a CARMEN log with scans: .clf, .log, .bz2, .gz')
-_WORD = ('beside a graph INPUT.trusted.txt and INPUT.struck.txt, lines `i j` of vertex ids, may '
-         'vouch for loops and strike loops out')
-_OUTPUT = '.g2o, .jrl or its .cbor, .tum, or a name without a suffix for a bag directory'
-_GRAPH_OUTPUT = '.g2o, .jrl or its .cbor, or a name without a suffix for a bag directory'
-_KIND = ('random: far poses said to be near each other; identity: at the very same place; '
-         'grouped: 10 to 20 in a row that agree (default: %(default)s)')
+_INPUT = ('a graph (.g2o, TORO .graph, .jrl, .cbor), a bag (rosbag2 directory, .mcap, .db3, .bag '
+          'of ROS 1) or a CARMEN log with laser scans (.clf, .log, also packed: .bz2, .gz)')
+_WORD = ('files beside a graph may vouch for loops (INPUT.trusted.txt) and strike loops out '
+         '(INPUT.struck.txt), by lines `i j` of vertex ids')
+_OUTPUT = '.g2o, .jrl, .cbor, .tum, or a name without a suffix for a bag directory'
+_GRAPH_OUTPUT = '.g2o, .jrl, .cbor, or a name without a suffix for a bag directory'
+_KIND = ('what a false loop measures. random: a small relative pose between two poses that are '
+         'far apart; identity: the zero pose between two such poses; grouped: 10 to 20 '
+         'consecutive loops that agree with each other (default: %(default)s)')
 _FIRST_STEPS = """\
 a first look:
   l1slam simulate world.g2o --poses 1000 --edges 2000
@@ -49,14 +50,14 @@ _MORE = """\
 
 exit codes:
   0  done
-  2  bad input or arguments, said in one line; nothing written
-  3  done, but only a part of the input was used: it is damaged, or the loops of a bag did not get
-     in, because most were refused or none of their topics was read; batch: some recordings failed
-     or were used only in part
-  4  solve, merge: the best map is written, but it is doubtful (also where the code would be 3)
+  2  bad input or arguments: one line says what is wrong, and nothing is written
+  3  done, but only a part of the input was used: the file is damaged, or a bag has loops that did
+     not get into the map (most were refused, or no topic with loops was read); batch: some
+     recordings failed or were used only in part
+  4  solve, merge: the best map is written, but it is doubtful (4 also where 3 would apply)
 
-completion of commands and options by the TAB key, in bash and zsh, where argcomplete is
-installed (pip install argcomplete, or the package python3-argcomplete):
+To complete commands and options with the TAB key in bash and zsh, install argcomplete
+(pip install argcomplete, or the package python3-argcomplete) and run:
   eval "$(register-python-argcomplete l1slam)"
 """
 
@@ -134,68 +135,79 @@ def _forget_output() -> None:
 
 def _add_force(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--force', action='store_true',
-                        help='replace what is there, though l1slam did not write it; an input '
-                        'is never replaced')
+                        help='replace an existing output even if l1slam did not write it; an '
+                        'input is never replaced')
 
 
 def _add_reading(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group('how to read a 3D g2o file, or a bag').add_argument
+    add = parser.add_argument_group('options for 3D g2o files and for bags').add_argument
     add('--rotation-information', choices=names.ROTATION_INFORMATION,
         default=names.ROTATION_INFORMATION[0],
-        help="in and out: what the information's rotation block is of, the vector part of the "
-        'quaternion, as g2o has it, or the angle (default: %(default)s)')
+        help='3D g2o files, read and written: the rotation block of the information is that of '
+        "the quaternion's vector part, as in g2o, or that of the angle (default: %(default)s)")
     for name, default, what in (
-        ('odom', DEFAULT_TOPICS.odometry, 'nav_msgs/Odometry; or, as a whole, the pose graph of '
-         'an rtabmap_msgs/MapGraph, pose_graph_tools_msgs/PoseGraph, slam_toolbox/PoseGraph or '
+        ('odom', DEFAULT_TOPICS.odometry, 'a topic of nav_msgs/Odometry; or a topic with the pose '
+         'graph of another front end, which is then taken whole: rtabmap_msgs/MapGraph, '
+         'pose_graph_tools_msgs/PoseGraph, slam_toolbox/PoseGraph, '
          'cslam_common_interfaces/KeyframeOdom'),
-        ('loop', DEFAULT_TOPICS.loops, 'geometry_msgs/PoseWithCovarianceStamped, or the loops of '
-         'such a pose graph'),
+        ('loop', DEFAULT_TOPICS.loops, 'a topic of geometry_msgs/PoseWithCovarianceStamped; or a '
+         'topic with such a pose graph, of which only the loops are taken'),
     ):
         add(f'--{name}-topic', default=default, metavar='TOPIC',
-            help=f'{what} (default: %(default)s)')
+            help=f'bags: {what} (default: %(default)s)')
     add('--params-file', type=Path, metavar='YAML',
-        help="the node's parameter file: what makes keyframes, their noise, and the solver; what "
-        'a bag of l1slam notes of itself comes before defaults')
+        help="the node's parameter file: its keyframe, noise and solver parameters are used here, "
+        'too. A bag written by l1slam says itself what its messages are; that replaces defaults, '
+        'not what the file sets')
 
 
 def _add_solve(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('input', type=Path, metavar='INPUT', help=f'{_INPUT}; {_WORD}')
     add('--start', choices=names.STARTS, default=names.STARTS[0],
-        help='where from: first poses from the graph alone, the stored poses, or the odometry; '
-        'where loops are doubted, always from the graph alone (default: %(default)s)')
+        help='the poses to start from. seed: computed from the graph alone; file: the poses '
+        'stored in INPUT; odometry: the odometry chained up. A robust solve always starts from '
+        'its own seed (default: %(default)s)')
     add('--norm', choices=names.NORMS,
-        help='what is minimised: l1, of each component; group-l1, of the length of each factor, '
-        'whatever axes it is written in; l2; huber (default: as of solver.norm, l1)')
+        help='the norm to minimise. l1: sum of the absolute values of all residual components; '
+        'group-l1: sum of the lengths of the residuals, independent of the axes they are written '
+        'in; l2; huber (default: solver.norm of --params-file, or l1)')
     add('--loop-norm', choices=(names.SAME, *names.NORMS),
-        help='what is minimised of loops and absolute poses (default: as of solver.loop_norm, '
-        'same)')
+        help='the norm for loops and absolute poses (default: solver.loop_norm of --params-file, '
+        'or the same norm as the odometry)')
     add('--solver', choices=names.SOLVERS, default=names.SOLVERS[0],
-        help='for l1; auto: interior-point on sparse graphs (default: %(default)s)')
+        help='solver for --norm l1; auto takes interior-point for sparse graphs and primal-dual '
+        'for dense ones (default: %(default)s)')
     add('--robust', action=argparse.BooleanOptionalAction,
-        help='refuse loops that cannot be believed, and say which, or believe all; by default '
-        'they are doubted wherever they can be judged')
-    add('--outer', type=int, metavar='N', help='most linearisations')
-    add('--inner', type=int, metavar='N', help='most primal-dual iterations of each')
-    add('--output', type=Path, metavar='OUT', help=_OUTPUT)
-    add('--reference', metavar='TRUTH',
-        help='print the position error to it: TUM, g2o, .jrl, `id x y theta` text, CSV of '
-        "`stamp, x, y, theta`, or a bag's topic, BAG:/TOPIC, where `bag` is INPUT; interpolated "
-        'at the stamps of the poses')
-    add('--plot', type=Path, metavar='PNG', help='draw the map and its cost; .svg and .pdf too')
+        help='--robust: judge the loops, refuse false ones and list them; --no-robust: use all '
+        'loops (default: judge them, unless the odometry has too many gaps to judge by)')
+    add('--outer', type=int, metavar='N', help='largest number of linearisations')
+    add('--inner', type=int, metavar='N',
+        help='largest number of primal-dual iterations for each linearisation')
     add('--scans', metavar='TOPIC',
-        help='of a bag: make the graph of the laser scans on this topic and of --odom-topic; a '
-        'CARMEN log needs none')
-    add('--grid', type=Path, metavar='PGM',
-        help='write the occupancy grid of the scans, with its .yaml, as the map server of nav2 '
-        'reads them')
-    add('--report', type=Path, metavar='HTML',
-        help='write a page that shows each loop, its fate and why, and lets one settle a doubt; '
-        'needs plotly')
-    _add_force(parser)
-    add('--json', action='store_true', help='one object on standard output')
-    add('--quiet', action='store_true', help='no progress, no summary, no warning')
+        help='bags: build the graph from the laser scans on this topic and the odometry on '
+        '--odom-topic; a CARMEN log needs no such option')
+    _add_results(parser)
     _add_reading(parser)
+
+
+def _add_results(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `solve` on what is written and printed."""
+    add = parser.add_argument
+    add('--output', type=Path, metavar='OUT', help=f'write the map: {_OUTPUT}')
+    add('--reference', metavar='TRUTH',
+        help='print the position error with respect to true poses: a TUM, g2o or .jrl file, text '
+        'of lines `id x y theta`, CSV of `stamp, x, y, theta`, or a topic of a bag as BAG:/TOPIC '
+        '(the word `bag` stands for INPUT); stamped poses are interpolated')
+    add('--plot', type=Path, metavar='PNG', help='draw the map and the cost: .png, .svg or .pdf')
+    add('--grid', type=Path, metavar='PGM',
+        help='write the occupancy grid of the scans as .pgm and .yaml for the map server of nav2')
+    add('--report', type=Path, metavar='HTML',
+        help='write a web page with the map and, for each loop, its state and the reason; it also '
+        'makes the lines that vouch for a loop or strike it out. Needs plotly')
+    _add_force(parser)
+    add('--json', action='store_true', help='print one JSON object on standard output')
+    add('--quiet', action='store_true', help='print no progress, no summary and no warnings')
 
 
 def _add_batch(parser: argparse.ArgumentParser) -> None:
@@ -218,16 +230,19 @@ def _add_convert(parser: argparse.ArgumentParser) -> None:
 def _add_simulate(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('output', type=Path, metavar='OUTPUT',
-        help=f'{_GRAPH_OUTPUT}; beside it OUTPUT.truth.txt and OUTPUT.false.txt')
+        help=f'{_GRAPH_OUTPUT}; the true poses are written to OUTPUT.truth.txt, the false loops '
+        'to OUTPUT.false.txt')
     add('--world', choices=names.WORLDS, default=names.WORLDS[0],
-        help='streets in the plane; in space a building of several floors, with ramps, or a drive '
-        'on a sphere or a torus (default: %(default)s)')
-    add('--poses', type=int, required=True, metavar='N')
-    add('--edges', type=int, required=True, metavar='M', help='true ones, odometry included')
+        help='streets: in the plane; in space: a building with several floors and ramps, or a '
+        'drive on a sphere or a torus (default: %(default)s)')
+    add('--poses', type=int, required=True, metavar='N', help='number of poses')
+    add('--edges', type=int, required=True, metavar='M',
+        help='number of true edges, those of the odometry included')
     add('--false-loops', type=int, default=0, metavar='K',
-        help='on top of the edges (default: %(default)s)')
+        help='number of false loops, added to the M edges (default: %(default)s)')
     add('--scans', action='store_true',
-        help='houses along the streets, and what a laser sees of them on /scan; OUTPUT is a bag')
+        help='also put houses along the streets and write what a laser sees of them to /scan; '
+        'OUTPUT must be a bag')
     _add_randomness(parser)
 
 
@@ -235,8 +250,9 @@ def _add_corrupt(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('input', type=Path, metavar='INPUT', help=_INPUT)
     add('output', type=Path, metavar='OUTPUT',
-        help=f'{_GRAPH_OUTPUT}; beside it OUTPUT.false.txt, the vertex ids of the false loops')
-    add('--false-loops', type=int, required=True, metavar='K', help='how many')
+        help=f'{_GRAPH_OUTPUT}; the vertex ids of the false loops are written to '
+        'OUTPUT.false.txt')
+    add('--false-loops', type=int, required=True, metavar='K', help='number of false loops')
     _add_randomness(parser)
     _add_reading(parser)
 
@@ -246,7 +262,7 @@ def _add_randomness(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--kind', choices=names.KINDS_OF_FALSE_LOOPS,
                         default=names.KINDS_OF_FALSE_LOOPS[0], help=_KIND)
     parser.add_argument('--seed', type=int, default=0, metavar='S',
-                        help='another one, another draw (default: %(default)s)')
+                        help='seed of the random numbers (default: %(default)s)')
 
 
 def _add_info(parser: argparse.ArgumentParser) -> None:
@@ -256,7 +272,8 @@ def _add_info(parser: argparse.ArgumentParser) -> None:
 
 def _add_plot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('input', type=Path, nargs='+', metavar='INPUT',
-                        help=f'{_INPUT}; INPUT.truth.txt and INPUT.false.txt are drawn, if there')
+                        help=f'{_INPUT}; INPUT.truth.txt and INPUT.false.txt are drawn, too, if '
+                        'they exist')
     parser.add_argument('--output', type=Path, required=True, metavar='PNG',
                         help='.png, .svg or .pdf')
     _add_force(parser)
@@ -266,43 +283,43 @@ def _add_plot(parser: argparse.ArgumentParser) -> None:
 def _add_reproduce(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('--datasets', type=Path, metavar='DIR',
-        help=f"the folder with the paper's own graphs: {', '.join(paper.FILES)}; "
-        'without it, the simulated worlds alone')
+        help=f"folder with the paper's own graphs: {', '.join(paper.FILES)}; "
+        'without it only the simulated worlds are used')
     add('--worlds', choices=list(paper.WORLDS), default='all',
-        help="which of the paper's large worlds to simulate: 10,000 poses with 64,000 edges, and "
-        '50,000 with 700,000, which takes minutes (default: %(default)s)')
+        help="which of the paper's large worlds to simulate. 10k: 10,000 poses with 64,000 edges; "
+        'all: also 50,000 poses with 700,000 edges, which takes minutes (default: %(default)s)')
     add('--output', type=Path, default=Path('reproduction'), metavar='DIR',
-        help='the folder for report.md and its pictures (default: %(default)s)')
+        help='folder for report.md and its pictures (default: %(default)s)')
     _add_force(parser)
 
 
-# By name: the module that runs a command, imported only then; what it does; an example; options.
+# Command -> the module that runs it (imported only then), what it does, an example, its options.
 _COMMANDS: dict[str, tuple[str, str, str, Callable[[argparse.ArgumentParser], None]]] = {
     'solve': ('solving', 'optimise a graph or a bag',
               'graph.g2o --output solved.g2o --plot map.png', _add_solve),
-    'merge': ('merging', 'make one map of several drives or robots',
+    'merge': ('merging', 'make one map from several drives or robots',
               'monday.g2o tuesday.mcap --loops between.txt --output both.g2o', _add_merge),
     'batch': ('batching', 'solve each recording of a folder, on all cores or on a cluster',
               'recordings --output results', _add_batch),
-    'convert': ('commands', 'turn a graph file into a bag, or back', 'graph.g2o bag',
+    'convert': ('commands', 'convert between graph files and bags', 'graph.g2o bag',
                 _add_convert),
-    'simulate': ('worlds', 'make a world, its truth known',
+    'simulate': ('worlds', 'simulate a graph with known true poses',
                  'world.g2o --poses 1000 --edges 2000 --seed 1', _add_simulate),
     'corrupt': ('worlds', 'add false loops to a graph',
                 'graph.g2o spoiled.g2o --false-loops 20 --kind grouped', _add_corrupt),
-    'info': ('commands', 'say what is in a graph or a bag, and what looks wrong', 'graph.g2o',
+    'info': ('commands', 'print what a graph or a bag holds, and what looks wrong', 'graph.g2o',
              _add_info),
-    'plot': ('drawing', 'draw maps beside each other, known false loops black',
+    'plot': ('drawing', 'draw maps side by side; loops known to be false are black',
              'graph.g2o solved.g2o --output maps.png', _add_plot),
     'reproduce': ('reproducing',
-                  "run the paper's experiments and report them beside what it printed",
+                  "run the paper's experiments and report the results beside the paper's",
                   '--datasets datasets --worlds 10k --output reproduction', _add_reproduce)}
 
 
 def _parser() -> argparse.ArgumentParser:
     as_written = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
-        prog='l1slam', description='Pose-graph SLAM by the L1 norm, from files; needs no ROS.',
+        prog='l1slam', description='Pose-graph SLAM with the L1 norm, from files, without ROS.',
         epilog=f'{_FIRST_STEPS}\n{_MORE}', formatter_class=as_written)
     parser.add_argument('--version', action='store_true', help='print the version and end')
     commands_of = parser.add_subparsers(metavar='COMMAND', dest='command')

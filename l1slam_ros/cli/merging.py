@@ -35,7 +35,7 @@ def merge(arguments: argparse.Namespace) -> Ending:
         raise OptionError(f'{len(paths)} input; expected {_FEWEST} or more, or `l1slam solve`')
     if arguments.output.suffix.lower() != '.g2o':
         raise FileError(arguments.output, 'expected a name that ends with .g2o: the other formats '
-                        'hold one drive')
+                        'hold the drive of one robot')
     formats.check_output(arguments.output, inputs(
         arguments, arguments.reference, arguments.loops), arguments.force)
     parts, found = _parts(arguments, paths)

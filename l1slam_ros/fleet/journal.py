@@ -72,7 +72,7 @@ class Journal:
                 content = path.read_bytes()
             if sha256(content).hexdigest() not in self._tables:
                 raise FileError(path, f'is not as {PROGRAM} wrote it, so it is not replaced; '
-                                'expected it as it was, or moved away')
+                                'expected the table unchanged, or no file of this name')
 
     def put(self, line: Values) -> None:
         """Append a line, such that a kill of this process does not take it away."""

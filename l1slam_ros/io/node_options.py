@@ -33,8 +33,9 @@ class UpdateOptions(Options):
     """When the node works."""
 
     period: float = option(
-        0.2, 'how often the timer wakes the solver', 's', 1e-3, 3600, fixed=True)
-    budget: float = option(0.1, 'how long one update may work', 's', 1e-3, 3600)
+        0.2, 'time from the begin of one update to the begin of the next', 's', 1e-3, 3600,
+        fixed=True)
+    budget: float = option(0.1, 'longest time that one update may take', 's', 1e-3, 3600)
 
 
 @dataclass(frozen=True)
@@ -44,25 +45,28 @@ class NodeOptions(BackendOptions):
     PASSED_OVER = OF_ROS
 
     autostart: bool = option(
-        True, 'be active from the start, as a node that nobody manages', fixed=True)
-    dimension: int = option(2, 'of the world: SE(2) or SE(3)', '', 2, 3, fixed=True)
+        True, 'configure and activate the node at start; false: a lifecycle manager does that',
+        fixed=True)
+    dimension: int = option(
+        2, '2: poses in the plane, SE(2); 3: poses in space, SE(3)', '', 2, 3, fixed=True)
     map_frame: str = option('map', 'frame of the optimised poses', fixed=True)
     odom_frame: str = option('odom', 'frame of the odometry', fixed=True)
     publish_tf: bool = option(
         True, 'publish map -> odom on /tf, where tf2_msgs is installed', fixed=True)
     transform_period: float = option(
-        0.05, 'how often map -> odom is published', 's', 1e-3, 3600, fixed=True)
+        0.05, 'time between two publications of map -> odom', 's', 1e-3, 3600, fixed=True)
     transform_tolerance: float = option(
-        0.1, 'how far at least map -> odom is stamped ahead of the newest odometry; further where '
-        'that comes more seldom', 's', 0, 3600)
-    save_path: str = option('', 'the .g2o file of ~/save and ~/load')
+        0.1, 'how far, at least, map -> odom is stamped ahead of the newest odometry; odometry '
+        'with a long period is stamped further ahead', 's', 0, 3600)
+    save_path: str = option('', 'the .g2o file that ~/save writes and ~/load reads')
     autosave_period: float = option(
-        60.0, 'with a save_path, within what time a changed map is saved, and at the end; 0: off',
-        's', 0, 1e9)
-    load_on_start: bool = option(False, 'load the map of save_path at start', fixed=True)
+        60.0, 'with save_path set, a map that changed is saved within this time, and when the '
+        'node ends; 0: off', 's', 0, 1e9)
+    load_on_start: bool = option(False, 'load the map at save_path at start', fixed=True)
     robots: tuple[str, ...] = option(
-        ('',), 'names of several robots, each with its own topics and frames below its name, in '
-        'one map; one that is empty: one robot without a name', fixed=True)
+        ('',), 'names of the robots that share one map; the topics and frames of each begin with '
+        'its name. One empty name: a single robot, whose topics and frames have no prefix',
+        fixed=True)
     update: UpdateOptions = UpdateOptions()
 
     @property
@@ -79,13 +83,13 @@ class NodeOptions(BackendOptions):
         frames = self.map_frame, self.odom_frame
         if '' in frames or frames[0] == frames[1]:
             raise OptionError(f'map_frame is {frames[0]!r} and odom_frame {frames[1]!r}, expected '
-                              'two names that differ')
+                              'two different names')
         # In a parameter file ROS reads no list of nothing.
         object.__setattr__(self, 'robots', self.robots or ('',))
         wrong = not all(_NAME.fullmatch(name) for name in self.names)
         if wrong or len({*self.names}) < len(self.robots) > 1:
-            raise OptionError(f'robots is {list(self.robots)}, expected names of letters, digits '
-                              'and underscores that differ')
+            raise OptionError(f'robots is {list(self.robots)}, expected different names of '
+                              'letters, digits and underscores')
         if self.save_path and not self.save_path.endswith('.g2o'):
             raise OptionError(f'save_path is {self.save_path!r}, expected the name of a .g2o file')
 

@@ -105,8 +105,8 @@ def refuse_others(outputs: Iterable[str | os.PathLike[str]],
             continue
         for path in read:
             if _is_part(output, path):
-                raise FileError(output, f'is read, as {path}, so it is not written; expected '
-                                'another name')
+                raise FileError(output, f'is an input, {path}, and inputs are never replaced; '
+                                'expected another name')
         if not force and os.path.exists(output) and not is_ours(output):
             raise FileError(output, f'was not written by {PROGRAM}, so it is not overwritten; '
                             'expected another name, or --force')

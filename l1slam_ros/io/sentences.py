@@ -6,7 +6,7 @@
 # WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the specific
 # language governing permissions and limitations under the License.
 # SPDX-License-Identifier: Apache-2.0
-"""What a robust solve refused, and what it found of the noise, in sentences for people."""
+"""Sentences on a judgement: refused loops, slips, drift, estimated noise and doubts."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -35,53 +35,54 @@ from l1slam_ros.io.graphs.graph_file import GraphRecord
 # The status of a map that is not to be relied on.
 DOUBTFUL = 'doubtful'
 
-# So many edges are named one by one; `--json` lists all.
+# Number of loops that are named one by one; `--json` lists all.
 _NAMED = 20
-# A gross slip of the odometry: said apart, because nothing that was driven after it can be trusted
-# without the loops across it.
-_SLIP = 'odometry {pair} lies: {sigmas:.1f} sigmas off what the loops say; left out'
-# The odometry of the map is not that which was measured: who takes the file of it has to know.
-_DRIFT = ('the odometry drifts by {drift:+.3g} rad on each metre, as the loops agree: the map is '
-          'made of odometry that is corrected by that')
-# Sigmas so many times the stated ones are worth a word; less is what people are wrong by.
+# A gross slip of the odometry comes first: nothing that was driven after it can be trusted without
+# the loops across it.
+_SLIP = ('the odometry slipped from {pair}: this step is {sigmas:.1f} sigmas off what the loops '
+         'say, and is left out')
+# The odometry in the written map is not as measured: whoever uses that file has to know.
+_DRIFT = ('the odometry drifts by {drift:+.3g} rad per metre, as the loops agree; the map uses '
+          'odometry that is corrected for that')
+# Estimated sigmas this many times the stated ones are reported; smaller errors are common.
 _NOISY = 2.0
-# Of odometry and of loops, as `Judgement.variance` has them.
+# Of odometry and of loops, in the order of `Judgement.variance`.
 _NOISE = (
-    'the odometry is about {times:.1f} times as noisy as it says: loops far apart in time are '
-    'judged by little',
-    'the loops are about {times:.1f} times as noisy as they say: a false one that is little off '
-    'passes for noise')
-_TOGETHER = ('the loops of a place err together: in the map each place counts as one loop, and '
-             'all are as noisy as was found')
+    'the odometry is about {times:.1f} times as noisy as stated: it says little about loops '
+    'between distant times',
+    'the loops are about {times:.1f} times as noisy as stated: a false loop that is off by little '
+    'cannot be told from noise')
+_TOGETHER = ('the errors of loops of one place are correlated: each place counts as one loop, '
+             'with the noise that was estimated')
 
-# By the kind of a doubt.
+# Kind of a doubt -> its sentence.
 _REASONS = {
-    WEAK: 'the map may well be {detail} m off: by the noise that was found, the loops that are '
-          'used hold it no better; {loops} are left out, {where}',
-    ONE_PLACE: 'all {loops} loops that are used are of one place, {where}, which the odometry '
-               'alone hardly bears out, so they may be one mistake',
-    ONE_JOINS: 'of how two parts lie to each other only loops of one place agree ({loops}, '
-               '{where}), and they may be one mistake',
+    WEAK: 'the map may well be {detail} m off: with the noise that was estimated, the loops that '
+          'are used allow that much; {loops} are left out, {where}',
+    ONE_PLACE: 'all {loops} loops that are used are of one place, {where}, and the odometry alone '
+               'hardly confirms them: they may be one mistake',
+    ONE_JOINS: 'two parts of the map are joined only by loops of one place ({loops}, {where}), '
+               'which may be one mistake',
     OTHER_MAP: '{loops} refused loops agree with each other on another map, {where}',
-    SLIP: 'whether the odometry slipped or not {where}, the {loops} loops across that are used '
-          'do not say for sure',
-    DRIFTS: 'the odometry turns by about {detail} rad too much on each metre, {where}, which the '
-            '{loops} loops that are used were too few to correct: it was taken for noise',
-    UNFINISHED: 'the judgement did not come to an end: the {loops} loops that are left out, '
-                '{where}, were still coming in a few at a time',
-    NORM: 'the map is further from the least squares map of the same {loops} loops than noise '
-          'explains, so factors err together or are not what they say; `--norm l2` and `huber` '
-          'make other maps',
-    FAILED: 'judging the loops failed ({detail}): the map is of what was believed until then, and '
-            '{loops} loops {where} are left out',
-    UNSOLVED: 'solving for the {loops} loops that are believed failed ({detail}): this is the map '
-              'by which they were judged',
+    SLIP: 'the odometry may have slipped {where}: the {loops} loops across it that are used do '
+          'not decide that',
+    DRIFTS: 'the odometry turns by about {detail} rad per metre too much, {where}: the {loops} '
+            'loops that are used were too few to correct that, and it was taken for noise',
+    UNFINISHED: 'the judgement of the loops did not come to an end: the {loops} loops that are '
+                'left out, {where}, were still being accepted, a few at a time',
+    NORM: 'the map differs by more than noise explains from the least squares map of the same '
+          '{loops} loops: errors are correlated, or factors are noisier than stated; `--norm l2` '
+          'and `--norm huber` make other maps',
+    FAILED: 'judging the loops failed ({detail}): the map is made of what was accepted until '
+            'then, and {loops} loops {where} are left out',
+    UNSOLVED: 'solving for the {loops} accepted loops failed ({detail}): this is the map by which '
+              'they were judged',
 }
-_REMEDY = 'Vouch for a loop that is right, strike out one that is false, or state the noise'
+_REMEDY = 'Vouch for a true loop, strike out a false one, or state the right noise'
 
 
 def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[str]:
-    """Yield what was refused and why, the worst first; then what is noisier than it says."""
+    """Yield slips, refused loops with the worst first, suspect loops, and misstated noise."""
     factors = record.graph.between
     accepted = judgement.accepted
     is_loop = ~factors.is_odometry
@@ -100,9 +101,8 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
     if len(refused) > _NAMED:
         yield f'  and {len(refused) - _NAMED:,} more; `--json` lists all'
     if len(suspect):
-        them, they = ('it', 'it') if len(suspect) == 1 else ('them', 'they')
-        yield (f'{counted(len(suspect), "loop")} suspect and left out: nothing vouches for '
-               f'{them}, and {they} could as well fit by chance')
+        yield (f'{counted(len(suspect), "loop")} suspect and left out: nothing confirms '
+               f'{"it" if len(suspect) == 1 else "them"}')
     for sentence, times in zip(_NOISE, np.sqrt(judgement.variance).tolist(), strict=True):
         if times >= _NOISY:
             yield sentence.format(times=times)
@@ -111,7 +111,7 @@ def judgement_sentences(record: GraphRecord, judgement: Judgement) -> Iterator[s
 
 
 def known_false_sentence(record: GraphRecord, judgement: Judgement | None) -> Iterator[str]:
-    """Yield how what is left out agrees with what the file says is false, where it says so."""
+    """Yield how many loops that the file itself calls false were kept, and true ones left out."""
     if judgement is None or record.log is None or record.log.false is None:
         return
     factors, false = record.graph.between, record.log.false
@@ -124,7 +124,7 @@ def known_false_sentence(record: GraphRecord, judgement: Judgement | None) -> It
 
 
 def offset_sentence(manifold: Manifold, offset: Array | None) -> Iterator[str]:
-    """Yield that loops lack a step (k,); None: they lack nothing."""
+    """Yield a sentence on the offset (k,) that all loops share; nothing for None."""
     if offset is not None:
         length, angle = manifold.motion(offset[None])
         yield (f'loops share an offset of {length[0]:.2g} m and {math.degrees(angle[0]):.2g} '
@@ -133,7 +133,7 @@ def offset_sentence(manifold: Manifold, offset: Array | None) -> Iterator[str]:
 
 
 def doubted(factors: BetweenFactors) -> str:
-    """Return how many loops, and absolute poses if any, there are to be doubted."""
+    """Return in words how many loops and absolute poses were judged."""
     absolute = int(factors.is_absolute.sum())
     loops = counted(int((~factors.is_odometry).sum()) - absolute, 'loop')
     return f'{loops} and {counted(absolute, "absolute pose")}' if absolute else loops
@@ -141,16 +141,16 @@ def doubted(factors: BetweenFactors) -> str:
 
 def doubt_sentence(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None) -> str:
     """
-    Return why and where a map is not to be relied on, and what can be done; empty: it may be.
+    Return why and where a map is doubtful, and what can be done; empty without doubts.
 
-    ids, stamps : (n,) of the keyframes
+    ids, stamps : (n,) vertex ids and stamps [ns] of the keyframes
     """
     reasons = '; '.join(doubt_reasons(doubts, ids, stamps))
     return f'{DOUBTFUL}: {reasons}. {_REMEDY}' if reasons else ''
 
 
 def doubt_reasons(doubts: Iterable[Doubt], ids: Indices, stamps: Indices | None) -> list[str]:
-    """Return why and where a map is not to be relied on, a clause on each doubt; see above."""
+    """Return a clause for each doubt: its reason, and between which keyframes; see above."""
     reasons = []
     for doubt in doubts:
         where = f'between {ids[doubt.first]} and {ids[doubt.last]}'

@@ -161,8 +161,7 @@ class Diagnostics:
                 f'{count} {cause}' for cause, count in sorted(lately.items())))
         if broken:
             causes = ', '.join(f'{count} {cause}' for cause, count in sorted(broken.items()))
-            wrong.append('odometry that did not go on as the robot moves, in the last minute: '
-                         f'{causes}')
+            wrong.append(f'jumps of the odometry in the last minute: {causes}')
         rejected = counts['rejected_loops']
         judged = rejected + counts['accepted_loops'] + counts['suspect_loops']
         if judged >= _FEW and rejected > judged / 2:

@@ -65,8 +65,8 @@ def _run_node(name: str, module: str, options: Callable[[], Options]) -> int:
             print(help_of(name, options()))
         leave(0)
     if own:
-        print(f'{name}: {own[0]!r} is no argument of it; expected those of ROS after --ros-args, '
-              f'see {name} --help', file=sys.stderr)
+        print(f'{name}: {own[0]!r} is not an argument of {name}; expected arguments of ROS, after '
+              f'--ros-args, see {name} --help', file=sys.stderr)
         return _BAD_INPUT
     return _run(name, module)
 

@@ -237,22 +237,26 @@ _not_negative = _number('of 0 or more', lambda value: value >= 0)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog='replay', description='Play a bag onto topics.',
-                                     epilog='What ROS is to know comes after --ros-args.')
+    parser = argparse.ArgumentParser(
+        prog='replay', description="Publish a bag's messages at the pace of their recording.",
+        epilog='Arguments of ROS come after --ros-args.')
     add = parser.add_argument
     add('bag', type=Path, help='.mcap, .db3, .bag (ROS 1) or a rosbag2 directory')
     add('--wait', type=_not_negative, metavar='SECONDS',
-        help='play after so long even if nobody subscribes; 0: at once (default: until somebody '
-             'does)')
+        help='longest time to wait for subscribers; 0: do not wait (default: wait as long as it '
+             'takes)')
     add('--nodes', nargs='+', default=[], metavar='NODE',
-        help='play only when each of these nodes subscribes, too: two may hear one topic')
-    add('--rate', type=_positive, default=1.0, help='times as fast as recorded')
-    add('--start', type=_not_negative, default=0.0, help='skip so much of the bag [s]')
-    add('--duration', type=_positive, help='play only so much of the bag [s]')
-    add('--loop', action='store_true', help='again and again')
-    add('--remap', type=_remapping, nargs='+', default=[], metavar='OLD:=NEW')
-    add('--topics', nargs='+', help='play only these')
-    add('--clock', action='store_true', help='publish /clock')
+        help='wait until each of these nodes subscribes, not just any node')
+    add('--rate', type=_positive, default=1.0, metavar='FACTOR',
+        help='factor on the pace of the recording (default: %(default)g)')
+    add('--start', type=_not_negative, default=0.0, metavar='SECONDS',
+        help='skip this much at the begin of the bag')
+    add('--duration', type=_positive, metavar='SECONDS', help='play only this much of the bag')
+    add('--loop', action='store_true', help='play again and again')
+    add('--remap', type=_remapping, nargs='+', default=[], metavar='OLD:=NEW',
+        help='publish topic OLD of the bag as NEW')
+    add('--topics', nargs='+', metavar='TOPIC', help='play only these topics of the bag')
+    add('--clock', action='store_true', help='also publish /clock')
     return parser
 
 

@@ -218,8 +218,9 @@ def test_odometry_that_lies_is_refused_and_named(capsys, lies):
     assert abs(slip[0] - 610) <= 9  # between loops nobody can tell which of the steps it was
     assert len(rejected) == 101 and report['parts'] == 1
     said = run(capsys, 'solve', lies)[0]
-    assert re.search(rf'\nodometry {slip[0]} - {slip[1]} lies: \d+\.\d sigmas off what the loops '
-                     'say; left out\n100 of 401 loops refused\n', said)
+    assert re.search(rf'\nthe odometry slipped from {slip[0]} - {slip[1]}: this step is \d+\.\d '
+                     'sigmas off what the loops say, and is left out\n100 of 401 loops refused\n',
+                     said)
 
 
 # Doubtful
@@ -227,7 +228,7 @@ def test_odometry_that_lies_is_refused_and_named(capsys, lies):
 
 DOUBT = re.compile(r'doubtful: (\d+) refused loops agree with each other on another map, '
                    r'between (\d+) and (\d+)( \([0-9.]+ s to [0-9.]+ s\))?\. Vouch '
-                   'for a loop that is right, strike out one that is false, or state the noise')
+                   'for a true loop, strike out a false one, or state the right noise')
 
 
 @pytest.fixture
@@ -331,8 +332,8 @@ def test_a_graph_too_dense_to_judge_is_solved_as_far_as_it_was_judged(
         assert re.match(
             r'doubtful: judging the loops failed \(factorising [0-9]+ keyframes and [0-9]+ '
             r'factors takes [0-9.e-]+ GB of memory or more, and [0-9.]+ GB are free\): the map is '
-            rf'of what was believed until then, and {len(report["suspect"])} loops between [0-9]+ '
-            r'and [0-9]+ are left out\. ', warning)
+            rf'made of what was accepted until then, and {len(report["suspect"])} loops between '
+            r'[0-9]+ and [0-9]+ are left out\. ', warning)
     report = solve_json(capsys, world, '--no-robust')
     assert report['solver'] == 'primal-dual' and report['warnings'] == []
 
@@ -658,8 +659,8 @@ def test_a_parameter_file_speaks_to_both_growth_and_solver(capsys, world, tmp_pa
     (['solve', 'graph.g2o', '--output', 'taken.g2o', '--plot', 'a.png'], 'it is a directory'),
     (['solve', 'graph.g2o', '--plot', 'missing/out.png'], 'missing is no folder'),
     (['solve', 'gap.g2o', '--start', 'odometry'], 'consecutive vertices 1 and 2'),
-    (['solve', 'graph.g2o', '--output', 'other'], 'other: exists and is no bag'),
-    (['simulate', 'other', '--poses', '10', '--edges', '12'], 'other: exists and is no bag'),
+    (['solve', 'graph.g2o', '--output', 'other'], 'other: exists and is not a bag'),
+    (['simulate', 'other', '--poses', '10', '--edges', '12'], 'other: exists and is not a bag'),
     (['convert', 'graph.g2o', 'out.doc'], 'suffix'),
     (['corrupt', 'graph.g2o', 'out.tum', '--false-loops', '1'], 'trajectory'),
     (['corrupt', 'graph.g2o', 'out.g2o', '--false-loops', '-1'], '--false-loops is -1'),

@@ -199,7 +199,7 @@ def test_a_slip_and_most_loops_refused_have_rivals(capsys, tmp_path):
     assert another['kind'] == 'another map' and len(another['loops']) == 3
     assert doubt['kind'] == 'a slip suspected'
     *_, rival = shown(page)['maps'][1:]
-    step = doubt['text'].split(' between ')[1].split(',')[0].split(' and ')
+    step = doubt['text'].split(' between ')[1].split(':')[0].split(' and ')
     assert rival['name'].split(' the step ')[1] == ' - '.join(step)
 
 
@@ -272,10 +272,11 @@ def test_a_page_replaces_a_page_and_nothing_of_others(capsys, tmp_path):
     reported(capsys, path)
     for name in 'map.png', 'map':
         err = run(capsys, 'solve', path, '--report', tmp_path / name, code=2)[1]
-        assert err.endswith('is no name of a page; expected one that ends in .html or .htm\n')
+        assert err.endswith('is not the name of a web page; expected one that ends in .html or '
+                            '.htm\n')
     link = tmp_path / 'graph.g2o'
     link.symlink_to(page)
-    assert 'is read' in run(capsys, 'solve', link, '--report', page, '--force', code=2)[1]
+    assert 'is an input' in run(capsys, 'solve', link, '--report', page, '--force', code=2)[1]
 
 
 def test_without_the_library_one_line_says_so_before_the_work(capsys, tmp_path, monkeypatch):

@@ -128,7 +128,7 @@ def test_without_transforms_it_says_where_it_takes_the_laser_to_be(drive, tmp_pa
 @pytest.mark.parametrize(('arguments', 'expected'), [
     (['--scans', '/laser', '--odom-topic', '/wheels'],
      'no scans on /laser; expected sensor_msgs/msg/LaserScan, which is on /scan'),
-    (['--scans', '/scan'], '0 messages of odometry on /odom; expected those of a drive'),
+    (['--scans', '/scan'], '0 messages of odometry on /odom; expected 2 or more'),
     (['--grid', 'map.pgm'], '--grid is of scans; expected --scans TOPIC, or a CARMEN log'),
     (['--scans', '/scan', '--odom-topic', '/wheels', '--grid', 'map.png'],
      'map.png: unknown suffix; expected .pgm')])

@@ -88,9 +88,9 @@ def test_a_recording_stays_as_it_is(capsys, recording, users):
         for force in (), ('--force',):
             for command in (('convert', recording), ('solve', recording, '--output')):
                 _, err = run(capsys, *command, output, *force, code=2)
-                assert err.count('\n') == 1 and 'is read' in err
+                assert err.count('\n') == 1 and 'is an input' in err
     file = next(p for p in recording.iterdir() if p.suffix != '.yaml')
-    assert 'is read' in run(capsys, 'convert', file, recording, '--force', code=2)[1]
+    assert 'is an input' in run(capsys, 'convert', file, recording, '--force', code=2)[1]
     assert contents(recording) == before
     run(capsys, 'convert', users, recording, '--force')
     assert is_ours(recording) and contents(recording) != before
@@ -102,8 +102,8 @@ def test_a_graph_of_a_user_stays_as_it_is(capsys, users, tmp_path, lies):
     os.link(users, hard)
     for force in (), ('--force',):
         for output in users, hard:
-            assert 'is read' in run(capsys, 'convert', users, output, *force, code=2)[1]
-            assert 'is read' in run(capsys, 'solve', users, '--output', output, *force,
+            assert 'is an input' in run(capsys, 'convert', users, output, *force, code=2)[1]
+            assert 'is an input' in run(capsys, 'solve', users, '--output', output, *force,
                                     code=2)[1]
     assert REFUSED in run(capsys, 'convert', lies, users, code=2)[1]
     assert REFUSED in run(capsys, 'solve', lies, '--output', users, code=2)[1]
@@ -151,7 +151,7 @@ def test_a_trajectory_that_others_wrote_stays(capsys, users, tmp_path):
     run(capsys, 'convert', users, output)
     output.write_text(output.read_text().split('\n', 1)[1])
     assert REFUSED in run(capsys, 'convert', users, output, code=2)[1]
-    assert 'is read' in run(capsys, 'solve', users, '--reference', output, '--output', output,
+    assert 'is an input' in run(capsys, 'solve', users, '--reference', output, '--output', output,
                             '--force', code=2)[1]
 
 

@@ -161,11 +161,11 @@ def test_every_option_has_a_meaning(kind):
 
 
 @pytest.mark.parametrize('values, said', [
-    ({'map_frame': ''}, "map_frame is '' and odom_frame 'odom', expected two names that differ"),
-    ({'odom_frame': ''}, "map_frame is 'map' and odom_frame '', expected two names that differ"),
-    ({'odom_frame': 'map'}, "map_frame is 'map' and odom_frame 'map', expected two names"),
-    ({'robots': ('r1', 'r1')}, r"robots is \['r1', 'r1'\], expected names"),
-    ({'robots': ('a/b',)}, r"robots is \['a/b'\], expected names"),
+    ({'map_frame': ''}, "map_frame is '' and odom_frame 'odom', expected two different names"),
+    ({'odom_frame': ''}, "map_frame is 'map' and odom_frame '', expected two different names"),
+    ({'odom_frame': 'map'}, "map_frame is 'map' and odom_frame 'map', expected two different"),
+    ({'robots': ('r1', 'r1')}, r"robots is \['r1', 'r1'\], expected different names"),
+    ({'robots': ('a/b',)}, r"robots is \['a/b'\], expected different names"),
     ({'save_path': '/maps'}, "save_path is '/maps', expected the name of a .g2o file")])
 def test_names_that_cannot_be_used_are_refused(values, said):
     with pytest.raises(OptionError, match=said):

@@ -70,10 +70,8 @@ def test_of_many_the_worst_twenty_are_named(record, count, more):
 
 
 @pytest.mark.parametrize('suspect, sentence', [
-    ([5], '1 loop suspect and left out: nothing vouches for it, and it could as well fit by '
-          'chance'),
-    ([5, 6], '2 loops suspect and left out: nothing vouches for them, and they could as well fit '
-             'by chance')])
+    ([5], '1 loop suspect and left out: nothing confirms it'),
+    ([5, 6], '2 loops suspect and left out: nothing confirms them')])
 def test_suspects_are_counted_apart_and_what_is_struck_out_is_not(record, suspect, sentence):
     record.graph.say(N - 1 + np.array([8, 9]), trusted=False)
     refused = {3: 8.0, 8: np.nan, 9: np.nan}
@@ -84,15 +82,17 @@ def test_suspects_are_counted_apart_and_what_is_struck_out_is_not(record, suspec
 
 def test_odometry_that_lies_is_said_first_and_is_no_loop(record):
     said = list(judgement_sentences(record, judgement({0: 8.0}, slips=[2, 9])))
-    assert said == ['odometry 16 - 19 lies: 42.0 sigmas off what the loops say; left out',
-                    'odometry 37 - 40 lies: 49.0 sigmas off what the loops say; left out',
+    assert said == ['the odometry slipped from 16 - 19: this step is 42.0 sigmas off what the '
+                    'loops say, and is left out',
+                    'the odometry slipped from 37 - 40: this step is 49.0 sigmas off what the '
+                    'loops say, and is left out',
                     '1 of 27 loops refused', '  10 - 16: 8.0 sigmas off the accepted ones']
 
 
-NOISY_ODOMETRY = ('the odometry is about {} times as noisy as it says: loops far apart in time '
-                  'are judged by little')
-NOISY_LOOPS = ('the loops are about {} times as noisy as they say: a false one that is little '
-               'off passes for noise')
+NOISY_ODOMETRY = ('the odometry is about {} times as noisy as stated: it says little about loops '
+                  'between distant times')
+NOISY_LOOPS = ('the loops are about {} times as noisy as stated: a false loop that is off by '
+               'little cannot be told from noise')
 
 
 @pytest.mark.parametrize('variance, said', [
@@ -107,8 +107,8 @@ def test_a_map_of_other_noise_than_is_stated_is_told(record):
     found = judgement(suspect=[5])
     said, more = (list(judgement_sentences(record, one))
                   for one in (found, replace(found, noise=2 * found.noise)))
-    assert more == [*said, 'the loops of a place err together: in the map each place counts as '
-                    'one loop, and all are as noisy as was found']
+    assert more == [*said, 'the errors of loops of one place are correlated: each place counts as '
+                    'one loop, with the noise that was estimated']
 
 
 @pytest.mark.parametrize('stamps, when', [
@@ -118,10 +118,10 @@ def test_a_doubt_says_why_and_where(stamps, when):
     said = doubt_sentence([Doubt(kind, 1234, 2, 7, '2.5') for kind in (WEAK, OTHER_MAP)],
                           ids, stamps)
     assert said == (
-        'doubtful: the map may well be 2.5 m off: by the noise that was found, the loops that are '
-        f'used hold it no better; 1,234 are left out, {where}; 1,234 refused loops agree with each '
-        f'other on another map, {where}. Vouch for a loop that is right, strike out one that is '
-        'false, or state the noise')
+        'doubtful: the map may well be 2.5 m off: with the noise that was estimated, the loops that '
+        f'are used allow that much; 1,234 are left out, {where}; 1,234 refused loops agree with '
+        f'each other on another map, {where}. Vouch for a true loop, strike out a false one, or '
+        'state the right noise')
     assert doubt_sentence((), ids, stamps) == ''
 
 

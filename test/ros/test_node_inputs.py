@@ -48,7 +48,7 @@ def test_odometry_in_a_frame_that_is_not_odom_frame_is_told_of(bench, capfd):
         b.send('/odom', message)
     b.until(lambda: len(b.path().poses) == 5, 'all are used')
     told = [line for line in capfd.readouterr().err.splitlines() if 'WARN' in line]
-    assert len(told) == 1 and "odometry in frame 'odom' is used, but m -> r/odom is pub" in told[0]
+    assert len(told) == 1 and "has the frame 'odom', but m -> r/odom is published" in told[0]
 
 
 def test_the_last_stamp_that_there_is_has_a_transform_too(bench):

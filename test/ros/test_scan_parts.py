@@ -316,4 +316,4 @@ def test_help_lists_topics_services_and_parameters():
 def test_an_unknown_argument_starts_nothing():
     ran = subprocess.run([executable('scan_loops'), '--loops'], capture_output=True, text=True)
     assert ran.returncode == 2
-    assert ran.stderr.startswith("scan_loops: '--loops' is no argument of it; expected those of")
+    assert ran.stderr.startswith("scan_loops: '--loops' is not an argument of scan_loops")

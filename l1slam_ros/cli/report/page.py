@@ -45,7 +45,7 @@ def check_report(path: Path, read: Sequence[Path], force: bool) -> None:
 
     """
     if path.suffix.lower() not in _SUFFIXES:
-        raise FileError(path, 'is no name of a page; expected one that ends in '
+        raise FileError(path, 'is not the name of a web page; expected one that ends in '
                         f'{" or ".join(_SUFFIXES)}')
     if find_spec('plotly') is None:
         raise OptionError('--report draws with plotly, which is not installed; expected it: `pip '

@@ -117,8 +117,8 @@ def in_order(loop: LoopClosure) -> LoopClosure:
     if reference is None or one != other or reference <= loop.stamp:
         return loop  # robots have clocks of their own
     if not np.isfinite(loop.covariance).all():
-        raise MessageError('order', f'a loop from {reference} ns back to {loop.stamp} ns leaves a '
-                           'component unsaid; expected its earlier time first')
+        raise MessageError('order', f'a loop from {reference} ns back to {loop.stamp} ns does not '
+                           'measure all components; expected its earlier time first')
     pose = sound_pose3(tuple(loop.pose3[:3].tolist()), tuple(loop.pose3[3:].tolist()))[None]
     Ad = se3.adjoint(pose)[0]
     return replace(loop, reference_stamp=loop.stamp, stamp=reference, pose3=se3.inverse(pose)[0],

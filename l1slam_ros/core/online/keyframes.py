@@ -32,9 +32,12 @@ _SUMMED = 512
 class KeyframeOptions(Options):
     """Which motion makes a keyframe: any one threshold; 0 switches one off; all 0: any message."""
 
-    translation: float = option(0.5, 'distance from the last keyframe; 0: off', 'm', 0, 1e6)
-    rotation: float = option(0.2, 'turn since the last keyframe; 0: off', 'rad', 0, 1e6)
-    period: float = option(0.0, 'time since the last keyframe; 0: off', 's', 0, 1e9)
+    translation: float = option(
+        0.5, 'distance from the last keyframe at which a new one is made; 0: off', 'm', 0, 1e6)
+    rotation: float = option(
+        0.2, 'turn since the last keyframe at which a new one is made; 0: off', 'rad', 0, 1e6)
+    period: float = option(
+        0.0, 'time since the last keyframe after which a new one is made; 0: off', 's', 0, 1e9)
 
 
 @dataclass(frozen=True)
@@ -42,18 +45,24 @@ class OdometryOptions(Options):
     """Where the covariance of the odometry comes from."""
 
     covariance_source: str = option(
-        'model', 'model: the sigmas below; increment: pose.covariance is that of the motion since '
-        'the previous message; twist: twist.covariance times the time squared', '',
-        choices=('model', 'increment', 'twist'))
-    sigma_translation: float = option(0.05, 'model: per metre travelled', 'm/m', 0, 1e6)
-    sigma_rotation: float = option(0.05, 'model: per radian turned', 'rad/rad', 0, 1e6)
+        'model', 'where the covariance of the odometry comes from. model: from the sigmas and '
+        'floors below; increment: pose.covariance is that of the motion since the previous '
+        'message; twist: twist.covariance times the square of the time since the previous '
+        'message', '', choices=('model', 'increment', 'twist'))
+    sigma_translation: float = option(
+        0.05, 'model: standard deviation of the position per metre travelled', 'm/m', 0, 1e6)
+    sigma_rotation: float = option(
+        0.05, 'model: standard deviation of the heading per radian turned', 'rad/rad', 0, 1e6)
     floor_translation: float = option(
-        0.02, 'model: of any motion, added in quadrature', 'm', 1e-9, 1e6)
+        0.02, 'model: standard deviation of the position that any motion has, added in '
+        'quadrature', 'm', 1e-9, 1e6)
     floor_rotation: float = option(
-        0.02, 'model: of any motion, added in quadrature', 'rad', 1e-9, 1e6)
+        0.02, 'model: standard deviation of the heading that any motion has, added in quadrature',
+        'rad', 1e-9, 1e6)
     reorder: float = option(
-        1.0, 'a message that comes so late is still put in its place while its keyframe is open, '
-        'and dropped after; no later one waits for it; 0: off', 's', 0, 60)
+        1.0, 'how late a message may come and still be inserted at its stamp, as long as its '
+        'keyframe is not finished; a later one is dropped. Nothing waits for late messages; 0: '
+        'off', 's', 0, 60)
 
 
 def diagonal_covariance(manifold: Manifold, translation: float, rotation: float) -> Array:

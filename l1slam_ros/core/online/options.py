@@ -28,9 +28,10 @@ class GraphBuilderOptions(Options):
     odometry: OdometryOptions = OdometryOptions()
     loop: LoopOptions = LoopOptions()
     on_time_jump: str = option(
-        'new_segment', "when the ROS clock or the odometry's stamps jump back, or odometry jumps "
-        'further than any robot moves: the map stays and a new part begins, which loops may join '
-        'to it; or the map begins anew; or the robot is taken to be where it was, and old stamps '
-        'are dropped', '', choices=tuple(ON_A_GAP))
+        'new_segment', 'what happens when the ROS clock or the stamps of the odometry jump back, '
+        'or the odometry jumps further than any robot moves. new_segment: the map stays and a new '
+        'part begins, which loops can join to it; reset: the map begins anew; ignore: the robot '
+        'is taken to be where it was, and messages with old stamps are dropped', '',
+        choices=tuple(ON_A_GAP))
     base_frame: str = option(
-        '', "the robot's frame; empty: the first child_frame_id seen", fixed=True)
+        '', "the robot's frame; empty: the first child_frame_id received", fixed=True)

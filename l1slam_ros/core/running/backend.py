@@ -60,8 +60,8 @@ class RobustOptions(Options):
     """Whether loops are doubted."""
 
     enabled: bool = option(
-        True, 'believe a loop only once others, or the odometry, vouch for it; without, every '
-        'loop is used at once')
+        True, 'use a loop only once other loops or the odometry confirm it; false: use every '
+        'loop at once')
 
 
 @dataclass(frozen=True)

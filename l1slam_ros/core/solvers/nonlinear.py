@@ -51,15 +51,16 @@ class OptimiserOptions(Options):
     """How long Algorithm 4 runs and when it is content."""
 
     norm: str = option(
-        NORMS[0], 'what `l1slam` and `~/optimize` minimise; updates on the way minimise l1', '',
-        choices=NORMS)
+        NORMS[0], 'norm that `l1slam` and `~/optimize` minimise; the updates in between always '
+        'minimise l1', '', choices=NORMS)
     loop_norm: str = option(
-        SAME, 'what is minimised of loops and absolute poses; same: as of odometry', '',
-        choices=(SAME, *NORMS))
-    outer_iterations: int = option(60, 'most linearisations of one solve', '', 0, 10**6)
+        SAME, 'norm of the residuals of loops and absolute poses; same: the norm of the odometry',
+        '', choices=(SAME, *NORMS))
+    outer_iterations: int = option(
+        60, 'largest number of linearisations of one solve', '', 0, 10**6)
     outer_tolerance: float = option(
-        1e-6, 'converged when the cost fell by less than this part of itself twice in a row',
-        '1', 0, 1)
+        1e-6, 'a solve has converged when the cost fell by less than this fraction of itself '
+        'twice in a row', '1', 0, 1)
     inner: PrimalDualOptions = PrimalDualOptions()
 
 

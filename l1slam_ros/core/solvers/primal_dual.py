@@ -48,10 +48,10 @@ Resolvent = Callable[[Array], Array]
 class PrimalDualOptions(Options):
     """How long a primal-dual solve runs and when it is content."""
 
-    iterations: int = option(400, 'most iterations of one primal-dual solve', '', 1, 10**7)
+    iterations: int = option(
+        400, 'largest number of iterations of one primal-dual solve', '', 1, 10**7)
     tolerance: float = option(
-        1e-5, 'stop when the duality gap is below this part of the cost', '1',
-        0, 1)
+        1e-5, 'stop when the duality gap is below this fraction of the cost', '1', 0, 1)
 
 
 @dataclass(frozen=True)

@@ -59,8 +59,8 @@ def unpacked(compression: str, data: bytes) -> bytes:
     """
     content: bytes = _UNPACK[compression](data, MOST_AT_ONCE + 1)
     if len(content) > MOST_AT_ONCE:
-        raise BombError(f'{len(data):,} bytes of {compression} that unpack to more than '
-                        f'{MOST_AT_ONCE // _MIB} MiB; expected a chunk or a message')
+        raise BombError(f'{len(data):,} bytes of {compression} unpack to more than a chunk or a '
+                        f'message may have; expected at most {MOST_AT_ONCE // _MIB} MiB')
     return content
 
 

@@ -182,12 +182,12 @@ def _require_sayable(record: GraphRecord) -> None:
                          'a bag needs the odometry of every vertex')
     unsaid = np.minimum(factors.i, factors.j)[rows[~factors.speaks[rows].all(axis=1)]]
     if len(unsaid):
-        raise GraphError(f'the odometry from vertex {ids[unsaid[0]]} leaves a component unsaid; '
-                         'in a bag it says all')
+        raise GraphError(f'the odometry from vertex {ids[unsaid[0]]} does not measure all '
+                         'components; a bag has no place for that')
     told = factors.j[factors.is_absolute & (factors.trusted | factors.struck)]
     if len(told):
-        raise GraphError(f'an absolute pose of vertex {ids[told[0]]} that is trusted or struck '
-                         'out; in a bag it would be doubted')
+        raise GraphError(f'the absolute pose of vertex {ids[told[0]]} is trusted or struck out; '
+                         'a bag has no place for that')
 
 
 def _backward(record: GraphRecord) -> Mask:
@@ -197,8 +197,8 @@ def _backward(record: GraphRecord) -> Mask:
     unsaid = np.flatnonzero(backward & ~factors.speaks.all(axis=1))
     if len(unsaid):
         i, j = ids[factors.pairs[unsaid[0]]]
-        raise GraphError(f'an edge from vertex {i} back to {j} leaves a component unsaid; in '
-                         'a bag a pose is seen from an earlier one')
+        raise GraphError(f'the edge from vertex {i} back to {j} does not measure all components; '
+                         'a bag has no place for that, as its edges lead from earlier to later')
     return backward
 
 
@@ -220,7 +220,7 @@ def _stamps(record: GraphRecord) -> list[int]:
     """Return the stamps [ns], each after the one before."""
     stamps = record.times
     if not len(stamps):
-        raise GraphError('a graph without vertices; expected one at least')
+        raise GraphError('the graph has no vertices; expected one or more')
     bad = np.flatnonzero(np.diff(stamps, prepend=0) <= 0)
     if len(bad) or stamps[-1] > LAST_STAMP:
         k = bad[0] if len(bad) else -1

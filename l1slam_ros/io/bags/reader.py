@@ -187,8 +187,8 @@ def _bag_path(path: str | os.PathLike[str]) -> Path:
     if not bag.exists():
         raise FileError(path, 'no such file or directory; expected a bag')
     if bag.is_file() and bag.suffix.lower() not in BAG_SUFFIXES:
-        raise FileError(path, f'no bag by its name; expected {", ".join(BAG_SUFFIXES)} '
-                        'or a rosbag2 directory')
+        raise FileError(path, f'does not have the name of a bag; expected '
+                        f'{", ".join(BAG_SUFFIXES)} or a rosbag2 directory')
     if bag.is_dir() and not (bag / METADATA).is_file() and len(bag_names(bag)) != 1:
         raise FileError(path, f'a directory without {METADATA} and with the files of '
                         f'{len(bag_names(bag))} bags; expected a rosbag2 directory')
@@ -271,8 +271,8 @@ def _salvage(bag: Path, error: Exception) -> Salvage:
     if isinstance(error, BombError):
         raise FileError(bag, str(error)) from error
     if bag.suffix.lower() == '.bag':
-        raise FileError(bag, f'damaged, or no bag ({complaint(error)}); {_TO_ITS_END}: '
-                        '`rosbag reindex` may make one of it') from error
+        raise FileError(bag, f'damaged, or not a bag ({complaint(error)}); {_TO_ITS_END}: '
+                        '`rosbag reindex` may repair it') from error
     try:
         salvage = Salvage(bag)
     except BombError as bomb:
@@ -282,4 +282,4 @@ def _salvage(bag: Path, error: Exception) -> Salvage:
     reason = complaint(error)
     if salvage.damage is not None and salvage.damage.where.startswith(': '):
         reason = salvage.damage.where[2:]
-    raise FileError(bag, f'damaged, or no bag ({reason}); {_TO_ITS_END}') from error
+    raise FileError(bag, f'damaged, or not a bag ({reason}); {_TO_ITS_END}') from error

@@ -198,7 +198,8 @@ class _Growing:
         if builder.stream.held:
             skipped.append(f'the last message is not used: {builder.stream.reason()}')
         if waiting := len(builder.loops.waiting):
-            skipped.append(f'{counted(waiting, "loop")} for times after the last odometry')
+            skipped.append(f'{counted(waiting, "loop")} not used: the odometry ends before '
+                           f'{"its" if waiting == 1 else "their"} times')
         return GraphRecord(builder.graph, None, np.arange(builder.graph.n_poses),
                            builder.track.keyframe_stamps, tuple(skipped), damage)
 

@@ -141,12 +141,12 @@ def refuse_other_than_bag(target: Path) -> None:
     if not os.path.lexists(target):
         return
     if not (target / METADATA).is_file():
-        raise FileError(target, 'exists and is no bag, so it is not overwritten; expected a bag '
-                        'or nothing there')
+        raise FileError(target, 'exists and is not a bag, so it is not overwritten; expected a '
+                        'bag or nothing there')
     for child in sorted(target.iterdir()):
         if child.name != METADATA and not child.name.endswith(_BAG_SUFFIXES):
-            raise FileError(target, f'holds {child.name}, which is no part of a bag, so it is not '
-                            'overwritten; expected a bag or nothing there')
+            raise FileError(target, f'holds {child.name}, which is not part of a bag, so it is '
+                            'not overwritten; expected a bag or nothing there')
 
 
 @contextmanager

@@ -347,6 +347,6 @@ def _lines(path: Path, record: GraphRecord, kind: str, ids: Indices, pose: Array
     if not readable.all():
         k = int(np.argmin(readable))
         line = ' '.join((name, *map(str, ids[k]), 'would be', *(f'{v:g}' for v in values[k])))
-        raise FileError(path, f'{line}; expected numbers to {LARGEST:g}; nothing written')
+        raise FileError(path, f'{line}; expected numbers up to {LARGEST:g}; nothing written')
     # %r: the fewest digits, 17 at most, that read back as the very same number.
     return formatted(f'{name}{" %d" * ids.shape[1]}{" %r" * values.shape[1]}', ids, values)

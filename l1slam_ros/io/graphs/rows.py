@@ -147,8 +147,8 @@ def _parse(path: object, name: str, lines: TextLines, rotation_information: str,
     moved = np.isin(ids[:, tag.vertices:], offsets).any(axis=1)
     if tag.vertices == 1 and moved.any():
         k = int(np.argmax(moved))
-        raise FileError(path, f'{name}: measured by {OFFSET} {ids[k, 1]}, which is not where the '
-                        'robot is; expected no offset', lines.numbers[k])
+        raise FileError(path, f'{name}: the pose is that of a sensor with the offset {OFFSET} '
+                        f'{ids[k, 1]}; expected a pose of the robot', lines.numbers[k])
     pose = tag.manifold.identity(m)
     information = np.zeros((m, d, d))
     read = tag.read(values[:, :p])
@@ -175,7 +175,7 @@ def vertices_of(path: object, groups: dict[str, TextLines], manifold: Manifold) 
     again = np.flatnonzero(ids[1:, 0] == ids[:-1, 0]) + 1
     if len(again):
         k = again[np.argmin(lines[again])]
-        raise FileError(path, f'vertex {ids[k, 0]} stands twice, before at line {lines[k - 1]}; '
+        raise FileError(path, f'vertex {ids[k, 0]} comes twice, first at line {lines[k - 1]}; '
                         'expected each once', int(lines[k]))
     return rows
 
@@ -207,7 +207,8 @@ def made_definite(edges: Rows) -> tuple[Rows, list[str]]:
     information[changed] = nearest[changed] / (units[:, :, None] * units[:, None, :])
     worst = changed[np.argmin(least[changed])]
     sentence = (f'{len(changed):,} of {counted(len(edges), "information matrix", _MATRICES)} not '
-                f'positive definite, the worst at line {edges.lines[worst]:,}: its least '
-                f'eigenvalue is {least[worst]:.2g} times its largest; each is used as the nearest '
-                f'one that has none below {LEAST_EIGENVALUE:g} times its largest')
+                f'positive definite, the worst at line {edges.lines[worst]:,}: its smallest '
+                f'eigenvalue is {least[worst]:.2g} times its largest; each is replaced by the '
+                'nearest matrix whose eigenvalues are at least '
+                f'{LEAST_EIGENVALUE:g} times its largest')
     return replace(edges, information=information), [sentence]

@@ -111,8 +111,8 @@ def read_stamps(path: str | os.PathLike[str], ids: Indices) -> Indices | None:
                             f'{"seconds" if in_order else "a vertex id and seconds"}',
                             number) from error
     if len(lines.texts) != len(ids) or stamp_of.keys() != set(ids.tolist()):
-        raise FileError(side, f'{len(lines.texts)} stamps that are not those of the {len(ids)} '
-                        'vertices; expected one for each, or no such file')
+        raise FileError(side, f'{len(lines.texts)} stamps do not match the {len(ids)} vertices; '
+                        'expected one for each, or no such file')
     return np.array([stamp_of[k] for k in ids.tolist()], np.int64)
 
 

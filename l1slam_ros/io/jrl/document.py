@@ -161,15 +161,15 @@ def _from_json(path: Path, content: bytes) -> Any:
     try:
         return json.loads(content.decode('utf-8-sig'))
     except json.JSONDecodeError as error:
-        raise FileError(path, f'no JSON at column {error.colno}: {error.msg}; expected a JRL '
+        raise FileError(path, f'not JSON at column {error.colno}: {error.msg}; expected a JRL '
                         'document', error.lineno) from error
     except UnicodeDecodeError as error:
         found = f'byte 0x{error.object[error.start]:02x} at offset {error.start}'
         raise FileError(path, f'{found}; expected JSON') from error
     except ValueError as error:  # a number of thousands of digits
-        raise FileError(path, 'a number of too many digits; expected JSON') from error
+        raise FileError(path, 'a number with too many digits; expected JSON') from error
     except RecursionError as error:
-        raise FileError(path, 'lists in lists without an end; expected JSON at most '
+        raise FileError(path, 'lists are nested too deeply; expected JSON at most '
                         f'{_DEEPEST} deep') from error
 
 
@@ -177,7 +177,7 @@ def _from_cbor(path: Path, content: bytes) -> Any:
     library = cbor_library()
 
     def refuse(_: object, *__: object) -> NoReturn:
-        raise ValueError('a tag, which JSON has not')
+        raise ValueError('a tag, which JSON does not have')
 
     try:
         return library.loads(content, tag_hook=refuse, max_depth=_DEEPEST,
@@ -185,7 +185,7 @@ def _from_cbor(path: Path, content: bytes) -> Any:
                              semantic_decoders=dict.fromkeys(_TAGS, refuse))
     except (library.CBORDecodeError, ValueError, OverflowError) as error:
         cause = error.__cause__ or error
-        raise FileError(path, f'no CBOR: {quoted(" ".join(str(cause).split()))}; expected a JRL '
+        raise FileError(path, f'not CBOR: {quoted(" ".join(str(cause).split()))}; expected a JRL '
                         'document') from error
 
 

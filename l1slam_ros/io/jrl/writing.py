@@ -57,8 +57,8 @@ def write_jrl_file(path: str | os.PathLike[str], record: GraphRecord,
     """
     path = Path(path)
     if record.ids.min(initial=0) < 0:
-        raise FileError(path, f'vertex {record.ids.min()} would be a key; expected ids from 0; '
-                        'nothing written')
+        raise FileError(path, f'vertex {record.ids.min()} cannot be a key; expected ids from 0 '
+                        'on; nothing is written')
     content = document_bytes(path, _document(record, _log_of(path, record, truth)))
     with replacing(path) as temporary:
         with temporary.open('wb') as file:

@@ -102,8 +102,8 @@ class EdgeGraph(ABC):
             raise MessageError('robot', 'a loop between two robots; expected those of one')
         for number in edge.i, edge.j:
             if number not in self._stamps:
-                raise MessageError('keyframe', f'a loop of keyframe {number}; expected one whose '
-                                   'time a message has told')
+                raise MessageError('keyframe', f'a loop of keyframe {number}, whose stamp no '
+                                   'message has given; expected a known keyframe')
         return in_order(LoopClosure(
             self._stamps[edge.i], self._stamps[edge.j], edge.pose3, edge.covariance))
 

@@ -51,7 +51,7 @@ def read_bag_scans(path: Path, odom_topic: str, scan_topic: str) -> LaserLog:
             f', which is on {", ".join(others)}' if others else ''))
     if len(taken.stamps) < 2:
         raise FileError(path, f'{counted(len(taken.stamps), "message")} of odometry on '
-                        f'{odom_topic}; expected those of a drive')
+                        f'{odom_topic}; expected 2 or more')
     order = np.argsort([scan.stamp for scan in taken.scans], kind='stable')
     scans = [taken.scans[k] for k in order]
     rising = np.flatnonzero(np.diff(taken.stamps, prepend=taken.stamps[0] - 1) > 0)

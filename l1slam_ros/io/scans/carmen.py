@@ -96,21 +96,22 @@ def _log(lines: list[_Line], damage: str) -> LaserLog:
     said = []
     stamps, rows, back = rising(np.array([line.scan.stamp for line in lines], np.int64))
     if back:
-        said.append(f'the clock was set back by {back * 1e-9:.1f} s in all, and is taken to go on')
+        said.append(f'the clock was set back by {back * 1e-9:.1f} s in all; stamps are shifted '
+                    'to undo that')
     if out := len(lines) - len(rows):
         said.append(f'{counted(out, "scan")} left out: their stamps are not in the order of the '
                     'file')
     scans = [line.scan for line in lines]
     if (farthest := _farthest(scans)) < np.inf:
-        said.append(f'ranges from {farthest:.2f} m on are taken to say that nothing is in range')
+        said.append(f'ranges of {farthest:.2f} m and more are taken to mean "nothing in range"')
     scans = [replace(scans[row], stamp=stamp, range_max=min(farthest, scans[row].range_max))
              for row, stamp in zip(rows, stamps.tolist(), strict=True)]
     robots = np.array([line.robot for line in lines])
     mount = se2.between(robots, np.array([line.laser for line in lines]))
     middle = np.median(mount, axis=0)
     if (np.median(abs(mount - middle), axis=0) > _FIXED).any():
-        said.append('the laser does not stay where it is on the robot, and is taken to be where '
-                    'the robot is')
+        said.append('the pose of the laser on the robot varies; it is taken to be the pose of '
+                    'the robot')
         middle = np.zeros(3)
     return LaserLog(scans, robots[rows], Mount(*middle.tolist()), tuple(said), damage)
 

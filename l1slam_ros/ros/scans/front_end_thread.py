@@ -292,6 +292,6 @@ class FrontEndThread:
 
     def _warn_of_left_out(self) -> None:
         if left := self.queue.counts['left_out']:
-            self._logger.warning(f'{left} scans were left out: they come faster than they are '
-                                 'used; expected a laser that is slower, or a machine that is '
-                                 'faster', once=True)
+            self._logger.warning(f'{left} scans were dropped: they come faster than they can be '
+                                 'matched; expected a slower laser, or a faster machine',
+                                 once=True)

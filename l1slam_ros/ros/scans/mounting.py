@@ -155,6 +155,6 @@ def _mount(laser: str, pose3: Array) -> Mount:
     ahead = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
     up = 1 - 2 * (x * x + y * y)
     if abs(up) < _LEVEL:
-        raise MessageError('laser_pose', f'the axis of {laser!r} is {up:.2g} of upright; expected '
-                           'a laser that looks along the floor')
+        raise MessageError('laser_pose', f'the z axis of {laser!r} is not vertical: its cosine is '
+                           f'{up:.2g}; expected a laser that scans parallel to the floor')
     return Mount(float(pose3[0]), float(pose3[1]), float(np.arctan2(ahead[1], ahead[0])), up < 0)

@@ -29,27 +29,31 @@ class ScanLoopsOptions(FrontEndOptions):
     PASSED_OVER = OF_ROS
 
     laser_pose: str = option(
-        '', 'x, y [m], yaw [rad] of the laser in the base frame, and roll where it hangs upside '
-        'down (3.1416); empty: from /tf_static where tf2_msgs is installed, else zero', fixed=True)
+        '', 'pose of the laser in the base frame: x, y [m], yaw [rad], and a roll of 3.1416 if it '
+        'hangs upside down; empty: read from /tf_static where tf2_msgs is installed, else zero',
+        fixed=True)
     range_max: float = option(
-        0.0, "farther is no surface; 0: as the scan's own range_max says", 'm', 0, 1e6)
+        0.0, "ranges beyond this count as no return; 0: only the scan's own range_max does", 'm',
+        0, 1e6)
     scan_wait: float = option(
-        2.0, 'how long a scan waits for odometry on both sides of its stamp, by the stamps of '
-        'later scans', 's', 0.01, 60)
+        2.0, 'how long a scan waits for odometry before and after its stamp, measured in stamps '
+        'of later scans; then it expires', 's', 0.01, 60)
     backlog: int = option(
-        30, 'so many scans may wait for their turn; of more, every other one is left out', '',
-        1, 100_000)
+        30, 'largest number of scans that wait to be matched; beyond it every other one is '
+        'dropped', '', 1, 100_000)
     base_frame: str = option(
-        '', "the robot's frame; empty: the first child_frame_id of odom", fixed=True)
+        '', "the robot's frame; empty: the first child_frame_id received on odom", fixed=True)
     odom_frame: str = option(
-        'scan_odom', 'frame of scan_odom; the wheels have another', fixed=True)
+        'scan_odom', 'frame of scan_odom; it must differ from the frame of odom', fixed=True)
     publish_tf: bool = option(
         True, 'publish odom_frame -> frame of odom on /tf, where tf2_msgs is installed',
         fixed=True)
-    map_resolution: float = option(0.05, 'of a cell of the map', 'm', 0.005, 10, fixed=True)
+    map_resolution: float = option(
+        0.05, 'edge of a cell of the occupancy grid', 'm', 0.005, 10, fixed=True)
     map_period: float = option(
-        2.0, 'how often the map is published, where it has changed', 's', 0.1, 3600)
-    map_path: str = option('', 'the .pgm file of ~/save_map; the .yaml stands beside it')
+        2.0, 'shortest time between two publications of the occupancy grid', 's', 0.1, 3600)
+    map_path: str = option(
+        '', 'the .pgm file that ~/save_map writes; its .yaml is written beside it')
 
     def __post_init__(self) -> None:
         """Check every field; a pose may be a list, as ROS has it, or its text."""

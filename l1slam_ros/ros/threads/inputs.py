@@ -116,7 +116,7 @@ class Inputs:
         frame, sample = conversion.odometry_in(data)
         if self._own(robot, frame) not in (self._odom_frame, ''):
             self._node.get_logger().warning(
-                f'odometry in frame {quoted(frame)} is used, but {self._map_frame} -> '
+                f'the odometry has the frame {quoted(frame)}, but {self._map_frame} -> '
                 f'{robot.odom_frame} is published; expected odom_frame to be its name',
                 once=True)
         if robot.prefix:

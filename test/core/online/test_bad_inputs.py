@@ -195,5 +195,5 @@ def test_a_strike_may_name_its_times_either_way_round():
 def test_a_loop_that_leads_back_and_leaves_a_component_unsaid_is_refused():
     covariance = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, np.inf])
     message = replace(loop(9 * PERIOD, PERIOD, [0.0, 0, 0]), covariance=covariance)
-    with pytest.raises(MessageError, match=' ns leaves a component unsaid; expected its earlier'):
+    with pytest.raises(MessageError, match=' ns does not measure all components; expected its e'):
         Backend(EVERY).add_loop(message)

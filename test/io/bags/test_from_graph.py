@@ -196,11 +196,11 @@ def with_word(record, trusted):
 
 @pytest.mark.parametrize(('pairs', 'change', 'truth', 'message'), [
     ([(0, 1), (2, 3), (1, 3)], None, None, 'no edge between the consecutive vertices 10 and 20'),
-    *((CHAIN, partial(with_word, trusted=trusted), None, 'an absolute pose of vertex 10 that is '
+    *((CHAIN, partial(with_word, trusted=trusted), None, 'the absolute pose of vertex 10 is '
        'trusted or struck out') for trusted in (True, False)),
     (CHAIN, None, np.zeros((2, 3)), '2 true poses; expected 3, one for each vertex'),
     (CHAIN, lambda _: GraphRecord(FactorGraph(se2), None, np.array([], int)), None,
-     'without vertices'),
+     'has no vertices'),
     *((CHAIN, lambda record, stamps=stamps: replace(record, stamps=np.array(stamps)), None,
        f'vertex {vertex} has the stamp') for stamps, vertex in (
         ([5, 5, 6], 10), ([5, 7, 6], 20), ([0, 1, 2], 0), ([1, 2, 2**31 * 10**9], 20)))])

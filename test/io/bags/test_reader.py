@@ -69,7 +69,8 @@ def test_what_is_no_bag_is_told(tmp_path, bag):
     for call in (read_messages, read_raw, bag_summary, read_note):
         assert error_of(call, tmp_path / 'none').endswith(': no such file or directory; '
                                                           'expected a bag')
-        assert 'no bag by its name; expected .mcap, .db3' in error_of(call, tmp_path / 'a.txt')
+        assert 'not have the name of a bag; expected .mcap, .db3' in error_of(
+            call, tmp_path / 'a.txt')
         for name, count in ('empty', 0), ('two', 2):
             assert (f'without metadata.yaml and with the files of {count} bags'
                     in error_of(call, tmp_path / name))
@@ -81,5 +82,5 @@ def test_what_is_no_bag_is_told(tmp_path, bag):
 def test_a_file_that_is_no_bag(tmp_path, content, suffix):
     path = tmp_path / f'a{suffix}'
     path.write_bytes(content)
-    assert error_of(read_messages, path).startswith(f'{path}: damaged, or no bag (')
-    assert error_of(bag_summary, path).startswith(f'{path}: damaged, or no bag (')
+    assert error_of(read_messages, path).startswith(f'{path}: damaged, or not a bag (')
+    assert error_of(bag_summary, path).startswith(f'{path}: damaged, or not a bag (')

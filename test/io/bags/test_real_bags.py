@@ -168,7 +168,7 @@ def test_what_cannot_be_used_is_counted_by_its_cause(tmp_path, world):
     broken(loops[4], lambda m: setattr(m.header.stamp, 'sec', 2_000_000))
     record = read_input(mcap_file(tmp_path / 'a.mcap', recording), EVERY)
     for said, start in zip(sorted(record.skipped), [
-            '1 loop for times after the last odometry',
+            '1 loop not used: the odometry ends before its times',
             "1 message refused: frame 'map' of a loop; expected base_link@",
             '1 message refused: pose (nan, ', '1 message refused: stamp 0 s 0 ns; expected'],
             strict=True):

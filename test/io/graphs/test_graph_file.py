@@ -160,9 +160,9 @@ def test_information_that_is_not_definite_is_used_as_the_nearest_that_is(
     assert record.graph.between.speaks[-1].tolist() == [True, True, 'XY' not in line]
     count = len(record.graph.between)
     assert record.skipped[0] == (
-        f'1 of {count} information matrices not positive definite, the worst at line 9: its least '
-        f'eigenvalue is {least} times its largest; each is used as the nearest one that has none '
-        'below 1e-06 times its largest')
+        f'1 of {count} information matrices not positive definite, the worst at line 9: its '
+        f'smallest eigenvalue is {least} times its largest; each is replaced by the nearest '
+        'matrix whose eigenvalues are at least 1e-06 times its largest')
     write_graph_file(path := write('', 'again.g2o'), record)
     again = read_graph_file(path)
     assert_allclose(information_of(again.graph.between)[-1], found, rtol=1e-9, atol=1e-15)
@@ -174,7 +174,7 @@ def test_many_matrices_that_are_not_definite_are_one_line_and_the_worst_is_named
     record = read_graph_file(write(SQUARE + '\n'.join(bad) + '\n'))
     sentence, = record.skipped
     assert sentence.startswith('3 of 6 information matrices not positive definite, the worst at '
-                               'line 10: its least eigenvalue is -0.8 times its largest; ')
+                               'line 10: its smallest eigenvalue is -0.8 times its largest; ')
 
 
 @pytest.mark.parametrize(('content', 'message'), [
@@ -373,12 +373,12 @@ def test_the_graph_survives_a_failing_replacement(tmp_path, rng):
 
 
 @pytest.mark.parametrize(('text', 'message'), [
-    ('3 1.5\n7 2.5\n', ': 2 stamps that are not those of the 3 vertices; expected one for each'),
-    ('3 1\n7 2\n8 3\n', ': 3 stamps that are not those of the 3 vertices'),
-    ('3 1\n7 2\n7 2\n9 3\n', ': 4 stamps that are not those of the 3 vertices'),
+    ('3 1.5\n7 2.5\n', ': 2 stamps do not match the 3 vertices; expected one for each'),
+    ('3 1\n7 2\n8 3\n', ': 3 stamps do not match the 3 vertices'),
+    ('3 1\n7 2\n7 2\n9 3\n', ': 4 stamps do not match the 3 vertices'),
     ('3 1\n# x\n7 two\n9 3\n', ":3: '7 two'; expected a vertex id and seconds"),
     ('3 1\n7\n9 3\n', ":2: '7'; expected a vertex id and seconds"),
-    ('1\n2\n', ': 2 stamps that are not those'), ('1\n' * 4, ': 4 stamps that are not those'),
+    ('1\n2\n', ': 2 stamps do not match'), ('1\n' * 4, ': 4 stamps do not match'),
     ('1\n2 3\n', ":2: '2 3'; expected seconds"), ('x\n', ":1: 'x'; expected seconds"),
 ])
 def test_damaged_stamps_are_named(write, text, message):

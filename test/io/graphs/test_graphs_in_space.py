@@ -126,7 +126,7 @@ def test_absolute_poses(write, tmp_path):
 
 def test_what_was_measured_elsewhere_than_at_the_robot_is_named(write):
     beside = ABSOLUTE.replace('4 0 0 0', '4 0 0.5 0')
-    with pytest.raises(FileError, match=r'a\.g2o:6: EDGE_SE3_PRIOR: measured by PARAMS'):
+    with pytest.raises(FileError, match=r'a\.g2o:6: EDGE_SE3_PRIOR: the pose is that of'):
         read_graph_file(write(SQUARE + beside))
 
 

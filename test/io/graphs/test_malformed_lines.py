@@ -54,7 +54,7 @@ SOUND = ['V 7 POSE', 'V 3 POSE', 'E 3 7 POSE INFO', 'V 9 POSE', 'E 7 9 POSE INFO
     ('E 3 7 POSE NONE', 'information [0 0 0'),
     ('E 3 8 POSE INFO', 'vertex 8 is unknown; expected one of the 3 vertices'),
     ('E 100 3 POSE INFO', 'vertex 100 is unknown; expected one of the 3 vertices'),
-    ('V 7 POSE', 'vertex 7 stands twice, before at line 1; expected each once'),
+    ('V 7 POSE', 'vertex 7 comes twice, first at line 1; expected each once'),
     ('OTHER 5 6', 'OTHER: a line of SE{beside} beside V at line 1; expected all poses in the '
      'plane, or all in space'),
     *((f'{tag} 5 6', f'unknown tag {tag!r}; expected VERTEX_SE2, EDGE_SE2, ')

@@ -332,8 +332,8 @@ def test_what_is_wrong_is_named(put, path, value, said):
 
 
 @pytest.mark.parametrize('text, said', [
-    ('', 'no JSON'), ('[' * 100_000, 'without an end'), ('[1]', 'expected an object'),
-    ('{"a":' * 3000, 'without an end'), ('1' * 5000, 'too many digits'), ('{"a": NaN', 'no JSON'),
+    ('', 'not JSON'), ('[' * 100_000, 'too deeply'), ('[1]', 'expected an object'),
+    ('{"a":' * 3000, 'too deeply'), ('1' * 5000, 'too many digits'), ('{"a": NaN', 'not JSON'),
     ('{"measurements": {}}', 'no edges'), ('{"measurements": {"ab": []}}', 'single character')])
 def test_text_that_is_none(put, text, said):
     with pytest.raises(FileError, match=said):

@@ -46,13 +46,16 @@ class LoopOptions(Options):
     """How loop closures are read."""
 
     covariance_source: str = option(
-        'message', 'message: as stated, the model where that is unusable; model: the sigmas below',
-        '', choices=('message', 'model'))
-    sigma_translation: float = option(0.1, 'model: of the position', 'm', 1e-9, 1e6)
-    sigma_rotation: float = option(0.05, 'model: of the heading', 'rad', 1e-9, 1e6)
+        'message', 'where the covariance of a loop comes from. message: from the message, or from '
+        'the model if that covariance is unusable; model: from the two sigmas below', '',
+        choices=('message', 'model'))
+    sigma_translation: float = option(
+        0.1, 'model: standard deviation of the position', 'm', 1e-9, 1e6)
+    sigma_rotation: float = option(
+        0.05, 'model: standard deviation of the heading', 'rad', 1e-9, 1e6)
     wait: float = option(
-        10.0, 'how long a loop for times not yet seen waits, on the clock of the odometry', 's',
-        0, 1e9)
+        10.0, 'how long a loop waits for odometry at its times, measured in odometry stamps; then '
+        'it expires', 's', 0, 1e9)
 
 
 class LoopFactors:
