@@ -118,10 +118,10 @@ def test_a_doubt_says_why_and_where(stamps, when):
     said = doubt_sentence([Doubt(kind, 1234, 2, 7, '2.5') for kind in (WEAK, OTHER_MAP)],
                           ids, stamps)
     assert said == (
-        'doubtful: the map may well be 2.5 m off: with the noise that was estimated, the loops that '
-        f'are used allow that much; 1,234 are left out, {where}; 1,234 refused loops agree with '
-        f'each other on another map, {where}. Vouch for a true loop, strike out a false one, or '
-        'state the right noise')
+        'doubtful: the map may well be 2.5 m off: with the noise that was estimated, the loops '
+        f'that are used allow that much; 1,234 are left out, {where}; 1,234 refused loops agree '
+        f'with each other on another map, {where}. Vouch for a true loop, strike out a false one, '
+        'or state the right noise')
     assert doubt_sentence((), ids, stamps) == ''
 
 
