@@ -12,8 +12,7 @@ What comes after a factorisation: covariances, and a small dense factor that gro
 The arrays of the sparse factor are those of `cholesky`. L^-1 e_p, the k columns of one keyframe p,
 is zero but on the way from p to the root of the elimination tree. The covariance of two keyframes
 is the product of their columns on what their ways have in common, which is the end of both. Where
-columns were too long to be kept, H^-1 e_p is solved for on the ways of those keyframes instead:
-in a chain a way may be as long as the chain.
+columns are too long to be kept, as in a chain, H^-1 e_p is solved for on the ways of those.
 
 Points are the keyframes that factors touch. Those that came later have no position in the factor;
 where they are hangs on another point, their parent: x = turn x_parent + noise. Triangles are kept
@@ -39,28 +38,21 @@ def reach(panels, first, start, pattern, offset, stride, owner, at, parent, turn
     """
     t, k = product.shape[:2]
     solved = np.where(begins < 0, at, -1)
-    ways = _ways(first, start, pattern, owner, solved)
     # Where in the columns each position on a way is.
     where, length = np.empty(len(owner), np.int32), 0
-    for s in ways:
-        for position in range(first[s], first[s + 1]):
-            where[position] = length
-            length += 1
+    for s in _ways(first, start, pattern, owner, solved):
+        where[first[s]:first[s + 1]] = np.arange(length, length + first[s + 1] - first[s])
+        length += first[s + 1] - first[s]
     values = np.zeros((k, length * k))
-    begin = at[t - 1]
     for q in range(k):
-        values[q, where[begin] * k + q] = 1.0
-    own_way, count = np.empty(len(ways), np.int32), 0
-    s = owner[begin]
-    while s >= 0:
-        own_way[count] = s
-        count += 1
+        values[q, where[at[t - 1]] * k + q] = 1.0
+    own = _ways(first, start, pattern, owner, at[t - 1:])
+    for s in own:
+        begin = max(first[s], at[t - 1])
         _climb_panel(panels[offset[s]:offset[s + 1]], stride[s],
                      pattern[start[s]:start[s + 1]], first[s + 1] - first[s], begin - first[s],
                      where, values, where[begin] * k)
-        s = _parent(first, start, pattern, owner, s)
-        begin = first[s]
-    columns, left = _along(first, own_way[:count], where, values)
+    columns, left = _along(first, own, where, values)
     solved[t - 1] = -1
     for s in _ways(first, start, pattern, owner, solved)[::-1]:
         _descend_panel(panels[offset[s]:offset[s + 1]], stride[s],
@@ -71,35 +63,27 @@ def reach(panels, first, start, pattern, offset, stride, owner, at, parent, turn
             _multiply(turn[s], product[parent[s]], product[s])
         elif at[s] < 0:
             product[s] = 0.0
-        elif s == t - 1:
-            _multiply_ends(columns.ravel(), columns.shape[1], columns, columns.shape[1],
-                           product[s])
-        elif begins[s] >= 0:
-            width, common = _lengths(first, start, pattern, owner, left, owner[at[s]], k)
-            _multiply_ends(kept[begins[s]:begins[s] + k * width], width, columns, common,
-                           product[s])
+        elif s < t - 1 and begins[s] < 0:
+            begin = where[at[s]] * k
+            product[s] = values[:, begin:begin + k].T
         else:
-            for a in range(k):
-                for b in range(k):
-                    product[s, a, b] = values[b, where[at[s]] * k + a]
+            width, common = _lengths(first, start, pattern, owner, left, owner[at[s]], k)
+            others = kept[begins[s]:begins[s] + k * width] if s < t - 1 else columns.ravel()
+            _multiply_ends(others, width, columns, common, product[s])
     return columns
 
 
 @compiled
 def _along(first, way, where, values):
     """Return the values on a way to the root, and how many numbers each supernode has left."""
-    k, width = len(values), 0
-    left = np.zeros(len(first) - 1, np.int64)
+    (k, end), width = values.shape, 0
+    left, columns = np.zeros(len(first) - 1, np.int64), np.empty(values.shape)
     for s in way[::-1]:
-        width += (first[s + 1] - first[s]) * k
-        left[s] = width
-    columns = np.empty((k, width))
-    for s in way:
         own, size = where[first[s]] * k, (first[s + 1] - first[s]) * k
-        begin = width - left[s]
-        for q in range(k):
-            columns[q, begin:begin + size] = values[q, own:own + size]
-    return columns, left
+        width += size
+        left[s], begin = width, end - width
+        columns[:, begin:begin + size] = values[:, own:own + size]
+    return columns[:, end - width:].copy(), left
 
 
 @compiled

@@ -101,9 +101,10 @@ def test_rows_of_wide_panels_are_whole_lines_of_the_cache(rng):
     layout.panels.reshape(69, 72)[:, 69:] = np.nan
     H = normal(system, np.ones(len(system.b)))
     check_solution(cholesky, H, rng)
-    found = cholesky.covariances(cholesky.pattern.position[:1].astype(np.int64), np.array([-1]),
-                                 np.zeros((1, 3, 3)))
-    assert_allclose(found[0], np.linalg.inv(H)[:3, :3], atol=1e-9)
+    none = np.array([-1, -1])
+    found, _ = cholesky.covariances(cholesky.pattern.position[:2].astype(np.int64), none,
+                                    np.zeros((2, 3, 3)), np.zeros(0), none)
+    assert_allclose(found, np.linalg.inv(H)[:6, 3:6].reshape(2, 3, 3), atol=1e-9)
     many = rng.standard_normal((23, 3, SAMPLES))
     expected = np.linalg.solve(H, many.reshape(69, -1))
     cholesky.solve_many(many)
