@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from l1slam_ros.core.errors import NoiseError
-from l1slam_ros.core.geometry.manifold import Array, Manifold
+from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
 
 Mask = NDArray[np.bool_]
 
@@ -248,6 +248,22 @@ def _is_definite(matrices: Array) -> Mask:
     definite = positive.copy()
     definite[doubtful] &= np.linalg.eigvalsh(correlation[doubtful])[:, 0] > _SINGULAR
     return definite
+
+
+def distinct(matrices: Array) -> tuple[Indices, Indices]:
+    """
+    Return the row of one of each distinct matrix, and which of these each is, (m,).
+
+    Measurements mostly share a few. Where more than a tenth of them differ, each is its own.
+    """
+    flat = matrices.reshape(len(matrices), np.prod(matrices.shape[1:]))
+    # Equal matrices have the same sum of entries, each times a number of its own.
+    with np.errstate(invalid='ignore', over='ignore'):
+        sums = flat @ np.sqrt(np.arange(2.0, 2 + flat.shape[1]))
+    _, rows, which = np.unique(sums, return_index=True, return_inverse=True)
+    if 10 * len(rows) <= len(flat) and np.array_equal(flat[rows][which], flat):
+        return rows, which
+    return np.arange(len(flat)), np.arange(len(flat))
 
 
 def whiten(sqrt_information: Array, vectors: Array) -> Array:

@@ -39,8 +39,8 @@ from l1slam_ros.core.robust.innovation import (
 )
 from l1slam_ros.core.robust.inspection import repeated_factors
 from l1slam_ros.core.robust.places import beside_refused, mates, places
-from l1slam_ros.core.solvers.block_cholesky import Pattern, cholesky_of, with_pattern
-from l1slam_ros.core.solvers.gauss_newton import l2_optimum
+from l1slam_ros.core.solvers.block_cholesky import with_pattern
+from l1slam_ros.core.solvers.gauss_newton import ChangingOrder, l2_optimum
 
 # At most one in so many true loops is refused for its noise alone; and of accepted ones, dropped.
 REFUSED = 1e-3
@@ -113,7 +113,7 @@ class Growth:
         self.learnt_of = np.zeros(0, bool)
         self.first_variance, self.at_their_word = np.ones(2), False
         self.posterior: Posterior
-        self._order: tuple[Indices, Pattern] | None = None
+        self._order: ChangingOrder | None = None
         self.slip_odds: dict[int, float] = {}
         none = np.zeros(len(self.factors), bool)
         self.ventured, self.in_tail, self.drops = none, ~none, none.astype(np.int64)
@@ -260,9 +260,8 @@ class Growth:
                 self.part = component_labels(self.graph.subset(self.accepted & ~self.cut))
             rows = np.flatnonzero(self.accepted)
             subgraph = self.subgraph(rows)
-            if self._order is None or not np.array_equal(rows, self._order[0]):
-                self._order = rows, cholesky_of(subgraph).pattern
-            cholesky = with_pattern(self._order[1], subgraph)
+            self._order = ChangingOrder.of(subgraph, rows, self._order)
+            cholesky = with_pattern(self._order.pattern, subgraph)
             self._check()
             self.poses, residual, solved = l2_optimum(subgraph, self.poses, cholesky,
                                                       lambda *_: self._check())

@@ -47,10 +47,10 @@ _NO_COLUMNS = np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, np.int32
 _LONG = 8000
 # Multiplications of numbers, some 50 ms, from which separators may pay for the loops that find
 # them: those are compiled at their first use on a machine, for 5 s.
-_VAST = 1.5e8
+VAST = 1.5e8
 # A graph that has grown by more is ordered anew, which is seldom enough to cost nothing. Had it
 # never been, City's last factorisation, six thousand keyframes on, would do a quarter more work.
-_GROWN = 1.1
+GROWN = 1.1
 # Multiplications of numbers from which a factorisation, of some 2 ms, is worth a second thread.
 _SHARED = 20e6
 # Part of its diagonal by which a loose keyframe is damped: above what factorising leaves of a
@@ -70,6 +70,8 @@ _NUMBER, _BYTES_PER_ENTRY = 8, 190
 _SECONDS_PER_ENTRY = 6e-6
 _FACTORISATIONS = 45
 _RATE = 1e10
+# Seconds a keyframe to find separators over the part of all multiplications that they spare.
+_SEARCH = 1.4e-5 / 0.5
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ class Pattern:
 
 
 def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
-                 before: Pattern | None = None) -> Pattern:
+                 before: Pattern | None = None, uses: int = _FACTORISATIONS) -> Pattern:
     """
     Return a pattern of little fill.
 
@@ -120,6 +122,7 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
     before : of fewer keyframes and factors. Until they are a tenth more, its order stays but for
         keyframes that new factors join and those above them in the elimination tree: finding that
         takes a fifth of the time, and it fills in little more
+    uses : factorisations to come; for few, separators are not worth the time
 
     Raises
     ------
@@ -127,13 +130,14 @@ def find_pattern(keyframe: Indices, size: int, most_blocks: int, k: int = 1,
 
     """
     graph = neighbours(keyframe, size)
-    if before is not None and before.found <= size < _GROWN * before.found:
+    if before is not None and before.found <= size < GROWN * before.found:
         begun = kernels.symbolic.untouched(*graph, *before.columns)
         pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), begun, before.found)
         if pattern is not None and pattern.blocks <= most_blocks:
             return pattern
     pattern = _laid_out(graph, most_blocks, np.zeros(size, np.int32), _NO_COLUMNS, size)
-    for dissect, least in (kernels.ordering.dissect, 0.0), (kernels.dissection.dissect, _VAST):
+    vast = max(VAST, _SEARCH * size * _RATE / uses)
+    for dissect, least in (kernels.ordering.dissect, 0.0), (kernels.dissection.dissect, vast):
         if pattern is None or pattern.work * k**3 > max(_LONG * size, least):
             dissected = _laid_out(graph, most_blocks, dissect(*graph), _NO_COLUMNS, size)
             if dissected and not (pattern and pattern.work <= dissected.work):
@@ -327,9 +331,10 @@ def _whole_lines(numbers: Indices) -> Indices:
     return -(-numbers // _LINE) * _LINE
 
 
-def cholesky_of(graph: FactorGraph, before: Pattern | None = None) -> BlockCholesky:
+def cholesky_of(graph: FactorGraph, before: Pattern | None = None,
+                uses: int = _FACTORISATIONS) -> BlockCholesky:
     """
-    Return what factors the systems of a graph; before : see `find_pattern`.
+    Return what factors the systems of a graph; before, uses : see `find_pattern`.
 
     Raises
     ------
@@ -340,14 +345,13 @@ def cholesky_of(graph: FactorGraph, before: Pattern | None = None) -> BlockChole
     keyframe = keyframes_of(graph, fixed)
     try:
         pattern = find_pattern(keyframe, graph.n_poses - fixed, most_blocks(graph),
-                               graph.manifold.TANGENT_SIZE, before)
+                               graph.manifold.TANGENT_SIZE, before, uses)
     except FillError as error:
         takes = needs(graph, error.blocks, 0.0).memory
         raise FillError(
             f'factorising {graph.n_poses} keyframes and {len(graph.between)} factors takes '
             f'{memory.in_gigabytes(takes)} of memory or more, and '
-            f'{memory.in_gigabytes(memory.free())} are free',
-            error.blocks) from error
+            f'{memory.in_gigabytes(memory.free())} are free', error.blocks) from error
     return BlockCholesky(pattern, keyframe, loose_keyframes(graph))
 
 

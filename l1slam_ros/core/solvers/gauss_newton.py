@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l1slam_ros.core.geometry.manifold import Array
+from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import (
     LinearSystem,
@@ -29,7 +29,13 @@ from l1slam_ros.core.graph.linear_system import (
     step_poses,
     whitened_residual,
 )
-from l1slam_ros.core.solvers.block_cholesky import BlockCholesky
+from l1slam_ros.core.solvers.block_cholesky import (
+    GROWN,
+    VAST,
+    BlockCholesky,
+    Pattern,
+    cholesky_of,
+)
 from l1slam_ros.core.solvers.nonlinear import Report, Solution
 from l1slam_ros.core.solvers.optimality import (
     Huber,
@@ -55,6 +61,8 @@ _SURPRISE = 0.1
 # Part of what its linear problem promised that a step has to bring, else others are looked at; and
 # of a last one, which is to say that little is left.
 _BRINGS, _LAST = 0.5, 0.25
+# Factorisations of one set of factors where they come and go.
+_FEW = 4
 # The least part of a step: where less is best, it goes the wrong way, and damping turns it.
 _SHORTEST = 0.25
 
@@ -203,6 +211,32 @@ def _nearer(graph: FactorGraph, here: _At, there: _At, step: Array, predicted: f
     step = weighted_least_squares(system, cholesky, weights)
     bent = _at(graph, step_part(graph, there.poses, step, entries), norm)
     return (bent if bent.cost < best.cost else best), True
+
+
+@dataclass(frozen=True)
+class ChangingOrder:
+    """
+    In which order a graph is eliminated whose factors come and go, for a few steps of each.
+
+    rows : (k,) the numbers of the factors; pattern : of these; anew : how many there were when
+    their order was last found without one before it
+    """
+
+    rows: Indices
+    pattern: Pattern
+    anew: int
+
+    @classmethod
+    def of(cls, graph: FactorGraph, rows: Indices,
+           before: 'ChangingOrder | None') -> 'ChangingOrder':
+        """Return the order of a graph; where finding one takes long, most of it stays."""
+        if before and np.array_equal(rows, before.rows):
+            return before
+        k = graph.manifold.TANGENT_SIZE
+        if before and len(rows) <= GROWN * before.anew and before.pattern.work * k**3 > VAST:
+            return cls(rows, cholesky_of(graph, before.pattern, _FEW).pattern, before.anew)
+        return cls(rows, cholesky_of(graph, None, _FEW).pattern, len(rows))
+
 
 
 def l2_map(graph: FactorGraph, poses: Array, cholesky: BlockCholesky,

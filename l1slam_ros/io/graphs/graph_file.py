@@ -21,7 +21,7 @@ import numpy as np
 from l1slam_ros.core.errors import FileError, NoiseError
 from l1slam_ros.core.geometry import se3
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import Mask, square_root_information
+from l1slam_ros.core.geometry.noise import Mask, distinct, square_root_information
 from l1slam_ros.core.graph.factor_graph import WORLD, BetweenFactors, FactorGraph
 from l1slam_ros.core.names import QUATERNION
 from l1slam_ros.core.robust.odometry.drift import straightened
@@ -243,7 +243,8 @@ def roots_of(path: object, rows: Rows) -> Array:
         return True
 
     try:
-        return square_root_information(rows.scaled)
+        place, which = distinct(rows.scaled)
+        return square_root_information(rows.scaled[place])[which]
     except NoiseError as error:
         k = first_failure(len(rows), works)
         entries = ' '.join(f'{v:g}' for v in rows.information[k].ravel())
@@ -338,15 +339,20 @@ def _lines(path: Path, record: GraphRecord, kind: str, ids: Indices, pose: Array
     # An absolute pose in space has the number of an offset where others have the second id.
     ids = np.pad(ids[:, :tag.vertices], ((0, 0), (0, tag.ids - tag.vertices)))
     values = pose[:, :tag.values]
+    place, which = distinct(roots)
     if tag.information:
         rows, columns = np.array(tag.information).T
-        roots = roots / tag.units(record.rotation_information)
-        information = rounded(roots.transpose(0, 2, 1) @ roots)
-        values = np.concatenate((values, information[:, rows, columns]), axis=1)
+        roots = roots[place] / tag.units(record.rotation_information)
+        information = rounded(roots.transpose(0, 2, 1) @ roots)[:, rows, columns]
+        values = np.concatenate((values, information[which]), axis=1)
     readable = (np.abs(values) <= LARGEST).all(axis=1)
     if not readable.all():
         k = int(np.argmin(readable))
         line = ' '.join((name, *map(str, ids[k]), 'would be', *(f'{v:g}' for v in values[k])))
         raise FileError(path, f'{line}; expected numbers up to {LARGEST:g}; nothing written')
     # %r: the fewest digits, 17 at most, that read back as the very same number.
-    return formatted(f'{name}{" %d" * ids.shape[1]}{" %r" * values.shape[1]}', ids, values)
+    head = f'{name}{" %d" * ids.shape[1]}{" %r" * tag.values}'
+    if not tag.information:
+        return formatted(head, ids, values)
+    said = '\n'.join(formatted(' %r' * len(tag.information), information)).split('\n')
+    return formatted(f'{head}%s', ids, values[:, :tag.values], np.array(said, object)[which, None])

@@ -17,7 +17,7 @@ import numpy as np
 from l1slam_ros.core.errors import FileError
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.geometry.manifold import Array, Indices, Manifold
-from l1slam_ros.core.geometry.noise import LEAST_EIGENVALUE, Mask, nearest_definite
+from l1slam_ros.core.geometry.noise import LEAST_EIGENVALUE, Mask, distinct, nearest_definite
 from l1slam_ros.core.names import QUATERNION
 from l1slam_ros.io.files import (
     TextLines,
@@ -198,13 +198,15 @@ def made_definite(edges: Rows) -> tuple[Rows, list[str]]:
 
     See `nearest_definite`, in the units of the residual; there is no sentence where all was.
     """
-    nearest, least = nearest_definite(edges.scaled)
+    place, which = distinct(edges.scaled)
+    nearest, least = nearest_definite(edges.scaled[place])
+    least = least[which]
     changed = np.flatnonzero(np.isfinite(least))
     if not len(changed):
         return edges, []
     information = edges.information.copy()
     units = edges.units[changed]
-    information[changed] = nearest[changed] / (units[:, :, None] * units[:, None, :])
+    information[changed] = nearest[which[changed]] / (units[:, :, None] * units[:, None, :])
     worst = changed[np.argmin(least[changed])]
     sentence = (f'{len(changed):,} of {counted(len(edges), "information matrix", _MATRICES)} not '
                 f'positive definite, the worst at line {edges.lines[worst]:,}: its smallest '

@@ -10,7 +10,7 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from problems import random_information
 
 from l1slam_ros.core.errors import L1SlamError, NoiseError
@@ -18,6 +18,7 @@ from l1slam_ros.core.geometry.noise import (
     LEAST_VARIANCE,
     MOST_OF_ODOMETRY,
     MOST_VARIANCE,
+    distinct,
     root_of_inverse,
     square_root_information,
     usable,
@@ -118,3 +119,12 @@ def test_variances_are_bounded_and_the_others_stay(stated, of_loop, of_odometry)
         assert_allclose(found[0], correlated(used, 0.0 if used == 0.5 else 0.5), rtol=1e-12)
         assert_allclose(np.reshape(bounded, (-1, 2)),
                         [(stated, used)] if stated != used else np.zeros((0, 2)))
+
+
+@pytest.mark.parametrize('kinds, count', [(3, 100), (50, 100), (1, 0)])
+def test_equal_matrices_are_found(kinds, count, rng):
+    each = rng.standard_normal((kinds, 3, 3))
+    matrices = each[rng.integers(kinds, size=count)]
+    rows, which = distinct(matrices)
+    assert_array_equal(matrices[rows][which], matrices)
+    assert len(rows) == (min(kinds, count) if kinds <= count / 10 else count)

@@ -16,6 +16,8 @@ from problems import chain_of, graph_of
 from l1slam_ros.core.names import KINDS_OF_FALSE_LOOPS
 from l1slam_ros.core.robust import batch_map
 from l1slam_ros.core.robust.odometry.drift import straightened, vote
+from l1slam_ros.core.worlds.false_loops import random_false_loops
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world, with_false_loops
 
 DRIFT = 0.05
 WORLD = careful_world(400, 800)
@@ -49,6 +51,13 @@ def test_odometry_that_does_not_drift_is_left_as_it_is():
     assert abs(vote(WORLD.graph)[0]) < 2e-3
     bad = spoilt(WORLD, 'random', 400)
     assert batch_map.solve(bad.graph, None, batch_map.SolveOptions()).judgement.drift == 0
+
+
+def test_what_no_loop_can_tell_over_all_of_the_way_is_no_drift(rng):
+    """Of a long way, chance alone prefers some drift of micro-radians to none."""
+    world = simulate_world(25_000, 50_000, WorldOptions(), np.random.default_rng(1))
+    lies = random_false_loops(world.graph, world.truth, 7_500, rng)
+    assert vote(with_false_loops(world, lies).graph) == (0.0, -np.inf)
 
 
 @pytest.mark.parametrize('norm', ['l1', 'l2'])

@@ -16,9 +16,11 @@ from problems import chain_of, graph_of, measure, straight
 from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.draws import keys
 from l1slam_ros.core.graph.factor_graph import FactorGraph
-from l1slam_ros.core.robust import innovation, rounds
+from l1slam_ros.core.robust import innovation
 from l1slam_ros.core.robust.batch import robust_solve
 from l1slam_ros.core.robust.rounds import Growth
+from l1slam_ros.core.solvers import gauss_newton
+from l1slam_ros.core.solvers.block_cholesky import cholesky_of
 
 
 def test_few_true_loops_are_beyond_the_gate(monkeypatch):
@@ -118,8 +120,8 @@ def test_a_long_part_behind_a_step_that_says_nothing_is_judged():
 
 def test_an_order_is_found_once_for_the_same_factors(monkeypatch):
     growth, found = Growth(careful_world(200, 600, 0).graph), []
-    monkeypatch.setattr(rounds, 'cholesky_of', lambda graph, find=rounds.cholesky_of: (
-        found.append(len(graph.between)) or find(graph)))
+    monkeypatch.setattr(gauss_newton, 'cholesky_of', lambda graph, *how, find=cholesky_of: (
+        found.append(len(graph.between)) or find(graph, *how)))
     growth.accepted[:] = True
     growth.solve()
     assert growth.accepted.all() and found == [600]

@@ -31,8 +31,15 @@ from l1slam_ros.core.geometry import se2
 from l1slam_ros.core.graph.factor_graph import FactorGraph
 from l1slam_ros.core.graph.linear_system import linearise
 from l1slam_ros.core.kernels.prediction import SAMPLES
-from l1slam_ros.core.solvers import block_cholesky
-from l1slam_ros.core.solvers.block_cholesky import BlockCholesky, cholesky_of, find_pattern
+from l1slam_ros.core.solvers import block_cholesky, gauss_newton
+from l1slam_ros.core.solvers.block_cholesky import (
+    BlockCholesky,
+    cholesky_of,
+    find_pattern,
+    with_pattern,
+)
+from l1slam_ros.core.solvers.gauss_newton import ChangingOrder
+from l1slam_ros.core.worlds.simulate import WorldOptions, simulate_world
 
 N = 26
 
@@ -361,6 +368,38 @@ def test_a_graph_that_grows_keeps_its_order_for_a_while(rng):
         assert_allclose(system.transposed_times(system.times(x)) + 0.1 * x, right, atol=1e-9)
     least = len(first.columns[-1]) - 1
     assert len(find_pattern(np.array([(0, 1)]), 20, least, 3, first).columns[-1]) == 1
+
+
+@pytest.mark.parametrize('vast, passed_on', [(0.0, [False, True, True, False]),
+                                             (np.inf, [False] * 4)])
+def test_while_most_factors_stay_an_order_is_passed_on(vast, passed_on, rng, monkeypatch):
+    """Where finding one takes long; solutions are those by an order of their own."""
+    asked = []
+    find = block_cholesky.find_pattern
+
+    def noted(*arguments):
+        *_, before, uses = arguments
+        if uses == gauss_newton._FEW:
+            asked.append(before is not None)
+        return find(*arguments)
+
+    monkeypatch.setattr(block_cholesky, 'find_pattern', noted)
+    monkeypatch.setattr(gauss_newton, 'VAST', vast)
+    world = simulate_world(300, 900, WorldOptions(), rng)
+    odometry = np.flatnonzero(world.graph.between.is_odometry)
+    loops = np.flatnonzero(~world.graph.between.is_odometry)
+    order = None
+    for count in (500, 520, 520, 510, 600):
+        rows = np.sort(np.concatenate((odometry, loops[:count])))
+        part = world.graph.subset(rows)
+        system = linearise(part, world.odometry)
+        steps = []
+        order = ChangingOrder.of(part, rows, order)
+        for cholesky in (with_pattern(order.pattern, part), cholesky_of(part)):
+            assert cholesky.factorise(system, np.ones_like(system.b))
+            steps.append(cholesky.solve(system.transposed_times(system.b)))
+        assert_allclose(*steps, atol=1e-7)
+    assert asked == passed_on
 
 
 def test_too_much_fill_is_refused():

@@ -93,6 +93,8 @@ def vote(graph: FactorGraph) -> tuple[float, float]:
             _highest(phi, metres, own[:, 2, 2] + q * (turned[high] - turned[low]), weight,
                      usual + q * walk) for q in _NOISE)
     value, drift, lead = best['drift']
+    if abs(drift) * way[-1] < np.sqrt(np.median(own[:, 2, 2])):
+        return 0.0, -np.inf  # all of the way, it turns by less than a loop can tell
     return drift, min(value - best['none'][0], lead - np.log(1 / DOUBT - 1))
 
 
