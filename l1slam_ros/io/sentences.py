@@ -23,6 +23,7 @@ from l1slam_ros.core.robust.judgement import (
     ONE_JOINS,
     ONE_PLACE,
     OTHER_MAP,
+    PARTS,
     SLIP,
     UNFINISHED,
     UNSOLVED,
@@ -76,6 +77,8 @@ _REASONS = {
             '{loops} loops {where} are left out',
     UNSOLVED: 'solving for the {loops} loops that are believed failed ({detail}): this is the map '
               'by which they were judged',
+    PARTS: '{detail} parts that nothing accepted joins, {where}, so where one lies from another '
+           'is a guess; {loops} loops between them are left out',
 }
 _REMEDY = 'Vouch for a loop that is right, strike out one that is false, or state the noise'
 
