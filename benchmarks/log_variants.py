@@ -63,13 +63,16 @@ class TrueLog:
         return np.array([scan.stamp for scan in self.log.scans])
 
 
-def _every_metre(given: TrueLog, _: np.random.Generator) -> TrueLog:
-    rows, wheels = [0], given.log.wheels
-    for k, pose in enumerate(wheels):
-        moved = abs(se2.between(wheels[rows[-1]][None], pose[None])[0])
-        if np.hypot(moved[0], moved[1]) >= 1.0 or moved[2] >= 0.5:
-            rows.append(k)
-    return given.kept(np.array(rows))
+def _apart(metres: float) -> Callable[[TrueLog, np.random.Generator], TrueLog]:
+    def kept(given: TrueLog, _: np.random.Generator) -> TrueLog:
+        rows = [0]
+        wheels = given.log.wheels
+        for k, pose in enumerate(wheels):
+            moved = abs(se2.between(wheels[rows[-1]][None], pose[None])[0])
+            if np.hypot(moved[0], moved[1]) >= metres or moved[2] >= 0.5:
+                rows.append(k)
+        return given.kept(np.array(rows))
+    return kept
 
 
 def _of_ranges(change: Callable[[Array, np.random.Generator], Array]
@@ -78,9 +81,13 @@ def _of_ranges(change: Callable[[Array, np.random.Generator], Array]
         lambda scan: replace(scan, ranges=change(scan.ranges, rng)))
 
 
-def _half_of_rays(given: TrueLog, _: np.random.Generator) -> TrueLog:
-    return given.changed(lambda scan: replace(
-        scan, ranges=scan.ranges[::2], angle_increment=2 * scan.angle_increment))
+def _one_ray_of(n: int) -> Callable[[TrueLog, np.random.Generator], TrueLog]:
+    return lambda given, _: given.changed(lambda scan: replace(
+        scan, ranges=scan.ranges[::n], angle_increment=n * scan.angle_increment))
+
+
+def _seen_within(metres: float) -> Callable[[TrueLog, np.random.Generator], TrueLog]:
+    return _of_ranges(lambda ranges, _: np.where(ranges < metres, ranges, np.inf))
 
 
 def _backwards(given: TrueLog, _: np.random.Generator) -> TrueLog:
@@ -123,9 +130,16 @@ def _carried(given: TrueLog, _: np.random.Generator) -> TrueLog:
                    truth=given.truth[~cut])
 
 
-def _with_gaps(given: TrueLog, _: np.random.Generator) -> TrueLog:
-    since = (given.times - given.times[0]) % (100 * _SECOND)
-    return given.kept(np.flatnonzero((since < 30 * _SECOND) | (since >= 35 * _SECOND)))
+def _with_gaps(seconds: int) -> Callable[[TrueLog, np.random.Generator], TrueLog]:
+    def kept(given: TrueLog, _: np.random.Generator) -> TrueLog:
+        since = (given.times - given.times[0]) % (100 * _SECOND)
+        return given.kept(np.flatnonzero(
+            (since < 30 * _SECOND) | (since >= (30 + seconds) * _SECOND)))
+    return kept
+
+
+def _without_wheels(given: TrueLog, _: np.random.Generator) -> TrueLog:
+    return given.driven(np.zeros_like(given.steps))
 
 
 def _noisy(ranges: Array, rng: np.random.Generator) -> Array:
@@ -141,14 +155,21 @@ def _random_rays(ranges: Array, rng: np.random.Generator) -> Array:
 VARIANTS: dict[str, Callable[[TrueLog, np.random.Generator], TrueLog]] = {
     'as recorded': lambda given, _: given,
     'every fourth scan': lambda given, _: given.kept(np.arange(0, len(given.log.scans), 4)),
-    'a scan each metre or .5 rad': _every_metre,
-    'half of the rays': _half_of_rays,
-    'nothing seen beyond 5 m': _of_ranges(lambda ranges, _: np.where(ranges < 5, ranges, np.inf)),
+    'a scan each .5 m or .5 rad': _apart(0.5),
+    'a scan each .75 m or .5 rad': _apart(0.75),
+    'a scan each metre or .5 rad': _apart(1.0),
+    'a scan each 1.5 m or .5 rad': _apart(1.5),
+    'half of the rays': _one_ray_of(2),
+    'a quarter of the rays': _one_ray_of(4),
+    'nothing seen beyond 5 m': _seen_within(5.0),
+    'nothing seen beyond 8 m': _seen_within(8.0),
     '5 cm of noise': _of_ranges(_noisy),
     'a tenth of the rays random': _of_ranges(_random_rays),
     'backwards in time': _backwards,
     'mirrored': _mirrored,
     'worse wheels': _worse_wheels,
     'carried away': _carried,
-    'no scans for 5 s of 100': _with_gaps,
+    'no scans for 5 s of 100': _with_gaps(5),
+    'no scans for 20 s of 100': _with_gaps(20),
+    'no wheels': _without_wheels,
 }

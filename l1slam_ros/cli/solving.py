@@ -122,12 +122,9 @@ def _read(arguments: argparse.Namespace) -> tuple[GraphRecord, 'ScanMap | None']
 
 
 def _remarks(outcome: Outcome) -> Iterator[str]:
-    """Yield a sentence on each limit of a map: loops not judged, parts not joined."""
+    """Yield that loops were not judged, where they were not."""
     if outcome.unjudged:
         yield f'no loop was doubted: {outcome.unjudged}'
-    if outcome.parts > 1:
-        yield (f'{outcome.parts:,} parts that nothing accepted joins: where one lies from another '
-               'is a guess')
 
 
 def _write(arguments: argparse.Namespace, record: GraphRecord, outcome: Outcome,

@@ -22,6 +22,7 @@ from l1slam_ros.core.robust.judgement import (
     ONE_JOINS,
     ONE_PLACE,
     OTHER_MAP,
+    PARTS,
     SLIP,
     UNFINISHED,
     UNSOLVED,
@@ -77,6 +78,8 @@ _REASONS = {
             'then, and {loops} loops {where} are left out',
     UNSOLVED: 'solving for the {loops} accepted loops failed ({detail}): this is the map by which '
               'they were judged',
+    PARTS: 'no accepted loop joins {detail} parts of the map, {where}, so their relative poses are '
+           'guesses; {loops} loops between them are left out',
 }
 _REMEDY = 'Vouch for a true loop, strike out a false one, or state the right noise'
 

@@ -27,6 +27,7 @@ from l1slam_ros.core.robust.judgement import (
     ONE_JOINS,
     ONE_PLACE,
     OTHER_MAP,
+    PARTS,
     SLIP,
     UNFINISHED,
     UNSOLVED,
@@ -72,6 +73,8 @@ _ADVICE = {
     UNFINISHED: 'A few loops ticked as true or as false shorten the judgement.',
     NORM: 'No single loop settles this. Switch to the least squares map: if that is the place as '
           'you know it, solve with `--norm l2`.',
+    PARTS: 'Loops between the parts that are surely true, ticked as true, say where one lies from '
+           'another. Each part on its own is a map.',
     FAILED: 'Please report the sentence.', UNSOLVED: 'Please report the sentence.'}
 # Doubts that no decision about loops settles.
 _UNSETTLED = NORM, FAILED, UNSOLVED

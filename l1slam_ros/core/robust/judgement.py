@@ -21,7 +21,7 @@ import numpy as np
 
 from l1slam_ros.core.geometry.manifold import Array, Indices
 from l1slam_ros.core.geometry.noise import Mask
-from l1slam_ros.core.graph.factor_graph import FactorGraph
+from l1slam_ros.core.graph.factor_graph import BetweenFactors, FactorGraph
 from l1slam_ros.core.robust.forecast import (
     CONFIDENT,
     forecast,
@@ -39,7 +39,7 @@ from l1slam_ros.core.robust.rounds import Growth
 # odometry factor may have slipped, and it was not believed; the odometry drifts, which was taken
 # for noise; there were more rounds to come; another norm of the same factors has another map;
 # judging the loops failed, and what is believed is what was by then; so did solving for what is
-# believed.
+# believed; nothing accepted joins two parts.
 WEAK = 'a weak map'
 ONE_PLACE = 'one place'
 ONE_JOINS = 'one place joins'
@@ -50,6 +50,7 @@ UNFINISHED = 'not at an end'
 NORM = 'another norm'
 FAILED = 'judging failed'
 UNSOLVED = 'solving failed'
+PARTS = 'parts'
 # Of fewer loops nothing is recorded.
 _HANDFUL = 5
 
@@ -196,6 +197,15 @@ def doubt_of(pairs: Indices, n_poses: int, kind: str, detail: str) -> Doubt:
     """Return a doubt about the loops between pairs of keyframes (k, 2), none: about them all."""
     first, last = (max(int(pairs.min()), 0), int(pairs.max())) if len(pairs) else (0, n_poses - 1)
     return Doubt(kind, len(pairs), first, last, detail, listed(pairs))
+
+
+def doubt_of_parts(factors: BetweenFactors, part: Indices) -> Doubt:
+    """Return the doubt of a map whose keyframes are of parts (n,) that nothing accepted joins."""
+    firsts = np.unique(part, return_index=True)[1]
+    pairs = factors.pairs[~factors.is_odometry & ~factors.is_absolute & ~factors.struck]
+    across = pairs[part[pairs[:, 0]] != part[pairs[:, 1]]]
+    return Doubt(PARTS, len(across), int(firsts[1]) - 1, int(firsts[-1]), f'{len(firsts):,}',
+                 listed(across))
 
 
 def listed(pairs: Indices) -> tuple[tuple[int, int], ...]:
