@@ -282,8 +282,8 @@ def test_a_doubt_is_said_even_quietly_with_the_times_of_a_bag_and_beside_its_dam
 
 @pytest.mark.parametrize(('poses', 'true', 'lies', 'code'), [
     (150, 101, 150, 0), (150, 101, 1800, 0), (600, 5, 100, 4)])
-def test_a_weak_map_is_doubtful_and_one_whose_most_loops_are_refused_is_not(capsys, tmp_path, poses, true,
-                                                                  lies, code):
+def test_a_weak_map_is_doubtful_and_not_one_of_many_lies(capsys, tmp_path, poses, true, lies,
+                                                         code):
     """Of maps that most loops are refused of, those that the others hold were right."""
     world, bad = tmp_path / 'world.g2o', tmp_path / 'bad.g2o'
     run(capsys, 'simulate', world, '--poses', poses, '--edges', poses - 1 + true)

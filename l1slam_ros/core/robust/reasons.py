@@ -132,12 +132,17 @@ def _may_be_right(growth: Growth, group: Indices, accepted: Mask) -> bool:
 
     Then the odometry slipped at a step that the group spans and no accepted loop does. Of all
     steps one is expected to have slipped: if these are less than a hundredth of them, a place is
-    rather one mistake.
+    rather one mistake. Or the group is of several places, all seen from one keyframe that is out
+    of line: the odometry slipped to it, and back.
     """
-    across = spanned(growth.low[accepted], growth.high[accepted], growth.graph.n_poses)
-    untold = np.count_nonzero(across[growth.low[common_steps(growth, group)]] == 0)
-    few = DOUBT * np.count_nonzero(~growth.is_loop) if growth.may_err_as_one(group, 2) else 1
-    return bool(untold >= few)
+    low, high = growth.low, growth.high
+    across = spanned(low[accepted], high[accepted], growth.graph.n_poses)
+    untold = np.count_nonzero(across[low[common_steps(growth, group)]] == 0)
+    if growth.may_err_as_one(group, 2):
+        return bool(untold >= DOUBT * np.count_nonzero(~growth.is_loop))
+    told = np.concatenate((low[accepted], high[accepted]))
+    return bool(untold) or any(not np.ptp(ends) and ends[0] not in told
+                               for ends in (low[group], high[group]))
 
 
 def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:
