@@ -120,8 +120,8 @@ def test_a_doubt_says_why_and_where(stamps, when):
     assert said == (
         'doubtful: the map may well be 2.5 m off: by the noise that was found, the loops that are '
         f'used hold it no better; 1,234 are left out, {where}; 1,234 refused loops agree with '
-        f'each other on another map, {where}. Vouch for a loop that is right, strike out one that is '
-        'false, or state the noise')
+        f'each other on another map, {where}. Vouch for a loop that is right, strike out one that '
+        'is false, or state the noise')
     assert doubt_sentence((), ids, stamps) == ''
 
 
