@@ -25,6 +25,7 @@ from l1slam_ros.core.robust.forecast import drift_taken_for_noise
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
+    HANDFUL,
     ONE_JOINS,
     ONE_PLACE,
     OTHER_MAP,
@@ -41,9 +42,6 @@ from l1slam_ros.core.robust.pairwise_consistency import (
 )
 from l1slam_ros.core.robust.places import join_what_no_other
 from l1slam_ros.core.robust.rounds import Growth
-
-# Fewer loops may well be of one place.
-_HANDFUL = 5
 
 
 def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
@@ -73,7 +71,7 @@ def _decides_alone(growth: Growth, accepted: Indices) -> bool:
 
     As one loop, by the median of what they say, it would not be believed by odometry alone.
     """
-    if (len(accepted) < _HANDFUL or not growth.may_err_as_one(accepted, 2)
+    if (len(accepted) < HANDFUL or not growth.may_err_as_one(accepted, 2)
             or (growth.trusted | growth.factors.is_absolute)[accepted].any()):
         return False
     odometry = growth.copy()
