@@ -130,12 +130,12 @@ MADE: dict[str, Callable[[int], Place]] = {
 
 
 # Kinds of drawn worlds. The first number of a seed is that of its set: weights are fitted on the
-# first, the others are fresh. The second was looked at while rules were made.
+# first, the others are fresh. Rules were made with a look at the second and the third.
 _DRAWN: dict[str, Callable[[np.random.Generator], Place]] = {
     'streets': drawn.streets, 'laps': drawn.laps, 'spokes': drawn.spokes, 'lawn': drawn.lawn,
     'rings': lambda rng: _ring(int(rng.integers(10**6)), rng.random() < 0.3),
     'corridors': lambda rng: _corridor(int(rng.integers(10**6)), rng.random() < 0.3)}
-_FITTED, _LOOKED_AT, _NEVER_SEEN = 1, 2, 3
+_FITTED, _LOOKED_AT, _NEVER_SEEN = 1, (2, 3), 4
 
 
 def runs_drawn(base: int, count: int) -> Iterator[Row]:
@@ -231,7 +231,7 @@ def main() -> int:
     parser.add_argument('--datasets', type=Path, required=True)
     parser.add_argument('--seeds', type=int, default=3, help='of graphs that are made')
     parser.add_argument('--drawn', type=int, default=30, help='worlds of each kind')
-    parser.add_argument('--fresh', type=int, nargs='*', default=(_LOOKED_AT, _NEVER_SEEN),
+    parser.add_argument('--fresh', type=int, nargs='*', default=(*_LOOKED_AT, _NEVER_SEEN),
                         help='the numbers of sets of fresh worlds, from 2 on')
     parser.add_argument('--only', nargs='+', choices=FIT + HELD, default=FIT + HELD)
     given = parser.parse_args()

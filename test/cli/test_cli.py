@@ -316,7 +316,7 @@ def test_where_the_odometry_is_full_of_gaps_nothing_is_there_to_judge_by(capsys,
     (doubt,) = report['doubts']
     assert report['parts'] == 2 and report['status'] == 'doubtful'
     assert (doubt['kind'], doubt['loops']) == ('parts', [[0, 2]])
-    assert doubt['text'].startswith('2 parts that nothing accepted joins, between 1 and 2')
+    assert doubt['text'].startswith('no accepted loop joins 2 parts of the map, between 1 and 2')
     assert report['warnings'] == [f'doubtful: {doubt["text"]}. {REMEDY}']
     assert err == f'l1slam: {report["warnings"][0]}\n'
     assert report['suspect'] == [[0, 2]] and not report['rejected']

@@ -181,7 +181,7 @@ def test_a_world_in_space_is_drawn_in_space(capsys, tmp_path):
     assert len(shown(page)['maps'][0]['at']) == 3
 
 
-def test_a_slip_and_most_loops_refused_have_rivals(capsys, tmp_path):
+def test_a_slip_and_a_weak_map_have_rivals(capsys, tmp_path):
     world, bad = tmp_path / 'world.g2o', tmp_path / 'bad.g2o'
     run(capsys, 'simulate', world, '--poses', 600, '--edges', 604)
     run(capsys, 'corrupt', world, bad, '--false-loops', 100)
@@ -194,9 +194,7 @@ def test_a_slip_and_most_loops_refused_have_rivals(capsys, tmp_path):
     (tmp_path / 'torn.g2o.trusted.txt').write_text(''.join(
         f'{i} {j}\n' for i, j in report['doubts'][0]['loops']))
     page, report = reported(capsys, path)
-    # What is vouched for outnumbers the true loops, three of which still agree with each other.
-    another, doubt = report['doubts']
-    assert another['kind'] == 'another map' and len(another['loops']) == 3
+    doubt, = report['doubts']
     assert doubt['kind'] == 'a slip suspected'
     *_, rival = shown(page)['maps'][1:]
     step = doubt['text'].split(' between ')[1].split(':')[0].split(' and ')

@@ -31,13 +31,11 @@ _WEIGHTS = np.array([-4.32, 5.17, 1.41, 2.55, 3.86, 3.45])
 CONFIDENT = 0.9
 # A right map is off by so much at most: [m], or this part of its diagonal.
 _OFF, _OFF_PART = 0.25, 0.005
-# A map that is surer of itself, or less, by these factors is no more likely to be right, or wrong.
-_SUREST, _LEAST_SURE = 0.3, 30.0
+# A map that is surer of itself than by this factor is no more likely to be right.
+_SUREST = 0.3
 # [sigmas] A drift counts from here on, where the map is less sure of itself than a right one is
 # exact.
 _SURE_DRIFT = 3.5
-# So many samples of the posterior tell how sure it is.
-_ASKED = 16
 
 
 def forecast(terms: Array) -> float:
@@ -52,7 +50,7 @@ def terms_of(accepts_any: bool, unsure: float, *reasons: bool) -> Array:
     accepts_any : whether any loop is accepted; unsure : see `unsureness`; reasons : whether
     odometry drifts, refused loops agree on another map, a slip is suspected
     """
-    return np.array([1.0, not accepts_any, np.log(np.clip(unsure, _SUREST, _LEAST_SURE)),
+    return np.array([1.0, not accepts_any, np.log(max(unsure, _SUREST)),
                      *reasons])
 
 
@@ -78,7 +76,7 @@ def unsureness(growth: Growth) -> float:
     positions = manifold.positions(poses)
     square = [absolute_trajectory_error(
         manifold.positions(manifold.retract(poses, samples[:, :, number])), positions) ** 2
-        for number in range(_ASKED)]
+        for number in range(samples.shape[2])]
     return float(np.sqrt(np.mean(square))) / right_within(positions)
 
 

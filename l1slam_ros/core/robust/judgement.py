@@ -52,7 +52,7 @@ FAILED = 'judging failed'
 UNSOLVED = 'solving failed'
 PARTS = 'parts'
 # Of fewer loops nothing is recorded.
-_HANDFUL = 5
+HANDFUL = 5
 
 
 @dataclass(frozen=True)
@@ -224,25 +224,20 @@ def judgement_of(growth: Growth, reasons: tuple[Doubt, ...] = (),
     loops = growth.is_loop[:size]
     slips = np.flatnonzero(slip[:size])
     unsure = unsureness(growth)
-    terms = _terms(growth, unsure, reasons)
+    kinds = {doubt.kind for doubt in reasons}
+    terms = terms_of(bool((growth.is_loop & growth.accepted).any()), unsure,
+                     *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
     confidence = forecast(terms) if loops.any() else float('nan')
     left_out = np.flatnonzero(loops & ~accepted)
-    if settled and np.count_nonzero(loops) >= _HANDFUL and forecast(terms[:3]) < CONFIDENT:
+    if settled and np.count_nonzero(loops) >= HANDFUL and forecast(terms[:3]) < CONFIDENT:
         metres = unsure * right_within(growth.graph.manifold.positions(growth.poses))
         reasons += (doubt_of(growth.factors.pairs[left_out], growth.graph.n_poses, WEAK,
                              f'{metres:.2g}'),)
-    doubted = bool(2 * len(left_out) > np.count_nonzero(loops) >= _HANDFUL) or any(
-        doubt.kind == OTHER_MAP for doubt in reasons)
+    doubted = OTHER_MAP in kinds or bool(
+        2 * len(left_out) > np.count_nonzero(loops) >= HANDFUL)
     return Judgement(accepted, suspect[:size], sigmas, growth.variance, _noise(growth)[:size],
                      slips, reasons, settled, confidence=confidence, terms=terms,
                      is_refusal_doubted=doubted)
-
-
-def _terms(growth: Growth, unsure: float, reasons: tuple[Doubt, ...]) -> Array:
-    """Return what a forecast is made of."""
-    kinds = {doubt.kind for doubt in reasons}
-    return terms_of(bool((growth.is_loop & growth.accepted).any()), unsure,
-                    *(kind in kinds for kind in (DRIFTS, OTHER_MAP, SLIP)))
 
 
 def _noise(growth: Growth) -> Array:

@@ -40,8 +40,6 @@ _MATES = 3
 _RUN_WAY = 2.5
 # One that is to outweigh the odometry has so many: of recorded ones five in six are true then.
 _LONG_RUN = 10
-# So many times vaguer than the surest one, a loop says little.
-_VAGUE, _TINY = 10.0, 1e-300
 
 
 @dataclass(frozen=True)
@@ -78,14 +76,8 @@ def strongest_group(growth: Growth, rows: Indices) -> Group:
 
 
 def longest_run(growth: Growth, rows: Indices) -> Group:
-    """
-    Return of some loops the run that most of them are of, empty where there is none.
-
-    Of loops that say little, as of times when no odometry came, none is asked.
-    """
-    diagonal = np.diagonal(growth.factors.sqrt_information[rows], axis1=1, axis2=2)
-    size = np.log(np.maximum(np.abs(diagonal), _TINY)).mean(axis=1)
-    rows = asked(growth, rows[size > size.max(initial=-np.inf) - np.log(_VAGUE)])
+    """Return of some loops the run that most of them are of, empty where there is none."""
+    rows = asked(growth, rows)
     longest = max(runs(growth, rows), key=lambda group: len(group.rows), default=NO_GROUP)
     return longest if len(longest.rows) >= max(_LONG_RUN, len(rows) / 2 + 1) else NO_GROUP
 

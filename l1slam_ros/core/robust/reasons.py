@@ -25,6 +25,7 @@ from l1slam_ros.core.robust.forecast import drift_taken_for_noise
 from l1slam_ros.core.robust.gating import DOUBT
 from l1slam_ros.core.robust.judgement import (
     DRIFTS,
+    HANDFUL,
     ONE_JOINS,
     ONE_PLACE,
     OTHER_MAP,
@@ -41,9 +42,6 @@ from l1slam_ros.core.robust.pairwise_consistency import (
 )
 from l1slam_ros.core.robust.places import join_what_no_other
 from l1slam_ros.core.robust.rounds import Growth
-
-# Fewer loops may well be of one place.
-_HANDFUL = 5
 
 
 def doubts(growth: Growth, ended: bool = True) -> tuple[Doubt, ...]:
@@ -73,7 +71,7 @@ def _decides_alone(growth: Growth, accepted: Indices) -> bool:
 
     As one loop, by the median of what they say, it would not be believed by odometry alone.
     """
-    if (len(accepted) < _HANDFUL or not growth.may_err_as_one(accepted, 2)
+    if (len(accepted) < HANDFUL or not growth.may_err_as_one(accepted, 2)
             or (growth.trusted | growth.factors.is_absolute)[accepted].any()):
         return False
     odometry = growth.copy()
@@ -132,12 +130,17 @@ def _may_be_right(growth: Growth, group: Indices, accepted: Mask) -> bool:
 
     Then the odometry slipped at a step that the group spans and no accepted loop does. Of all
     steps one is expected to have slipped: if these are less than a hundredth of them, a place is
-    rather one mistake.
+    rather one mistake. Or the group is of several places, all seen from one keyframe that is out
+    of line: the odometry slipped to it, and back.
     """
-    across = spanned(growth.low[accepted], growth.high[accepted], growth.graph.n_poses)
-    untold = np.count_nonzero(across[growth.low[common_steps(growth, group)]] == 0)
-    few = DOUBT * np.count_nonzero(~growth.is_loop) if growth.may_err_as_one(group, 2) else 1
-    return bool(untold >= few)
+    low, high = growth.low, growth.high
+    across = spanned(low[accepted], high[accepted], growth.graph.n_poses)
+    untold = np.count_nonzero(across[low[common_steps(growth, group)]] == 0)
+    if growth.may_err_as_one(group, 2):
+        return bool(untold >= DOUBT * np.count_nonzero(~growth.is_loop))
+    told = np.concatenate((low[accepted], high[accepted]))
+    return bool(untold) or any(not np.ptp(ends) and ends[0] not in told
+                               for ends in (low[group], high[group]))
 
 
 def _doubt(growth: Growth, kind: str, rows: Indices) -> Doubt:

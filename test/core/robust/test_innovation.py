@@ -23,6 +23,7 @@ from l1slam_ros.core.robust.innovation import (
     innovations,
     log_likelihood_ratio,
     sample_posterior,
+    spread_of,
     student_quantile,
 )
 from l1slam_ros.core.solvers.block_cholesky import cholesky_of
@@ -92,7 +93,7 @@ def test_the_noise_that_there_is_shows_in_the_map_by_the_weights_that_are_stated
     A = linearise(part, poses).A.toarray()
     gain = np.linalg.inv(A.T @ A) @ A.T * np.sqrt(np.repeat(variance, 3))
     exact = np.diag(gain @ gain.T)
-    found = covariances(part, poses, cholesky_of(part), variance)
+    found = covariances(spread_of(part, poses, cholesky_of(part), variance))
     ratio = np.diagonal(found, axis1=1, axis2=2).ravel() / exact
     assert np.median(ratio) == pytest.approx(1, abs=0.1)
     assert ratio.min() > 0.4 and ratio.max() < 2.5

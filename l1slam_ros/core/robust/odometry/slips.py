@@ -54,8 +54,6 @@ SURE = float(np.log(1 / DOUBT - 1))
 # By so much more the odometry may vary than its good steps say, for a run to be looked at; and
 # with it, than was found first, and than it states.
 _NOISIER, _MOST = 30.0, 10.0
-# Of fewer steps there is no habit.
-_FEWEST_STEPS = 20
 
 
 def join(growth: Growth, by_runs: bool = False) -> bool:
@@ -84,24 +82,19 @@ def join(growth: Growth, by_runs: bool = False) -> bool:
 
 def _join_by(growth: Growth, group: Group) -> None:
     """Move the later one of two parts to where the first loop of a group says, accept all."""
-    loop = group.rows[0]
+    manifold, loop = growth.graph.manifold, group.rows[0]
     fixed, moving = growth.low[loop], growth.high[loop]
     Z = growth.factors.measurement[loop, None]
     if growth.part[fixed] > growth.part[moving]:
-        fixed, moving, Z = moving, fixed, growth.graph.manifold.inverse(Z)
-    _carry(growth, growth.part == growth.part[moving], (fixed, moving), Z)
+        fixed, moving, Z = moving, fixed, manifold.inverse(Z)
+    wanted = manifold.compose(growth.poses[fixed, None], Z)
+    motion = manifold.compose(wanted, manifold.inverse(growth.poses[moving, None]))
+    part = growth.part == growth.part[moving]
+    growth.poses = growth.poses.copy()
+    growth.poses[part] = manifold.compose(
+        np.broadcast_to(motion, growth.poses[part].shape), growth.poses[part])
     growth.accepted[group.rows] = True
     growth.solve()
-
-
-def _carry(growth: Growth, some: Mask, ends: tuple[int, int], Z: Array) -> None:
-    """Move some keyframes, (n,), all alike, to where one sees the other at Z; ends : these."""
-    manifold = growth.graph.manifold
-    fixed, moving = growth.poses[list(ends), None]
-    motion = manifold.compose(manifold.compose(fixed, Z), manifold.inverse(moving))
-    growth.poses = growth.poses.copy()
-    growth.poses[some] = manifold.compose(
-        np.broadcast_to(motion, growth.poses[some].shape), growth.poses[some])
 
 
 def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
@@ -113,8 +106,6 @@ def without_slip(growth: Growth, as_stated: Growth) -> Growth | None:
     as_stated : the state where all may be as noisy as they say; what that explains needs no slip
     """
     growth.slip_odds = {step: odds for step, odds in growth.slip_odds.items() if growth.cut[step]}
-    if np.count_nonzero(~growth.is_loop & ~growth.cut) < _FEWEST_STEPS:
-        return None
     motion = usual_motion(growth)
     found, most = None, 0.0
     for steps, odds, state, usual in _tried(growth, as_stated, motion):
@@ -298,14 +289,12 @@ def _cut_at(state: Growth, cut: int, step: int) -> Growth:
     state = state.copy()
     state.cut[[cut, step]] = False, True
     # What lies between goes over to the other side.
-    between = np.zeros(state.graph.n_poses, bool)
-    between[slice(*np.sort(state.high[[cut, step]]))] = True
-    low, high = state.low[cut], state.high[cut]
-    Z = state.factors.measurement[cut, None]
-    if state.low[step] > low:
-        _carry(state, between, (low, high), Z)
-    else:
-        _carry(state, between, (high, low), state.graph.manifold.inverse(Z))
+    side = state.low[cut] if state.low[step] > state.low[cut] else state.high[cut]
+    between = np.arange(*np.sort(state.high[[cut, step]]))
+    chain, manifold = odometry_poses(state.graph), state.graph.manifold
+    here, start = (np.tile(poses[side], (len(between), 1)) for poses in (state.poses, chain))
+    state.poses = state.poses.copy()
+    state.poses[between] = manifold.compose(here, manifold.between(start, chain[between]))
     state.solve()
     _accept_more(state)
     return state
